@@ -4,6 +4,7 @@
     python benchmarks/segmentation.py tissues --data ring --methods "segment_mri"       # a part of it
     python benchmarks/segmentation.py tissues --label-map aseg.nii.gz                   # phantoms of other brains
     python benchmarks/segmentation.py tissues --scan T1.nii.gz aseg.nii.gz              # a scan labelled by others
+    python benchmarks/segmentation.py parts --label-map aseg.nii.gz                     # of these phantoms, bias field
     python benchmarks/segmentation.py brains --head HEAD.nii.gz [--head ...]            # brain extraction; minutes each
     python benchmarks/segmentation.py patients            # ReMIND-022: T1, T2, both; shares and hemispheres
 
@@ -15,6 +16,7 @@ Names of data: mni152, colin27, ring; a part of a case's name selects too, as "7
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -28,10 +30,13 @@ from scipy import ndimage
 from SlicerUSSim.Logic import Volume, segment_mri
 from SlicerUSSim.Logic.base import write_json
 from SlicerUSSim.Logic.base.errors import SimulationError, require
+from SlicerUSSim.Logic.mri.bias import without_bias
 from SlicerUSSim.Logic.verification.benchmark.files import output_file
 from SlicerUSSim.Logic.verification.brain_phantoms import (
+    PARTS,
     BrainPhantom,
     TissueMaps,
+    part_of,
     phantom,
     tissue_maps,
     with_ring_tumour,
@@ -48,29 +53,33 @@ TISSUES = ("csf", "grey matter", "white matter", "grey and white")
 # ---- tissues ---------------------------------------------------------------------------------------------------------
 
 
+def maps_of(brain: str, files: dict[str, Path]) -> TissueMaps:
+    """The maps of a brain of the package, also warped, or of a label map."""
+    if brain in files:
+        return maps_of_labels(Volume.read(files[brain]), brain)
+    found = tissue_maps(brain.split()[0])
+    require(found, f"{brain} is not installed")
+    found = cast(TissueMaps, found)
+    return found.warped() if brain.endswith("warped") else found
+
+
 def cases(arguments: argparse.Namespace) -> Iterator[tuple[str, Callable[[], tuple[BrainPhantom, str]]]]:
     """(name, function that makes the phantom and says its contrast) of every case."""
     files = {path.name.split(".")[0]: path for path in arguments.label_map}
-
-    def maps(brain: str) -> TissueMaps:
-        if brain in files:
-            return maps_of_labels(Volume.read(files[brain]), brain)
-        found = tissue_maps(brain.split()[0])
-        require(found, f"{brain} is not installed")
-        found = cast(TissueMaps, found)
-        return found.warped() if brain.endswith("warped") else found
-
     for brain in ("mni152", "mni152 warped", "colin27", *files):
         for mask in ("full", "tight"):
             for noise, bias in QUALITIES:
                 yield (
                     f"{brain}, {noise:.0%} noise, {bias:.0%} bias, {mask} mask",
-                    lambda b=brain, n=noise, f=bias, m=mask: (phantom(maps(b), noise=n, bias=f, mask=m), "t1"),
+                    lambda b=brain, n=noise, f=bias, m=mask: (
+                        phantom(maps_of(b, files), noise=n, bias=f, mask=m),
+                        "t1",
+                    ),
                 )
             if brain in ("mni152", "colin27"):
                 yield (
                     f"{brain}, ring tumour, 3% noise, 20% bias, {mask} mask",
-                    lambda b=brain, m=mask: (phantom(with_ring_tumour(maps(b)), "t1gd", mask=m), "t1gd"),
+                    lambda b=brain, m=mask: (phantom(with_ring_tumour(maps_of(b, files)), "t1gd", mask=m), "t1gd"),
                 )
     for image, labels in arguments.scan:
         name = Path(image).name.split(".")[0] + ", scan"
@@ -183,6 +192,37 @@ def picture(path: Path, case: BrainPhantom, found: dict[str, np.ndarray]) -> Non
     plt.close(figure)
 
 
+# ---- parts ----------------------------------------------------------------------------------------------------------
+
+
+def measure_parts(arguments: argparse.Namespace) -> list[dict]:
+    """Mean Dice of grey and white matter in parts of phantoms (brain_phantoms.PARTS), whose field no atlas leads."""
+    rows = []
+    print("| data | field left in | N4 | segment_mri |")
+    print("|---|---|---|---|", flush=True)
+    files = {path.name.split(".")[0]: path for path in arguments.label_map}
+    for brain, bias in itertools.product(("mni152 warped", "colin27", *files), (0.0, 0.05, 0.1, 0.2)):
+        named = {f"{brain}, {part}, {bias:.0%} bias": part for part in PARTS}
+        wanted_data = [name for name in named if not arguments.data or any(text in name for text in arguments.data)]
+        whole = phantom(maps_of(brain, files), noise=0.03, bias=bias, seed=3) if wanted_data else None
+        for name in wanted_data:
+            case = part_of(cast(BrainPhantom, whole), named[name])
+            inside = case.mask.array > 0
+            n4 = case.mri.with_array(without_bias(case.mri, inside, lambda share: None))
+            row: dict[str, Any] = {"data": name}
+            for method, mri, wanted in (
+                ("none", case.mri, False),
+                ("N4", n4, False),
+                ("segment_mri", case.mri, None),
+            ):
+                found = segment_mri(mri, contrast="t1", mask=case.mask, bias_correction=wanted)
+                names = dict(enumerate(found.tissue_names, start=1))
+                row[method] = scores(found.labels.array, names, case)["grey and white"]
+            rows.append(row)
+            print(f"| {name} | {row['none']:.3f} | {row['N4']:.3f} | {row['segment_mri']:.3f} |", flush=True)
+    return rows
+
+
 # ---- patients --------------------------------------------------------------------------------------------------------
 
 
@@ -248,7 +288,7 @@ def hemispheres(mask: np.ndarray, ijk_to_ras: np.ndarray) -> np.ndarray:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=str(__doc__).splitlines()[0])
-    parser.add_argument("what", choices=("tissues", "brains", "patients"), nargs="+")
+    parser.add_argument("what", choices=("tissues", "parts", "brains", "patients"), nargs="+")
     parser.add_argument("--data", nargs="+", default=[], help="parts of the names of cases (default: all)")
     parser.add_argument("--methods", nargs="+", default=[], help="names of methods as in the table (default: all)")
     parser.add_argument("--label-map", type=Path, nargs="+", default=[], help="with FreeSurfer's values")
@@ -263,7 +303,9 @@ def main() -> None:
     arguments = parser.parse_args()
     if arguments.keep:
         arguments.keep.mkdir(parents=True, exist_ok=True)
-    measures = {"tissues": measure_tissues, "brains": measure_brains, "patients": measure_patients}
+    measures = {
+        "tissues": measure_tissues, "parts": measure_parts, "brains": measure_brains, "patients": measure_patients
+    }  # fmt: skip
     results = {}
     for what in arguments.what:
         print(f"\n{what}\n")

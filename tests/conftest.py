@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import locale
+import os
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -59,6 +60,18 @@ def example(name: str):
     module = sys.modules[name] = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module
+
+
+@pytest.fixture(autouse=True, scope="session")
+def _own_state(tmp_path_factory):
+    """Sessions of workstations are kept in a folder of the tests, not of the user."""
+    before = os.environ.get("XDG_STATE_HOME")
+    os.environ["XDG_STATE_HOME"] = str(tmp_path_factory.mktemp("state"))
+    yield
+    if before is None:
+        del os.environ["XDG_STATE_HOME"]
+    else:
+        os.environ["XDG_STATE_HOME"] = before
 
 
 @pytest.fixture(autouse=True)

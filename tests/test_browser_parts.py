@@ -70,6 +70,7 @@ from SlicerUSSim.Widget.sections import panel_sections  # noqa: E402
 from SlicerUSSim.Workstation import page as page_of  # noqa: E402
 from SlicerUSSim.Workstation.buttons import Buttons  # noqa: E402
 from SlicerUSSim.Workstation.comparison import Comparison, RealImages  # noqa: E402
+from SlicerUSSim.Workstation.content import Kind  # noqa: E402
 from SlicerUSSim.Workstation.export import Cine  # noqa: E402
 from SlicerUSSim.Workstation.messages import Messages  # noqa: E402
 from SlicerUSSim.Workstation.opener import Files, Opener  # noqa: E402
@@ -685,11 +686,13 @@ def test_a_label_map_is_opened_with_the_table_of_its_labels_whatever_that_is_cal
     alone = {name: content for name, content in sent.items() if name == "rem.nii.gz"}
     with (
         pytest.raises(SimulationError, match=r"^rem.nii.gz: .*open it together with .*\.json file"),
-        opener.uploaded(alone) as upload,
+        opener.sent(alone) as parcel,
     ):
+        ((upload,), _) = opener.uploads(parcel)
         opener.labels(upload.path, upload.table)
-    with opener.uploaded(sent) as upload:
-        assert upload.kind == "labels"
+    with opener.sent(sent) as parcel:
+        ((upload,), _) = opener.uploads(parcel)
+        assert upload.kind is Kind.LABELS
         node, found = opener.labels(upload.path, upload.table)
     assert node.GetName() == "rem.nii.gz" and set(found.names) == set(names)
     for name, n in zip(names, range(1, 5), strict=True):
@@ -704,10 +707,9 @@ def test_a_label_map_is_opened_with_the_table_of_its_labels_whatever_that_is_cal
         (["rem.json"], "rem.json is the tissue table of a label map: open both files together"),
         (["names.txt"], "names.txt is a table of the labels of a label map: open both files together"),
         (["names.txt", "rem.json"], "names.txt, rem.json: are tables, expected a label map with one of them"),
-        (["a.nii.gz", "b.nii.gz"], "a.nii.gz, b.nii.gz: are 2 files, expected one, or a label map with the table of"),
-        (["a.nii.gz", "names.txt", "rem.json"], "are 3 files, expected one, or a label map with the table of"),
+        (["a.nii.gz", "b.nii.gz", "rem.json"], "rem.json: is a table of 2 label maps, expected one for each, called"),
+        (["a.nii.gz", "names.txt", "rem.json"], "names.txt, rem.json: are tables of 1 label map, expected one for"),
         (["mri.nii.gz", "rem.json"], "mri.nii.gz is no label map, and rem.json a table of labels"),
-        (["a.nii.gz", "preset.json"], "preset.json is a preset: open it alone"),
     ],
 )  # fmt: skip
 def test_files_that_cannot_be_opened_together_or_alone_are_one_line(head, tmp_path, names, message):
@@ -719,9 +721,9 @@ def test_files_that_cannot_be_opened_together_or_alone_are_one_line(head, tmp_pa
     Preset().write(tmp_path / "preset.json")
     with (
         pytest.raises(SimulationError, match=re.escape(message)) as caught,
-        _opener().uploaded({name: (tmp_path / name).read_bytes() for name in names}),
+        (opener := _opener()).sent({name: (tmp_path / name).read_bytes() for name in names}) as parcel,
     ):
-        pass
+        opener.uploads(parcel)
     assert str(tmp_path) not in str(caught.value) and "/tmp" not in str(caught.value)
 
 
@@ -730,21 +732,30 @@ def test_the_pages_proposal_for_labels_in_another_order_is_a_file_that_opens_the
     opener = _opener()
     with (
         pytest.raises(SimulationError) as caught,
-        opener.uploaded(_as_sent(tmp_path)) as upload,
+        opener.sent(_as_sent(tmp_path)) as parcel,
     ):
+        ((upload,), _) = opener.uploads(parcel)
         opener.labels(upload.path, upload.table)
     proposal = re.search(r"with a \.json file with (\{.*\})$", str(caught.value))
     assert proposal is not None, str(caught.value)
     (tmp_path / "spm.json").write_text(proposal[1])
-    with opener.uploaded(_as_sent(tmp_path)) as upload:
+    with opener.sent(_as_sent(tmp_path)) as parcel:
+        ((upload,), _) = opener.uploads(parcel)
         _, found = opener.labels(upload.path, upload.table)
     assert found.names == ("grey matter", "white matter", "csf")
 
 
-def test_a_preset_is_opened_alone(tmp_path):
+def test_a_label_map_and_a_preset_are_told_apart(head, tmp_path):
+    """A preset is no table of the labels that are opened with it."""
     Preset().write(tmp_path / "preset.json")
-    with _opener().uploaded(_as_sent(tmp_path)) as upload:
-        assert upload.kind == "preset" and upload.table is None
+    head.labels.write(tmp_path / "a.nii.gz")
+    opener = _opener()
+    with opener.sent(_as_sent(tmp_path)) as parcel:
+        uploads, wrong = opener.uploads(parcel)
+    assert [(upload.name, upload.kind) for upload in uploads] == [
+        ("preset.json", Kind.PRESET), ("a.nii.gz", Kind.LABELS),
+    ]  # fmt: skip
+    assert not wrong and all(upload.table is None for upload in uploads)
 
 
 def test_nothing_tracked_is_said():

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import io
+
 import numpy as np
 import pytest
 
@@ -10,12 +12,14 @@ slicer = pytest.importorskip("slicer", reason="MRML nodes come with slicer-core:
 from vtkmodules.vtkCommonCore import vtkPoints  # noqa: E402
 
 from SlicerUSSim.Logic import SimulationError, Volume  # noqa: E402
+from SlicerUSSim.Logic.base.reading import read_values, write_values  # noqa: E402
 from SlicerUSSim.Logic.base.vtk_data import vtk_matrix  # noqa: E402
 from SlicerUSSim.Logic.mri.craniotomy import disc_opening, opened  # noqa: E402
 from SlicerUSSim.Logic.mrml.label_nodes import read_labels, write_labels  # noqa: E402
 from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic  # noqa: E402
 from SlicerUSSim.Logic.mrml.nodes import node_to_world, nodes_of_class, set_node_to_world, write_volume  # noqa: E402
 from SlicerUSSim.Logic.mrml.own_labels import mark_as_made  # noqa: E402
+from SlicerUSSim.Logic.mrml.scene_record import put_nodes, record_scene  # noqa: E402
 from SlicerUSSim.Logic.probe.placement import pose_looking_at  # noqa: E402
 from SlicerUSSim.Widget.presenter import PanelPresenter  # noqa: E402
 from tests.test_craniotomy import NAMES, TOP, head  # noqa: E402, F401
@@ -275,3 +279,29 @@ def test_hidden_segments_of_an_opening_stay_closed_and_are_said_to(head):  # noq
     opening.GetDisplayNode().SetSegmentVisibility(first, False)
     bench.presenter.openCraniotomy()
     assert "all its segments are hidden, expected a visible one to open" in bench.view.errors[-1]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_an_opening_is_there_after_the_scene_was_kept_as_values_and_can_be_closed(kind, head):  # noqa: F811
+    bench = Bench(head, kind)
+    bench.presenter.openCraniotomy()
+    assert not bench.view.errors
+    bench.presenter.simulate()
+    image, whole = bench.logic.lastFrame.image, bench.tissues(bench.whole)
+    file = io.BytesIO()
+    write_values(file, record_scene(bench.scene))
+    file.seek(0)
+    record = read_values(file)
+    assert set(record.nodes) == {"labels", "closed"}
+    again = Bench(head, KINDS[0], np.eye(4))
+    again.scene.RemoveNode(again.whole)
+    nodes = put_nodes(again.scene, record)
+    again.logic.parameters.labels = nodes["labels"]
+    set_node_to_world(again.probe, record.pose)
+    again.presenter.simulate()
+    assert not again.view.errors and np.array_equal(again.logic.lastFrame.image, image)
+    flaps = [node for node in nodes_of_class(again.scene, "vtkMRMLModelNode") if "removed" in node.GetName()]
+    assert len(flaps) == 1 and flaps[0].GetPolyData().GetNumberOfPoints() > 20
+    again.presenter.closeCraniotomy()
+    assert not again.view.errors and again.labels is nodes["closed"]
+    assert np.array_equal(np.unique(again.tissues(again.labels)), np.unique(whole))

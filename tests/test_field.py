@@ -336,6 +336,38 @@ def test_saturated_images_and_a_mirroring_calibration_are_said(caplog):
     assert "ImageToReference mirrors" in caplog.text
 
 
+def test_what_is_white_in_all_saturated_images_is_the_patient_and_no_logo(caplog):
+    """A real sweep five times too bright lost 12 % of its field as "text, rulers, logos and boxes"."""
+    sequence = recording(CONVEX)
+    bright = np.where(sequence.images > 120, 255, sequence.images).astype(np.uint8)
+    middle = np.array(bright.shape[1:]) // 2
+    bright[:, middle[0] : middle[0] + 30, middle[1] : middle[1] + 30] = 255
+    found = TrackedImages.of(sequence.with_images(range(6), bright), probe=CONVEX)
+    assert "the images are saturated" in caplog.text
+    assert "are the same in all images" not in caplog.text
+    assert found.field.mask[middle[0] : middle[0] + 30, middle[1] : middle[1] + 30].all()
+
+
+def test_a_white_logo_is_no_saturation(caplog):
+    sequence = recording(CONVEX)
+    images = sequence.images.copy()
+    middle = np.array(images.shape[1:]) // 2
+    images[:, middle[0] : middle[0] + 40, middle[1] : middle[1] + 60] = 255
+    TrackedImages.of(sequence.with_images(range(6), images), probe=CONVEX)
+    assert "are the same in all images" in caplog.text
+    assert "saturated" not in caplog.text
+
+
+@pytest.mark.parametrize("level", [100, 255])
+def test_an_image_of_one_grey_level_is_refused_with_its_number_and_the_level(level):
+    """White images were fitted, with costs and textures that were no numbers."""
+    sequence = recording(CONVEX, 2)
+    images = sequence.images.copy()
+    images[1] = level
+    with pytest.raises(SimulationError, match=f"image 1 has the grey level {level} in all of the probe's field"):
+        TrackedImages.of(sequence.with_images([0, 1], images), probe=CONVEX)
+
+
 @needs_shared
 def test_the_real_sweep_is_cut_at_column_543():
     sequence = TrackedSequence.read(SHARED / "brain_sweep" / "brain_sweep.igs.mha")

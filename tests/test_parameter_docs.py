@@ -30,9 +30,10 @@ of a parameter also defines its checks, its name in a preset, its option, its fi
 the bounds of its fit.
 
 A preset is a JSON file with the objects `probe`, `display`, `settings`, `tissues` (by label, `"1"` to `"62"`, and `"0"`
-for the coupling medium) and `membrane`. `ussim demo` and the panels write presets; `--preset` and the panels read them.
-Types are strict: `true` and `"5"` are not accepted as numbers, nor 3.0 as a whole number, and names that are not in
-these tables are refused. *None* is `null` in JSON.
+for the coupling medium) and `membrane`, and `probe_to_ras`, four rows of four numbers, if it has a pose of the probe
+(*Pose in presets*); `--pose` reads it from there, too. `ussim demo` and the panels write presets; `--preset` and the
+panels read them. Types are strict: `true` and `"5"` are not accepted as numbers, nor 3.0 as a whole number, and names
+that are not in these tables are refused. *None* is `null` in JSON.
 
 In the command, `--set` changes any parameter of probe, display, settings, membrane and tissues. Its value is the name
 of the section or tissue, a dot, the name of the parameter, and the new value: `--set settings.max_ray_depth=4`,

@@ -14,10 +14,11 @@ import pytest
 slicer = pytest.importorskip("slicer", reason="MRML nodes come with slicer-core: pip install '.[slicer]'")
 
 from SlicerUSSim.Logic.base.declaration import Shown, parameter  # noqa: E402
+from SlicerUSSim.Logic.base.transforms import pose_of_angles  # noqa: E402
 from SlicerUSSim.Logic.mri.samples import head_mri  # noqa: E402
 from SlicerUSSim.Logic.mrml.label_nodes import read_labels, write_labels  # noqa: E402
 from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic  # noqa: E402
-from SlicerUSSim.Logic.mrml.nodes import read_volume, write_volume  # noqa: E402
+from SlicerUSSim.Logic.mrml.nodes import probe_pose, read_volume, set_node_to_world, write_volume  # noqa: E402
 from SlicerUSSim.Logic.mrml.own_labels import content_of  # noqa: E402
 from SlicerUSSim.Logic.mrml.share_nodes import read_shares  # noqa: E402
 from SlicerUSSim.Logic.mrml.taken_image import about_image, is_frozen, patient_of  # noqa: E402
@@ -92,6 +93,30 @@ def test_from_mri_to_live_image(presenter):
     assert after.astype(float).mean() > before.astype(float).mean() + 10
     presenter.setLive(False)
     assert not presenter.isLive()
+
+
+def test_presets_carry_the_pose_if_it_is_wanted(presenter, tmp_path):
+    view, parameters = presenter.view, presenter.logic.parameters
+    presenter.setValue("scene.preset_pose", True)
+    presenter.savePreset(tmp_path / "none.json")
+    assert "Pose in presets is ticked, and there is no probe" in view.errors.pop() and not list(tmp_path.iterdir())
+    presenter.segment()
+    presenter.placeProbe()
+    pose = probe_pose(parameters.probe_transform) @ pose_of_angles([3.0, 0, 5.0], [0, 10.0, 20.0])
+    set_node_to_world(parameters.probe_transform, pose)
+    presenter.savePreset(tmp_path / "with.json")
+    presenter.setValue("scene.preset_pose", False)
+    presenter.savePreset(tmp_path / "without.json")
+    presenter.placeProbe()
+    placed = probe_pose(parameters.probe_transform)
+    presenter.loadPreset(tmp_path / "without.json")
+    np.testing.assert_array_equal(probe_pose(parameters.probe_transform), placed)
+    presenter.loadPreset(tmp_path / "with.json")
+    np.testing.assert_allclose(probe_pose(parameters.probe_transform), pose, atol=1e-9)
+    assert not view.errors and presenter.logic.preset.probe_to_ras is None  # the probe's node has it
+    parameters.labels = None
+    presenter.loadPreset(tmp_path / "with.json")
+    assert "the pose of the preset is not used, since there are no tissues" in view.errors.pop()
 
 
 def test_an_output_of_others_is_kept_and_a_new_one_selected(presenter):

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import json
 
+import numpy as np
 import pytest
 from hypothesis import given, strategies as st
 
 from SlicerUSSim.Logic import ConvexProbe, LinearProbe, Preset, SimulationError, TissueTable
+from SlicerUSSim.Logic.base.transforms import pose_of_angles
 from SlicerUSSim.Logic.probe.arrays import PROBES
 from SlicerUSSim.Logic.tissue.names import tissue_named
+from SlicerUSSim.Logic.tracked.pose_files import read_pose
 
 
 @given(
@@ -26,6 +29,21 @@ def test_a_preset_survives_its_file(tmp_path_factory, probe, gain, noise, size, 
     path = tmp_path_factory.mktemp("preset") / "preset.json"
     preset.write(path)
     assert Preset.read(path) == preset
+
+
+def test_a_preset_may_carry_a_pose_and_one_without_is_as_before(tmp_path):
+    pose = pose_of_angles([10.0, -20.0, 30.5], [10.0, 20.0, 30.0])
+    assert "probe_to_ras" not in Preset().to_dict() and Preset().probe_to_ras is None
+    preset = Preset(PROBES["convex"], probe_to_ras=pose)
+    preset.write(tmp_path / "preset.json")
+    again = Preset.read(tmp_path / "preset.json")
+    assert again == preset and again.changed("display", gain_db=3).probe_to_ras == preset.probe_to_ras
+    np.testing.assert_allclose(again.probe_to_ras, pose)
+    np.testing.assert_allclose(read_pose(tmp_path / "preset.json"), pose)  # --pose takes it from there
+    with pytest.raises(SimulationError, match="probe_to_ras is not rigid"):
+        Preset.from_dict({**preset.to_dict(), "probe_to_ras": (2 * np.diag([1, 1, 1, 0.5])).tolist()})
+    with pytest.raises(SimulationError, match="is a pose and no preset; open it as a pose"):
+        Preset.from_dict({"probe_to_ras": pose.tolist()})  # which would reset probe and tissues
 
 
 def test_changing_the_kind_of_probe_keeps_what_both_have():

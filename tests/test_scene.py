@@ -879,7 +879,7 @@ def test_every_declared_setting_is_remembered_one_by_one_and_together(bench):
         *(entry.name for entry in fields(SegmentationSettings)),
         *(f"fit_{entry.name}" for entry in fields(FitSettings)),
         *(f"sheet_{entry.name}" for entry in fields(SheetSettings)), "lesion_as", "gel",
-        "show_in_slice", "preset", "second_contrast", "craniotomy_mm", "view",
+        "show_in_slice", "preset", "preset_pose", "second_contrast", "craniotomy_mm", "view",
     }  # fmt: skip
 
 

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from SlicerUSSim.Logic import LinearProbe, SimulationError, TrackedSequence, Volume
 from SlicerUSSim.Logic.base.transforms import rigid_between
 from SlicerUSSim.Logic.tracked.images import TrackedImages
-from SlicerUSSim.Logic.tracked.pose_files import read_matrix, read_tags, read_transform
+from SlicerUSSim.Logic.tracked.pose_files import fit_landmarks, read_calibration, read_matrix, read_tags, read_transform
 from SlicerUSSim.Logic.tracked.sequence import read_coordinate_definitions
 from tests.conftest import SHARED, needs_shared
 
@@ -377,6 +377,42 @@ def test_calibrations_are_read_from_plus_configurations_and_matrices(tmp_path):
         (tmp_path / "bad.xml").write_text(text)
         with pytest.raises(SimulationError, match=message):
             read_coordinate_definitions(tmp_path / "bad.xml")
+
+
+@pytest.mark.parametrize(
+    ("points", "words"),
+    [
+        ([[0, 0, 0], [9, 0, 0]], "2 pairs of landmarks, expected three or more"),
+        ([[0, 0, 0]], "1 pair of landmarks"),
+        ([[0, 0, 0], [9, 9, 9], [20, 20, 20.5]], r"landmarks in the ultrasound lie within 0\.\d+ mm of a line"),
+    ],
+)
+def test_landmarks_that_leave_a_turn_free_are_refused(points, words):
+    with pytest.raises(SimulationError, match=words):
+        fit_landmarks(np.array(points, float), np.array(points, float))
+
+
+def test_a_calibration_is_read_from_a_transform_as_slicer_saves_it(tmp_path):
+    """The map from the parent in LPS; a calibration scales."""
+    import SimpleITK as sitk
+
+    matrix = np.array([[0.0, -0.2, 0, 5], [0.1, 0, 0, -7], [0, 0, 0.2, 3], [0, 0, 0, 1]])
+    flip = np.diag([-1.0, -1, 1, 1])
+    to_image = flip @ np.linalg.inv(matrix) @ flip
+    transform = sitk.AffineTransform(to_image[:3, :3].ravel().tolist(), to_image[:3, 3].tolist())
+    for name in ("calibration.tfm", "calibration.txt", "calibration.h5"):
+        sitk.WriteTransform(transform, str(tmp_path / name))
+        (found,) = read_calibration(tmp_path / name, "ImageToTool").items()
+        assert found[0] == "ImageToTool"
+        np.testing.assert_allclose(found[1], matrix, atol=1e-9)
+
+
+def test_what_is_left_at_each_landmark_is_told():
+    points = np.array([[0.0, 0, 0], [50, 0, 0], [0, 40, 0], [0, 0, 30], [30, 30, 30]])
+    shift = np.array([5.0, 4.0, -2.0])
+    matrix, line, left = fit_landmarks(points, points + shift + np.eye(5, 3, k=-2) * [0.0, 0.0, 1.0])
+    assert np.allclose(matrix[:3, 3], shift, atol=1.0) and line.startswith("5 landmarks agree to 0.")
+    assert line == f"5 landmarks agree to {np.sqrt((left**2).mean()):.2f} mm (root mean square)" and left.argmax() == 4
 
 
 # ---- real files ------------------------------------------------------------------------------------------------------

@@ -87,6 +87,13 @@ def test_fit_with_speckle_beats_the_fit_without(tracked):
     assert written["speckle"]["grey_map_found"] is True
 
 
+def test_the_speckle_of_one_image_is_fitted_and_that_is_said(tracked, caplog):
+    fit(
+        simulator(), tracked[1].only([1]), speckle=True, free=["gain_db"], display=PLAIN, max_evaluations=10, restarts=0
+    )  # fmt: skip
+    assert "the speckle of 1 image is fitted (1): grey map, smoothing and texture" in caplog.text
+
+
 def test_textures_of_presets_are_for_even_tissues_only():
     own = TISSUES.replace("tumour", texture_db=1.0)
     assert with_preset_texture(own).tissue("tumour").texture_db == 1.0

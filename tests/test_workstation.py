@@ -12,6 +12,7 @@ import shutil
 import socket
 import subprocess
 import sys
+import tempfile
 from collections import Counter
 from pathlib import Path
 from time import monotonic
@@ -57,9 +58,11 @@ POSE = ("right_deg", "front_deg", "rotate_deg", "rock_deg", "tilt_deg", "lift_mm
 @contextlib.contextmanager
 def serving(*arguments: str):
     """The URL printed by `ussim serve`, while it runs."""
+    state = tempfile.mkdtemp(prefix="ussim-state-")  # of its own: it offers no session of another server
     server = subprocess.Popen(
         [sys.executable, "-m", "SlicerUSSim.Command.cli", "serve", "--port", "0", *arguments],
-        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env={**os.environ, "PYTHONUNBUFFERED": "1"},
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+        env={**os.environ, "PYTHONUNBUFFERED": "1", "XDG_STATE_HOME": state},
     )  # fmt: skip
     try:
         url = server.stdout.readline().strip()
@@ -72,6 +75,7 @@ def serving(*arguments: str):
             server.wait(10)
         server.kill()
         server.communicate()
+        shutil.rmtree(state, ignore_errors=True)
 
 
 @pytest.fixture(scope="module")
@@ -317,6 +321,13 @@ def _held(page: Page, key: str | None):
 def in_view(view, across: float, down: float) -> tuple[float, float]:
     box = view.bounding_box()
     return box["x"] + across * box["width"], box["y"] + down * box["height"]
+
+
+def answer_new_patient(page: Page, title: str = "New patient") -> None:
+    """Answer the question about a file that is opened while a patient is: it is a new one's, or `title`."""
+    page.wait_for_function("document.getElementById('question')?.dataset.number > 0")
+    page.locator("#question .ussim-choice").filter(has_text=title).click()
+    page.locator("#question").wait_for(state="detached")
 
 
 def download(page: Page, kind: str) -> Path:
@@ -1050,6 +1061,7 @@ def test_another_mri_takes_the_place_of_the_first(page, files):
     content = (files / "head.nii.gz").read_bytes()
     with new_image(page):
         page.set_input_files("#open-file", {"name": "again.nii.gz", "mimeType": "application/gzip", "buffer": content})
+        answer_new_patient(page)
     eventually(page, lambda: state(page, NAMES.title) == "again.nii.gz")
     settled(page)
     assert not errors(page) and shown(page, "liveCheckBox") and pixels(page).mean() > 5
@@ -1060,6 +1072,7 @@ def test_another_mri_takes_the_place_of_the_first(page, files):
     Volume(elsewhere.array, elsewhere.ijk_to_ras + 400.0 * np.eye(4, k=3)).write(files / "elsewhere.nii.gz")
     with new_image(page):
         page.set_input_files("#open-file", files / "elsewhere.nii.gz")
+        answer_new_patient(page)
     settled(page)
     assert not errors(page) and pixels(page).mean() > 5  # the probe is placed on the patient in another frame
 
@@ -1069,9 +1082,10 @@ def test_an_opened_patient_takes_the_place_of_title_notes_and_warnings(page, fil
     aseg.write(tmp_path / "aseg.nii.gz")
     Volume(aseg.array[:, :35].copy(), aseg.ijk_to_ras).write(tmp_path / "crop.nii.gz")
 
-    def opened_as(path: Path) -> str:
+    def opened_as(path: Path, title: str = "New patient") -> str:
         with new_image(page):
             page.set_input_files("#open-file", path)
+            answer_new_patient(page, title)
         settled(page)
         assert state(page, NAMES.title) == page.locator("#title").inner_text() == path.name
         return page.locator("#notesLabel").inner_text()
@@ -1080,19 +1094,18 @@ def test_an_opened_patient_takes_the_place_of_title_notes_and_warnings(page, fil
         return " ".join(page.locator("body").inner_text().split())
 
     assert "share" in opened_as(files / "head.nii.gz")  # the table of the MRI
-    notes = opened_as(files / "labels.nii.gz")
+    notes = opened_as(files / "labels.nii.gz", "Tissues of head.nii.gz")
     assert "of the MRI head.nii.gz, which is shown: its intensities follow the labels" in notes
     assert page.locator("#mriSelector option:checked").inner_text().strip() == "head.nii.gz"
-    notes = opened_as(tmp_path / "crop.nii.gz")
+    notes = opened_as(tmp_path / "crop.nii.gz", "Tissues of labels.nii.gz")
     assert "crop.nii.gz: FreeSurfer aseg: 8 labels to 3 tissues" in notes and "share" not in notes
     assert "Check: crop.nii.gz: a part of a brain of 1048 ml, cut off at the front" in notes
-    assert "Check: the MRI head.nii.gz was closed: its intensities do not follow the labels" in notes
-    assert shown(page, "mriSelector") is None
+    assert "Check: the intensities of head.nii.gz do not follow the labels (of another patient?)" in notes
     assert errors(page) == [line.removeprefix("Check: ") for line in notes.splitlines() if "cut off" in line]
     assert "/tmp" not in as_shown() and str(tmp_path) not in as_shown()
     notes = opened_as(tmp_path / "aseg.nii.gz")
     assert "aseg.nii.gz: FreeSurfer aseg: 8 labels to 3 tissues" in notes
-    assert not errors(page) and "crop" not in notes
+    assert not errors(page) and "crop" not in notes and shown(page, "mriSelector") is None
     page.set_input_files("#open-file", files / "broken.nii.gz")  # changes nothing
     assert "broken.nii.gz: " in shown_errors(page)
     settled(page)
@@ -1111,10 +1124,12 @@ def test_a_label_map_is_opened_together_with_its_table(page, files, tmp_path):
     assert "rem.json is the tissue table of a label map: open both files together" in shown_errors(page)
     page.locator(".ussim-error button").first.click()
     page.set_input_files("#open-file", tmp_path / "rem.nii.gz")
+    answer_new_patient(page)
     assert "open it together with the .json file that was written beside it" in shown_errors(page)
     page.locator(".ussim-error button").first.click()
     with new_image(page):
         page.set_input_files("#open-file", [tmp_path / "rem.nii.gz", tmp_path / "rem.json"])
+        answer_new_patient(page)
     settled(page)
     assert state(page, NAMES.title) == "rem.nii.gz" and not errors(page)
     assert "4 labels by their numbers in the tissue table" in page.locator("#notesLabel").inner_text()
@@ -1125,9 +1140,11 @@ def test_a_label_map_is_opened_together_with_its_table(page, files, tmp_path):
     write_label_files(tmp_path / "gd.nii.gz", enhancing, tissues)
     with new_image(page):
         page.set_input_files("#open-file", [tmp_path / "gd.nii.gz", tmp_path / "gd.json"])
+        answer_new_patient(page)
     settled(page)
     assert state(page, NAMES.title) == "gd.nii.gz" and not errors(page)
     page.set_input_files("#open-file", tmp_path / "rem.nii.gz")
+    answer_new_patient(page)
     assert "open it together with the .json file that was written beside it" in shown_errors(page)
     assert state(page, NAMES.title) == "gd.nii.gz"
 

@@ -139,7 +139,7 @@ def test_sliders_and_buttons_have_names(page):
 
 
 def test_axe_finds_nothing_wrong(page):
-    for title in ("Probe", "Tissues", "Rays", "Fit to real ultrasound"):
+    for title in ("Probe", "Tissues", "Rays", "Tracked ultrasound", "Fit to real ultrasound"):
         open_section(page, title)
     page.evaluate("window.trame.trigger('set', ['classesSpinBox', 99])")
     shown_errors(page)
@@ -150,9 +150,40 @@ def test_axe_finds_nothing_wrong(page):
         for entry in found.response["violations"]
         for node in entry["nodes"]
     ]
-    for title in ("Tissues", "Rays", "Fit to real ultrasound"):
+    for title in ("Tissues", "Rays", "Tracked ultrasound", "Fit to real ultrasound"):
         page.get_by_role("button", name=title, exact=True).click()
     assert not wrong, "\n".join(map(str, wrong[:30]))
+
+
+def test_a_question_is_asked_of_everyone(page, files):
+    """Of screen readers and keyboards, too, within four sizes of the window."""
+    sent = files / "head.nii.gz"
+    page.set_input_files("#open-file", sent)
+    page.wait_for_function("document.getElementById('question')?.dataset.number > 0")
+    page.get_by_role("button", name="New patient").wait_for()
+    for width, height in SIZES:
+        page.set_viewport_size({"width": width, "height": height})
+        page.wait_for_timeout(300)
+        box = page.locator("#question").bounding_box()
+        assert (
+            box["x"] >= 0 and box["y"] >= 0 and box["x"] + box["width"] <= width and box["y"] + box["height"] <= height
+        )
+        folder = os.environ.get("USSIM_SCREENSHOTS")
+        if folder:
+            page.screenshot(path=str(Path(folder) / f"question-{width}x{height}.png"))
+    found = axe_of.Axe().run(page, options={"runOnly": ["wcag2a", "wcag2aa", "cat.name-role-value"]})
+    wrong = [(entry["id"], node["html"][:150]) for entry in found.response["violations"] for node in entry["nodes"]]
+    before = pose(page)
+    page.keyboard.press("a")  # does not move the probe
+    for _ in range(4):
+        page.keyboard.press("Tab")
+    inside = page.evaluate("Boolean(document.activeElement.closest('#question'))")
+    page.locator("#question-cancel").focus()
+    page.keyboard.press("Enter")
+    page.locator("#question").wait_for(state="detached")
+    settled(page)
+    assert inside and not wrong and not errors(page) and state(page, NAMES.title) == "labels.nii.gz", wrong
+    assert pose(page) == before
 
 
 # ---- room ------------------------------------------------------------------------------------------------------------

@@ -24,6 +24,7 @@ from SlicerUSSim.Logic.base.volume import read_array
 from SlicerUSSim.Logic.mri.samples import head_mri
 from SlicerUSSim.Workstation.state import NAMES
 from tests.test_workstation import (
+    answer_new_patient,
     browser as browser,
     click,
     cost,
@@ -213,6 +214,7 @@ def test_a_new_patient_clears_image_ruler_and_cost_at_once_and_the_probe_is_plac
         window.looking = true; look(); }"""
     )
     page.set_input_files("#open-file", tmp_path / "other.nii.gz")
+    answer_new_patient(page)
     page.wait_for_function("window.ussim.image?.patient === 'other.nii.gz'")
     settled(page)
     seen = page.evaluate("() => { window.looking = false; return window.cleared; }")
@@ -239,6 +241,7 @@ def test_a_saved_scene_holds_this_patient_only_and_a_patient_can_be_closed(page,
     for name in ("second", "third"):
         shutil.copy(files / "head.nii.gz", tmp_path / f"{name}.nii.gz")
         page.set_input_files("#open-file", tmp_path / f"{name}.nii.gz")
+        answer_new_patient(page)
         page.wait_for_function(f"window.ussim.image?.patient === '{name}.nii.gz'")
         settled(page)
     held = nodes_of_scene(download(page, "mrb"))
@@ -258,6 +261,7 @@ def test_a_saved_scene_holds_this_patient_only_and_a_patient_can_be_closed(page,
 
 def test_the_last_segment_is_undone_on_the_page(page, files):
     page.set_input_files("#open-file", files / "head.nii.gz")
+    answer_new_patient(page)
     page.wait_for_function("window.ussim.image?.patient === 'head.nii.gz'")
     settled(page)
     notes, before = shown(page, "notesLabel"), np.asarray(Image.open(download(page, "png")))
@@ -301,6 +305,7 @@ def test_an_upload_shows_how_far_it_is_can_be_cancelled_and_images_go_on(page, f
 def test_cancel_ends_a_segmentation_within_a_second_and_images_go_on(page, tmp_path):
     head_mri(1.0).write(tmp_path / "fine.nii.gz")
     page.set_input_files("#open-file", tmp_path / "fine.nii.gz")
+    answer_new_patient(page)
     page.wait_for_function("window.ussim.image?.patient === 'fine.nii.gz'")
     settled(page)
     notes = shown(page, "notesLabel")

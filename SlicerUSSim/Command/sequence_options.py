@@ -138,33 +138,24 @@ def open_tracked(
 
 def read_sequence(path: str, calibration: str | None) -> TrackedSequence:
     """The TrackedSequence of --sequence, with the transform of --calibration."""
-    from SlicerUSSim.Logic.tracked.pose_files import read_matrix
-    from SlicerUSSim.Logic.tracked.sequence import TrackedSequence, read_coordinate_definitions
+    from SlicerUSSim.Logic.tracked.pose_files import read_calibration
+    from SlicerUSSim.Logic.tracked.sequence import TrackedSequence
 
     source = Path(path)
     if source.is_dir():
         sequence = TrackedSequence.from_slices(sorted(source.glob("*.mnc")))
     else:
         sequence = TrackedSequence.read(source)
-    if calibration:
-        is_xml = Path(calibration).suffix.lower() == ".xml"
-        constant = read_coordinate_definitions(calibration) if is_xml else {"ImageToProbe": read_matrix(calibration)}
-        sequence = sequence.with_transforms(constant)
-    return sequence
+    return sequence.with_transforms(read_calibration(calibration)) if calibration else sequence
 
 
 def read_to_mri(path: str) -> np.ndarray:
     """(4, 4) map of --to-mri, from the reference frame of the ultrasound to the MRI."""
-    from SlicerUSSim.Logic.base.transforms import rigid_between
-    from SlicerUSSim.Logic.tracked.pose_files import read_tags, read_transform
+    from SlicerUSSim.Logic.tracked.pose_files import read_registration
 
-    if Path(path).suffix.lower() != ".tag":
-        return read_transform(path)
-    in_mri, in_ultrasound = read_tags(path)
-    if in_ultrasound is None:
-        raise SimulationError(f"{path}: has points of one volume, expected pairs in MRI and ultrasound")
-    to_ras, left = rigid_between(in_ultrasound, in_mri)
-    note(f"{len(in_mri)} landmarks agree to {left:.2f} mm (root mean square)")
+    to_ras, line = read_registration(path)
+    if line:
+        note(line)
     return to_ras
 
 

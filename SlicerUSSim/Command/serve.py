@@ -30,7 +30,7 @@ from SlicerUSSim.Logic.mri.settings import CT, SegmentationSettings
 if TYPE_CHECKING:
     import ssl
 
-    from trame_server import Server
+    from SlicerUSSim.Workstation.workstation import Workstation
 
 _PORT = 8080
 
@@ -70,6 +70,14 @@ _PORT = 8080
     "for a client on this computer, listen:HOST:PORT for one on another computer (listen:0.0.0.0:18944). OpenIGTLink "
     "has no authentication: anyone who can reach the port can move the probe and receive the images.",
 )
+@click.option(
+    "--autosave/--no-autosave",
+    default=True,
+    show_default=True,
+    envvar="USSIM_AUTOSAVE",
+    show_envvar=True,
+    help="Keep patient, probe and settings in a folder of yours, to be restored after a crash; see docs/security.md.",
+)
 @click.option("--igtl-device", help="Name of the transform to follow (default: the first one received).")
 @device_option
 def serve(
@@ -96,6 +104,7 @@ def serve(
     cert: str | None,
     key: str | None,
     igtl: str | None,
+    autosave: bool,
     igtl_device: str | None,
     device: str | None,
 ) -> None:
@@ -177,6 +186,7 @@ def serve(
     _prepare_libraries()
     from SlicerUSSim.Logic.mri.settings import SheetSettings
     from SlicerUSSim.Workstation.opener import Files
+    from SlicerUSSim.Workstation.session_store import SessionStore, sessions_folder
     from SlicerUSSim.Workstation.workstation import Workstation
 
     sheet_settings = SheetSettings()
@@ -193,8 +203,9 @@ def serve(
             to_ras=to_ras, tracker=igtl, tracker_device=igtl_device, volumes=volumes,
         ),
         device,
+        SessionStore(sessions_folder()) if autosave else None,
     )  # fmt: skip
-    _run(workstation.server, host, port, tls)
+    _run(workstation, host, port, tls)
 
 
 def _require_opening(path: str) -> None:
@@ -223,15 +234,13 @@ def _tls(cert: str | None, key: str | None) -> ssl.SSLContext | None:
     return tls_context(cert, key)
 
 
-def _run(server: Server | None, host: str, port: int, tls: ssl.SSLContext | None) -> None:
+def _run(workstation: Workstation, host: str, port: int, tls: ssl.SSLContext | None) -> None:
     """Print the URL and serve until the command is interrupted."""
-    import secrets
     import socket
 
     from SlicerUSSim.Workstation.access import guard
 
-    assert server is not None  # the declared result of trame's get_server includes None
-    token = secrets.token_urlsafe(24)
+    server, token = workstation.server, workstation.take_token(port)
 
     def bind(wslink: Any) -> None:
         guard(wslink.app, token, host)
@@ -243,10 +252,16 @@ def _run(server: Server | None, host: str, port: int, tls: ssl.SSLContext | None
     def tell(**_: Any) -> None:
         shown = host if host not in ("0.0.0.0", "::") else socket.gethostname()
         shown = f"[{shown}]" if ":" in shown else shown
+        workstation.keep_token(server.port, token)
         click.echo(f"http{'' if tls is None else 's'}://{shown}:{server.port}/?token={token}")
 
     server.controller.on_server_ready.add(tell)
-    server.start(port=port, host=host, open_browser=False, show_connection_info=False, disable_logging=True, timeout=0)
+    try:
+        server.start(
+            port=port, host=host, open_browser=False, show_connection_info=False, disable_logging=True, timeout=0
+        )
+    finally:
+        workstation.end_session()
 
 
 def _usable_port(host: str, port: int | None) -> int:

@@ -15,6 +15,8 @@ from pathlib import Path
 from time import perf_counter
 from typing import Any
 
+import numpy as np
+
 from SlicerUSSim.Logic.base.errors import Cancelled, SimulationError, require, required, user_message
 from SlicerUSSim.Logic.imaging.preset import Preset
 from SlicerUSSim.Logic.mri.segmentation import Segmentation
@@ -22,7 +24,7 @@ from SlicerUSSim.Logic.mri.settings import GEL_MM
 from SlicerUSSim.Logic.mrml.fitting_nodes import fits
 from SlicerUSSim.Logic.mrml.labels_before import LabelsBefore
 from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic
-from SlicerUSSim.Logic.mrml.nodes import display_of, nodes_of_class
+from SlicerUSSim.Logic.mrml.nodes import display_of, nodes_of_class, probe_pose, set_node_to_world
 from SlicerUSSim.Logic.mrml.parameter_node import BY_LOOK
 from SlicerUSSim.Logic.probe.arrays import PROBES, Probe
 from SlicerUSSim.Logic.probe.beam import TRANSMIT_OF
@@ -165,13 +167,38 @@ class PanelPresenter:
     def loadPreset(self, path: str | os.PathLike) -> None:
         """Read the preset from a JSON file of the module or the `ussim` command."""
         with self.shown():
-            self.logic.preset = Preset.read(path)
+            self.takePreset(Preset.read(path))
         self.view.refresh()
+
+    def takePreset(self, preset: Preset) -> None:
+        """Use a preset; one with a pose moves the probe there, if there are tissues to look at."""
+        pose, parameters = preset.probe_to_ras, self.logic.parameters
+        self.logic.preset = replace(preset, probe_to_ras=None)
+        if pose is None:
+            return
+        require(
+            parameters.labels is not None,
+            "the pose of the preset is not used, since there are no tissues to look at; segment the MRI, and load it "
+            "again",
+        )
+        if parameters.probe_transform is None:
+            self._put_probe()
+        set_node_to_world(parameters.probe_transform, np.array(pose))
+
+    def presetToSave(self) -> Preset:
+        """The preset, with the pose of the probe if it is wanted. Raises SimulationError if it has none."""
+        preset, parameters = self._preset(), self.logic.parameters
+        if not parameters.panel.preset_pose:
+            return preset
+        transform = required(
+            parameters.probe_transform, "Pose in presets is ticked, and there is no probe; place it, or untick it"
+        )
+        return replace(preset, probe_to_ras=tuple(map(tuple, probe_pose(transform).tolist())))
 
     def savePreset(self, path: str | os.PathLike) -> None:
         """Write the preset to a JSON file."""
         with self.shown():
-            self._preset().write(path)
+            self.presetToSave().write(path)
 
     # ---- tissues -----------------------------------------------------------------------------------------------
 
@@ -538,6 +565,15 @@ class PanelPresenter:
     def notes(self) -> str:
         """What the last segmentation or addition did, and what a user should check, in lines."""
         return "\n".join([*self._notes, *self._gel()])
+
+    @property
+    def noteLines(self) -> tuple[str, ...]:
+        """The same without what follows from the present choices, for setNotes."""
+        return tuple(self._notes)
+
+    def addNotes(self, *lines: str) -> None:
+        """Add lines to them."""
+        self._notes += lines
 
     def _gel(self) -> list[str]:
         """A line about gel on the skin, if the chosen tissues have it by default."""

@@ -304,6 +304,7 @@ def _output() -> tuple[Row, ...]:
                 "Save probe, ultrasound, tissues and rays to a JSON file for this module and the ussim command",
             ),
         ),
+        value("scene.preset_pose"),
         Control("status", "words", tip="Images per second, or a warning"),
     )  # fmt: skip
 

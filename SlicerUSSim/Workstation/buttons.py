@@ -29,7 +29,7 @@ class Buttons:
         self._shared, self._tasks, self._presenter, self._loading = shared, tasks, presenter, loading
         self._controls = by_widget(sections)
         #: By widget, and by name of the page's own buttons
-        self._own_actions: dict[str, Callable[[], None]] = {
+        self._own_actions: dict[str, Callable[[], object]] = {
             "segmentButton": loading.segment,
             "undoSegmentButton": loading.undo_segment,
             "addTissuesButton": loading.add_tissues,

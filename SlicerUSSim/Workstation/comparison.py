@@ -76,12 +76,27 @@ class Comparison:
         """Whether the similarity of the latest images is still to be shown."""
         return self._comparing is not None
 
-    def take(self, tracked: TrackedImages, browser_node: Any) -> None:
-        """Use these images for comparison from now on."""
+    def take(self, tracked: TrackedImages, browser_node: Any, number: int = 0) -> None:
+        """Use these images for comparison from now on, and show that with the index `number`."""
         self._real, self._browser = RealImages(tracked), browser_node
         with self._shared.changing() as now:
             now.sequence.length = len(self._real)
-        self.show(0)
+        self.show(number)
+
+    def pixel_at(self, across: float, down: float) -> tuple[int, np.ndarray] | None:
+        """(number of the real image in its file, (2,) column and row there) at fractions of the shown image's size.
+
+        None while no real image is shown.
+        """
+        if self._real is None or self._grid is None:
+            return None
+        grid, tracked = self._grid, self._real.tracked
+        width, height = (
+            count * spacing for count, spacing in zip((grid.columns, grid.rows), grid.pixel_spacing_mm, strict=True)
+        )
+        in_probe = [grid.left_mm + across * width, grid.top_mm + down * height, 0.0, 1.0]
+        pixel = np.linalg.inv(tracked.field.image_to_probe) @ in_probe
+        return tracked.numbers[self._shared.now.sequence.number], pixel[:2]
 
     def show(self, number: int) -> None:
         """Move the probe to the pose of the real image with this index, and show that image."""

@@ -5,7 +5,9 @@ from __future__ import annotations
 import asyncio
 import io
 import json
+import os
 from collections import deque
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -18,6 +20,7 @@ from trame_slicer.core import SlicerApp
 from vtkmodules.vtkCommonCore import vtkOutputWindow
 
 from SlicerUSSim.Logic.base.errors import SimulationError, require, required
+from SlicerUSSim.Logic.imaging.preset import Preset
 from SlicerUSSim.Logic.mri.sheets.surfels import KINDS
 from SlicerUSSim.Logic.mrml.label_nodes import read_labels
 from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic
@@ -31,8 +34,8 @@ FRAME_SUFFIXES = (".nrrd", ".mha", ".vti")
 #: Key of a file's header under which is what its image is of, see TakenImage.about
 ABOUT = "SlicerUSSim"
 _NO_IMAGE = "there is no image, expected labels and a probe"
-#: Number of images in a cine loop, and limits of the display time of each, in milliseconds.
-_MOST_IMAGES = 200
+#: Number of images in a cine loop; and limits of the display time of each, in milliseconds.
+MOST_IMAGES = 200
 _SHORTEST_MS, _LONGEST_MS = 40, 500
 
 
@@ -60,9 +63,11 @@ class Cine:
     """A cine loop: the last images, as in a scanner."""
 
     def __init__(self) -> None:
-        self._images: deque[tuple[float, np.ndarray]] = deque(maxlen=_MOST_IMAGES)
+        self._images: deque[tuple[float, np.ndarray]] = deque(maxlen=MOST_IMAGES)
         #: What the last image is of
         self.about = ""
+        #: Number of images that were ever added, and of loops that were begun
+        self.added = self.loop = 0
 
     def __len__(self) -> int:
         return len(self._images)
@@ -72,11 +77,24 @@ class Cine:
         if self._images and self._images[-1][1].shape != image.shape:
             self.clear()
         self._images.append((seconds, image))
+        self.added += 1
         self.about = about
 
     def clear(self) -> None:
         """Forget all images."""
         self._images.clear()
+        self.loop += 1
+
+    def since(self, added: int) -> list[tuple[float, np.ndarray]]:
+        """(time, image) of those in the loop that were added after the first `added` images."""
+        count = min(max(self.added - added, 0), len(self._images))
+        return list(self._images)[len(self._images) - count :]
+
+    def restore(self, images: list[tuple[float, np.ndarray]], until: float, about: str = "") -> None:
+        """Begin with (time, image) of an earlier loop, the last of which is moved to the time `until`."""
+        self.clear()
+        for seconds, image in images:
+            self.add(image, until + seconds - images[-1][0], about)
 
     def gif(self) -> bytes:
         """An animated GIF with the original timing. Raises SimulationError for fewer than two images."""
@@ -93,21 +111,39 @@ class Cine:
 
 
 class Exports:
-    """The contents of the menu Export, by kind: png, .nrrd, .mha, .vti, gif, mrb, json; and the script.
+    """The contents of the menu Export, by kind: png, .nrrd, .mha, .vti, gif, mrb, json, zip; and the script.
 
     Each is (file name, content, MIME type). Raises SimulationError if there is nothing to export.
+
+    Parameters
+    ----------
+    preset : the settings to save.
     """
 
-    def __init__(self, app: SlicerApp, logic: UltrasoundSceneLogic, opener: Opener, cine: Cine) -> None:
-        self._app, self._logic, self._opener, self._cine = app, logic, opener, cine
+    def __init__(
+        self,
+        app: SlicerApp,
+        logic: UltrasoundSceneLogic,
+        opener: Opener,
+        cine: Cine,
+        preset: Callable[[], Preset],
+    ) -> None:
+        self._app, self._logic, self._opener, self._cine, self._preset = app, logic, opener, cine, preset
 
     async def export(self, kind: str) -> tuple[str, bytes, str]:
         """Export one kind; slow encoding runs outside the event loop."""
         if kind == "json":
-            return "preset.json", json.dumps(self._logic.preset.to_dict(), indent=2).encode(), "application/json"
+            return "preset.json", json.dumps(self._preset().to_dict(), indent=2).encode(), "application/json"
         if kind == "mrb":
             with self._logic.imageHeld():
                 return "ultrasound.mrb", scene_file(self._app), "application/zip"
+        if kind == "zip":
+            text, missing = self._script()
+            sent = self._opener.sent_files
+            for name in missing:
+                require(sent.has(name), f"{name} was not opened in this page, expected it beside the script")
+            content = await asyncio.get_running_loop().run_in_executor(None, sent.bundle, text, missing)
+            return "ultrasound.zip", content, "application/zip"
         if kind == "gif":
             content = await asyncio.get_running_loop().run_in_executor(None, self._cine.gif)
             return "ultrasound.gif", content, "image/gif"
@@ -116,8 +152,13 @@ class Exports:
             return "ultrasound.png", png(taken), "image/png"
         return f"ultrasound{kind}", frame_file(taken, kind), "application/octet-stream"
 
-    def script(self) -> str:
-        """A Python script that reproduces the image on the screen."""
+    def script(self) -> tuple[str, bool]:
+        """(a Python script that reproduces the image on the screen, whether it needs files that a page has sent)."""
+        text, missing = self._script()
+        return text, bool(missing)
+
+    def _script(self) -> tuple[str, tuple[str, ...]]:
+        """(the script, names of the files that a page has sent which it needs beside it)."""
         labels: Any = self._logic.parameters.labels
         taken = required(self._logic.taken, _NO_IMAGE)
         require(labels is not None, _NO_IMAGE)
@@ -129,12 +170,10 @@ class Exports:
         in_labels, moved = pose_in_labels(labels, taken.probe_to_world)
         require(np.allclose(moved, np.eye(4)), f"the transform of {labels.GetName()!r} scales, expected a rigid one")
         names = read_labels(labels, preset.tissues).names
-        return python_script(
-            source,
-            replace(preset, tissues=preset.tissues.for_names(names)),
-            in_labels,
-            self._shown_sheets(source),
-        )
+        sheets = self._shown_sheets(source)
+        text = python_script(source, replace(preset, tissues=preset.tissues.for_names(names)), in_labels, sheets)
+        needed = (*source.missing, *((sheets,) if isinstance(sheets, str) and not os.path.isabs(sheets) else ()))
+        return text, tuple(dict.fromkeys(needed))
 
     def _shown_sheets(self, source: LabelSource) -> tuple[str, ...] | str:
         """Kinds of the sheets of Segment that the image shows, or the file with them; () without.

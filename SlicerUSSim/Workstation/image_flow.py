@@ -8,6 +8,8 @@ from time import perf_counter
 import numpy as np
 
 from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic
+from SlicerUSSim.Logic.mrml.nodes import node_to_world
+from SlicerUSSim.Logic.mrml.taken_image import TakenImage
 from SlicerUSSim.Logic.probe.arrays import Probe
 from SlicerUSSim.Logic.probe.image_grid import ImageGrid
 from SlicerUSSim.Workstation.anatomy import AnatomyViews
@@ -104,8 +106,13 @@ class ImageFlow:
         taken = self._logic.taken
         if taken is not None:
             self._views.show_image(taken, self._field_of(taken.frame.grid, taken.preset.probe))
-            if self._logic.isLive:
+            if self._logic.isLive or self._is_at(taken):  # the first image comes before Live has begun
                 self._views.follow(taken.probe_to_world, taken.preset.probe)
+
+    def _is_at(self, taken: TakenImage) -> bool:
+        """Whether the probe is where an image was taken."""
+        transform = self._logic.parameters.probe_transform
+        return transform is not None and np.allclose(node_to_world(transform), taken.probe_to_world)
 
     def _field_of(self, grid: ImageGrid, probe: Probe) -> np.ndarray:
         """(rows, columns) bool: the imaged field."""

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Mapping, Sequence
-from contextlib import ExitStack
+from collections.abc import Callable, Hashable, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -12,21 +12,22 @@ from trame_slicer.core import SlicerApp
 
 from SlicerUSSim.Logic.base.errors import SimulationError, require
 from SlicerUSSim.Logic.base.volume import Volume
-from SlicerUSSim.Logic.imaging.preset import Preset
 from SlicerUSSim.Logic.mri.craniotomy import disc_diameter_mm
+from SlicerUSSim.Logic.mri.given_mask import checked_mask
 from SlicerUSSim.Logic.mri.label_agreement import follows
 from SlicerUSSim.Logic.mrml.label_nodes import labels_version
 from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic
 from SlicerUSSim.Logic.mrml.nodes import pose_in_labels, probe_pose, read_volume
-from SlicerUSSim.Logic.tissue.label_maps import LabelledTissues
-from SlicerUSSim.Logic.tracked.sequence import TrackedSequence
+from SlicerUSSim.Logic.tissue.label_maps import LabelledTissues, as_whole
 from SlicerUSSim.Widget.presenter import PanelPresenter
 from SlicerUSSim.Workstation.anatomy import AnatomyViews
 from SlicerUSSim.Workstation.comparison import Comparison
+from SlicerUSSim.Workstation.content import Kind
 from SlicerUSSim.Workstation.messages import Messages
-from SlicerUSSim.Workstation.opener import Files, Opener, Upload
+from SlicerUSSim.Workstation.opener import FILE, Files, LabelTable, Opener
 from SlicerUSSim.Workstation.patient_nodes import remove_patient_nodes
 from SlicerUSSim.Workstation.probe_control import ProbeControl
+from SlicerUSSim.Workstation.registration import Recording, Registration
 from SlicerUSSim.Workstation.script import LabelSource
 from SlicerUSSim.Workstation.state import ORGANS, SharedState
 from SlicerUSSim.Workstation.tasks import Tasks
@@ -53,10 +54,12 @@ class Loading:
         views: AnatomyViews,
         probe: ProbeControl,
         comparison: Comparison,
+        registration: Registration,
     ) -> None:
         self._shared, self._scene, self._logic, self._tasks = shared, app.scene, logic, tasks
         self._opener, self._presenter, self._messages = opener, presenter, messages
         self._views, self._probe, self._comparison = views, probe, comparison
+        self._registration = registration
         self._is_new = False  # a patient was opened, on whom the probe is not yet
         self._source_before: LabelSource | None = None  # of the labels before the last Segment
         self._dropped = ""  # name of an MRI that was closed for labels that are not of it
@@ -66,7 +69,7 @@ class Loading:
         parameters = self._logic.parameters
         with self._presenter.shown():
             if files.preset is not None:
-                self._logic.preset = files.preset
+                self._logic.preset = replace(files.preset, probe_to_ras=None)
             parameters.segmentation = replace(
                 parameters.segmentation, contrast=files.contrast, skull_strip=files.skull_strip, outside=files.outside
             )
@@ -93,65 +96,153 @@ class Loading:
                 self.segment()
             self._open_at_start(files)
             if files.sequence is not None:
-                self._take_sequence(files.sequence, files.sequence_name)
+                recording = Recording(files.sequence, files.sequence_name, files.transform)
+                self._registration.take(recording, files.to_ras)
+            elif files.preset is not None and files.preset.probe_to_ras is not None:
+                self._presenter.takePreset(files.preset)
 
-    def open(self, files: Mapping[str, bytes]) -> None:
-        """Open what a page has sent, {name: content}: an MRI, a label map, a tracked sequence or a preset.
+    @property
+    def has_users_patient(self) -> bool:
+        """Whether a patient is open, other than the demo brain as it is."""
+        parameters: Any = self._logic.parameters
+        is_demo = parameters.mri is not None and parameters.mri.GetAttribute(FILE) == ""
+        mine = (parameters.lesions, parameters.mask, parameters.second_mri)
+        is_untouched = all(node is None or self._logic.isOwnBrain(node) for node in mine)
+        return bool(self._opener.patient()) and not (is_demo and is_untouched)
 
-        A label map may come with the table of its labels.
+    # ---- files of a page: each is read, and then taken without anything that can fail or be cancelled --------------
 
-        Nothing changes if it cannot be read. An MRI or a label map takes the place of the patient before, of whom no
-        lesions, notes and messages stay.
-        """
-        with self._presenter.shown(), ExitStack() as sent:
-            with self._presenter.view.progress(f"Open {', '.join(files)}"):
-                upload = sent.enter_context(self._opener.uploaded(files))
-                take = self._read(upload)
-            take()
+    def reading_mri(self, path: str, contrast: str, then_segment: bool) -> Callable[[], str | None]:
+        """Of a new patient, segmented with this contrast; what is done says so if that fails."""
+        with self._reading(path):
+            mri = self._opener.mri(path)
 
-    def _read(self, upload: Upload) -> Callable[[], None]:
-        """Read what a page has sent, and return what takes it, without anything that can fail or be cancelled."""
-        path = upload.path
-        if upload.kind == "preset":
-            preset = Preset.read(path)
-            return lambda: setattr(self._logic, "preset", preset)
-        if upload.kind == "sequence":
-            sequence, name = self._tasks.doAside(lambda: TrackedSequence.read(path)), Path(path).name.split(".")[0]
-            return lambda: self._take_sequence(sequence, name)
-        if upload.kind == "sheets":
-            sheets = self._opener.sheets(path)
-            return lambda: setattr(self._logic.parameters, "sheets", sheets)
-        if upload.kind == "labels":
-            node, found = self._opener.labels(path, upload.table)
-            kept = self._mri_of(found.labels)
-
-            def take_labels() -> None:
-                self._messages.clear()
-                self._forget_patient(node, *kept)
-                self._take_labels(node, found, kept)
-
-            return take_labels
-        mri = self._opener.mri(path)
-
-        def take_mri() -> None:
+        def take() -> str | None:
+            parameters = self._logic.parameters
             self._messages.clear()
             self._take_mri(mri)
-            self.segment()
+            if parameters.segmentation.contrast != contrast:
+                parameters.segmentation = replace(parameters.segmentation, contrast=contrast)
+            return None if not then_segment or self.segment() else "a new patient, whose tissues were not found"
 
-        return take_mri
+        return take
+
+    def reading_image(self, path: str) -> Callable[[], None]:
+        """The MRI or CT of a patient of whom only labels are open."""
+        with self._reading(path):
+            mri = self._opener.mri(path)
+
+        def take() -> None:
+            self._logic.parameters.mri = mri
+            self._views.show_volume(mri)
+
+        return take
+
+    def reading_second(self, path: str, contrast: str) -> Callable[[], None]:
+        """A second MRI of the patient."""
+        with self._reading(path):
+            mri = self._opener.second_mri(path)
+
+        def take() -> None:
+            parameters = self._logic.parameters
+            parameters.second_mri = mri
+            parameters.panel = replace(parameters.panel, second_contrast=contrast)
+
+        return take
+
+    def reading_labels(self, path: str, table: LabelTable | None, are_of_patient: bool | None) -> Callable[[], None]:
+        """A label map: of the patient, whose MRI stays; of a new one; None: of the MRI that is there if it follows."""
+        with self._reading(path):
+            node, found = self._opener.labels(path, table)
+            mri: Any = self._logic.parameters.mri
+            follow = self._mri_of(found.labels)
+            kept = follow if are_of_patient is None else []
+
+        def take_own() -> None:
+            self._logic.parameters.labels = node
+            checks = [f"Check: {warning}" for warning in found.warnings]
+            if mri is not None and not follow:
+                checks.append(
+                    f"Check: the intensities of {mri.GetName()} do not follow the labels (of another patient?)"
+                )
+            elif mri is not None:
+                checks.append(_of_mri(mri))
+            self._presenter.setNotes(f"{node.GetName()}: {found.message}", *checks)
+            for warning in found.warnings:
+                self._presenter.view.showError(warning)
+            self.show_title()
+            self.labels_ready()
+
+        def take() -> None:
+            self._messages.clear()
+            self.forget_patient(node, *kept)
+            if are_of_patient is False:
+                self._dropped = ""  # the user said that it is another patient's
+            self._take_labels(node, found, kept)
+
+        return take_own if are_of_patient else take
+
+    def are_of_mri(self, path: str) -> bool:
+        """Whether the intensities of the MRI follow a label map, as those of the same head do."""
+        mri: Any = self._logic.parameters.mri
+        if mri is None:
+            return False
+        volume = read_volume(mri)
+        with self._reading(path):
+            labels = self._opener.peek(path)
+            try:
+                whole = as_whole(labels, path)
+            except SimulationError:  # probabilities
+                return False
+            return self._tasks.doAside(lambda: follows(volume, whole))
+
+    def reading_organs(self, path: str) -> Callable[[], None]:
+        """The organs of the CT."""
+        with self._reading(path):
+            organs = self._opener.organs(path)
+        return lambda: self._take_organs(*organs)
+
+    def reading_brain(self, path: str) -> Callable[[], str | None]:
+        """A brain mask on the grid of the MRI, with which it is segmented again."""
+        with self._reading(path):
+            volume, mri = self._opener.peek(path), read_volume(self._logic.parameters.mri)
+            self._tasks.doAside(lambda: checked_mask(volume, mri))
+            node = self._opener.mask(path)
+
+        def take() -> str | None:
+            self._logic.parameters.mask = node
+            return None if self.segment() else "brain mask, with which no tissues were found"
+
+        return take
+
+    def reading_opening(self, path: str) -> Callable[[], None]:
+        """An opening of skin and skull."""
+        with self._reading(path):
+            node = self._opener.opening(path)
+        return lambda: setattr(self._logic.parameters, "opening", node)
+
+    def reading_lesion(self, path: str, tissue: str) -> Callable[[], None]:
+        """Lesions, laid over the tissues."""
+        with self._reading(path):
+            mask, file = self._opener.lesion(path)
+        return lambda: self._lay(mask, tissue, Path(path).name, file)
 
     def add(self, name: str, content: bytes, tissue: str) -> None:
         """Add a mask sent by a page to the lesions, and lay them over the tissues."""
         if tissue == ORGANS:
-            with self._presenter.shown(), self._opener.uploaded({name: content}) as upload:
-                require(upload.kind == "labels", f"{name} is no label map, expected one of organs")
+            with self._presenter.shown(), self._opener.sent({name: content}) as parcel:
+                (upload, *_), _ = self._opener.uploads(parcel)
+                require(upload.kind in (Kind.LABELS, Kind.MASK), f"{name} is no label map, expected one of organs")
                 self._take_organs(*self._opener.organs(upload.path))
             return
-        with self._presenter.shown(), self._opener.uploaded_mask(name, content) as volume:
-            self._lay(volume, tissue, name)
+        with self._presenter.shown(), self._opener.uploaded_mask(name, content) as (mask, file):
+            self._lay(mask, tissue, name, file)
 
-    def segment(self) -> None:
-        """Segment the MRI into tissues, and place a probe on the patient if there is none."""
+    def _reading(self, path: str) -> AbstractContextManager[object]:
+        return self._presenter.view.progress(f"Open {Path(path).name}")
+
+    def segment(self) -> bool:
+        """Segment the MRI into tissues, and place a probe on the patient if there is none; whether that was done."""
         parameters: Any = self._logic.parameters
         # A mask that Segment extracted is found again by the same options.
         mask = None if self._logic.isOwnBrain(parameters.mask) else parameters.mask
@@ -161,10 +252,12 @@ class Loading:
         lesions, organs = parameters.lesions, parameters.organs
         kinds = parameters.sheet.kinds if parameters.sheet.find else ()
         before = self._opener.known_source(parameters.labels)
-        if self._changed(self._presenter.segment):
-            self._source_before = before
-            self._opener.segmented(parameters.labels, *inputs, others, lesions, kinds, organs)
-            self._labels_ready()
+        if not self._changed(self._presenter.segment):
+            return False
+        self._source_before = before
+        self._opener.segmented(parameters.labels, *inputs, others, lesions, kinds, organs)
+        self.labels_ready()
+        return True
 
     def undo_segment(self) -> None:
         """Go back to the tissues from before the last Segment."""
@@ -176,7 +269,7 @@ class Loading:
             self._views.show_volume(self._logic.parameters.mri)
         else:
             self._opener.restored(self._source_before, labels)
-            self._labels_ready()
+            self.labels_ready()
         self.show_title()
 
     def add_tissues(self) -> None:
@@ -203,7 +296,7 @@ class Loading:
                 diameter = parameters.panel.craniotomy_mm or disc_diameter_mm(self._logic.preset.probe)
                 disc = diameter, pose
             self._opener.opened(source, patient, parameters.labels, disc)
-            self._labels_ready()
+            self.labels_ready()
 
     def _open_at_start(self, files: Files) -> None:
         """Open what --craniotomy asks for, and place the probe on the brain in it, as commands do."""
@@ -222,7 +315,7 @@ class Loading:
     def close_craniotomy(self) -> None:
         """Go back to the labels without the opening."""
         if self._changed(self._presenter.closeCraniotomy):
-            self._labels_ready()
+            self.labels_ready()
 
     def place_probe(self) -> None:
         """Place the probe at a typical craniotomy."""
@@ -243,13 +336,13 @@ class Loading:
 
     # ---- implementation ----------------------------------------------------------------------------------------
 
-    def _lay(self, mask: Volume, tissue: str, name: str) -> None:
-        """Add a mask to the lesions, and lay them over the tissues, if there are any; otherwise Segment does so."""
+    def _lay(self, mask: Volume, tissue: str, name: str, file: str) -> None:
+        """Add a mask of a file to the lesions, and lay them over the tissues; without tissues Segment does so."""
         parameters: Any = self._logic.parameters
         before, source, patient = (
             parameters.lesions, self._opener.known_source(parameters.labels), self._opener.patient()
         )  # fmt: skip
-        node, undo = self._opener.add_lesion(before, mask, tissue, name)
+        node, undo = self._opener.add_lesion(before, mask, tissue, name, file)
         parameters.lesions = node
         try:
             if parameters.labels is not None:
@@ -265,7 +358,7 @@ class Loading:
         """The lesions now lie over labels of this source and patient."""
         parameters = self._logic.parameters
         self._opener.added(source, patient, parameters.labels, parameters.lesions)
-        self._labels_ready()
+        self.labels_ready()
 
     def _changed(self, action: Callable[[], None]) -> bool:
         """Whether an action has written labels."""
@@ -285,7 +378,7 @@ class Loading:
             self._presenter.view.showError(warning)
         checks = [f"Check: {warning}" for warning in found.warnings]
         if mris:
-            checks.append(f"of the MRI {mris[0].GetName()}, which is shown: its intensities follow the labels")
+            checks.append(_of_mri(mris[0]))
         elif self._dropped:
             checks.append(
                 f"Check: the MRI {self._dropped} was closed: its intensities do not follow the labels (of another "
@@ -302,7 +395,7 @@ class Loading:
         parameters.labels = node
         self._presenter.setNotes(f"{node.GetName()}: {found.message}", *checks)
         self.show_title()
-        self._labels_ready()
+        self.labels_ready()
 
     def _mri_of(self, labels: Volume) -> list[Any]:
         """The MRI if it follows the labels; otherwise it may be of another patient."""
@@ -325,47 +418,66 @@ class Loading:
         """Close the patient: nothing of him stays on the page, in the scene or in memory; settings stay."""
         parameters = self._logic.parameters
         self._messages.clear()
-        self._forget_patient()
+        self.forget_patient()
         parameters.mri = parameters.labels = parameters.mask = parameters.second_mri = None
         self._presenter.setNotes()
         self.show_title()
 
-    def _forget_patient(self, *new: Any) -> None:
+    def forget_patient(self, *new: Any) -> None:
         """Show, choose and keep nothing of the patient before, when another one is opened; `new` are nodes of his."""
         parameters = self._logic.parameters
         self._logic.stopLiveUpdate()
         self._logic.clearImage(parameters.output)
-        self._comparison.drop()
+        # Ultrasound that was opened before any patient of the user's is of this one
+        kept = [] if self.has_users_patient else self._registration.nodes
+        if self.has_users_patient:
+            self._forget_ultrasound()
         self._probe.forget_patient()
         self._presenter.forgetPatient()
-        self._opener.forget_patient()
-        kept = [parameters.output, parameters.outline, parameters.probe_transform, *new]
+        self._opener.forget_patient(*new)
+        kept += [parameters.output, parameters.outline, parameters.probe_transform, *new]
         for role in _OF_PATIENT:
             node: Any = getattr(parameters, role)
-            if node not in new:
+            if node not in kept:
                 setattr(parameters, role, None)
         remove_patient_nodes(self._scene, kept)
         with self._shared.changing() as now:
             now.fit.curve, now.fit.costs = [], ""
         self._is_new = True
 
+    def _forget_ultrasound(self) -> None:
+        self._comparison.drop()
+        self._registration.forget()
+
     def _take_mri(self, node: Any) -> None:
         parameters = self._logic.parameters
-        self._forget_patient(node)
+        self.forget_patient(node)
         parameters.mri = node
         self._presenter.setNotes()
         self.show_title()
         self._views.show_volume(node)
 
-    def _take_sequence(self, sequence: TrackedSequence, name: str) -> None:
-        """Use the probe and the poses of a tracked sequence."""
-        tracked, browser, images = self._opener.sequence(sequence, name)
-        self._logic.preset = replace(self._logic.preset, probe=tracked.probe)
-        self._logic.parameters.real = images
-        self._comparison.take(tracked, browser)
+    def begin_patient(self, *nodes: Any) -> None:
+        """Close the patient before, also the ultrasound that was opened before him; `nodes` are all of the next one."""
+        self._messages.clear()
+        self._forget_ultrasound()
+        self.forget_patient(*nodes)
 
-    def _labels_ready(self) -> None:
-        if self._logic.parameters.probe_transform is None or self._is_new:
+    def show_number(self, number: int) -> None:
+        """Show the real image with this index, and move the probe there."""
+        self._comparison.show(number)
+
+    def show_restored(self, *, is_placed: bool) -> None:
+        """Show the nodes that were chosen; the probe `is_placed`, or is placed now, if there are tissues."""
+        parameters: Any = self._logic.parameters
+        self._views.show_volume(parameters.labels if parameters.mri is None else parameters.mri)
+        self.show_title()
+        if parameters.labels is not None:
+            self.labels_ready(is_placed=is_placed)
+
+    def labels_ready(self, *, is_placed: bool = False) -> None:
+        """Show the image of new labels; the probe `is_placed`, or is placed now if they are of a new patient."""
+        if self._logic.parameters.probe_transform is None or (self._is_new and not is_placed):
             self._presenter.placeProbe()
         self._is_new = False
         self.show_title()
@@ -373,3 +485,7 @@ class Loading:
             self._presenter.setLive(True)
         self._probe.update_surface()  # after the start of live images, which do not need it
         self._probe.look()
+
+
+def _of_mri(mri_node: Any) -> str:
+    return f"of the MRI {mri_node.GetName()}, which is shown: its intensities follow the labels"

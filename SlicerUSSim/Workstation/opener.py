@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
+from collections import deque
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
@@ -12,11 +13,11 @@ from typing import Any
 
 import numpy as np
 
-from SlicerUSSim.Logic.base.errors import SimulationError, require
+from SlicerUSSim.Logic.base.errors import Cancelled, SimulationError, require
 from SlicerUSSim.Logic.base.files import read_json
 from SlicerUSSim.Logic.base.reading import untrusted_folder
 from SlicerUSSim.Logic.base.volume import Volume
-from SlicerUSSim.Logic.imaging.preset import SECTIONS, Preset
+from SlicerUSSim.Logic.imaging.preset import Preset
 from SlicerUSSim.Logic.mri.craniotomy import is_open, polygon_of_file
 from SlicerUSSim.Logic.mri.kept_mask import mask_beside
 from SlicerUSSim.Logic.mri.masks import with_label_names
@@ -28,22 +29,32 @@ from SlicerUSSim.Logic.mrml.label_nodes import read_labels, write_labels
 from SlicerUSSim.Logic.mrml.lesion_nodes import add_lesion
 from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic
 from SlicerUSSim.Logic.mrml.nodes import display_of, write_volume
+from SlicerUSSim.Logic.mrml.scene_record import SequenceRecord
 from SlicerUSSim.Logic.mrml.sequence_nodes import add_sequence
 from SlicerUSSim.Logic.mrml.taken_image import PATIENT, patient_of
+from SlicerUSSim.Logic.probe.arrays import Probe
 from SlicerUSSim.Logic.tissue.label_advice import PAGE
-from SlicerUSSim.Logic.tissue.label_files import TABLE_SUFFIXES
 from SlicerUSSim.Logic.tissue.label_mapping import LabelMapping
 from SlicerUSSim.Logic.tissue.label_maps import LabelledTissues, as_whole
-from SlicerUSSim.Logic.tissue.label_sources import is_label_file, read_label_file, table_beside
-from SlicerUSSim.Logic.tissue.table import TissueTable
+from SlicerUSSim.Logic.tissue.label_sources import read_label_file, table_beside
+from SlicerUSSim.Logic.tissue.table import TissueTable, tissues_beside
 from SlicerUSSim.Logic.tracked.images import TrackedImages
 from SlicerUSSim.Logic.tracked.sequence import TrackedSequence
+from SlicerUSSim.Workstation.content import Content, Kind, content_of, has_probe
+from SlicerUSSim.Workstation.parcel import Parcel
 from SlicerUSSim.Workstation.script import LabelSource
+from SlicerUSSim.Workstation.sent_files import SentFiles
 from SlicerUSSim.Workstation.tasks import Tasks
-from SlicerUSSim.Workstation.uploads import require_whole_files
 
 _log = logging.getLogger(__name__)
 
+#: Kinds of files in the order in which those of one parcel are opened: settings, a patient, what is laid on him
+_ORDER = (
+    Kind.SCENE, Kind.PRESET, Kind.MRI, Kind.CT, Kind.LABELS, Kind.LESIONS, Kind.MASK, Kind.SHEETS, Kind.SEQUENCE,
+    Kind.TRANSFORM, Kind.POSE, Kind.TABLE,
+)  # fmt: skip
+#: Parcels whose names of files are known
+_MOST_PARCELS = 8
 #: Attribute of a node: the file from which it was read; "" for the demo brain, the name alone for one sent by a page.
 FILE = "SlicerUSSim.file"
 
@@ -101,10 +112,19 @@ class Upload:
     """A file that a page has sent."""
 
     path: str
-    #: "preset", "sequence", "labels" or "mri"
-    kind: str
+    content: Content
     #: Of the labels; None without
     table: LabelTable | None = None
+
+    @property
+    def kind(self) -> Kind:
+        """What it was recognised as."""
+        return self.content.kind
+
+    @property
+    def name(self) -> str:
+        """Its name, as the user knows it."""
+        return Path(self.path).name
 
 
 class Opener:
@@ -118,8 +138,16 @@ class Opener:
         self._volumes = dict(files.volumes)  # read, but not yet used
         #: Names of the preset's tissues since the table of a label map was added to them
         self._names_of_table: list[str] | tuple[str, ...] = ()
-        #: {temporary path: name} of the files that a page has sent last
-        self._uploads: dict[str, str] = {}
+        #: The sequence of the patient, which is opened
+        self.opened_sequence: SequenceRecord | None = None
+        #: What pages have sent last, some of which may still wait for an answer
+        self._parcels: deque[Parcel] = deque(maxlen=_MOST_PARCELS)
+        #: Of files that pages have sent, by temporary path: the others that are read with it, and the name under which
+        #: it is kept
+        self._read_with: dict[str, tuple[Path, ...]] = {}
+        self._kept_names: dict[str, str] = {}
+        #: Those of the patient that scripts need
+        self.sent_files = SentFiles()
 
     def mri(self, path: str | None):
         """A volume node with the MRI of a file, or with the demo brain."""
@@ -128,10 +156,7 @@ class Opener:
         node = self._scene.AddNewNodeByClass("vtkMRMLScalarVolumeNode", name)
         write_volume(node, volume)
         node.SetAttribute(FILE, "" if path is None else self._place(path))
-        display = display_of(node)
-        display.SetAutoWindowLevel(False)  # the automatic window saturates bright tissue
-        inside = volume.array[volume.array > 0]
-        display.SetWindowLevelMinMax(0.0, 1.1 * float(np.percentile(inside, 99.8)) if inside.size else 1.0)
+        show_all_tissue(node, volume)
         return node
 
     def mask_file(self, mri_node) -> Path | None:
@@ -158,7 +183,7 @@ class Opener:
         volume, table = self._volume(path), TissueTable({})
         mapping = LabelMapping.of(maps, table)
         found = self._tasks.doAside(lambda: read_label_file(Path(path), volume, mapping, default=table, advice=PAGE))
-        return self._label_map(found.labels, path, found.names), replace(found, message=self._as_known(found.message))
+        return self._label_map(found.labels, path, found.names), replace(found, message=self.as_known(found.message))
 
     def second_mri(self, path: str):
         """A volume node with a further MRI of the patient."""
@@ -209,8 +234,8 @@ class Opener:
             found = replace(found, message=f"{found.message}, named in {table.name}")
         found = replace(
             found,
-            message=self._as_known(found.message),
-            warnings=tuple(map(self._as_known, (*found.warnings, *volume.doubts))),
+            message=self.as_known(found.message),
+            warnings=tuple(map(self.as_known, (*found.warnings, *volume.doubts))),
         )
         node = self._label_map(found.labels, path, found.names)
         node.SetAttribute(PATIENT, node.GetName())
@@ -220,15 +245,24 @@ class Opener:
         self._sources = {_voxels_of(node): source}
         return node, found
 
+    def lesion(self, path: str) -> tuple[Volume, str]:
+        """(volume with the names of its labels, path or kept name) of a file with lesions."""
+        return self._mask(path), self._place(path)
+
+    def peek(self, path: str) -> Volume:
+        """The volume of a file, which is read again from what is known of it."""
+        self._volumes[path] = volume = self._volume(path)
+        return volume
+
     def lesion_of_file(self, lesions_node, tissue: str, path: str):
         """The segmentation node with the lesions, with a mask of a file; made if it is None."""
         node, _ = self.add_lesion(lesions_node, self._mask(path), tissue, Path(path).name, os.path.abspath(path))
         return node
 
-    def add_lesion(self, lesions_node, mask: Volume, tissue: str, name: str, file: str | None = None):
+    def add_lesion(self, lesions_node, mask: Volume, tissue: str, name: str, file: str):
         """(segmentation node with the lesions, function that takes the mask out of it again).
 
-        `file` is that of the mask; default: it has no path, since a page has sent it.
+        `file` is that of the mask: its path, or the name under which what a page has sent is kept.
         """
         files = self.lesion_files(lesions_node)
         made = lesions_node is None
@@ -241,14 +275,18 @@ class Opener:
                 self._scene.RemoveNode(node)
 
         try:
-            told = replace(mask, doubts=tuple(map(self._as_known, mask.doubts)))
+            told = replace(mask, doubts=tuple(map(self.as_known, mask.doubts)))
             ids = add_lesion(node, told, tissue, name, PAGE)
         except SimulationError:
             undo()
             raise
         if files is not None:
-            self._lesion_files[_segments_of(node)] = (*files, (tissue, file or name))
+            self._lesion_files[_segments_of(node)] = (*files, (tissue, file))
         return node, lambda: undo(ids)
+
+    def restore_lesions(self, lesions_node, files: tuple[tuple[str, str], ...]) -> None:
+        """Record the (tissue, file) of all lesions of a node that was restored."""
+        self._lesion_files[_segments_of(lesions_node)] = files
 
     def lesion_files(self, lesions_node) -> tuple[tuple[str, str], ...] | None:
         """(tissue, file) of all lesions; None if they are not all of files."""
@@ -292,8 +330,9 @@ class Opener:
         if source is not None and disc is not None:
             self._sources[_voxels_of(labels_node)] = replace(source, disc=disc)
 
-    def forget_patient(self) -> None:
-        """Release what is kept of the last patient."""
+    def forget_patient(self, *new: Any) -> None:
+        """Release what is kept of the last patient; `new` are nodes of the next one."""
+        self.sent_files.forget(node.GetAttribute(FILE) or "" for node in new if node is not None)
         self._sources, self._lesion_files = {}, {}
 
     def patient(self) -> str:
@@ -315,103 +354,119 @@ class Opener:
             raise SimulationError(f"{name!r} has no source file, expected labels of a file (save, open with --labels)")
         return source
 
-    def sequence(self, sequence: TrackedSequence, name: str):
-        """(TrackedImages, sequence browser node, sequence node of the images)."""
-        files, preset = self._files, self._logic.preset
-        tracked = self._tasks.doAside(
-            lambda: TrackedImages.of(
-                sequence, path=files.transform, reference_to_ras=files.to_ras, beam=preset.probe,
-                probe=preset.probe if files.preset is not None else None,
+    def sequence(self, record: SequenceRecord, probe: Probe | None = None):
+        """(TrackedImages, sequence browser node, sequence node of the images, all nodes that were made).
+
+        `probe` is that of the images; default: that of the preset at the start, if there was one.
+        """
+        files, preset, scene, tracked = self._files, self._logic.preset, self._scene, record.tracked
+        known = preset.probe if probe is None and files.preset is not None else probe
+        if tracked is None:
+            tracked = self._tasks.doAside(
+                lambda: TrackedImages.of(
+                    record.sequence, path=record.path, reference_to_ras=record.to_ras, beam=preset.probe, probe=known
+                )
             )
-        )  # fmt: skip
+        before = {scene.GetNthNode(number) for number in range(scene.GetNumberOfNodes())}
         browser, images = add_sequence(
-            self._scene, sequence, name, files.transform, files.to_ras, tracked.poses,
+            scene, record.sequence, record.name, record.path, record.to_ras, tracked.poses,
             self._logic.parameters.probe_transform,
         )  # fmt: skip
-        return tracked, browser, images
+        now = [scene.GetNthNode(number) for number in range(scene.GetNumberOfNodes())]
+        return tracked, browser, images, [node for node in now if node not in before]
 
     @contextmanager
-    def uploaded_mask(self, name: str, content: bytes) -> Iterator[Volume]:
-        """The volume of a file with a mask uploaded from a page."""
-        with untrusted_folder() as folder, self._sent({name: content}, folder) as (path,):
-            volume = self._mask(str(path))
-        yield volume
+    def uploaded_mask(self, name: str, content: bytes) -> Iterator[tuple[Volume, str]]:
+        """(volume, name under which it is kept) of a file with a mask uploaded from a page."""
+        with self.sent({name: content}) as parcel:
+            path = str(parcel.paths[0] if parcel.paths else self._tasks.doAside(lambda: _of_dicom(parcel)))
+            volume, file = self.lesion(path)
+            self.keep(path)
+        yield volume, file
 
     @contextmanager
-    def uploaded(self, files: Mapping[str, bytes]) -> Iterator[Upload]:
-        """What a page has sent together, {name: content}: one file, or a label map with the table of its labels."""
-        with untrusted_folder() as folder, self._sent(files, folder) as paths:
-            presets = [path for path in paths if _is_json(path) and len(paths) == 1 and not _has_tissues_only(path)]
-            for path in paths if len(paths) > 1 else ():
-                require(not (_is_json(path) and _has_probe(path)), f"{path.name} is a preset: open it alone")
-            tables = [path for path in paths if path not in presets and (_is_json(path) or _is_table(path))]
-            others = [path for path in paths if path not in tables]
-            called = ", ".join(path.name for path in paths)
-            if not others:
-                what = "the tissue table" if _is_json(paths[0]) else "a table of the labels"
-                require(len(paths) == 1, f"{called}: are tables, expected a label map with one of them")
-                raise SimulationError(f"{called} is {what} of a label map: open both files together")
-            require(
-                len(others) == 1 and len(tables) <= 1,
-                f"{called}: are {len(paths)} files, expected one, or a label map with the table of its labels",
-            )
-            path, kind, table = others[0], self._kind(others[0]), None
-            if tables:
-                require(
-                    kind == "labels",
-                    f"{path.name} is no label map, and {tables[0].name} a table of labels, expected both of a label "
-                    "map; open it alone",
-                )
-                table = self._table(tables[0])
-            yield Upload(str(path), kind, table)
+    def sent(self, files: Mapping[str, bytes]) -> Iterator[Parcel]:
+        """What a page has sent together, {name: content}, which can be opened within the block.
 
-    def _kind(self, path: Path) -> str:
-        """The kind of a file, as Upload has it."""
-        name = path.name.lower()
-        if name.endswith(".json"):
-            return "preset"
-        if name.endswith(".vtp"):
-            return "sheets"
-        if ".igs." in name or ".seq." in name:
-            return "sequence"
-        volume = self._volumes[str(path)] = self._volume(str(path))
-        kind = "labels" if is_label_file(path, volume) else "mri"
-        _log.info("%s: opened as %s", path.name, "a label map" if kind == "labels" else "an MRI")
-        return kind
+        Errors within the block are about the names of files, as the user knows them. Raises SimulationError for names
+        that are no plain names and for headers without their voxels, before anything is written.
+        """
+        with untrusted_folder() as folder:
+            parcel = Parcel(folder, files)
+            self._parcels.append(parcel)
+            try:
+                with self.known_names():
+                    yield parcel
+            finally:
+                for path in parcel.names:
+                    for known in (self._volumes, self._read_with, self._kept_names):
+                        known.pop(path, None)
+
+    @contextmanager
+    def known_names(self) -> Iterator[None]:
+        """Errors within the block are about the names of files, as the user knows them."""
+        try:
+            yield
+        except SimulationError as error:
+            if isinstance(error, Cancelled):
+                raise
+            raise SimulationError(self.as_known(str(error))) from None
+
+    def uploads(self, parcel: Parcel) -> tuple[list[Upload], list[str]]:
+        """(what the files of a parcel are, in the order in which they can be opened; lines about those that cannot).
+
+        Label maps come with the tables of their labels. Raises SimulationError if there is nothing to open.
+        """
+        found: dict[Path, Content] = {}
+        wrong: list[str] = []
+        for path in parcel.paths:
+            try:
+                found[path] = content = self._tasks.doAside(lambda path=path: content_of(path))
+            except SimulationError as error:
+                if isinstance(error, Cancelled):
+                    raise
+                wrong.append(parcel.as_known(str(error)))
+                continue
+            _log.info("%s: is %s", path.name, content.what)
+            if content.volume is not None:
+                self._volumes[str(path)] = content.volume
+        if not found:
+            raise SimulationError("; ".join(wrong) or "no files were sent, expected one or more")
+        tables = _tables_of(found)
+        parts = {name for content in found.values() for name in content.files[1:]}
+        for path, content in found.items():
+            self._read_with[str(path)] = tuple(path.with_name(name) for name in content.files[1:])
+        uploads = [
+            Upload(str(path), content, None if path not in tables else self._table(tables[path]))
+            for path, content in found.items()
+            if path not in tables.values() and path.name not in parts
+        ]
+        return sorted(uploads, key=lambda upload: _ORDER.index(upload.kind)), wrong
 
     def _table(self, path: Path) -> LabelTable:
         if _is_json(path) and _has_tissues_only(path):
             return LabelTable(path.name, TissueTable.read(path))
         return LabelTable(path.name, mapping=LabelMapping.of([str(path)], self._logic.preset.tissues))
 
-    @contextmanager
-    def _sent(self, files: Mapping[str, bytes], folder: str) -> Iterator[list[Path]]:
-        """The paths of files that a page has sent, {name: content}.
-
-        Errors within the block are about their names, as the user knows them. Before anything is written, raises
-        SimulationError as require_whole_files does.
-        """
-        require_whole_files(files)
-        self._uploads = {str(Path(folder) / name): name for name in files}
-        for path, content in zip(self._uploads, files.values(), strict=True):
-            Path(path).write_bytes(content)
-        try:
-            yield list(map(Path, self._uploads))
-        except SimulationError as error:
-            raise SimulationError(self._as_known(str(error))) from None
-        finally:
-            for path in self._uploads:
-                self._volumes.pop(path, None)
-
-    def _as_known(self, text: str) -> str:
+    def as_known(self, text: str) -> str:
         """A message with the names of files as the user knows them, without the temporary folder."""
-        for path in self._uploads:
-            text = text.replace(os.path.dirname(path) + os.sep, "")
+        for parcel in self._parcels:
+            text = parcel.as_known(text)
         return text
 
     def _place(self, path: str) -> str:
-        """The path of a file; its name alone if a page has sent it."""
-        return self._uploads.get(path) or os.path.abspath(path)
+        """The path of a file; if a page has sent it, the name under which it is kept."""
+        parcel = next((parcel for parcel in self._parcels if path in parcel.names), None)
+        if parcel is None:
+            return os.path.abspath(path)
+        if path not in self._kept_names:
+            self._kept_names[path] = self.sent_files.name_for(Path(path), self._read_with.get(path, ()))
+        return self._kept_names[path]
+
+    def keep(self, path: str) -> None:
+        """Keep a file that a page has sent for scripts, if it was read into a node; it is moved from where it was."""
+        if path in self._kept_names:
+            self.sent_files.keep(self._kept_names[path], Path(path), self._read_with.get(path, ()))
 
     def _volume(self, path: str) -> Volume:
         """The volume of a file, read once."""
@@ -429,24 +484,64 @@ class Opener:
         return node
 
 
+def show_all_tissue(mri_node, volume: Volume) -> None:
+    """Choose the grey levels of an MRI; the automatic window saturates bright tissue."""
+    display = display_of(mri_node)
+    display.SetAutoWindowLevel(False)
+    inside = volume.array[volume.array > 0]
+    display.SetWindowLevelMinMax(0.0, 1.1 * float(np.percentile(inside, 99.8)) if inside.size else 1.0)
+
+
 def _is_json(path: Path) -> bool:
     return path.suffix.lower() == ".json"
-
-
-def _is_table(path: Path) -> bool:
-    return path.suffix.lower() in TABLE_SUFFIXES
 
 
 def _has_tissues_only(path: Path) -> bool:
     """Whether a .json file has the tissues of a label map, as `ussim segment` writes them, and is no preset."""
     values = read_json(path)
-    return isinstance(values, dict) and "tissues" in values and not _has_probe(path)
+    return isinstance(values, dict) and "tissues" in values and not has_probe(values)
 
 
-def _has_probe(path: Path) -> bool:
-    """Whether a .json file has sections that a preset has, and no table."""
-    values = read_json(path)
-    return isinstance(values, dict) and bool(values.keys() & {"probe", *SECTIONS})
+def _tables_of(found: dict[Path, Content]) -> dict[Path, Path]:
+    """{label map: table of its labels} of what was sent together. Raises SimulationError for tables of nothing."""
+    maps = [path for path, content in found.items() if content.kind in (Kind.LABELS, Kind.MASK, Kind.LESIONS)]
+    # With a label map, a .json file that is no preset says what its labels are
+    tables = [
+        path
+        for path, content in found.items()
+        if content.kind is Kind.TABLE
+        or (maps and content.kind is Kind.PRESET and _is_json(path) and not has_probe(read_json(path)))
+    ]
+    if not tables:
+        return {}
+    called = ", ".join(path.name for path in tables)
+    others = [path.name for path in found if path not in tables]
+    if not maps:
+        what = "the tissue table" if _is_json(tables[0]) else "a table of the labels"
+        require(
+            not others,
+            f"{', '.join(others)} is no label map, and {called} a table of labels, expected both of a label map; open "
+            "it alone",
+        )
+        require(len(tables) == 1, f"{called}: are tables, expected a label map with one of them")
+        raise SimulationError(f"{called} is {what} of a label map: open both files together")
+    pairs: dict[Path, Path] = {}
+    for table in tables:
+        own = [path for path in maps if tissues_beside(path).stem == table.stem] or maps
+        require(
+            len(own) == 1 and own[0] not in pairs,
+            f"{called}: {'are tables' if len(tables) > 1 else 'is a table'} of {len(maps)} label "
+            f"map{'s' * (len(maps) > 1)}, expected one for each, called as its label map",
+        )
+        pairs[own[0]] = table
+    return pairs
+
+
+def _of_dicom(parcel: Parcel) -> Path:
+    """The folder of the only series of a parcel."""
+    series = parcel.series()
+    require(len(series) == 1, f"has {len(series)} DICOM series, expected one of a mask")
+    return parcel.take(series[0], series)
 
 
 def _file_of(node) -> str:

@@ -20,13 +20,16 @@ from SlicerUSSim.Logic.mri.pathology import LESIONS
 from SlicerUSSim.Logic.tissue.label_advice import PAGE_SEVERAL
 from SlicerUSSim.Widget.controls import Control, Section
 from SlicerUSSim.Widget.presenter import FROZEN, TISSUE_COLUMNS
+from SlicerUSSim.Workstation.page_parts import question_dialog, registration_section
+from SlicerUSSim.Workstation.pose_widgets import pose_numbers
+from SlicerUSSim.Workstation.session_widgets import keep_session, session_offer
 from SlicerUSSim.Workstation.state import NAMES, ORGANS, PLANES, SLICE_VIEWS, ComparisonMode
 
 _STATIC = Path(__file__).parent / "static"
 #: Files that the page loads in addition to those of trame.
 MODULE = {
     "serve": {"ussim": str(_STATIC)},
-    "scripts": ["ussim/overlay.js", "ussim/workstation.js"],
+    "scripts": ["ussim/overlay.js", "ussim/workstation.js", "ussim/session.js"],
     "styles": ["ussim/workstation.css"],
 }
 #: Controls of the panel that are not on the page: its slice views follow the probe, it compares the fit in the
@@ -77,6 +80,7 @@ _EXPORTS = (
     ("gif", "Cine of the last images (GIF)"),
     ("mrb", "Scene for 3D Slicer (MRB)"),
     ("json", "Settings (JSON)"),
+    ("zip", "Python script with its files (ZIP)"),
 )
 
 
@@ -90,6 +94,7 @@ def build_page(server: Server, sections: tuple[Section, ...], layout: LayoutMana
             _drawer(sections)
         with v3.VMain(style="height: 100vh"), html.Div(classes="ussim-main"):
             with html.Div(classes="ussim-image"):
+                session_offer()
                 _tools()
                 _screens(keys)
                 _player()
@@ -98,6 +103,7 @@ def build_page(server: Server, sections: tuple[Section, ...], layout: LayoutMana
                 layout.initialize_layout_grid(page)
         _messages()
         _script_dialog()
+        question_dialog()
 
 
 def view_tools(_server: Server, _view_id: str, view: AbstractView) -> None:
@@ -128,6 +134,8 @@ def _drawer(sections: tuple[Section, ...]) -> None:
     html.Div(f"{{{{ {NAMES.title} }}}}", classes="text-caption px-4 pb-1 text-medium-emphasis", id="title")
     with v3.VExpansionPanels(multiple=True, v_model=(NAMES.open_sections,), variant="accordion"):
         for section in _in_order(sections):
+            if section.title.startswith("Fit"):
+                registration_section()
             with v3.VExpansionPanel(value=section.title):
                 v3.VExpansionPanelTitle(section.title, style="min-height: 36px; font-size: 13px")
                 with v3.VExpansionPanelText(eager=True, id=f"section-{section.title.replace(' ', '-').lower()}"):
@@ -138,6 +146,7 @@ def _drawer(sections: tuple[Section, ...]) -> None:
                             _control(control)
                     if section.title == "Probe":
                         _pose_sliders()
+                        pose_numbers()
                     if section.title.startswith("Fit"):
                         _cost_curve()
 
@@ -156,13 +165,27 @@ def _open_file() -> None:
     html.Div(
         """<label for="open-file">Open files</label>
         <input type="file" multiple id="open-file" @change="window.ussim.send($event.target, {for: 'open'})">""",
-        classes="ussim-line", title="An MRI, a label map (with its table), a tracked sequence, sheets (.vtp), a preset",
+        classes="ussim-line",
+        title="Also dropped on the page: MRI, CT, label map (with its table), mask, DICOM, tracked ultrasound, its "
+        "calibration or registration, sheets (.vtp), a scene (.mrb), preset, pose. What they are is recognised by "
+        "their content",
+    )  # fmt: skip
+    html.Div(
+        """<label for="open-folder">Open a folder</label>
+        <input type="file" webkitdirectory id="open-folder"
+        @change="window.ussim.send($event.target, {for: 'open'})">""",
+        classes="ussim-line", title="Of DICOM images; of several series the one is asked",
+    )  # fmt: skip
+    html.Div(
+        f"""<div v-for="line in {NAMES.opened}">{{{{ line }}}}</div>""", id="opened", classes="ussim-opened",
+        raw_attrs=['aria-live="polite"'],
     )  # fmt: skip
     v3.VBtn(
         "Close patient", size="small", classes="mb-1", id="close-patient", click="trigger('press', ['closePatient'])",
         title="Nothing of the patient stays on the page, in the scene or in memory; settings stay",
         disabled=(f"{NAMES.title} === ''",),
     )  # fmt: skip
+    keep_session()
     options = "".join(f'<option value="{name}">{_LESION_TEXTS.get(name, name)}</option>' for name in (*LESIONS, ORGANS))
     html.Div(
         f"""<label for="added-as">Add a mask as</label>
@@ -367,7 +390,11 @@ def _screens(keys: tuple[str, ...]) -> None:
         with html.Div(classes="ussim-screen", v_show=f"{there} && {beside}"):
             html.Div(f"Real, {{{{ {NAMES.sequence.name} }}}}", classes="ussim-caption")
             with html.Div(classes="ussim-frame", id="real"):
-                html.Div('<canvas data-stream="real"></canvas>')
+                html.Div(
+                    f"""<canvas data-stream="real"
+                    :class="{{picking: {NAMES.registration.picking} === 'ultrasound'}}"
+                    @click="window.ussim.pickLandmark($event)"></canvas>"""
+                )
 
 
 def _player() -> None:
@@ -430,6 +457,11 @@ def _script_dialog() -> None:
         with v3.VCardText():
             html.Div(f'<textarea id="ussim-script" class="ussim-script" readonly :value="{script.text}"></textarea>')
         with v3.VCardActions():
+            html.Div(
+                "It reads files that were opened in the page, expected beside it", v_if=script.needs_files,
+                id="script-files", classes="text-caption",
+            )  # fmt: skip
             v3.VSpacer()
+            v3.VBtn("Save with its files", v_if=script.needs_files, click="window.ussim.save('zip')", id="save-script")
             v3.VBtn("Copy", click=f"window.ussim.copy({script.text})", id="copy-script")
             v3.VBtn("Close", click=f"{script.is_open} = false")

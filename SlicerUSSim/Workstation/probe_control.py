@@ -49,6 +49,8 @@ class ProbeControl:
         self._surface_version: object = None
         self._drawn: tuple | None = None
         self._refused = False  # whether the last pose was
+        #: Called after the sliders were set to the pose
+        self.told: Callable[[], None] = lambda: None
         self._turn = AtMost(_TURN_EVERY_S, self._turn_slices)
         self._tell = AtMost(_TELL_EVERY_S, self._tell_pose)
         self.hand = ProbeHand(
@@ -150,7 +152,7 @@ class ProbeControl:
         self.surface = self._surface_version = self._drawn = None
         self._views.hide_patient()
         with self._shared.changing() as now:
-            now.pose = None
+            now.pose, now.pose_numbers, now.pose_matrix = None, "", ""
 
     def draw(self) -> None:
         """Draw the probe if it or its transform node has changed, once there is a patient."""
@@ -187,3 +189,4 @@ class ProbeControl:
         where = self.surface.where(pose)
         with self._shared.changing() as now:
             now.pose = SurfacePose(**{name: round(float(getattr(where, name)), 2) for name in _POSE_FIELDS})
+        self.told()

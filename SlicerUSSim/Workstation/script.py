@@ -5,9 +5,10 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pprint import pformat
 from textwrap import indent
+from typing import Any
 
 import numpy as np
 
@@ -60,6 +61,29 @@ class LabelSource:
     additions: tuple[tuple[str, str], ...] = ()
     #: Of a craniotomy: diameter of the disc, mm, and the (4, 4) pose of the probe in the frame of the labels
     disc: tuple[float, np.ndarray] | None = None
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values for JSON."""
+        values = asdict(self)
+        values["relabelled"] = [[int(old), int(new)] for old, new in self.relabelled.items()]
+        if self.disc is not None:
+            values["disc"] = [float(self.disc[0]), np.asarray(self.disc[1]).tolist()]
+        return values
+
+    @classmethod
+    def from_dict(cls, values: Mapping[str, Any]) -> LabelSource:
+        """The inverse of to_dict, also after JSON. Raises TypeError or ValueError for other values."""
+        disc = values.get("disc")
+        return cls(
+            **{
+                **values,
+                "relabelled": {int(old): int(new) for old, new in values.get("relabelled", ())},
+                "tissue_names": tuple(values.get("tissue_names", ())),
+                "sheets": tuple(values.get("sheets", ())),
+                "additions": tuple((str(tissue), str(file)) for tissue, file in values.get("additions", ())),
+                "disc": None if disc is None else (float(disc[0]), np.array(disc[1], float)),
+            }
+        )
 
     @property
     def missing(self) -> tuple[str, ...]:

@@ -68,6 +68,25 @@ class FreeParameter:
     on: bool
 
 
+@dataclass(frozen=True)
+class Choice:
+    """One answer to a question."""
+
+    key: str
+    #: On its button, and what it does
+    title: str
+    tip: str = ""
+
+
+@dataclass(frozen=True)
+class LandmarkLine:
+    """A pair of landmarks, and what remains between them after the fit."""
+
+    ultrasound: str
+    patient: str
+    remaining: str
+
+
 # ---- shared state, by topic ------------------------------------------------------------------------------------------
 
 
@@ -150,6 +169,44 @@ class ScriptState:
 
     text: str = ""
     is_open: bool = False
+    #: Whether it needs files that a page has sent
+    needs_files: bool = False
+
+
+@dataclass
+class RegistrationState:
+    """Calibration and registration of the tracked ultrasound."""
+
+    #: What it is, one line; "" without
+    recording: str = ""
+    #: Frame that is fixed to the patient, and those that there are
+    frame: str = ""
+    frames: list[str] = field(default_factory=list)
+    #: Name of the transform that is given as calibration
+    name: str = "ImageToProbe"
+    #: Where calibration and registration are from, and their 16 numbers by rows
+    calibration: str = ""
+    calibration_text: str = ""
+    registration: str = ""
+    registration_text: str = ""
+    landmarks: list[LandmarkLine] = field(default_factory=list)
+    #: What the next click gives a landmark: "ultrasound", "patient" or ""
+    picking: str = ""
+    #: A landmark that is typed: column and row in the image, R, A and S in the patient
+    typed_pixel: str = ""
+    typed_point: str = ""
+
+
+@dataclass
+class QuestionState:
+    """A question to the user, until it is answered on one of the pages."""
+
+    #: Number of the question; 0 while there is none
+    number: int = 0
+    title: str = ""
+    #: What was recognised, and what is asked
+    text: str = ""
+    choices: list[Choice] = field(default_factory=list)
 
 
 @dataclass
@@ -158,6 +215,13 @@ class PageState:
 
     #: Name of the patient: the file with the labels, or with the MRI from which they are
     title: str = ""
+    #: The question whether a session of before is to be restored; "": there is none
+    offer: str = ""
+    #: Whether this session is kept on the disk, and whether that is possible
+    keeps_session: bool = False
+    can_keep_session: bool = False
+    #: With which a page knows that a server is this one, see access.proof
+    proof_key: str = ""
     #: Titles of the panel's sections that are open
     open_sections: list[str] = field(default_factory=list)
     #: The tissue that a mask is which is added
@@ -166,6 +230,9 @@ class PageState:
     is_frozen: bool = False
     #: Pose of the probe on the patient; None without a probe or a patient
     pose: SurfacePose | None = None
+    #: The same as texts: position and angles, and matrix, as pose_files.pose_of_text reads them; "" without a probe
+    pose_numbers: str = ""
+    pose_matrix: str = ""
     #: Whether the probe is aligned with the surface normal while it slides
     upright: bool = True
     #: Whether the latency from mouse to image is measured
@@ -176,6 +243,10 @@ class PageState:
     sequence: SequenceState = field(default_factory=SequenceState)
     fit: FitState = field(default_factory=FitState)
     script: ScriptState = field(default_factory=ScriptState)
+    registration: RegistrationState = field(default_factory=RegistrationState)
+    question: QuestionState = field(default_factory=QuestionState)
+    #: What was opened last: what each file is, and what was done with it, one line each
+    opened: list[str] = field(default_factory=list)
 
 
 #: A PageState whose fields are the names of the values in trame's state, for the page's expressions.

@@ -97,6 +97,26 @@ class Tasks(AtOnce):
         """The same for what needs no device, such as reading a file: images do not wait for it."""
         return self._wait(function, is_aside=True)
 
+    def ask(self, asked: Callable[[Callable[[T], None]], None]) -> T:
+        """What a user answers; `asked` is called with a function that takes the answer, in the event loop.
+
+        Until then the task counts as done: nothing is computed, and everything else goes on.
+        """
+        waiting, answers = getcurrent(), []
+        event_loop = waiting.parent
+        assert event_loop is not None, "only a task can wait for a user"
+
+        def answered(answer: T) -> None:
+            if not answers:
+                answers.append(answer)
+                self._unfinished += 1
+                self._loop.call_soon(waiting.switch)
+
+        asked(answered)
+        self._unfinished -= 1
+        event_loop.switch()
+        return answers[0]
+
     def _wait(self, function: Callable[[], T], is_aside: bool) -> T:
         waiting = getcurrent()
         event_loop = waiting.parent

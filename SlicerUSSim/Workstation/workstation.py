@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import asyncio
+import secrets
 from collections.abc import Callable
+from contextlib import suppress
+from time import perf_counter
 from typing import Any, cast
 
 import slicer
@@ -14,7 +17,9 @@ from trame_slicer.core import SlicerApp
 from SlicerUSSim.Logic.base.errors import SimulationError
 from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic
 from SlicerUSSim.Widget.sections import panel_sections
+from SlicerUSSim.Workstation.access import proof_key
 from SlicerUSSim.Workstation.anatomy import AnatomyViews
+from SlicerUSSim.Workstation.autosave import Autosave
 from SlicerUSSim.Workstation.buttons import Buttons
 from SlicerUSSim.Workstation.comparison import Comparison
 from SlicerUSSim.Workstation.export import Cine, Exports
@@ -25,10 +30,16 @@ from SlicerUSSim.Workstation.loading import Loading
 from SlicerUSSim.Workstation.messages import Messages
 from SlicerUSSim.Workstation.observed import Observed
 from SlicerUSSim.Workstation.opener import Files, Opener
+from SlicerUSSim.Workstation.opening import Opening
 from SlicerUSSim.Workstation.page import build_page, view_tools
 from SlicerUSSim.Workstation.panel import BrowserPanel
+from SlicerUSSim.Workstation.pose_entry import PoseEntry
 from SlicerUSSim.Workstation.probe_control import ProbeControl
+from SlicerUSSim.Workstation.questions import Questions
 from SlicerUSSim.Workstation.receiver import Receiver
+from SlicerUSSim.Workstation.registration import Registration
+from SlicerUSSim.Workstation.restoring import Restoring
+from SlicerUSSim.Workstation.session_store import OwnSession, SessionStore
 from SlicerUSSim.Workstation.state import NAMES, SharedState
 from SlicerUSSim.Workstation.tasks import Tasks
 from SlicerUSSim.Workstation.tracker import Tracker
@@ -44,9 +55,10 @@ class Workstation:
     ----------
     files : files and options at the start.
     device : see opencl.devices.choose_device.
+    sessions : where sessions are kept; None: nowhere.
     """
 
-    def __init__(self, files: Files, device: str | None = None) -> None:
+    def __init__(self, files: Files, device: str | None = None, sessions: SessionStore | None = None) -> None:
         self.server = cast(Server, get_server("ussim", client_type="vue3"))
         self._files = files
         self._shared = shared = SharedState(self.server.state)
@@ -63,6 +75,8 @@ class Workstation:
         self._presenter = presenter = self._panel.presenter
         self._views = AnatomyViews(app, self.server, view_tools)
         self._probe = ProbeControl(shared, logic, tasks, self._views, stamps.probe_moved)
+        self._poses = PoseEntry(shared, tasks, presenter, self._probe.pose, self._probe.move)
+        self._probe.told = self._poses.show
         self._comparison = Comparison(shared, self._probe.move)
         self._tracker = Tracker(shared, tasks, self._probe.move)
         self._images = ImageFlow(
@@ -72,10 +86,29 @@ class Workstation:
         opener = Opener(app.scene, logic, tasks, files)
         presenter.maskFile, presenter.sheetsFile = opener.mask_file, opener.sheets_file
         self._panel.pick = self._probe.hand.pick
-        self._exports = Exports(app, logic, opener, cine)
-        self._loading = Loading(
-            shared, app, logic, tasks, opener, presenter, self._messages, self._views, self._probe, self._comparison
+        self._exports = Exports(app, logic, opener, cine, presenter.presetToSave)
+        self._registration = Registration(
+            shared, logic, tasks, opener, presenter, self._comparison, self._probe.hand
         )  # fmt: skip
+        self._loading = Loading(
+            shared, app, logic, tasks, opener, presenter, self._messages, self._views, self._probe, self._comparison,
+            self._registration,
+        )  # fmt: skip
+        self._questions = Questions(shared, tasks)
+        self._opening = Opening(
+            shared, logic, tasks, opener, presenter, self._loading, self._registration, self._questions, self._poses
+        )  # fmt: skip
+
+        self._session = self._begun_session(sessions)
+        self._autosave = Autosave(
+            self._session, shared, logic, presenter, opener, cine, self._probe.pose, self._messages.show, tasks.tell
+        )
+        self._restoring = Restoring(
+            sessions if self._session is not None else None,
+            shared, app.scene, logic, tasks, opener, presenter, self._loading, self._registration,
+            self._probe, cine, self._autosave.when_kept, perf_counter,
+        )  # fmt: skip
+        self._opening.open_scene = self._restoring.open_scene
 
         self._following = False
         self._probe_node = Observed("TransformModifiedEvent", self._probe.moved)
@@ -84,14 +117,46 @@ class Workstation:
         self._parameter_node.watch(logic.parameters.node)
         self._answer_pages(Buttons(shared, tasks, presenter, sections, self._loading), stamps)
         self._follow_pages()
-        receiver = Receiver(self._open_files, self._add_file, self._messages.show)
+        receiver = Receiver(self._open_files, self._add_file, self._messages.show, self._open_pose)
         self.server.controller.on_server_bind.add(lambda wslink: receiver.serve(wslink.app))
         self.server.controller.on_server_ready.add(self._ready)
         self.server.controller.on_server_exited.add(self.close)
         build_page(self.server, sections, self._views.layout, (*KEYS, "Escape"))
 
+    def take_token(self, port: int) -> str:
+        """The token of the last server at this port, if it was killed, so that its pages go on; otherwise a new one."""
+        kept = None if self._sessions is None or port == 0 else self._sessions.token_of(port)
+        token = kept or secrets.token_urlsafe(24)
+        with self._shared.changing() as now:
+            now.proof_key = proof_key(token)
+        return token
+
+    def keep_token(self, port: int, token: str) -> None:
+        """Keep the token, in case this server is killed; called once it listens at this port."""
+        if self._session is not None and self._shared.now.keeps_session:
+            with suppress(SimulationError):  # the page then says that a new address is to be opened
+                self._session.keep_address(port, token)
+
+    def end_session(self) -> None:
+        """Called when the server ends as it should; what was kept of the patient stays."""
+        if self._session is not None:
+            self._session.end()
+            self._session = None
+
+    def _begun_session(self, sessions: SessionStore | None) -> OwnSession | None:
+        self._sessions, session = sessions, None
+        if sessions is not None:
+            try:
+                session = sessions.begin()
+            except SimulationError as error:
+                self._messages.show(f"this session is not kept: {error}")
+        with self._shared.changing() as now:
+            now.keeps_session = now.can_keep_session = session is not None
+        return session
+
     def close(self, **_: object) -> None:
         """Close the connection to the tracker and cancel waiting tasks."""
+        self._autosave.end()
         self._logic.stopLiveUpdate()
         self._tracker.stop()
         self._tasks.stop()
@@ -100,23 +165,36 @@ class Workstation:
 
     def _answer_pages(self, buttons: Buttons, stamps: LatencyStamps) -> None:
         """Register the triggers by which pages call methods."""
-        probe, comparison = self._probe, self._comparison
+        probe, comparison, registration = self._probe, self._comparison, self._registration
         triggers: dict[str, Callable[..., object]] = {
             "set": self._panel.set,
             "press": buttons.press,
             "set_tissue": self._in_task(self._presenter.setTissue),
             "set_free": self._in_task(self._presenter.fits.setFree),
             "set_pose": probe.set_pose,
+            "type_pose": self._in_task(self._poses.type),
             "key": probe.hand.key,
             "plane": probe.choose_plane,
             "look": probe.look,
             "aim_image": probe.aim_image,
             "play": comparison.play,
             "show_number": comparison.show,
+            "answer": self._questions.answer,
+            "calibrate": self._in_task(registration.calibrate),
+            "register": self._in_task(registration.register),
+            "choose_frame": self._in_task(registration.choose_frame),
+            "pick_landmark": registration.pick,
+            "landmark_in_image": registration.picked_in_image,
+            "add_landmark": registration.add_typed,
+            "remove_landmark": registration.remove_landmark,
+            "fit_landmarks": self._in_task(registration.fit),
             "cancel": self._panel.cancel,
             "dismiss": self._messages.dismiss,
             "export": self._export,
             "script": self._show_script,
+            "restore_session": self._in_task(lambda: self._then_refresh(self._restoring.restore)),
+            "discard_session": self._in_task(self._restoring.discard),
+            "session_kept": self._session_kept,
             "stamp": stamps.receive,
             "page_opened": self._images.show_again,
             "at_rest": self._at_rest,
@@ -134,11 +212,14 @@ class Workstation:
     def _in_task(self, method: Callable[..., None]) -> Callable[..., None]:
         return lambda *arguments: self._tasks.start(lambda: method(*arguments))
 
-    def _open_files(self, files: dict[str, bytes]) -> None:
-        self._tasks.start(lambda: self._then_refresh(self._loading.open, files))
+    def _open_files(self, files: dict[str, bytes], meant: str) -> None:
+        self._tasks.start(lambda: self._then_refresh(self._opening.open, files, meant))
 
     def _add_file(self, name: str, content: bytes, tissue: str) -> None:
         self._tasks.start(lambda: self._then_refresh(self._loading.add, name, content, tissue))
+
+    def _open_pose(self, name: str, content: bytes) -> None:
+        self._tasks.start(lambda: self._poses.open(name, content))
 
     def _then_refresh(self, method: Callable[..., None], *arguments: object) -> None:
         method(*arguments)
@@ -147,7 +228,10 @@ class Workstation:
     async def _export(self, kind: str) -> list[object] | None:
         """[file name, content, MIME type], or None after an error was shown on the page."""
         try:
-            name, content, mime = await self._exports.export(kind)
+            if kind.startswith("pose."):
+                name, content, mime = *self._poses.file(kind.removeprefix("pose")), "application/octet-stream"
+            else:
+                name, content, mime = await self._exports.export(kind)
         except SimulationError as error:
             self._messages.show(str(error))
             return None
@@ -156,7 +240,16 @@ class Workstation:
 
     def _show_script(self) -> None:
         with self._presenter.shown(), self._shared.changing() as now:
-            now.script.text, now.script.is_open = self._exports.script(), True
+            (now.script.text, now.script.needs_files), now.script.is_open = self._exports.script(), True
+
+    async def _session_kept(self) -> bool:
+        """Wait until the present state is kept on the disk; returns whether it is. For programs that control a page."""
+        while not (self._is_at_rest and self._autosave.is_done):
+            await asyncio.sleep(_LOOK_EVERY_S)
+        self._autosave.look()
+        while not self._autosave.is_done:
+            await asyncio.sleep(_LOOK_EVERY_S)
+        return self._autosave.has_kept
 
     async def _at_rest(self) -> dict[str, int]:
         """Wait until all requests of pages and trackers are done; returns the number of the last image by stream.
@@ -179,6 +272,7 @@ class Workstation:
         for stream in self._images.streams:
             self.server.controller.rc_area_register(stream)
         self._tasks.start(self._begin)
+        self._autosave.begin()
 
     def _begin(self) -> None:
         files = self._files
@@ -186,6 +280,7 @@ class Workstation:
             with self._presenter.shown():
                 self._tracker.start(files.tracker, files.tracker_device)
         self._loading.begin(files)
+        self._restoring.offer()  # not before: what is restored takes the place of this patient
         self._panel.refresh()
 
     def _parameters_changed(self) -> None:

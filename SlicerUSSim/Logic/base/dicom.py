@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import re
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,6 +11,7 @@ import numpy as np
 
 from SlicerUSSim.Logic.base.errors import SimulationError, require
 from SlicerUSSim.Logic.base.headers import require_spacing
+from SlicerUSSim.Logic.base.reading import reader
 
 _log = logging.getLogger(__name__)
 
@@ -23,6 +25,8 @@ _MOST_FOLDERS = 1000
 _UNEVEN, _TILT_DEG = 0.2, 0.5
 #: Direction cosines that differ by less are the same, as scanners round them
 _SAME_AXES = 1e-3
+#: Letters of a description that are used as a name
+_LONGEST_TITLE = 60
 #: The part of a file in which modality and series are
 _HEADER_BYTES = 2**16
 
@@ -69,6 +73,13 @@ class Series:
         return f"{name or self.uid}: {len(self.files)} images of {self.size} ({Path(self.files[0]).name})"
 
     @property
+    def title(self) -> str:
+        """Its description, as far as it can be a name, and its number."""
+        description = " ".join(re.sub(r"[^\w+.,() -]", " ", self.description).split())[:_LONGEST_TITLE].strip(" .")
+        number = f"series {self.number}" if self.number else ""
+        return f"{description} ({number})" if description and number else description or number or "DICOM"
+
+    @property
     def is_stack(self) -> bool:
         """Whether it has enough images for a volume, all of one orientation."""
         if len(self.files) < _LEAST_IMAGES:
@@ -109,6 +120,36 @@ def read_dicom_folder(folder: Path):
     if len(found) > 1:
         _log.warning("%s: has %d DICOM series; the only volume is read: %s", folder, len(found), stacks[0])
     return _read(stacks[0], str(folder))
+
+
+@dataclass(frozen=True)
+class FoundSeries:
+    """A series of a folder, for a user who chooses."""
+
+    #: Description and number, without anything about the patient: "T1 MPRAGE (series 3)"
+    title: str
+    #: Numbers and sizes of its images: "176 images of 256x256"
+    images: str
+    #: Paths of its files
+    files: tuple[str, ...]
+    #: Whether it has enough parallel images for a volume, or is one file with several
+    is_volume: bool
+    #: Number of the patient, from 0, among those of the folder
+    patient: int
+
+
+@reader
+def list_series(path: Path) -> list[FoundSeries]:
+    """All DICOM series of a folder, by their numbers; those of the folders in it too, if it has none itself."""
+    found = _series_of(path) or _series_of(path, recursive=True)
+    patients = list(dict.fromkeys(series.patient for series in found))
+    return [
+        FoundSeries(
+            series.title, f"{len(series.files)} images of {series.size}", series.files,
+            series.is_stack or len(found) == 1, patients.index(series.patient),
+        )
+        for series in found
+    ]  # fmt: skip
 
 
 def series_with(file: Path) -> Series | None:

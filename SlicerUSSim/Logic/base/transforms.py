@@ -53,6 +53,44 @@ def nearest_rotation(axes: np.ndarray) -> np.ndarray:
     return u @ vt
 
 
+def pose_of_angles(position_mm, angles_deg) -> np.ndarray:
+    """(4, 4) rigid map that turns about the axes R, A and S of the world, in this order, and then moves.
+
+    Parameters
+    ----------
+    position_mm : (3,) R, A, S to which the origin is moved.
+    angles_deg : (3,) right-handed, about R, A and S.
+
+    >>> from SlicerUSSim.Logic.base.transforms import pose_of_angles
+    >>> pose_of_angles([10.0, 0.0, 5.0], [90.0, 0.0, 0.0]).round(3).tolist()[2]
+    [0.0, 1.0, 0.0, 5.0]
+    """
+    pose = np.eye(4)
+    for axis, angle in enumerate(np.radians(np.asarray(angles_deg, float))):
+        one, other = (axis + 1) % 3, (axis + 2) % 3
+        turn = np.eye(3)
+        turn[one, one] = turn[other, other] = np.cos(angle)
+        turn[other, one], turn[one, other] = np.sin(angle), -np.sin(angle)
+        pose[:3, :3] = turn @ pose[:3, :3]
+    pose[:3, 3] = position_mm
+    return pose
+
+
+def angles_of_pose(pose: np.ndarray) -> np.ndarray:
+    """(3,) degrees, the angles of pose_of_angles, of a (4, 4) rigid map; about A from -90 to 90.
+
+    Where A is turned by 90 degrees either way, R and S turn about the same axis, and R is 0.
+    """
+    rotation = np.asarray(pose)[:3, :3]
+    about_a = np.arcsin(np.clip(-rotation[2, 0], -1.0, 1.0))
+    if np.hypot(rotation[2, 1], rotation[2, 2]) < 1e-6:
+        about_r, about_s = 0.0, np.arctan2(-rotation[0, 1], rotation[1, 1])
+    else:
+        about_r = np.arctan2(rotation[2, 1], rotation[2, 2])
+        about_s = np.arctan2(rotation[1, 0], rotation[0, 0])
+    return np.degrees([about_r, about_a, about_s])
+
+
 def rigid_between(points: np.ndarray, onto: np.ndarray) -> tuple[np.ndarray, float]:
     """((4, 4) rigid map with the least squared distances of points (n, 3) to others, remaining RMS distance in mm).
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 
@@ -19,6 +20,8 @@ from SlicerUSSim.Logic.fitting.texture_costs import TextureReference
 from SlicerUSSim.Logic.fitting.tracked_fit import Fit, fit as fit_images, simulated
 from SlicerUSSim.Logic.imaging.simulator import UltrasoundSimulator
 from SlicerUSSim.Logic.tracked.images import TrackedImages
+
+_log = logging.getLogger(__name__)
 
 #: Names of the display that a fit of one tissue takes over as they are
 _DISPLAY_NAMES = frozenset((*DISPLAY_BOUNDS, *GROUPS, "display"))
@@ -56,6 +59,11 @@ def predict(
         not both,
         f"images {', '.join(map(str, both))} are fitted and predicted, expected others: what was fitted says little",
     )
+    if len(others.images) == 1:
+        _log.warning(
+            "1 image is predicted (%d): fits with other speckle (seed) differ by 0.01 there; predict more if there are",
+            others.numbers[0],
+        )
     given, simulator = simulator, found.simulator or simulator
     if found.registration is not None:
         others = replace(others, poses=[found.registration.correction @ pose for pose in others.poses])

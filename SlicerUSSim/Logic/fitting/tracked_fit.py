@@ -113,6 +113,12 @@ def fit(
     free = parameters_seen(free, simulator, tracked)
     masks = [tracked.mask] * len(tracked.images)
     given, patient = tracked, simulator
+    if speckle and len(tracked.images) == 1:
+        _log.warning(
+            "the speckle of 1 image is fitted (%d): grey map, smoothing and texture of one place may not hold at "
+            "others; fit more, or predict others",
+            tracked.numbers[0],
+        )
 
     def appearance_at(poses: Sequence[np.ndarray], **options: Any) -> AppearanceResult:
         # Of the patient and the probe as they are by then

@@ -13,6 +13,7 @@ from SlicerUSSim.Logic.base.files import read_json, write_json
 from SlicerUSSim.Logic.base.own_outputs import MARK
 from SlicerUSSim.Logic.base.reading import reader
 from SlicerUSSim.Logic.base.settings import DisplaySettings, SimulationSettings
+from SlicerUSSim.Logic.base.transforms import check_rigid
 from SlicerUSSim.Logic.probe.arrays import PROBE_KINDS, PROBES, Probe, probe_from_dict, probe_kind
 from SlicerUSSim.Logic.probe.beam import TRANSMIT_OF
 from SlicerUSSim.Logic.tissue.table import TissueTable
@@ -24,6 +25,8 @@ SECTIONS: dict[str, type[DisplaySettings] | type[SimulationSettings]] = {
     "display": DisplaySettings,
     "settings": SimulationSettings,
 }
+#: Name of the pose, as in files of poses
+_POSE = "probe_to_ras"
 #: Tissues of segment_mri with thin sulci.
 _BRAIN = ("csf", "grey matter", "white matter", "leptomeninges")
 
@@ -45,8 +48,13 @@ class Preset:
     display: DisplaySettings = field(default_factory=DisplaySettings)
     settings: SimulationSettings = field(default_factory=SimulationSettings)
     tissues: TissueTable = field(default_factory=lambda: TissueTable.brain(_BRAIN))
+    #: (4, 4) pose of the probe by rows, which a preset has if it is to be loaded together with it
+    probe_to_ras: tuple[tuple[float, ...], ...] | None = None
 
     def __post_init__(self) -> None:
+        if self.probe_to_ras is not None:
+            pose = check_rigid("preset: probe_to_ras", self.probe_to_ras)
+            object.__setattr__(self, "probe_to_ras", tuple(map(tuple, pose.tolist())))
         for name, kind in (
             ("probe", Probe), ("display", DisplaySettings), ("settings", SimulationSettings), ("tissues", TissueTable),
         ):  # fmt: skip
@@ -70,10 +78,12 @@ class Preset:
 
     def to_dict(self) -> dict:
         """Plain values; from_dict reads them back."""
+        pose = {} if self.probe_to_ras is None else {_POSE: [list(row) for row in self.probe_to_ras]}
         return {
             "probe": self.probe.to_dict(),
             **{name: asdict(getattr(self, name)) for name in SECTIONS},
             **self.tissues.to_dict(),
+            **pose,
         }
 
     @classmethod
@@ -82,7 +92,7 @@ class Preset:
 
         Raises SimulationError that names `source` and the error in it.
         """
-        known = ("probe", *SECTIONS, "tissues", "membrane")
+        known = ("probe", *SECTIONS, "tissues", "membrane", _POSE)
         require(isinstance(values, dict), f"{source}: is {kind_of(values)}, expected an object")
         for name in values.keys() - {MARK}:
             require(name in known, f"{source}: has {short(name)}, expected {', '.join(known)}")
@@ -94,7 +104,10 @@ class Preset:
                 sections[name] = built(kind, values[name], f"{source}: {name}")
         if "tissues" in values or "membrane" in values:
             sections["tissues"] = TissueTable.from_dict(values, source)
-        missing = [name for name in known[:-1] if name not in values]
+        if values.get(_POSE) is not None:
+            require(values.keys() - {MARK, _POSE} != set(), f"{source}: is a pose and no preset; open it as a pose")
+            sections[_POSE] = check_rigid(f"{source}: {_POSE}", values[_POSE])
+        missing = [name for name in known[:-2] if name not in values]
         if missing:
             _log.info("%s: has no %s; the defaults are used", source, ", ".join(missing))
         return cls(**sections)

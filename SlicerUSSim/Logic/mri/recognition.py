@@ -122,6 +122,11 @@ def require_no_ultrasound(mri: Volume) -> None:
             raise SimulationError(_ULTRASOUND)
 
 
+def is_head_sized(mri: Volume) -> bool:
+    """Whether what is brighter than air has the volume of a head, as a fast guess before `recognise`."""
+    return _may_be_head(CoarseImage.of(mri))
+
+
 def _may_be_head(image: CoarseImage) -> bool:
     millilitres = image.foreground.sum() * image.spacing_mm**3 / 1000.0
     return bool(_LEAST_HEAD_ML <= millilitres <= _MOST_HEAD_ML)

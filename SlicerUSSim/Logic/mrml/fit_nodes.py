@@ -64,7 +64,7 @@ def tracked_images(
     is_sequence = images_node.IsA("vtkMRMLSequenceNode")
     require(is_sequence or not apart, f"{named(images_node)} is no sequence, expected one to predict other images")
     if is_sequence:
-        sequence = _sequence(images_node)
+        sequence = sequence_of(images_node)
     else:
         volume = read_volume(images_node, "real image")
         if volume.array.shape[0] > 1:
@@ -83,10 +83,14 @@ def tracked_images(
 
 def neighbours_in(images_node, tracked: TrackedImages) -> list[list[np.ndarray]] | None:
     """The images before and after each of `tracked` in its sequence; None if they are not of a sequence node."""
-    return neighbours_of(_sequence(images_node), tracked) if images_node.IsA("vtkMRMLSequenceNode") else None
+    return neighbours_of(sequence_of(images_node), tracked) if images_node.IsA("vtkMRMLSequenceNode") else None
 
 
-def _sequence(sequence_node) -> TrackedSequence:
+def sequence_of(sequence_node) -> TrackedSequence:
+    """The images of a sequence node, each with its ImageToReference, which leads to the world.
+
+    Raises SimulationError for an empty sequence, and for items that are no images.
+    """
     count = sequence_node.GetNumberOfDataNodes()
     require(count > 0, f"sequence {named(sequence_node)} is empty, expected images")
     browser = next(

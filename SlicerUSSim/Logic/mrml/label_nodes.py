@@ -36,6 +36,8 @@ _log = logging.getLogger(__name__)
 #: Classes of nodes with labels.
 LABEL_CLASSES = ("vtkMRMLLabelMapVolumeNode", "vtkMRMLSegmentationNode")
 
+#: Slicer's table for every label map
+_DEFAULT_COLOURS = "GenericAnatomyColors"
 #: Tissues of label 0, 1, 2, ... of every preset that nobody has changed
 _OF_EVERY_BRAIN = tuple(Preset().tissues.names())
 
@@ -227,7 +229,7 @@ def _colour_names(labels_node, volume: Volume) -> dict[int, str]:
     as_whole(volume, f"label map {named(labels_node)}")
     colours, names = _colour_node(labels_node), {}
     # Slicer assigns this table to every label map; its names (2 is bone, 3 is skin) are therefore ignored.
-    is_default = colours is not None and colours.GetName() == "GenericAnatomyColors"
+    is_default = colours is not None and colours.GetName() == _DEFAULT_COLOURS
     if is_default:
         _log.info("%s: has Slicer's default colours, so labels are identified by their numbers", named(labels_node))
     present = [label for label in map(int, np.unique(volume.array)) if label]
@@ -260,22 +262,55 @@ def write_labels(labels_node, labels: Volume, names: Iterable[str], like_node) -
 
 
 def _write_label_map(labels_node, labels: Volume, names: tuple[str, ...]) -> None:
-    scene = labels_node.GetScene()
     write_volume(labels_node, labels)
-    colours, kept = labels_node.GetNodeReference("tissueColors"), {}
-    if colours is None:
-        colours = scene.AddNewNodeByClass("vtkMRMLColorTableNode", f"{labels_node.GetName()} tissues")
-        labels_node.SetNodeReferenceID("tissueColors", colours.GetID())
-    else:
-        kept = _colours_of_table(colours)
+    is_new = labels_node.GetNodeReference("tissueColors") is None
+    colours = _own_colours(labels_node)
+    kept = {} if is_new else _colours_of_table(colours)
     colours.SetTypeToUser()
     colours.SetNumberOfColors(len(names) + 1)
     colours.SetColor(0, "coupling", 0.0, 0.0, 0.0, 0.0)
     for label, name in enumerate(names, 1):
         colours.SetColor(label, name, *kept.get(name, (*colour_of(name), 1.0)))
+    _show_in_colours(labels_node, colours)
+
+
+def colour_table(labels_node) -> tuple[tuple[str, float, float, float, float], ...] | None:
+    """(name, red, green, blue, opacity) of label 0, 1, ... of a label map; None for Slicer's default colours."""
+    colours = _colour_node(labels_node)
+    if colours is None or colours.GetName() == _DEFAULT_COLOURS:
+        return None
+    lines = []
+    for label in range(colours.GetNumberOfColors()):
+        colour = [0.0] * 4
+        colours.GetColor(label, colour)
+        red, green, blue, opacity = colour
+        lines.append((colours.GetColorName(label) or "", red, green, blue, opacity))
+    return tuple(lines)
+
+
+def set_colour_table(labels_node, lines: tuple[tuple[str, float, float, float, float], ...]) -> None:
+    """Give a label map names and colours as colour_table returns them."""
+    colours = _own_colours(labels_node)
+    colours.SetTypeToUser()
+    colours.SetNumberOfColors(len(lines))
+    for label, line in enumerate(lines):
+        colours.SetColor(label, *line)
+    _show_in_colours(labels_node, colours)
+
+
+def _own_colours(labels_node):
+    """The colour table of a label map that write_labels or set_colour_table made, or a new one."""
+    colours, scene = labels_node.GetNodeReference("tissueColors"), labels_node.GetScene()
+    if colours is None:
+        colours = scene.AddNewNodeByClass("vtkMRMLColorTableNode", f"{labels_node.GetName()} tissues")
+        labels_node.SetNodeReferenceID("tissueColors", colours.GetID())
+    return colours
+
+
+def _show_in_colours(labels_node, colours) -> None:
     display = labels_node.GetDisplayNode()
     if display is None:  # the default display node requires colours that exist only in Slicer's own scene
-        display = scene.AddNewNodeByClass("vtkMRMLLabelMapVolumeDisplayNode")
+        display = labels_node.GetScene().AddNewNodeByClass("vtkMRMLLabelMapVolumeDisplayNode")
         labels_node.SetAndObserveDisplayNodeID(display.GetID())
     display.SetAndObserveColorNodeID(colours.GetID())
     labels_node.Modified()

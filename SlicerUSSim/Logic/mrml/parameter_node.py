@@ -53,6 +53,10 @@ class PanelSettings(Declared):
         next(iter(VIEWS)), "View", "; ".join(f"{name}: {view.tip}" for name, view in VIEWS.items()),
         choices=tuple(VIEWS), shown=True,
     )  # fmt: skip
+    preset_pose: bool = parameter(
+        False, "Pose in presets", "Save preset saves the pose of the probe, too; a preset with a pose moves the probe "
+        "there when it is loaded", shown=True,
+    )  # fmt: skip
     preset: str = parameter("", "Preset", "The JSON text of a Preset; empty: the default")
 
     def _owner(self) -> str:

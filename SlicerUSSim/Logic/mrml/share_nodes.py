@@ -43,6 +43,17 @@ def write_shares(labels_node, labels: Volume, names: Sequence[str], texture: Tex
     write_volume(node, labels.with_array(voxels))
 
 
+def shares_node(labels_node):
+    """The volume node that write_shares wrote for a node; None without one."""
+    return labels_node.GetNodeReference(_ROLE)
+
+
+def set_shares_node(labels_node, node) -> None:
+    """Let labels refer to a volume with shares, which write_shares wrote for the same content in another scene."""
+    node.SetHideFromEditors(True)
+    labels_node.SetNodeReferenceID(_ROLE, node.GetID())
+
+
 def shares_version(labels_node) -> Hashable:
     """A value that changes with what write_shares kept for a node."""
     node = labels_node.GetNodeReference(_ROLE)

@@ -30,6 +30,7 @@ _AROUND = 2
 _MOST_IMAGES = 200
 #: Of the field at 255 grey levels, from which images are said to be saturated
 _SATURATED = 0.02
+_WHITE = 255
 
 
 def spread_images(images: np.ndarray) -> np.ndarray:
@@ -56,16 +57,19 @@ def visible_part(images: np.ndarray, field: np.ndarray, coloured: np.ndarray | N
         hidden = np.asarray(ndimage.binary_dilation(coloured, iterations=_AROUND), bool) & seen
         _say(hidden, seen, "have colours, as of Doppler or markers")
         seen &= ~hidden
-    drawn = _drawn_over(images, seen)
+    is_white = images[:, seen] == _WHITE
+    # What is drawn is white in all images; what changes is the patient
+    changing = is_white[:, ~is_white.all(axis=0)] if len(images) >= _LEAST_IMAGES else is_white
+    is_saturated = bool(changing.size) and float(changing.mean()) > _SATURATED
+    if is_saturated:
+        _log.warning(
+            "%.0f %% of the field is at 255 grey levels: the images are saturated, and levels above are lost",
+            100 * float(is_white.mean()),
+        )
+    drawn = _drawn_over(images, seen, _WHITE if is_saturated else 256)
     if drawn.any():
         _say(drawn, seen, "are the same in all images, as text, rulers, logos and boxes are")
         seen = seen & ~drawn
-    share = float((images[:, seen] == 255).mean()) if seen.any() else 0.0
-    if share > _SATURATED:
-        _log.warning(
-            "%.0f %% of the field is at 255 grey levels: the images are saturated, and levels above are lost",
-            100 * share,
-        )
     return seen
 
 
@@ -102,8 +106,11 @@ def _cut_off(brightest: np.ndarray, field: np.ndarray) -> np.ndarray:
     return hidden
 
 
-def _drawn_over(images: np.ndarray, field: np.ndarray) -> np.ndarray:
-    """(rows, columns) bool, bright pixels of the field that stay the same while those around them change."""
+def _drawn_over(images: np.ndarray, field: np.ndarray, below: int) -> np.ndarray:
+    """(rows, columns) bool, bright pixels of the field that stay the same while those around them change.
+
+    Grey levels from `below` on are left, as the patient's in saturated images.
+    """
     nothing = np.zeros_like(field)
     if len(images) < _LEAST_IMAGES:
         return nothing
@@ -111,7 +118,7 @@ def _drawn_over(images: np.ndarray, field: np.ndarray) -> np.ndarray:
     same = (high - low <= _SAME) & field
     if same.sum() > _MOST_DRAWN * field.sum() + (same & (high <= _DARK)).sum():
         return nothing
-    core = same & (low >= _DRAWN)
+    core = same & (low >= _DRAWN) & (high < below)
     # Single pixels are chance; letters and lines are not
     labels, count = _components(core)
     sizes = np.bincount(labels.ravel(), minlength=count + 1)

@@ -66,8 +66,8 @@ class TrackedImages:
         beam : probe whose parameters other than the geometry are used for an estimated probe.
 
         Raises SimulationError for images that do not exist or were not tracked, a skewed calibration, a field that
-        cannot be estimated, and images that are entirely black. A calibration that mirrors, saturated images, and what
-        a file cuts off or a scanner draws over the field (hidden.py) are warned of.
+        cannot be estimated, and images that are entirely black or of one grey level. A calibration that mirrors,
+        saturated images, and what a file cuts off or a scanner draws over the field (hidden.py) are warned of.
         """
         require(
             sequence.image_type == "BRIGHTNESS",
@@ -96,6 +96,11 @@ class TrackedImages:
         field = _located_field(sequence, images, spacing, probe, beam)
         seen = visible_part(_as_uint8(spread_images(sequence.images)), field.mask, sequence.coloured)
         require(bool(seen.any()), "nothing of the probe's field is seen in the images")
+        for number, image in zip(kept, images, strict=True):
+            low, high = int(image[seen].min()), int(image[seen].max())
+            require(
+                low < high, f"image {number} has the grey level {low} in all of the probe's field, expected a patient"
+            )
         field = replace(field, mask=seen)
         to_ras = np.eye(4) if reference_to_ras is None else check_rigid("reference_to_ras", reference_to_ras)
         poses = [to_ras @ _probe_pose(matrix, field, path) for matrix in matrices]

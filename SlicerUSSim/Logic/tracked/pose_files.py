@@ -10,12 +10,22 @@ from pathlib import Path
 import numpy as np
 
 from SlicerUSSim.Logic.base.errors import SimulationError, require, required
-from SlicerUSSim.Logic.base.files import read_json, write_json
+from SlicerUSSim.Logic.base.files import read_json, write_json, written_whole
 from SlicerUSSim.Logic.base.reading import in_child, reader, starts_like_hdf5
-from SlicerUSSim.Logic.base.transforms import LPS_TO_RAS, MOST_MM, check_affine, check_rigid, is_singular
+from SlicerUSSim.Logic.base.transforms import (
+    LPS_TO_RAS,
+    MOST_MM,
+    check_affine,
+    check_rigid,
+    is_singular,
+    pose_of_angles,
+    rigid_between,
+)
 
 _log = logging.getLogger(__name__)
 
+#: Least root mean square distance of landmarks from the line through most of them
+_LEAST_WIDTH_MM = 1.0
 _ITK_SUFFIXES = (".tfm", ".h5", ".hdf5", ".mat")
 
 
@@ -48,10 +58,13 @@ def read_pose(path: str | os.PathLike) -> np.ndarray:
 def read_matrix(path: str | os.PathLike) -> np.ndarray:
     """(4, 4) affine matrix, such as a calibration, from a text file of sixteen numbers by rows or from JSON rows.
 
+    An ITK file (.tfm, .h5, .mat, .txt) contains the inverse map in LPS, as Slicer writes a linear transform.
     The matrix may scale. Raises SimulationError for other files.
     """
     path = Path(path)
     require(path.is_file(), f"{path}: no such file")
+    if path.suffix.lower() in _ITK_SUFFIXES or _starts_like_itk(path):
+        return check_affine(f"{path}: transform", _itk_to_world(path))
     try:
         matrix = np.array(read_json(path), float) if path.suffix.lower() == ".json" else _numbers(path)
     except (TypeError, ValueError):
@@ -70,8 +83,43 @@ def _numbers(path: Path) -> np.ndarray:
 
 
 def write_pose(path: str | os.PathLike, probe_to_ras: np.ndarray) -> None:
-    """Write a pose as JSON; an existing file is replaced only when the new one is complete."""
-    write_json(path, {"probe_to_ras": np.asarray(probe_to_ras).tolist()})
+    """Write a pose, which read_pose reads; an existing file is replaced only when the new one is complete.
+
+    An ITK file (.tfm, .h5, .mat) has the map from world to probe in LPS, as Slicer writes and reads linear transforms;
+    a text file (.txt) sixteen numbers by rows. Others are JSON. Raises SimulationError for a matrix that is not rigid.
+    """
+    path, pose = Path(path), check_rigid("probe_to_ras", probe_to_ras)
+    suffix = path.suffix.lower()
+    if suffix in _ITK_SUFFIXES:
+        _write_itk(path, pose)
+    elif suffix == ".txt":
+        with written_whole(path) as partial:
+            partial.write_text("\n".join(" ".join(map(repr, row)) for row in pose.tolist()) + "\n", encoding="utf-8")
+    else:
+        write_json(path, {"probe_to_ras": pose.tolist()})
+
+
+def pose_of_text(text: str) -> np.ndarray:
+    """(4, 4) probe_to_ras of a text: sixteen numbers by rows, or six: position and angles as in pose_of_angles.
+
+    Raises SimulationError for other texts and for a matrix that is not rigid.
+
+    >>> pose_of_text("10 20 30  0 0 90").round(3).tolist()[0]
+    [0.0, -1.0, 0.0, 10.0]
+    """
+    parts = re.sub(r"[,;\[\]()]", " ", text).split()
+    try:
+        numbers = np.array(parts, float)
+    except ValueError:
+        numbers = np.zeros(0)
+    require(
+        numbers.size in (6, 16) and numbers.size == len(parts),
+        f"the pose is {text.strip()[:60]!r}, expected 6 numbers (R A S in mm, and angles about these axes in degrees) "
+        "or 16 (a 4x4 matrix by rows)",
+    )
+    if numbers.size == 6:
+        return check_rigid("the pose", pose_of_angles(numbers[:3], numbers[3:]))
+    return check_rigid("the pose", numbers.reshape(4, 4))
 
 
 def _starts_like_itk(path: Path) -> bool:
@@ -87,11 +135,27 @@ def _is_text(content: bytes) -> bool:
 
 
 def _read_itk(path: Path) -> np.ndarray:
+    return check_rigid(f"{path}: transform", _itk_to_world(path))
+
+
+def _itk_to_world(path: Path) -> np.ndarray:
+    """(4, 4) in RAS of the inverse of an ITK file's linear map, which is in LPS."""
     is_hdf5 = path.suffix.lower() in (".h5", ".hdf5") or starts_like_hdf5(path)
     linear = _linear_map_of_hdf5 if is_hdf5 else _linear_map
     world_to_probe = linear(path)
     require(not is_singular(world_to_probe), f"{path}: the transform is singular, expected a rigid one")
-    return check_rigid(f"{path}: transform", LPS_TO_RAS @ np.linalg.inv(world_to_probe) @ LPS_TO_RAS)
+    return LPS_TO_RAS @ np.linalg.inv(world_to_probe) @ LPS_TO_RAS
+
+
+def _write_itk(path: Path, pose: np.ndarray) -> None:
+    import SimpleITK as sitk
+
+    world_to_probe = np.linalg.inv(LPS_TO_RAS @ pose @ LPS_TO_RAS)
+    transform = sitk.AffineTransform(3)
+    transform.SetMatrix(world_to_probe[:3, :3].ravel().tolist())
+    transform.SetTranslation(world_to_probe[:3, 3].tolist())
+    with written_whole(path) as partial:
+        sitk.WriteTransform(transform, str(partial))
 
 
 def _linear_map(path: Path) -> np.ndarray:
@@ -158,6 +222,57 @@ def read_tags(path: str | os.PathLike) -> tuple[np.ndarray, np.ndarray | None]:
     farthest = float(np.abs(array).max())
     require(farthest <= MOST_MM, f"{path}: has a coordinate of {farthest:.3g} mm, expected at most {MOST_MM:g} mm")
     return array[:, :3], (array[:, 3:] if per_point == 6 else None)
+
+
+def read_calibration(path: str | os.PathLike, name: str = "ImageToProbe") -> dict[str, np.ndarray]:
+    """{"ImageToProbe": (4, 4), ...} of a Plus configuration (.xml), or of a file with one matrix, which is `name`.
+
+    That is 16 numbers by rows, JSON rows, or a linear ITK transform as 3D Slicer saves it (.tfm, .h5); it may scale.
+    Raises SimulationError for other files.
+    """
+    from SlicerUSSim.Logic.tracked.sequence import read_coordinate_definitions
+
+    if Path(path).suffix.lower() == ".xml":
+        return read_coordinate_definitions(path)
+    return {name: read_matrix(path)}
+
+
+def read_registration(path: str | os.PathLike) -> tuple[np.ndarray, str]:
+    """((4, 4) map from the reference frame of ultrasound to the MRI, a line about it), as of --to-mri.
+
+    A file is one of read_transform, or a .tag with landmarks in MRI and ultrasound, for which the rigid map with the
+    least squared distances is computed. Raises SimulationError for others, and for landmarks of one volume.
+    """
+    if Path(path).suffix.lower() != ".tag":
+        return read_transform(path), ""
+    in_mri, in_ultrasound = read_tags(path)
+    if in_ultrasound is None:
+        raise SimulationError(f"{path}: has points of one volume, expected pairs in MRI and ultrasound")
+    return fit_landmarks(in_ultrasound, in_mri)[:2]
+
+
+def fit_landmarks(in_ultrasound: np.ndarray, in_mri: np.ndarray) -> tuple[np.ndarray, str, np.ndarray]:
+    """((4, 4) rigid map of the first to the second, a line about it, (n,) what remains of each in millimetres).
+
+    Parameters
+    ----------
+    in_ultrasound, in_mri : (n, 3) the same landmarks, millimetres.
+
+    Raises SimulationError for fewer than three pairs, and for landmarks that lie on a line, about which they turn.
+    """
+    in_ultrasound, in_mri = np.asarray(in_ultrasound, float), np.asarray(in_mri, float)
+    count = len(in_ultrasound)
+    require(count >= 3, f"{count} pair{'s' * (count != 1)} of landmarks, expected three or more")
+    for points, where in ((in_ultrasound, "ultrasound"), (in_mri, "MRI")):
+        wide = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)[1] / np.sqrt(count)
+        require(
+            wide >= _LEAST_WIDTH_MM,
+            f"landmarks in the {where} lie within {wide:.2g} mm of a line, about which the fit would turn; expected "
+            f"{_LEAST_WIDTH_MM:g} mm or more",
+        )
+    matrix, left = rigid_between(in_ultrasound, in_mri)
+    remaining = np.linalg.norm(in_ultrasound @ matrix[:3, :3].T + matrix[:3, 3] - in_mri, axis=1)
+    return matrix, f"{count} landmarks agree to {left:.2f} mm (root mean square)", remaining
 
 
 def _read_xfm(path: Path) -> np.ndarray:

@@ -203,6 +203,40 @@ class BrainPhantom:
     noise: float
 
 
+#: Parts of a brain as MRIs of operations and single slabs show them: from and to, of its extent along R, A and S
+PARTS = {
+    "coronal slab": ((0.0, 1.0), (0.45, 0.52), (0.0, 1.0)),
+    "part of a coronal slab": ((0.2, 1.0), (0.62, 0.69), (0.2, 1.0)),
+    "axial slab": ((0.0, 1.0), (0.0, 1.0), (0.45, 0.75)),
+    "sagittal slab": ((0.55, 0.7), (0.0, 1.0), (0.0, 1.0)),
+    "quarter": ((0.5, 1.0), (0.3, 0.9), (0.4, 1.0)),
+}
+
+
+def part_of(case: BrainPhantom, part: str) -> BrainPhantom:
+    """One of PARTS of a phantom, cut out along its voxels; its maps stay those of the whole brain.
+
+    Raises SimulationError for an unknown part.
+    """
+    require(part in PARTS, f"part is {part!r}, expected one of {', '.join(PARTS)}")
+    box = ndimage.find_objects((case.mask.array > 0).astype(np.uint8))[0]
+    matrix = case.mri.ijk_to_ras
+    inside = list(box)
+    for ras, (low, high) in enumerate(PARTS[part]):
+        column = int(np.abs(matrix[ras, :3]).argmax())
+        if matrix[ras, column] < 0.0:
+            low, high = 1.0 - high, 1.0 - low
+        side, size = box[2 - column], box[2 - column].stop - box[2 - column].start
+        inside[2 - column] = slice(side.start + int(low * size), side.start + int(high * size))
+    k, j, i = inside
+    moved = matrix.copy()
+    moved[:3, 3] = (matrix @ [i.start, j.start, k.start, 1.0])[:3]
+    mri, mask, truth = (
+        Volume(np.ascontiguousarray(volume.array[k, j, i]), moved) for volume in (case.mri, case.mask, case.truth)
+    )
+    return replace(case, name=f"{case.name}, {part}", mri=mri, mask=mask, truth=truth, bias=case.bias[k, j, i])
+
+
 def phantom(
     maps: TissueMaps,
     contrast: str = "t1",

@@ -105,6 +105,11 @@
     { capture: true, passive: true },
   );
   window.addEventListener("keydown", (event) => {
+    const question = document.getElementById("question");
+    if (question) {
+      if (event.key === "Escape") window.trame.trigger("answer", [Number(question.dataset.number), null]);
+      return; // keys that move the probe are not for a question
+    }
     if (event.ctrlKey || event.altKey || event.metaKey || isTaken(event.key, event.target)) return;
     const keys = canvasOf("simulated")?.dataset.keys.split(" ") ?? [];
     const key = event.key.length === 1 ? event.key.toLowerCase() : event.key;
@@ -115,11 +120,17 @@
 
   // Sends the files of an input; the bar below the image shows how far they are.
   workstation.send = (input, purpose) => {
-    const form = new FormData();
-    for (const file of input.files) form.append("file", file, file.name);
-    const names = [...input.files].map((file) => file.name).join(", ");
+    const files = [...input.files].map((file) => [file.webkitRelativePath || file.name, file]);
+    sendFiles(files, purpose);
     input.value = ""; // so that the same file can be chosen again
-    if (!names) return;
+  };
+
+  // `files` are [path, file]; the folders above a file become part of its name, since a name is no path.
+  function sendFiles(files, purpose) {
+    if (!files.length) return;
+    const form = new FormData();
+    for (const [path, file] of files) form.append("file", file, path.split("/").slice(-3).join("_"));
+    const names = files.length > 4 ? `${files.length} files` : files.map(([, file]) => file.name).join(", ");
     const bar = document.getElementById("upload");
     const request = new XMLHttpRequest();
     const tell = (percent) => (document.getElementById("upload-text").textContent = `Send ${names} ${percent} %`);
@@ -134,6 +145,47 @@
     };
     request.open("POST", `upload?${new URLSearchParams(purpose)}`);
     request.send(form);
+  }
+
+  // ---- files and folders that are dropped on the page -----------------------------------------------------------
+
+  const hasFiles = (event) => [...(event.dataTransfer?.types ?? [])].includes("Files");
+
+  // [path, file] of all files in a folder, or of one file.
+  async function filesOf(entry, path) {
+    if (entry.isFile) return [[path + entry.name, await new Promise((done, failed) => entry.file(done, failed))]];
+    const reader = entry.createReader();
+    const found = [];
+    for (;;) {
+      const some = await new Promise((done, failed) => reader.readEntries(done, failed)); // a hundred at once
+      if (!some.length) return found;
+      for (const inside of some) found.push(...(await filesOf(inside, `${path}${entry.name}/`)));
+    }
+  }
+
+  window.addEventListener("dragover", (event) => {
+    if (!hasFiles(event)) return;
+    event.preventDefault();
+    document.body.classList.add("ussim-dropping");
+  });
+  window.addEventListener("dragleave", (event) => {
+    if (!event.relatedTarget) document.body.classList.remove("ussim-dropping");
+  });
+  window.addEventListener("drop", async (event) => {
+    if (!hasFiles(event)) return;
+    event.preventDefault();
+    document.body.classList.remove("ussim-dropping");
+    // What was dropped can be asked for only before the first wait
+    const entries = [...event.dataTransfer.items].map((item) => item.webkitGetAsEntry?.()).filter(Boolean);
+    const plain = entries.length ? [] : [...event.dataTransfer.files].map((file) => [file.name, file]);
+    const found = await Promise.all(entries.map((entry) => filesOf(entry, "")));
+    sendFiles([...plain, ...found.flat()], { for: "open" });
+  });
+
+  workstation.pickLandmark = (event) => {
+    const box = event.target.getBoundingClientRect();
+    const at = [(event.clientX - box.left) / box.width, (event.clientY - box.top) / box.height];
+    window.trame.trigger("landmark_in_image", at);
   };
 
   workstation.save = async (kind) => {

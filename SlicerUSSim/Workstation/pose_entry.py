@@ -1,0 +1,89 @@
+"""PoseEntry: poses of the probe that are typed, opened from files and saved."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+
+from SlicerUSSim.Logic.base.errors import SimulationError, require, required
+from SlicerUSSim.Logic.base.reading import untrusted_folder
+from SlicerUSSim.Logic.base.transforms import angles_of_pose
+from SlicerUSSim.Logic.tracked.pose_files import pose_of_text, read_pose, write_pose
+from SlicerUSSim.Widget.presenter import PanelPresenter
+from SlicerUSSim.Workstation.state import SharedState
+from SlicerUSSim.Workstation.tasks import Tasks
+from SlicerUSSim.Workstation.uploads import require_whole_files
+
+#: Suffixes of files of poses
+POSE_SUFFIXES = (".json", ".tfm", ".h5", ".mat", ".txt")
+_NO_PROBE = "there is no probe yet, expected a patient; open an MRI or labels"
+
+
+class PoseEntry:
+    """Sets the pose of the probe from texts and files.
+
+    Parameters
+    ----------
+    pose : (4, 4) of the probe; None without one.
+    move : sets it; the image follows.
+    """
+
+    def __init__(
+        self,
+        shared: SharedState,
+        tasks: Tasks,
+        presenter: PanelPresenter,
+        pose: Callable[[], np.ndarray | None],
+        move: Callable[[np.ndarray], None],
+    ) -> None:
+        self._shared, self._tasks, self._presenter = shared, tasks, presenter
+        self._pose, self._move = pose, move
+
+    def show(self) -> None:
+        """Show the pose of the probe as numbers."""
+        pose = self._pose()
+        numbers = matrix = ""
+        if pose is not None:
+            numbers = _text(np.concatenate([pose[:3, 3], angles_of_pose(pose)]), 2)
+            matrix = "\n".join(_text(row, 4) for row in pose)
+        with self._shared.changing() as now:
+            now.pose_numbers, now.pose_matrix = numbers, matrix
+
+    def type(self, text: str) -> None:
+        """Set the pose from six or sixteen numbers; called in a task."""
+        with self._presenter.shown():
+            self.set(pose_of_text(text))
+
+    def open(self, name: str, content: bytes) -> None:
+        """Set the pose from a file that a page has sent; called in a task."""
+        with self._presenter.shown(), untrusted_folder() as folder:
+            require_whole_files({name: content})
+            path = Path(folder) / name
+            path.write_bytes(content)
+            try:
+                self.set(self._tasks.doAside(lambda: read_pose(path)))
+            except SimulationError as error:
+                raise SimulationError(str(error).replace(f"{folder}{os.sep}", "")) from None
+
+    def file(self, suffix: str) -> tuple[str, bytes]:
+        """(name, content) of a file with the pose. Raises SimulationError without a probe, or for another suffix."""
+        pose = required(self._pose(), _NO_PROBE)
+        require(suffix in POSE_SUFFIXES, f"the file type is {suffix!r}, expected {', '.join(POSE_SUFFIXES)}")
+        with TemporaryDirectory() as folder:
+            path = Path(folder) / f"pose{suffix}"
+            write_pose(path, pose)
+            return path.name, path.read_bytes()
+
+    def set(self, pose: np.ndarray) -> None:
+        """Move the probe to a pose, (4, 4) probe_to_ras. Raises SimulationError without a probe."""
+        require(self._pose() is not None, _NO_PROBE)
+        self._move(pose)
+
+
+def _text(numbers: np.ndarray, decimals: int) -> str:
+    """Numbers with so many decimals, without -0."""
+    return " ".join(f"{value:.{decimals}f}" for value in numbers.round(decimals) + 0.0)

@@ -1,0 +1,229 @@
+"""Restoring: offers the last session of a server that was killed, and puts kept sessions and scenes into the scene."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from SlicerUSSim.Logic.base.errors import SimulationError, require, required
+from SlicerUSSim.Logic.base.transforms import check_rigid
+from SlicerUSSim.Logic.fitting.tracked_fit import Fit
+from SlicerUSSim.Logic.imaging.preset import Preset
+from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic
+from SlicerUSSim.Logic.mrml.nodes import display_of, set_node_to_world
+from SlicerUSSim.Logic.mrml.scene_record import ROLES, SceneRecord, SequenceRecord, put_nodes, put_values
+from SlicerUSSim.Widget.presenter import PanelPresenter
+from SlicerUSSim.Workstation.export import Cine
+from SlicerUSSim.Workstation.loading import Loading
+from SlicerUSSim.Workstation.opener import Opener, show_all_tissue
+from SlicerUSSim.Workstation.probe_control import ProbeControl
+from SlicerUSSim.Workstation.registration import Registration
+from SlicerUSSim.Workstation.scene_files import read_scene
+from SlicerUSSim.Workstation.script import LabelSource
+from SlicerUSSim.Workstation.session_store import KeptSession, SessionStore
+from SlicerUSSim.Workstation.state import PLANES, SLICE_VIEWS, ComparisonMode, SharedState
+from SlicerUSSim.Workstation.tasks import Tasks
+
+
+class Restoring:
+    """Puts kept sessions into the scene. All methods run in a task.
+
+    Parameters
+    ----------
+    store : where sessions are kept; None: there is nothing to offer.
+    when_kept : see Autosave.
+    now : seconds, as of the images of the cine loop.
+    """
+
+    def __init__(
+        self,
+        store: SessionStore | None,
+        shared: SharedState,
+        scene,
+        logic: UltrasoundSceneLogic,
+        tasks: Tasks,
+        opener: Opener,
+        presenter: PanelPresenter,
+        loading: Loading,
+        registration: Registration,
+        probe: ProbeControl,
+        cine: Cine,
+        when_kept: Callable[[Callable[[], None]], None],
+        now: Callable[[], float],
+    ) -> None:
+        self._store, self._shared, self._scene, self._logic, self._tasks = store, shared, scene, logic, tasks
+        self._opener, self._presenter, self._loading = opener, presenter, loading
+        self._registration = registration
+        self._probe, self._cine, self._when_kept, self._now = probe, cine, when_kept, now
+        self._offered: KeptSession | None = None
+
+    # ---- sessions ----------------------------------------------------------------------------------------------
+
+    def offer(self) -> None:
+        """Offer the last session that ended, if there is one."""
+        store = self._store
+        kept = [] if store is None else self._tasks.doAside(store.ended)
+        self._offered = kept[0] if kept else None
+        self._show_offer()
+
+    def restore(self) -> None:
+        """Restore what is offered, which takes the place of the patient; what cannot be read changes nothing."""
+        session = self._offered
+        if session is None:
+            return
+        with self._presenter.shown():
+            with TemporaryDirectory(prefix="ussim-sent-") as folder:
+                with self._presenter.view.progress("Restore the session"):
+                    record, fit, images = self._tasks.doAside(lambda: _parts_of(session))
+                    sent = self._tasks.doAside(lambda: session.copies("sent", Path(folder)))
+                self._take(record, session.content, fit, images)
+                for name, path in sent.items():
+                    self._opener.sent_files.keep(name, path)
+            self._offered = None
+            self._show_offer()
+            self._when_kept(session.remove)  # by the session of this server; until then it stays on the disk
+
+    def discard(self) -> None:
+        """Remove what is offered from the disk."""
+        session, self._offered = self._offered, None
+        self._show_offer()
+        if session is not None:
+            self._tasks.doAside(session.remove)
+
+    def _show_offer(self) -> None:
+        session, text = self._offered, ""
+        if session is not None:
+            saved = session.saved.astimezone()
+            is_today = saved.date() == saved.now(saved.tzinfo).date()
+            when = f"{saved:%H:%M}" if is_today else f"{saved:%d %B, %H:%M}"
+            text = f"Restore the session of {when} ({session.patient})?"
+        with self._shared.changing() as now:
+            now.offer = text
+
+    # ---- into the scene ----------------------------------------------------------------------------------------
+
+    def open_scene(self, path: str) -> str:
+        """Show the patient of a scene file in place of the present one; returns what was done.
+
+        Nothing changes if it cannot be read.
+        """
+        before = self._opener.patient()
+        with self._presenter.view.progress(f"Open {Path(path).name}"):
+            record = self._tasks.doAside(lambda: read_scene(path))
+        self._take_scene(record, Path(path).name)
+        return f"shown as it was{f'; {before} is closed' if before else ''}"
+
+    def _take_scene(self, record: SceneRecord, name: str) -> None:
+        self._take(record, {"values": dict(record.values)}, None, [])
+        parameters = self._logic.parameters
+        lines = [f"{name}: a scene"]
+        if record.left_out:
+            lines.append(f"left out, since the simulator does not use them: {', '.join(record.left_out)}")
+        if parameters.labels is None:
+            self._loading.segment()
+            self._presenter.addNotes(*lines)
+        else:
+            message, warnings = self._logic.recognised()
+            checks = [f"Check: {warning}" for warning in warnings]
+            self._presenter.setNotes(*lines, f"{parameters.labels.GetName()}: {message}", *checks)
+
+    def _take(
+        self,
+        record: SceneRecord,
+        kept: Mapping[str, Any],
+        fit: tuple[Fit, Preset | None] | None,
+        images: list[tuple[float, np.ndarray]],
+    ) -> None:
+        parameters: Any = self._logic.parameters
+        made = put_nodes(self._scene, record)
+        parents = [node.GetParentTransformNode() for node in made.values()]
+        labels: Any = made.get("labels")
+        flap = None if labels is None else labels.GetNodeReference("SlicerUSSim.flap")
+        self._loading.begin_patient(*made.values(), *parents, flap)
+        refused = put_values(parameters, kept.get("values", {}))
+        preset = self._logic.preset
+        for role in ROLES:
+            if role != "real" or record.sequence is None:
+                setattr(parameters, role, made.get(role))
+        mri, pose = made.get("mri"), record.pose
+        if mri is not None:
+            show_all_tissue(mri, required(record.nodes["mri"].volume, "the MRI has no voxels"))
+        source = kept.get("source")
+        if labels is not None and source is not None:
+            self._opener.restored(LabelSource.from_dict(source), labels)
+        if parameters.lesions is not None and kept.get("lesions") is not None:
+            files = tuple((str(tissue), str(file)) for tissue, file in kept["lesions"])
+            self._opener.restore_lesions(parameters.lesions, files)
+        if pose is not None:
+            self._put_probe(pose)
+        if record.sequence is not None:
+            self._registration.restore(record.sequence, preset.probe)
+            self._logic.preset = preset
+        page = kept.get("page", {})
+        self._show_page(page)
+        if pose is not None:
+            self._put_probe(pose)  # the sequence has moved it
+        if fit is not None and labels is not None:
+            self._presenter.fits.restore(*fit, labels)
+            with self._shared.changing() as now:
+                now.fit.curve, now.fit.costs = [float(cost) for cost in kept["curve"]], str(kept["costs"])
+        self._cine.restore(images, self._now(), str(kept.get("about", "")))
+        self._presenter.setNotes(*map(str, kept.get("notes", ())), *refused)
+        self._loading.show_restored(is_placed=pose is not None)
+
+    def _put_probe(self, pose: np.ndarray) -> None:
+        parameters: Any = self._logic.parameters
+        transform = parameters.probe_transform
+        if transform is None:
+            transform = self._scene.AddNewNodeByClass("vtkMRMLLinearTransformNode", "Probe")
+            parameters.probe_transform = transform
+            display = display_of(transform)
+            if display is not None:
+                display.SetEditorVisibility(False)
+        set_node_to_world(transform, pose)
+
+    def _show_page(self, page: Mapping[str, Any]) -> None:
+        for view, plane in dict(page.get("planes", {})).items():
+            if view in SLICE_VIEWS and plane in PLANES:
+                self._probe.choose_plane(view, plane)
+        if not page:
+            return
+        with self._shared.changing() as now:
+            now.views.blend = min(max(float(page["blend"]), 0.0), 1.0)
+            now.views.follow, now.views.show_tissues = bool(page["follow"]), bool(page["show_tissues"])
+            now.upright = bool(page["upright"])
+            now.sequence.comparison = ComparisonMode(page["comparison"])
+        if self._shared.now.sequence.length:
+            self._loading.show_number(int(page["number"]))
+
+
+def _parts_of(session: KeptSession) -> tuple[SceneRecord, tuple[Fit, Preset | None] | None, list]:
+    """(patient and probe, fit, cine loop) of a session. Raises SimulationError for one that is damaged."""
+    content = session.content
+    anatomy = session.read("anatomy")
+    require(isinstance(anatomy, SceneRecord), "the session has no patient, expected one; discard it")
+    sequence = session.read("sequence")
+    pose = content.get("pose")
+    if pose is not None:
+        pose = check_rigid("the session's pose", pose)
+    record = SceneRecord(anatomy.nodes, {}, pose, sequence if isinstance(sequence, SequenceRecord) else None)
+    images = []
+    for name in content["files"].get("cine", []):
+        for seconds, jpeg in session.read_file(str(name)):
+            images.append((float(seconds), _decoded(jpeg)))
+    fit: Any = session.read("fit")
+    return record, fit, images
+
+
+def _decoded(content: bytes) -> np.ndarray:
+    """(rows, columns) uint8 of an image of the loop."""
+    try:
+        return np.asarray(Image.open(io.BytesIO(content), formats=["JPEG"]).convert("L"))
+    except (OSError, ValueError) as error:
+        raise SimulationError(f"an image of the session's cine loop is damaged ({error})") from None

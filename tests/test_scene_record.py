@@ -1,0 +1,187 @@
+"""A scene as plain values and back: autosaves write them, and scene files are read into them by a child process."""
+
+from __future__ import annotations
+
+import io
+import os
+import pickle
+
+import numpy as np
+import pytest
+from vtkmodules.vtkCommonTransforms import vtkTransform
+
+slicer = pytest.importorskip("slicer", reason="MRML nodes come with slicer-core: pip install '.[slicer]'")
+
+from SlicerUSSim.Logic import SimulationError, Volume  # noqa: E402
+from SlicerUSSim.Logic.base.errors import required  # noqa: E402
+from SlicerUSSim.Logic.base.reading import read_values, write_values  # noqa: E402
+from SlicerUSSim.Logic.base.vtk_data import vtk_matrix  # noqa: E402
+from SlicerUSSim.Logic.imaging.preset import Preset  # noqa: E402
+from SlicerUSSim.Logic.mri.samples import head_mri  # noqa: E402
+from SlicerUSSim.Logic.mri.settings import SegmentationSettings  # noqa: E402
+from SlicerUSSim.Logic.mri.sheets.polydata import as_polydata  # noqa: E402
+from SlicerUSSim.Logic.mri.sheets.surfels import Surfels  # noqa: E402
+from SlicerUSSim.Logic.mrml.label_nodes import write_labels  # noqa: E402
+from SlicerUSSim.Logic.mrml.lesion_nodes import add_lesion, read_lesions  # noqa: E402
+from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic  # noqa: E402
+from SlicerUSSim.Logic.mrml.nodes import node_to_world, write_volume  # noqa: E402
+from SlicerUSSim.Logic.mrml.parameter_node import SceneParameters  # noqa: E402
+from SlicerUSSim.Logic.mrml.scene_record import (  # noqa: E402
+    NodeRecord,
+    SceneRecord,
+    nodes_version,
+    put_nodes,
+    put_values,
+    record_nodes,
+    record_scene,
+    recorded_values,
+)
+
+
+def add(scene, kind: str, name: str = ""):
+    return scene.AddNewNodeByClass(f"vtkMRML{kind}Node", name or kind)
+
+
+def segmented(kind: str = "LabelMapVolume") -> UltrasoundSceneLogic:
+    """A scene with a head, its tissues with a tumour on top, a probe and an image."""
+    logic = UltrasoundSceneLogic(slicer.vtkMRMLScene())
+    scene, parameters = logic.scene, logic.parameters
+    mri = head_mri(3.0)
+    node, labels, lesions = add(scene, "ScalarVolume", "head"), add(scene, kind, "tissues"), add(scene, "Segmentation")
+    turned = np.array([[0, -1, 0, 5.0], [1, 0, 0, -3.0], [0, 0, 1, 7.0], [0, 0, 0, 1]])
+    tilt = add(scene, "LinearTransform", "registration")
+    tilt.SetMatrixTransformToParent(vtk_matrix(turned))
+    write_volume(node, mri)
+    node.SetAndObserveTransformNodeID(tilt.GetID())
+    lesions.SetAndObserveTransformNodeID(tilt.GetID())
+    tumour = np.zeros(mri.array.shape, np.uint8)
+    middle = np.array(mri.array.shape) // 2
+    tumour[tuple(slice(m - 2, m + 3) for m in middle)] = 1
+    add_lesion(lesions, mri.with_array(tumour), "tumour", "tumour.nii.gz")
+    parameters.mri, parameters.labels, parameters.lesions = node, labels, lesions
+    logic.segment(node, labels, lesions_node=lesions)
+    parameters.probe_transform, parameters.output = add(scene, "LinearTransform"), add(scene, "ScalarVolume")
+    logic.placeProbe(labels, parameters.probe_transform)
+    logic.preset = Preset().changed("display", gain_db=4.0).changed("probe", depth_mm=60.0)
+    parameters.segmentation = SegmentationSettings("t2")
+    return logic
+
+
+def image_of(logic: UltrasoundSceneLogic) -> np.ndarray:
+    chosen = logic.parameters
+    if chosen.output is None:
+        chosen.output = add(logic.scene, "ScalarVolume")
+    return logic.simulate(chosen.labels, chosen.probe_transform, chosen.output).image
+
+
+def written_and_read(record: SceneRecord) -> SceneRecord:
+    file = io.BytesIO()
+    write_values(file, record)
+    file.seek(0)
+    return read_values(file)
+
+
+def in_new_scene(record: SceneRecord) -> UltrasoundSceneLogic:
+    logic = UltrasoundSceneLogic(slicer.vtkMRMLScene())
+    nodes = put_nodes(logic.scene, record)
+    for role, node in nodes.items():
+        if role in ("mri", "labels", "lesions", "mask", "sheets"):
+            setattr(logic.parameters, role, node)
+    assert put_values(logic.parameters, record.values) == []
+    if record.pose is not None:
+        logic.parameters.probe_transform = add(logic.scene, "LinearTransform")
+        logic.parameters.probe_transform.SetMatrixTransformToParent(vtk_matrix(record.pose))
+    return logic
+
+
+@pytest.mark.parametrize("kind", ["LabelMapVolume", "Segmentation"])
+def test_a_scene_has_the_same_image_after_it_was_kept_as_values(kind):
+    """With the shares of tissues in voxels, lesions, transforms, probe, display and tissues."""
+    logic = segmented(kind)
+    before = image_of(logic)
+    record = written_and_read(record_scene(logic.scene))
+    assert set(record.nodes) == {"mri", "labels", "shares", "lesions"} and record.left_out == ()
+    again = in_new_scene(record)
+    assert np.array_equal(image_of(again), before)
+    assert again.parameters.segmentation.contrast == "t2" and again.preset == logic.preset
+    np.testing.assert_allclose(node_to_world(again.parameters.mri), node_to_world(logic.parameters.mri))
+    assert again.mayReplace(again.parameters.labels)  # it is still what Segment made
+    lesions = again.parameters.lesions.GetSegmentation()
+    assert [lesions.GetNthSegment(n).GetName() for n in range(lesions.GetNumberOfSegments())] == ["tumour"]
+    found, _ = read_lesions(again.parameters.lesions, again.parameters.mri, again.preset.tissues)
+    assert [(tissue, source) for tissue, _, source in found] == [("tumour", "tumour.nii.gz (segment 'tumour')")]
+
+
+def test_taking_a_record_copies_no_voxels_and_its_version_changes_with_them():
+    logic = segmented()
+    parameters = logic.parameters
+    before = nodes_version(parameters)
+    record = record_nodes(parameters)
+    mri = Volume.from_vtk(parameters.mri.GetImageData(), np.eye(4)).array
+    assert np.shares_memory(required(record["mri"].volume, "none").array, mri) and nodes_version(parameters) == before
+    logic.segment(parameters.mri, parameters.labels)
+    after = nodes_version(parameters)
+    assert after != before
+    labels = required(record["labels"].volume, "none")
+    kept = labels.array.copy()
+    write_labels(parameters.labels, labels.with_array(kept * 0 + 1), ["bone"], parameters.mri)
+    assert nodes_version(parameters) != after
+    assert np.array_equal(labels.array, kept)  # it is replaced and not changed
+
+
+def test_sheets_stay_where_a_hardened_transform_moved_them():
+    scene = slicer.vtkMRMLScene()
+    parameters = SceneParameters(scene)
+    parameters.mri = add(scene, "ScalarVolume")
+    write_volume(parameters.mri, head_mri(4.0))
+    one = np.ones(3, np.float32)
+    surfels = Surfels(np.zeros((3, 3), np.float32), np.tile([0, 0, 1], (3, 1)).astype(np.float32), one, one, one,
+                      np.zeros(3, np.uint8))  # fmt: skip
+    parameters.sheets = add(scene, "Model", "falx")
+    parameters.sheets.SetAndObservePolyData(as_polydata(surfels))
+    shift = vtkTransform()
+    shift.Translate(0, 0, 9)
+    parameters.sheets.ApplyTransform(shift)
+    record = written_and_read(record_scene(scene))
+    again = in_new_scene(record)
+    points = again.parameters.sheets.GetPolyData().GetBounds()
+    assert points[4] == points[5] == 9.0
+
+
+def test_a_scene_without_choices_has_its_first_volume_as_mri_and_names_what_is_left_out():
+    scene = slicer.vtkMRMLScene()
+    for name in ("one", "two"):
+        write_volume(add(scene, "ScalarVolume", name), head_mri(4.0))
+    record = record_scene(scene)
+    assert record.nodes["mri"].name == "one" and record.left_out == ("two",) and record.pose is None
+    with pytest.raises(SimulationError, match="the scene has no volume, expected an MRI"):
+        record_scene(slicer.vtkMRMLScene())
+
+
+def test_values_that_this_version_does_not_take_are_said_and_have_their_default():
+    logic = segmented()
+    values = {**recorded_values(logic.parameters), "contrast": "t9", "what_is_that": "1"}
+    again = UltrasoundSceneLogic(slicer.vtkMRMLScene())
+    lines = put_values(again.parameters, values)
+    assert len(lines) == 1 and "t9" in lines[0] and again.parameters.segmentation.contrast == "t1"
+
+
+def test_what_does_not_fit_together_leaves_nothing_in_the_scene():
+    scene = slicer.vtkMRMLScene()
+    wrong = NodeRecord("vtkMRMLCameraNode", "camera", {}, np.eye(4))
+    good = NodeRecord("vtkMRMLScalarVolumeNode", "mri", {}, 2 * np.eye(4) - np.diag([0, 0, 0, 1.0]), head_mri(4.0))
+    before = scene.GetNumberOfNodes()
+    with pytest.raises(SimulationError, match="is not kept in sessions"):
+        put_nodes(scene, SceneRecord({"mri": good, "mask": wrong}))
+    assert scene.GetNumberOfNodes() == before
+
+
+def test_a_file_of_values_calls_nothing():
+    class Bad:
+        def __reduce__(self):
+            return os.system, ("exit 3",)
+
+    with pytest.raises(SimulationError, match="is damaged, or of another version"):
+        read_values(io.BytesIO(pickle.dumps(Bad())))
+    with pytest.raises(SimulationError, match="is damaged, or of another version"):
+        read_values(io.BytesIO(b"x"))

@@ -1,0 +1,324 @@
+"""Calibration and registration of tracked ultrasound on the page: from files, from values, and by landmarks."""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+import pytest
+from scipy import ndimage
+from scipy.spatial.transform import Rotation
+
+pytest.importorskip("trame_slicer", reason="the workstation comes with: pip install '.[serve]'")
+pytest.importorskip("playwright", reason="browser tests need playwright: pip install '.[test]'")
+
+from SlicerUSSim.Logic import Volume
+from SlicerUSSim.Logic.tracked.field import estimate_field
+from SlicerUSSim.Logic.tracked.sequence import TrackedSequence
+from SlicerUSSim.Workstation.state import NAMES
+from tests.conftest import SHARED, needs_shared, rigid
+from tests.test_workstation import (
+    browser as browser,
+    click,
+    cost,
+    errors,
+    eventually,
+    files as files,
+    in_view,
+    opened,
+    pytestmark as pytestmark,
+    serving,
+    settled,
+    state,
+    views,
+)
+
+#: Where the marker is on the probe, the tracker's frame, and that of the reference in the patient
+MARKER = rigid(Rotation.from_euler("xyz", [20, -70, 110], degrees=True).as_matrix(), [12, -40, 7])
+TRACKER = rigid(Rotation.from_euler("xyz", [-80, 15, 40], degrees=True).as_matrix(), [300, 20, -150])
+TO_RAS = rigid(Rotation.from_euler("xyz", [35, -25, 160], degrees=True).as_matrix(), [-60, 90, 30])
+
+
+@pytest.fixture(scope="module")
+def recording(files, tmp_path_factory) -> dict:
+    """The sweep of the head as an optical tracker records it, without its calibration, and what is known about it."""
+    sweep = TrackedSequence.read(files / "sweep.igs.mha")
+    to_probe = np.array(sweep.transforms[0]["ImageToProbe"])
+    poses = [np.array(entry["ProbeToReference"]) for entry in sweep.transforms]
+    tracked = tuple(
+        {
+            "ProbeToTracker": TRACKER @ np.linalg.inv(TO_RAS) @ pose @ np.linalg.inv(MARKER),
+            "ReferenceToTracker": TRACKER,
+            "StylusToTracker": TRACKER,
+        }
+        for pose in poses
+    )
+    folder = tmp_path_factory.mktemp("recording")
+    TrackedSequence(sweep.images, tracked, sweep.timestamps).write(folder / "phantom.igs.mha")
+    calibration = MARKER @ to_probe
+    numbers = " ".join(f"{value:.9g}" for value in calibration.ravel())
+    (folder / "plus.xml").write_text(
+        "<PlusConfiguration><CoordinateDefinitions>"
+        f'<Transform From="Image" To="Probe" Matrix="{numbers}"/></CoordinateDefinitions></PlusConfiguration>'
+    )
+    np.savetxt(folder / "registration.txt", TO_RAS)
+    return {"folder": folder, "calibration": calibration, "poses": poses, "image_to_ras": [p @ to_probe for p in poses]}
+
+
+@pytest.fixture(scope="module")
+def url(files):
+    with serving(str(files / "head.nii.gz"), "--labels", str(files / "labels.nii.gz")) as address:
+        yield address
+
+
+@pytest.fixture(scope="module")
+def first_page(browser, url):
+    problems: list[str] = []
+    yield opened(browser, url, problems), problems
+
+
+@pytest.fixture
+def page(first_page, recording):
+    """The page with the recording as it is in its file."""
+    page, problems = first_page
+    for _ in errors(page):
+        page.evaluate("window.trame.trigger('dismiss', [0])")
+    page.set_input_files("#open-file", recording["folder"] / "phantom.igs.mha")
+    settled(page)
+    yield page
+    assert not problems
+
+
+def text(matrix: np.ndarray) -> str:
+    return "\n".join(" ".join(f"{value:.9g}" for value in row) for row in matrix)
+
+
+def fill(page, name: str, matrix: np.ndarray | str) -> None:
+    page.fill(f"#{name}-values", matrix if isinstance(matrix, str) else text(matrix))
+    click(page, "#calibrate" if name == "calibration" else "#register")
+    settled(page)
+
+
+def shown_pose(page, number: int) -> np.ndarray:
+    page.evaluate("number => window.trame.trigger('show_number', [number])", number)
+    settled(page)
+    return np.array(page.evaluate("window.ussim.image.pose"))
+
+
+def test_ultrasound_without_a_calibration_asks_for_it_and_is_compared_with_it(page, recording):
+    said = state(page, NAMES.opened)[0]
+    assert said.endswith(
+        "tracked ultrasound: 6 images of 624x512, transforms ProbeToTracker, ReferenceToTracker, StylusToTracker: its "
+        "calibration is asked for in Tracked ultrasound"
+    )
+    assert state(page, NAMES.sequence.length) == 0 and "Tracked ultrasound" in state(page, NAMES.open_sections)
+    assert "no path from Image to Reference" in page.locator("#calibration-from").inner_text()
+    page.set_input_files("#calibration-file", recording["folder"] / "plus.xml")
+    settled(page)
+    assert page.locator("#calibration-from").inner_text() == "Calibration ImageToProbe of plus.xml"
+    assert state(page, NAMES.sequence.length) == 6 and not errors(page)
+    assert "none: the frame of the ultrasound is taken" in page.locator("#registration-from").inner_text()
+    page.set_input_files("#registration-file", recording["folder"] / "registration.txt")
+    settled(page)
+    assert page.locator("#registration-from").inner_text() == "Registration registration.txt"
+    for number in (0, 5):
+        np.testing.assert_allclose(shown_pose(page, number), recording["poses"][number], atol=0.5)
+    assert 0 < cost(page) < 0.5 and not errors(page)
+
+
+def test_values_are_typed_and_wrong_ones_are_said_and_change_nothing(page, recording):
+    for typed, words in (
+        ("1 0 0", "Calibration has 3 numbers, expected 16 numbers, the 4x4 matrix by rows"),
+        ("1 0 0 x" + " 0" * 12, "Calibration has 'x', expected 16 numbers, the 4x4 matrix by rows"),
+        (text(np.diag([0.1, 0.1, 0.1, 2.0])), "Calibration has last row"),
+    ):
+        fill(page, "calibration", typed)
+        assert errors(page)[-1].startswith(words), errors(page)
+    page.fill("#calibration-name", "Image")
+    fill(page, "calibration", recording["calibration"])
+    assert errors(page)[-1] == "Its name is 'Image', expected two frames joined by To, such as ImageToProbe"
+    page.fill("#calibration-name", "ImageToProbe")
+    assert state(page, NAMES.sequence.length) == 0
+    skewed = recording["calibration"] @ np.array([[1, 0.2, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
+    fill(page, "calibration", skewed)
+    assert "is skewed" in errors(page)[-1] and state(page, NAMES.sequence.length) == 0
+    fill(page, "calibration", recording["calibration"])
+    assert page.locator("#calibration-from").inner_text() == "Calibration ImageToProbe as typed"
+    assert state(page, NAMES.sequence.length) == 6
+    before = shown_pose(page, 2)
+    fill(page, "registration", np.diag([2.0, 1.0, 1.0, 1.0]))
+    assert errors(page)[-1].startswith("Registration is not rigid")
+    np.testing.assert_array_equal(shown_pose(page, 2), before)
+    fill(page, "registration", TO_RAS)
+    np.testing.assert_allclose(shown_pose(page, 2), recording["poses"][2], atol=0.5)
+
+
+def add(page, recording, number: int, pixel: tuple[float, float], off_mm=(0.0, 0.0, 0.0)) -> None:
+    """Type a landmark of an image, which is found `off_mm` beside its place in the patient."""
+    shown_pose(page, number)
+    point = (recording["image_to_ras"][number] @ [*pixel, 0.0, 1.0])[:3] + off_mm
+    page.fill("#landmark-pixel", f"{pixel[0]} {pixel[1]}")
+    page.fill("#landmark-point", ", ".join(f"{value:.3f}" for value in point))
+    click(page, "#add-landmark")
+    settled(page)
+
+
+def test_landmarks_register_and_what_remains_is_told(page, recording):
+    page.set_input_files("#calibration-file", recording["folder"] / "plus.xml")
+    settled(page)
+    add(page, recording, 0, (200.0, 150.0))
+    add(page, recording, 0, (420.0, 160.0))
+    click(page, "#fit-landmarks")
+    settled(page)
+    assert errors(page)[-1] == "2 pairs of landmarks, expected three or more"
+    add(page, recording, 0, (310.0, 155.0))
+    click(page, "#fit-landmarks")
+    settled(page)
+    assert re.match(r"landmarks in the ultrasound lie within .* mm of a line", errors(page)[-1])
+    add(page, recording, 3, (300.0, 400.0))
+    add(page, recording, 5, (330.0, 280.0), (3.0, 0.0, 0.0))
+    click(page, "#fit-landmarks")
+    settled(page)
+    found = page.locator("#registration-from").inner_text()
+    left = float(re.search(r"5 landmarks agree to ([0-9.]+) mm \(root mean square\)", found)[1])
+    assert 0.3 < left < 3.0
+    remaining = [float(line["remaining"].split()[0]) for line in state(page, NAMES.registration.landmarks)]
+    assert np.argmax(remaining) == 4 and np.sqrt(np.mean(np.square(remaining))) == pytest.approx(left, abs=0.01)
+    page.get_by_role("button", name="Remove landmark 5").click()
+    click(page, "#fit-landmarks")
+    settled(page)
+    assert "4 landmarks agree to 0.00 mm" in page.locator("#registration-from").inner_text()
+    np.testing.assert_allclose(shown_pose(page, 4), recording["poses"][4], atol=0.5)
+    assert 0 < cost(page) < 0.5
+
+
+def test_a_landmark_is_picked_in_the_real_image_and_in_a_slice(page, recording):
+    page.set_input_files("#calibration-file", recording["folder"] / "plus.xml")
+    settled(page)
+    page.set_input_files("#registration-file", recording["folder"] / "registration.txt")
+    settled(page)
+    shown_pose(page, 1)
+    click(page, "#pick-landmark")
+    page.locator("#picking").get_by_text("click the landmark in the real image").wait_for()
+    box = page.locator("#real canvas").bounding_box()
+    page.mouse.click(box["x"] + 0.5 * box["width"], box["y"] + 0.6 * box["height"])
+    page.locator("#picking").get_by_text("click the same landmark in a slice view").wait_for()
+    page.mouse.click(*in_view(views(page)[1], 0.5, 0.5))
+    eventually(page, lambda: len(state(page, NAMES.registration.landmarks)) == 1)
+    (line,) = state(page, NAMES.registration.landmarks)
+    column, row = map(float, line["ultrasound"].removeprefix("image 1: ").split(","))
+    assert abs(column - 312) < 2 and abs(row - 307) < 4  # of 624x512
+    in_image = np.linalg.inv(recording["image_to_ras"][1]) @ [*map(float, line["patient"].split(",")), 1.0]
+    assert abs(in_image[2]) < 0.5  # the view is in the image plane
+    click(page, "#pick-landmark")
+    eventually(page, lambda: state(page, NAMES.registration.picking) == "ultrasound")
+    page.mouse.move(600, 500)
+    page.keyboard.press("Escape")
+    eventually(page, lambda: page.locator("#picking").inner_text() == "")
+    assert len(state(page, NAMES.registration.landmarks)) == 1 and not errors(page)
+
+
+def test_transforms_without_ultrasound_and_of_other_kinds_are_said(page, recording, files):
+    page.set_input_files("#calibration-file", files / "far.nii.gz")
+    settled(page)
+    assert (
+        errors(page)[-1].startswith("far.nii.gz is a mask")
+        and "expected the calibration of tracked" in errors(page)[-1]
+    )
+    click(page, "#close-patient")
+    settled(page)
+    assert state(page, NAMES.registration.recording) == ""
+    page.set_input_files("#open-file", recording["folder"] / "registration.txt")
+    settled(page)
+    assert errors(page)[-1].startswith("registration.txt: a 4x4 matrix, expected tracked ultrasound first")
+
+
+# ---- a real recording ------------------------------------------------------------------------------------------------
+
+#: From the transducer of a tracked Ultrasonix L14-5 to its sensor, as its maker calibrates it: in PlusLib's data,
+#: ConfigFiles/PlusDeviceSet_Server_Ultrasonix_L14-5_Ascension3DG_calibrated.xml
+TRANSDUCER = [
+    [0.0018, 0.9477, -0.0175, 14.8449],
+    [-1.0000, 0.0016, -0.0052, 15.0061],
+    [-0.0052, 0.0166, 0.9998, 0.1638],
+    [0, 0, 0, 1],
+]
+
+
+def labels_of(sequence: TrackedSequence, to_ras: np.ndarray) -> Volume:
+    """Tissue (1) where a recording shows something, and bone (2) where it is bright below the skin; of 1 mm voxels.
+
+    No CT of this phantom is at hand: this stands for one, in its place.
+    """
+    rows, columns = sequence.images.shape[1:]
+    matrices = [to_ras @ sequence.pose(n, "ImageToReference") for n in range(len(sequence))]
+    shown = np.argwhere(sequence.images.max(axis=0) > 0)
+    corners = np.array([shown.min(axis=0), shown.max(axis=0)])
+    ends = np.array([[x, y, 0, 1] for x in corners[:, 1] for y in corners[:, 0]], float)
+    points = np.concatenate([(ends @ matrix.T)[:, :3] for matrix in matrices])
+    low, high = points.min(axis=0) - 6, points.max(axis=0) + 6
+    counts = np.ceil(high - low).astype(int)
+    to_patient = np.eye(4)
+    to_patient[:3, 3] = low
+    index = np.indices(counts[::-1])[::-1].reshape(3, -1)
+    voxels = np.concatenate([index + low[:, None], np.ones((1, index.shape[1]))])
+    labels = np.ones(index.shape[1], np.uint8)
+    for matrix, image in zip(matrices, sequence.images, strict=True):
+        smooth = ndimage.gaussian_filter(image.astype(np.float32), 8.0)
+        x, y, z, _ = np.linalg.inv(matrix) @ voxels
+        near = (np.abs(z) < 1.2) & (x > 0) & (x < columns - 1) & (y > 130) & (y < rows - 1)
+        bright = smooth[y[near].round().astype(int), x[near].round().astype(int)] > 120
+        labels[np.flatnonzero(near)[bright]] = 2
+    return Volume(labels.reshape(counts[::-1]), to_patient)
+
+
+@pytest.fixture(scope="module")
+def phantom(tmp_path_factory) -> dict:
+    """The recording of a spine phantom, two files with its calibration, and a label map in another frame."""
+    folder = tmp_path_factory.mktemp("phantom")
+    sequence = TrackedSequence.read(SHARED / "SpinePhantomFreehand.igs.mha")
+    in_image = estimate_field(sequence.images, width_mm=38.0).image_to_probe  # L14-5: 38 mm wide
+    constant = {"ImageToTransducer": in_image, "TransducerToProbe": np.array(TRANSDUCER)}
+    numbers = " ".join(f"{value:g}" for value in np.ravel(TRANSDUCER))
+    (folder / "l14-5.xml").write_text(
+        f'<PlusConfiguration><Transform From="Transducer" To="Probe" Matrix="{numbers}"/></PlusConfiguration>'
+    )
+    calibrated = sequence.with_transforms(constant)
+    labels_of(calibrated, TO_RAS).write(folder / "spine.nii.gz")
+    (folder / "spine.json").write_text('{"1": "muscle", "2": "bone"}')
+    return {"folder": folder, "in_image": in_image, "sequence": calibrated}
+
+
+@needs_shared
+def test_a_real_recording_of_a_spine_phantom_is_calibrated_registered_and_compared(browser, phantom):
+    """SpinePhantomFreehand of Plus, whose file has no calibration and the frame of its tracker."""
+    folder, sequence = phantom["folder"], phantom["sequence"]
+    with serving("--labels", str(folder / "spine.nii.gz"), "--map", str(folder / "spine.json")) as address:
+        page = opened(browser, address)
+        page.set_input_files("#open-file", SHARED / "SpinePhantomFreehand.igs.mha")
+        settled(page)
+        assert "21 images of 820x616" in state(page, NAMES.opened)[0] and state(page, NAMES.sequence.length) == 0
+        page.fill("#calibration-name", "ImageToTransducer")
+        fill(page, "calibration", phantom["in_image"])
+        assert "no path from Image to Reference" in page.locator("#calibration-from").inner_text()
+        page.set_input_files("#calibration-file", folder / "l14-5.xml")
+        settled(page)
+        assert (
+            page.locator("#calibration-from").inner_text()
+            == "Calibration ImageToTransducer as typed; TransducerToProbe of l14-5.xml"
+        )
+        assert state(page, NAMES.sequence.length) == 21 and not errors(page)
+        known = {"image_to_ras": [TO_RAS @ sequence.pose(n, "ImageToReference") for n in range(21)]}
+        for number, pixel in ((0, (370, 180)), (10, (330, 230)), (10, (500, 260)), (20, (430, 240)), (4, (250, 150))):
+            add(page, known, number, pixel, (0.4, -0.3, 0.2) if number == 4 else (0.0, 0.0, 0.0))
+        off = state(page, NAMES.sequence.similarity)  # the probe is beside the phantom
+        click(page, "#fit-landmarks")
+        settled(page)
+        assert re.search(r"5 landmarks agree to 0\.\d+ mm", page.locator("#registration-from").inner_text())
+        shown_pose(page, 10)
+        assert off == "" and 0 < cost(page) < 0.9 and not errors(page)
+        assert state(page, NAMES.panel.values)["kindComboBox"] == "linear"
+        in_image = np.array(page.evaluate("window.ussim.image.pose"))
+        right = TO_RAS @ sequence.pose(10, "ImageToReference") @ np.linalg.inv(phantom["in_image"])
+        np.testing.assert_allclose(in_image[:3, 3], right[:3, 3], atol=1.0)
+        page.close()

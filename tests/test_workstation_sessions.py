@@ -1,0 +1,398 @@
+"""Nothing is lost when the server is killed: sessions are kept, offered and restored, and the page comes back."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import signal
+import socket
+import stat
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+pytest.importorskip("trame_slicer", reason="the workstation comes with: pip install '.[serve]'")
+pytest.importorskip("playwright", reason="browser tests need playwright: pip install '.[test]'")
+
+from SlicerUSSim.Logic.base.volume import Volume, read_array
+from SlicerUSSim.Workstation.state import NAMES
+from tests.test_workstation import (
+    PATIENCE_S,
+    answer_new_patient,
+    browser as browser,
+    click,
+    download,
+    drawn,
+    errors,
+    eventually,
+    files as files,
+    loaded,
+    new_image,
+    opened,
+    picture,
+    pixels,
+    pose,
+    pytestmark as pytestmark,
+    settled,
+    shown,
+    state,
+    views,
+)
+from tests.test_workstation_opening import dicom as dicom
+from tests.test_workstation_registration import recording as recording
+
+
+class Server:
+    """`ussim serve` at one port, which can be killed and started again."""
+
+    def __init__(self, folder: Path, *arguments: str) -> None:
+        with socket.create_server(("127.0.0.1", 0)) as free:
+            self.port = free.getsockname()[1]
+        self.sessions = folder / "slicerussim" / "sessions"
+        self._folder, self._arguments = folder, arguments
+        self.url = ""
+        self.start()
+
+    def start(self, *other: str) -> None:
+        self.process = subprocess.Popen(
+            [sys.executable, "-m", "SlicerUSSim.Command.cli", "serve", "--port", str(self.port),
+             *(other or self._arguments)],
+            stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+            env={**os.environ, "PYTHONUNBUFFERED": "1", "XDG_STATE_HOME": str(self._folder)},
+        )  # fmt: skip
+        self.url = self.process.stdout.readline().strip()
+        assert self.url.startswith("http"), self.process.stderr.read()
+
+    def kill(self) -> None:
+        self.process.send_signal(signal.SIGKILL)
+        self.process.communicate()
+
+    def end(self) -> None:
+        self.process.terminate()
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            self.process.wait(20)
+        self.process.kill()
+        self.process.communicate()
+
+
+@pytest.fixture
+def server(tmp_path, files):
+    made: list[Server] = []
+
+    def start(*arguments: str) -> Server:
+        made.append(Server(tmp_path / "state", *arguments))
+        return made[-1]
+
+    yield start
+    for one in made:
+        one.end()
+
+
+def kept(page) -> None:
+    """Wait until the present state is on the disk."""
+    assert page.evaluate("window.trame.trigger('session_kept')")
+
+
+def reloaded(page) -> None:
+    """Wait until the page has loaded itself again after its server was killed, and shows an image."""
+    page.wait_for_function("window.ussim && !window.before && window.ussim.images > 0")
+    loaded(page)
+    settled(page)
+
+
+def killed_and_started(server: Server, page, *other: str) -> None:
+    page.evaluate("window.before = true")
+    server.kill()
+    page.locator("#connection-lost").wait_for()
+    server.start(*other)
+
+
+def test_after_kill_9_the_page_reconnects_by_itself_and_restores_all(server, browser, files):
+    own = server(str(files / "head.nii.gz"), "--sequence", str(files / "sweep.igs.mha"))
+    problems: list[str] = []
+    page = opened(browser, own.url, problems)
+    settled(page)
+    assert page.locator("#session-offer").count() == 0
+    # A fit, applied; a tissue, a setting, a view; then the pose, away from the images
+    page.evaluate("window.trame.trigger('set', ['fitEvaluationsSpinBox', 20])")
+    page.evaluate("window.trame.trigger('press', ['fitButton'])")
+    eventually(page, lambda: "cost" in shown(page, "fitLabel"))
+    settled(page)
+    page.evaluate("window.trame.trigger('press', ['applyFitButton'])")
+    page.evaluate("window.trame.trigger('set_tissue', ['white matter', 'mu0', '0.41'])")
+    page.evaluate("window.trame.trigger('set', ['classesSpinBox', 4])")
+    page.evaluate("window.trame.trigger('plane', ['Green', 'Sagittal'])")
+    page.evaluate("window.trame.trigger('show_number', [2])")
+    for _ in range(3):
+        with new_image(page):
+            page.keyboard.press("a")
+    settled(page)
+    was = {
+        "pose": page.evaluate("window.ussim.image.pose"), "sliders": pose(page), "pixels": pixels(page),
+        "values": {name: value for name, value in state(page, NAMES.panel.values).items() if "Selector" not in name},
+        "tissues": state(page, NAMES.panel.tissues), "curve": state(page, NAMES.fit.curve),
+    }  # fmt: skip
+    assert any(row["name"] == "white matter" and "0.41" in row["values"] for row in was["tissues"])
+    cine = page.evaluate("window.ussim.images")
+    kept(page)
+
+    assert not problems
+    killed_and_started(own, page)
+    reloaded(page)
+    problems.clear()  # what it had asked when the server was killed had no answer
+    offer = page.locator("#session-offer-text")
+    offer.wait_for()
+    assert offer.inner_text().startswith("Restore the session of ") and "(head.nii.gz)?" in offer.inner_text()
+    assert pose(page) != was["sliders"]  # nothing is restored unasked
+    click(page, "#restore-session")
+    page.locator("#session-offer").wait_for(state="detached")
+    settled(page)
+    assert not errors(page)
+    np.testing.assert_allclose(page.evaluate("window.ussim.image.pose"), was["pose"], atol=1e-3)
+    assert np.array_equal(pixels(page), was["pixels"])
+    values = {name: value for name, value in state(page, NAMES.panel.values).items() if "Selector" not in name}
+    assert {name: (values[name], value) for name, value in was["values"].items() if values[name] != value} == {}
+    assert state(page, NAMES.panel.tissues) == was["tissues"] and state(page, NAMES.fit.curve) == was["curve"]
+    assert state(page, NAMES.views.planes)["Green"] == "Sagittal" and state(page, NAMES.sequence.number) == 2
+    assert state(page, NAMES.panel.can)["revertFitButton"] and cine > 3
+    # The cine loop has the images from before
+    gif = download(page, "gif").read_bytes()
+    assert gif.count(b"\x21\xf9\x04") > 3
+    # and it is kept again; the old one is gone only then
+    kept(page)
+    eventually(page, lambda: len([path for path in own.sessions.iterdir() if (path / "state.json").exists()]) == 1)
+    page.evaluate("window.trame.trigger('press', ['revertFitButton'])")
+    settled(page)
+    assert not errors(page) and not problems
+    page.close()
+
+
+def sector_rows(page) -> int:
+    """Rows that the outline of the imaged field covers in the slice view of the image plane."""
+    drawn(page)
+    red, green, blue = np.moveaxis(picture(page, views(page)[1].bounding_box()), -1, 0)
+    rows, _ = np.nonzero((red > 110) & (green > 80) & (blue < 0.6 * green))
+    return int(np.ptp(rows)) if rows.size else 0
+
+
+def test_slices_are_in_the_image_plane_at_start_and_after_a_session_is_restored(server, browser, files):
+    """They were not until the probe had moved."""
+    own = server("--labels", str(files / "labels.nii.gz"))
+    page = opened(browser, own.url)
+    settled(page)
+    assert sector_rows(page) > 50
+    kept(page)
+    killed_and_started(own, page)
+    reloaded(page)
+    assert sector_rows(page) > 50
+    click(page, "#restore-session")
+    page.locator("#session-offer").wait_for(state="detached")
+    settled(page)
+    assert sector_rows(page) > 50
+    page.close()
+
+
+def test_the_folder_is_for_the_user_alone_and_holds_this_patient_only(server, browser, files, tmp_path):
+    own = server("--labels", str(files / "labels.nii.gz"))
+    page = opened(browser, own.url)
+    settled(page)
+    kept(page)
+    (session,) = own.sessions.iterdir()
+    for path in (own.sessions.parent, own.sessions, session):
+        assert stat.S_IMODE(path.stat().st_mode) == 0o700, path
+    parts = {path.name.split("-")[0] for path in session.iterdir()}
+    assert parts == {"lock", "address.json", "state.json", "anatomy", "cine"}
+    assert all(stat.S_IMODE(path.stat().st_mode) == 0o600 for path in session.iterdir())
+    first = [path.name for path in session.glob("anatomy-*")]
+    page.set_input_files("#open-file", files / "head.nii.gz")
+    answer_new_patient(page)
+    page.wait_for_function("window.ussim.image?.patient === 'head.nii.gz'")
+    settled(page)
+    kept(page)
+    assert json.loads((session / "state.json").read_text())["patient"] == "head.nii.gz"
+    assert len(list(session.glob("anatomy-*"))) == 1 and not (session / first[0]).exists()
+    # A patient that is closed is not on the disk either, and neither is one who is not to be kept
+    click(page, "#close-patient")
+    settled(page)
+    page.evaluate("window.trame.trigger('session_kept')")
+    assert {path.name for path in session.iterdir()} == {"lock", "address.json"}
+    page.set_input_files("#open-file", files / "head.nii.gz")
+    page.wait_for_function("window.ussim.image?.patient === 'head.nii.gz'")
+    settled(page)
+    kept(page)
+    page.locator("#keeps-session").uncheck()
+    settled(page)
+    page.evaluate("window.trame.trigger('session_kept')")
+    assert {path.name for path in session.iterdir()} == {"lock", "address.json"}
+    page.close()
+    own.end()
+    assert not session.exists()  # nothing is left of one without a patient
+
+
+def test_a_session_is_never_put_onto_another_patient(server, browser, files, tmp_path):
+    own = server(str(files / "head.nii.gz"))
+    page = opened(browser, own.url)
+    for _ in range(3):
+        page.keyboard.press("Shift+a")
+    settled(page)
+    kept(page)
+    killed_and_started(own, page, "--labels", str(files / "labels.nii.gz"))
+    reloaded(page)
+    page.locator("#session-offer").wait_for()
+    assert state(page, NAMES.title) == "labels.nii.gz"
+    assert abs(pose(page)["rock_deg"]) < 10  # placed anew on this one
+    assert "(head.nii.gz)?" in page.locator("#session-offer-text").inner_text()
+    click(page, "#restore-session")
+    page.wait_for_function("window.ussim.image?.patient === 'head.nii.gz'")
+    settled(page)
+    assert state(page, NAMES.title) == "head.nii.gz" and pose(page)["rock_deg"] > 10
+    assert not any("labels" in item["title"] for item in state(page, NAMES.panel.nodes)["labelsSelector"])
+    page.close()
+
+
+def test_what_is_discarded_or_damaged_changes_nothing(server, browser, files):
+    own = server("--labels", str(files / "labels.nii.gz"))
+    page = opened(browser, own.url)
+    settled(page)
+    kept(page)
+    (session,) = own.sessions.iterdir()
+    (anatomy,) = session.glob("anatomy-*")
+    killed_and_started(own, page)
+    anatomy.write_bytes(anatomy.read_bytes()[:1000])
+    reloaded(page)
+    before = pixels(page)
+    click(page, "#restore-session")
+    page.locator(".ussim-error").first.wait_for()
+    text = errors(page)[0]
+    assert "is damaged, or of another version" in text and "\n" not in text
+    settled(page)
+    assert np.array_equal(pixels(page), before) and page.locator("#session-offer").count() == 1
+    click(page, "#discard-session")
+    page.locator("#session-offer").wait_for(state="detached")
+    settled(page)
+    assert not session.exists()
+    page.close()
+
+
+def test_a_new_server_with_another_token_is_said_and_not_trusted(server, browser, files):
+    """After an end as it should be the token is a new one; the cookie is sent to no server that cannot prove itself."""
+    own = server("--labels", str(files / "labels.nii.gz"))
+    page = opened(browser, own.url)
+    settled(page)
+    before = own.url
+    page.evaluate("window.before = true")
+    own.end()
+    page.locator("#connection-lost").wait_for()
+    own.start()
+    assert own.url != before
+    page.wait_for_function("document.getElementById('connection-lost').textContent.includes('Open the address')")
+    assert page.evaluate("window.before")
+    page.goto(own.url)
+    page.locator("#session-offer").wait_for()  # what was kept is offered nevertheless
+    page.close()
+
+
+def test_without_autosave_nothing_is_on_the_disk(server, browser, files, tmp_path):
+    own = server("--labels", str(files / "labels.nii.gz"), "--no-autosave")
+    page = opened(browser, own.url)
+    settled(page)
+    assert not page.evaluate("window.trame.trigger('session_kept')") and not own.sessions.exists()
+    assert page.locator("#keeps-session").is_disabled()
+    page.close()
+
+
+def bundled(page, folder: Path) -> np.ndarray:
+    """The image of the exported script, run beside nothing but what was exported with it."""
+    folder.mkdir()
+    with zipfile.ZipFile(download(page, "zip")) as archive:
+        archive.extractall(folder)
+    done = subprocess.run(
+        [sys.executable, "image.py"], cwd=folder, capture_output=True, text=True, timeout=PATIENCE_S, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    return read_array(folder / "image.nrrd")[0][0]
+
+
+def test_scripts_run_after_uploads_also_of_files_with_one_name_and_after_a_restart(server, browser, files, tmp_path):
+    """They read files that nobody had any more."""
+    own = server("--labels", str(files / "labels.nii.gz"))
+    page = opened(browser, own.url)
+    settled(page)
+    page.set_input_files("#open-file", files / "head.nii.gz")
+    answer_new_patient(page)
+    page.wait_for_function("window.ussim.image?.patient === 'head.nii.gz'")
+    settled(page)
+    mri = Volume.read(files / "head.nii.gz")
+    middle = np.array(mri.array.shape) // 2
+    for number, tissue in enumerate(("tumour", "cyst")):
+        mask = np.zeros(mri.array.shape, np.uint8)
+        mask[tuple(slice(m - 4, m + 4) for m in middle + [8, 8 - 16 * number, 8])] = 1
+        folder = tmp_path / tissue
+        folder.mkdir()
+        mri.with_array(mask).write(folder / "mask.nii.gz")
+        page.select_option("#added-as", tissue)
+        with new_image(page):
+            page.set_input_files("#add-file", folder / "mask.nii.gz")
+        settled(page)
+    assert not errors(page)
+    image = np.asarray(Image.open(download(page, "png")))
+    assert np.array_equal(bundled(page, tmp_path / "script"), image)
+    found = sorted(path.name for path in (tmp_path / "script").iterdir())
+    assert found == ["head.nii.gz", "image.nrrd", "image.py", "mask (2).nii.gz", "mask.nii.gz"]
+    click(page, "#export")
+    click(page, "#export-python")
+    with page.expect_download() as waiting:
+        click(page, "#save-script")
+    assert waiting.value.suggested_filename == "ultrasound.zip"
+    page.get_by_role("button", name="Close", exact=True).click()
+    kept(page)
+    killed_and_started(own, page)
+    reloaded(page)
+    click(page, "#restore-session")
+    page.wait_for_function("window.ussim.image?.patient === 'head.nii.gz'")
+    settled(page)
+    assert np.array_equal(np.asarray(Image.open(download(page, "png"))), image)
+    assert np.array_equal(bundled(page, tmp_path / "again"), image)
+    page.close()
+
+
+def test_a_dicom_series_and_ultrasound_calibrated_in_the_page_come_back_after_a_crash(
+    server, browser, files, dicom, recording, tmp_path
+):
+    own = server("--labels", str(files / "labels.nii.gz"))
+    page = opened(browser, own.url)
+    settled(page)
+    page.set_input_files("#open-file", sorted((dicom / "IMAGES" / "A").iterdir()))
+    answer_new_patient(page)
+    page.wait_for_function("window.ussim.image?.patient.startsWith('T1 MPRAGE')")
+    settled(page)
+    page.set_input_files("#open-file", recording["folder"] / "phantom.igs.mha")
+    settled(page)
+    for name, file in (("calibration", "plus.xml"), ("registration", "registration.txt")):
+        page.set_input_files(f"#{name}-file", recording["folder"] / file)
+        settled(page)
+    page.evaluate("window.trame.trigger('show_number', [5])")
+    settled(page)
+    image = np.asarray(Image.open(download(page, "png")))
+    assert np.array_equal(bundled(page, tmp_path / "script"), image)
+    assert not errors(page)
+    kept(page)
+    killed_and_started(own, page)
+    reloaded(page)
+    click(page, "#restore-session")
+    page.wait_for_function("window.ussim.image?.patient.startsWith('T1 MPRAGE')")
+    settled(page)
+    assert not errors(page) and np.array_equal(np.asarray(Image.open(download(page, "png"))), image)
+    assert np.array_equal(bundled(page, tmp_path / "again"), image)
+    assert state(page, NAMES.registration.recording).startswith("phantom: 6 images")
+    assert page.locator("#registration-from").inner_text() == "Registration as it was kept"
+    page.evaluate("window.trame.trigger('show_number', [0])")
+    settled(page)
+    np.testing.assert_allclose(page.evaluate("window.ussim.image.pose"), recording["poses"][0], atol=0.5)
+    page.close()
