@@ -209,6 +209,7 @@ def test_a_bundle_with_files_outside_or_headers_of_others_is_refused(module_scen
 
 
 def test_a_scene_that_cannot_be_read_changes_nothing_on_the_page(page, module_scene, tmp_path):
+    settled(page)  # the page draws its first images for a while
     before, title = pixels(page), state(page, NAMES.title)
     bad = changed(module_scene[0], tmp_path / "bad.mrb", r'fileName="[^"]*\.nrrd"', 'fileName="/etc/passwd"')
     page.set_input_files("#open-file", bad)
