@@ -11,7 +11,7 @@ from SlicerUSSim.Logic.base.errors import require
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.mri.craniotomy import mask_opening, middle_of, polygon_opening
 from SlicerUSSim.Logic.mrml.label_nodes import LABEL_CLASSES, hidden_segments, node_labels
-from SlicerUSSim.Logic.mrml.nodes import display_of, named, node_to_world, require_node
+from SlicerUSSim.Logic.mrml.nodes import control_points, display_of, named, node_to_world, require_node
 from SlicerUSSim.Logic.mrml.own_results import FLAP, mark_as_result, may_replace_result
 
 #: Nodes that describe an opening
@@ -46,9 +46,9 @@ def opening_of(opening_node: Any, labels: Volume, names: tuple[str, ...], world_
     """
     require_node(opening_node, *OPENING_CLASSES, use="opening")
     if opening_node.IsA("vtkMRMLMarkupsNode"):
-        return polygon_opening(
-            labels, names, _points(opening_node) @ world_to_labels[:3, :3].T + world_to_labels[:3, 3]
-        )
+        points = control_points(opening_node)
+        require(len(points) >= 3, f"opening {named(opening_node)} has {len(points)} points, expected three or more")
+        return polygon_opening(labels, names, points @ world_to_labels[:3, :3].T + world_to_labels[:3, 3])
     hidden = hidden_segments(opening_node) if opening_node.IsA("vtkMRMLSegmentationNode") else {}
     require(
         not hidden or len(hidden) < opening_node.GetSegmentation().GetNumberOfSegments(),
@@ -58,18 +58,6 @@ def opening_of(opening_node: Any, labels: Volume, names: tuple[str, ...], world_
     mask = mask.with_array((mask.array != 0).astype(np.uint8))
     placed = Volume(mask.array, world_to_labels @ node_to_world(opening_node) @ mask.ijk_to_ras)
     return mask_opening(labels, placed, named(opening_node))
-
-
-def _points(markups_node: Any) -> np.ndarray:
-    """(points, 3) world RAS mm of the control points that are placed."""
-    points = []
-    for number in range(markups_node.GetNumberOfControlPoints()):
-        if markups_node.GetNthControlPointPositionStatus(number) == markups_node.PositionDefined:
-            position = [0.0, 0.0, 0.0]
-            markups_node.GetNthControlPointPositionWorld(number, position)
-            points.append(position)
-    require(len(points) >= 3, f"opening {named(markups_node)} has {len(points)} points, expected three or more")
-    return np.array(points)
 
 
 def show_flap(labels_node: Any, removed: Volume) -> Any:

@@ -53,10 +53,10 @@ def read_lesions(lesions_node, to_frame_of, tissues: TissueTable) -> tuple[list[
         if mask is None:
             warnings.append(f"segment {name!r} of {lesions_node.GetName()!r} is not added: it is empty")
         else:
-            source = _tag_of(segmentation.GetSegment(segment_id), _SOURCE)
+            source = tag_of(segmentation.GetSegment(segment_id), _SOURCE)
             called = f"{source} (segment {name!r})" if source else f"segment {name!r}"
             found.append((tissue, Volume(mask.array, moved @ mask.ijk_to_ras), called))
-            warnings += _tag_of(segmentation.GetSegment(segment_id), _CHECKS).splitlines()
+            warnings += tag_of(segmentation.GetSegment(segment_id), _CHECKS).splitlines()
     require(
         bool(found),
         f"lesions {named(lesions_node)}: {'; '.join(warnings)}; expected segments with voxels, called as one of: "
@@ -92,7 +92,7 @@ def add_lesion(lesions_node, mask: Volume, tissue: str, name: str, advice: Advic
     return ids
 
 
-def _tag_of(segment, tag: str) -> str:
+def tag_of(segment, tag: str) -> str:
     """The text of a segment's tag; "" without one."""
     text = mutable("")
     return str(text) if segment.GetTag(tag, text) else ""

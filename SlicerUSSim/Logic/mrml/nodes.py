@@ -105,6 +105,16 @@ def pose_in_labels(labels_node, probe_to_world: np.ndarray) -> tuple[np.ndarray,
 # ---- volumes ---------------------------------------------------------------------------------------------------------
 
 
+def control_points(markups_node) -> np.ndarray:
+    """(points, 3) world RAS mm of the control points that are placed."""
+    points, place = [], [0.0, 0.0, 0.0]
+    for number in range(markups_node.GetNumberOfControlPoints()):
+        if markups_node.GetNthControlPointPositionStatus(number) == markups_node.PositionDefined:
+            markups_node.GetNthControlPointPositionWorld(number, place)
+            points.append(tuple(place))
+    return np.array(points).reshape(-1, 3)
+
+
 def ijk_to_ras(volume_node) -> np.ndarray:
     """(4, 4) of a volume node, in its own frame."""
     matrix = vtkMatrix4x4()

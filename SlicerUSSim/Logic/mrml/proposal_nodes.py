@@ -14,7 +14,7 @@ from SlicerUSSim.Logic.mri.lesions.proposal import Proposal
 from SlicerUSSim.Logic.mri.lesions.seeded import grow_lesion
 from SlicerUSSim.Logic.mri.segmentation import Segmentation
 from SlicerUSSim.Logic.mrml.lesion_nodes import add_lesion
-from SlicerUSSim.Logic.mrml.nodes import named, node_to_world, require_node
+from SlicerUSSim.Logic.mrml.nodes import control_points, named, node_to_world, require_node
 from SlicerUSSim.Logic.mrml.own_labels import mark_as_made, may_replace
 
 #: Name of the node with a proposal
@@ -64,14 +64,9 @@ class LesionProposals:
     def growFrom(self, mri_node, points_node, tissue: str | None = None):
         """As grow, from the last control point of a markups node that is placed."""
         require_node(points_node, "vtkMRMLMarkupsFiducialNode", use="point in the lesion")
-        count = points_node.GetNumberOfControlPoints()
-        placed = [
-            n for n in range(count) if points_node.GetNthControlPointPositionStatus(n) == points_node.PositionDefined
-        ]
-        require(bool(placed), f"{named(points_node)} has no point, expected one in the lesion")
-        position = [0.0, 0.0, 0.0]
-        points_node.GetNthControlPointPositionWorld(placed[-1], position)
-        return self.grow(mri_node, position, tissue)
+        placed = control_points(points_node)
+        require(len(placed) > 0, f"{named(points_node)} has no point, expected one in the lesion")
+        return self.grow(mri_node, placed[-1].tolist(), tissue)
 
     def propose(self, mri_node):
         """The segmentation node with what looks like lesions, without a point; None if nothing does."""

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import slicer
 from vtkmodules.util.numpy_support import numpy_to_vtk, vtk_to_numpy
-from vtkmodules.vtkCommonCore import mutable, vtkPoints
+from vtkmodules.vtkCommonCore import vtkPoints
 from vtkmodules.vtkCommonMath import vtkMatrix4x4
 
 from SlicerUSSim.Logic.base.errors import SimulationError, require
@@ -24,7 +24,9 @@ from SlicerUSSim.Logic.mri.sheets.surfels import Surfels
 from SlicerUSSim.Logic.mrml.craniotomy_nodes import closed_labels, set_closed_labels, show_flap
 from SlicerUSSim.Logic.mrml.fit_nodes import sequence_of
 from SlicerUSSim.Logic.mrml.label_nodes import colour_table, node_labels, read_mask, set_colour_table
+from SlicerUSSim.Logic.mrml.lesion_nodes import tag_of
 from SlicerUSSim.Logic.mrml.nodes import (
+    control_points,
     display_of,
     ijk_to_ras,
     named,
@@ -45,7 +47,8 @@ _VOLUME, _LABELS, _SEGMENTS, _MODEL, _POINTS = (
 )  # fmt: skip
 #: Roles of nodes of a patient, and of their labels before an opening and the shares of both
 ROLES = ("mri", "second_mri", "labels", "mask", "lesions", "organs", "sheets", "seed", "opening", "real")
-_CLOSED, _SHARES = "closed", "shares"
+_CLOSED = "closed"
+_SHARES_OF = {"labels": "shares", _CLOSED: "closed shares"}
 #: Begin of the attributes of nodes that are this package's
 _OWN = "SlicerUSSim."
 #: Tags of a segment that are this package's
@@ -149,7 +152,7 @@ def record_nodes(parameters: SceneParameters, roles: Iterable[str] = ROLES) -> d
                 found[name] = _as_label_map(labels)
                 shares = shares_node(labels)
                 if shares is not None and shares.GetImageData() is not None:
-                    found[_SHARES if name == "labels" else f"{_CLOSED} {_SHARES}"] = _recorded(shares)
+                    found[_SHARES_OF[name]] = _recorded(shares)
         elif role == "mask" and node.IsA(_SEGMENTS) and parameters.mri is not None:
             volume = read_mask(node, parameters.mri)
             mask = volume.with_array((volume.array != 0).astype(np.uint8))
@@ -254,7 +257,7 @@ def _recorded(node) -> NodeRecord:
         corners = np.array(vtk_to_numpy(data.GetPoints().GetData()), np.float32)
         return NodeRecord(_MODEL, name, attributes, to_world, surfels=surfels, corners=corners)
     require(node.IsA(_POINTS), f"{named(node)} is of a class that is not kept")
-    return NodeRecord(node.GetClassName(), name, attributes, np.eye(4), points=_points(node))
+    return NodeRecord(node.GetClassName(), name, attributes, np.eye(4), points=control_points(node))
 
 
 def _as_label_map(node) -> NodeRecord:
@@ -296,23 +299,8 @@ def _segments(node) -> Iterable[SegmentRecord]:
         matrix = vtkMatrix4x4()
         image.GetImageToWorldMatrix(matrix)
         mask = Volume.from_vtk(image, matrix_array(matrix))
-        tags = {name: text for name in _TAGS if (text := _tag(segment, name))}
+        tags = {name: text for name in _TAGS if (text := tag_of(segment, name))}
         yield SegmentRecord(segment.GetName(), segment.GetColor(), mask.with_array(mask.array > 0), tags)
-
-
-def _tag(segment, name: str) -> str:
-    text = mutable("")
-    return str(text) if segment.GetTag(name, text) else ""
-
-
-def _points(node) -> np.ndarray:
-    found = []
-    for number in range(node.GetNumberOfControlPoints()):
-        if node.GetNthControlPointPositionStatus(number) == node.PositionDefined:
-            place = [0.0, 0.0, 0.0]
-            node.GetNthControlPointPositionWorld(number, place)
-            found.append(place)
-    return np.array(found).reshape(-1, 3)
 
 
 # ---- into a scene ----------------------------------------------------------------------------------------------------
@@ -328,8 +316,8 @@ def put_nodes(scene, record: SceneRecord) -> dict[str, Any]:
     try:
         for role, entry in record.nodes.items():
             made[role] = _put(scene, entry, extra)
-        for role in ("labels", _CLOSED):
-            shares = made.get(_SHARES if role == "labels" else f"{_CLOSED} {_SHARES}")
+        for role, of_role in _SHARES_OF.items():
+            shares = made.get(of_role)
             if role in made and shares is not None:
                 set_shares_node(made[role], shares)
         if _CLOSED in made and "labels" in made:

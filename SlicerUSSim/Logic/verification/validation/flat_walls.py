@@ -105,6 +105,12 @@ def turned_planes(rotation: np.ndarray, device) -> Outcome:
     return Outcome(tuple(rows), partial(draw_plots, plots=[plot]))
 
 
+def _lowest_facing(along: np.ndarray, straight: np.ndarray) -> float:
+    """The lowest of levels in dB by line, re those of a straight plane, of the lines that it faces."""
+    facing = straight > np.nanmax(straight) - 0.7
+    return float(np.min((along - straight)[facing], initial=np.inf))
+
+
 def planes_in_small_maps(rotation: np.ndarray, device) -> Outcome:
     """Planes that face the beam in maps of 80 x 66 x 52 voxels, re those on a face of voxels that are not turned."""
     probes = {name: replace(PROBES[name], frequency_mhz=5.0, band_mhz=None) for name in _SMALL_PROBES}
@@ -130,8 +136,7 @@ def planes_in_small_maps(rotation: np.ndarray, device) -> Outcome:
             axis = np.radians(turn) * np.array([np.cos(azimuth), 0.0, np.sin(azimuth)])
             turned = (Rotation.from_rotvec(axis) * Rotation.from_rotvec([0.0, spin, 0.0])).as_matrix()
             for name, along in levels(turned, random.uniform(-0.5, 0.5)).items():
-                facing = straight[name] > np.nanmax(straight[name]) - 0.7
-                lowest[name] = min(lowest[name], float(np.min((along - straight[name])[facing], initial=np.inf)))
+                lowest[name] = min(lowest[name], _lowest_facing(along, straight[name]))
         for name, level in lowest.items():
             what = f"turned by {turn:g} degrees, {_SMALL_MAPS} small maps of 1 mm, {name}"
             rows.append(Row(f"lowest level, {what}", "dB", 0.0, level, 3.0, "at least"))
@@ -164,9 +169,7 @@ def planes_with_edges(rotation: np.ndarray, device) -> Outcome:
         lowest = {name: (np.inf, 0.0) for name in probes}
         for end in ends:
             for name, along in levels(turn, end).items():
-                facing = whole[name] > np.nanmax(whole[name]) - 0.7
-                loss = float(np.min((along - whole[name])[facing], initial=np.inf))
-                lowest[name] = min(lowest[name], (loss, end))
+                lowest[name] = min(lowest[name], (_lowest_facing(along, whole[name]), end))
         for name, (level, end) in lowest.items():
             where = f"edges {ends[0]:g} to {ends[-1]:g} voxels beside (lowest at {end:g})"
             what = f"{where}, turned by {turn:g} degrees, {name}"
