@@ -166,8 +166,7 @@ def first_page(browser, url):
 def page(first_page):
     """The page with the probe at a craniotomy and no messages."""
     page, problems = first_page
-    for _ in state(page, NAMES.messages.errors):
-        page.evaluate("window.trame.trigger('dismiss', [0])")
+    dismiss_messages(page)
     page.mouse.move(600, 500)  # away from what shows tips
     page.evaluate("window.trame.trigger('press', ['placeButton'])")
     settled(page)
@@ -191,6 +190,12 @@ def shown(page: Page, control: str):
 
 def errors(page: Page) -> list[str]:
     return state(page, NAMES.messages.errors)
+
+
+def dismiss_messages(page: Page) -> None:
+    """Dismiss all errors that the page shows."""
+    for _ in errors(page):
+        page.evaluate("window.trame.trigger('dismiss', [0])")
 
 
 def pose(page: Page) -> dict[str, float]:

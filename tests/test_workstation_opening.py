@@ -24,11 +24,12 @@ from tests.test_workstation import (
     browser as browser,
     click,
     cost,
+    dismiss_messages,
     errors,
     eventually,
     files as files,
+    first_page as first_page,
     new_image,
-    opened,
     pytestmark as pytestmark,
     serving,
     settled,
@@ -43,18 +44,11 @@ def url(files):
         yield address
 
 
-@pytest.fixture(scope="module")
-def first_page(browser, url):
-    problems: list[str] = []
-    yield opened(browser, url, problems), problems
-
-
 @pytest.fixture
 def page(first_page, files):
     """The page with the head and no messages."""
     page, problems = first_page
-    for _ in errors(page):
-        page.evaluate("window.trame.trigger('dismiss', [0])")
+    dismiss_messages(page)
     title = state(page, NAMES.title)
     if title != "head.nii.gz":
         answered(page, files / "head.nii.gz", *(["New patient"] if title else []))

@@ -14,6 +14,7 @@ axe_of = pytest.importorskip("axe_playwright_python.sync_playwright", reason="it
 from SlicerUSSim.Workstation.state import NAMES  # noqa: E402
 from tests.test_workstation import (  # noqa: E402
     browser as browser,
+    dismiss_messages,
     errors,
     eventually,
     files as files,
@@ -44,8 +45,7 @@ def first_page(browser, files):
 @pytest.fixture
 def page(first_page):
     page, problems = first_page
-    for _ in errors(page):
-        page.evaluate("window.trame.trigger('dismiss', [0])")
+    dismiss_messages(page)
     page.set_viewport_size({"width": 1500, "height": 900})
     page.evaluate("document.activeElement?.blur()")
     page.evaluate("window.trame.trigger('press', ['placeButton'])")

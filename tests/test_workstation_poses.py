@@ -19,6 +19,7 @@ from SlicerUSSim.Workstation.state import NAMES
 from tests.test_workstation import (
     browser as browser,
     click,
+    dismiss_messages,
     errors,
     eventually,
     files as files,
@@ -44,8 +45,7 @@ def first_page(browser, files):
 @pytest.fixture
 def page(first_page):
     page, problems = first_page
-    for _ in errors(page):
-        page.evaluate("window.trame.trigger('dismiss', [0])")
+    dismiss_messages(page)
     page.evaluate("window.trame.trigger('press', ['placeButton'])")
     settled(page)
     yield page

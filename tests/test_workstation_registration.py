@@ -21,9 +21,11 @@ from tests.test_workstation import (
     browser as browser,
     click,
     cost,
+    dismiss_messages,
     errors,
     eventually,
     files as files,
+    first_page as first_page,
     in_view,
     opened,
     pytestmark as pytestmark,
@@ -71,18 +73,11 @@ def url(files):
         yield address
 
 
-@pytest.fixture(scope="module")
-def first_page(browser, url):
-    problems: list[str] = []
-    yield opened(browser, url, problems), problems
-
-
 @pytest.fixture
 def page(first_page, recording):
     """The page with the recording as it is in its file."""
     page, problems = first_page
-    for _ in errors(page):
-        page.evaluate("window.trame.trigger('dismiss', [0])")
+    dismiss_messages(page)
     page.set_input_files("#open-file", recording["folder"] / "phantom.igs.mha")
     settled(page)
     yield page

@@ -28,13 +28,14 @@ from tests.test_workstation import (
     browser as browser,
     click,
     cost,
+    dismiss_messages,
     download,
     errors,
     eventually,
     files as files,
+    first_page as first_page,
     fit,
     new_image,
-    opened,
     pixels,
     pose,
     pytestmark as pytestmark,
@@ -53,17 +54,10 @@ def url(files):
         yield address
 
 
-@pytest.fixture(scope="module")
-def first_page(browser, url):
-    problems: list[str] = []
-    yield opened(browser, url, problems), problems
-
-
 @pytest.fixture
 def page(first_page):
     page, problems = first_page
-    for _ in errors(page):
-        page.evaluate("window.trame.trigger('dismiss', [0])")
+    dismiss_messages(page)
     page.mouse.move(600, 500)
     if not shown(page, "liveCheckBox"):
         click(page, "#live")
