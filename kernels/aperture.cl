@@ -87,9 +87,7 @@ inline float border_nepers(float impedance, float other_impedance) {
 // One work-item follows one ray of a fan. Global size (angles, points, rows). Look-ups are trilinear, so that sums over
 // steps of a voxel are smooth. Strong tissue counts as what lies in front of it, with what it takes more recorded: by
 // its borders, its attenuation, and by refraction. With `all_soft`, no tissues have a strong border.
-#ifdef NO_IMPLICIT_VECTORS
-__attribute__((intel_vec_len_hint(1)))
-#endif
+ONE_BY_ONE
 __kernel void fans(__constant const Acquisition *acquisition, __global const ushort *voxels,
                    __global const float4 *acoustics, int all_soft, __global float *sums) {
   const int ray = get_global_id(0), point = get_global_id(1), row = get_global_id(2);

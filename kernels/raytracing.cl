@@ -396,9 +396,7 @@ inline float membrane_coherence(__constant const Acquisition *acquisition, Tissu
   return exp_fast(-0.5f * phase * phase);
 }
 
-#ifdef NO_IMPLICIT_VECTORS
-__attribute__((intel_vec_len_hint(1)))
-#endif
+ONE_BY_ONE
 __kernel void trace(__constant const Acquisition *acquisition, __global const ushort *voxels,
                     __global const uchar *groups, __global const ushort *smooth, __constant const Tissue *tissues,
                     __global const float *roots, __global const float *quantiles, __global const float *beams,

@@ -603,9 +603,7 @@ inline void scatter_piece(__constant const Acquisition *acquisition, __global co
                 sum VARIED_ARGUMENTS);
 }
 
-#ifdef NO_IMPLICIT_VECTORS
-__attribute__((intel_vec_len_hint(1)))
-#endif
+ONE_BY_ONE
 __kernel void scatter(__constant const Acquisition *acquisition, __global const ushort *voxels,
                       __global const uint *planes, __global const uint *texture, __global const float *sites,
                       __global const Segment *segments, __global const int *segment_counts, __global float *re,

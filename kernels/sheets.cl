@@ -3,14 +3,14 @@
 // find_cores marks the points inside thick layers. fit_sheets fits a plane to the others: along the normal of a sheet
 // its voxels have the least variance. One work-item computes their mean and covariance in Gaussian windows about a
 // voxel, and writes the normal, the distance, and the tissue beside the sheet. A wide window gives the normal, a narrow
-// one the distance: in the wide one, the mean of a bent sheet is away from it. Global size (points).
+// one the distance: in the wide one, the mean of a bent sheet is away from it. Global size (at least the points).
 //
 // Buffers: bits uchar, a bit per voxel of [k][j][i], 1 for the sheet's label, after 8 zeros; rows float8 [512], sums
 // over the voxels of a row of the window for each set of its bits: of weights, weights x, weights x^2; narrow weights,
-// those times x; weights of find_cores; taps float [5 + SHEET_REACH], weights along an axis by the distance; labels
-// uchar [k][j][i]; points int [point], flat indices of the voxels with the sheet's label; cores uchar [k][j][i];
-// is_thin uchar [point]; planes uint [k][j][i], 0 where there is none. A plane is packed: normal by octahedral
-// coordinates (9 bits each), distance (8 bits), tissue (6 bits).
+// those times x; weights of find_cores; 0; the first again; taps float [5 + SHEET_REACH], weights along an axis by the
+// distance; labels uchar [k][j][i]; points int [point], flat indices of the voxels with the sheet's label; cores uchar
+// [k][j][i]; is_thin uchar [point]; planes uint [k][j][i], 0 where there is none. A plane is packed: normal by
+// octahedral coordinates (9 bits each), distance (8 bits), tissue (6 bits).
 
 #include "common.clh"
 #include "sheets.clh"
@@ -26,8 +26,11 @@ inline int row_inside(int i, int nx) {
   return (511 << max(SHEET_REACH - i, 0)) & (511 >> max(SHEET_REACH - (nx - 1 - i), 0));
 }
 
+ONE_BY_ONE
 __kernel void find_cores(__global const uchar *bits, int nx, int ny, int nz, __constant const float8 *rows,
-                         __constant const float *taps, __global const int *points, __global uchar *cores) {
+                         __constant const float *taps, __global const int *points, int point_count,
+                         __global uchar *cores) {
+  if ((int)get_global_id(0) >= point_count) return;
   const int here = points[get_global_id(0)];
   const int k = here / (nx * ny), j = here / nx - k * ny, i = here - (k * ny + j) * nx;
   const int inside = row_inside(i, nx);
@@ -67,10 +70,12 @@ inline int step_to(int neighbour, int nx, int ny) {
   return neighbour & 1 ? size : -size;
 }
 
+ONE_BY_ONE
 __kernel void fit_sheets(__global const uchar *bits, int nx, int ny, int nz, int sheet, float side_x, float side_y,
                          float side_z, __constant const float8 *rows, __constant const float *taps,
-                         __global const uchar *labels, __global const int *points, __global const uchar *cores,
-                         __global uchar *is_thin, __global uint *planes) {
+                         __global const uchar *labels, __global const int *points, int point_count,
+                         __global const uchar *cores, __global uchar *is_thin, __global uint *planes) {
+  if ((int)get_global_id(0) >= point_count) return;
   const int here = points[get_global_id(0)];
   const int k = here / (nx * ny), j = here / nx - k * ny, i = here - (k * ny + j) * nx;
   int is_thick = 0;
@@ -84,18 +89,23 @@ __kernel void fit_sheets(__global const uchar *bits, int nx, int ny, int nz, int
   float3 sum = (float3)(0.0f), near_sum = (float3)(0.0f), squares = (float3)(0.0f), mixed = (float3)(0.0f);
   const int inside = row_inside(i, nx);
   for (int z = max(-SHEET_REACH, -k); z <= min(SHEET_REACH, nz - 1 - k); z++) {
+    // Over the rows of a plane: of the words of `rows`, and of those times y. The last word is the first one again.
+    float8 plain = 0.0f, by_y = 0.0f;
     for (int y = max(-SHEET_REACH, -j); y <= min(SHEET_REACH, ny - 1 - j); y++) {
       const int set = row_bits(bits, here + (z * ny + y) * nx, inside);
       if (!set) continue;
-      const float8 row = rows[set];
-      const float weight = taps[abs(y)] * taps[abs(z)], near = weight * weight * weight * weight;  // half as wide
-      count += weight * row.s0;
-      sum += weight * (float3)(row.s1, y * row.s0, z * row.s0);
-      squares += weight * (float3)(row.s2, y * y * row.s0, z * z * row.s0);
-      mixed += weight * (float3)(y * z * row.s0, z * row.s1, y * row.s1);
-      near_count += near * row.s3;
-      near_sum += near * (float3)(row.s4, y * row.s3, z * row.s3);
+      const float wide = taps[abs(y)], wide2 = wide * wide, narrow = wide2 * wide2;  // half as wide
+      const float8 row = (float8)(wide, wide, wide, narrow, narrow, 0.0f, 0.0f, wide * (y * y)) * rows[set];
+      plain += row;
+      by_y += (float)y * row;
     }
+    const float wide = taps[abs(z)], wide2 = wide * wide, narrow = wide2 * wide2;
+    count += wide * plain.s0;
+    sum += wide * (float3)(plain.s1, by_y.s0, z * plain.s0);
+    squares += wide * (float3)(plain.s2, plain.s7, z * z * plain.s0);
+    mixed += wide * (float3)(z * by_y.s0, z * plain.s1, by_y.s1);
+    near_count += narrow * plain.s3;
+    near_sum += narrow * (float3)(plain.s4, by_y.s3, z * plain.s3);
   }
   const float3 side = (float3)(side_x, side_y, side_z), mean = sum / count;
   const float3 diagonal = (squares / count - mean * mean) * side * side + 1e-4f;
@@ -131,8 +141,10 @@ __kernel void fit_sheets(__global const uchar *bits, int nx, int ny, int nz, int
 
 // Voxels beside a sheet get the nearest plane of the six voxels around them: a scatterer then finds it at the nearest
 // voxel. The first of these six that has the sheet's label writes.
+ONE_BY_ONE
 __kernel void spread_sheets(__global const uchar *labels, int nx, int ny, int nz, int sheet, __global const int *points,
-                            __global uint *planes) {
+                            int point_count, __global uint *planes) {
+  if ((int)get_global_id(0) >= point_count) return;
   const int here = points[get_global_id(0)];
   for (int n = 0; n < 6; n++) {
     const int beside = here + step_to(n, nx, ny);

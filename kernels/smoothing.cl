@@ -11,11 +11,21 @@
 
 #include "common.clh"
 
+// Whether all bytes of LANES voxels are `byte`
 #if LANES == 1
-#define LOAD_BYTES(pointer) ((float)*(pointer))
+#define ALL_BYTES(pointer, byte) (*(pointer) == (byte))
+#elif LANES == 8
+#define ALL_BYTES(pointer, byte) (as_ulong(vload8(0, pointer)) == (byte) * 0x0101010101010101ul)
+#else
+#define ALL_BYTES(pointer, byte) (ALL_EIGHT(pointer, byte) && ALL_EIGHT((pointer) + 8, byte))
+#define ALL_EIGHT(pointer, byte) (as_ulong(vload8(0, pointer)) == (byte) * 0x0101010101010101ul)
+#endif
+
+#if LANES == 1
+#define LOAD_BYTES(pointer) ((int)*(pointer))
 #define STORE_SMOOTH(value, pointer) (*(pointer) = (ushort)((value) * 65535.0f + 0.5f))
 #else
-#define LOAD_BYTES(pointer) TO_FLOATN(JOIN(vload, LANES)(0, pointer))
+#define LOAD_BYTES(pointer) TO_INTN(JOIN(vload, LANES)(0, pointer))
 #define STORE_SMOOTH(value, pointer) \
   JOIN(vstore, LANES)(JOIN(JOIN(convert_ushort, LANES), _sat)((value) * 65535.0f + 0.5f), 0, pointer)
 #endif
@@ -27,15 +37,23 @@
 #endif
 
 // Defines a function for LANES values of a row from `column`; beyond the row its outermost voxels are repeated.
-#define DEFINE_ROW_FROM(NAME, TYPE, LOAD)                                                    \
-  inline floatn NAME(__global const TYPE *row, int column, int columns, int is_inside) {     \
+#define DEFINE_ROW_FROM(NAME, TYPE, VALUE, VALUES, LOAD, LOAD_VALUES)                        \
+  inline VALUES NAME(__global const TYPE *row, int column, int columns, int is_inside) {     \
     if (is_inside) return LOAD(row + column);                                                \
-    float at_the_ends[LANES];                                                                \
+    VALUE at_the_ends[LANES];                                                                \
     for (int n = 0; n < LANES; n++) at_the_ends[n] = row[clamp(column + n, 0, columns - 1)]; \
-    return LOAD_LANES(at_the_ends);                                                          \
+    return LOAD_VALUES(at_the_ends);                                                         \
   }
-DEFINE_ROW_FROM(bytes_from, uchar, LOAD_BYTES)
-DEFINE_ROW_FROM(floats_from, float, LOAD_LANES)
+DEFINE_ROW_FROM(bytes_from, uchar, int, intn, LOAD_BYTES, LOAD_LANES)
+DEFINE_ROW_FROM(floats_from, float, float, floatn, LOAD_LANES, LOAD_LANES)
+
+// Whether the bytes of LANES voxels and of `reach` beside them on either side are the first one; all lie in the row.
+inline int is_uniform(__global const uchar *bytes, int reach) {
+  const ulong first = bytes[-reach];
+  for (int at = -reach; at < reach; at += LANES)
+    if (!ALL_BYTES(bytes + at, first)) return 0;
+  return ALL_BYTES(bytes + reach, first);
+}
 
 // Along i, from groups: planes starting at `first`, each clamped to the volume.
 __kernel void smooth_rows(__global const uchar *groups, MEMBERSHIP_PARAMETERS int group, __constant const float *taps,
@@ -46,18 +64,31 @@ __kernel void smooth_rows(__global const uchar *groups, MEMBERSHIP_PARAMETERS in
   __global const uchar *from = groups + ((size_t)plane * rows + row) * columns;
   const int is_inside = column >= reach && column + LANES + reach <= columns;
   floatn sum = 0.0f;
+  // Most voxels are far from a border.
+  int is_far = is_inside && is_uniform(from + column, reach);
+#ifdef MEMBERSHIP
+  __global const uchar *shares = share + (from - groups) + column;
+  is_far = is_far && shares[0] == 0 && is_uniform(shares, reach);
+#endif
+  if (is_far) {
+    if ((from[column] & GROUP_MASK) == group)
+      for (int k = 0; k <= 2 * reach; k++) sum += taps[k];
+    STORE_LANES(sum, partial + ((size_t)get_global_id(2) * rows + row) * columns + column);
+    return;
+  }
   for (int k = -reach; k <= reach; k++) {
     const int at = column + k;
-    const floatn words = bytes_from(from, at, columns, is_inside);  // the flag is worth 128
-    const floatn found = words >= (floatn)SAME_GROUP ? words - (floatn)SAME_GROUP : words;
-    floatn member = found == (floatn)group ? (floatn)(1.0f) : (floatn)(0.0f);
+    const intn found = bytes_from(from, at, columns, is_inside) & GROUP_MASK;
 #ifdef MEMBERSHIP
     const size_t row_start = (size_t)(from - groups);
-    const floatn other = bytes_from(second + row_start, at, columns, is_inside);
-    const floatn part = bytes_from(share + row_start, at, columns, is_inside) * (1.0f / 255.0f);
-    member += part * ((other == (floatn)group ? (floatn)(1.0f) : (floatn)(0.0f)) - member);
-#endif
+    const intn other = bytes_from(second + row_start, at, columns, is_inside);
+    const floatn part = TO_FLOATN(bytes_from(share + row_start, at, columns, is_inside)) * (1.0f / 255.0f);
+    floatn member = found == group ? (floatn)(1.0f) : (floatn)(0.0f);
+    member += part * ((other == group ? (floatn)(1.0f) : (floatn)(0.0f)) - member);
     sum += taps[k + reach] * member;
+#else
+    sum += found == group ? (floatn)(taps[k + reach]) : (floatn)(0.0f);
+#endif
   }
   STORE_LANES(sum, partial + ((size_t)get_global_id(2) * rows + row) * columns + column);
 }
@@ -85,6 +116,7 @@ __kernel void smooth_planes(__global const float *from, __constant const float *
 
 // Means of two voxels along each axis: half the resolution. `columns`, `rows` and `planes` are those of `smooth`, whose
 // last voxels are repeated; the planes of the result start at `first`, each clamped.
+ONE_BY_ONE
 __kernel void halve(__global const ushort *smooth, ulong offset, int columns, int rows, int planes, int first,
                     __global float *to) {
   const int column = get_global_id(0), row = get_global_id(1);
@@ -99,6 +131,7 @@ __kernel void halve(__global const ushort *smooth, ulong offset, int columns, in
 }
 
 // Along i, within planes of floats.
+ONE_BY_ONE
 __kernel void smooth_halved_rows(__global const float *from, __constant const float *taps, int reach, int columns,
                                  int rows, __global float *to) {
   const int column = min((int)get_global_id(0) * LANES, columns - LANES);

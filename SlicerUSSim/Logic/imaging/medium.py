@@ -24,7 +24,7 @@ from SlicerUSSim.Logic.imaging.borders import smoothed_indicators, smoothed_memb
 from SlicerUSSim.Logic.imaging.found_sheets import FoundSheets, cells_around, found_sheets
 from SlicerUSSim.Logic.imaging.sheets import sheet_planes
 from SlicerUSSim.Logic.mri.sheets.surfels import Surfels
-from SlicerUSSim.Logic.opencl.device import Device
+from SlicerUSSim.Logic.opencl.device import Device, divisible
 from SlicerUSSim.Logic.opencl.layout import CONSTANTS, TISSUE
 from SlicerUSSim.Logic.tissue.sheet_looks import looks_of
 from SlicerUSSim.Logic.tissue.table import MAX_LABEL, TissueTable
@@ -205,15 +205,14 @@ class Medium:
         return found.labels
 
     def _upload(self, padded: np.ndarray, tissues: TissueTable) -> None:
+        same = _are_same(padded)
         label = _sheet_label(tissues)
         self.sheet_buffer, sheets = sheet_planes(self.device, padded, label, self.labels.spacing_mm)
         self.sheet_label = label if len(sheets) else -1
         if self.found is not None:
             self._add_planes(padded.shape, self.found, bool(len(sheets)))
         distance, self.membrane_reach = self._fluid_distance(padded, tissues, sheets)
-        lowest, highest = _cell_extremes(padded)
-        flags = (lowest == highest).view(np.uint8) * np.uint8(CONSTANTS["SAME_LABEL"])
-        no_membrane = np.True_
+        no_membrane: np.ndarray = np.True_
         if distance is not None:
             lowest, highest = _cell_extremes(distance)
             no_membrane = (lowest > 127.5 + self.membrane_reach) | (highest < 127.5 - self.membrane_reach)
@@ -222,12 +221,15 @@ class Medium:
         if self.found is not None:
             no_membrane = np.broadcast_to(no_membrane, padded.shape).copy()
             no_membrane.ravel()[cells_around(self.found.voxels[self.found.is_near], padded.shape)] = False
+        flags = same.view(np.uint8) * np.uint8(CONSTANTS["SAME_LABEL"])
         flags |= no_membrane.view(np.uint8) * np.uint8(CONSTANTS["NO_MEMBRANE"])
         flags |= padded
-        words = np.zeros((*padded.shape, 2), np.uint8)  # of 16 bits, the low one first
-        words[..., 0] = flags
-        if distance is not None:
-            words[..., 1] = distance
+        if distance is None:
+            words = flags.astype("<u2")
+        else:
+            words = distance.astype("<u2")
+            words <<= 8
+            words |= flags
         self.voxel_buffer = self.device.upload(words)
 
     def _add_planes(self, shape: tuple[int, ...], found: FoundSheets, has_fitted: bool) -> None:
@@ -244,11 +246,11 @@ class Medium:
         """The acoustic group of every voxel, and smoothed indicators of the first groups, which give the most accurate
         normals on flat interfaces. For them tissues go on beyond the volume, whose ends are no borders."""
         group_of = self.rows["group"].astype(np.uint8)
-        group = group_of[padded]
-        lowest, highest = _cell_extremes(group)
-        words = group | np.uint8(CONSTANTS["SAME_GROUP"]) * (lowest == highest)
-        # Rows are read eight voxels at a time, including the last one.
-        self.group_buffer = self.device.upload(np.pad(words.ravel(), (0, 8)))
+        group = np.zeros(padded.shape, np.uint8)
+        for label in self.present:  # faster than indices of eight bytes for every voxel
+            group |= (padded == label).view(np.uint8) * group_of[label]
+        if group_of[0]:
+            group |= (padded == 0).view(np.uint8) * group_of[0]
         # The coupling medium surrounds the volume even if its label does not occur.
         groups = {int(group_of[label]) for label in (0, *self.present)}
         room = max(_SMOOTHED_VOXELS // padded.size, 2)
@@ -265,6 +267,10 @@ class Medium:
         self.smooth_buffer = smoothed_indicators(
             self.device, continued, self.dims, groups, self.smooth_groups, membership
         )
+        self.device.mark()  # the device begins, and the host goes on
+        words = group | np.uint8(CONSTANTS["SAME_GROUP"]) * _are_same(group)
+        # Rows are read eight voxels at a time, including the last one.
+        self.group_buffer = self.device.upload(np.pad(words.ravel(), (0, 8)))
 
     def _fluid_distance(
         self, padded: np.ndarray, tissues: TissueTable, sheets: np.ndarray
@@ -277,7 +283,9 @@ class Medium:
         if membrane is None or membrane.thickness_mm == 0:
             return None, -1.0
         fluids = _fluid_labels(tissues, membrane)
-        is_fluid = np.isin(np.arange(256), fluids)[padded]
+        is_fluid = np.zeros(padded.shape, bool)
+        for label in fluids:
+            is_fluid |= padded == label
         if is_fluid.all() or not is_fluid.any():
             return None, -1.0
         spacing = self.labels.spacing_mm[::-1]
@@ -295,32 +303,36 @@ class Medium:
         smooth = smoothed_members(self.device, is_fluid, sigma_mm / spacing[::-1], 3.0)
         sigmas = np.clip(special.ndtri(np.arange(65536) / 65535.0), -_FARTHEST_SIGMAS, _FARTHEST_SIGMAS)
         unit = 127.5 / _FARTHEST_SIGMAS
-        distance = np.rint(127.5 + unit * sigmas).astype(np.uint8)[smooth]
-        self._flatten(distance, tissues, fluids, unit / 0.75)
+        distance_of = np.rint(127.5 + unit * sigmas).astype(np.uint8)
+        between = np.flatnonzero((distance_of > 0) & (distance_of < 255))
+        points = np.flatnonzero((smooth >= between[0]) & (smooth <= between[-1]))
+        distance = (smooth > between[-1]).view(np.uint8) * np.uint8(255)
+        distance.ravel()[points] = distance_of[smooth.ravel()[points]]
+        self._flatten(distance, points.astype(np.int32), fluids, unit / 0.75)
         reach = 0.5 * membrane.thickness_mm / sigma_mm * unit
         _keep_membrane_inside(distance, reach)
         return distance, reach
 
-    def _flatten(self, distance: np.ndarray, tissues: TissueTable, fluids: tuple[int, ...], per_voxel: float) -> None:
+    def _flatten(self, distance: np.ndarray, points: np.ndarray, fluids: tuple[int, ...], per_voxel: float) -> None:
         """Place the border of (k, j, i) uint8 `distance` by the wide Gaussians of acoustic groups where it is flat.
 
-        The narrow one follows the steps of a plane between layers of voxels. Only for a group of fluids alone, and in
-        voxels that are cubes.
+        `points` are the flat indices, int32, of the voxels near it. The narrow Gaussian follows the steps of a plane
+        between layers of voxels. Only for a group of fluids alone, and in voxels that are cubes.
         """
         spacing = self.labels.spacing_mm
         fluid = fluid_group(self.rows["group"], self.present, fluids)
         if not 0 <= fluid < self.smooth_groups or spacing.max() > 1.02 * spacing.min():
             return
-        points = np.flatnonzero((distance > 0) & (distance < 255)).astype(np.int32)
         if not len(points):
             return
         before = ((distance.ravel()[points] - np.float32(127.5)) / np.float32(per_voxel)).astype(np.float32)
         flat = self.device.zeros(before.nbytes)
         self.device.write(flat, before)
+        lanes = self.device.lanes
         self.device.run(
-            self.device.kernels("membrane.cl")["flatten_membrane"], (len(points),), self.smooth_buffer,
-            *(np.int32(n) for n in self.dims), np.int32(self.smooth_groups), np.int32(fluid),
-            self.device.upload(points), flat,
+            self.device.kernels("membrane.cl", lanes)["flatten_membrane"], (divisible(-(-len(points) // lanes)),),
+            self.smooth_buffer, *(np.int32(n) for n in self.dims), np.int32(self.smooth_groups), np.int32(fluid),
+            self.device.upload(points), np.int32(len(points)), flat,
         )  # fmt: skip
         after = self.device.download(flat, len(points), np.float32)
         distance.ravel()[points] = np.rint(np.clip(127.5 + per_voxel * after, 0.0, 255.0)).astype(np.uint8)
@@ -355,15 +367,31 @@ def as_labels(array: np.ndarray) -> np.ndarray:
 def _cell_extremes(array: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Smallest and largest of the eight voxels at (k, j, i) + {0, 1}^3, for every (k, j, i)."""
     lowest, highest = array.copy(), array.copy()
-    for axis in range(3):
-        here = [slice(None)] * 3
-        there = [slice(None)] * 3
-        here[axis], there[axis] = slice(0, -1), slice(1, None)
-        here, there = tuple(here), tuple(there)
+    for here, there in _neighbours():
         # In place, in ascending memory order: `there` still has its old value when `here` is written.
         lowest[here] = np.minimum(lowest[here], lowest[there])
         highest[here] = np.maximum(highest[here], highest[there])
     return lowest, highest
+
+
+def _are_same(array: np.ndarray) -> np.ndarray:
+    """(k, j, i) bool: the eight voxels at (k, j, i) + {0, 1}^3 have the same value."""
+    same = np.ones(array.shape, bool)
+    for here, there in _neighbours():
+        equal = array[here] == array[there]
+        equal &= same[there]
+        same[here] &= equal
+    return same
+
+
+def _neighbours() -> list[tuple[tuple[slice, ...], tuple[slice, ...]]]:
+    """Indices of voxels and of those after them, along k, j and i; the last ones have none."""
+    pairs = []
+    for axis in range(3):
+        here, there = [slice(None)] * 3, [slice(None)] * 3
+        here[axis], there[axis] = slice(0, -1), slice(1, None)
+        pairs.append((tuple(here), tuple(there)))
+    return pairs
 
 
 def _keep_membrane_inside(distance: np.ndarray, reach: float) -> None:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from SlicerUSSim.Logic.opencl.device import Device
+from SlicerUSSim.Logic.opencl.device import Device, divisible
 from SlicerUSSim.Logic.opencl.layout import CONSTANTS
 
 if TYPE_CHECKING:
@@ -40,12 +40,13 @@ def sheet_planes(device: Device, padded: np.ndarray, sheet: int, spacing_mm: np.
     rows, taps = (device.upload(table) for table in window_tables())
     point_buffer, labels = device.upload(points), device.upload(padded)
     side = (spacing_mm / np.cbrt(np.prod(spacing_mm))).astype(np.float32)
-    device.run(kernels["find_cores"], (len(points),), bits, *dims, rows, taps, point_buffer, cores)
+    size, listed = (divisible(len(points)),), (point_buffer, np.int32(len(points)))
+    device.run(kernels["find_cores"], size, bits, *dims, rows, taps, *listed, cores)
     device.run(
-        kernels["fit_sheets"], (len(points),), bits, *dims, np.int32(sheet), *side, rows, taps, labels, point_buffer,
-        cores, is_thin, planes,
+        kernels["fit_sheets"], size, bits, *dims, np.int32(sheet), *side, rows, taps, labels, *listed, cores, is_thin,
+        planes,
     )  # fmt: skip
-    device.run(kernels["spread_sheets"], (len(points),), labels, *dims, np.int32(sheet), point_buffer, planes)
+    device.run(kernels["spread_sheets"], size, labels, *dims, np.int32(sheet), *listed, planes)
     return planes, points[device.download(is_thin, len(points), np.uint8) > 0]
 
 
@@ -60,6 +61,6 @@ def window_tables() -> tuple[np.ndarray, np.ndarray]:
     wide = np.exp(-0.5 * (x / CONSTANTS["SHEET_SIGMA"]) ** 2)
     core = np.where(abs(x) <= _CORE_REACH, np.exp(-0.5 * (x / _CORE_SIGMA) ** 2), 0.0)
     core /= core.sum()
-    of_voxel = np.stack([wide, wide * x, wide * x**2, wide**4, wide**4 * x, core, 0.0 * x, 0.0 * x])
+    of_voxel = np.stack([wide, wide * x, wide * x**2, wide**4, wide**4 * x, core, 0.0 * x, wide])
     is_set = np.arange(512)[:, None] >> np.arange(9) & 1
     return (is_set @ of_voxel.T).astype(np.float32), np.concatenate([wide[reach:], core[reach:]]).astype(np.float32)

@@ -223,6 +223,7 @@ class Device:
         _require_not_forked()
         array = np.empty(shape, dtype)
         if array.nbytes:
+            self.queue.finish()  # this thread takes part in Intel's runtime, unlike one that waits for a copy
             self.cl.enqueue_copy(self.queue, array, buffer)
         return array
 
@@ -285,6 +286,12 @@ def _require_not_forked() -> None:
             "this process is a fork of one that uses OpenCL, whose threads it lacks; start processes anew, for example "
             'by multiprocessing.get_context("spawn"), or fork before the first simulation'
         )
+
+
+def divisible(count: int) -> int:
+    """The next larger global size that a runtime can divide into groups: of a prime number of work-items, it makes one
+    group, which one core computes, or a group of each."""
+    return -(-count // 1024) * 1024
 
 
 def _was_cached(program: Program) -> bool:
