@@ -13,8 +13,9 @@ from hypothesis import given, settings, strategies as st
 
 from SlicerUSSim.Logic import SimulationError, Volume
 from SlicerUSSim.Logic.tissue import TissueTable
-from SlicerUSSim.Logic.tracked.pose_files import read_pose, read_tags
-from SlicerUSSim.Logic.tracked.sequence import TrackedSequence
+from SlicerUSSim.Logic.tissue.label_files import read_names
+from SlicerUSSim.Logic.tracked.pose_files import read_pose, read_tags, read_transform
+from SlicerUSSim.Logic.tracked.sequence import TrackedSequence, read_coordinate_definitions
 
 ARRAY = (np.arange(6 * 5 * 4) % 200).reshape(6, 5, 4).astype(np.int16)
 #: What numbers of a header are replaced by
@@ -205,3 +206,18 @@ def test_tags_that_are_no_numbers_are_one_line(tmp_path):
     path = tmp_path / "points.tag"
     path.write_text("MNI Tag Point File\nVolumes = 1;\nPoints =\n 1 2 1e999;\n")
     refused(path, "", read_tags)
+
+
+@pytest.mark.parametrize(
+    ("name", "read"),
+    [
+        ("p.txt", read_pose), ("t.tfm", read_pose), ("t.xfm", read_transform), ("p.tag", read_tags),
+        ("plus.xml", read_coordinate_definitions), ("n.ctbl", read_names), ("p.json", read_pose),
+        ("t.json", TissueTable.read),
+    ],
+)  # fmt: skip
+def test_a_text_far_larger_than_any_of_its_kind_is_refused_before_it_is_read(tmp_path, name, read):
+    path = tmp_path / name
+    path.write_text("#Insight\n" if name == "t.tfm" else "1 ")
+    os.truncate(path, 2**40)  # without blocks on the disk
+    refused(path, f"has {2**40} bytes, expected at most", read)

@@ -66,7 +66,7 @@ def test_minc2_is_read_as_written_by_itk(tmp_path):
     np.testing.assert_allclose(back.array, numbered(), atol=1e-3)
 
 
-def write_dicom(volume, folder, patient="Nobody"):
+def write_dicom(volume, folder, patient="Nobody", compressor=""):
     """A series of one file per slice."""
     import SimpleITK as sitk
 
@@ -74,6 +74,9 @@ def write_dicom(volume, folder, patient="Nobody"):
     image = volume.to_sitk()
     writer = sitk.ImageFileWriter()
     writer.KeepOriginalImageUIDOn()
+    if compressor:
+        writer.UseCompressionOn()
+        writer.SetCompressor(compressor)
     for k in range(image.GetSize()[2]):
         sheet = image[:, :, k]
         position = image.TransformIndexToPhysicalPoint((0, 0, k))
@@ -168,6 +171,68 @@ def test_names_of_patients_stay_out_of_messages_logs_and_files(tmp_path, caplog)
     said += str(error.value).replace(str(tmp_path), "").encode()
     for secret in (b"Jane", b"Rick", b"Number4711"):
         assert secret not in said
+
+
+def of_size(dicom: bytes, rows: int, columns: int, frames: int = 0) -> bytes:
+    """A DICOM file that promises another size."""
+    content = bytearray(dicom)
+    for element, value in ((0x10, rows), (0x11, columns)):
+        at = content.index(tag(0x28, element))
+        content[at + 8 : at + 10] = value.to_bytes(2, "little")
+    if frames:
+        text = str(frames).encode()
+        text += b" " * (len(text) % 2)
+        at = content.index(tag(0x28, 0x10))
+        content[at:at] = tag(0x28, 0x08) + len(text).to_bytes(4, "little") + text
+    return bytes(content)
+
+
+@pytest.mark.parametrize("name", ["0.dcm", "IM0"])
+@pytest.mark.parametrize(
+    ("size", "words"),
+    [
+        ((65535, 65535), "voxels.* expected at most 2147483648 in all"),
+        ((9000, 9000), r"promises .* voxels, \d+ bytes, which its \d+ bytes cannot hold; copy or export it again"),
+        ((40, 50, 500), r"promises .* voxels, \d+ bytes, which its \d+ bytes cannot hold; copy or export it again"),
+        ((40, 50, 2000000), "voxels.* expected at most 2147483648 in all"),
+    ],
+)
+@pytest.mark.parametrize("how", ["one", "series", "folder"])
+def test_what_a_dicom_file_promises_is_bounded_before_it_is_read(tmp_path, monkeypatch, name, size, words, how):
+    """Without a suffix, and as one of a series, ITK asked for the memory that the header says."""
+    import SimpleITK as sitk
+
+    write_dicom(Volume(numbered((6, 40, 50)), np.diag([-1.0, -1.0, 2.5, 1.0])), tmp_path)
+    whole = (tmp_path / "0.dcm").read_bytes()
+    if how == "one":
+        for path in tmp_path.iterdir():
+            path.unlink()
+        (tmp_path / name).write_bytes(of_size(whole, *size))
+    else:
+        for path in list(tmp_path.iterdir()):
+            path.write_bytes(of_size(path.read_bytes(), *size))
+            path.rename(path.with_name(path.name if name == "0.dcm" else f"IM{path.stem}"))
+    monkeypatch.setattr(sitk.ImageFileReader, "Execute", lambda *_: pytest.fail("it was read"))
+    monkeypatch.setattr(sitk.ImageSeriesReader, "Execute", lambda *_: pytest.fail("it was read"))
+    with pytest.raises(SimulationError, match=words):
+        Volume.read(tmp_path if how == "folder" else tmp_path / name)
+
+
+def test_a_compressed_series_of_one_grey_level_is_read(tmp_path):
+    """Its files are far smaller than its voxels."""
+    volume = Volume(np.full((12, 512, 512), 7, np.int16), np.diag([-1.0, -1.0, 2.5, 1.0]))
+    write_dicom(volume, tmp_path, compressor="JPEG2000")
+    assert sum(path.stat().st_size for path in tmp_path.iterdir()) < volume.array.nbytes / 100
+    np.testing.assert_array_equal(Volume.read(tmp_path).array, volume.array)
+
+
+@pytest.mark.parametrize("below", [False, True])
+def test_a_folder_with_more_files_than_any_study_is_refused(tmp_path, monkeypatch, below):
+    monkeypatch.setattr("SlicerUSSim.Logic.base.dicom._MOST_FILES", 5)
+    place = tmp_path / "below" if below else tmp_path
+    write_dicom(Volume(numbered((6, 40, 50)), np.diag([-1.0, -1.0, 2.5, 1.0])), place)
+    with pytest.raises(SimulationError, match="has more than 5 files in it, give the folder of the series"):
+        Volume.read(tmp_path)
 
 
 def tag(group: int, element: int) -> bytes:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 import os
 import re
+from collections.abc import Sequence
 from pathlib import Path
 from xml.parsers import expat
 
@@ -19,7 +20,14 @@ MOST_VOXELS = 2**31
 #: Deflate turns at most 1032 bytes into one (zlib, "An Explanation of the Deflate Algorithm"), and headers are small
 _MOST_EXPANSION = 1100
 #: Formats with all voxels in one file, compressed by deflate or not at all
-_ONE_FILE = (".mha", ".nii", ".nii.gz", ".nrrd", ".mgz", ".mgh", ".vti", ".dcm", ".ima")
+_ONE_FILE = (".mha", ".nii", ".nii.gz", ".nrrd", ".mgz", ".mgh", ".vti")
+#: Endings of DICOM files that may lack the prefix
+_DICOM = (".dcm", ".ima")
+#: Transfer syntaxes of DICOM without compression, in which a byte holds at most eight pixels of one bit, and where the
+#: element with the syntax is: behind the preamble of 128 bytes and DICM, with an explicit type and two bytes of length
+_UNCOMPRESSED = (b"1.2.840.10008.1.2", b"1.2.840.10008.1.2.1", b"1.2.840.10008.1.2.2")
+_PIXELS_PER_BYTE = 8
+_SYNTAX, _META_BYTES = b"\x02\x00\x10\x00UI", 4096
 #: Largest coordinate, direction and voxel size that is read, in any unit of length
 _MOST = 1e9
 #: The part of a file in which its header ends; sequences have some hundred bytes for every image
@@ -56,13 +64,46 @@ def require_bytes(path: Path, size: tuple[int, ...], bytes_per_voxel: int = 1) -
     voxels = math.prod(int(n) for n in size)
     text = "x".join(str(n) for n in size)
     require(voxels <= MOST_VOXELS, f"{path}: has {text} voxels, expected at most {MOST_VOXELS} in all")
-    if path.is_file() and path.name.lower().endswith(_ONE_FILE):
-        most = _MOST_EXPANSION * max(path.stat().st_size, 1)
-        require(
-            voxels * bytes_per_voxel <= most,
-            f"{path}: promises {text} voxels, {voxels * bytes_per_voxel} bytes, which its {path.stat().st_size} bytes "
-            "cannot hold; copy or export it again",
-        )
+    if path.is_file():
+        require_held(str(path), text, voxels * bytes_per_voxel, [path])
+
+
+def require_held(name: str, size: str, least_bytes: int, files: Sequence[Path]) -> None:
+    """Raise SimulationError if files cannot hold `least_bytes` of voxels, however they are compressed.
+
+    `size` is the number of voxels as text. Nothing is said about formats with voxels in other files, or unknown ones.
+    """
+    held = [_most_held(file) for file in files]
+    if None in held:
+        return
+    stored = sum(file.stat().st_size for file in files)
+    require(
+        least_bytes <= sum(filter(None, held)),
+        f"{name}: promises {size} voxels, {least_bytes} bytes, which its {stored} bytes cannot hold; copy or export it "
+        "again",
+    )
+
+
+def _most_held(file: Path) -> int | None:
+    """Bytes of voxels that a file can hold, a pixel of one bit counted as a byte; None for formats of several files."""
+    expansion = _MOST_EXPANSION
+    if is_dicom(file):
+        with file.open("rb") as opened:
+            _, found, value = opened.read(_META_BYTES).partition(_SYNTAX)
+        length = int.from_bytes(value[:2], "little")
+        if found and value[2 : 2 + length].rstrip(b"\0 ") in _UNCOMPRESSED:
+            expansion = _PIXELS_PER_BYTE
+    elif not file.name.lower().endswith(_ONE_FILE):
+        return None
+    return expansion * max(file.stat().st_size, 1)
+
+
+def is_dicom(file: Path) -> bool:
+    """Whether a file has the DICOM prefix, or the suffix of the older ones that lack it."""
+    if file.suffix.lower() in _DICOM:
+        return True
+    with open(file, "rb") as opened:
+        return opened.read(132)[128:] == b"DICM"
 
 
 def require_spacing(name: str, spacing_mm: tuple[float, ...]) -> None:

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from SlicerUSSim.Logic.base.errors import SimulationError, require, required
-from SlicerUSSim.Logic.base.files import read_json, write_json, written_whole
+from SlicerUSSim.Logic.base.files import read_json, require_small, write_json, written_whole
 from SlicerUSSim.Logic.base.reading import in_child, reader, starts_like_hdf5
 from SlicerUSSim.Logic.base.transforms import (
     LPS_TO_RAS,
@@ -76,6 +76,7 @@ def read_matrix(path: str | os.PathLike) -> np.ndarray:
 
 def _numbers(path: Path) -> np.ndarray:
     """(4, 4) of sixteen numbers in a text file."""
+    require_small(path)
     try:
         numbers = np.array(path.read_text().replace(",", " ").split(), float)
     except (ValueError, UnicodeDecodeError):
@@ -291,6 +292,7 @@ def _read_xfm(path: Path) -> np.ndarray:
 
 def _mni_text(path: Path, first_words: str) -> str:
     require(path.is_file(), f"{path}: no such file")
+    require_small(path)
     try:
         text = path.read_text()
     except UnicodeDecodeError:
