@@ -62,6 +62,27 @@ def write_dicom(path: Path) -> None:
     sitk.WriteImage(sitk.GetImageFromArray(np.arange(80, dtype=np.uint16).reshape(4, 4, 5)), str(path))
 
 
+def write_bare_dicom(path: Path) -> None:
+    whole = path.with_suffix(".dcm")
+    write_dicom(whole)
+    whole.rename(path)
+
+
+def write_dicom_series(path: Path) -> None:
+    """Twelve images in a folder, one of which is `path`."""
+    image = sitk.GetImageFromArray(np.arange(20, dtype=np.uint16).reshape(4, 5))
+    writer = sitk.ImageFileWriter()
+    writer.KeepOriginalImageUIDOn()
+    for k in range(12):
+        for key, value in {
+            "0008|0060": "MR", "0020|000e": "1.2.3", "0020|0032": f"0\\0\\{2 * k}", "0020|0037": "1\\0\\0\\0\\1\\0",
+            "0008|0018": f"1.2.3.{k}",
+        }.items():  # fmt: skip
+            image.SetMetaData(key, value)
+        writer.SetFileName(str(path.with_name(f"{k}.dcm")))
+        writer.Execute(image)
+
+
 def text(content: str) -> Callable[[Path], object]:
     return lambda path: path.write_text(content)
 
@@ -85,6 +106,12 @@ class Format(NamedTuple):
     header_bytes: int
     #: Whether each input costs a child process
     in_child: bool = False
+    #: Whether what is read is the folder of the file
+    folder: bool = False
+
+    def of(self, path: Path) -> Path:
+        """What is read."""
+        return path.parent if self.folder else path
 
 
 FORMATS = {
@@ -97,6 +124,8 @@ FORMATS = {
     "mgh": Format("v.mgh", write_mgh, Volume.read, 284),
     "mnc": Format("v.mnc", write_volume, Volume.read, 9000, in_child=True),
     "dcm": Format("v.dcm", write_dicom, Volume.read, 900),
+    "IM": Format("IM1", write_bare_dicom, Volume.read, 900),
+    "dcms": Format("3.dcm", write_dicom_series, Volume.read, 900, folder=True),
     "mhaseq": Format("s.igs.mha", write_sequence, TrackedSequence.read, 1500),
     "nrrdseq": Format("s.seq.nrrd", write_sequence, TrackedSequence.read, 1500),
     "pose": Format("p.json", lambda path: write_pose(path, np.eye(4)), read_pose, 250),
@@ -166,9 +195,11 @@ def is_read_or_refused(path: Path, read: Callable[[Path], object]) -> None:
 
 
 def test_every_format_is_read_before_it_is_damaged(tmp_path):
-    for file in FORMATS.values():
-        file.write(tmp_path / file.name)
-        assert file.read(tmp_path / file.name) is not None
+    for number, file in enumerate(FORMATS.values()):
+        path = tmp_path / str(number) / file.name
+        path.parent.mkdir()
+        file.write(path)
+        assert file.read(file.of(path)) is not None
 
 
 @pytest.mark.parametrize("name", FORMATS)
@@ -185,7 +216,7 @@ def test_a_damaged_file_is_read_or_refused_in_one_line(name, tmp_path_factory):
     @given(content=damages(whole, file.header_bytes))
     def damaged(content: bytes) -> None:
         path.write_bytes(content)
-        is_read_or_refused(path, file.read)
+        is_read_or_refused(file.of(path), file.read)
 
     damaged()
 

@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 from SlicerUSSim.Logic import SimulationError, Volume
 from SlicerUSSim.Logic.base.files import written_whole
 from SlicerUSSim.Logic.base.transforms import check_rigid
+from SlicerUSSim.Logic.base.volume import read_array
 
 angles = st.floats(-180, 180)
 spacings = st.floats(0.2, 6.0)
@@ -216,6 +217,52 @@ def test_what_a_dicom_file_promises_is_bounded_before_it_is_read(tmp_path, monke
     monkeypatch.setattr(sitk.ImageSeriesReader, "Execute", lambda *_: pytest.fail("it was read"))
     with pytest.raises(SimulationError, match=words):
         Volume.read(tmp_path if how == "folder" else tmp_path / name)
+
+
+def with_length(dicom: bytes, at: int, length: int) -> bytes:
+    return dicom[:at] + length.to_bytes(4, "little") + dicom[at + 4 :]
+
+
+@pytest.mark.parametrize("where", ["meta", "patient", "sequence", "explicit", "no prefix"])
+@pytest.mark.parametrize("door", ["file", "folder", "array"])
+def test_a_length_far_beyond_the_end_of_a_dicom_file_is_refused(tmp_path, where, door):
+    """GDCM filled 4 GB with zeros for a file of 1.5 kB."""
+    write_dicom(Volume(numbered((6, 40, 50)), np.diag([-1.0, -1.0, 2.5, 1.0])), tmp_path)
+    whole = (tmp_path / "3.dcm").read_bytes()
+    patient = whole.index(tag(0x10, 0x10))
+    if where == "meta":  # its version, explicit as all of that part
+        damaged = with_length(whole, whole.index(tag(2, 1)) + 8, 2**32 - 16)
+    elif where == "patient":
+        damaged = with_length(whole, patient + 4, 2**32 - 16)
+    elif where == "sequence":  # a code of an anatomic region
+        code = tag(0x08, 0x0100) + b"\xf0\xff\xff\xf0" + b"T-A0100 "
+        inner = tag(0xFFFE, 0xE000) + len(code).to_bytes(4, "little") + code
+        damaged = whole[:patient] + tag(0x08, 0x2218) + len(inner).to_bytes(4, "little") + inner + whole[patient:]
+    elif where == "explicit":
+        name = tag(0x08, 0x0070) + b"UT\0\0\xf0\xff\xff\xf0" + b"nobody"
+        damaged = whole[:132] + tag(2, 0x10) + b"UI\x14\x001.2.840.10008.1.2.1\0" + name
+    else:
+        damaged = with_length(whole, patient + 4, 2**32 - 16)[whole.index(tag(8, 0x16)) :]
+    (tmp_path / "3.dcm").write_bytes(damaged)
+    read = read_array if door == "array" else Volume.read
+    with pytest.raises(SimulationError, match=r"3\.dcm: is damaged: its element .* has 4\d{9} bytes, and \d+ are left"):
+        read(tmp_path if door == "folder" else tmp_path / "3.dcm")
+
+
+def test_sequences_and_compressed_pixels_are_no_damage(tmp_path):
+    write_dicom(Volume(numbered((6, 40, 50)), np.diag([-1.0, -1.0, 2.5, 1.0])), tmp_path)
+    code = tag(0x08, 0x0100) + b"\x08\0\0\0" + b"T-A0100 "
+    for open_ended in (False, True):
+        end = tag(0xFFFE, 0xE00D) + bytes(4) if open_ended else b""
+        length = b"\xff" * 4 if open_ended else len(code).to_bytes(4, "little")
+        item = tag(0xFFFE, 0xE000) + length + code + end
+        end = tag(0xFFFE, 0xE0DD) + bytes(4) if open_ended else b""
+        length = b"\xff" * 4 if open_ended else len(item).to_bytes(4, "little")
+        for path in tmp_path.iterdir():
+            whole = path.read_bytes()
+            at = whole.index(tag(0x10, 0x10))
+            path.write_bytes(whole[:at] + tag(0x08, 0x2218) + length + item + end + whole[at:])
+        assert Volume.read(tmp_path).array.shape == (6, 40, 50)
 
 
 def test_a_compressed_series_of_one_grey_level_is_read(tmp_path):

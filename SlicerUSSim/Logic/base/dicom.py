@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from SlicerUSSim.Logic.base.dicom_elements import require_sound_elements
 from SlicerUSSim.Logic.base.errors import SimulationError, require
 from SlicerUSSim.Logic.base.headers import MOST_VOXELS, is_dicom, require_held, require_spacing
 from SlicerUSSim.Logic.base.reading import reader
@@ -158,6 +159,7 @@ def series_with(file: Path) -> Series | None:
     """The DICOM series of several images, in its folder, to which a file belongs; None if there is no such series."""
     if not is_dicom(file):
         return None
+    require_sound_elements(file)
     uid = _value(_header(str(file)), "0020|000e")
     for series in _series_of(file.parent):
         # ITK's identifiers begin with the series instance UID.
@@ -183,6 +185,9 @@ def _series_of(folder: Path, recursive: bool = False) -> list[Series]:
         len(entries) <= _MOST_FILES,
         f"{folder}: has more than {_MOST_FILES} files in it, give the folder of the series, or one of its images",
     )
+    for file in entries:
+        if file.is_file():
+            require_sound_elements(file)
     if recursive:
         folders = sorted(place for place in entries if place.is_dir())
         require(len(folders) <= _MOST_FOLDERS, f"{folder}: has {len(folders)} folders in it, give that of the series")

@@ -13,6 +13,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from xml.parsers import expat
 
+from SlicerUSSim.Logic.base.dicom_elements import require_sound_elements
 from SlicerUSSim.Logic.base.errors import SimulationError, require, shown_path
 
 #: Voxels of the largest image: 2000 slices of 1024 x 1024
@@ -45,7 +46,7 @@ def require_readable_name(path: str | os.PathLike) -> None:
 
 
 def require_sound_header(path: Path) -> None:
-    """Raise SimulationError for a MetaImage or VTI file whose header is none that can be read.
+    """Raise SimulationError for a MetaImage, VTI or DICOM file whose header is none that can be read.
 
     Files of other formats pass, and so do files whose voxels are missing, of which ITK and VTK say so.
     """
@@ -54,6 +55,8 @@ def require_sound_header(path: Path) -> None:
         _require_metaimage(path)
     elif suffix == ".vti":
         _require_vti(path)
+    elif path.is_file() and is_dicom(path):
+        require_sound_elements(path)
 
 
 def require_bytes(path: Path, size: tuple[int, ...], bytes_per_voxel: int = 1) -> None:
