@@ -21,7 +21,7 @@ from SlicerUSSim.Logic.opencl import runtimes
 from SlicerUSSim.Logic.opencl.device import Device, kernel_folder
 from SlicerUSSim.Logic.opencl.devices import DeviceInfo, choose_device, faster_hint
 from SlicerUSSim.Logic.opencl.pocl import name_unknown_processor, remove_damaged_kernels, require_linker
-from SlicerUSSim.Logic.opencl.runtimes import register_pip_runtimes
+from SlicerUSSim.Logic.opencl.runtimes import pocl_of_pip, register_pip_runtimes
 from SlicerUSSim.Logic.probe import pose_looking_at
 from tests.conftest import SPECKLE, block, rigid, simulator
 
@@ -294,6 +294,7 @@ import os, sys
 import numpy as np
 from SlicerUSSim.Logic import LinearProbe, SimulationError, TissueTable, UltrasoundSimulator, Volume
 from SlicerUSSim.Logic.probe import pose_looking_at
+from SlicerUSSim.Logic.opencl.runtimes import pocl_of_pip
 from SlicerUSSim.Logic.opencl.device import Device
 
 labels = Volume(np.ones((30, 30, 30), np.uint8), np.eye(4))
@@ -395,6 +396,7 @@ def _in_process(script: str, **environment: str) -> subprocess.CompletedProcess[
 _LIMITED = """
 import resource
 from SlicerUSSim.Logic import list_devices
+from SlicerUSSim.Logic.opencl.runtimes import pocl_of_pip
 from SlicerUSSim.Logic.opencl.device import Device
 found = list_devices() if {after} else []
 resource.setrlimit(resource.RLIMIT_AS, (400 * 10**6, resource.RLIM_INFINITY))
@@ -409,6 +411,31 @@ def test_too_small_an_address_space_is_named(after):
     done = _in_process(_LIMITED.format(after=after))
     assert done.returncode == 0, done.stderr[-800:]
     assert re.search(r"refused: .*limited to 400 MB \(ulimit -v\), expected at least \d+ MB", done.stdout), done.stdout
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="PoCL's wheel is for Linux")
+def test_a_cache_that_cannot_be_written_is_named(tmp_path):
+    """PoCL has no device then; without this: "no OpenCL device found; run: pip install"."""
+    (tmp_path / "file").write_text("")
+    done = _in_process(
+        "from SlicerUSSim.Logic.opencl.device import Device\nDevice.get('pocl')",
+        XDG_CACHE_HOME=str(tmp_path / "file"), OCL_ICD_VENDORS=_only_pocl(tmp_path),
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr[-800:]
+    assert re.search(
+        r"refused: .*PoCL keeps programs in .*file/pocl/kcache, which cannot be written \(Not a dir", done.stdout
+    )
+
+
+def _only_pocl(folder: Path) -> str:
+    """A folder for the loader that names PoCL alone."""
+    library = pocl_of_pip()
+    if library is None:
+        pytest.skip("needs PoCL's wheel")
+    vendors = folder / "vendors"
+    vendors.mkdir()
+    (vendors / "pocl.icd").write_text(str(library))
+    return str(vendors)
 
 
 def test_a_full_disk_of_the_caches_is_named(monkeypatch):
