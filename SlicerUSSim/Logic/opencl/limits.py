@@ -41,8 +41,8 @@ def lack_of_cache(folder: Path) -> str | None:
             return None
     except OSError as error:
         return (
-            f"PoCL keeps programs in {folder}, which cannot be written ({error.strerror}); set XDG_CACHE_HOME to another "
-            "folder"
+            f"PoCL keeps programs in {folder}, which cannot be written ({error.strerror}); set XDG_CACHE_HOME to "
+            "another folder"
         )
 
 
