@@ -223,7 +223,7 @@ def with_length(dicom: bytes, at: int, length: int) -> bytes:
     return dicom[:at] + length.to_bytes(4, "little") + dicom[at + 4 :]
 
 
-@pytest.mark.parametrize("where", ["meta", "patient", "sequence", "explicit", "no prefix"])
+@pytest.mark.parametrize("where", ["meta", "type", "patient", "sequence", "explicit", "no prefix"])
 @pytest.mark.parametrize("door", ["file", "folder", "array"])
 def test_a_length_far_beyond_the_end_of_a_dicom_file_is_refused(tmp_path, where, door):
     """GDCM filled 4 GB with zeros for a file of 1.5 kB."""
@@ -232,6 +232,9 @@ def test_a_length_far_beyond_the_end_of_a_dicom_file_is_refused(tmp_path, where,
     patient = whole.index(tag(0x10, 0x10))
     if where == "meta":  # its version, explicit as all of that part
         damaged = with_length(whole, whole.index(tag(2, 1)) + 8, 2**32 - 16)
+    elif where == "type":  # GDCM took this text for a length then: 774 MB
+        at = whole.index(tag(2, 3)) + 4
+        damaged = whole[:at] + b"1.2." + whole[at + 4 :]
     elif where == "patient":
         damaged = with_length(whole, patient + 4, 2**32 - 16)
     elif where == "sequence":  # a code of an anatomic region
@@ -245,7 +248,8 @@ def test_a_length_far_beyond_the_end_of_a_dicom_file_is_refused(tmp_path, where,
         damaged = with_length(whole, patient + 4, 2**32 - 16)[whole.index(tag(8, 0x16)) :]
     (tmp_path / "3.dcm").write_bytes(damaged)
     read = read_array if door == "array" else Volume.read
-    with pytest.raises(SimulationError, match=r"3\.dcm: is damaged: its element .* has 4\d{9} bytes, and \d+ are left"):
+    words = r"has the type b'1\.', expected one of DICOM" if where == "type" else r"has 4\d{9} bytes, and \d+ are left"
+    with pytest.raises(SimulationError, match=rf"3\.dcm: is damaged: its element .* {words}"):
         read(tmp_path if door == "folder" else tmp_path / "3.dcm")
 
 
