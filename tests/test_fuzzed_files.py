@@ -21,6 +21,7 @@ import SimpleITK as sitk
 from hypothesis import HealthCheck, given, settings, strategies as st
 
 from SlicerUSSim.Logic import SimulationError, TissueTable, Volume
+from SlicerUSSim.Logic.base.volume import read_array
 from SlicerUSSim.Logic.imaging.preset import Preset
 from SlicerUSSim.Logic.mri.sheets import Surfels
 from SlicerUSSim.Logic.mri.sheets.polydata import read_surfels, write_surfels
@@ -66,6 +67,15 @@ def write_bare_dicom(path: Path) -> None:
     whole = path.with_suffix(".dcm")
     write_dicom(whole)
     whole.rename(path)
+
+
+def write_compressed_dicom(path: Path) -> None:
+    writer = sitk.ImageFileWriter()
+    writer.UseCompressionOn()
+    writer.SetCompressor("JPEG2000")
+    writer.SetFileName(str(path))
+    # A small one corrupts the memory of its writer
+    writer.Execute(sitk.GetImageFromArray(np.add.outer(np.arange(64), np.arange(48)).astype(np.uint16)[None]))
 
 
 def write_dicom_series(path: Path) -> None:
@@ -125,6 +135,7 @@ FORMATS = {
     "mnc": Format("v.mnc", write_volume, Volume.read, 9000, in_child=True),
     "dcm": Format("v.dcm", write_dicom, Volume.read, 900),
     "IM": Format("IM1", write_bare_dicom, Volume.read, 900),
+    "j2k": Format("j.dcm", write_compressed_dicom, read_array, 900, in_child=True),
     "dcms": Format("3.dcm", write_dicom_series, Volume.read, 900, folder=True),
     "mhaseq": Format("s.igs.mha", write_sequence, TrackedSequence.read, 1500),
     "nrrdseq": Format("s.seq.nrrd", write_sequence, TrackedSequence.read, 1500),

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from SlicerUSSim.Logic.base.dicom_elements import require_sound_elements
+from SlicerUSSim.Logic.base.dicom_elements import is_compressed, require_sound_elements
 from SlicerUSSim.Logic.base.errors import SimulationError, require
 from SlicerUSSim.Logic.base.headers import MOST_VOXELS, is_dicom, require_held, require_spacing
 from SlicerUSSim.Logic.base.reading import reader
@@ -167,6 +167,18 @@ def series_with(file: Path) -> Series | None:
         if series.uid.startswith(uid) and file.name in names and len(series.files) > 1:
             return series
     return None
+
+
+def has_compressed(path: Path) -> bool:
+    """Whether DICOM images in a folder, or those beside one, are compressed.
+
+    They are read in a child process: decoders of JPEG and JPEG 2000 are where image libraries are broken into, and
+    print several lines about a damaged one.
+    """
+    if not path.is_dir() and not is_dicom(path):
+        return False
+    beside = path.rglob("*") if path.is_dir() else path.parent.iterdir()
+    return any(file.is_file() and is_compressed(file) for file in islice(beside, _MOST_FILES))
 
 
 def read_series(series: Series, name: str):

@@ -20,7 +20,10 @@ _PIXELS, _ITEM, _SYNTAX = (0x7FE0, 0x0010), (0xFFFE, 0xE000), (0x0002, 0x0010)
 #: Value representations with a length of four bytes (PS3.5, table 7.1-1); those of sequences are walked through
 _LONG = {b"OB", b"OD", b"OF", b"OL", b"OV", b"OW", b"SQ", b"SV", b"UC", b"UN", b"UR", b"UT", b"UV"}
 _TYPES = _LONG | set(b"AE AS AT CS DA DS DT FL FD IS LO LT PN SH SL SS ST TM UI UL US".split())
+#: The bytes before the length of the transfer syntax, and how far into the file it is at most
+_SYNTAX_ELEMENT, _META_BYTES = b"\x02\x00\x10\x00UI", 4096
 _IMPLICIT, _BIG_ENDIAN, _DEFLATED = b"1.2.840.10008.1.2", b"1.2.840.10008.1.2.2", b"1.2.840.10008.1.2.1.99"
+_UNCOMPRESSED = (_IMPLICIT, b"1.2.840.10008.1.2.1", _BIG_ENDIAN)
 
 
 def require_sound_elements(path: Path) -> None:
@@ -41,6 +44,20 @@ def require_sound_elements(path: Path) -> None:
         damage = _damage(content, start)
     if damage:
         raise SimulationError(f"{path}: is damaged: {damage}; copy or export it again")
+
+
+def is_compressed(file: Path) -> bool:
+    """Whether a DICOM file says that its pixels are compressed, or are in another way that is not among the plain ones.
+
+    False for other files, and for older ones without a prefix, which cannot say so.
+    """
+    with file.open("rb") as opened:
+        start = opened.read(_META_BYTES)
+    if start[_PREAMBLE : _PREAMBLE + 4] != _PREFIX:
+        return False
+    _, found, value = start.partition(_SYNTAX_ELEMENT)
+    length = int.from_bytes(value[:2], "little")
+    return not found or value[2 : 2 + length].rstrip(b"\0 ") not in _UNCOMPRESSED
 
 
 def _damage(content: mmap.mmap, at: int) -> str:

@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from xml.parsers import expat
 
-from SlicerUSSim.Logic.base.dicom_elements import require_sound_elements
+from SlicerUSSim.Logic.base.dicom_elements import is_compressed, require_sound_elements
 from SlicerUSSim.Logic.base.errors import SimulationError, require, shown_path
 
 #: Voxels of the largest image: 2000 slices of 1024 x 1024
@@ -24,11 +24,8 @@ _MOST_EXPANSION = 1100
 _ONE_FILE = (".mha", ".nii", ".nii.gz", ".nrrd", ".mgz", ".mgh", ".vti")
 #: Endings of DICOM files that may lack the prefix
 _DICOM = (".dcm", ".ima")
-#: Transfer syntaxes of DICOM without compression, in which a byte holds at most eight pixels of one bit, and where the
-#: element with the syntax is: behind the preamble of 128 bytes and DICM, with an explicit type and two bytes of length
-_UNCOMPRESSED = (b"1.2.840.10008.1.2", b"1.2.840.10008.1.2.1", b"1.2.840.10008.1.2.2")
+#: Pixels of one bit in a byte of a DICOM file that is not compressed
 _PIXELS_PER_BYTE = 8
-_SYNTAX, _META_BYTES = b"\x02\x00\x10\x00UI", 4096
 #: Largest coordinate, direction and voxel size that is read, in any unit of length
 _MOST = 1e9
 #: The part of a file in which its header ends; sequences have some hundred bytes for every image
@@ -91,10 +88,7 @@ def _most_held(file: Path) -> int | None:
     """Bytes of voxels that a file can hold, a pixel of one bit counted as a byte; None for formats of several files."""
     expansion = _MOST_EXPANSION
     if is_dicom(file):
-        with file.open("rb") as opened:
-            _, found, value = opened.read(_META_BYTES).partition(_SYNTAX)
-        length = int.from_bytes(value[:2], "little")
-        if found and value[2 : 2 + length].rstrip(b"\0 ") in _UNCOMPRESSED:
+        if not is_compressed(file):
             expansion = _PIXELS_PER_BYTE
     elif not file.name.lower().endswith(_ONE_FILE):
         return None
