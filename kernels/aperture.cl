@@ -50,7 +50,8 @@ inline float point_angle(__constant const Acquisition *acquisition, float along)
 
 inline float2 point_on_face(__constant const Acquisition *acquisition, float along) {
   const float angle = point_angle(acquisition, along);
-  return angle == 0.0f ? (float2)(along, 0.0f) : acquisition->apex_radius_mm * (float2)(sin(angle), cos(angle) - 1.0f);
+  return angle == 0.0f ? (float2)(along, 0.0f)
+                       : acquisition->apex_radius_mm * (float2)(sin_of(angle), cos_of(angle) - 1.0f);
 }
 
 // Extra path and nepers per mm of tissue beside `soft`, of which strong tissue has the attenuation, and also the extra
@@ -81,7 +82,7 @@ inline float4 rates_in_cell(__global const float4 *acoustics, __global const ush
 
 // What a border takes from an amplitude, both ways, in nepers.
 inline float border_nepers(float impedance, float other_impedance) {
-  return -log(fmax(1.0f - square_reflection(impedance, other_impedance), 1e-6f));
+  return -log_fast(fmax(1.0f - square_reflection(impedance, other_impedance), 1e-6f));
 }
 
 // One work-item follows one ray of a fan. Global size (angles, points, rows). Look-ups are trilinear, so that sums over
@@ -102,8 +103,9 @@ __kernel void fans(__constant const Acquisition *acquisition, __global const ush
   const float angle = own + point_angle(acquisition, along);
   const float3 start = affine_point(acquisition->ras_to_voxel,
                                     affine_point(acquisition->probe_to_ras, (float3)(origin.x, origin.y, 0.0f)));
-  const float3 step = affine_vector(acquisition->ras_to_voxel,
-                                    affine_vector(acquisition->probe_to_ras, (float3)(sin(angle), cos(angle), 0.0f)));
+  const float3 step =
+      affine_vector(acquisition->ras_to_voxel,
+                    affine_vector(acquisition->probe_to_ras, (float3)(sin_of(angle), cos_of(angle), 0.0f)));
   const float3 aside =
       affine_vector(acquisition->ras_to_voxel, affine_vector(acquisition->probe_to_ras, (float3)(0.0f, 0.0f, 1.0f))) *
       (ROW_SIGMA * (row - 1));
@@ -184,7 +186,7 @@ __kernel void fans(__constant const Acquisition *acquisition, __global const ush
         strong += length * excess;
         // Beside bone a line is covered in part, as its neighbours are in whole: no step as the edge comes to it.
         if (bone > covered) {
-          strong += 2.0f * log((1.0f - covered) / fmax(1.0f - bone, LEAST_OPEN));
+          strong += 2.0f * log_fast((1.0f - covered) / fmax(1.0f - bone, LEAST_OPEN));
           covered = fmin(bone, 1.0f - LEAST_OPEN);
           is_seen = 1;
         }
@@ -205,7 +207,7 @@ __kernel void fans(__constant const Acquisition *acquisition, __global const ush
 }
 
 // The amplitude that is left after these nepers (both ways) in strong tissue.
-inline float passed_strong(float nepers) { return nepers == 0.0f ? 1.0f : exp(-0.5f * fmax(nepers, -4.0f)); }
+inline float passed_strong(float nepers) { return nepers == 0.0f ? 1.0f : exp_fast(-0.5f * fmax(nepers, -4.0f)); }
 
 // The sums of a point's fan in the direction `place` (in rays) at distance `far` (in stored depths); of strong tissue
 // the amplitude that passes it. Between a ray in bone and one beside it that is half, where the mean of the nepers is
@@ -247,7 +249,7 @@ inline float overlap(const float2 *first, const float2 *second, int count) {
 inline float3 place_in_fan(__constant const Acquisition *acquisition, float along, float2 target) {
   const float2 towards = target - point_on_face(acquisition, along);
   const float away = sqrt(towards.x * towards.x + towards.y * towards.y);
-  const float turned = atan2(towards.x, towards.y) - point_angle(acquisition, along);
+  const float turned = direction_of(towards.x, towards.y) - point_angle(acquisition, along);
   return (float3)(clamp((turned - acquisition->fan_first_angle) / acquisition->fan_angle_step, 0.0f,
                         acquisition->fan_angles - 1.001f),
                   clamp(away / acquisition->fan_step, 0.0f, acquisition->fan_depths - 1.001f), away);
@@ -266,7 +268,7 @@ inline Axis axis_of(__constant const Acquisition *acquisition, int line) {
   const float radius = acquisition->apex_radius_mm;
   Axis axis;
   axis.direction = acquisition->linear ? (float2)(acquisition->steering_sin, acquisition->steering_cos)
-                                       : (float2)(sin(position), cos(position));
+                                       : (float2)(sin_of(position), cos_of(position));
   axis.centre = acquisition->linear ? position / acquisition->steering_cos : radius * position;
   if (acquisition->steered && !acquisition->linear) axis.centre = radius * axis.direction.x / axis.direction.y;
   axis.origin = acquisition->flat_face ? (float2)(axis.centre, 0.0f)
@@ -533,8 +535,8 @@ inline float4 level_and_spread(__constant const Acquisition *acquisition, const 
     level = fmax(overlap(waves.received, waves.transmitted, count) / still, LEAST_POWER * by_soft);
   }
   const float own = lines->uneven < LEAST_UNEVEN ? loss : lines->least_loss;  // that of a line which is `kept`
-  return (float4)(own - loss - 0.5f * log(by_soft), 0.5f * log(by_soft / level), spread,
-                  differs > 0.0f ? -0.5f * log(fmax(lit / fmax(all, 1e-6f), LEAST_POWER)) : 0.0f);
+  return (float4)(own - loss - 0.5f * log_fast(by_soft), 0.5f * log_fast(by_soft / level), spread,
+                  differs > 0.0f ? -0.5f * log_fast(fmax(lit / fmax(all, 1e-6f), LEAST_POWER)) : 0.0f);
 }
 
 // Of lines that soft tissue alone disturbs: the mean loss of what arrives.
@@ -633,7 +635,7 @@ inline float mean_passed(__constant const Acquisition *acquisition, __global con
     const float place = clamp(line + side * 1.2247449f * sigma, 0.0f, lines - 1.001f);
     const int left = (int)place;
     const float a = screens_[4 * (left * nodes + node)], b = screens_[4 * ((left + 1) * nodes + node)];
-    sum += 0.1666667f * exp(clamp(-2.0f * (blend(a, b, place - left) - own), -10.0f, 10.0f));
+    sum += 0.1666667f * exp_fast(clamp(-2.0f * (blend(a, b, place - left) - own), -10.0f, 10.0f));
   }
   return sum;
 }

@@ -19,7 +19,7 @@ __kernel void direct_path(__constant const Acquisition *acquisition, __global co
     __global const Segment *segment = segments + line * MAX_SEGMENTS + index;
     if (segment->reflections > 0) continue;
     const float end = segment->depth_mm + segment->length_mm * segment->depth_per_mm;
-    const float before = -log(segment->attenuation);
+    const float before = -log_fast(segment->attenuation);
     for (; sample < acquisition->samples && sample * acquisition->sample_mm <= end; sample++) {
       const float along = fmax(sample * acquisition->sample_mm - segment->depth_mm, 0.0f) / segment->depth_per_mm;
       spent = before + segment->decay_per_mm * along;

@@ -54,7 +54,7 @@ __kernel void shift_frequency(__constant const Acquisition *acquisition, __globa
   const float cycles = acquisition->sample_mm * acquisition->cycles_per_mm;
   floatn step_c, step_s;
   turn((1.0f - frequency_at(of_line, sample)) * cycles, &step_c, &step_s);
-  const floatn kept = rsqrt((2.0f + step_c) / 3.0f);
+  const floatn kept = 1.0f / sqrt((2.0f + step_c) / 3.0f);
   const floatn x = kept * LOAD_LANES(re + here), y = kept * LOAD_LANES(im + here);
   STORE_LANES(x * c - y * s, re + here);
   STORE_LANES(x * s + y * c, im + here);

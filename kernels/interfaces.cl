@@ -56,7 +56,7 @@ inline float flatness(float turning) { return 1.0f / (1.0f + 16.0f * turning * t
 // integral. A single hit, or one far from the next, is all of the beam: no patch is moved farther than to its middle.
 inline float part_carried(float least, float phase, float most, float flat) {
   const float share = phase / most, part = fmin(least, 1.0f);
-  return part + flat * (1.0f - part) * (1.0f - rsqrt(1.0f + share * share));
+  return part + flat * (1.0f - part) * (1.0f - 1.0f / sqrt(1.0f + share * share));
 }
 
 // One work-item computes the walls of one traced line.
@@ -108,10 +108,10 @@ __kernel void find_walls(__constant const Acquisition *acquisition, __global con
       // Of a bent patch only the Fresnel zone contributes. The mean curvature says nothing of its direction; laterally,
       // where patches are wide, this is within 2 dB of theory for spheres and for cylinders along and across the plane.
       const float zones = per_mm * bend * inside * sigma2;
-      wall.echo *= rsqrt(sqrt(1.0f + zones * zones));
+      wall.echo /= sqrt(sqrt(1.0f + zones * zones));
       const float share = patch_echo(phase2, inside2, pulse);
       if (share < 1e-4f) continue;
-      const float lines = step * rsqrt(width2), per_line = lines / every;
+      const float lines = step / sqrt(width2), per_line = lines / every;
       wall.depth_per_line = carried * hit->lateral_slope * step / every;
       wall.echo *= share * 0.39894228f * lines;  // 1 / sqrt(2 pi): unit sum over the lines
       wall.fall = -0.5f * LOG2_E * per_line * per_line;

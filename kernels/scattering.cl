@@ -714,16 +714,16 @@ __kernel void scatter(__constant const Acquisition *acquisition, __global const 
 #endif
       // Unit energy of the point spread function for all widths: sqrt(1 / (sigma_l sigma_e)) times the scale. The
       // weights of beam.cl have unit sum, that is apart / (sqrt(2 pi) sigma_l) at the peak.
-      const float gain = log2(segment->weight * segment->attenuation * acquisition->speckle_scale * 2.50662827f);
+      const float gain = log2_scalar(segment->weight * segment->attenuation * acquisition->speckle_scale * 2.50662827f);
       const float decay = LOG2_E * segment->decay_per_mm;
       // Behind a curved mirror the same power is spread over a wider tube.
       const float4 tube_low = tube_after(vload4(0, segment->tube), low);
       const float4 tube_high = tube_after(vload4(0, segment->tube), high);
       piece.gain0 = gain + LOG2_E * band_low - decay * low +
-                    0.5f * log2(sigma_low.x / (tall_low * tube_low.x * tube_low.z)) - log2(apart_low);
+                    0.5f * log2_scalar(sigma_low.x / (tall_low * tube_low.x * tube_low.z)) - log2_scalar(apart_low);
       piece.gain1 = gain + LOG2_E * band_high - decay * high +
-                    0.5f * log2(sigma_high.x / (tall_high * tube_high.x * tube_high.z)) - log2(apart_high) -
-                    piece.gain0;
+                    0.5f * log2_scalar(sigma_high.x / (tall_high * tube_high.x * tube_high.z)) -
+                    log2_scalar(apart_high) - piece.gain0;
 
       // Off the axis of a curved array the same range is reached slightly earlier.
       const float lines_aside = max(line - left_line, left_line + lines - 1 - line) + 0.5f;

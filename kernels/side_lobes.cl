@@ -126,14 +126,15 @@ __kernel void side_lobes(__constant const Acquisition *acquisition, __global con
     at_node(node_re, node_im, places, offsets, weights, last, nodes, reach, &lobe_re, &lobe_im);
     // Of those that there are
     const int left = min(last, reach), right = min(nodes - 1 - last, reach);
-    const float kept = rsqrt(1.0f + power[0] + (left > 0 ? power[left] : 0.0f) + (right > 0 ? power[right] : 0.0f));
+    const float kept =
+        1.0f / sqrt(1.0f + power[0] + (left > 0 ? power[left] : 0.0f) + (right > 0 ? power[right] : 0.0f));
     if (node == 0) before_re = lobe_re, before_im = lobe_im, before_kept = kept;
     // Up to the middle of the lines of this node
     const int end = node == nodes ? lines : min(lines, node * step + step / 2);
     for (; line < end; line++) {
       const float part = (line + 0.5f) / step + 0.5f - node;
       // Nodes are independent: equal power between them
-      const float even = node == 0 || node == nodes ? 1.0f : rsqrt(1.0f - 2.0f * part * (1.0f - part));
+      const float even = node == 0 || node == nodes ? 1.0f : 1.0f / sqrt(1.0f - 2.0f * part * (1.0f - part));
       floatn x = LOAD_LANES(re + line * stride + here), y = LOAD_LANES(im + line * stride + here);
       const float whole = blend(before_kept, kept, part);
       x = whole * (x - even * (before_im + part * (lobe_im - before_im)));

@@ -13,8 +13,9 @@ from hypothesis import given, settings, strategies as st
 
 from SlicerUSSim.Logic import SimulationError, Volume
 from SlicerUSSim.Logic.tissue import TissueTable
-from SlicerUSSim.Logic.tracked.pose_files import read_pose, read_tags
-from SlicerUSSim.Logic.tracked.sequence import TrackedSequence
+from SlicerUSSim.Logic.tissue.label_files import read_names
+from SlicerUSSim.Logic.tracked.pose_files import read_pose, read_tags, read_transform
+from SlicerUSSim.Logic.tracked.sequence import TrackedSequence, read_coordinate_definitions
 
 ARRAY = (np.arange(6 * 5 * 4) % 200).reshape(6, 5, 4).astype(np.int16)
 #: What numbers of a header are replaced by
@@ -152,6 +153,47 @@ def test_a_transform_that_is_not_text_is_one_line(tmp_path, damage):
 
 
 @pytest.mark.parametrize(
+    "old, new, words",
+    [
+        ("0.1 0.2", "inf 0.2", "Parameters of Euler3DTransform has 'inf', expected numbers"),  # ended the process
+        ("0.1 0.2 ", "", "Euler3DTransform has 4 parameters, expected 6"),  # was made of what lies behind in memory
+        ("Parameters: 0.1", "P: 0.1", "expected Transform, Parameters and FixedParameters"),  # was the identity
+        ("\nFixedParameters: 0 0 0 0", "", "expected Transform, Parameters and FixedParameters"),  # was the identity
+        ("Euler3DTransform_double_3_3", "BSplineTransform_double_3_3", "expected a linear one"),
+        ("Euler3DTransform_double_3_3", "Euler2DTransform_double_2_2", "expected a linear one in three dimensions"),
+        ("#Transform 0\n", "#Transform 0\nTransform: IdentityTransform_double_3_3\nParameters: \nFixedParameters: \n",
+         "has 2 transforms that are not chained"),  # all but the first were left out
+    ],
+)  # fmt: skip
+def test_a_transform_without_all_its_numbers_is_refused(tmp_path, old, new, words):
+    path = tmp_path / "pose.tfm"
+    sitk.WriteTransform(sitk.Euler3DTransform((0, 0, 0), 0.1, 0.2, 0.3, (1, 2, 3)), str(path))
+    refused(with_bytes(path, old.encode(), new.encode()), words, read_pose)
+
+
+@pytest.mark.parametrize("suffix", [".tfm", ".mat", ".h5"])
+def test_every_rigid_kind_of_transform_and_a_chain_of_them_are_read(tmp_path, suffix):
+    path = tmp_path / f"pose{suffix}"
+    euler = sitk.Euler3DTransform((0, 0, 0), 0.1, 0.2, 0.3, (1, 2, 3))
+    affine = sitk.AffineTransform(3)
+    affine.SetMatrix(euler.GetMatrix())
+    affine.SetTranslation(euler.GetTranslation())
+    versor = sitk.VersorRigid3DTransform()
+    versor.SetMatrix(euler.GetMatrix())
+    versor.SetTranslation(euler.GetTranslation())
+    sitk.WriteTransform(euler, str(path))
+    expected = read_pose(path)
+    assert abs(expected - np.eye(4)).max() > 1.0
+    for other in (affine, versor):
+        sitk.WriteTransform(other, str(path))
+        np.testing.assert_allclose(read_pose(path), expected, atol=1e-12)
+    if suffix != ".mat":  # which holds no chain
+        sitk.WriteTransform(sitk.CompositeTransform([euler, sitk.TranslationTransform(3, (0, 0, 5))]), str(path))
+        np.testing.assert_allclose(read_pose(path)[:3, :3], expected[:3, :3], atol=1e-12)
+        assert abs(read_pose(path)[:3, 3] - expected[:3, 3]).max() > 1.0
+
+
+@pytest.mark.parametrize(
     "text", ["1" + "0" * 400, '{"tissues": 5}', '{"tissues": {"1": {"name": "csf", "sources": 5}}}']
 )
 def test_a_table_of_other_content_is_one_line(tmp_path, text):
@@ -164,3 +206,18 @@ def test_tags_that_are_no_numbers_are_one_line(tmp_path):
     path = tmp_path / "points.tag"
     path.write_text("MNI Tag Point File\nVolumes = 1;\nPoints =\n 1 2 1e999;\n")
     refused(path, "", read_tags)
+
+
+@pytest.mark.parametrize(
+    ("name", "read"),
+    [
+        ("p.txt", read_pose), ("t.tfm", read_pose), ("t.xfm", read_transform), ("p.tag", read_tags),
+        ("plus.xml", read_coordinate_definitions), ("n.ctbl", read_names), ("p.json", read_pose),
+        ("t.json", TissueTable.read),
+    ],
+)  # fmt: skip
+def test_a_text_far_larger_than_any_of_its_kind_is_refused_before_it_is_read(tmp_path, name, read):
+    path = tmp_path / name
+    path.write_text("#Insight\n" if name == "t.tfm" else "1 ")
+    os.truncate(path, 2**40)  # without blocks on the disk
+    refused(path, f"has {2**40} bytes, expected at most", read)

@@ -20,8 +20,9 @@ from SlicerUSSim.Logic import LinearProbe, SimulationError, TissueTable, Ultraso
 from SlicerUSSim.Logic.opencl import runtimes
 from SlicerUSSim.Logic.opencl.device import Device, kernel_folder
 from SlicerUSSim.Logic.opencl.devices import DeviceInfo, choose_device, faster_hint
+from SlicerUSSim.Logic.opencl.layout import shared_source
 from SlicerUSSim.Logic.opencl.pocl import name_unknown_processor, remove_damaged_kernels, require_linker
-from SlicerUSSim.Logic.opencl.runtimes import register_pip_runtimes
+from SlicerUSSim.Logic.opencl.runtimes import pocl_of_pip, register_pip_runtimes
 from SlicerUSSim.Logic.probe import pose_looking_at
 from tests.conftest import SPECKLE, block, rigid, simulator
 
@@ -294,6 +295,7 @@ import os, sys
 import numpy as np
 from SlicerUSSim.Logic import LinearProbe, SimulationError, TissueTable, UltrasoundSimulator, Volume
 from SlicerUSSim.Logic.probe import pose_looking_at
+from SlicerUSSim.Logic.opencl.runtimes import pocl_of_pip
 from SlicerUSSim.Logic.opencl.device import Device
 
 labels = Volume(np.ones((30, 30, 30), np.uint8), np.eye(4))
@@ -395,6 +397,7 @@ def _in_process(script: str, **environment: str) -> subprocess.CompletedProcess[
 _LIMITED = """
 import resource
 from SlicerUSSim.Logic import list_devices
+from SlicerUSSim.Logic.opencl.runtimes import pocl_of_pip
 from SlicerUSSim.Logic.opencl.device import Device
 found = list_devices() if {after} else []
 resource.setrlimit(resource.RLIMIT_AS, (400 * 10**6, resource.RLIM_INFINITY))
@@ -409,6 +412,31 @@ def test_too_small_an_address_space_is_named(after):
     done = _in_process(_LIMITED.format(after=after))
     assert done.returncode == 0, done.stderr[-800:]
     assert re.search(r"refused: .*limited to 400 MB \(ulimit -v\), expected at least \d+ MB", done.stdout), done.stdout
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="PoCL's wheel is for Linux")
+def test_a_cache_that_cannot_be_written_is_named(tmp_path):
+    """PoCL has no device then; without this: "no OpenCL device found; run: pip install"."""
+    (tmp_path / "file").write_text("")
+    done = _in_process(
+        "from SlicerUSSim.Logic.opencl.device import Device\nDevice.get('pocl')",
+        XDG_CACHE_HOME=str(tmp_path / "file"), OCL_ICD_VENDORS=_only_pocl(tmp_path),
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr[-800:]
+    assert re.search(
+        r"refused: .*PoCL keeps programs in .*file/pocl/kcache, which cannot be written \(Not a dir", done.stdout
+    )
+
+
+def _only_pocl(folder: Path) -> str:
+    """A folder for the loader that names PoCL alone."""
+    library = pocl_of_pip()
+    if library is None:
+        pytest.skip("needs PoCL's wheel")
+    vendors = folder / "vendors"
+    vendors.mkdir()
+    (vendors / "pocl.icd").write_text(str(library))
+    return str(vendors)
 
 
 def test_a_full_disk_of_the_caches_is_named(monkeypatch):
@@ -433,3 +461,48 @@ def test_a_refused_buffer_names_its_size(monkeypatch):
     for ask in (lambda: device.empty(3 * 2**20), lambda: device.upload(np.zeros(3 * 2**20, np.uint8))):
         with pytest.raises(SimulationError, match="has no memory for a buffer of 3 MB; close other programs"):
             ask()
+
+
+def test_kernels_call_no_function_that_devices_round_differently():
+    """Built-in square roots and divisions are rounded as in IEEE 754, fma too; those named here are not."""
+    names = (
+        "log|log2|log10|exp|exp2|exp10|pow|powr|pown|sin|cos|tan|sincos|asin|acos|atan|atan2|sinh|cosh|tanh|erf|erfc"
+    )
+    names += "|cbrt|rsqrt|hypot|mad|length|normalize|distance|fast_[a-z]+|native_[a-z0-9]+|half_[a-z0-9]+|lgamma|tgamma"
+    called = re.compile(rf"(?<![\w.])({names})\s*\(")
+    found = []
+    for path in sorted(kernel_folder().glob("*.cl*")):
+        if path.name == "machine.cl":  # measures a device's speed
+            continue
+        code = re.sub(r"//[^\n]*|/\*.*?\*/", "", path.read_text(), flags=re.DOTALL)
+        found += [f"{path.name}: {match[1]}" for match in called.finditer(code)]
+    assert not found
+
+
+def test_sines_cosines_and_angles_of_the_kernels_are_those_of_numpy():
+    device = Device.get()
+    angles = np.linspace(-7.0, 7.0, 4001).astype(np.float32)
+    x, y = np.cos(angles.astype(float)), np.sin(angles.astype(float))
+    source = shared_source() + (kernel_folder() / "common.clh").read_text() + _ANGLES
+    kernel = device.cl.Program(device.context, source).build(options=["-cl-std=CL1.2", "-DLANES=1"]).angles
+    out = device.empty(4 * 3 * angles.size)
+    pairs = device.upload(np.stack([x, y], -1).astype(np.float32))
+    device.run(kernel, (angles.size,), device.upload(angles), pairs, out)
+    sine, cosine, direction = device.download(out, (angles.size, 3), np.float32).T
+    np.testing.assert_allclose(sine, y, atol=4e-7)
+    np.testing.assert_allclose(cosine, x, atol=4e-7)
+    expected = np.arctan2(y, x)
+    np.testing.assert_allclose(
+        np.where(np.abs(expected) > 3.14159, np.abs(direction), direction),
+        np.where(np.abs(expected) > 3.14159, np.abs(expected), expected),
+        atol=6e-7,
+    )
+
+
+_ANGLES = """
+__kernel void angles(__global const float *of, __global const float *pairs, __global float *out) {
+  const int n = get_global_id(0);
+  out[3 * n] = sin_of(of[n]), out[3 * n + 1] = cos_of(of[n]);
+  out[3 * n + 2] = direction_of(pairs[2 * n + 1], pairs[2 * n]);
+}
+"""

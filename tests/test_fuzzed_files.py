@@ -21,6 +21,7 @@ import SimpleITK as sitk
 from hypothesis import HealthCheck, given, settings, strategies as st
 
 from SlicerUSSim.Logic import SimulationError, TissueTable, Volume
+from SlicerUSSim.Logic.base.volume import read_array
 from SlicerUSSim.Logic.imaging.preset import Preset
 from SlicerUSSim.Logic.mri.sheets import Surfels
 from SlicerUSSim.Logic.mri.sheets.polydata import read_surfels, write_surfels
@@ -62,6 +63,36 @@ def write_dicom(path: Path) -> None:
     sitk.WriteImage(sitk.GetImageFromArray(np.arange(80, dtype=np.uint16).reshape(4, 4, 5)), str(path))
 
 
+def write_bare_dicom(path: Path) -> None:
+    whole = path.with_suffix(".dcm")
+    write_dicom(whole)
+    whole.rename(path)
+
+
+def write_compressed_dicom(path: Path) -> None:
+    writer = sitk.ImageFileWriter()
+    writer.UseCompressionOn()
+    writer.SetCompressor("JPEG2000")
+    writer.SetFileName(str(path))
+    # A small one corrupts the memory of its writer
+    writer.Execute(sitk.GetImageFromArray(np.add.outer(np.arange(64), np.arange(48)).astype(np.uint16)[None]))
+
+
+def write_dicom_series(path: Path) -> None:
+    """Twelve images in a folder, one of which is `path`."""
+    image = sitk.GetImageFromArray(np.arange(20, dtype=np.uint16).reshape(4, 5))
+    writer = sitk.ImageFileWriter()
+    writer.KeepOriginalImageUIDOn()
+    for k in range(12):
+        for key, value in {
+            "0008|0060": "MR", "0020|000e": "1.2.3", "0020|0032": f"0\\0\\{2 * k}", "0020|0037": "1\\0\\0\\0\\1\\0",
+            "0008|0018": f"1.2.3.{k}",
+        }.items():  # fmt: skip
+            image.SetMetaData(key, value)
+        writer.SetFileName(str(path.with_name(f"{k}.dcm")))
+        writer.Execute(image)
+
+
 def text(content: str) -> Callable[[Path], object]:
     return lambda path: path.write_text(content)
 
@@ -85,6 +116,12 @@ class Format(NamedTuple):
     header_bytes: int
     #: Whether each input costs a child process
     in_child: bool = False
+    #: Whether what is read is the folder of the file
+    folder: bool = False
+
+    def of(self, path: Path) -> Path:
+        """What is read."""
+        return path.parent if self.folder else path
 
 
 FORMATS = {
@@ -97,6 +134,9 @@ FORMATS = {
     "mgh": Format("v.mgh", write_mgh, Volume.read, 284),
     "mnc": Format("v.mnc", write_volume, Volume.read, 9000, in_child=True),
     "dcm": Format("v.dcm", write_dicom, Volume.read, 900),
+    "IM": Format("IM1", write_bare_dicom, Volume.read, 900),
+    "j2k": Format("j.dcm", write_compressed_dicom, read_array, 900, in_child=True),
+    "dcms": Format("3.dcm", write_dicom_series, Volume.read, 900, folder=True),
     "mhaseq": Format("s.igs.mha", write_sequence, TrackedSequence.read, 1500),
     "nrrdseq": Format("s.seq.nrrd", write_sequence, TrackedSequence.read, 1500),
     "pose": Format("p.json", lambda path: write_pose(path, np.eye(4)), read_pose, 250),
@@ -166,9 +206,11 @@ def is_read_or_refused(path: Path, read: Callable[[Path], object]) -> None:
 
 
 def test_every_format_is_read_before_it_is_damaged(tmp_path):
-    for file in FORMATS.values():
-        file.write(tmp_path / file.name)
-        assert file.read(tmp_path / file.name) is not None
+    for number, file in enumerate(FORMATS.values()):
+        path = tmp_path / str(number) / file.name
+        path.parent.mkdir()
+        file.write(path)
+        assert file.read(file.of(path)) is not None
 
 
 @pytest.mark.parametrize("name", FORMATS)
@@ -185,7 +227,7 @@ def test_a_damaged_file_is_read_or_refused_in_one_line(name, tmp_path_factory):
     @given(content=damages(whole, file.header_bytes))
     def damaged(content: bytes) -> None:
         path.write_bytes(content)
-        is_read_or_refused(path, file.read)
+        is_read_or_refused(file.of(path), file.read)
 
     damaged()
 

@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 from SlicerUSSim.Logic import SimulationError, Volume
 from SlicerUSSim.Logic.base.files import written_whole
 from SlicerUSSim.Logic.base.transforms import check_rigid
+from SlicerUSSim.Logic.base.volume import read_array
 
 angles = st.floats(-180, 180)
 spacings = st.floats(0.2, 6.0)
@@ -66,7 +67,7 @@ def test_minc2_is_read_as_written_by_itk(tmp_path):
     np.testing.assert_allclose(back.array, numbered(), atol=1e-3)
 
 
-def write_dicom(volume, folder, patient="Nobody"):
+def write_dicom(volume, folder, patient="Nobody", compressor=""):
     """A series of one file per slice."""
     import SimpleITK as sitk
 
@@ -74,6 +75,9 @@ def write_dicom(volume, folder, patient="Nobody"):
     image = volume.to_sitk()
     writer = sitk.ImageFileWriter()
     writer.KeepOriginalImageUIDOn()
+    if compressor:
+        writer.UseCompressionOn()
+        writer.SetCompressor(compressor)
     for k in range(image.GetSize()[2]):
         sheet = image[:, :, k]
         position = image.TransformIndexToPhysicalPoint((0, 0, k))
@@ -168,6 +172,130 @@ def test_names_of_patients_stay_out_of_messages_logs_and_files(tmp_path, caplog)
     said += str(error.value).replace(str(tmp_path), "").encode()
     for secret in (b"Jane", b"Rick", b"Number4711"):
         assert secret not in said
+
+
+def of_size(dicom: bytes, rows: int, columns: int, frames: int = 0) -> bytes:
+    """A DICOM file that promises another size."""
+    content = bytearray(dicom)
+    for element, value in ((0x10, rows), (0x11, columns)):
+        at = content.index(tag(0x28, element))
+        content[at + 8 : at + 10] = value.to_bytes(2, "little")
+    if frames:
+        text = str(frames).encode()
+        text += b" " * (len(text) % 2)
+        at = content.index(tag(0x28, 0x10))
+        content[at:at] = tag(0x28, 0x08) + len(text).to_bytes(4, "little") + text
+    return bytes(content)
+
+
+@pytest.mark.parametrize("name", ["0.dcm", "IM0"])
+@pytest.mark.parametrize(
+    ("size", "words"),
+    [
+        ((65535, 65535), "voxels.* expected at most 2147483648 in all"),
+        ((9000, 9000), r"promises .* voxels, \d+ bytes, which its \d+ bytes cannot hold; copy or export it again"),
+        ((40, 50, 500), r"promises .* voxels, \d+ bytes, which its \d+ bytes cannot hold; copy or export it again"),
+        ((40, 50, 2000000), "voxels.* expected at most 2147483648 in all"),
+    ],
+)
+@pytest.mark.parametrize("how", ["one", "series", "folder"])
+def test_what_a_dicom_file_promises_is_bounded_before_it_is_read(tmp_path, monkeypatch, name, size, words, how):
+    """Without a suffix, and as one of a series, ITK asked for the memory that the header says."""
+    import SimpleITK as sitk
+
+    write_dicom(Volume(numbered((6, 40, 50)), np.diag([-1.0, -1.0, 2.5, 1.0])), tmp_path)
+    whole = (tmp_path / "0.dcm").read_bytes()
+    if how == "one":
+        for path in tmp_path.iterdir():
+            path.unlink()
+        (tmp_path / name).write_bytes(of_size(whole, *size))
+    else:
+        for path in list(tmp_path.iterdir()):
+            path.write_bytes(of_size(path.read_bytes(), *size))
+            path.rename(path.with_name(path.name if name == "0.dcm" else f"IM{path.stem}"))
+    monkeypatch.setattr(sitk.ImageFileReader, "Execute", lambda *_: pytest.fail("it was read"))
+    monkeypatch.setattr(sitk.ImageSeriesReader, "Execute", lambda *_: pytest.fail("it was read"))
+    with pytest.raises(SimulationError, match=words):
+        Volume.read(tmp_path if how == "folder" else tmp_path / name)
+
+
+def with_length(dicom: bytes, at: int, length: int) -> bytes:
+    return dicom[:at] + length.to_bytes(4, "little") + dicom[at + 4 :]
+
+
+@pytest.mark.parametrize("where", ["meta", "type", "patient", "sequence", "explicit", "no prefix"])
+@pytest.mark.parametrize("door", ["file", "folder", "array"])
+def test_a_length_far_beyond_the_end_of_a_dicom_file_is_refused(tmp_path, where, door):
+    """GDCM filled 4 GB with zeros for a file of 1.5 kB."""
+    write_dicom(Volume(numbered((6, 40, 50)), np.diag([-1.0, -1.0, 2.5, 1.0])), tmp_path)
+    whole = (tmp_path / "3.dcm").read_bytes()
+    patient = whole.index(tag(0x10, 0x10))
+    if where == "meta":  # its version, explicit as all of that part
+        damaged = with_length(whole, whole.index(tag(2, 1)) + 8, 2**32 - 16)
+    elif where == "type":  # GDCM took this text for a length then: 774 MB
+        at = whole.index(tag(2, 3)) + 4
+        damaged = whole[:at] + b"1.2." + whole[at + 4 :]
+    elif where == "patient":
+        damaged = with_length(whole, patient + 4, 2**32 - 16)
+    elif where == "sequence":  # a code of an anatomic region
+        code = tag(0x08, 0x0100) + b"\xf0\xff\xff\xf0" + b"T-A0100 "
+        inner = tag(0xFFFE, 0xE000) + len(code).to_bytes(4, "little") + code
+        damaged = whole[:patient] + tag(0x08, 0x2218) + len(inner).to_bytes(4, "little") + inner + whole[patient:]
+    elif where == "explicit":
+        name = tag(0x08, 0x0070) + b"UT\0\0\xf0\xff\xff\xf0" + b"nobody"
+        damaged = whole[:132] + tag(2, 0x10) + b"UI\x14\x001.2.840.10008.1.2.1\0" + name
+    else:
+        damaged = with_length(whole, patient + 4, 2**32 - 16)[whole.index(tag(8, 0x16)) :]
+    (tmp_path / "3.dcm").write_bytes(damaged)
+    read = read_array if door == "array" else Volume.read
+    words = r"has the type b'1\.', expected one of DICOM" if where == "type" else r"has 4\d{9} bytes, and \d+ are left"
+    with pytest.raises(SimulationError, match=rf"3\.dcm: is damaged: its element .* {words}"):
+        read(tmp_path if door == "folder" else tmp_path / "3.dcm")
+
+
+def test_sequences_and_compressed_pixels_are_no_damage(tmp_path):
+    write_dicom(Volume(numbered((6, 40, 50)), np.diag([-1.0, -1.0, 2.5, 1.0])), tmp_path)
+    code = tag(0x08, 0x0100) + b"\x08\0\0\0" + b"T-A0100 "
+    for open_ended in (False, True):
+        end = tag(0xFFFE, 0xE00D) + bytes(4) if open_ended else b""
+        length = b"\xff" * 4 if open_ended else len(code).to_bytes(4, "little")
+        item = tag(0xFFFE, 0xE000) + length + code + end
+        end = tag(0xFFFE, 0xE0DD) + bytes(4) if open_ended else b""
+        length = b"\xff" * 4 if open_ended else len(item).to_bytes(4, "little")
+        for path in tmp_path.iterdir():
+            whole = path.read_bytes()
+            at = whole.index(tag(0x10, 0x10))
+            path.write_bytes(whole[:at] + tag(0x08, 0x2218) + length + item + end + whole[at:])
+        assert Volume.read(tmp_path).array.shape == (6, 40, 50)
+
+
+def test_a_compressed_series_of_one_grey_level_is_read(tmp_path):
+    """Its files are far smaller than its voxels."""
+    volume = Volume(np.full((12, 512, 512), 7, np.int16), np.diag([-1.0, -1.0, 2.5, 1.0]))
+    write_dicom(volume, tmp_path, compressor="JPEG2000")
+    assert sum(path.stat().st_size for path in tmp_path.iterdir()) < volume.array.nbytes / 100
+    for path in (tmp_path, tmp_path / "3.dcm"):
+        np.testing.assert_array_equal(Volume.read(path).array, volume.array)
+
+
+@pytest.mark.parametrize("door", ["folder", "file", "array"])
+def test_compressed_dicom_is_decoded_in_another_process(tmp_path, monkeypatch, door):
+    """Decoders print several lines about a damaged one, and are where image libraries are broken into."""
+    write_dicom(Volume(numbered((12, 40, 50)), np.diag([-1.0, -1.0, 2.5, 1.0])), tmp_path, compressor="JPEG2000")
+    expected = read_array(tmp_path / "3.dcm")[0] if door == "array" else Volume.read(tmp_path).array
+    for name in ("ImageFileReader", "ImageSeriesReader"):
+        monkeypatch.setattr(f"SimpleITK.{name}", lambda: pytest.fail("decoded here"))
+    read = (lambda path: read_array(path)[0]) if door == "array" else (lambda path: Volume.read(path).array)
+    np.testing.assert_array_equal(read(tmp_path if door == "folder" else tmp_path / "3.dcm"), expected)
+
+
+@pytest.mark.parametrize("below", [False, True])
+def test_a_folder_with_more_files_than_any_study_is_refused(tmp_path, monkeypatch, below):
+    monkeypatch.setattr("SlicerUSSim.Logic.base.dicom._MOST_FILES", 5)
+    place = tmp_path / "below" if below else tmp_path
+    write_dicom(Volume(numbered((6, 40, 50)), np.diag([-1.0, -1.0, 2.5, 1.0])), place)
+    with pytest.raises(SimulationError, match="has more than 5 files in it, give the folder of the series"):
+        Volume.read(tmp_path)
 
 
 def tag(group: int, element: int) -> bytes:

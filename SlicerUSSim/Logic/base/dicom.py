@@ -5,12 +5,14 @@ from __future__ import annotations
 import logging
 import re
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
 
+from SlicerUSSim.Logic.base.dicom_elements import is_compressed, require_sound_elements
 from SlicerUSSim.Logic.base.errors import SimulationError, require
-from SlicerUSSim.Logic.base.headers import require_spacing
+from SlicerUSSim.Logic.base.headers import MOST_VOXELS, is_dicom, require_held, require_spacing
 from SlicerUSSim.Logic.base.reading import reader
 
 _log = logging.getLogger(__name__)
@@ -19,8 +21,9 @@ _log = logging.getLogger(__name__)
 _LEAST_IMAGES = 10
 #: Endings of files with a whole volume each
 _ONE_FILE = (".nii", ".nii.gz", ".nrrd", ".mha", ".mgz")
-#: Folders below one that is searched for images
-_MOST_FOLDERS = 1000
+#: Folders below one that is searched for images, and files and folders in a folder and below it: some studies have
+#: 10 000 images, and each is opened
+_MOST_FOLDERS, _MOST_FILES = 1000, 50_000
 #: Spacing that differs by more than this share of the median, and tilt of the stack, that ITK would silently ignore
 _UNEVEN, _TILT_DEG = 0.2, 0.5
 #: Direction cosines that differ by less are the same, as scanners round them
@@ -156,6 +159,7 @@ def series_with(file: Path) -> Series | None:
     """The DICOM series of several images, in its folder, to which a file belongs; None if there is no such series."""
     if not is_dicom(file):
         return None
+    require_sound_elements(file)
     uid = _value(_header(str(file)), "0020|000e")
     for series in _series_of(file.parent):
         # ITK's identifiers begin with the series instance UID.
@@ -165,18 +169,22 @@ def series_with(file: Path) -> Series | None:
     return None
 
 
+def has_compressed(path: Path) -> bool:
+    """Whether DICOM images in a folder, or those beside one, are compressed.
+
+    They are read in a child process: decoders of JPEG and JPEG 2000 are where image libraries are broken into, and
+    print several lines about a damaged one.
+    """
+    if not path.is_dir() and not is_dicom(path):
+        return False
+    beside = path.rglob("*") if path.is_dir() else path.parent.iterdir()
+    return any(file.is_file() and is_compressed(file) for file in islice(beside, _MOST_FILES))
+
+
 def read_series(series: Series, name: str):
     """The SimpleITK image of a series, which is said."""
     _log.warning("%s: is one image of a DICOM series, which is read: %s", name, series)
     return _read(series, name)
-
-
-def is_dicom(file: Path) -> bool:
-    """Whether a file has the DICOM prefix, or the suffix of the older ones that lack it."""
-    if file.suffix.lower() in (".dcm", ".ima"):
-        return True
-    with open(file, "rb") as opened:
-        return opened.read(132)[128:] == b"DICM"
 
 
 def _series_of(folder: Path, recursive: bool = False) -> list[Series]:
@@ -184,8 +192,16 @@ def _series_of(folder: Path, recursive: bool = False) -> list[Series]:
 
     sitk.ProcessObject.SetGlobalWarningDisplay(False)
     folders = [folder]
+    entries = list(islice(folder.rglob("*") if recursive else folder.iterdir(), _MOST_FILES + 1))
+    require(
+        len(entries) <= _MOST_FILES,
+        f"{folder}: has more than {_MOST_FILES} files in it, give the folder of the series, or one of its images",
+    )
+    for file in entries:
+        if file.is_file():
+            require_sound_elements(file)
     if recursive:
-        folders = [place for place in sorted(folder.rglob("*")) if place.is_dir()]
+        folders = sorted(place for place in entries if place.is_dir())
         require(len(folders) <= _MOST_FOLDERS, f"{folder}: has {len(folders)} folders in it, give that of the series")
     uids = {uid for place in folders for uid in sitk.ImageSeriesReader.GetGDCMSeriesIDs(str(place))}
     return sorted(
@@ -197,7 +213,9 @@ def _read(series: Series, name: str):
     import SimpleITK as sitk
 
     _log.info("%s: DICOM series %s with %d files", name, series.uid, len(series.files))
-    _check_slices(series, name)
+    headers = [_header(file) for file in series.files]
+    _require_bounded(series, headers, name)
+    _check_slices(series, headers, name)
     reader = sitk.ImageSeriesReader()
     reader.SetFileNames(series.files)
     try:
@@ -206,7 +224,20 @@ def _read(series: Series, name: str):
         raise SimulationError(f"{name}: cannot be read ({str(error).strip().splitlines()[-1]})") from None
 
 
-def _check_slices(series: Series, name: str) -> None:
+def _require_bounded(series: Series, headers: list[dict[str, str]], name: str) -> None:
+    """Raise SimulationError for more voxels than are read, or than the files can hold, before any is allocated."""
+    values = 0
+    for file, header in zip(series.files, headers, strict=True):
+        rows, columns = (_required(file, header, tag, name)[0] for tag in (_ROWS, _COLUMNS))
+        # Frames and samples: 1 where they are not said
+        more = [_numbers(header, tag, 1) for tag in ("0028|0008", "0028|0002")]
+        values += int(rows * columns * np.prod([max(one[0], 1.0) for one in more if one is not None and one[0] < 1e9]))
+    size = f"{len(series.files)} images of {series.size}"
+    require(values <= MOST_VOXELS, f"{name}: has {values} voxels in {size}, expected at most {MOST_VOXELS} in all")
+    require_held(name, f"{size}, {values}", values, [Path(file) for file in series.files])
+
+
+def _check_slices(series: Series, headers: list[dict[str, str]], name: str) -> None:
     """Raise SimulationError for slices of several patients, missing or repeated ones, a tilted stack, and for slices
     without a place, an orientation or a pixel spacing, or of several.
 
@@ -214,7 +245,6 @@ def _check_slices(series: Series, name: str) -> None:
     """
     if len(series.files) < 2:  # one with many frames has the places of all of them elsewhere in its header
         return
-    headers = [_header(file) for file in series.files]
     patients = len({_value(header, "0010|0020") for header in headers})
     require(patients == 1, f"{name}: its images are of {patients} patients by their PatientID, expected one patient")
     damaged = _damaged_files(series, _value(headers[0], "0008|0060"))

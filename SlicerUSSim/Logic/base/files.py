@@ -210,6 +210,12 @@ def hash_of_file(path: Path) -> str:
     return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
+def require_small(path: str | os.PathLike, most_bytes: int = 16 * 2**20) -> None:
+    """Raise SimulationError for a file that is larger than any of its kind, before all of it is read."""
+    size = Path(path).stat().st_size
+    require(size <= most_bytes, f"{path}: has {size} bytes, expected at most {most_bytes}")
+
+
 def read_json(path: str | os.PathLike, most_bytes: int = 4 * 2**20):
     """The content of a JSON file.
 
@@ -218,8 +224,7 @@ def read_json(path: str | os.PathLike, most_bytes: int = 4 * 2**20):
     """
     require_path(path)
     try:
-        size = Path(path).stat().st_size
-        require(size <= most_bytes, f"{path}: has {size} bytes, expected at most {most_bytes}")
+        require_small(path, most_bytes)
         text = Path(path).read_text(encoding="utf-8")
         _check_nesting(path, text)
         return json.loads(text, object_pairs_hook=_distinct, parse_constant=_refused)

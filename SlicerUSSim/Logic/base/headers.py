@@ -9,9 +9,11 @@ from __future__ import annotations
 import math
 import os
 import re
+from collections.abc import Sequence
 from pathlib import Path
 from xml.parsers import expat
 
+from SlicerUSSim.Logic.base.dicom_elements import is_compressed, require_sound_elements
 from SlicerUSSim.Logic.base.errors import SimulationError, require, shown_path
 
 #: Voxels of the largest image: 2000 slices of 1024 x 1024
@@ -19,7 +21,11 @@ MOST_VOXELS = 2**31
 #: Deflate turns at most 1032 bytes into one (zlib, "An Explanation of the Deflate Algorithm"), and headers are small
 _MOST_EXPANSION = 1100
 #: Formats with all voxels in one file, compressed by deflate or not at all
-_ONE_FILE = (".mha", ".nii", ".nii.gz", ".nrrd", ".mgz", ".mgh", ".vti", ".dcm", ".ima")
+_ONE_FILE = (".mha", ".nii", ".nii.gz", ".nrrd", ".mgz", ".mgh", ".vti")
+#: Endings of DICOM files that may lack the prefix
+_DICOM = (".dcm", ".ima")
+#: Pixels of one bit in a byte of a DICOM file that is not compressed
+_PIXELS_PER_BYTE = 8
 #: Largest coordinate, direction and voxel size that is read, in any unit of length
 _MOST = 1e9
 #: The part of a file in which its header ends; sequences have some hundred bytes for every image
@@ -37,7 +43,7 @@ def require_readable_name(path: str | os.PathLike) -> None:
 
 
 def require_sound_header(path: Path) -> None:
-    """Raise SimulationError for a MetaImage or VTI file whose header is none that can be read.
+    """Raise SimulationError for a MetaImage, VTI or DICOM file whose header is none that can be read.
 
     Files of other formats pass, and so do files whose voxels are missing, of which ITK and VTK say so.
     """
@@ -46,6 +52,8 @@ def require_sound_header(path: Path) -> None:
         _require_metaimage(path)
     elif suffix == ".vti":
         _require_vti(path)
+    elif path.is_file() and is_dicom(path):
+        require_sound_elements(path)
 
 
 def require_bytes(path: Path, size: tuple[int, ...], bytes_per_voxel: int = 1) -> None:
@@ -56,13 +64,43 @@ def require_bytes(path: Path, size: tuple[int, ...], bytes_per_voxel: int = 1) -
     voxels = math.prod(int(n) for n in size)
     text = "x".join(str(n) for n in size)
     require(voxels <= MOST_VOXELS, f"{path}: has {text} voxels, expected at most {MOST_VOXELS} in all")
-    if path.is_file() and path.name.lower().endswith(_ONE_FILE):
-        most = _MOST_EXPANSION * max(path.stat().st_size, 1)
-        require(
-            voxels * bytes_per_voxel <= most,
-            f"{path}: promises {text} voxels, {voxels * bytes_per_voxel} bytes, which its {path.stat().st_size} bytes "
-            "cannot hold; copy or export it again",
-        )
+    if path.is_file():
+        require_held(str(path), text, voxels * bytes_per_voxel, [path])
+
+
+def require_held(name: str, size: str, least_bytes: int, files: Sequence[Path]) -> None:
+    """Raise SimulationError if files cannot hold `least_bytes` of voxels, however they are compressed.
+
+    `size` is the number of voxels as text. Nothing is said about formats with voxels in other files, or unknown ones.
+    """
+    held = [_most_held(file) for file in files]
+    if None in held:
+        return
+    stored = sum(file.stat().st_size for file in files)
+    require(
+        least_bytes <= sum(filter(None, held)),
+        f"{name}: promises {size} voxels, {least_bytes} bytes, which its {stored} bytes cannot hold; copy or export it "
+        "again",
+    )
+
+
+def _most_held(file: Path) -> int | None:
+    """Bytes of voxels that a file can hold, a pixel of one bit counted as a byte; None for formats of several files."""
+    expansion = _MOST_EXPANSION
+    if is_dicom(file):
+        if not is_compressed(file):
+            expansion = _PIXELS_PER_BYTE
+    elif not file.name.lower().endswith(_ONE_FILE):
+        return None
+    return expansion * max(file.stat().st_size, 1)
+
+
+def is_dicom(file: Path) -> bool:
+    """Whether a file has the DICOM prefix, or the suffix of the older ones that lack it."""
+    if file.suffix.lower() in _DICOM:
+        return True
+    with open(file, "rb") as opened:
+        return opened.read(132)[128:] == b"DICM"
 
 
 def require_spacing(name: str, spacing_mm: tuple[float, ...]) -> None:

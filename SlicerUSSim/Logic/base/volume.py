@@ -10,7 +10,8 @@ from pathlib import Path
 
 import numpy as np
 
-from SlicerUSSim.Logic.base.dicom import read_dicom_folder, read_series, series_with
+from SlicerUSSim.Logic.base.dicom import has_compressed, read_dicom_folder, read_series, series_with
+from SlicerUSSim.Logic.base.dicom_elements import is_compressed
 from SlicerUSSim.Logic.base.errors import SimulationError, require, require_package, require_path
 from SlicerUSSim.Logic.base.files import (
     messages_withheld,
@@ -19,6 +20,7 @@ from SlicerUSSim.Logic.base.files import (
     written_whole,
 )
 from SlicerUSSim.Logic.base.headers import (
+    is_dicom,
     require_bytes,
     require_readable_name,
     require_sound_header,
@@ -26,7 +28,7 @@ from SlicerUSSim.Logic.base.headers import (
 )
 from SlicerUSSim.Logic.base.label_numbers import numbers_of
 from SlicerUSSim.Logic.base.nifti import check_numbers, log_nifti_geometry, require_complete, require_written
-from SlicerUSSim.Logic.base.reading import in_child, reader, starts_like_hdf5
+from SlicerUSSim.Logic.base.reading import in_child, is_in_child, reader, starts_like_hdf5
 from SlicerUSSim.Logic.base.segments import flattened, segments_of
 from SlicerUSSim.Logic.base.transforms import LPS_TO_RAS, check_affine, is_singular, nearest_rotation
 
@@ -146,6 +148,8 @@ class Volume:
         require_readable_name(path)
         path, doubts = Path(path), ()
         require(path.exists(), f"{path}: no such file or folder")
+        if has_compressed(path) and not is_in_child():
+            return cls._read_compressed(path)
         if path.suffix.lower() == ".vti":
             volume = cls._read_vti(path)
             _log.info("%s: coordinates are read as RAS millimetres, since VTI files do not specify them", path)
@@ -167,6 +171,11 @@ class Volume:
         require_spacing(str(path), tuple(volume.spacing_mm))
         _log_size(volume, path)
         return replace(volume, name=str(path), doubts=doubts)
+
+    @classmethod
+    @in_child
+    def _read_compressed(cls, path: Path) -> Volume:
+        return cls.read(path)
 
     @classmethod
     def from_sitk(cls, image, name: str = "image") -> Volume:
@@ -368,11 +377,13 @@ def read_array(path: str | os.PathLike) -> tuple[np.ndarray, np.ndarray]:
 def read_itk_image(path: Path):
     """A SimpleITK image of any file that ITK can read. Raises SimulationError, naming the file, for others."""
     require_readable_name(path)
-    return _read_hdf5(path) if path.is_file() and starts_like_hdf5(path) else _read_by_itk(path)
+    if path.is_file() and (starts_like_hdf5(path) or (is_dicom(path) and is_compressed(path))):
+        return _read_by_itk_in_child(path)
+    return _read_by_itk(path)
 
 
-@in_child  # the library ends the process for some damaged files
-def _read_hdf5(path: Path):
+@in_child  # the libraries end the process for some damaged files
+def _read_by_itk_in_child(path: Path):
     return _read_by_itk(path)
 
 

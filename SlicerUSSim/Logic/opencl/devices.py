@@ -12,11 +12,13 @@ import os
 import platform
 import sys
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from SlicerUSSim.Logic.base.errors import SimulationError
-from SlicerUSSim.Logic.opencl.limits import lack_of_address_space
-from SlicerUSSim.Logic.opencl.runtimes import INTEL_RUNTIME, load_pyopencl
+from SlicerUSSim.Logic.opencl.limits import lack_of_address_space, lack_of_cache
+from SlicerUSSim.Logic.opencl.pocl import cache_folder
+from SlicerUSSim.Logic.opencl.runtimes import INTEL_RUNTIME, load_pyopencl, pocl_of_pip
 
 if TYPE_CHECKING:
     import pyopencl
@@ -116,7 +118,8 @@ def choose_device(device: str | DeviceInfo | None = None) -> tuple[DeviceInfo, s
     devices = list_devices()
     _log.debug("OpenCL devices: %s", "; ".join(map(str, devices)) or "none")
     if not devices:
-        raise SimulationError(f"no OpenCL device found; {lack_of_address_space() or _how_to_get_one()}")
+        why = lack_of_address_space() or (lack_of_cache(cache_folder()) if _has_pocl() else None)
+        raise SimulationError(f"no OpenCL device found; {why or _how_to_get_one()}")
     for choice, source in (
         (device, "argument"),
         (os.environ.get("PYOPENCL_CTX"), "PYOPENCL_CTX"),
@@ -155,6 +158,11 @@ def faster_hint(device: DeviceInfo) -> str | None:
 def _intel_hint() -> str | None:
     packages = _INTEL_PACKAGES.get(sys.platform)
     return None if packages is None or not _is_x86_64() else f"pip install {packages}"
+
+
+def _has_pocl() -> bool:
+    """Whether PoCL is installed, by pip or in the system."""
+    return pocl_of_pip() is not None or any(Path("/etc/OpenCL/vendors").glob("pocl*.icd"))
 
 
 def _is_x86_64() -> bool:

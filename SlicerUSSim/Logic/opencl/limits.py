@@ -1,4 +1,4 @@
-"""What of this computer keeps an OpenCL runtime from working: a limited address space, a full disk for its caches."""
+"""What keeps an OpenCL runtime from working: a limited address space, a cache that cannot be written, its full disk."""
 
 from __future__ import annotations
 
@@ -31,6 +31,19 @@ def lack_of_address_space(platform: str = "") -> str | None:
         f"the address space of this process is limited to {limit / 1e6:.0f} MB (ulimit -v), expected at least "
         f"{least / 1e6:.0f} MB"
     )
+
+
+def lack_of_cache(folder: Path) -> str | None:
+    """What to say if the folder in which PoCL keeps programs cannot be made or written, else None: it has no device."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            return None
+    except OSError as error:
+        return (
+            f"PoCL keeps programs in {folder}, which cannot be written ({error.strerror}); set XDG_CACHE_HOME to "
+            "another folder"
+        )
 
 
 def lack_of_disk(folders: list[Path]) -> str | None:

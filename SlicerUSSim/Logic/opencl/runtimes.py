@@ -87,11 +87,7 @@ def _point_at_vendors_folder() -> None:
     A separate folder therefore lists Intel's library, PoCL's wheel and the runtimes installed in the system.
     """
     libraries = {}
-    for name, distribution, pattern in (
-        ("intel", INTEL_RUNTIME, r"libintelocl\.so.*"),
-        ("pocl", "pocl-binary-distribution", r"libpocl-.*\.so.*"),
-    ):
-        library = _library_of(distribution, pattern)
+    for name, library in (("intel", _library_of(INTEL_RUNTIME, r"libintelocl\.so.*")), ("pocl", pocl_of_pip())):
         if library is not None:
             libraries[f"ussim-{name}.icd"] = str(library)
     if "ussim-intel.icd" not in libraries:
@@ -118,6 +114,11 @@ def _point_at_vendors_folder() -> None:
         return
     _log.debug("OpenCL runtimes: %s", ", ".join(libraries.values()))
     os.environ["OCL_ICD_VENDORS"] = str(folder)
+
+
+def pocl_of_pip() -> Path | None:
+    """The library of PoCL's wheel, or None."""
+    return _library_of("pocl-binary-distribution", r"libpocl-.*\.so.*")
 
 
 def _library_of(distribution: str, pattern: str) -> Path | None:

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from SlicerUSSim.Logic.base.errors import SimulationError, require, required
-from SlicerUSSim.Logic.base.files import read_json, write_json, written_whole
+from SlicerUSSim.Logic.base.files import read_json, require_small, write_json, written_whole
 from SlicerUSSim.Logic.base.reading import in_child, reader, starts_like_hdf5
 from SlicerUSSim.Logic.base.transforms import (
     LPS_TO_RAS,
@@ -21,12 +21,14 @@ from SlicerUSSim.Logic.base.transforms import (
     pose_of_angles,
     rigid_between,
 )
+from SlicerUSSim.Logic.tracked.itk_transforms import require_sound, require_sound_text
 
 _log = logging.getLogger(__name__)
 
 #: Least root mean square distance of landmarks from the line through most of them
 _LEAST_WIDTH_MM = 1.0
-_ITK_SUFFIXES = (".tfm", ".h5", ".hdf5", ".mat")
+_BINARY = (".h5", ".hdf5", ".mat")
+_ITK_SUFFIXES = (".tfm", *_BINARY)
 
 
 @reader
@@ -74,6 +76,7 @@ def read_matrix(path: str | os.PathLike) -> np.ndarray:
 
 def _numbers(path: Path) -> np.ndarray:
     """(4, 4) of sixteen numbers in a text file."""
+    require_small(path)
     try:
         numbers = np.array(path.read_text().replace(",", " ").split(), float)
     except (ValueError, UnicodeDecodeError):
@@ -128,22 +131,14 @@ def _starts_like_itk(path: Path) -> bool:
         return file.read(8) == b"#Insight"
 
 
-def _is_text(content: bytes) -> bool:
-    try:
-        return "\0" not in content.decode("utf-8")
-    except UnicodeDecodeError:
-        return False
-
-
 def _read_itk(path: Path) -> np.ndarray:
     return check_rigid(f"{path}: transform", _itk_to_world(path))
 
 
 def _itk_to_world(path: Path) -> np.ndarray:
     """(4, 4) in RAS of the inverse of an ITK file's linear map, which is in LPS."""
-    is_hdf5 = path.suffix.lower() in (".h5", ".hdf5") or starts_like_hdf5(path)
-    linear = _linear_map_of_hdf5 if is_hdf5 else _linear_map
-    world_to_probe = linear(path)
+    is_binary = path.suffix.lower() in _BINARY or starts_like_hdf5(path)
+    world_to_probe = _linear_map_of_binary(path) if is_binary else _linear_map(path)
     require(not is_singular(world_to_probe), f"{path}: the transform is singular, expected a rigid one")
     return LPS_TO_RAS @ np.linalg.inv(world_to_probe) @ LPS_TO_RAS
 
@@ -163,15 +158,15 @@ def _linear_map(path: Path) -> np.ndarray:
     """(4, 4) of a linear ITK transform, in LPS."""
     import SimpleITK as sitk
 
-    if path.suffix.lower() not in (".h5", ".hdf5", ".mat"):  # ITK crashes on NUL, and ends a number at other bytes
-        require(_is_text(path.read_bytes()), f"{path}: is not a text, expected an ITK transform")
+    if path.suffix.lower() not in _BINARY and not starts_like_hdf5(path):
+        require_sound_text(path)
     try:
         transform = sitk.ReadTransform(str(path))
     except RuntimeError as error:
         raise SimulationError(
             f"{path}: cannot be read as a transform ({str(error).splitlines()[-1].strip()})"
         ) from None
-    require(transform.IsLinear(), f"{path}: the transform is not linear, expected a rigid one")
+    require_sound(path, transform)
     # A linear map is determined by the images of the origin and the axes.
     origin = np.array(transform.TransformPoint((0.0, 0.0, 0.0)))
     world_to_probe = np.eye(4)
@@ -182,7 +177,7 @@ def _linear_map(path: Path) -> np.ndarray:
 
 
 @in_child  # ITK ends the process for some damaged files
-def _linear_map_of_hdf5(path: Path) -> np.ndarray:
+def _linear_map_of_binary(path: Path) -> np.ndarray:
     return _linear_map(path)
 
 
@@ -297,6 +292,7 @@ def _read_xfm(path: Path) -> np.ndarray:
 
 def _mni_text(path: Path, first_words: str) -> str:
     require(path.is_file(), f"{path}: no such file")
+    require_small(path)
     try:
         text = path.read_text()
     except UnicodeDecodeError:

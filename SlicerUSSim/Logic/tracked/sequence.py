@@ -20,7 +20,7 @@ from typing import NamedTuple
 import numpy as np
 
 from SlicerUSSim.Logic.base.errors import SimulationError, require, require_package, require_path
-from SlicerUSSim.Logic.base.files import written_whole
+from SlicerUSSim.Logic.base.files import require_small, written_whole
 from SlicerUSSim.Logic.base.own_outputs import MADE_BY
 from SlicerUSSim.Logic.base.reading import reader
 from SlicerUSSim.Logic.base.transforms import check_affine, is_singular
@@ -342,6 +342,7 @@ def read_coordinate_definitions(path: str | os.PathLike) -> dict[str, np.ndarray
 
     path = Path(path)
     try:
+        require_small(path)
         root = ElementTree.parse(path).getroot()
     except OSError as error:
         raise SimulationError(f"{path}: cannot be read ({error.strerror})") from None
