@@ -141,16 +141,20 @@ class AnatomyViews:
         self.show_volume(None)
         self.show_labels(None, False)
         self.hide_image()
-        for name in (_PATIENT, _BODY):
-            display_of(self._model(name)).SetVisibility(False)
-        self._model(_PATIENT).SetAndObservePolyData(None)
-        self.threed.schedule_render()
+        display_of(self._model(_BODY)).SetVisibility(False)
+        self.hide_surface()
 
     def hide_image(self) -> None:
         """Show no image in the views."""
         for view in self.slices:
             view.set_foreground_volume_id(None)
         display_of(self._model(_FIELD)).SetVisibility(False)
+        self.threed.schedule_render()
+
+    def hide_surface(self) -> None:
+        """Show no surface of a patient."""
+        display_of(self._model(_PATIENT)).SetVisibility(False)
+        self._model(_PATIENT).SetAndObservePolyData(None)
         self.threed.schedule_render()
 
     def show_surface(self, surface: PatientSurface) -> None:
