@@ -203,12 +203,12 @@ class AnatomyViews:
 
         `field` (rows, columns) bool is the imaged field; outside it the MRI is unchanged.
         """
-        image = taken.frame.image
+        image = taken.image
         # A copy without zeros inside the field, so that the threshold removes only the pixels outside.
         seen = np.where(field, np.maximum(image, 1), 0).astype(np.uint8)
         shown, pose = self._seen, self._pose
         pose.SetMatrixTransformToParent(vtk_matrix(taken.probe_to_world))
-        write_slice(shown, Volume(seen[None], taken.frame.grid.slice_to_probe), pose)
+        write_slice(shown, Volume(seen[None], taken.grid.slice_to_probe), pose)
         if self._image.GetOutputDataObject(0) is not shown.GetImageData():
             self._image.SetOutput(shown.GetImageData())
             display = display_of(shown)

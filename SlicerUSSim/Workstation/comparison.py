@@ -20,6 +20,8 @@ from SlicerUSSim.Workstation.streams import ImageStream
 
 #: Seconds between two images during playback of a sequence.
 _PLAY_EVERY_S = 0.1
+#: Difference of matrices up to which a pose is the same, mm: nodes and files keep some digits
+_SAME_POSE = 1e-3
 
 
 class RealImages:
@@ -110,6 +112,14 @@ class Comparison:
         self._move(tracked.poses[number])
         self.send()
 
+    def show_at(self, pose: np.ndarray) -> bool:
+        """As show, for the image with this pose (4, 4); whether there is one."""
+        poses = () if self._real is None else self._real.tracked.poses
+        found = [number for number, known in enumerate(poses) if np.allclose(known, pose, atol=_SAME_POSE)]
+        if found:
+            self.show(found[0])
+        return bool(found)
+
     def send(self) -> None:
         """Send the real image to the pages if they show it."""
         sequence = self._shared.now.sequence
@@ -146,8 +156,7 @@ class Comparison:
 
     def drop(self) -> None:
         """Forget the sequence, which is of another patient."""
-        if self._playing is not None:
-            self.play()
+        self.stop()
         self._real = self._browser = None
         self.sees_nothing(None)
         for stream in self.streams:
@@ -180,6 +189,11 @@ class Comparison:
             self._playing = get_event_loop().create_task(self._play_on())
         with self._shared.changing() as now:
             now.sequence.playing = self._playing is not None
+
+    def stop(self) -> None:
+        """Play no more."""
+        if self._playing is not None:
+            self.play()
 
     async def _play_on(self) -> None:
         while self._real is not None:

@@ -45,7 +45,7 @@ def png(taken: TakenImage) -> bytes:
     """An image as a PNG file, without scaling, with what it is of as a text."""
     buffer, text = io.BytesIO(), PngInfo()
     text.add_itxt(ABOUT, json.dumps(taken.about()))
-    Image.fromarray(taken.frame.image).save(buffer, "PNG", pnginfo=text)
+    Image.fromarray(taken.image).save(buffer, "PNG", pnginfo=text)
     return buffer.getvalue()
 
 
@@ -204,7 +204,9 @@ class Exports:
         require(np.allclose(moved, np.eye(4)), f"the transform of {labels.GetName()!r} scales, expected a rigid one")
         names = read_labels(labels, preset.tissues).names
         sheets = self._shown_sheets(source)
-        text = python_script(source, replace(preset, tissues=preset.tissues.for_names(names)), in_labels, sheets)
+        text = python_script(
+            source, replace(preset, tissues=preset.tissues.for_names(names)), in_labels, sheets, taken.number
+        )
         needed = (*source.missing, *((sheets,) if isinstance(sheets, str) and not os.path.isabs(sheets) else ()))
         return text, tuple(dict.fromkeys(needed))
 

@@ -68,8 +68,8 @@ class BrowserPanel:
         self._thread = threading.get_ident()
         #: Calls a function with the point (3,), in the world, of the next click in a slice view, or None
         self.pick: Callable[[Callable[[np.ndarray | None], None]], None] = lambda clicked: None
-        #: Called when live images may have ended, or begun to wait for other work
-        self.frozen_changed: Callable[[], None] = lambda: None
+        #: Called after every change, such as when live images have ended, or begun to wait for other work
+        self.refreshed: Callable[[], None] = lambda: None
         #: The work under way: its title, whether it is cancelled, and the task that does it. The last is shown
         self._under_way: list[_Work] = []
         self._status, self._status_until = "", 0.0
@@ -139,7 +139,7 @@ class BrowserPanel:
             panel.can = {name: is_usable for name, (is_usable, _) in can.items()}
             panel.tips = {name: tip for name, (_, tip) in can.items()}
             now.fit.free = [FreeParameter(name, on) for name, on in presenter.fits.freeParameters()]
-        self.frozen_changed()
+        self.refreshed()
 
     @contextmanager
     def progress(self, title: str) -> Iterator[Callable[[float], None]]:

@@ -15,6 +15,7 @@ from SlicerUSSim.Logic.base.errors import SimulationError, require, required
 from SlicerUSSim.Logic.base.transforms import check_affine, check_rigid
 from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic
 from SlicerUSSim.Logic.mrml.scene_record import SequenceRecord
+from SlicerUSSim.Logic.mrml.sequence_nodes import MADE_FROM, POSES
 from SlicerUSSim.Logic.probe.arrays import Probe
 from SlicerUSSim.Logic.tracked.pose_files import fit_landmarks, read_calibration, read_registration
 from SlicerUSSim.Logic.tracked.sequence import TrackedSequence
@@ -304,10 +305,20 @@ class Registration:
             self._logic.preset = replace(self._logic.preset, probe=tracked.probe)
             self._logic.parameters.real = images
             self._comparison.take(tracked, browser, number)
+            self._choose_poses(browser, old)
         self._opener.opened_sequence = record
         for node in old:
             if node.GetScene() is not None:
                 node.GetScene().RemoveNode(node)
+
+    def _choose_poses(self, browser: Any, old: list[Any]) -> None:
+        """Let Simulate sequence use the poses of the images, instead of those before, or of none."""
+        parameters: Any = self._logic.parameters
+        if parameters.transform_sequence is None or parameters.transform_sequence in old:
+            parameters.transform_sequence = browser.GetNodeReference(POSES)
+        images = parameters.image_sequence
+        if images is not None and images.GetNodeReference(MADE_FROM) in old:  # which are at other poses
+            parameters.image_sequence = None
 
     def _required(self) -> Recording:
         return required(self.recording, "no tracked ultrasound is open, expected a file with it first")

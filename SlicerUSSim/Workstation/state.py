@@ -154,6 +154,17 @@ class SequenceState:
 
 
 @dataclass
+class SimulatedState:
+    """The sequence of simulated images."""
+
+    #: Number of images; 0 without a sequence
+    length: int = 0
+    #: Index of that which is shown, or was last
+    number: int = 0
+    playing: bool = False
+
+
+@dataclass
 class FitState:
     """The fit to real ultrasound."""
 
@@ -241,6 +252,7 @@ class PageState:
     messages: MessageState = field(default_factory=MessageState)
     views: ViewState = field(default_factory=ViewState)
     sequence: SequenceState = field(default_factory=SequenceState)
+    simulated: SimulatedState = field(default_factory=SimulatedState)
     fit: FitState = field(default_factory=FitState)
     script: ScriptState = field(default_factory=ScriptState)
     registration: RegistrationState = field(default_factory=RegistrationState)

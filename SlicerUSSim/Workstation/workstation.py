@@ -41,6 +41,7 @@ from SlicerUSSim.Workstation.registration import Registration
 from SlicerUSSim.Workstation.restoring import Restoring
 from SlicerUSSim.Workstation.sender import Sender
 from SlicerUSSim.Workstation.session_store import OwnSession, SessionStore
+from SlicerUSSim.Workstation.simulated import SimulatedSequence
 from SlicerUSSim.Workstation.state import NAMES, SharedState
 from SlicerUSSim.Workstation.tasks import Tasks
 from SlicerUSSim.Workstation.tracker import Tracker
@@ -83,7 +84,8 @@ class Workstation:
         self._images = ImageFlow(
             shared, logic, self._views, self._comparison, cine, self._tracker, stamps, lambda: presenter.isBusy
         )
-        self._panel.frozen_changed = self._images.tell_frozen
+        self._simulated = SimulatedSequence(shared, logic, presenter, self._comparison, self._probe.move)
+        self._panel.refreshed = self._refreshed
         opener = Opener(app.scene, logic, tasks, files)
         presenter.maskFile, presenter.sheetsFile = opener.mask_file, opener.sheets_file
         self._panel.pick = self._probe.hand.pick
@@ -179,7 +181,9 @@ class Workstation:
             "plane": probe.choose_plane,
             "look": self._in_task(probe.look_again),
             "aim_image": probe.aim_image,
-            "play": comparison.play,
+            "play": self._play,
+            "play_simulated": self._in_task(self._simulated.play),
+            "show_simulated": self._in_task(self._simulated.show),
             "show_number": comparison.show,
             "answer": self._questions.answer,
             "calibrate": self._in_task(registration.calibrate),
@@ -244,6 +248,14 @@ class Workstation:
 
         self._tasks.start(export)
         return await exported
+
+    def _refreshed(self) -> None:
+        self._images.tell_frozen()
+        self._simulated.look()
+
+    def _play(self) -> None:
+        self._simulated.stop()
+        self._comparison.play()
 
     def _show_script(self) -> None:
         with self._presenter.shown(), self._shared.changing() as now:

@@ -63,7 +63,8 @@
     if (ruler !== drawnRuler) window.ussimOverlay(document.getElementById("overlay"), meta.ruler);
     drawnRuler = ruler;
     const caption = document.getElementById("image-caption");
-    caption.textContent = meta.blank ? "" : `${meta.patient}, ${meta.time.slice(11, 19)} UTC`;
+    const place = meta.sequence ? `image ${meta.sequence} of the simulated sequence, ` : "";
+    caption.textContent = meta.blank ? "" : `${place}${meta.patient}, ${meta.time.slice(11, 19)} UTC`;
   }
 
   workstation.summary = (count = 100) => {
