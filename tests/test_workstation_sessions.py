@@ -379,6 +379,9 @@ def test_a_dicom_series_and_ultrasound_calibrated_in_the_page_come_back_after_a_
         settled(page)
     page.evaluate("window.trame.trigger('show_number', [5])")
     settled(page)
+    page.evaluate("window.trame.trigger('add_landmark', ['200 150', '10, 20.5, 30'])")
+    settled(page)
+    landmarks = state(page, NAMES.registration.landmarks)
     image = np.asarray(Image.open(download(page, "png")))
     assert np.array_equal(bundled(page, tmp_path / "script"), image)
     assert not errors(page)
@@ -392,6 +395,7 @@ def test_a_dicom_series_and_ultrasound_calibrated_in_the_page_come_back_after_a_
     assert np.array_equal(bundled(page, tmp_path / "again"), image)
     assert state(page, NAMES.registration.recording).startswith("phantom: 6 images")
     assert page.locator("#registration-from").inner_text() == "Registration as it was kept"
+    assert state(page, NAMES.registration.landmarks) == landmarks and landmarks[0]["patient"] == "10.0, 20.5, 30.0"
     page.evaluate("window.trame.trigger('show_number', [0])")
     settled(page)
     np.testing.assert_allclose(page.evaluate("window.ussim.image.pose"), recording["poses"][0], atol=0.5)

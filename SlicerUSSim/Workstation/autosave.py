@@ -10,7 +10,7 @@ import io
 import logging
 import shutil
 import threading
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from time import monotonic
@@ -22,6 +22,7 @@ from trame_server.utils.asynchronous import get_event_loop
 
 from SlicerUSSim.Logic.base.errors import SimulationError
 from SlicerUSSim.Logic.base.reading import write_values
+from SlicerUSSim.Logic.mrml.landmark_nodes import Landmark
 from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic
 from SlicerUSSim.Logic.mrml.scene_record import (
     SceneRecord,
@@ -73,6 +74,7 @@ class Autosave:
     ----------
     session : where; None: nothing is kept.
     pose : (4, 4) of the probe, or None.
+    landmarks : of the registration.
     told : called with a line if it cannot be kept, once.
     in_loop : calls a function in the event loop, from any thread.
     """
@@ -86,12 +88,13 @@ class Autosave:
         opener: Opener,
         cine: Cine,
         pose: Callable[[], np.ndarray | None],
+        landmarks: Callable[[], Sequence[Landmark]],
         told: Callable[[str], None],
         in_loop: Callable[[Callable[[], None]], None],
     ) -> None:
         self._session, self._shared, self._logic, self._presenter = session, shared, logic, presenter
         self._opener, self._cine, self._pose = opener, cine, pose
-        self._told, self._in_loop = told, in_loop
+        self._landmarks, self._told, self._in_loop = landmarks, told, in_loop
         self._is_told = False
         self._is_ended = False
         self._not_before = 0.0  # time, s
@@ -161,7 +164,7 @@ class Autosave:
         seen = (
             anatomy, tuple(self._opener.sent_files.files.items()), parameters.node.GetMTime(),
             None if pose is None else pose.tobytes(), fit is not None, sequence is not None, cine, repr(page),
-            self._presenter.noteLines,
+            self._presenter.noteLines, tuple(map(id, self._landmarks())),
         )  # fmt: skip
         if seen == self._seen and not is_new_fit and not is_new_sequence:
             return
@@ -182,6 +185,7 @@ class Autosave:
             "source": None if source is None else source.to_dict(),
             "lesions": None if files is None else [list(entry) for entry in files],
             "about": self._cine.about,
+            "landmarks": [mark.to_list() for mark in self._landmarks()],
         }
         is_new_loop = self._cine.loop != self._cine_seen[0]
         taken = _Taken(

@@ -393,7 +393,10 @@ def _screens(keys: tuple[str, ...]) -> None:
                 html.Div(
                     f"""<canvas data-stream="real"
                     :class="{{picking: {NAMES.registration.picking} === 'ultrasound'}}"
-                    @click="window.ussim.pickLandmark($event)"></canvas>"""
+                    @click="window.ussim.pickLandmark($event)"></canvas>
+                    <template v-for="(mark, n) in {NAMES.registration.landmarks}">
+                    <div v-if="mark.place && mark.image === {NAMES.sequence.name}" class="ussim-landmark"
+                    :style="{{left: mark.place[0] + '%', top: mark.place[1] + '%'}}">{{{{ n + 1 }}}}</div></template>"""
                 )
 
 

@@ -15,6 +15,7 @@ from SlicerUSSim.Logic.base.errors import SimulationError, require, required
 from SlicerUSSim.Logic.base.transforms import check_rigid
 from SlicerUSSim.Logic.fitting.tracked_fit import Fit
 from SlicerUSSim.Logic.imaging.preset import Preset
+from SlicerUSSim.Logic.mrml.landmark_nodes import Landmark
 from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic
 from SlicerUSSim.Logic.mrml.nodes import display_of, set_node_to_world
 from SlicerUSSim.Logic.mrml.scene_record import ROLES, SceneRecord, SequenceRecord, put_nodes, put_values
@@ -163,7 +164,7 @@ class Restoring:
         if pose is not None:
             self._put_probe(pose)
         if record.sequence is not None:
-            self._registration.restore(record.sequence, preset.probe)
+            self._registration.restore(record.sequence, preset.probe, record.landmarks)
             self._logic.preset = preset
         page = kept.get("page", {})
         self._show_page(page)
@@ -212,7 +213,12 @@ def _parts_of(session: KeptSession) -> tuple[SceneRecord, tuple[Fit, Preset | No
     pose = content.get("pose")
     if pose is not None:
         pose = check_rigid("the session's pose", pose)
-    record = SceneRecord(anatomy.nodes, {}, pose, sequence if isinstance(sequence, SequenceRecord) else None)
+    try:
+        landmarks = tuple(map(Landmark.of_list, content.get("landmarks", ())))
+    except (ValueError, TypeError) as error:
+        raise SimulationError(f"the session's landmarks are damaged ({error})") from None
+    recorded = sequence if isinstance(sequence, SequenceRecord) else None
+    record = SceneRecord(anatomy.nodes, {}, pose, recorded, landmarks=landmarks)
     images = []
     for name in content["files"].get("cine", []):
         for seconds, jpeg in session.read_file(str(name)):

@@ -85,6 +85,9 @@ class LandmarkLine:
     ultrasound: str
     patient: str
     remaining: str
+    #: Name of its image, and where it is in it as it is shown: percent from the left and from the top
+    image: str = ""
+    place: list[float] | None = None
 
 
 # ---- shared state, by topic ------------------------------------------------------------------------------------------

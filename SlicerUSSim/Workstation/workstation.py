@@ -104,8 +104,9 @@ class Workstation:
 
         self._session = self._begun_session(sessions)
         self._autosave = Autosave(
-            self._session, shared, logic, presenter, opener, cine, self._probe.pose, self._messages.show, tasks.tell
-        )
+            self._session, shared, logic, presenter, opener, cine, self._probe.pose,
+            lambda: self._registration.landmarks, self._messages.show, tasks.tell,
+        )  # fmt: skip
         self._restoring = Restoring(
             sessions if self._session is not None else None,
             shared, app.scene, logic, tasks, opener, presenter, self._loading, self._registration,

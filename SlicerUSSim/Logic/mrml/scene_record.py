@@ -24,6 +24,7 @@ from SlicerUSSim.Logic.mri.sheets.surfels import Surfels
 from SlicerUSSim.Logic.mrml.craniotomy_nodes import closed_labels, set_closed_labels, show_flap
 from SlicerUSSim.Logic.mrml.fit_nodes import sequence_of
 from SlicerUSSim.Logic.mrml.label_nodes import colour_table, node_labels, read_mask, set_colour_table
+from SlicerUSSim.Logic.mrml.landmark_nodes import Landmark, landmarks_of
 from SlicerUSSim.Logic.mrml.lesion_nodes import tag_of
 from SlicerUSSim.Logic.mrml.nodes import (
     control_points,
@@ -124,6 +125,8 @@ class SceneRecord:
     sequence: SequenceRecord | None = None
     #: Names of nodes with data that have no role and are left out
     left_out: tuple[str, ...] = ()
+    #: Of the registration of the sequence
+    landmarks: tuple[Landmark, ...] = ()
 
     @property
     def size(self) -> int:
@@ -186,7 +189,9 @@ def record_scene(scene) -> SceneRecord:
         sequence = SequenceRecord(sequence_of(real), real.GetName())
     transform = parameters.probe_transform
     pose = None if transform is None else probe_pose(transform)
-    return SceneRecord(nodes, recorded_values(parameters), pose, sequence, tuple(_others(scene, parameters)))
+    landmarks = () if sequence is None else landmarks_of(scene)
+    others = tuple(_others(scene, parameters))
+    return SceneRecord(nodes, recorded_values(parameters), pose, sequence, others, landmarks)
 
 
 def _choose_missing(scene, parameters: SceneParameters) -> None:
