@@ -119,6 +119,15 @@ def test_after_kill_9_the_page_reconnects_by_itself_and_restores_all(server, bro
     page = opened(browser, own.url, problems)
     settled(page)
     assert page.locator("#session-offer").count() == 0
+    # Images at all poses
+    page.evaluate("window.trame.trigger('press', ['simulateSequenceButton'])")
+    page.locator("#simulated-player").wait_for()
+    settled(page)
+    page.evaluate("window.trame.trigger('show_simulated', [3])")
+    settled(page)
+    simulated = page.evaluate("window.ussim.image"), pixels(page)
+    click(page, "#live")
+    settled(page)
     # A fit, applied; a tissue, a setting, a view; then the pose, away from the images
     page.evaluate("window.trame.trigger('set', ['fitEvaluationsSpinBox', 20])")
     page.evaluate("window.trame.trigger('press', ['fitButton'])")
@@ -169,6 +178,14 @@ def test_after_kill_9_the_page_reconnects_by_itself_and_restores_all(server, bro
     eventually(page, lambda: len([path for path in own.sessions.iterdir() if (path / "state.json").exists()]) == 1)
     page.evaluate("window.trame.trigger('press', ['revertFitButton'])")
     settled(page)
+    page.evaluate("window.trame.trigger('show_simulated', [3])")
+    settled(page)
+    again = page.evaluate("window.ussim.image")
+    told = ("time", "pose", "patient", "sequence", "ruler")
+    assert {name: again[name] for name in told} == {name: simulated[0][name] for name in told}
+    assert np.array_equal(pixels(page), simulated[1])
+    # The last Segment was of the program that is gone, which the button says
+    assert state(page, NAMES.panel.can)["undoSegmentButton"] is False
     assert not errors(page) and not problems
     page.close()
 

@@ -22,6 +22,7 @@ from SlicerUSSim.Logic import Volume
 from SlicerUSSim.Logic.base.volume import read_array
 from SlicerUSSim.Logic.mri.samples import head_mri
 from SlicerUSSim.Logic.tracked.sequence import TrackedSequence
+from SlicerUSSim.Workstation.scene_files import read_scene
 from SlicerUSSim.Workstation.state import NAMES
 from tests.test_workstation import (
     answer_new_patient,
@@ -352,6 +353,10 @@ def test_the_images_of_simulate_sequence_are_shown_and_played_where_they_were_ta
     (tmp_path / "head.nii.gz").write_bytes((files / "head.nii.gz").read_bytes())
     again = run_again(script_of(page), tmp_path)
     assert np.array_equal(again, np.asarray(Image.open(download(page, "png"))))
+    shutil.copy(download(page, "mrb"), tmp_path / "sequence.mrb")
+    record = read_scene(str(tmp_path / "sequence.mrb")).simulated
+    assert record is not None and len(record.images) == 6 and np.array_equal(record.images[4], again)
+    assert '"patient": "head.nii.gz"' in record.about
     click(page, "#play-simulated")
     page.wait_for_function(f"window.trame.state.get('{NAMES.simulated.number}') === 2")
     page.wait_for_function(f"window.trame.state.get('{NAMES.simulated.number}') === 5")
