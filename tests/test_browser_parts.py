@@ -32,6 +32,7 @@ from SlicerUSSim.Logic import (
     TissueTable,
     UltrasoundSimulator,
 )
+from SlicerUSSim.Logic.base.errors import Cancelled
 from SlicerUSSim.Logic.base.volume import Volume, read_array
 from SlicerUSSim.Logic.fitting.search import Progress
 from SlicerUSSim.Logic.imaging.noise import seed_of_pose
@@ -71,7 +72,7 @@ from SlicerUSSim.Workstation import page as page_of  # noqa: E402
 from SlicerUSSim.Workstation.buttons import Buttons  # noqa: E402
 from SlicerUSSim.Workstation.comparison import Comparison, RealImages  # noqa: E402
 from SlicerUSSim.Workstation.content import Kind  # noqa: E402
-from SlicerUSSim.Workstation.export import Cine  # noqa: E402
+from SlicerUSSim.Workstation.export import Cine, gif  # noqa: E402
 from SlicerUSSim.Workstation.messages import Messages  # noqa: E402
 from SlicerUSSim.Workstation.opener import Files, Opener  # noqa: E402
 from SlicerUSSim.Workstation.panel import BrowserPanel  # noqa: E402
@@ -429,15 +430,45 @@ def test_of_images_that_come_fast_the_last_is_compared(head):
 def test_a_cine_keeps_time_and_begins_anew_with_another_size():
     cine = Cine()
     with pytest.raises(SimulationError, match="has 0 images"):
-        cine.gif()
+        gif(cine.images)
     cine.add(np.zeros((10, 10), np.uint8), 0.0)
     for number in range(4):
         cine.add(np.full((12, 16), 50 * number, np.uint8), 10.0 + 0.25 * number)
-    gif = Image.open(io.BytesIO(cine.gif()))
-    assert gif.size == (16, 12) and gif.n_frames == 4 and len(cine) == 4
+    told: list[float] = []
+    loop = Image.open(io.BytesIO(gif(cine.images, "whose", told.append)))
+    assert loop.size == (16, 12) and loop.n_frames == 4 and len(cine) == 4 and told == [0.25, 0.5, 0.75]
     for number in range(3):
-        gif.seek(number)
-        assert gif.info["duration"] == 250 and np.asarray(gif.convert("L"))[0, 0] == 50 * number
+        loop.seek(number)
+        assert loop.info["duration"] == 250 and np.asarray(loop.convert("L"))[0, 0] == 50 * number
+
+    def cancelled(share: float) -> None:
+        raise Cancelled
+
+    with pytest.raises(Cancelled):
+        gif(cine.images, progress=cancelled)
+
+
+def test_of_things_that_are_done_at_once_the_last_is_shown_and_each_can_be_cancelled():
+    """After the first of two had ended, the other one was neither shown nor could be cancelled."""
+    shared = SharedState(State(ready=True))
+    tasks = SimpleNamespace(abandonSoon=lambda *ignored: None)
+    logic = UltrasoundSceneLogic(slicer.vtkMRMLScene())
+    panel = BrowserPanel(shared, Messages(shared), logic, tasks, panel_sections(), lambda: None)
+    messages = shared.now.messages
+    first, second = panel.progress("First"), panel.progress("Second")
+    report_first, report_second = first.__enter__(), second.__enter__()
+    report_first(0.2)
+    report_second(0.4)
+    assert (messages.progress_title, messages.progress_percent) == ("Second", 40)
+    first.__exit__(None, None, None)
+    assert (messages.progress_title, messages.progress_percent) == ("Second", 40)
+    panel.cancel()
+    with pytest.raises(Cancelled):
+        report_second(0.5)
+    report_first(0.9)  # which was not cancelled
+    second.__exit__(None, None, None)
+    assert messages.progress_title == ""
+    panel.cancel()  # nothing
 
 
 #: Methods of Loading that buttons call

@@ -684,6 +684,30 @@ def test_a_sequence_of_transforms_becomes_one_of_images(bench):
         np.testing.assert_array_equal(pixels(images.GetNthDataNode(number)), expected(pose, number))
 
 
+def test_an_image_of_a_sequence_says_what_it_is_of_and_is_shown_where_it_was_taken(bench, tmp_path):
+    """Also after it was saved, which keeps no attributes of single images."""
+    poses = [ABOVE @ rigid(np.eye(3), [0, 0, z]) for z in (0, 1)]
+    transforms, images = sequence_of(bench.scene, poses), add(bench.scene, "Sequence", "images")
+    bench.logic.simulateSequence(bench.labels, transforms, images)
+    assert about_image(images.GetNthDataNode(1))["patient"] == "tissues"
+    live = bench.live()
+    taken = bench.logic.showSequenceImage(images, 1, bench.image)
+    assert not bench.logic.isLive and live is None and bench.logic.taken is taken and bench.logic.lastFrame is None
+    put(bench.probe, ABOVE)
+    np.testing.assert_allclose(node_to_world(bench.image) @ ijk_to_ras(bench.image), taken.image_to_world, atol=1e-6)
+    assert is_frozen(bench.image) and taken.number == 1 and not taken.is_empty
+    np.testing.assert_allclose(taken.probe_to_world, poses[1], atol=1e-6)
+    np.testing.assert_array_equal(pixels(bench.image), expected(poses[1], 1))
+    assert taken.anatomy == bench.logic.anatomyOf(bench.labels)
+    bench.logic.simulate(bench.labels, bench.probe, bench.image)  # into the same volume again
+    assert not is_frozen(bench.image)
+    images.SetAttribute("SlicerUSSim.images", None)
+    with pytest.raises(SimulationError, match="does not say what its images are of, expected those of Simulate"):
+        bench.logic.showSequenceImage(images, 1, bench.image)
+    with pytest.raises(SimulationError, match="has 2 images, expected one with the number 2"):
+        bench.logic.showSequenceImage(images, 2, bench.image)
+
+
 @pytest.mark.parametrize(
     "values, expected_values",
     [

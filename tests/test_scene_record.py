@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import os
 import pickle
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -36,6 +37,7 @@ from SlicerUSSim.Logic.mrml.scene_record import (  # noqa: E402
     record_scene,
     recorded_values,
 )
+from SlicerUSSim.Logic.mrml.taken_sequence import put_taken  # noqa: E402
 
 
 def add(scene, kind: str, name: str = ""):
@@ -185,3 +187,49 @@ def test_a_file_of_values_calls_nothing():
         read_values(io.BytesIO(pickle.dumps(Bad())))
     with pytest.raises(SimulationError, match="is damaged, or of another version"):
         read_values(io.BytesIO(b"x"))
+
+
+def test_images_of_a_sequence_and_a_proposal_there_and_back():
+    logic = segmented()
+    parameters, scene = logic.parameters, logic.scene
+    transforms, images = add(scene, "Sequence", "sweep"), add(scene, "Sequence", "sweep ultrasound")
+    for number in range(2):
+        item = slicer.vtkMRMLLinearTransformNode()
+        item.SetMatrixTransformToParent(vtk_matrix(node_to_world(parameters.probe_transform)))
+        transforms.SetDataNodeAtValue(item, f"{0.1 * number:g}")
+    logic.simulateSequence(parameters.labels, transforms, images)
+    parameters.image_sequence = images
+    mri = head_mri(3.0)
+    mask = np.zeros(mri.array.shape, np.uint8)
+    mask[20:23, 20:25, 20:24] = 1
+    proposal = add(scene, "Segmentation", "Lesion proposal")
+    add_lesion(proposal, mri.with_array(mask), "tumour", "tumour")
+    parameters.proposal = proposal
+    before = record_scene(scene)
+    assert before.simulated is not None and before.size > sum(image.nbytes for image in before.simulated.images)
+    buffer = io.BytesIO()
+    write_values(buffer, before)
+    buffer.seek(0)
+    record = read_values(buffer)
+
+    other = UltrasoundSceneLogic(slicer.vtkMRMLScene())
+    made = put_nodes(other.scene, record)
+    segmentation = made["proposal"].GetSegmentation()
+    assert segmentation.GetNumberOfSegments() == 1 and segmentation.GetNthSegment(0).GetName() == "tumour"
+    sequence = put_taken(other.scene, record.simulated)
+    for number in range(2):
+        old, new = logic.sequenceImage(images, number), other.sequenceImage(sequence, number)
+        assert np.array_equal(old.image, new.image) and old.about() == new.about() and new.grid == old.grid
+        assert np.array_equal(old.probe_to_world, new.probe_to_world)
+        assert sequence.GetNthIndexValue(number) == images.GetNthIndexValue(number)
+        assert new.anatomy is None  # of which nobody knows whether it is the same still
+    # What does not go together is refused, and nothing of it stays
+    count = other.scene.GetNumberOfNodesByClass("vtkMRMLSequenceNode")
+    for damaged in (
+        replace(record.simulated, about="{}"),
+        replace(record.simulated, images=(np.zeros((3, 3), np.uint8),) * 2),
+        replace(record.simulated, images=record.simulated.images[:1]),
+    ):
+        with pytest.raises(SimulationError, match=r"of a sequence is|images of"):
+            put_taken(other.scene, damaged)
+    assert other.scene.GetNumberOfNodesByClass("vtkMRMLSequenceNode") == count

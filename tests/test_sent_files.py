@@ -13,7 +13,7 @@ SentFiles = pytest.importorskip("SlicerUSSim.Workstation.sent_files").SentFiles
 
 def bundled(sent, *names: str) -> dict[str, bytes]:
     """{name: content} of what goes with a script that needs these names."""
-    with zipfile.ZipFile(io.BytesIO(sent.bundle("script", names))) as archive:
+    with zipfile.ZipFile(io.BytesIO(sent.bundle("script", names, lambda share: None))) as archive:
         assert archive.read("image.py") == b"script"
         return {name: archive.read(name) for name in archive.namelist() if name != "image.py"}
 

@@ -203,7 +203,7 @@ def autosave_of(session: OwnSession, told: list[str]):
         now.keeps_session = True
     opener = Opener(scene, logic, None, Files())
     presenter = PanelPresenter(logic, PlainView())
-    autosave = Autosave(session, shared, logic, presenter, opener, cine, lambda: None, told.append, calls.append)
+    autosave = Autosave(session, shared, logic, presenter, opener, cine, lambda: None, tuple, told.append, calls.append)
     return autosave, logic, cine, calls, shared
 
 

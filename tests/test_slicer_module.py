@@ -704,6 +704,15 @@ def test_a_sequence_is_simulated_and_its_browser_plays_it(session):
     images = session.scene.GetFirstNodeByName("sweep ultrasound")
     assert images.GetNumberOfDataNodes() == 3 and browser.IsSynchronizedSequenceNode(images, True)
     assert session.ui.statusLabel.text() == "3 images in 'sweep ultrasound'"
+    # The next ones take their place; of other transforms they are others
+    session.ui.simulateSequenceButton.click()
+    assert session.parameters.image_sequence is images and not session.app.errors
+    other = session.add("Sequence", "other sweep")
+    other.SetDataNodeAtValue(item, "0")
+    session.ui.transformSequenceSelector.setCurrentNode(other)
+    session.ui.simulateSequenceButton.click()
+    assert not session.app.errors and images.GetNumberOfDataNodes() == 3
+    assert session.parameters.image_sequence.GetName() == "other sweep ultrasound"
 
 
 def test_a_sequence_that_fails_leaves_no_node_behind(session):

@@ -10,6 +10,7 @@ from hypothesis import given, strategies as st
 from scipy.spatial.transform import Rotation
 
 from SlicerUSSim.Logic import SimulationError, Volume
+from SlicerUSSim.Logic.base.errors import Cancelled
 from SlicerUSSim.Logic.mri.samples import head_mri
 from SlicerUSSim.Logic.probe.placement import aimed_at, angles_to_surface, carried, turned
 from SlicerUSSim.Logic.probe.surface import PatientSurface
@@ -158,3 +159,15 @@ def test_the_surface_lies_where_the_labels_lie_in_any_grid():
 def test_nothing_to_lie_on_is_said():
     with pytest.raises(SimulationError, match="label map is empty"):
         PatientSurface(Volume(np.zeros((4, 4, 4), np.uint8), np.eye(4)))
+
+
+def test_a_surface_tells_how_far_it_is_and_can_be_cancelled():
+    told: list[float] = []
+    PatientSurface(BALL, told.append)
+    assert len(told) > 3 and told == sorted(told) and told[0] > 0 and told[-1] < 1
+
+    def cancelled(share: float) -> None:
+        raise Cancelled
+
+    with pytest.raises(Cancelled):
+        PatientSurface(BALL, cancelled)

@@ -226,7 +226,7 @@ _DRAWN = """(numbers) => Object.entries(numbers).every(([name, number]) =>
 
 def settled(page: Page) -> None:
     """Wait until all requests of the page are done and it shows the last images."""
-    page.wait_for_function("!window.ussim.uploading")
+    page.wait_for_function("!window.ussim.uploading && !window.ussim.exporting")
     page.wait_for_function(_DRAWN, arg=page.evaluate(_AT_REST, 1000 * PATIENCE_S))
 
 

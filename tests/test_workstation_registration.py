@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shutil
 
 import numpy as np
 import pytest
@@ -18,16 +19,20 @@ from SlicerUSSim.Logic.tracked.sequence import TrackedSequence
 from SlicerUSSim.Workstation.state import NAMES
 from tests.conftest import SHARED, needs_shared, rigid
 from tests.test_workstation import (
+    answer_new_patient,
     browser as browser,
     click,
     cost,
     dismiss_messages,
+    download,
+    drawn,
     errors,
     eventually,
     files as files,
     first_page as first_page,
     in_view,
     opened,
+    picture,
     pytestmark as pytestmark,
     serving,
     settled,
@@ -205,6 +210,27 @@ def test_a_landmark_is_picked_in_the_real_image_and_in_a_slice(page, recording):
     assert abs(column - 312) < 2 and abs(row - 307) < 4  # of 624x512
     in_image = np.linalg.inv(recording["image_to_ras"][1]) @ [*map(float, line["patient"].split(",")), 1.0]
     assert abs(in_image[2]) < 0.5  # the view is in the image plane
+    # It is drawn where it was clicked: in the real image of its number, and in the views
+    mark, (x, y) = page.locator(".ussim-landmark"), in_view(views(page)[1], 0.5, 0.5)
+    assert mark.inner_text() == "1"
+    at, box = mark.bounding_box(), page.locator("#real canvas").bounding_box()
+    assert at["x"] == pytest.approx(box["x"] + 0.5 * box["width"], abs=3)
+    assert at["y"] == pytest.approx(box["y"] + 0.6 * box["height"], abs=3)
+    drawn(page)
+    near = picture(page, {"x": x - 12, "y": y - 12, "width": 24, "height": 24})
+    assert ((near[..., 0] > 200) & (abs(near[..., 1] - 158) < 40) & (near[..., 2] < 110)).any()  # orange
+    shown_pose(page, 2)
+    assert mark.count() == 0
+    shown_pose(page, 1)
+    # A scene keeps it
+    shutil.copy(download(page, "mrb"), recording["folder"] / "marked.mrb")
+    page.set_input_files("#open-file", recording["folder"] / "marked.mrb")
+    answer_new_patient(page, "The patient of the scene")
+    eventually(page, lambda: state(page, NAMES.registration.recording) != "")
+    settled(page)
+    (again,) = state(page, NAMES.registration.landmarks)
+    assert (again["ultrasound"], again["patient"]) == (line["ultrasound"], line["patient"])
+    assert not any("landmarks" in item["title"] for item in state(page, NAMES.panel.nodes)["seedSelector"])
     click(page, "#pick-landmark")
     eventually(page, lambda: state(page, NAMES.registration.picking) == "ultrasound")
     page.mouse.move(600, 500)

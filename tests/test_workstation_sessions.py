@@ -119,6 +119,15 @@ def test_after_kill_9_the_page_reconnects_by_itself_and_restores_all(server, bro
     page = opened(browser, own.url, problems)
     settled(page)
     assert page.locator("#session-offer").count() == 0
+    # Images at all poses
+    page.evaluate("window.trame.trigger('press', ['simulateSequenceButton'])")
+    page.locator("#simulated-player").wait_for()
+    settled(page)
+    page.evaluate("window.trame.trigger('show_simulated', [3])")
+    settled(page)
+    simulated = page.evaluate("window.ussim.image"), pixels(page)
+    click(page, "#live")
+    settled(page)
     # A fit, applied; a tissue, a setting, a view; then the pose, away from the images
     page.evaluate("window.trame.trigger('set', ['fitEvaluationsSpinBox', 20])")
     page.evaluate("window.trame.trigger('press', ['fitButton'])")
@@ -169,6 +178,14 @@ def test_after_kill_9_the_page_reconnects_by_itself_and_restores_all(server, bro
     eventually(page, lambda: len([path for path in own.sessions.iterdir() if (path / "state.json").exists()]) == 1)
     page.evaluate("window.trame.trigger('press', ['revertFitButton'])")
     settled(page)
+    page.evaluate("window.trame.trigger('show_simulated', [3])")
+    settled(page)
+    again = page.evaluate("window.ussim.image")
+    told = ("time", "pose", "patient", "sequence", "ruler")
+    assert {name: again[name] for name in told} == {name: simulated[0][name] for name in told}
+    assert np.array_equal(pixels(page), simulated[1])
+    # The last Segment was of the program that is gone, which the button says
+    assert state(page, NAMES.panel.can)["undoSegmentButton"] is False
     assert not errors(page) and not problems
     page.close()
 
@@ -379,6 +396,9 @@ def test_a_dicom_series_and_ultrasound_calibrated_in_the_page_come_back_after_a_
         settled(page)
     page.evaluate("window.trame.trigger('show_number', [5])")
     settled(page)
+    page.evaluate("window.trame.trigger('add_landmark', ['200 150', '10, 20.5, 30'])")
+    settled(page)
+    landmarks = state(page, NAMES.registration.landmarks)
     image = np.asarray(Image.open(download(page, "png")))
     assert np.array_equal(bundled(page, tmp_path / "script"), image)
     assert not errors(page)
@@ -392,6 +412,7 @@ def test_a_dicom_series_and_ultrasound_calibrated_in_the_page_come_back_after_a_
     assert np.array_equal(bundled(page, tmp_path / "again"), image)
     assert state(page, NAMES.registration.recording).startswith("phantom: 6 images")
     assert page.locator("#registration-from").inner_text() == "Registration as it was kept"
+    assert state(page, NAMES.registration.landmarks) == landmarks and landmarks[0]["patient"] == "10.0, 20.5, 30.0"
     page.evaluate("window.trame.trigger('show_number', [0])")
     settled(page)
     np.testing.assert_allclose(page.evaluate("window.ussim.image.pose"), recording["poses"][0], atol=0.5)

@@ -7,7 +7,6 @@ import re
 import shutil
 import zipfile
 from pathlib import Path
-from time import monotonic
 
 import numpy as np
 import pytest
@@ -22,6 +21,8 @@ from vtkmodules.vtkIOXML import vtkXMLImageDataReader
 from SlicerUSSim.Logic import Volume
 from SlicerUSSim.Logic.base.volume import read_array
 from SlicerUSSim.Logic.mri.samples import head_mri
+from SlicerUSSim.Logic.tracked.sequence import TrackedSequence
+from SlicerUSSim.Workstation.scene_files import read_scene
 from SlicerUSSim.Workstation.state import NAMES
 from tests.test_workstation import (
     answer_new_patient,
@@ -46,6 +47,7 @@ from tests.test_workstation import (
     shown,
     state,
 )
+from tests.test_workstation_waiting import cancelled
 
 
 @pytest.fixture(scope="module")
@@ -309,10 +311,69 @@ def test_cancel_ends_a_segmentation_within_a_second_and_images_go_on(page, tmp_p
     click(page, "#segmentButton")
     page.locator("#cancel").wait_for()
     page.wait_for_timeout(300)
-    start = monotonic()
-    click(page, "#cancel")
-    page.wait_for_function(f"!window.trame.state.get('{NAMES.messages.progress_title}')")
-    took = monotonic() - start
+    took = cancelled(page)
     with new_image(page):
         page.keyboard.press("a")
     assert took < 1.5 and shown(page, "notesLabel") == notes and not errors(page)  # and the page hears of it
+
+
+# ---- images of a sequence --------------------------------------------------------------------------------------------
+
+
+def test_the_images_of_simulate_sequence_are_shown_and_played_where_they_were_taken(page, files, tmp_path):
+    """The page made images that it could not show."""
+    page.set_input_files("#open-file", files / "head.nii.gz")
+    answer_new_patient(page)
+    page.wait_for_function("window.ussim.image?.patient === 'head.nii.gz'")
+    page.set_input_files("#open-file", files / "sweep.igs.mha")
+    eventually(page, lambda: state(page, NAMES.sequence.length) == 6)
+    settled(page)
+    assert page.locator("#simulated-player").count() == 0
+    page.evaluate("window.trame.trigger('press', ['simulateSequenceButton'])")
+    page.locator("#simulated-player").wait_for()
+    settled(page)
+    assert not errors(page)
+    assert page.locator("#simulated-text").inner_text() == "Simulated 1 of 6"
+    recorded = TrackedSequence.read(files / "sweep.igs.mha")
+    seen = []
+    for number in (1, 4):
+        page.evaluate("number => window.trame.trigger('show_simulated', [number])", number)
+        settled(page)
+        image = page.evaluate("window.ussim.image")
+        assert image["sequence"] == number + 1 and page.locator("#frozen").inner_text() == "FROZEN"
+        caption = page.locator("#image-caption").inner_text()
+        assert caption.startswith(f"image {number + 1} of the simulated sequence, head.nii.gz, ")
+        np.testing.assert_allclose(image["pose"], recorded.transforms[number]["ProbeToReference"], atol=0.05)
+        assert state(page, NAMES.sequence.number) == number and cost(page) > 0  # beside the real image of that pose
+        assert not shown(page, "liveCheckBox")
+        seen.append(pixels(page))
+    assert not np.array_equal(*seen)
+    # The probe is there, and what is exported is that image
+    np.testing.assert_allclose(probe_pose(page), recorded.transforms[4]["ProbeToReference"], atol=0.05)
+    (tmp_path / "head.nii.gz").write_bytes((files / "head.nii.gz").read_bytes())
+    again = run_again(script_of(page), tmp_path)
+    assert np.array_equal(again, np.asarray(Image.open(download(page, "png"))))
+    shutil.copy(download(page, "mrb"), tmp_path / "sequence.mrb")
+    record = read_scene(str(tmp_path / "sequence.mrb")).simulated
+    assert record is not None and len(record.images) == 6 and np.array_equal(record.images[4], again)
+    assert '"patient": "head.nii.gz"' in record.about
+    click(page, "#play-simulated")
+    page.wait_for_function(f"window.trame.state.get('{NAMES.simulated.number}') === 2")
+    page.wait_for_function(f"window.trame.state.get('{NAMES.simulated.number}') === 5")
+    click(page, "#live")  # ends it
+    eventually(page, lambda: not state(page, NAMES.simulated.playing))
+    eventually(page, lambda: shown(page, "liveCheckBox"))
+    with new_image(page):
+        page.keyboard.press("a")
+    assert page.evaluate("window.ussim.image.sequence") is None and page.locator("#frozen").is_hidden()
+    # Those of a patient go with him
+    page.set_input_files("#open-file", files / "labels.nii.gz")
+    answer_new_patient(page)
+    page.wait_for_function("window.ussim.image?.patient === 'labels.nii.gz'")
+    settled(page)
+    assert page.locator("#simulated-player").count() == 0 and not errors(page)
+
+
+def probe_pose(page) -> np.ndarray:
+    """(4, 4) of the probe, as the page shows it in numbers."""
+    return np.array(state(page, NAMES.pose_matrix).split(), float).reshape(4, 4)

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import asyncio
 import os
+import shutil
 import signal
 import subprocess
 import sys
 import threading
 from time import monotonic, sleep
 
+import numpy as np
 import pytest
 
 pytest.importorskip("greenlet", reason="the workstation comes with: pip install '.[serve]'")
@@ -17,9 +19,28 @@ pytest.importorskip("trame_slicer", reason="the workstation comes with: pip inst
 pytest.importorskip("playwright", reason="browser tests need playwright: pip install '.[test]'")
 
 from SlicerUSSim.Logic.base.errors import Cancelled
+from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.mri.samples import head_mri
+from SlicerUSSim.Workstation.scene_files import read_scene
+from SlicerUSSim.Workstation.state import NAMES
 from SlicerUSSim.Workstation.tasks import Tasks
 from tests.test_browser_parts import run_in_loop
+from tests.test_workstation import (
+    answer_new_patient,
+    browser as browser,
+    click,
+    dismiss_messages,
+    download,
+    errors,
+    files as files,
+    first_page as first_page,
+    new_image,
+    pixels,
+    pytestmark as pytestmark,
+    serving,
+    settled,
+    state,
+)
 
 
 def test_what_does_not_hear_of_its_cancellation_is_abandoned_within_a_second():
@@ -100,3 +121,111 @@ def test_the_server_ends_within_two_seconds_whatever_it_computes(tmp_path, end):
     finally:
         server.kill()
     assert took < 2.0 and "Traceback" not in errors, (took, errors[-500:])
+
+
+# ---- on the page -----------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def url(files):
+    with serving("--labels", str(files / "labels.nii.gz")) as address:
+        yield address
+
+
+@pytest.fixture
+def page(first_page):
+    page, problems = first_page
+    page.mouse.move(600, 500)
+    settled(page)
+    yield page
+    assert not problems and not errors(page)
+
+
+_AT_WORK = f"title => window.trame.state.get('{NAMES.messages.progress_title}') === title"
+
+
+def cancelled(page) -> float:
+    """Press Cancel; returns the seconds until the page shows that nothing is under way.
+
+    By the page's clock: playwright waits until a button stands still, which takes seconds on a busy computer.
+    """
+    begun = page.evaluate("() => { const begun = performance.now(); document.getElementById('cancel').click();"
+        " return begun; }")  # fmt: skip
+    page.wait_for_function(_AT_WORK, arg="")
+    return (page.evaluate("performance.now()") - begun) / 1e3
+
+
+def image_during(page, title: str) -> None:
+    """Assert that the image follows the probe while something is under way."""
+    count = page.evaluate("window.ussim.images")
+    page.keyboard.press("a")
+    page.wait_for_function("n => window.ussim.images > n", arg=count)
+    assert page.evaluate(_AT_WORK, title)
+
+
+@pytest.fixture(scope="module")
+def large(tmp_path_factory, files):
+    """Labels of a ball in voxels of 1 mm, with their table, and an image whose noise takes seconds to compress."""
+    folder = tmp_path_factory.mktemp("large")
+    k, j, i = np.ogrid[-119.5:120, -119.5:120, -119.5:120]
+    away = k**2 + j**2 + i**2
+    ball = sum((away < radius**2).astype(np.uint8) for radius in (60.0, 90.0, 110.0))
+    Volume(ball, np.eye(4)).write(folder / "ball.nii.gz")
+    shutil.copy(files / "labels.json", folder / "ball.json")
+    noise = np.random.default_rng(0).random((300, 300, 300), np.float32)
+    Volume(noise, np.eye(4)).write(folder / "noise.nrrd")
+    return folder
+
+
+def test_a_scene_is_exported_with_progress_and_cancel_while_images_go_on(page, large, files, tmp_path):
+    """No image came while the scene was compressed, and nothing was shown."""
+    page.set_input_files("#open-file", large / "noise.nrrd")
+    answer_new_patient(page, "Image of labels.nii.gz")
+    settled(page)
+    before = state(page, NAMES.title)
+    page.evaluate(
+        "() => { window.fetched = []; const click = HTMLAnchorElement.prototype.click;"
+        " HTMLAnchorElement.prototype.click = function () { window.fetched.push(this.download); click.call(this); }; }"
+    )
+    click(page, "#export")
+    click(page, "#export-mrb")
+    page.wait_for_function(_AT_WORK, arg="Export the scene")
+    image_during(page, "Export the scene")
+    assert cancelled(page) < 1.5  # .6 s at most, and the page hears of it
+    settled(page)
+    assert page.evaluate("window.fetched") == [] and state(page, NAMES.title) == before
+    shutil.copy(download(page, "mrb"), tmp_path / "scene.mrb")
+    assert page.evaluate("window.fetched") == ["ultrasound.mrb"]
+    record = read_scene(str(tmp_path / "scene.mrb"))
+    found, wanted = record.nodes["mri"].volume, Volume.read(large / "noise.nrrd")
+    assert found is not None and np.array_equal(found.array, wanted.array)
+    with new_image(page):  # it goes on after that
+        page.keyboard.press("a")
+
+
+def test_a_surface_has_progress_and_can_be_cancelled_while_images_go_on(page, large):
+    """A surface held all images for 42 s."""
+    page.set_input_files("#open-file", [large / "ball.nii.gz", large / "ball.json"])
+    answer_new_patient(page)
+    page.wait_for_function(_AT_WORK, arg="Make the surface")
+    assert cancelled(page) < 1.5
+    settled(page)
+    assert state(page, NAMES.title) == "ball.nii.gz" and state(page, NAMES.pose) is None
+    assert state(page, NAMES.messages.status).startswith("no surface of the patient") and pixels(page).any()
+    click(page, "#look")
+    page.wait_for_function(_AT_WORK, arg="Make the surface")
+    image_during(page, "Make the surface")
+    settled(page)
+    assert abs(state(page, NAMES.pose)["lift_mm"]) < 5
+
+
+def test_exports_are_for_whom_has_the_token(page, browser, url):
+    other = browser.new_context()
+    address = f"{url.split('?')[0]}exported?kind="
+    assert other.request.get(f"{address}json").status == 403
+    found = page.request.get(f"{address}json")
+    assert found.status == 200 and found.headers["cache-control"] == "no-store" and "probe" in found.json()
+    assert page.request.get(f"{address}../secret").status == 204
+    assert errors(page) == ["the export is '../secret', expected one of the menu"]
+    dismiss_messages(page)
+    other.close()

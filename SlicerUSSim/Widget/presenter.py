@@ -26,6 +26,7 @@ from SlicerUSSim.Logic.mrml.labels_before import LabelsBefore
 from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic
 from SlicerUSSim.Logic.mrml.nodes import display_of, nodes_of_class, probe_pose, set_node_to_world
 from SlicerUSSim.Logic.mrml.parameter_node import BY_LOOK
+from SlicerUSSim.Logic.mrml.sequence_nodes import MADE_FROM
 from SlicerUSSim.Logic.probe.arrays import PROBES, Probe
 from SlicerUSSim.Logic.probe.beam import TRANSMIT_OF
 from SlicerUSSim.Logic.tissue.names import same_name
@@ -662,9 +663,14 @@ class PanelPresenter:
     def simulateSequence(self) -> None:
         """Simulate an image for each transform of the chosen sequence; its sequence browser plays both."""
         parameters = self.logic.parameters
-        transforms_node, images_node = parameters.transform_sequence, parameters.image_sequence
+        transforms_node: Any = parameters.transform_sequence
+        images_node: Any = parameters.image_sequence
         with self.shown(), self.working("Simulate sequence") as progress:
             require(transforms_node is not None, "no sequence of transforms chosen, expected a Sequence node")
+            if images_node is not None and images_node.GetNodeReferenceID(MADE_FROM) not in (
+                None, transforms_node.GetID()
+            ):  # fmt: skip
+                images_node = None  # those of other transforms stay
             with self._made(images_node, "Sequence", f"{transforms_node.GetName()} ultrasound") as images:
                 count = self.logic.simulateSequence(
                     parameters.labels,
@@ -673,6 +679,8 @@ class PanelPresenter:
                     browser_node=self._browser_of(transforms_node),
                     progress=progress,
                 )
+            images.SetNodeReferenceID(MADE_FROM, transforms_node.GetID())
+            parameters.image_sequence = images  # in place of which the next ones come
             self.view.showStatus(f"{count} images in {images.GetName()!r}")
         self.view.refresh()
 

@@ -141,16 +141,20 @@ class AnatomyViews:
         self.show_volume(None)
         self.show_labels(None, False)
         self.hide_image()
-        for name in (_PATIENT, _BODY):
-            display_of(self._model(name)).SetVisibility(False)
-        self._model(_PATIENT).SetAndObservePolyData(None)
-        self.threed.schedule_render()
+        display_of(self._model(_BODY)).SetVisibility(False)
+        self.hide_surface()
 
     def hide_image(self) -> None:
         """Show no image in the views."""
         for view in self.slices:
             view.set_foreground_volume_id(None)
         display_of(self._model(_FIELD)).SetVisibility(False)
+        self.threed.schedule_render()
+
+    def hide_surface(self) -> None:
+        """Show no surface of a patient."""
+        display_of(self._model(_PATIENT)).SetVisibility(False)
+        self._model(_PATIENT).SetAndObservePolyData(None)
         self.threed.schedule_render()
 
     def show_surface(self, surface: PatientSurface) -> None:
@@ -199,12 +203,12 @@ class AnatomyViews:
 
         `field` (rows, columns) bool is the imaged field; outside it the MRI is unchanged.
         """
-        image = taken.frame.image
+        image = taken.image
         # A copy without zeros inside the field, so that the threshold removes only the pixels outside.
         seen = np.where(field, np.maximum(image, 1), 0).astype(np.uint8)
         shown, pose = self._seen, self._pose
         pose.SetMatrixTransformToParent(vtk_matrix(taken.probe_to_world))
-        write_slice(shown, Volume(seen[None], taken.frame.grid.slice_to_probe), pose)
+        write_slice(shown, Volume(seen[None], taken.grid.slice_to_probe), pose)
         if self._image.GetOutputDataObject(0) is not shown.GetImageData():
             self._image.SetOutput(shown.GetImageData())
             display = display_of(shown)

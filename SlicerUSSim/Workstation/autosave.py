@@ -10,7 +10,7 @@ import io
 import logging
 import shutil
 import threading
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from time import monotonic
@@ -22,6 +22,7 @@ from trame_server.utils.asynchronous import get_event_loop
 
 from SlicerUSSim.Logic.base.errors import SimulationError
 from SlicerUSSim.Logic.base.reading import write_values
+from SlicerUSSim.Logic.mrml.landmark_nodes import Landmark
 from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic
 from SlicerUSSim.Logic.mrml.scene_record import (
     SceneRecord,
@@ -30,6 +31,7 @@ from SlicerUSSim.Logic.mrml.scene_record import (
     record_nodes,
     recorded_values,
 )
+from SlicerUSSim.Logic.mrml.taken_sequence import SimulatedRecord, record_taken, version_taken
 from SlicerUSSim.Widget.presenter import PanelPresenter
 from SlicerUSSim.Workstation.export import MOST_IMAGES, Cine
 from SlicerUSSim.Workstation.opener import Opener
@@ -57,6 +59,9 @@ class _Taken:
     sequence: SequenceRecord | None
     #: Whether there is one at all
     has_sequence: bool
+    #: Images of Simulate sequence
+    simulated: SimulatedRecord | None
+    has_simulated: bool
     fit: tuple | None
     has_fit: bool
     #: (time, image) that are new, and whether they begin a loop
@@ -73,6 +78,7 @@ class Autosave:
     ----------
     session : where; None: nothing is kept.
     pose : (4, 4) of the probe, or None.
+    landmarks : of the registration.
     told : called with a line if it cannot be kept, once.
     in_loop : calls a function in the event loop, from any thread.
     """
@@ -86,12 +92,13 @@ class Autosave:
         opener: Opener,
         cine: Cine,
         pose: Callable[[], np.ndarray | None],
+        landmarks: Callable[[], Sequence[Landmark]],
         told: Callable[[str], None],
         in_loop: Callable[[Callable[[], None]], None],
     ) -> None:
         self._session, self._shared, self._logic, self._presenter = session, shared, logic, presenter
         self._opener, self._cine, self._pose = opener, cine, pose
-        self._told, self._in_loop = told, in_loop
+        self._landmarks, self._told, self._in_loop = landmarks, told, in_loop
         self._is_told = False
         self._is_ended = False
         self._not_before = 0.0  # time, s
@@ -104,6 +111,7 @@ class Autosave:
         self._seen: Hashable = None  # when it was written last
         self._anatomy_seen: Hashable = None
         self._sequence_seen: Any = None
+        self._simulated_seen: Hashable = None
         self._fit_seen: Any = None  # with the preset that Apply replaced; these objects themselves, not their ids
         self._cine_seen = (-1, 0)  # loop, and number of images
         self._number = 0  # of files
@@ -155,18 +163,20 @@ class Autosave:
         page = self._page()
         pose, fit, sequence = self._pose(), self._presenter.fits.kept(), self._opener.opened_sequence
         anatomy = nodes_version(parameters)
+        simulated = version_taken(parameters.image_sequence)
         is_new_fit = fit is not None and not _are_same(fit, self._fit_seen)
         is_new_sequence = sequence is not None and sequence is not self._sequence_seen
         cine = self._cine.loop, self._cine.added
         seen = (
             anatomy, tuple(self._opener.sent_files.files.items()), parameters.node.GetMTime(),
-            None if pose is None else pose.tobytes(), fit is not None, sequence is not None, cine, repr(page),
-            self._presenter.noteLines,
+            None if pose is None else pose.tobytes(), fit is not None, sequence is not None, simulated, cine,
+            repr(page), self._presenter.noteLines, tuple(map(id, self._landmarks())),
         )  # fmt: skip
         if seen == self._seen and not is_new_fit and not is_new_sequence:
             return
         try:
             record = SceneRecord(record_nodes(parameters)) if anatomy != self._anatomy_seen else None
+            made = record_taken(parameters.image_sequence) if simulated != self._simulated_seen else None
         except SimulationError as error:
             self._tell(str(error))
             return
@@ -182,16 +192,18 @@ class Autosave:
             "source": None if source is None else source.to_dict(),
             "lesions": None if files is None else [list(entry) for entry in files],
             "about": self._cine.about,
+            "landmarks": [mark.to_list() for mark in self._landmarks()],
         }
         is_new_loop = self._cine.loop != self._cine_seen[0]
         taken = _Taken(
             self._opener.patient(), state, record,
-            sequence if is_new_sequence else None, sequence is not None,
+            sequence if is_new_sequence else None, sequence is not None, made, simulated is not None,
             (replace(fit[0], simulator=None), fit[1]) if fit is not None and is_new_fit else None,
             fit is not None, self._cine.since(0 if is_new_loop else self._cine_seen[1]), is_new_loop,
             dict(self._opener.sent_files.files),
         )  # fmt: skip
         self._seen, self._anatomy_seen, self._sequence_seen, self._fit_seen = seen, anatomy, sequence, fit
+        self._simulated_seen = simulated
         self._cine_seen = cine
         self._start(lambda: self._write(taken))
 
@@ -241,6 +253,11 @@ class Autosave:
         assert session is not None
         size = self._bytes_of("anatomy") if taken.anatomy is None else taken.anatomy.size
         size += self._bytes_of("sequence") if taken.sequence is None else taken.sequence.sequence.images.nbytes
+        size += (
+            self._bytes_of("simulated")
+            if taken.simulated is None
+            else sum(image.nbytes for image in taken.simulated.images)
+        )
         size += sum(path.stat().st_size for path in taken.sent.values() if path.exists())
         room = session.room()
         if size > room:
@@ -250,12 +267,16 @@ class Autosave:
             self._put("anatomy", taken.anatomy)
         if taken.sequence is not None:
             self._put("sequence", taken.sequence)
+        if taken.simulated is not None:
+            self._put("simulated", taken.simulated)
         if taken.fit is not None:
             self._put("fit", taken.fit)
         # By their places: another patient may have a file of the same name
         sent = {name: self._sent.get(path) or self._copied(path) for name, path in taken.sent.items()}
         self._files["sent"] = {name: file for name, file in sent.items() if file is not None}
-        for part, is_there in (("sequence", taken.has_sequence), ("fit", taken.has_fit)):
+        for part, is_there in (
+            ("sequence", taken.has_sequence), ("simulated", taken.has_simulated), ("fit", taken.has_fit),
+        ):  # fmt: skip
             if not is_there:
                 self._files.pop(part, None)
         if taken.is_new_loop:

@@ -20,6 +20,8 @@ from SlicerUSSim.Workstation.streams import ImageStream
 
 #: Seconds between two images during playback of a sequence.
 _PLAY_EVERY_S = 0.1
+#: Difference of matrices up to which a pose is the same, mm: nodes and files keep some digits
+_SAME_POSE = 1e-3
 
 
 class RealImages:
@@ -68,6 +70,8 @@ class Comparison:
         self._waiting: tuple[RealImages, int, np.ndarray, ImageGrid] | None = None  # to be compared
         self._comparing: asyncio.Task | None = None
         self._era = 0  # changes when a similarity of before must not be shown any more
+        #: Called when real images are shown in another frame
+        self.grid_changed: Callable[[], None] = lambda: None
         #: For display next to the simulated image, and over it
         self.streams = (ImageStream("real"), ImageStream("real-over"))
 
@@ -98,6 +102,17 @@ class Comparison:
         pixel = np.linalg.inv(tracked.field.image_to_probe) @ in_probe
         return tracked.numbers[self._shared.now.sequence.number], pixel[:2]
 
+    def place_of(self, pixel: np.ndarray) -> tuple[float, float] | None:
+        """The inverse of pixel_at: fractions of the width and height, also outside; None while no image is shown."""
+        if self._real is None or self._grid is None:
+            return None
+        in_probe = self._real.tracked.field.image_to_probe @ [*pixel, 0.0, 1.0]
+        grid = self._grid
+        width, height = (
+            count * spacing for count, spacing in zip((grid.columns, grid.rows), grid.pixel_spacing_mm, strict=True)
+        )
+        return float((in_probe[0] - grid.left_mm) / width), float((in_probe[1] - grid.top_mm) / height)
+
     def show(self, number: int) -> None:
         """Move the probe to the pose of the real image with this index, and show that image."""
         if self._real is None:
@@ -109,6 +124,14 @@ class Comparison:
         self._browser.SetSelectedItemNumber(number)
         self._move(tracked.poses[number])
         self.send()
+
+    def show_at(self, pose: np.ndarray) -> bool:
+        """As show, for the image with this pose (4, 4); whether there is one."""
+        poses = () if self._real is None else self._real.tracked.poses
+        found = [number for number, known in enumerate(poses) if np.allclose(known, pose, atol=_SAME_POSE)]
+        if found:
+            self.show(found[0])
+        return bool(found)
 
     def send(self) -> None:
         """Send the real image to the pages if they show it."""
@@ -128,6 +151,7 @@ class Comparison:
         if grid != self._grid:
             self._grid = grid
             self.send()
+            self.grid_changed()
         if self._real is None:
             return
         self._waiting = (self._real, self._shared.now.sequence.number, simulated, grid)
@@ -146,8 +170,7 @@ class Comparison:
 
     def drop(self) -> None:
         """Forget the sequence, which is of another patient."""
-        if self._playing is not None:
-            self.play()
+        self.stop()
         self._real = self._browser = None
         self.sees_nothing(None)
         for stream in self.streams:
@@ -180,6 +203,11 @@ class Comparison:
             self._playing = get_event_loop().create_task(self._play_on())
         with self._shared.changing() as now:
             now.sequence.playing = self._playing is not None
+
+    def stop(self) -> None:
+        """Play no more."""
+        if self._playing is not None:
+            self.play()
 
     async def _play_on(self) -> None:
         while self._real is not None:

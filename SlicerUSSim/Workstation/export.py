@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import asyncio
 import io
 import json
 import os
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -24,10 +24,12 @@ from SlicerUSSim.Logic.imaging.preset import Preset
 from SlicerUSSim.Logic.mri.sheets.surfels import KINDS
 from SlicerUSSim.Logic.mrml.label_nodes import read_labels
 from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic
-from SlicerUSSim.Logic.mrml.nodes import pose_in_labels
+from SlicerUSSim.Logic.mrml.nodes import nodes_of_class, pose_in_labels
 from SlicerUSSim.Logic.mrml.taken_image import TakenImage
 from SlicerUSSim.Workstation.opener import FILE, Opener
 from SlicerUSSim.Workstation.script import LabelSource, python_script
+from SlicerUSSim.Workstation.tasks import Tasks
+from SlicerUSSim.Workstation.zipped import zipped
 
 #: File formats of an image with its geometry.
 FRAME_SUFFIXES = (".nrrd", ".mha", ".vti")
@@ -43,7 +45,7 @@ def png(taken: TakenImage) -> bytes:
     """An image as a PNG file, without scaling, with what it is of as a text."""
     buffer, text = io.BytesIO(), PngInfo()
     text.add_itxt(ABOUT, json.dumps(taken.about()))
-    Image.fromarray(taken.frame.image).save(buffer, "PNG", pnginfo=text)
+    Image.fromarray(taken.image).save(buffer, "PNG", pnginfo=text)
     return buffer.getvalue()
 
 
@@ -96,18 +98,35 @@ class Cine:
         for seconds, image in images:
             self.add(image, until + seconds - images[-1][0], about)
 
-    def gif(self) -> bytes:
-        """An animated GIF with the original timing. Raises SimulationError for fewer than two images."""
-        require(len(self._images) > 1, f"the cine loop has {len(self._images)} images, expected two or more")
-        times = np.array([seconds for seconds, _ in self._images])
-        waits = np.clip(np.diff(times, append=times[-1] + 0.2) * 1e3, _SHORTEST_MS, _LONGEST_MS)
-        first, *others = [Image.fromarray(image) for _, image in self._images]
-        buffer = io.BytesIO()
-        first.save(
-            buffer, "GIF", save_all=True, append_images=others, duration=waits.round(-1).astype(int).tolist(), loop=0,
-            comment=self.about.encode(),
-        )  # fmt: skip
-        return buffer.getvalue()
+    @property
+    def images(self) -> list[tuple[float, np.ndarray]]:
+        """(time, image) of all, which are never changed."""
+        return list(self._images)
+
+
+def gif(
+    timed: Sequence[tuple[float, np.ndarray]], about: str = "", progress: Callable[[float], None] = lambda share: None
+) -> bytes:
+    """An animated GIF of (time, image), with the original timing.
+
+    `progress` is called with the fraction done before every image, and may raise errors.Cancelled.
+    Raises SimulationError for fewer than two images.
+    """
+    require(len(timed) > 1, f"the cine loop has {len(timed)} images, expected two or more")
+    times = np.array([seconds for seconds, _ in timed])
+    waits = np.clip(np.diff(times, append=times[-1] + 0.2) * 1e3, _SHORTEST_MS, _LONGEST_MS)
+
+    def others() -> Iterator[Image.Image]:
+        for number, (_, image) in enumerate(timed[1:], 1):
+            progress(number / len(timed))
+            yield Image.fromarray(image)
+
+    buffer = io.BytesIO()
+    Image.fromarray(timed[0][1]).save(
+        buffer, "GIF", save_all=True, append_images=others(), duration=waits.round(-1).astype(int).tolist(), loop=0,
+        comment=about.encode(),
+    )  # fmt: skip
+    return buffer.getvalue()
 
 
 class Exports:
@@ -118,39 +137,53 @@ class Exports:
     Parameters
     ----------
     preset : the settings to save.
+    progress : shows that something is done, by its title, and takes the fraction done; see PanelView.
     """
 
     def __init__(
         self,
         app: SlicerApp,
         logic: UltrasoundSceneLogic,
+        tasks: Tasks,
         opener: Opener,
         cine: Cine,
         preset: Callable[[], Preset],
+        progress: Callable[[str], AbstractContextManager[Callable[[float], None]]],
     ) -> None:
-        self._app, self._logic, self._opener, self._cine, self._preset = app, logic, opener, cine, preset
+        self._app, self._logic, self._tasks, self._opener = app, logic, tasks, opener
+        self._cine, self._preset, self._progress = cine, preset, progress
 
-    async def export(self, kind: str) -> tuple[str, bytes, str]:
-        """Export one kind; slow encoding runs outside the event loop."""
+    def export(self, kind: str) -> tuple[str, bytes, str]:
+        """Export one kind, in a task: what takes time can be cancelled, and images go on meanwhile."""
         if kind == "json":
             return "preset.json", json.dumps(self._preset().to_dict(), indent=2).encode(), "application/json"
         if kind == "mrb":
-            with self._logic.imageHeld():
-                return "ultrasound.mrb", scene_file(self._app), "application/zip"
+            return "ultrasound.mrb", self._scene(), "application/zip"
         if kind == "zip":
             text, missing = self._script()
             sent = self._opener.sent_files
             for name in missing:
                 require(sent.has(name), f"{name} was not opened in this page, expected it beside the script")
-            content = await asyncio.get_running_loop().run_in_executor(None, sent.bundle, text, missing)
+            with self._progress("Export the script") as progress:
+                content = self._tasks.doAside(lambda: sent.bundle(text, missing, progress))
             return "ultrasound.zip", content, "application/zip"
         if kind == "gif":
-            content = await asyncio.get_running_loop().run_in_executor(None, self._cine.gif)
+            images, about = self._cine.images, self._cine.about
+            with self._progress("Export the images") as progress:
+                content = self._tasks.doAside(lambda: gif(images, about, progress))
             return "ultrasound.gif", content, "image/gif"
+        require(kind in ("png", *FRAME_SUFFIXES), f"the export is {kind[:20]!r}, expected one of the menu")
         taken = required(self._logic.taken, _NO_IMAGE)
         if kind == "png":
             return "ultrasound.png", png(taken), "image/png"
         return f"ultrasound{kind}", frame_file(taken, kind), "application/octet-stream"
+
+    def _scene(self) -> bytes:
+        """The scene of this moment as .mrb, which 3D Slicer opens."""
+        with self._progress("Export the scene") as progress, TemporaryDirectory() as folder:
+            with self._logic.imageHeld():
+                files = write_bundle(self._app, Path(folder) / "ultrasound")
+            return self._tasks.doAside(lambda: zipped(files, progress))
 
     def script(self) -> tuple[str, bool]:
         """(a Python script that reproduces the image on the screen, whether it needs files that a page has sent)."""
@@ -171,7 +204,9 @@ class Exports:
         require(np.allclose(moved, np.eye(4)), f"the transform of {labels.GetName()!r} scales, expected a rigid one")
         names = read_labels(labels, preset.tissues).names
         sheets = self._shown_sheets(source)
-        text = python_script(source, replace(preset, tissues=preset.tissues.for_names(names)), in_labels, sheets)
+        text = python_script(
+            source, replace(preset, tissues=preset.tissues.for_names(names)), in_labels, sheets, taken.number
+        )
         needed = (*source.missing, *((sheets,) if isinstance(sheets, str) and not os.path.isabs(sheets) else ()))
         return text, tuple(dict.fromkeys(needed))
 
@@ -195,16 +230,32 @@ class Exports:
         return drawn
 
 
-def scene_file(app: SlicerApp) -> bytes:
-    """The scene of a SlicerApp as .mrb, which 3D Slicer opens. Raises SimulationError if it cannot be written."""
-    with TemporaryDirectory() as folder:
-        path = Path(folder) / "ultrasound.mrb"
-        window = vtkOutputWindow.GetInstance()
-        window.SetDisplayModeToNever()  # VTK would report every file of the scene
-        try:
-            written = app.io_manager.write_scene(path)
-        finally:
-            window.SetDisplayModeToAlwaysStdErr()
-        if not written or not path.exists():
-            raise SimulationError("the scene could not be written")
-        return path.read_bytes()
+def write_bundle(app: SlicerApp, folder: Path) -> dict[str, Path]:
+    """{name in an .mrb: file} of the scene of a SlicerApp, which is written into a new folder.
+
+    Nothing is compressed yet: this is done in the event loop, where 100 MB take some hundredths of a second.
+    Raises SimulationError if it cannot be written.
+    """
+    folder.mkdir()
+    stores: dict[Any, Any] = {}
+    for node in nodes_of_class(app.scene, "vtkMRMLStorableNode"):
+        if node.GetSaveWithScene() and (node.GetStorageNode() is not None or node.AddDefaultStorageNode()):
+            store = node.GetStorageNode()
+            if store is not None:  # some are whole in the scene's own file
+                stores[store] = store.GetUseCompression()
+    window = vtkOutputWindow.GetInstance()
+    window.SetDisplayModeToNever()  # VTK would report every file of the scene
+    try:
+        for store in stores:
+            store.SetUseCompression(False)
+        is_written = app.app_logic.SaveSceneToSlicerDataBundleDirectory(str(folder), None)
+    finally:
+        for store, uses_compression in stores.items():
+            store.SetUseCompression(uses_compression)
+        window.SetDisplayModeToAlwaysStdErr()
+    scene = folder / f"{folder.name}.mrml"
+    if not is_written or not scene.exists():
+        raise SimulationError("the scene could not be written")
+    # What is saved from this scene again is compressed, as usual
+    scene.write_text(scene.read_text("utf-8").replace('useCompression="0"', 'useCompression="1"'), "utf-8")
+    return {path.relative_to(folder.parent).as_posix(): path for path in sorted(folder.rglob("*")) if path.is_file()}

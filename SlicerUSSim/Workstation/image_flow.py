@@ -67,16 +67,15 @@ class ImageFlow:
         if taken is None:
             self.clear()
             return
-        frame = taken.frame
-        self._simulated.send(frame.image, stamp=self._stamps.computed, **description(taken))
-        self._cine.add(frame.image, perf_counter(), f"{taken.patient}, {taken.time}")
+        self._simulated.send(taken.image, stamp=self._stamps.computed, **description(taken))
+        self._cine.add(taken.image, perf_counter(), f"{taken.patient}, {taken.time}")
         self._show_in_views()
         if self._tracker.is_on:
             self._tracker.send(taken.volume())
         if taken.is_empty:
-            self._comparison.sees_nothing(frame.grid)
+            self._comparison.sees_nothing(taken.grid)
         else:
-            self._comparison.compare(frame.image, frame.grid)
+            self._comparison.compare(taken.image, taken.grid)
         self.tell_frozen()
 
     def clear(self) -> None:
@@ -105,7 +104,7 @@ class ImageFlow:
         """Show the image in Slicer's views, and turn the slices to it: both are of one moment."""
         taken = self._logic.taken
         if taken is not None:
-            self._views.show_image(taken, self._field_of(taken.frame.grid, taken.preset.probe))
+            self._views.show_image(taken, self._field_of(taken.grid, taken.preset.probe))
             if self._logic.isLive or self._is_at(taken):  # the first image comes before Live has begun
                 self._views.follow(taken.probe_to_world, taken.preset.probe)
 

@@ -393,7 +393,10 @@ def _screens(keys: tuple[str, ...]) -> None:
                 html.Div(
                     f"""<canvas data-stream="real"
                     :class="{{picking: {NAMES.registration.picking} === 'ultrasound'}}"
-                    @click="window.ussim.pickLandmark($event)"></canvas>"""
+                    @click="window.ussim.pickLandmark($event)"></canvas>
+                    <template v-for="(mark, n) in {NAMES.registration.landmarks}">
+                    <div v-if="mark.place && mark.image === {NAMES.sequence.name}" class="ussim-landmark"
+                    :style="{{left: mark.place[0] + '%', top: mark.place[1] + '%'}}">{{{{ n + 1 }}}}</div></template>"""
                 )
 
 
@@ -421,6 +424,23 @@ def _player() -> None:
             update_modelValue="trigger('show_number', [$event])",
         )  # fmt: skip
         html.Div(f"{{{{ {number} + 1 }}}} of {{{{ {length} }}}}", style="white-space: nowrap", id="sequence-text")
+    simulated = NAMES.simulated
+    with html.Div(classes="ussim-bar", v_if=f"{simulated.length} > 0", id="simulated-player"):
+        with v3.VBtn(
+            icon=True, size="x-small", variant="text", click="trigger('play_simulated')", id="play-simulated",
+            title="Images of Simulate sequence; live images pause",
+            raw_attrs=[f""":aria-label="({simulated.playing} ? 'Stop' : 'Play') + ' the simulated sequence'\""""],
+        ):  # fmt: skip
+            v3.VIcon(icon=(f"{simulated.playing} ? 'mdi-pause' : 'mdi-play'",))
+        v3.VSlider(
+            model_value=(simulated.number,), min=0, max=(f"Math.max({simulated.length} - 1, 1)",), step=1,
+            density="compact", hide_details=True, thumb_size=12, track_size=2, id="simulated-slider",
+            name="Image of the simulated sequence", update_modelValue="trigger('show_simulated', [$event])",
+        )  # fmt: skip
+        html.Div(
+            f"Simulated {{{{ {simulated.number} + 1 }}}} of {{{{ {simulated.length} }}}}", style="white-space: nowrap",
+            id="simulated-text",
+        )  # fmt: skip
 
 
 def _status() -> None:

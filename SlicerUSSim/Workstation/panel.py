@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass, field
 from time import perf_counter
 from typing import Any
 
@@ -29,6 +30,17 @@ _CURVE_POINTS = 150
 
 
 _CLICK = "click in the lesion, in a slice view (Escape: not)"
+
+
+@dataclass(eq=False)
+class _Work:
+    """Something that a user waits for."""
+
+    title: str
+    task: greenlet
+    percent: int = 0
+    #: Of this work alone: what is abandoned goes on to hear of it
+    is_cancelled: threading.Event = field(default_factory=threading.Event)
 
 
 class BrowserPanel:
@@ -56,10 +68,10 @@ class BrowserPanel:
         self._thread = threading.get_ident()
         #: Calls a function with the point (3,), in the world, of the next click in a slice view, or None
         self.pick: Callable[[Callable[[np.ndarray | None], None]], None] = lambda clicked: None
-        #: Called when live images may have ended, or begun to wait for other work
-        self.frozen_changed: Callable[[], None] = lambda: None
-        #: Whether the work under way is cancelled, and the task that does it
-        self._under_way: tuple[threading.Event, greenlet] | None = None
+        #: Called after every change, such as when live images have ended, or begun to wait for other work
+        self.refreshed: Callable[[], None] = lambda: None
+        #: The work under way: its title, whether it is cancelled, and the task that does it. The last is shown
+        self._under_way: list[_Work] = []
         self._status, self._status_until = "", 0.0
         self._table: Any = None  # vtkMRMLTableNode with the costs of a fit
         self._costs = Observed("ModifiedEvent", self._show_costs)
@@ -127,41 +139,36 @@ class BrowserPanel:
             panel.can = {name: is_usable for name, (is_usable, _) in can.items()}
             panel.tips = {name: tip for name, (_, tip) in can.items()}
             now.fit.free = [FreeParameter(name, on) for name, on in presenter.fits.freeParameters()]
-        self.frozen_changed()
+        self.refreshed()
 
     @contextmanager
     def progress(self, title: str) -> Iterator[Callable[[float], None]]:
-        is_cancelled = threading.Event()  # of this work alone: what is abandoned goes on to hear of it
-        before, self._under_way = self._under_way, (is_cancelled, getcurrent())
-        reported_percent = 0
-        with self._shared.changing() as now:
-            now.messages.progress_title, now.messages.progress_percent = title, reported_percent
+        work = _Work(title, getcurrent())
+        self._under_way.append(work)
+        self._show_work()
 
         def report(share: float) -> None:
-            nonlocal reported_percent
             percent = int(100 * share)
-            if is_cancelled.is_set():
+            if work.is_cancelled.is_set():
                 raise Cancelled
-            if percent != reported_percent:
-                reported_percent = percent
-                self._in_loop(lambda: self._send_percent(percent))
+            if percent != work.percent:
+                work.percent = percent
+                self._in_loop(self._show_work)
 
         try:
             yield report
         finally:
-            self._under_way = before
-            with self._shared.changing() as now:
-                now.messages.progress_title = ""
+            self._under_way.remove(work)
+            self._show_work()
 
     # ---- triggers of the page ----------------------------------------------------------------------------------
 
     def cancel(self) -> None:
         """Stop the work under way, within a second."""
-        under_way = self._under_way
-        if under_way is not None:
-            is_cancelled, waiting = under_way
-            is_cancelled.set()
-            self._tasks.abandonSoon(waiting, lambda: self._under_way is under_way, self._logic.renewSimulator)
+        if self._under_way:
+            work = self._under_way[-1]
+            work.is_cancelled.set()
+            self._tasks.abandonSoon(work.task, lambda: work in self._under_way, self._logic.renewSimulator)
 
     def set(self, name: str, value: Any) -> None:
         """Called when the user changes the value of a control."""
@@ -246,9 +253,11 @@ class BrowserPanel:
         with self._shared.changing() as now:
             now.messages.status = message
 
-    def _send_percent(self, percent: int) -> None:
+    def _show_work(self) -> None:
+        work = self._under_way[-1] if self._under_way else None
         with self._shared.changing() as now:
-            now.messages.progress_percent = percent
+            now.messages.progress_title = "" if work is None else work.title
+            now.messages.progress_percent = 0 if work is None else work.percent
 
     def _in_loop(self, function: Callable[[], None]) -> None:
         if threading.get_ident() == self._thread:

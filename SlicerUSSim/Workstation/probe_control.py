@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
+from contextlib import AbstractContextManager
 from dataclasses import fields
 from typing import Any
 
 import numpy as np
 
-from SlicerUSSim.Logic.base.errors import SimulationError
+from SlicerUSSim.Logic.base.errors import Cancelled, SimulationError
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.mrml.label_nodes import labels_version, read_labels
 from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic
@@ -24,6 +25,8 @@ _log = logging.getLogger(__name__)
 
 #: Seconds between two updates of the slice views, and of the sliders: both delay the image.
 _TURN_EVERY_S, _TELL_EVERY_S = 0.12, 0.4
+#: What is said when a surface was cancelled
+_NO_SURFACE = "no surface of the patient, along which the probe slides: the camera over the 3D view makes it"
 _POSE_FIELDS = tuple(entry.name for entry in fields(SurfacePose))
 
 
@@ -33,6 +36,7 @@ class ProbeControl:
     Parameters
     ----------
     about_to_move : called before the user moves the probe with mouse or keys.
+    progress : shows that something is done, by its title, and takes the fraction done; see PanelView.
     """
 
     def __init__(
@@ -42,9 +46,10 @@ class ProbeControl:
         tasks: Tasks,
         views: AnatomyViews,
         about_to_move: Callable[[], None],
+        progress: Callable[[str], AbstractContextManager[Callable[[float], None]]],
     ) -> None:
         self._shared, self._logic, self._tasks, self._views = shared, logic, tasks, views
-        self._about_to_move = about_to_move
+        self._about_to_move, self._progress = about_to_move, progress
         self.surface: PatientSurface | None = None
         self._surface_version: object = None
         self._drawn: tuple | None = None
@@ -107,6 +112,13 @@ class ProbeControl:
             point = [left + across * (right - left), top + down * (bottom - top), 0.0, 1.0]
             self.hand.aim((pose @ point)[:3])
 
+    def look_again(self) -> None:
+        """As look, called in a task: a surface that was cancelled is made now."""
+        if self.surface is None:
+            self._surface_version = None
+            self.update_surface()
+        self.look()
+
     def look(self) -> None:
         """Turn the 3D view to the probe."""
         pose = self.pose()
@@ -132,7 +144,10 @@ class ProbeControl:
     # ---- patient and probe in the views ------------------------------------------------------------------------
 
     def update_surface(self) -> None:
-        """Recompute the surface if the labels have changed; called in a task."""
+        """Recompute the surface if the labels have changed; called in a task.
+
+        Images go on meanwhile. One that is cancelled is not made again before the labels change, or look_again.
+        """
         labels: Any = self._logic.parameters.labels
         if labels is None or (labels.IsA("vtkMRMLVolumeNode") and labels.GetImageData() is None):
             return
@@ -142,8 +157,21 @@ class ProbeControl:
         self._surface_version = version
         volume = read_labels(labels, self._logic.preset.tissues).labels
         placed = Volume(volume.array, node_to_world(labels) @ volume.ijk_to_ras)
-        self.surface = self._tasks.doAside(lambda: PatientSurface(placed))
-        self._views.show_surface(self.surface)
+        try:
+            with self._progress("Make the surface") as progress:
+                made = self._tasks.doAside(lambda: PatientSurface(placed, progress))
+        except Cancelled:
+            if self._surface_version == version:
+                self.surface = None  # that of the labels before is not of these
+                self._views.hide_surface()
+                with self._shared.changing() as now:
+                    now.pose = None
+                    now.messages.status = _NO_SURFACE
+            return
+        if self._surface_version != version:  # of a patient who was closed meanwhile, or of labels of before
+            return
+        self.surface = made
+        self._views.show_surface(made)
         self.show_tissues(self._shared.now.views.show_tissues)
         self._tell()
 

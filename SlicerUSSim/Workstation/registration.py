@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -13,8 +13,11 @@ import numpy as np
 
 from SlicerUSSim.Logic.base.errors import SimulationError, require, required
 from SlicerUSSim.Logic.base.transforms import check_affine, check_rigid
+from SlicerUSSim.Logic.mrml.landmark_nodes import Landmark, write_landmarks
 from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic
+from SlicerUSSim.Logic.mrml.nodes import display_of
 from SlicerUSSim.Logic.mrml.scene_record import SequenceRecord
+from SlicerUSSim.Logic.mrml.sequence_nodes import MADE_FROM, POSES
 from SlicerUSSim.Logic.probe.arrays import Probe
 from SlicerUSSim.Logic.tracked.pose_files import fit_landmarks, read_calibration, read_registration
 from SlicerUSSim.Logic.tracked.sequence import TrackedSequence
@@ -30,6 +33,8 @@ _CALIBRATION, _REGISTRATION = "Calibration", "Registration"
 #: What is to be clicked next, as the page shows it
 PICK_IMAGE = "click the landmark in the real image (Escape: not)"
 PICK_PATIENT = "click the same landmark in a slice view (Escape: not)"
+#: Name and colour of the landmarks in the views, as in workstation.css
+_MARKS, _MARK_COLOR = "Registration landmarks", (1.0, 0.62, 0.18)
 _NOT_REGISTERED = "none: the frame of the ultrasound is taken for the patient's"
 
 
@@ -57,15 +62,6 @@ class Recording:
         return any(self.sequence.has_pose(number, self.path) for number in range(len(self.sequence)))
 
 
-@dataclass(frozen=True, eq=False)
-class _Landmark:
-    #: Number of the image in the recording, and (2,) column and row in it
-    number: int
-    pixel: np.ndarray
-    #: (3,) RAS in millimetres
-    point: np.ndarray
-
-
 class Registration:
     """The tracked ultrasound of the page. Methods that change it run in a task."""
 
@@ -85,9 +81,11 @@ class Registration:
         self._calibration: dict[str, np.ndarray] = {}
         self._to_ras = np.eye(4)
         self._from = {_CALIBRATION: "", _REGISTRATION: ""}
-        self._landmarks: list[_Landmark] = []
+        self._landmarks: list[Landmark] = []
         self._remaining: np.ndarray | None = None
         self._nodes: list[Any] = []
+        self._marks: Any = None  # vtkMRMLMarkupsFiducialNode with the landmarks
+        comparison.grid_changed = self._tell_landmarks
 
     # ---- recording ---------------------------------------------------------------------------------------------
 
@@ -115,11 +113,16 @@ class Registration:
         if not recording.is_calibrated:
             self._open_section()
 
-    def restore(self, record: SequenceRecord, probe: Probe) -> None:
+    @property
+    def landmarks(self) -> tuple[Landmark, ...]:
+        """Those that were picked."""
+        return tuple(self._landmarks)
+
+    def restore(self, record: SequenceRecord, probe: Probe, landmarks: Iterable[Landmark] = ()) -> None:
         """Use what was kept of a recording, calibrated and in its place; its images are of this probe."""
         place = np.eye(4) if record.to_ras is None else record.to_ras
         self._apply(Recording(record.sequence, record.name, record.path), {}, place, record, probe)
-        self._landmarks, self._remaining = [], None
+        self._landmarks, self._remaining = list(landmarks), None
         is_placed = not np.allclose(place, np.eye(4))
         self._from = {_CALIBRATION: "", _REGISTRATION: "as it was kept" if is_placed else ""}
         self._tell()
@@ -210,7 +213,7 @@ class Registration:
         def clicked(point: np.ndarray | None) -> None:
             self._end_picking()
             if point is not None:
-                self._add(_Landmark(number, pixel, point))
+                self._add(Landmark(number, pixel, point))
 
         self._hand.pick(clicked)
         with self._shared.changing() as now:
@@ -231,7 +234,7 @@ class Registration:
                 self._comparison.pixel_at(0.0, 0.0),
                 "no real image is shown, expected tracked ultrasound with its calibration",
             )
-            self._add(_Landmark(found[0], column_row, ras))
+            self._add(Landmark(found[0], column_row, ras))
             with self._shared.changing() as now:
                 now.registration.typed_pixel = now.registration.typed_point = ""
 
@@ -254,7 +257,7 @@ class Registration:
             matrix, line, remaining = fit_landmarks(np.reshape(placed, (-1, 3)), np.reshape(points, (-1, 3)))
             self._register(matrix, line, remaining)
 
-    def _add(self, landmark: _Landmark) -> None:
+    def _add(self, landmark: Landmark) -> None:
         self._landmarks.append(landmark)
         self._remaining = None
         self._tell()
@@ -304,10 +307,20 @@ class Registration:
             self._logic.preset = replace(self._logic.preset, probe=tracked.probe)
             self._logic.parameters.real = images
             self._comparison.take(tracked, browser, number)
+            self._choose_poses(browser, old)
         self._opener.opened_sequence = record
         for node in old:
             if node.GetScene() is not None:
                 node.GetScene().RemoveNode(node)
+
+    def _choose_poses(self, browser: Any, old: list[Any]) -> None:
+        """Let Simulate sequence use the poses of the images, instead of those before, or of none."""
+        parameters: Any = self._logic.parameters
+        if parameters.transform_sequence is None or parameters.transform_sequence in old:
+            parameters.transform_sequence = browser.GetNodeReference(POSES)
+        images = parameters.image_sequence
+        if images is not None and images.GetNodeReference(MADE_FROM) in old:  # which are at other poses
+            parameters.image_sequence = None
 
     def _required(self) -> Recording:
         return required(self.recording, "no tracked ultrasound is open, expected a file with it first")
@@ -316,14 +329,8 @@ class Registration:
         """Show what is used."""
         recording = self.recording
         calibration, to_ras = self._calibration, self._to_ras
-        lines = [
-            LandmarkLine(
-                f"image {mark.number}: {mark.pixel[0]:.1f}, {mark.pixel[1]:.1f}",
-                ", ".join(f"{value:.1f}" for value in mark.point),
-                "" if self._remaining is None else f"{self._remaining[n]:.2f} mm",
-            )
-            for n, mark in enumerate(self._landmarks)
-        ]
+        self._draw_landmarks()
+        self._tell_landmarks()
         with self._shared.changing() as now:
             about = now.registration
             about.recording = "" if recording is None else f"{recording.name}: {recording.what}"
@@ -337,8 +344,45 @@ class Registration:
             about.calibration_text = _text(calibration[name]) if name else ""
             about.registration = self._from[_REGISTRATION] or (_NOT_REGISTERED if recording is not None else "")
             about.registration_text = _text(to_ras) if self._from[_REGISTRATION] else ""
-            about.landmarks = lines
         self._presenter.view.refresh()
+
+    def _tell_landmarks(self) -> None:
+        lines = []
+        for n, mark in enumerate(self._landmarks):
+            place = self._comparison.place_of(mark.pixel)
+            lines.append(
+                LandmarkLine(
+                    f"image {mark.number}: {mark.pixel[0]:.1f}, {mark.pixel[1]:.1f}",
+                    ", ".join(f"{value:.1f}" for value in mark.point),
+                    "" if self._remaining is None else f"{self._remaining[n]:.2f} mm",
+                    f"image {mark.number}",
+                    None if place is None else [round(100.0 * share, 2) for share in place],
+                )
+            )
+        with self._shared.changing() as now:
+            now.registration.landmarks = lines
+
+    def _draw_landmarks(self) -> None:
+        """Show the landmarks in the views of the patient, and save them with the scene."""
+        node, scene = self._marks, self._logic.scene
+        if node is not None and node.GetScene() is not scene:  # it went with a patient
+            node = None
+        if not self._landmarks:
+            if node is not None:
+                scene.RemoveNode(node)
+            self._marks = None
+            return
+        if node is None:
+            node = scene.AddNewNodeByClass("vtkMRMLMarkupsFiducialNode", _MARKS)
+            node.CreateDefaultDisplayNodes()
+            display_of(node).SetSelectedColor(*_MARK_COLOR)
+        self._marks = node
+        recording = self._required()
+        sequence = recording.sequence.with_transforms(self._calibration)
+        placed = [number for number in range(len(sequence)) if sequence.has_pose(number, recording.path)]
+        # The scene has no other images, see add_sequence: there they have other numbers
+        known = [replace(mark, number=placed.index(mark.number)) for mark in self._landmarks if mark.number in placed]
+        write_landmarks(node, known)
 
     def _calibration_line(self, recording: Recording | None) -> str:
         if recording is None:

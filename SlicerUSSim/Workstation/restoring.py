@@ -15,9 +15,11 @@ from SlicerUSSim.Logic.base.errors import SimulationError, require, required
 from SlicerUSSim.Logic.base.transforms import check_rigid
 from SlicerUSSim.Logic.fitting.tracked_fit import Fit
 from SlicerUSSim.Logic.imaging.preset import Preset
+from SlicerUSSim.Logic.mrml.landmark_nodes import Landmark
 from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic
 from SlicerUSSim.Logic.mrml.nodes import display_of, set_node_to_world
 from SlicerUSSim.Logic.mrml.scene_record import ROLES, SceneRecord, SequenceRecord, put_nodes, put_values
+from SlicerUSSim.Logic.mrml.taken_sequence import SimulatedRecord, put_taken
 from SlicerUSSim.Widget.presenter import PanelPresenter
 from SlicerUSSim.Workstation.export import Cine
 from SlicerUSSim.Workstation.loading import Loading
@@ -141,11 +143,17 @@ class Restoring:
         images: list[tuple[float, np.ndarray]],
     ) -> None:
         parameters: Any = self._logic.parameters
-        made = put_nodes(self._scene, record)
+        simulated = None if record.simulated is None else put_taken(self._scene, record.simulated)
+        try:
+            made = put_nodes(self._scene, record)
+        except BaseException:
+            if simulated is not None:
+                self._scene.RemoveNode(simulated)
+            raise
         parents = [node.GetParentTransformNode() for node in made.values()]
         labels: Any = made.get("labels")
         flap = None if labels is None else labels.GetNodeReference("SlicerUSSim.flap")
-        self._loading.begin_patient(*made.values(), *parents, flap)
+        self._loading.begin_patient(*made.values(), *parents, flap, simulated)
         refused = put_values(parameters, kept.get("values", {}))
         preset = self._logic.preset
         for role in ROLES:
@@ -163,8 +171,11 @@ class Restoring:
         if pose is not None:
             self._put_probe(pose)
         if record.sequence is not None:
-            self._registration.restore(record.sequence, preset.probe)
+            self._registration.restore(record.sequence, preset.probe, record.landmarks)
             self._logic.preset = preset
+        parameters.image_sequence = simulated
+        if parameters.proposal is not None and display_of(parameters.proposal) is not None:
+            display_of(parameters.proposal).SetVisibility(True)
         page = kept.get("page", {})
         self._show_page(page)
         if pose is not None:
@@ -212,7 +223,14 @@ def _parts_of(session: KeptSession) -> tuple[SceneRecord, tuple[Fit, Preset | No
     pose = content.get("pose")
     if pose is not None:
         pose = check_rigid("the session's pose", pose)
-    record = SceneRecord(anatomy.nodes, {}, pose, sequence if isinstance(sequence, SequenceRecord) else None)
+    try:
+        landmarks = tuple(map(Landmark.of_list, content.get("landmarks", ())))
+    except (ValueError, TypeError) as error:
+        raise SimulationError(f"the session's landmarks are damaged ({error})") from None
+    simulated = session.read("simulated")
+    made = simulated if isinstance(simulated, SimulatedRecord) else None
+    recorded = sequence if isinstance(sequence, SequenceRecord) else None
+    record = SceneRecord(anatomy.nodes, {}, pose, recorded, landmarks=landmarks, simulated=made)
     images = []
     for name in content["files"].get("cine", []):
         for seconds, jpeg in session.read_file(str(name)):

@@ -31,7 +31,7 @@ preset = Preset.from_dict(
 probe_to_ras = np.array({pose})
 
 simulator = UltrasoundSimulator(labels, preset.tissues, preset.settings{texture}{sheets})
-frame = simulator.simulate(preset.probe, probe_to_ras, preset.display, noise_seed=seed_of_pose(probe_to_ras))
+frame = simulator.simulate(preset.probe, probe_to_ras, preset.display, noise_seed={seed})
 frame.to_volume().write("image.nrrd")  # frame.image is a (rows, columns) uint8 array
 print(frame.image.shape, "pixels, mean", frame.image.mean())
 '''
@@ -93,13 +93,18 @@ class LabelSource:
 
 
 def python_script(
-    source: LabelSource, preset: Preset, probe_to_ras: np.ndarray, sheets: Sequence[str] | str = ()
+    source: LabelSource,
+    preset: Preset,
+    probe_to_ras: np.ndarray,
+    sheets: Sequence[str] | str = (),
+    number: int | None = None,
 ) -> str:
     """A script that simulates an image of these labels with `preset`, whose tissues are by label, at a pose (4, 4).
 
     `sheets` are the kinds of those that Segment found which the image shows, or the file with all that it shows.
+    `number` is that of an image of a sequence, the seed of its noise; otherwise that follows from the pose.
     """
-    imports, more, lines = ["UltrasoundSimulator", "seed_of_pose"], "", []
+    imports, more, lines = ["UltrasoundSimulator", *(["seed_of_pose"] if number is None else [])], "", []
     is_demo, is_ct = not source.path, source.options.get("contrast") == CT
     if is_demo:
         more = "from SlicerUSSim.Logic.mri.samples import demo_mri\n"
@@ -181,6 +186,7 @@ def python_script(
         labels="\n".join(lines),
         preset=indent(pformat(_plain(preset), width=112, sort_dicts=False), "    ").strip(),
         pose=_array(probe_to_ras),
+        seed="seed_of_pose(probe_to_ras)" if number is None else number,
         texture=f", texture={texture}" if needs_texture else "",
         sheets=surfels,
     )

@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import filecmp
-import io
 import shutil
-import zipfile
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path, PurePosixPath
 from tempfile import TemporaryDirectory
 
-#: Suffixes of files that are compressed
-_COMPRESSED = (".gz", ".zip", ".mgz")
+from SlicerUSSim.Workstation.zipped import zipped
 
 
 class SentFiles:
@@ -63,15 +60,10 @@ class SentFiles:
         for name in self._files.keys() - self._meant(kept):
             self._files.pop(name).unlink(missing_ok=True)
 
-    def bundle(self, script: str, names: Iterable[str]) -> bytes:
-        """A .zip with a script, and the files of these names beside it."""
-        buffer = io.BytesIO()
-        with zipfile.ZipFile(buffer, "w") as archive:
-            archive.writestr("image.py", script, zipfile.ZIP_DEFLATED)
-            for name in sorted(self._meant(names)):
-                kind = zipfile.ZIP_STORED if name.lower().endswith(_COMPRESSED) else zipfile.ZIP_DEFLATED
-                archive.write(self._files[name], name, kind, 1)
-        return buffer.getvalue()
+    def bundle(self, script: str, names: Iterable[str], progress: Callable[[float], None]) -> bytes:
+        """A .zip with a script, and the files of these names beside it; `progress` may raise Cancelled."""
+        files = {name: self._files[name] for name in sorted(self._meant(names))}
+        return zipped(files, progress, {"image.py": script})
 
     def _meant(self, names: Iterable[str]) -> set[str]:
         """The kept files that names of files and folders mean."""

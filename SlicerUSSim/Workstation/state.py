@@ -85,6 +85,9 @@ class LandmarkLine:
     ultrasound: str
     patient: str
     remaining: str
+    #: Name of its image, and where it is in it as it is shown: percent from the left and from the top
+    image: str = ""
+    place: list[float] | None = None
 
 
 # ---- shared state, by topic ------------------------------------------------------------------------------------------
@@ -151,6 +154,17 @@ class SequenceState:
     comparison: ComparisonMode = ComparisonMode.BESIDE
     #: Cost between simulated and real image, as text
     similarity: str = ""
+
+
+@dataclass
+class SimulatedState:
+    """The sequence of simulated images."""
+
+    #: Number of images; 0 without a sequence
+    length: int = 0
+    #: Index of that which is shown, or was last
+    number: int = 0
+    playing: bool = False
 
 
 @dataclass
@@ -241,6 +255,7 @@ class PageState:
     messages: MessageState = field(default_factory=MessageState)
     views: ViewState = field(default_factory=ViewState)
     sequence: SequenceState = field(default_factory=SequenceState)
+    simulated: SimulatedState = field(default_factory=SimulatedState)
     fit: FitState = field(default_factory=FitState)
     script: ScriptState = field(default_factory=ScriptState)
     registration: RegistrationState = field(default_factory=RegistrationState)

@@ -39,7 +39,9 @@ from SlicerUSSim.Workstation.questions import Questions
 from SlicerUSSim.Workstation.receiver import Receiver
 from SlicerUSSim.Workstation.registration import Registration
 from SlicerUSSim.Workstation.restoring import Restoring
+from SlicerUSSim.Workstation.sender import Sender
 from SlicerUSSim.Workstation.session_store import OwnSession, SessionStore
+from SlicerUSSim.Workstation.simulated import SimulatedSequence
 from SlicerUSSim.Workstation.state import NAMES, SharedState
 from SlicerUSSim.Workstation.tasks import Tasks
 from SlicerUSSim.Workstation.tracker import Tracker
@@ -74,7 +76,7 @@ class Workstation:
         self._panel = BrowserPanel(shared, self._messages, logic, tasks, sections, stamps.image_begun)
         self._presenter = presenter = self._panel.presenter
         self._views = AnatomyViews(app, self.server, view_tools)
-        self._probe = ProbeControl(shared, logic, tasks, self._views, stamps.probe_moved)
+        self._probe = ProbeControl(shared, logic, tasks, self._views, stamps.probe_moved, self._panel.progress)
         self._poses = PoseEntry(shared, tasks, presenter, self._probe.pose, self._probe.move)
         self._probe.told = self._poses.show
         self._comparison = Comparison(shared, self._probe.move)
@@ -82,11 +84,12 @@ class Workstation:
         self._images = ImageFlow(
             shared, logic, self._views, self._comparison, cine, self._tracker, stamps, lambda: presenter.isBusy
         )
-        self._panel.frozen_changed = self._images.tell_frozen
+        self._simulated = SimulatedSequence(shared, logic, presenter, self._comparison, self._probe.move)
+        self._panel.refreshed = self._refreshed
         opener = Opener(app.scene, logic, tasks, files)
         presenter.maskFile, presenter.sheetsFile = opener.mask_file, opener.sheets_file
         self._panel.pick = self._probe.hand.pick
-        self._exports = Exports(app, logic, opener, cine, presenter.presetToSave)
+        self._exports = Exports(app, logic, tasks, opener, cine, presenter.presetToSave, self._panel.progress)
         self._registration = Registration(
             shared, logic, tasks, opener, presenter, self._comparison, self._probe.hand
         )  # fmt: skip
@@ -101,8 +104,9 @@ class Workstation:
 
         self._session = self._begun_session(sessions)
         self._autosave = Autosave(
-            self._session, shared, logic, presenter, opener, cine, self._probe.pose, self._messages.show, tasks.tell
-        )
+            self._session, shared, logic, presenter, opener, cine, self._probe.pose,
+            lambda: self._registration.landmarks, self._messages.show, tasks.tell,
+        )  # fmt: skip
         self._restoring = Restoring(
             sessions if self._session is not None else None,
             shared, app.scene, logic, tasks, opener, presenter, self._loading, self._registration,
@@ -119,6 +123,7 @@ class Workstation:
         self._follow_pages()
         receiver = Receiver(self._open_files, self._add_file, self._messages.show, self._open_pose)
         self.server.controller.on_server_bind.add(lambda wslink: receiver.serve(wslink.app))
+        self.server.controller.on_server_bind.add(lambda wslink: Sender(self._export).serve(wslink.app))
         self.server.controller.on_server_ready.add(self._ready)
         self.server.controller.on_server_exited.add(self.close)
         build_page(self.server, sections, self._views.layout, (*KEYS, "Escape"))
@@ -175,9 +180,11 @@ class Workstation:
             "type_pose": self._in_task(self._poses.type),
             "key": probe.hand.key,
             "plane": probe.choose_plane,
-            "look": probe.look,
+            "look": self._in_task(probe.look_again),
             "aim_image": probe.aim_image,
-            "play": comparison.play,
+            "play": self._play,
+            "play_simulated": self._in_task(self._simulated.play),
+            "show_simulated": self._in_task(self._simulated.show),
             "show_number": comparison.show,
             "answer": self._questions.answer,
             "calibrate": self._in_task(registration.calibrate),
@@ -190,7 +197,6 @@ class Workstation:
             "fit_landmarks": self._in_task(registration.fit),
             "cancel": self._panel.cancel,
             "dismiss": self._messages.dismiss,
-            "export": self._export,
             "script": self._show_script,
             "restore_session": self._in_task(lambda: self._then_refresh(self._restoring.restore)),
             "discard_session": self._in_task(self._restoring.discard),
@@ -225,18 +231,32 @@ class Workstation:
         method(*arguments)
         self._panel.refresh()
 
-    async def _export(self, kind: str) -> list[object] | None:
-        """[file name, content, MIME type], or None after an error was shown on the page."""
-        try:
-            if kind.startswith("pose."):
-                name, content, mime = *self._poses.file(kind.removeprefix("pose")), "application/octet-stream"
-            else:
-                name, content, mime = await self._exports.export(kind)
-        except SimulationError as error:
-            self._messages.show(str(error))
-            return None
-        protocol: Any = self.server.protocol
-        return [name, protocol.addAttachment(content), mime]
+    async def _export(self, kind: str) -> tuple[str, bytes, str] | None:
+        """(file name, content, MIME type), or None after an error was shown on the page, or a cancellation."""
+        exported: asyncio.Future[tuple[str, bytes, str] | None] = asyncio.get_running_loop().create_future()
+
+        def export() -> None:
+            found = None
+            try:
+                with self._presenter.shown():
+                    if kind.startswith("pose."):
+                        found = *self._poses.file(kind.removeprefix("pose")), "application/octet-stream"
+                    else:
+                        found = self._exports.export(kind)
+            finally:
+                if not exported.done():  # the page may be gone
+                    exported.set_result(found)
+
+        self._tasks.start(export)
+        return await exported
+
+    def _refreshed(self) -> None:
+        self._images.tell_frozen()
+        self._simulated.look()
+
+    def _play(self) -> None:
+        self._simulated.stop()
+        self._comparison.play()
 
     def _show_script(self) -> None:
         with self._presenter.shown(), self._shared.changing() as now:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+from SlicerUSSim.Logic.mrml.landmark_nodes import is_landmarks
 from SlicerUSSim.Logic.mrml.own_results import IMAGE, OUTLINE, SEQUENCE, SHEETS, is_empty, kind_of_result
 from SlicerUSSim.Logic.mrml.parameter_node import NODE_PARAMETERS
 
@@ -48,6 +49,7 @@ _RULES: dict[str, Callable[[Any], bool]] = {
     "mri": _is_anatomy,
     "second_mri": _is_anatomy,
     "sheets": lambda node: kind_of_result(node) in (None, SHEETS, "1"),
+    "seed": lambda node: not is_landmarks(node),
     "probe_transform": lambda node: kind_of_result(node) is None,
     "output": lambda node: not node.IsA("vtkMRMLLabelMapVolumeNode") and _made_as(IMAGE)(node),
     "outline": _made_as(OUTLINE),

@@ -72,13 +72,13 @@ from SlicerUSSim.Logic.mrml.nodes import (
     show_in_slice,
     write_image,
     write_outline,
+    write_slice,
 )
 from SlicerUSSim.Logic.mrml.own_labels import mark_as_made, may_replace
 from SlicerUSSim.Logic.mrml.own_results import (
     IMAGE,
     OUTLINE,
     REGISTRATION,
-    SEQUENCE,
     mark_as_result,
     may_replace_result,
     require_result,
@@ -97,6 +97,7 @@ from SlicerUSSim.Logic.mrml.taken_image import (
     remove_image,
     write_about,
 )
+from SlicerUSSim.Logic.mrml.taken_sequence import in_node, read_taken, write_taken
 from SlicerUSSim.Logic.probe.placement import pose_in_slice
 from SlicerUSSim.Logic.tissue.label_maps import LabelledTissues
 from SlicerUSSim.Logic.tissue.table import TissueTable
@@ -180,6 +181,8 @@ class UltrasoundSceneLogic:
         self._preset: tuple[str, Preset] = ("", Preset())
         self._live: LiveUpdate | None = None
         self._taken: TakenImage | None = None
+        #: ID of the last simulated sequence, and what its images show of the patient
+        self._in_sequence: tuple[str, Hashable] = ("", None)
 
     # ---- choices -------------------------------------------------------------------------------------------
 
@@ -506,7 +509,9 @@ class UltrasoundSceneLogic:
         """
         self._check_output(labels_node, output_node)
         try:
-            taken = self._take(labels_node, probe_transform_node, output_node, warned)
+            taken = self._take(labels_node, probe_pose(probe_transform_node), output_node, warned)
+            self._check_output(labels_node, output_node)  # nodes may have changed in the meantime
+            require_node(probe_transform_node, "vtkMRMLTransformNode", use="probe transform")
         except BaseException:
             if may_replace_result(output_node):
                 self.clearImage(output_node)  # an image of before would be taken for that of this pose
@@ -514,25 +519,33 @@ class UltrasoundSceneLogic:
         self._taken = taken
         was_modifying = output_node.StartModify()
         write_about(taken)
-        write_image(output_node, taken.frame, probe_transform_node)
+        frame = required(taken.frame, "the image has no frame")
+        write_image(output_node, frame, probe_transform_node)
         mark_as_result(output_node, IMAGE)
         output_node.EndModify(was_modifying)
-        return taken.frame
+        return frame
 
     def _take(
-        self, labels_node, probe_transform_node, output_node, warned: Callable[[Warning], None]
-    ) -> TakenImage:  # fmt: skip
+        self,
+        labels_node,
+        probe_to_world: np.ndarray,
+        output_node,
+        warned: Callable[[Warning], None],
+        number: int | None = None,
+    ) -> TakenImage:
+        """The image at a pose (4, 4) for a volume node, into which nothing is written; `number`: in a sequence."""
         warnings: list[Warning] = []
-        probe_to_world, anatomy = probe_pose(probe_transform_node), self.anatomyOf(labels_node)
+        anatomy = self.anatomyOf(labels_node)
         preset, patient = self._effective_preset(labels_node), patient_of(labels_node)
-        frame = self._frame(labels_node, probe_to_world, warnings.append)
-        self._check_output(labels_node, output_node)  # nodes may have changed in the meantime
-        require_node(probe_transform_node, "vtkMRMLTransformNode", use="probe transform")
+        frame = self._frame(labels_node, probe_to_world, warnings.append, number)
         for warning in warnings:
             warned(warning)
         is_empty = any(isinstance(warning, EmptyViewWarning) for warning in warnings) or not frame.iq.any()
         time = datetime.now(timezone.utc).isoformat(timespec="milliseconds")
-        return TakenImage(frame, probe_to_world, preset, patient, anatomy, time, is_empty, output_node)
+        return TakenImage(
+            frame.image, frame.grid, probe_to_world, preset, patient, anatomy, time, is_empty, output_node,
+            frame=frame, number=number,
+        )  # fmt: skip
 
     def anatomyOf(self, labels_node) -> Hashable:
         """A value that changes with what images show of the patient: labels and sheets."""
@@ -584,7 +597,7 @@ class UltrasoundSceneLogic:
         self._simulators.forget()
         self._patients = PatientReader()
         self._segmented = self._sheets = self._texture = self._taken = None
-        self._laid = (None, {})
+        self._laid, self._in_sequence = (None, {}), ("", None)
         self.proposals = LesionProposals(self.scene, lambda work: self._work.do(work))
         self.notes = self.warnings = ()
 
@@ -635,23 +648,25 @@ class UltrasoundSceneLogic:
         parent = None if proxy is None else proxy.GetParentTransformNode()
         to_world = np.eye(4) if parent is None else node_to_world(parent)
 
-        images = []
+        images: list[TakenImage] = []
         for number in range(count):
             item = transforms_node.GetNthDataNode(number)
             require_node(item, "vtkMRMLTransformNode", use=f"item {number} of {named(transforms_node)}")
             pose = check_rigid(f"item {number} of {named(transforms_node)}", to_world @ node_to_world(item))
-            frame = self._frame(labels_node, pose, warn_again, noise_seed=number)
             image = self.scene.CreateNodeByClass("vtkMRMLScalarVolumeNode")
             image.UnRegister(None)
-            write_image(image, frame)
+            taken = self._take(labels_node, pose, image, warn_again, number)
+            write_about(taken)
+            write_slice(image, Volume(taken.image[None], taken.grid.slice_to_probe))
             mark_as_result(image, IMAGE)  # the browser's node for the shown image is a copy
-            images.append(image)
+            images.append(replace(taken, frame=None))  # whose signals are many times larger
             if progress is not None:
                 progress((number + 1) / count)
         require_node(images_node, "vtkMRMLSequenceNode", use="sequence of images")
 
-        SequenceIndex.of_node(transforms_node).fill(images_node, images)
-        mark_as_result(images_node, SEQUENCE)
+        write_taken(images_node, SequenceIndex.of_node(transforms_node), images)
+        same = {image.anatomy for image in images}
+        self._in_sequence = (images_node.GetID(), images[0].anatomy if len(same) == 1 else None)
         if browser_node is not None:
             if not browser_node.IsSynchronizedSequenceNode(images_node, True):
                 browser_node.AddSynchronizedSequenceNode(images_node)
@@ -659,6 +674,34 @@ class UltrasoundSceneLogic:
             if shown is not None and proxy is not None:
                 shown.SetAndObserveTransformNodeID(proxy.GetID())
         return count
+
+    def sequenceImage(self, images_node, number: int) -> TakenImage:
+        """The image with a number, from 0, that simulateSequence made, with all that it is of.
+
+        Raises SimulationError for a sequence of something else.
+        """
+        require_node(images_node, "vtkMRMLSequenceNode", use="sequence of images")
+        node_id, anatomy = self._in_sequence
+        return read_taken(images_node, number, anatomy if node_id == images_node.GetID() else None)
+
+    def showSequenceImage(self, images_node, number: int, output_node) -> TakenImage:
+        """Write an image that simulateSequence made into a scalar volume node, where it was taken; it stays there.
+
+        Ends live update, whose next image would take its place. Raises SimulationError for an output with data that
+        this module did not make.
+        """
+        require_node(output_node, "vtkMRMLScalarVolumeNode", use="output")
+        require_result(output_node, "output")
+        taken = in_node(self.sequenceImage(images_node, number), output_node)
+        self.stopLiveUpdate()
+        self._taken = taken
+        was_modifying = output_node.StartModify()
+        write_about(taken)
+        write_slice(output_node, Volume(taken.image[None], taken.grid.slice_to_probe))
+        mark_as_result(output_node, IMAGE)
+        freeze(taken)
+        output_node.EndModify(was_modifying)
+        return taken
 
     def placeProbe(
         self, labels_node, probe_transform_node, slice_node=None, target_ras=None, *, view: str | None = None,

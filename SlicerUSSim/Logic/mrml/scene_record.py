@@ -24,6 +24,7 @@ from SlicerUSSim.Logic.mri.sheets.surfels import Surfels
 from SlicerUSSim.Logic.mrml.craniotomy_nodes import closed_labels, set_closed_labels, show_flap
 from SlicerUSSim.Logic.mrml.fit_nodes import sequence_of
 from SlicerUSSim.Logic.mrml.label_nodes import colour_table, node_labels, read_mask, set_colour_table
+from SlicerUSSim.Logic.mrml.landmark_nodes import Landmark, landmarks_of
 from SlicerUSSim.Logic.mrml.lesion_nodes import tag_of
 from SlicerUSSim.Logic.mrml.nodes import (
     control_points,
@@ -37,6 +38,7 @@ from SlicerUSSim.Logic.mrml.nodes import (
 )
 from SlicerUSSim.Logic.mrml.parameter_node import VALUE_PARAMETERS, SceneParameters
 from SlicerUSSim.Logic.mrml.share_nodes import set_shares_node, shares_node
+from SlicerUSSim.Logic.mrml.taken_sequence import SimulatedRecord, record_taken
 from SlicerUSSim.Logic.tracked.images import TrackedImages
 from SlicerUSSim.Logic.tracked.sequence import TrackedSequence
 
@@ -46,7 +48,7 @@ _VOLUME, _LABELS, _SEGMENTS, _MODEL, _POINTS = (
     "vtkMRMLMarkupsNode",
 )  # fmt: skip
 #: Roles of nodes of a patient, and of their labels before an opening and the shares of both
-ROLES = ("mri", "second_mri", "labels", "mask", "lesions", "organs", "sheets", "seed", "opening", "real")
+ROLES = ("mri", "second_mri", "labels", "mask", "lesions", "organs", "sheets", "seed", "proposal", "opening", "real")
 _CLOSED = "closed"
 _SHARES_OF = {"labels": "shares", _CLOSED: "closed shares"}
 #: Begin of the attributes of nodes that are this package's
@@ -124,11 +126,16 @@ class SceneRecord:
     sequence: SequenceRecord | None = None
     #: Names of nodes with data that have no role and are left out
     left_out: tuple[str, ...] = ()
+    #: Of the registration of the sequence
+    landmarks: tuple[Landmark, ...] = ()
+    #: Images of Simulate sequence
+    simulated: SimulatedRecord | None = None
 
     @property
     def size(self) -> int:
         """Bytes of voxels and images."""
         images = 0 if self.sequence is None else self.sequence.sequence.images.nbytes
+        images += 0 if self.simulated is None else sum(image.nbytes for image in self.simulated.images)
         return images + sum(node.voxels for node in self.nodes.values())
 
 
@@ -186,7 +193,11 @@ def record_scene(scene) -> SceneRecord:
         sequence = SequenceRecord(sequence_of(real), real.GetName())
     transform = parameters.probe_transform
     pose = None if transform is None else probe_pose(transform)
-    return SceneRecord(nodes, recorded_values(parameters), pose, sequence, tuple(_others(scene, parameters)))
+    landmarks = () if sequence is None else landmarks_of(scene)
+    others = tuple(_others(scene, parameters))
+    return SceneRecord(
+        nodes, recorded_values(parameters), pose, sequence, others, landmarks, record_taken(parameters.image_sequence)
+    )
 
 
 def _choose_missing(scene, parameters: SceneParameters) -> None:

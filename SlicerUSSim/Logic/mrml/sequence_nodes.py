@@ -17,6 +17,8 @@ from SlicerUSSim.Logic.tracked.sequence import TrackedSequence
 
 #: Attribute of an image in a sequence: its time in seconds, independent of its index value.
 TIME = "SlicerUSSim.time"
+#: Reference of a sequence of simulated images to that of their transforms, and of a browser to the probe's poses
+MADE_FROM, POSES = "SlicerUSSim.transforms", "SlicerUSSim.poses"
 #: Default tolerance within which a sequence node considers numbers equal; step between generated values.
 _TOLERANCE, _STEP = 1e-3, 1e-6
 
@@ -116,8 +118,9 @@ def add_sequence(
 
     The images are in pixels, under the recorded transforms to the world (RAS); `path` and `to_ras` (4, 4) are those of
     TrackedImages.of. Images that were not tracked are omitted. `poses`, one probe_to_ras (4, 4) for each remaining
-    image, become a sequence for `probe_transform_node`, which follows the browser. The index of all three sequences is
-    the images' times (with unique values, see SequenceIndex); the original time of an image is its attribute TIME.
+    image, become a sequence for `probe_transform_node`, which follows the browser, and has the reference POSES. The
+    index of all three sequences is the images' times (with unique values, see SequenceIndex); the original time of an
+    image is its attribute TIME.
     Raises SimulationError if no image was tracked.
     """
     numbers = [number for number in range(len(sequence)) if sequence.has_pose(number, path)] or [0]
@@ -141,6 +144,7 @@ def add_sequence(
         held = _sequence_node(scene, f"{name} probe")
         index.fill(held, (_transform(f"{name} probe", pose) for pose in poses))
         browser.AddSynchronizedSequenceNodeID(held.GetID())
+        browser.SetNodeReferenceID(POSES, held.GetID())
         if probe_transform_node is not None:
             browser.AddProxyNode(probe_transform_node, held, False)
     return browser, images

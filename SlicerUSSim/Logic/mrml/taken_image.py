@@ -17,6 +17,7 @@ from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.base.vtk_data import vtk_matrix
 from SlicerUSSim.Logic.imaging.frame import Frame
 from SlicerUSSim.Logic.imaging.preset import Preset
+from SlicerUSSim.Logic.probe.image_grid import ImageGrid
 
 #: Attribute of a node with an MRI or labels: the name of the patient; without it the node's own name is
 PATIENT = "SlicerUSSim.patient"
@@ -28,7 +29,9 @@ _ABOUT, _FROZEN = "SlicerUSSim.image", "SlicerUSSim.frozen"
 class TakenImage:
     """An image that was simulated on nodes of a scene."""
 
-    frame: Frame
+    #: (rows, columns) uint8, and its place in the probe frame
+    image: np.ndarray
+    grid: ImageGrid
     #: (4, 4) at the time of the image
     probe_to_world: np.ndarray
     #: Probe, display, settings and tissues with which it was simulated
@@ -43,15 +46,19 @@ class TakenImage:
     is_empty: bool
     #: The volume node into which it was written
     node: Any
+    #: The signals from which it was made; None of an image of a sequence that was made before
+    frame: Frame | None = None
+    #: Its number in a simulated sequence, from 0, which is the seed of its noise; None: not of a sequence
+    number: int | None = None
 
     @property
     def image_to_world(self) -> np.ndarray:
         """(4, 4) from (column, row, 0, 1) of the slice to the world, mm."""
-        return self.probe_to_world @ self.frame.grid.slice_to_probe
+        return self.probe_to_world @ self.grid.slice_to_probe
 
     def volume(self) -> Volume:
         """One slice where it was taken."""
-        return Volume(self.frame.image[None], self.image_to_world)
+        return Volume(self.image[None], self.image_to_world)
 
     def about(self) -> dict[str, object]:
         """Patient, time, pose and preset, as JSON can hold them."""
@@ -103,7 +110,7 @@ def follow(taken: TakenImage, transform_node) -> None:
     node = taken.node
     was_modifying = node.StartModify()
     node.SetAndObserveTransformNodeID(transform_node.GetID())
-    node.SetIJKToRASMatrix(vtk_matrix(taken.frame.grid.slice_to_probe))
+    node.SetIJKToRASMatrix(vtk_matrix(taken.grid.slice_to_probe))
     node.RemoveAttribute(_FROZEN)
     node.EndModify(was_modifying)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any, cast
 
@@ -58,6 +59,7 @@ class PatientSurface:
     Parameters
     ----------
     labels : non-zero voxels are the patient. All points here are in the world frame of `labels.ijk_to_ras`.
+    progress : called with the fraction done; may raise errors.Cancelled.
 
     Raises SimulationError for labels that are all zero.
 
@@ -70,15 +72,16 @@ class PatientSurface:
     1.0
     """
 
-    def __init__(self, labels: Volume) -> None:
+    def __init__(self, labels: Volume, progress: Callable[[float], None] = lambda share: None) -> None:
         require(bool((labels.array > 0).any()), "the label map is empty, expected labelled voxels")
-        self.polydata: vtkPolyData = _closed_surface(labels)
+        self.polydata: vtkPolyData = _closed_surface(labels, lambda share: progress(0.7 * share))
         points = vtk_to_numpy(self.polydata.GetPoints().GetData()).astype(float)
         self._normals = vtk_to_numpy(self.polydata.GetPointData().GetNormals()).astype(float)
         self._tree = KDTree(points)
         self._locator = vtkStaticCellLocator()
         self._locator.SetDataSet(self.polydata)
         self._locator.BuildLocator()
+        progress(0.8)
         #: The same surface with fewer triangles, for rendering without a GPU
         self.coarse_polydata: vtkPolyData = _with_fewer_triangles(self.polydata)
         low, high = points.min(axis=0), points.max(axis=0)
@@ -175,15 +178,19 @@ def _distance_mm(outside: np.ndarray, size: np.ndarray) -> np.ndarray:
     return cast(np.ndarray, ndimage.distance_transform_edt(outside, sampling=size))
 
 
-def _closed_surface(labels: Volume) -> vtkPolyData:
+def _closed_surface(labels: Volume, progress: Callable[[float], None]) -> vtkPolyData:
     spacing = np.array(labels.spacing_mm)[::-1]  # k, j, i
     step = np.maximum(1, np.round(_VOXEL_MM / spacing)).astype(int)
     margin = np.ceil((_CLOSING_MM + 3 * _SMOOTHING_MM) / (step * spacing)).astype(int)
     inside = np.pad(_coarse(labels.array > 0, step), [(m, m) for m in margin])
     size = step * spacing
+    progress(0.1)
     near = _distance_mm(~inside, size) <= _CLOSING_MM
+    progress(0.4)
     closed = _distance_mm(near, size) > _CLOSING_MM
+    progress(0.7)
     soft = ndimage.gaussian_filter((closed | inside).astype(np.float32), _SMOOTHING_MM / size)
+    progress(0.8)
 
     contour = vtkFlyingEdges3D()
     contour.SetInputData(Volume(soft, np.eye(4)).to_vtk())

@@ -8,7 +8,7 @@
   let drawnRuler = "null";
   const shown = []; // times at which simulated images were displayed
 
-  const workstation = { measured, shown, measuring: false, images: 0, image: null, uploading: 0, connected: false };
+  const workstation = { measured, shown, measuring: false, images: 0, image: null, uploading: 0, exporting: 0, connected: false };
   window.ussim = workstation;
 
   const session = () => window.trame?.client?.getConnection?.()?.getSession?.();
@@ -63,7 +63,8 @@
     if (ruler !== drawnRuler) window.ussimOverlay(document.getElementById("overlay"), meta.ruler);
     drawnRuler = ruler;
     const caption = document.getElementById("image-caption");
-    caption.textContent = meta.blank ? "" : `${meta.patient}, ${meta.time.slice(11, 19)} UTC`;
+    const place = meta.sequence ? `image ${meta.sequence} of the simulated sequence, ` : "";
+    caption.textContent = meta.blank ? "" : `${place}${meta.patient}, ${meta.time.slice(11, 19)} UTC`;
   }
 
   workstation.summary = (count = 100) => {
@@ -188,11 +189,20 @@
     window.trame.trigger("landmark_in_image", at);
   };
 
+  // Over HTTP: on the web socket keys and Cancel would wait until the file is there.
   workstation.save = async (kind) => {
-    const result = await window.trame.trigger("export", [kind]);
-    if (!result) return; // the server shows the error
-    const [name, content, type] = result;
-    window.trame.utils.download(name, content, type);
+    workstation.exporting += 1;
+    try {
+      const answer = await fetch(`exported?${new URLSearchParams({ kind })}`, { cache: "no-store" });
+      if (answer.status !== 200) return; // the server shows the error, or it was cancelled
+      const link = document.createElement("a");
+      link.download = decodeURIComponent(answer.headers.get("Content-Disposition").split("''")[1]);
+      link.href = URL.createObjectURL(await answer.blob());
+      link.click();
+      setTimeout(() => URL.revokeObjectURL(link.href), 60_000); // the browser saves it in its own time
+    } finally {
+      workstation.exporting -= 1;
+    }
   };
 
   workstation.copy = async (text) => {

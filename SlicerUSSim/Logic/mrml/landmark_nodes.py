@@ -1,0 +1,72 @@
+"""Landmarks of a registration as a markups node: points in the patient, and the pixels of a recording that they are."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from SlicerUSSim.Logic.base.errors import SimulationError
+from SlicerUSSim.Logic.mrml.nodes import control_points, named, nodes_of_class
+
+#: Attribute of a markups node: number of the image, column and row of each of its points, as JSON
+_PIXELS = "SlicerUSSim.landmarks"
+
+
+@dataclass(frozen=True, eq=False)
+class Landmark:
+    """A place in a recorded image, and the same in the patient."""
+
+    #: Number of the image in the recording, and (2,) column and row in it
+    number: int
+    pixel: np.ndarray
+    #: (3,) RAS in millimetres
+    point: np.ndarray
+
+    def to_list(self) -> list[float]:
+        """Number, column, row, R, A and S, as JSON can hold them."""
+        return [self.number, *map(float, self.pixel), *map(float, self.point)]
+
+    @classmethod
+    def of_list(cls, values: Sequence[float]) -> Landmark:
+        """The inverse of to_list. Raises ValueError or TypeError for something else."""
+        number, *rest = values
+        numbers = np.array(rest, float)
+        if numbers.shape != (5,) or not np.isfinite(numbers).all():
+            raise ValueError(f"{values}: expected six numbers")
+        return cls(int(number), numbers[:2], numbers[2:])
+
+
+def is_landmarks(node: Any) -> bool:
+    """Whether a node was written by write_landmarks."""
+    return node.GetAttribute(_PIXELS) is not None
+
+
+def write_landmarks(node: Any, landmarks: Sequence[Landmark]) -> None:
+    """Replace the points of a vtkMRMLMarkupsFiducialNode; each is called by its number, from 1."""
+    was_modifying = node.StartModify()
+    node.RemoveAllControlPoints()
+    for number, landmark in enumerate(landmarks, 1):
+        node.AddControlPointWorld(*landmark.point.tolist(), str(number))
+    node.SetAttribute(_PIXELS, json.dumps([[mark.number, *map(float, mark.pixel)] for mark in landmarks]))
+    node.SetLocked(True)  # a point that is dragged would not be what was registered
+    node.EndModify(was_modifying)
+
+
+def landmarks_of(scene) -> tuple[Landmark, ...]:
+    """Those of a scene. Raises SimulationError for a node whose points and pixels do not go together."""
+    for node in nodes_of_class(scene, "vtkMRMLMarkupsFiducialNode"):
+        if is_landmarks(node):
+            try:
+                pixels, points = json.loads(node.GetAttribute(_PIXELS)), control_points(node)
+                return tuple(
+                    Landmark.of_list([*pixel, *point]) for pixel, point in zip(pixels, points, strict=True)
+                )  # fmt: skip
+            except (ValueError, TypeError):
+                raise SimulationError(
+                    f"{named(node)}: its points and the attribute {_PIXELS} do not go together; remove the node"
+                ) from None
+    return ()
