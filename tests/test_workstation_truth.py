@@ -449,12 +449,18 @@ def test_the_images_of_simulate_sequence_are_shown_and_played_where_they_were_ta
         image = page.evaluate("window.ussim.image")
         assert image["sequence"] == number + 1 and page.locator("#frozen").inner_text() == "FROZEN"
         caption = page.locator("#image-caption").inner_text()
-        assert caption.startswith(f"image {number + 1} of the simulated sequence, head.nii.gz, ")
+        assert caption.startswith(f"Sequence no. {number + 1}, head.nii.gz, ")
         np.testing.assert_allclose(image["pose"], recorded.transforms[number]["ProbeToReference"], atol=0.05)
         assert state(page, NAMES.sequence.number) == number and cost(page) > 0  # beside the real image of that pose
         assert not shown(page, "liveCheckBox")
         seen.append(pixels(page))
     assert not np.array_equal(*seen)
+    # Nothing covers whose image it is, in small windows either
+    page.set_viewport_size({"width": 1024, "height": 768})
+    page.wait_for_timeout(700)
+    caption, frozen = (page.locator(f"#{name}").bounding_box() for name in ("image-caption", "frozen"))
+    assert caption["x"] + caption["width"] < frozen["x"] and caption["height"] < 24
+    page.set_viewport_size({"width": 1500, "height": 900})
     # The probe is there, and what is exported is that image
     np.testing.assert_allclose(probe_pose(page), recorded.transforms[4]["ProbeToReference"], atol=0.05)
     (tmp_path / "head.nii.gz").write_bytes((files / "head.nii.gz").read_bytes())
