@@ -15,6 +15,7 @@ pytest.importorskip("playwright", reason="browser tests need playwright: pip ins
 
 from SlicerUSSim.Logic import Volume
 from SlicerUSSim.Logic.tracked.field import estimate_field
+from SlicerUSSim.Logic.tracked.pose_files import write_pose
 from SlicerUSSim.Logic.tracked.sequence import TrackedSequence
 from SlicerUSSim.Workstation.state import NAMES
 from tests.conftest import SHARED, needs_shared, rigid
@@ -249,9 +250,41 @@ def test_transforms_without_ultrasound_and_of_other_kinds_are_said(page, recordi
     click(page, "#close-patient")
     settled(page)
     assert state(page, NAMES.registration.recording) == ""
-    page.set_input_files("#open-file", recording["folder"] / "registration.txt")
+    page.set_input_files("#registration-file", recording["folder"] / "registration.txt")
     settled(page)
     assert errors(page)[-1].startswith("registration.txt: a 4x4 matrix, expected tracked ultrasound first")
+
+
+def test_a_transform_without_ultrasound_is_asked_and_is_a_pose_or_of_the_ultrasound_that_comes_next(
+    browser, recording, files, tmp_path
+):
+    """It was refused."""
+    with serving("--labels", str(files / "labels.nii.gz")) as address:
+        page = opened(browser, address)
+        settled(page)
+        wanted = np.array(page.evaluate("window.ussim.image.pose"))
+        wanted[:3, :3] = np.linalg.svd(wanted[:3, :3])[0] @ np.linalg.svd(wanted[:3, :3])[2]  # the page rounds
+        wanted[:3, 3] += [0.0, 0.0, 2.0]
+        write_pose(tmp_path / "moved.tfm", wanted)
+        page.set_input_files("#open-file", tmp_path / "moved.tfm")
+        answer_new_patient(page, "Pose of the probe")
+        settled(page)
+        np.testing.assert_allclose(page.evaluate("window.ussim.image.pose"), wanted, atol=2e-3)
+        assert state(page, NAMES.opened)[-1].endswith("the probe is moved there") and not errors(page)
+        page.set_input_files("#open-file", recording["folder"] / "registration.txt")
+        answer_new_patient(page, "Registration")
+        settled(page)
+        page.set_input_files("#open-file", recording["folder"] / "plus.xml")
+        eventually(page, lambda: "plus.xml" in "".join(state(page, NAMES.opened)))
+        settled(page)
+        assert "calibration of the tracked ultrasound that is opened next" in state(page, NAMES.opened)[-1]
+        page.set_input_files("#open-file", recording["folder"] / "phantom.igs.mha")
+        eventually(page, lambda: state(page, NAMES.sequence.length) == 6)
+        settled(page)
+        assert page.locator("#registration-from").inner_text() == "Registration registration.txt"
+        assert "plus.xml" in page.locator("#calibration-from").inner_text() and not errors(page)
+        np.testing.assert_allclose(shown_pose(page, 3), recording["poses"][3], atol=0.5)
+        page.close()
 
 
 # ---- a real recording ------------------------------------------------------------------------------------------------

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import re
 import shutil
+import subprocess
+import sys
 import zipfile
 from pathlib import Path
 
@@ -28,11 +30,13 @@ from SlicerUSSim.Workstation.scene_files import read_scene
 from SlicerUSSim.Workstation.state import NAMES
 from tests.test_presenter import PlainView
 from tests.test_workstation import (
+    PATIENCE_S,
     answer_new_patient,
     browser as browser,
     click,
     download,
     errors,
+    eventually,
     files as files,
     new_image,
     opened,
@@ -228,3 +232,50 @@ def test_a_scene_that_this_module_was_not_used_in_is_opened_as_its_mri(page, tmp
     page.wait_for_function("window.ussim.image?.patient === 'T1 of a study'")
     notes = shown(page, "notesLabel")
     assert not errors(page) and "other.mrb: a scene" in notes and "white matter" in notes
+
+
+def test_the_workstation_starts_with_a_scene(browser, module_scene):
+    path, image, pose = module_scene
+    with serving(str(path)) as address:
+        page = opened(browser, address)
+        settled(page)
+        assert not errors(page) and state(page, NAMES.title) == "Ms. Example T1"
+        np.testing.assert_allclose(page.evaluate("window.ussim.image.pose"), pose, atol=2e-3)
+        assert np.array_equal(np.asarray(Image.open(download(page, "png"))), image)
+        # It is that of a user, who is asked before it is closed
+        page.set_input_files("#open-file", path)
+        page.wait_for_function("document.getElementById('question')?.dataset.number > 0")
+        page.keyboard.press("Escape")
+        page.close()
+
+
+def test_the_workstation_starts_with_what_the_page_opens(browser, files, tmp_path):
+    shutil.copy(files / "sweep.igs.mha", tmp_path / "recording.mha")  # known by its content
+    with serving(str(tmp_path / "recording.mha"), "--labels", str(files / "labels.nii.gz")) as address:
+        page = opened(browser, address)
+        eventually(page, lambda: state(page, NAMES.sequence.length) == 6)
+        settled(page)
+        assert not errors(page) and state(page, NAMES.title) == "labels.nii.gz"
+        assert state(page, NAMES.opened)[-1].startswith("recording.mha: tracked ultrasound")
+        page.close()
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (
+            ["{scene}", "--outside", "--add", "tumour=x.nii.gz"],
+            "is a scene, which has a patient and settings, expected",
+        ),
+        (["{broken}"], "broken.mrb: is no bundle of a scene, expected a .mrb"),
+    ],
+)
+def test_scenes_that_cannot_be_served_are_said_in_one_line(module_scene, tmp_path, options, message):
+    (tmp_path / "broken.mrb").write_bytes(b"PK\x03\x04 and nothing more")
+    names = {"scene": module_scene[0], "broken": tmp_path / "broken.mrb"}
+    done = subprocess.run(
+        [sys.executable, "-m", "SlicerUSSim.Command.cli", "serve", *(text.format(**names) for text in options)],
+        capture_output=True, text=True, timeout=PATIENCE_S, check=False,
+    )  # fmt: skip
+    assert done.returncode == 2 and done.stdout == ""
+    assert done.stderr.startswith("ussim: ") and message in done.stderr and len(done.stderr.strip().splitlines()) == 1

@@ -226,6 +226,19 @@ def test_a_surface_has_progress_and_can_be_cancelled_while_images_go_on(page, la
     assert abs(state(page, NAMES.pose)["lift_mm"]) < 5
 
 
+def test_a_surface_of_a_patient_who_was_closed_meanwhile_is_not_shown(page, large):
+    page.set_input_files("#open-file", [large / "ball.nii.gz", large / "ball.json"])
+    answer_new_patient(page)
+    page.wait_for_function(_AT_WORK, arg="Make the surface")
+    page.evaluate("window.trame.trigger('press', ['closePatient'])")
+    page.wait_for_function("window.ussim.image === null")
+    settled(page)
+    assert state(page, NAMES.title) == "" and state(page, NAMES.pose) is None
+    page.keyboard.press("ArrowRight")  # along no surface
+    settled(page)
+    assert state(page, NAMES.pose) is None and page.evaluate("window.ussim.image") is None
+
+
 def test_exports_are_for_whom_has_the_token(page, browser, url):
     other = browser.new_context()
     address = f"{url.split('?')[0]}exported?kind="

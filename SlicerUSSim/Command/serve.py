@@ -30,9 +30,17 @@ from SlicerUSSim.Logic.mri.settings import CT, SegmentationSettings
 if TYPE_CHECKING:
     import ssl
 
+    from SlicerUSSim.Logic.mrml.scene_record import SceneRecord
     from SlicerUSSim.Workstation.workstation import Workstation
 
 _PORT = 8080
+#: Names of options that are about a patient, his ultrasound or settings; and their values when they are not given
+_OF_PATIENT = (
+    "labels", "maps", "sequence", "calibration", "to_mri", "preset", "outside", "mask", "also", "additions", "organs",
+)  # fmt: skip
+_NOT_GIVEN = (None, False, ())
+#: Suffixes of files that are no images, and that the page opens
+_TEXTS = (".json", ".vtp", ".tfm", ".h5", ".hdf5", ".mat", ".xfm", ".xml", ".tag", ".txt")
 
 
 @click.command()
@@ -108,8 +116,16 @@ def serve(
     igtl_device: str | None,
     device: str | None,
 ) -> None:
-    """The workstation in the browser, with live images. Without a file it shows the demo brain."""
+    """The workstation in the browser, with live images. Without a file it shows the demo brain.
+
+    The file is an MRI, or what the page opens, by its content: a scene (.mrb), tracked ultrasound, a preset, ...
+    """
     _require_workstation()
+    scene, also_open = None, None
+    if mri is not None and _is_no_image(mri):
+        given = click.get_current_context().params
+        patient = [name for name in _OF_PATIENT if given[name] not in _NOT_GIVEN]
+        scene, also_open, mri = _opened_first(mri, [f"--{name.replace('_', '-')}" for name in patient])
     added = split_additions(additions)
     others = split_also(also)
     if len(others) > 1:
@@ -200,12 +216,41 @@ def serve(
             sheet_settings=sheet_settings,
             craniotomy=opening.source, craniotomy_mm=opening.diameter_mm, preset=chosen_preset,
             sequence=tracked, sequence_name=Path(sequence).name.split(".")[0] if sequence else "", transform=transform,
-            to_ras=to_ras, tracker=igtl, tracker_device=igtl_device, volumes=volumes,
+            to_ras=to_ras, scene=None if scene is None else scene[0], scene_name="" if scene is None else scene[1],
+            also_open=also_open, tracker=igtl, tracker_device=igtl_device, volumes=volumes,
         ),
         device,
         SessionStore(sessions_folder()) if autosave else None,
     )  # fmt: skip
     _run(workstation, host, port, tls)
+
+
+def _is_no_image(path: str) -> bool:
+    """Whether a file is neither an MRI, nor a CT, nor a label map, of which the command knows more than the page."""
+    from SlicerUSSim.Logic.tracked.sequence import is_tracked_sequence
+
+    if not Path(path).is_file():
+        return False
+    with Path(path).open("rb") as file:
+        is_zip = file.read(4) == b"PK\x03\x04"
+    return is_zip or Path(path).suffix.lower() in _TEXTS or is_tracked_sequence(path)
+
+
+def _opened_first(path: str, options: list[str]) -> tuple[tuple[SceneRecord, str] | None, str | None, None]:
+    """((scene, name), file that is opened as in the page, None); `options` are those about a patient.
+
+    Raises SimulationError for a file that cannot be opened, and for a scene with such options.
+    """
+    from SlicerUSSim.Workstation.content import Kind, content_of
+    from SlicerUSSim.Workstation.scene_files import read_scene
+
+    with Path(path).open("rb") as file:
+        is_zip = file.read(4) == b"PK\x03\x04"
+    if not is_zip and content_of(Path(path)).kind is not Kind.SCENE:
+        return None, path, None
+    require(not options, f"{path} is a scene, which has a patient and settings, expected no {', '.join(options)}")
+    _prepare_libraries()
+    return (read_scene(path), Path(path).name), None, None
 
 
 def _require_opening(path: str) -> None:

@@ -29,7 +29,7 @@ from SlicerUSSim.Logic.mrml.label_nodes import read_labels, write_labels
 from SlicerUSSim.Logic.mrml.lesion_nodes import add_lesion
 from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic
 from SlicerUSSim.Logic.mrml.nodes import display_of, write_volume
-from SlicerUSSim.Logic.mrml.scene_record import SequenceRecord
+from SlicerUSSim.Logic.mrml.scene_record import SceneRecord, SequenceRecord
 from SlicerUSSim.Logic.mrml.sequence_nodes import add_sequence
 from SlicerUSSim.Logic.mrml.taken_image import PATIENT, patient_of
 from SlicerUSSim.Logic.probe.arrays import Probe
@@ -90,6 +90,11 @@ class Files:
     #: Transform from pixels to the reference frame, and from there to the MRI; see TrackedImages.of
     transform: str = "ImageToReference"
     to_ras: np.ndarray | None = None
+    #: A scene that is shown in place of a patient from files, and its name
+    scene: SceneRecord | None = None
+    scene_name: str = ""
+    #: A file that is opened as if a page had sent it, after the others
+    also_open: str | None = None
     #: OpenIGTLink, as openigtlink.parse_address reads it, and the transform to follow
     tracker: str | None = None
     tracker_device: str | None = None

@@ -7,7 +7,7 @@ from contextlib import ExitStack
 from typing import Any
 
 from SlicerUSSim.Logic.base.dicom import FoundSeries
-from SlicerUSSim.Logic.base.errors import SimulationError, require
+from SlicerUSSim.Logic.base.errors import Cancelled, SimulationError, require
 from SlicerUSSim.Logic.imaging.preset import Preset
 from SlicerUSSim.Logic.mri.modality import has_brain_mask
 from SlicerUSSim.Logic.mri.pathology import LESIONS
@@ -29,7 +29,7 @@ from SlicerUSSim.Workstation.uploads import listed
 #: Keys of choices
 _NEW, _SECOND, _SHOWN, _OWN = "new", "second", "shown", "own"
 _ORGANS, _BRAIN, _OPENING, _AS = "organs", "brain", "opening", "as "
-_CALIBRATION, _REGISTRATION = "calibration", "registration"
+_CALIBRATION, _REGISTRATION, _POSE = "calibration", "registration", "pose"
 #: The tissue that stands for several
 _SEVERAL = "brats"
 
@@ -249,21 +249,41 @@ class Opening:
         return f"{recording.what}: {deed}", lambda: self._registration.take(recording)
 
     def _transform(self, upload: Upload, beside: list[Upload]) -> tuple[str, Callable[[], object]]:
-        self._require_recording(upload)
+        """A calibration, a registration or a pose: of these only two files say which they are."""
         name = upload.name.lower()
         if name.endswith(".xml"):
             key = _CALIBRATION
         elif name.endswith(".tag"):
             key = _REGISTRATION
         else:
-            key = self._ask_what(
-                upload,
-                [
-                    Choice(_CALIBRATION, "Calibration", "From pixels to the tracked probe: ImageToProbe"),
-                    Choice(_REGISTRATION, "Registration", "From the frame of the tracked ultrasound to the patient"),
-                ],
-            )
-        return self._transform_as(upload, key)
+            later = "" if self._registration.recording is not None else "; of the one that is opened next"
+            choices = [
+                Choice(_CALIBRATION, "Calibration", f"Of tracked ultrasound: from pixels to its probe{later}"),
+                Choice(_REGISTRATION, "Registration", f"Of tracked ultrasound: from its frame to the patient{later}"),
+            ]
+            if self._logic.parameters.labels is not None and self._is_pose(upload):
+                tip = f"The simulated probe is moved there, on {self._opener.patient()}"
+                choices.append(Choice(_POSE, "Pose of the probe", tip))
+            key = self._ask_what(upload, choices)
+        if key == _POSE:
+            return self._pose(upload, beside)
+        if self._registration.recording is not None:
+            return self._transform_as(upload, key)
+        registration = self._registration
+        if key == _CALIBRATION:
+            take = registration.reading_calibration(upload.path, for_next=True)
+        else:
+            take = registration.reading_registration(upload.path, for_next=True)
+        return f"{key} of the tracked ultrasound that is opened next", take
+
+    def _is_pose(self, upload: Upload) -> bool:
+        try:
+            self._tasks.doAside(lambda: read_pose(upload.path))
+        except Cancelled:
+            raise
+        except SimulationError:
+            return False
+        return True
 
     def _require_recording(self, upload: Upload) -> None:
         require(

@@ -84,6 +84,9 @@ class Registration:
         self._landmarks: list[Landmark] = []
         self._remaining: np.ndarray | None = None
         self._nodes: list[Any] = []
+        #: Calibration and registration of the ultrasound that is opened next, and where they are from
+        self._next_calibration: tuple[dict[str, np.ndarray], str] = ({}, "")
+        self._next_to_ras: tuple[np.ndarray | None, str] = (None, "")
         self._marks: Any = None  # vtkMRMLMarkupsFiducialNode with the landmarks
         comparison.grid_changed = self._tell_landmarks
 
@@ -105,12 +108,16 @@ class Registration:
 
         Its probe and poses are used once its calibration is known. Nothing changes if it cannot be used.
         """
-        place = np.eye(4) if to_ras is None else to_ras
-        self._apply(recording, {}, place)
+        source = "given at the start"
+        if to_ras is None:
+            to_ras, source = self._next_to_ras
+        calibration, calibrated_by = self._next_calibration
+        self._apply(recording, calibration, np.eye(4) if to_ras is None else to_ras)
+        self._forget_next()
         self._landmarks, self._remaining = [], None
-        self._from = {_CALIBRATION: "", _REGISTRATION: "" if to_ras is None else "given at the start"}
+        self._from = {_CALIBRATION: calibrated_by, _REGISTRATION: source if to_ras is not None else ""}
         self._tell()
-        if not recording.is_calibrated:
+        if not replace(recording, sequence=recording.sequence.with_transforms(calibration)).is_calibrated:
             self._open_section()
 
     @property
@@ -132,6 +139,7 @@ class Registration:
         self.recording, self._calibration, self._to_ras = None, {}, np.eye(4)
         self._landmarks, self._remaining, self._nodes = [], None, []
         self._opener.opened_sequence = None
+        self._forget_next()
         self._from = {_CALIBRATION: "", _REGISTRATION: ""}
         self.stop_picking()
         self._tell()
@@ -145,12 +153,21 @@ class Registration:
 
     # ---- calibration and registration --------------------------------------------------------------------------
 
-    def reading_calibration(self, path: str) -> Callable[[], None]:
-        """The calibration of a file: of the name that is chosen, or those of a Plus configuration."""
+    def _forget_next(self) -> None:
+        self._next_calibration, self._next_to_ras = ({}, ""), (None, "")
+
+    def reading_calibration(self, path: str, *, for_next: bool = False) -> Callable[[], None]:
+        """The calibration of a file: of the name that is chosen, or those of a Plus configuration.
+
+        It is that of the ultrasound that is open, or `for_next` of the one that is opened next.
+        """
         name = _checked_name(self._shared.now.registration.name)
         with self._reading(path):
             found = self._tasks.doAside(lambda: read_calibration(path, name))
-        return lambda: self._calibrate(found, f"{', '.join(found)} of {Path(path).name}")
+        source = f"{', '.join(found)} of {Path(path).name}"
+        if for_next:
+            return lambda: setattr(self, "_next_calibration", (found, source))
+        return lambda: self._calibrate(found, source)
 
     def calibrate(self, name: str, text: str) -> None:
         """Use a calibration whose 16 numbers were typed."""
@@ -159,11 +176,15 @@ class Registration:
             matrix = check_affine(_CALIBRATION, _matrix(_CALIBRATION, text))
             self._calibrate({name: matrix}, f"{name} as typed")
 
-    def reading_registration(self, path: str) -> Callable[[], None]:
-        """The registration of a file: a transform, or landmarks in MRI and ultrasound (.tag)."""
+    def reading_registration(self, path: str, *, for_next: bool = False) -> Callable[[], None]:
+        """The registration of a file: a transform, or landmarks in MRI and ultrasound (.tag); `for_next` as above."""
         with self._reading(path):
             matrix, line = self._tasks.doAside(lambda: read_registration(path))
-        return lambda: self._register(matrix, f"{Path(path).name}{f': {line}' if line else ''}")
+        source = f"{Path(path).name}{f': {line}' if line else ''}"
+        if for_next:
+            place = check_rigid(_REGISTRATION, matrix)
+            return lambda: setattr(self, "_next_to_ras", (place, source))
+        return lambda: self._register(matrix, source)
 
     def register(self, text: str) -> None:
         """Use a registration whose 16 numbers were typed."""

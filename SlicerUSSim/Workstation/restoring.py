@@ -121,6 +121,11 @@ class Restoring:
         self._take_scene(record, Path(path).name)
         return f"shown as it was{f'; {before} is closed' if before else ''}"
 
+    def show_scene(self, record: SceneRecord, name: str) -> None:
+        """Show a scene that was read already, in place of the present patient."""
+        with self._presenter.shown():
+            self._take_scene(record, name)
+
     def _take_scene(self, record: SceneRecord, name: str) -> None:
         self._take(record, {"values": dict(record.values)}, None, [])
         parameters = self._logic.parameters

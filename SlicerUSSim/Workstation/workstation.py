@@ -6,6 +6,7 @@ import asyncio
 import secrets
 from collections.abc import Callable
 from contextlib import suppress
+from pathlib import Path
 from time import perf_counter
 from typing import Any, cast
 
@@ -299,7 +300,13 @@ class Workstation:
         if files.tracker is not None:
             with self._presenter.shown():
                 self._tracker.start(files.tracker, files.tracker_device)
-        self._loading.begin(files)
+        if files.scene is not None:
+            self._restoring.show_scene(files.scene, files.scene_name)
+        else:
+            self._loading.begin(files)
+        if files.also_open is not None:
+            with self._presenter.shown():
+                self._opening.open({Path(files.also_open).name: Path(files.also_open).read_bytes()})
         self._restoring.offer()  # not before: what is restored takes the place of this patient
         self._panel.refresh()
 

@@ -63,7 +63,8 @@
     if (ruler !== drawnRuler) window.ussimOverlay(document.getElementById("overlay"), meta.ruler);
     drawnRuler = ruler;
     const caption = document.getElementById("image-caption");
-    const place = meta.sequence ? `image ${meta.sequence} of the simulated sequence, ` : "";
+    const place = meta.sequence ? `Sequence no. ${meta.sequence}, ` : "";
+    caption.previousElementSibling.hidden = Boolean(meta.sequence); // "Simulated": there is no room for both
     caption.textContent = meta.blank ? "" : `${place}${meta.patient}, ${meta.time.slice(11, 19)} UTC`;
   }
 
