@@ -212,7 +212,7 @@ class Medium:
         if self.found is not None:
             self._add_planes(padded.shape, self.found, bool(len(sheets)))
         distance, self.membrane_reach = self._fluid_distance(padded, tissues, sheets)
-        no_membrane: np.ndarray = np.True_
+        no_membrane = np.True_
         if distance is not None:
             lowest, highest = _cell_extremes(distance)
             no_membrane = (lowest > 127.5 + self.membrane_reach) | (highest < 127.5 - self.membrane_reach)
