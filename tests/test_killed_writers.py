@@ -18,6 +18,9 @@ from SlicerUSSim.Logic import Volume
 from SlicerUSSim.Logic.base.errors import SimulationError
 from SlicerUSSim.Logic.tracked.sequence import TrackedSequence
 from SlicerUSSim.Logic.base.files import write_json
+from SlicerUSSim.Logic.mri.sheets import Surfels
+from SlicerUSSim.Logic.mri.sheets.polydata import read_surfels, write_surfels
+from SlicerUSSim.Logic.tracked.pose_files import read_pose, write_pose
 import SimpleITK, nrrd
 
 place, name, how = Path(sys.argv[1]), sys.argv[2], sys.argv[3]
@@ -25,7 +28,14 @@ path = place / name
 
 
 def write(value):
-    if name.endswith(".json"):
+    if name.startswith("p."):
+        pose = np.eye(4)
+        pose[:3, 3] = value
+        write_pose(path, pose)
+    elif name.endswith(".vtp"):
+        points = np.full((20, 3), value, np.float32)
+        write_surfels(path, Surfels.of("falx", points, np.tile([0.0, 0.0, 1.0], (20, 1)), 0.3, 1.0, 1.0))
+    elif name.endswith(".json"):
         write_json(path, {"values": [value] * 500})
     elif ".seq." in name or ".igs." in name:
         images = np.full((3, 20, 30), value, np.uint8)
@@ -35,7 +45,11 @@ def write(value):
 
 
 def value_of():
-    if name.endswith(".json"):
+    if name.startswith("p."):
+        values = read_pose(path)[:3, 3].round(6).tolist()
+    elif name.endswith(".vtp"):
+        values = read_surfels(path).place.ravel().tolist()
+    elif name.endswith(".json"):
         values = eval(path.read_text())["values"]
     elif ".seq." in name or ".igs." in name:
         values = TrackedSequence.read(path).images.ravel().tolist()
@@ -55,7 +69,7 @@ def stop_at(step):
                 if how == "kill":
                     os._exit(9)
                 if left[0] == -1:
-                    raise OSError(errno.ENOSPC, "No space left on device")
+                    raise OSError(errno.ENOSPC if how == "fail" else errno.EIO, "as the disk says")
             return function(*arguments, **more)
         return call
 
@@ -81,7 +95,7 @@ for step in range(60):
     assert status in (0, 7, 9), status
     found = value_of()
     assert found in (1, 2) and (status != 0 or found == 2), (step, status, found)
-    if how == "fail":
+    if how != "kill":
         assert not list(place.glob(".ussim-*")), "something is left of a run that failed"
     if status == 0:
         break
@@ -95,9 +109,25 @@ print("steps", steps)
 """
 
 
-@pytest.mark.parametrize("how", ["kill", "fail"])
+@pytest.mark.parametrize("how", ["kill", "fail", "EIO"])
 @pytest.mark.parametrize(
-    "name", ["v.nii.gz", "v.nrrd", "v.mha", "v.mhd", "v.nhdr", "v.vti", "s.igs.mha", "s.seq.nrrd", "t.json"]
+    "name",
+    [
+        "p.tfm",
+        "p.h5",
+        "p.txt",
+        "s.vtp",
+        "v.mnc",
+        "v.nii.gz",
+        "v.nrrd",
+        "v.mha",
+        "v.mhd",
+        "v.nhdr",
+        "v.vti",
+        "s.igs.mha",
+        "s.seq.nrrd",
+        "t.json",
+    ],
 )
 def test_at_every_step_the_file_is_the_old_or_the_new_one(name, how, tmp_path: Path):
     done = subprocess.run([sys.executable, "-c", _STEPS, tmp_path, name, how], capture_output=True, text=True)
