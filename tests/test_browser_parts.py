@@ -883,3 +883,131 @@ def test_the_field_as_triangles_has_its_area_and_the_image_lies_on_it(probe):
     assert np.allclose(left + across * (right - left), points[:, 0], atol=1e-3)
     assert np.allclose(top + down * (bottom - top), points[:, 1], atol=1e-3)
     assert np.allclose(probe.outline_mm()[:-1], points, atol=1e-4)
+
+
+# ---- views -----------------------------------------------------------------------------------------------------------
+
+
+def test_a_frozen_image_stays_where_it_was_taken_in_3d_and_in_the_slices():
+    """It was draped over the anatomy at the probe's new place."""
+    from trame.app import get_server
+    from trame_slicer.core import SlicerApp
+
+    from SlicerUSSim.Logic.mrml.label_nodes import write_labels
+    from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic
+    from SlicerUSSim.Logic.mrml.nodes import ijk_to_ras, node_called, node_to_world, set_node_to_world
+    from SlicerUSSim.Workstation.anatomy import AnatomyViews
+
+    async def scenario():
+        app = SlicerApp()
+        views = AnatomyViews(app, get_server("views of a test", client_type="vue3"), lambda *ignored: None)
+        logic = UltrasoundSceneLogic(app.scene)
+        segmentation = segment_mri(head_mri(3.0))
+        labels, probe, output = (
+            app.scene.AddNewNodeByClass(f"vtkMRML{kind}Node")
+            for kind in ("LabelMapVolume", "LinearTransform", "ScalarVolume")
+        )
+        write_labels(labels, segmentation.labels, segmentation.tissue_names, labels)
+        logic.placeProbe(labels, probe)
+        logic.simulate(labels, probe, output)
+        taken = logic.taken
+        views.show_probe(taken.preset.probe, probe)
+        views.show_image(taken, taken.grid.field(taken.preset.probe))
+        views.follow(taken.probe_to_world, taken.preset.probe)
+        logic.holdImage(output)
+        moved = taken.probe_to_world.copy()
+        moved[:3, 3] += [5.0, -7.0, 9.0]
+        set_node_to_world(probe, moved)
+        views.follow(moved, taken.preset.probe)
+        field, seen = (
+            node_called(app.scene, "Model", "Ultrasound field"),
+            node_called(app.scene, "ScalarVolume", "Ultrasound as shown"),
+        )
+        body = node_called(app.scene, "Model", "Probe body")
+        in_slices = node_to_world(seen) @ ijk_to_ras(seen)
+        shown_ids = {view.get_foreground_volume_id() for view in views.slices}
+        return (
+            node_to_world(field), in_slices, node_to_world(output) @ ijk_to_ras(output), node_to_world(body), moved,
+            taken, shown_ids == {seen.GetID()},
+        )  # fmt: skip
+
+    field, in_slices, in_scene, body, moved, taken, is_shown = run_in_loop(scenario)
+    np.testing.assert_allclose(field, taken.probe_to_world, atol=1e-6)
+    np.testing.assert_allclose(in_slices, taken.image_to_world, atol=1e-6)
+    np.testing.assert_allclose(in_scene, taken.volume().ijk_to_ras, atol=1e-6)
+    np.testing.assert_allclose(body, moved, atol=1e-6)  # the probe has gone on
+    assert is_shown
+
+
+def test_a_view_stands_in_the_plane_that_it_is_called_at_start_and_after_a_file_was_opened():
+    """ "Axial" showed a coronal section until the probe had moved."""
+    from trame.app import get_server
+    from trame_slicer.core import SlicerApp
+
+    from SlicerUSSim.Logic.base.vtk_data import matrix_array
+    from SlicerUSSim.Logic.mrml.nodes import write_volume
+    from SlicerUSSim.Workstation.anatomy import AnatomyViews
+    from SlicerUSSim.Workstation.state import ACROSS, IN_PLANE
+
+    normals = {"Axial": [0, 0, 1], "Coronal": [0, 1, 0], "Sagittal": [1, 0, 0]}
+
+    def stand_as_called(views) -> bool:
+        for view in views.slices:
+            plane = views.planes[view.get_singleton_tag()]
+            if plane not in (IN_PLANE, ACROSS):
+                normal = matrix_array(view.get_view_node().GetSliceToRAS())[:3, 2]
+                np.testing.assert_allclose(abs(normal), normals[plane], atol=1e-6)
+        return any(plane in normals for plane in views.planes.values())
+
+    async def scenario():
+        app = SlicerApp()
+        views = AnatomyViews(app, get_server("planes of a test", client_type="vue3"), lambda *ignored: None)
+        assert stand_as_called(views)
+        node = app.scene.AddNewNodeByClass("vtkMRMLScalarVolumeNode", "head")
+        write_volume(node, head_mri(4.0))
+        views.show_volume(node)
+        assert stand_as_called(views)
+        for plane in normals:
+            views.set_plane("Green", plane)
+            assert stand_as_called(views)
+            # Those that follow the probe are empty until it is there, and show no other section under their name
+            shown = {view.get_singleton_tag(): view.get_background_volume_id() for view in views.slices}
+            assert shown["Green"] == node.GetID() and not shown["Red"] and not shown["Yellow"]
+        probe_to_ras = np.array([[1.0, 0, 0, 3], [0, 0, 1, 5], [0, -1, 0, 40], [0, 0, 0, 1]])
+        views.follow(probe_to_ras, PhasedProbe(field_of_view_deg=75.0, depth_mm=70.0))
+        assert stand_as_called(views)
+        red = next(view for view in views.slices if view.get_singleton_tag() == "Red")
+        in_view = matrix_array(red.get_view_node().GetSliceToRAS())[:3, 2]
+        np.testing.assert_allclose(abs(in_view), [0, 1, 0], atol=1e-6)  # the image plane
+        assert red.get_background_volume_id() == node.GetID()
+        return True
+
+    assert run_in_loop(scenario)
+
+
+def test_a_scene_is_written_again_after_nodes_are_gone(tmp_path):
+    """It named the folder of the last one as the file of a node that was gone, and was refused."""
+    from trame_slicer.core import SlicerApp
+
+    from SlicerUSSim.Workstation.export import write_bundle
+    from SlicerUSSim.Workstation.scene_files import read_scene
+    from SlicerUSSim.Workstation.zipped import zipped
+
+    app = SlicerApp()
+    app.register_module_logic(slicer.vtkSlicerSequencesLogic())
+    mri = head_mri(5.0)
+    write_volume(app.scene.AddNewNodeByClass("vtkMRMLScalarVolumeNode", "head"), mri)
+    images = app.scene.AddNewNodeByClass("vtkMRMLSequenceNode", "sweep")
+    for number in range(2):
+        item = slicer.vtkMRMLScalarVolumeNode()
+        write_volume(item, Volume(np.ones((1, 4, 4), np.uint8), np.eye(4)))
+        images.SetDataNodeAtValue(item, str(number))
+    for number in range(3):
+        files = write_bundle(app, tmp_path / f"scene {number}")
+        told: list[float] = []
+        (tmp_path / "scene.mrb").write_bytes(zipped(files, told.append))
+        record = read_scene(tmp_path / "scene.mrb")
+        assert np.array_equal(record.nodes["mri"].volume.array, mri.array) and told[-1] == 1.0
+        assert 'useCompression="0"' not in files[f"scene {number}/scene {number}.mrml"].read_text()
+        if number == 0:
+            app.scene.RemoveNode(images)

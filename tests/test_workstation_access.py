@@ -64,6 +64,12 @@ class Server:
             connection.sendall(request.replace("\n", "\r\n").encode())
             return connection.recv(200).decode(errors="replace").partition("\r\n")[0]
 
+    def page(self, request: str) -> str:
+        """The whole answer to a request after which the connection is closed."""
+        with socket.create_connection(("127.0.0.1", self.port), timeout=60) as connection:
+            connection.sendall(request.replace("\n", "\r\n").encode())
+            return b"".join(iter(lambda: connection.recv(2**16), b"")).decode()
+
     def end(self) -> str:
         """What it wrote to its log."""
         self.process.terminate()
@@ -84,6 +90,8 @@ def test_on_loopback_too_the_token_is_asked(labels):
         )
         elsewhere = server.answer(f"GET /?token={server.token} HTTP/1.1\nHost: elsewhere.example\n\n")
         assert elsewhere.split()[1] == "403"  # a name that another site makes resolve to this computer
+        refused = server.page("GET / HTTP/1.1\nHost: <script>alert(1)</script>\nConnection: close\n\n")
+        assert " 403 " in refused and "&lt;script&gt;" in refused and "<script>" not in refused
     finally:
         server.end()
 

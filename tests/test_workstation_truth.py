@@ -19,13 +19,12 @@ import slicer
 from PIL import Image
 from vtkmodules.vtkIOXML import vtkXMLImageDataReader
 
-from SlicerUSSim.Logic import PhasedProbe, Volume, segment_mri
+from SlicerUSSim.Logic import Volume
 from SlicerUSSim.Logic.base.volume import read_array
 from SlicerUSSim.Logic.mri.samples import head_mri
 from SlicerUSSim.Logic.tracked.sequence import TrackedSequence
 from SlicerUSSim.Workstation.scene_files import read_scene
 from SlicerUSSim.Workstation.state import NAMES
-from tests.test_browser_parts import run_in_loop
 from tests.test_workstation import (
     answer_new_patient,
     browser as browser,
@@ -145,111 +144,6 @@ def test_a_frozen_image_stays_where_it_was_taken_in_every_export(page, tmp_path)
     assert node.GetAttribute("SlicerUSSim.frozen")
     click(page, "#live")
     page.locator("#frozen").wait_for(state="hidden")
-
-
-def test_a_frozen_image_stays_where_it_was_taken_in_3d_and_in_the_slices():
-    """It was draped over the anatomy at the probe's new place."""
-    from trame.app import get_server
-    from trame_slicer.core import SlicerApp
-
-    from SlicerUSSim.Logic.mrml.label_nodes import write_labels
-    from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic
-    from SlicerUSSim.Logic.mrml.nodes import ijk_to_ras, node_called, node_to_world, set_node_to_world
-    from SlicerUSSim.Workstation.anatomy import AnatomyViews
-
-    async def scenario():
-        app = SlicerApp()
-        views = AnatomyViews(app, get_server("views of a test", client_type="vue3"), lambda *ignored: None)
-        logic = UltrasoundSceneLogic(app.scene)
-        segmentation = segment_mri(head_mri(3.0))
-        labels, probe, output = (
-            app.scene.AddNewNodeByClass(f"vtkMRML{kind}Node")
-            for kind in ("LabelMapVolume", "LinearTransform", "ScalarVolume")
-        )
-        write_labels(labels, segmentation.labels, segmentation.tissue_names, labels)
-        logic.placeProbe(labels, probe)
-        logic.simulate(labels, probe, output)
-        taken = logic.taken
-        views.show_probe(taken.preset.probe, probe)
-        views.show_image(taken, taken.grid.field(taken.preset.probe))
-        views.follow(taken.probe_to_world, taken.preset.probe)
-        logic.holdImage(output)
-        moved = taken.probe_to_world.copy()
-        moved[:3, 3] += [5.0, -7.0, 9.0]
-        set_node_to_world(probe, moved)
-        views.follow(moved, taken.preset.probe)
-        field, seen = (
-            node_called(app.scene, "Model", "Ultrasound field"),
-            node_called(app.scene, "ScalarVolume", "Ultrasound as shown"),
-        )
-        body = node_called(app.scene, "Model", "Probe body")
-        in_slices = node_to_world(seen) @ ijk_to_ras(seen)
-        shown_ids = {view.get_foreground_volume_id() for view in views.slices}
-        return (
-            node_to_world(field), in_slices, node_to_world(output) @ ijk_to_ras(output), node_to_world(body), moved,
-            taken, shown_ids == {seen.GetID()},
-        )  # fmt: skip
-
-    field, in_slices, in_scene, body, moved, taken, is_shown = run_in_loop(scenario)
-    np.testing.assert_allclose(field, taken.probe_to_world, atol=1e-6)
-    np.testing.assert_allclose(in_slices, taken.image_to_world, atol=1e-6)
-    np.testing.assert_allclose(in_scene, taken.volume().ijk_to_ras, atol=1e-6)
-    np.testing.assert_allclose(body, moved, atol=1e-6)  # the probe has gone on
-    assert is_shown
-
-
-def test_a_view_stands_in_the_plane_that_it_is_called_at_start_and_after_a_file_was_opened():
-    """ "Axial" showed a coronal section until the probe had moved."""
-    from trame.app import get_server
-    from trame_slicer.core import SlicerApp
-
-    from SlicerUSSim.Logic.base.vtk_data import matrix_array
-    from SlicerUSSim.Logic.mrml.nodes import write_volume
-    from SlicerUSSim.Workstation.anatomy import AnatomyViews
-    from SlicerUSSim.Workstation.state import ACROSS, IN_PLANE
-
-    normals = {"Axial": [0, 0, 1], "Coronal": [0, 1, 0], "Sagittal": [1, 0, 0]}
-
-    def stand_as_called(views) -> bool:
-        for view in views.slices:
-            plane = views.planes[view.get_singleton_tag()]
-            if plane not in (IN_PLANE, ACROSS):
-                normal = matrix_array(view.get_view_node().GetSliceToRAS())[:3, 2]
-                np.testing.assert_allclose(abs(normal), normals[plane], atol=1e-6)
-        return any(plane in normals for plane in views.planes.values())
-
-    async def scenario():
-        app = SlicerApp()
-        views = AnatomyViews(app, get_server("planes of a test", client_type="vue3"), lambda *ignored: None)
-        assert stand_as_called(views)
-        node = app.scene.AddNewNodeByClass("vtkMRMLScalarVolumeNode", "head")
-        write_volume(node, head_mri(4.0))
-        views.show_volume(node)
-        assert stand_as_called(views)
-        for plane in normals:
-            views.set_plane("Green", plane)
-            assert stand_as_called(views)
-            # Those that follow the probe are empty until it is there, and show no other section under their name
-            shown = {view.get_singleton_tag(): view.get_background_volume_id() for view in views.slices}
-            assert shown["Green"] == node.GetID() and not shown["Red"] and not shown["Yellow"]
-        probe_to_ras = np.array([[1.0, 0, 0, 3], [0, 0, 1, 5], [0, -1, 0, 40], [0, 0, 0, 1]])
-        views.follow(probe_to_ras, PhasedProbe(field_of_view_deg=75.0, depth_mm=70.0))
-        assert stand_as_called(views)
-        red = next(view for view in views.slices if view.get_singleton_tag() == "Red")
-        in_view = matrix_array(red.get_view_node().GetSliceToRAS())[:3, 2]
-        np.testing.assert_allclose(abs(in_view), [0, 1, 0], atol=1e-6)  # the image plane
-        assert red.get_background_volume_id() == node.GetID()
-        return True
-
-    assert run_in_loop(scenario)
-
-
-def test_slices_are_in_the_image_plane_right_after_a_file_was_opened(page, files):
-    page.set_input_files("#open-file", files / "head.nii.gz")
-    answer_new_patient(page)
-    page.wait_for_function("window.ussim.image?.patient === 'head.nii.gz'")
-    settled(page)
-    assert sector_rows(page) > 50  # and the probe has not been moved
 
 
 def output_of_scene(bundle: Path, folder: Path):
@@ -488,6 +382,14 @@ def test_the_images_of_simulate_sequence_are_shown_and_played_where_they_were_ta
     page.wait_for_function("window.ussim.image?.patient === 'labels.nii.gz'")
     settled(page)
     assert page.locator("#simulated-player").count() == 0 and not errors(page)
+
+
+def test_slices_are_in_the_image_plane_right_after_a_file_was_opened(page, files):
+    page.set_input_files("#open-file", files / "head.nii.gz")
+    answer_new_patient(page)
+    page.wait_for_function("window.ussim.image?.patient === 'head.nii.gz'")
+    settled(page)
+    assert sector_rows(page) > 50  # and the probe has not been moved
 
 
 def probe_pose(page) -> np.ndarray:

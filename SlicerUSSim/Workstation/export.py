@@ -237,6 +237,7 @@ def write_bundle(app: SlicerApp, folder: Path) -> dict[str, Path]:
     Raises SimulationError if it cannot be written.
     """
     folder.mkdir()
+    _remove_unused_stores(app.scene)
     stores: dict[Any, Any] = {}
     for node in nodes_of_class(app.scene, "vtkMRMLStorableNode"):
         if node.GetSaveWithScene() and (node.GetStorageNode() is not None or node.AddDefaultStorageNode()):
@@ -259,3 +260,15 @@ def write_bundle(app: SlicerApp, folder: Path) -> dict[str, Path]:
     # What is saved from this scene again is compressed, as usual
     scene.write_text(scene.read_text("utf-8").replace('useCompression="0"', 'useCompression="1"'), "utf-8")
     return {path.relative_to(folder.parent).as_posix(): path for path in sorted(folder.rglob("*")) if path.is_file()}
+
+
+def _remove_unused_stores(scene) -> None:
+    """Remove storage nodes of nodes that are gone: scenes would name the folder of the last one as their file."""
+    used = {
+        node.GetNthStorageNode(number)
+        for node in nodes_of_class(scene, "vtkMRMLStorableNode")
+        for number in range(node.GetNumberOfStorageNodes())
+    }
+    for store in nodes_of_class(scene, "vtkMRMLStorageNode"):
+        if store not in used:
+            scene.RemoveNode(store)
