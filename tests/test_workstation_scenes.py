@@ -154,6 +154,60 @@ def test_the_workstation_opens_the_scene_of_the_slicer_module(page, module_scene
     assert page.locator("#frozen").is_hidden()
 
 
+def test_a_frozen_image_comes_back_with_its_scene(page, files, tmp_path):
+    """A live image where the probe is was shown in its place, and said to be "as it was"."""
+    page.set_input_files("#open-file", files / "labels.nii.gz")
+    answer_new_patient(page)
+    page.wait_for_function("window.ussim.image?.patient === 'labels.nii.gz'")
+    settled(page)
+    click(page, "#live")
+    page.locator("#frozen").wait_for()
+    settled(page)
+    image, about = pixels(page), page.evaluate("window.ussim.image")
+    for _ in range(3):
+        page.keyboard.press("d")
+    settled(page)
+    moved = state(page, NAMES.pose_matrix)
+    shutil.copy(download(page, "mrb"), tmp_path / "frozen.mrb")
+    page.set_input_files("#open-file", files / "head.nii.gz")
+    answer_new_patient(page)
+    page.wait_for_function("window.ussim.image?.patient === 'head.nii.gz'")
+    settled(page)
+    open_scene(page, tmp_path / "frozen.mrb")
+    assert not errors(page) and page.locator("#frozen").is_visible() and not shown(page, "liveCheckBox")
+    again = page.evaluate("window.ussim.image")
+    assert np.array_equal(pixels(page), image) and {name: again[name] for name in ("patient", "time")} == {
+        name: about[name] for name in ("patient", "time")
+    }
+    np.testing.assert_allclose(again["pose"], about["pose"], atol=1e-3)
+    now = state(page, NAMES.pose_matrix)
+    np.testing.assert_allclose(*(np.array(text.split(), float) for text in (now, moved)), atol=1e-3)
+    click(page, "#live")
+    page.locator("#frozen").wait_for(state="hidden")
+    settled(page)
+
+
+def test_nothing_of_a_patient_stays_on_the_next_one(page, files, tmp_path):
+    """The line "FROZEN: ..." and the outline of the imaged field of the patient before lay over the next one."""
+    page.set_input_files("#open-file", files / "labels.nii.gz")
+    answer_new_patient(page)
+    page.wait_for_function("window.ussim.image?.patient === 'labels.nii.gz'")
+    settled(page)
+    click(page, "#close-patient")
+    settled(page)
+    assert state(page, NAMES.messages.status) == "" and state(page, NAMES.title) == ""
+    shutil.copy(download(page, "mrb"), tmp_path / "closed.mrb")
+    with zipfile.ZipFile(tmp_path / "closed.mrb") as bundle:
+        names = bundle.namelist()
+        scene = bundle.read(next(name for name in names if name.endswith(".mrml"))).decode()
+    assert not [name for name in names if "outline" in name.lower()]
+    poses = re.findall(r'name="Probe"[^>]*matrixTransformToParent="([^"]*)"', scene)
+    assert [np.array(pose.split(), float).reshape(4, 4).tolist() for pose in poses] == [np.eye(4).tolist()]
+    page.set_input_files("#open-file", files / "head.nii.gz")
+    page.wait_for_function("window.ussim.image?.patient === 'head.nii.gz'")
+    settled(page)
+
+
 def test_a_scene_comes_from_a_child_process_as_plain_values(module_scene):
     path, _, pose = module_scene
     record = read_scene(path)

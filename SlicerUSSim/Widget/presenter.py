@@ -27,6 +27,7 @@ from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic
 from SlicerUSSim.Logic.mrml.nodes import display_of, nodes_of_class, probe_pose, set_node_to_world
 from SlicerUSSim.Logic.mrml.parameter_node import BY_LOOK
 from SlicerUSSim.Logic.mrml.sequence_nodes import MADE_FROM
+from SlicerUSSim.Logic.mrml.taken_sequence import FrozenRecord
 from SlicerUSSim.Logic.probe.arrays import PROBES, Probe
 from SlicerUSSim.Logic.probe.beam import TRANSMIT_OF
 from SlicerUSSim.Logic.tissue.names import same_name
@@ -588,6 +589,7 @@ class PanelPresenter:
     def forgetPatient(self) -> None:
         """Release what is kept in memory of the last patient, with notes and fit; nodes stay."""
         self.logic.forgetPatient()
+        self.view.showStatus("")
         self.fits.forget()
         self._before_segment = None
         self.setNotes()
@@ -630,6 +632,12 @@ class PanelPresenter:
             if not self.logic.isLive:
                 self.logic.holdImage(nodes.output)
         self.view.refresh()
+
+    def showFrozen(self, record: FrozenRecord) -> None:
+        """Show the image of a scene that was saved, which stays where it was taken."""
+        with self.shown():
+            self.logic.showFrozen(record, self._nodes().output)
+            self._stopped()
 
     def _say_labels(self, labels: Any) -> None:
         """Replace the notes by what labels were recognised as, if they are about others."""

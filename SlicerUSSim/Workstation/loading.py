@@ -8,6 +8,7 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from trame_slicer.core import SlicerApp
 
 from SlicerUSSim.Logic.base.errors import SimulationError, require
@@ -18,6 +19,7 @@ from SlicerUSSim.Logic.mri.label_agreement import follows
 from SlicerUSSim.Logic.mrml.label_nodes import labels_version
 from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic
 from SlicerUSSim.Logic.mrml.nodes import pose_in_labels, probe_pose, read_volume
+from SlicerUSSim.Logic.mrml.taken_sequence import FrozenRecord
 from SlicerUSSim.Logic.tissue.label_maps import LabelledTissues, as_whole
 from SlicerUSSim.Widget.presenter import PanelPresenter
 from SlicerUSSim.Workstation.anatomy import AnatomyViews
@@ -428,11 +430,14 @@ class Loading:
         parameters = self._logic.parameters
         self._logic.stopLiveUpdate()
         self._logic.clearImage(parameters.output)
+        self._logic.clearOutline(parameters.outline)
         # Ultrasound that was opened before any patient of the user's is of this one
         kept = [] if self.has_users_patient else self._registration.nodes
         if self.has_users_patient:
             self._forget_ultrasound()
         self._probe.forget_patient()
+        if parameters.probe_transform is not None and self._registration.recording is None:
+            self._probe.move(np.eye(4))  # it is placed on the next one; a saved scene has no pose of the one before
         self._presenter.forgetPatient()
         self._opener.forget_patient(*new)
         kept += [parameters.output, parameters.outline, parameters.probe_transform, *new]
@@ -467,21 +472,29 @@ class Loading:
         """Show the real image with this index, and move the probe there."""
         self._comparison.show(number)
 
-    def show_restored(self, *, is_placed: bool) -> None:
-        """Show the nodes that were chosen; the probe `is_placed`, or is placed now, if there are tissues."""
+    def show_restored(self, *, is_placed: bool, frozen: FrozenRecord | None = None) -> None:
+        """Show the nodes that were chosen, and a `frozen` image; the probe `is_placed`, or is now if there are tissues.
+
+        Without such an image live ones begin.
+        """
         parameters: Any = self._logic.parameters
         self._views.show_volume(parameters.labels if parameters.mri is None else parameters.mri)
         self.show_title()
         if parameters.labels is not None:
-            self.labels_ready(is_placed=is_placed)
+            self.labels_ready(is_placed=is_placed, frozen=frozen)
 
-    def labels_ready(self, *, is_placed: bool = False) -> None:
-        """Show the image of new labels; the probe `is_placed`, or is placed now if they are of a new patient."""
+    def labels_ready(self, *, is_placed: bool = False, frozen: FrozenRecord | None = None) -> None:
+        """Show the image of new labels, or a `frozen` one of them.
+
+        The probe `is_placed`, or is placed now if they are of a new patient.
+        """
         if self._logic.parameters.probe_transform is None or (self._is_new and not is_placed):
             self._presenter.placeProbe()
         self._is_new = False
         self.show_title()
-        if not self._logic.isLive:
+        if frozen is not None:
+            self._presenter.showFrozen(frozen)
+        elif not self._logic.isLive:
             self._presenter.setLive(True)
         self._probe.update_surface()  # after the start of live images, which do not need it
         self._probe.look()

@@ -191,7 +191,7 @@ class Restoring:
                 now.fit.curve, now.fit.costs = [float(cost) for cost in kept["curve"]], str(kept["costs"])
         self._cine.restore(images, self._now(), str(kept.get("about", "")))
         self._presenter.setNotes(*map(str, kept.get("notes", ())), *refused)
-        self._loading.show_restored(is_placed=pose is not None)
+        self._loading.show_restored(is_placed=pose is not None, frozen=record.frozen)
 
     def _put_probe(self, pose: np.ndarray) -> None:
         parameters: Any = self._logic.parameters

@@ -97,7 +97,7 @@ from SlicerUSSim.Logic.mrml.taken_image import (
     remove_image,
     write_about,
 )
-from SlicerUSSim.Logic.mrml.taken_sequence import in_node, read_taken, write_taken
+from SlicerUSSim.Logic.mrml.taken_sequence import FrozenRecord, in_node, read_taken, taken_of, write_taken
 from SlicerUSSim.Logic.probe.placement import pose_in_slice
 from SlicerUSSim.Logic.tissue.label_maps import LabelledTissues
 from SlicerUSSim.Logic.tissue.table import TissueTable
@@ -565,17 +565,25 @@ class UltrasoundSceneLogic:
 
     @contextmanager
     def imageHeld(self) -> Iterator[None]:
-        """As if Live ended, and goes on after that: in a scene that is saved, the image is where it was taken."""
-        taken = self._taken
-        transform = None if taken is None else taken.node.GetParentTransformNode()
-        if taken is None or transform is None or not self.isLive:
+        """While a scene is saved: as if Live ended, so that the image is where it was taken; it goes on after that.
+
+        Saving lays the segments of tissues together into one label map. The image is of them as before.
+        """
+        taken, labels = self._taken, self.parameters.labels
+        if taken is None:
             yield
             return
-        freeze(taken)
+        is_of_labels = labels is not None and self.anatomyOf(labels) == taken.anatomy
+        transform = taken.node.GetParentTransformNode() if self.isLive else None
+        if transform is not None:
+            freeze(taken)
         try:
             yield
         finally:
-            follow(taken, transform)
+            if transform is not None:
+                follow(taken, transform)
+            if is_of_labels:
+                self._taken = replace(taken, anatomy=self.anatomyOf(labels))
 
     def clearImage(self, output_node) -> None:
         """Empty a node with an image of this module, which is not of the present patient or pose."""
@@ -586,6 +594,12 @@ class UltrasoundSceneLogic:
             self._taken = None
         if output_node.GetImageData() is not None:
             remove_image(output_node)
+
+    def clearOutline(self, model_node) -> None:
+        """Empty a model with an outline of this module, which is where a probe was on another patient."""
+        if model_node is not None:
+            require_result(model_node, "outline")
+            model_node.SetAndObservePolyData(None)
 
     def renewSimulator(self) -> None:
         """Make images with another simulator from now on: work that was abandoned may still use the one of before."""
@@ -684,6 +698,15 @@ class UltrasoundSceneLogic:
         node_id, anatomy = self._in_sequence
         return read_taken(images_node, number, anatomy if node_id == images_node.GetID() else None)
 
+    def showFrozen(self, record: FrozenRecord, output_node) -> TakenImage:
+        """Write an image of a scene that was saved into a scalar volume node, where it was taken; it stays there.
+
+        Ends live update. Raises SimulationError for a damaged record, and for an output that this module did not make.
+        """
+        require_node(output_node, "vtkMRMLScalarVolumeNode", use="output")
+        require_result(output_node, "output")
+        return self._show_frozen(taken_of(record, output_node), output_node)
+
     def showSequenceImage(self, images_node, number: int, output_node) -> TakenImage:
         """Write an image that simulateSequence made into a scalar volume node, where it was taken; it stays there.
 
@@ -692,7 +715,9 @@ class UltrasoundSceneLogic:
         """
         require_node(output_node, "vtkMRMLScalarVolumeNode", use="output")
         require_result(output_node, "output")
-        taken = in_node(self.sequenceImage(images_node, number), output_node)
+        return self._show_frozen(in_node(self.sequenceImage(images_node, number), output_node), output_node)
+
+    def _show_frozen(self, taken: TakenImage, output_node) -> TakenImage:
         self.stopLiveUpdate()
         self._taken = taken
         was_modifying = output_node.StartModify()

@@ -38,7 +38,7 @@ from SlicerUSSim.Logic.mrml.nodes import (
 )
 from SlicerUSSim.Logic.mrml.parameter_node import VALUE_PARAMETERS, SceneParameters
 from SlicerUSSim.Logic.mrml.share_nodes import set_shares_node, shares_node
-from SlicerUSSim.Logic.mrml.taken_sequence import SimulatedRecord, record_taken
+from SlicerUSSim.Logic.mrml.taken_sequence import FrozenRecord, SimulatedRecord, record_frozen, record_taken
 from SlicerUSSim.Logic.tracked.images import TrackedImages
 from SlicerUSSim.Logic.tracked.sequence import TrackedSequence
 
@@ -130,6 +130,8 @@ class SceneRecord:
     landmarks: tuple[Landmark, ...] = ()
     #: Images of Simulate sequence
     simulated: SimulatedRecord | None = None
+    #: The simulated image, if it is not the one of the probe's pose
+    frozen: FrozenRecord | None = None
 
     @property
     def size(self) -> int:
@@ -195,9 +197,13 @@ def record_scene(scene) -> SceneRecord:
     pose = None if transform is None else probe_pose(transform)
     landmarks = () if sequence is None else landmarks_of(scene)
     others = tuple(_others(scene, parameters))
+    frozen = record_frozen(parameters.output)
+    if frozen is not None and pose is not None and np.allclose(frozen.pose, pose, atol=1e-4):
+        frozen = None  # a live one, which a saved scene has where it was taken, too
     return SceneRecord(
-        nodes, recorded_values(parameters), pose, sequence, others, landmarks, record_taken(parameters.image_sequence)
-    )
+        nodes, recorded_values(parameters), pose, sequence, others, landmarks, record_taken(parameters.image_sequence),
+        frozen,
+    )  # fmt: skip
 
 
 def _choose_missing(scene, parameters: SceneParameters) -> None:

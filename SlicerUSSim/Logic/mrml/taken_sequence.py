@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Hashable, Sequence
+from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -17,7 +17,7 @@ from SlicerUSSim.Logic.imaging.preset import Preset
 from SlicerUSSim.Logic.mrml.nodes import ijk_to_ras, named, write_slice
 from SlicerUSSim.Logic.mrml.own_results import IMAGE, SEQUENCE, mark_as_result
 from SlicerUSSim.Logic.mrml.sequence_nodes import SequenceIndex
-from SlicerUSSim.Logic.mrml.taken_image import TakenImage, write_about
+from SlicerUSSim.Logic.mrml.taken_image import TakenImage, about_image, is_frozen, write_about
 from SlicerUSSim.Logic.probe.image_grid import ImageGrid
 
 #: Attribute of a sequence node with images: what each is of, as JSON. Those of its items are lost when Slicer saves
@@ -70,15 +70,22 @@ def _taken(about: str, number: int, image: np.ndarray, anatomy: Hashable, node: 
     """The image with a number and what `about` says of it; raises one of several errors for another text."""
     values = json.loads(about)
     line = values["images"][number]
-    preset = Preset.from_dict(values["presets"][line["preset"]])
+    return _image_of(line, values["presets"][line["preset"]], image, anatomy, node, number)
+
+
+def _image_of(
+    line: Mapping[str, Any], settings: Any, image: np.ndarray, anatomy: Hashable, node: Any, number: int | None
+) -> TakenImage:
+    preset = Preset.from_dict(settings)
     pose = check_rigid("the pose of an image", line["probe_to_ras"])
     grid = ImageGrid.for_probe(preset.probe, preset.display.image_size)
+    what = "a saved image" if number is None else f"image {number} of a sequence"
     require(
         image.shape == (grid.rows, grid.columns) and image.dtype == np.uint8,
-        f"image {number} of a sequence is {image.shape}, expected {grid.rows} rows of {grid.columns} pixels",
+        f"{what} is {image.shape}, expected {grid.rows} rows of {grid.columns} pixels",
     )
     return TakenImage(
-        image, grid, pose, preset, str(line["patient"]), anatomy, str(line["time"]), bool(line["is_empty"]), node,
+        image, grid, pose, preset, str(line["patient"]), anatomy, str(line["time"]), bool(line.get("is_empty")), node,
         number=number,
     )  # fmt: skip
 
@@ -93,6 +100,44 @@ def count_taken(images_node: Any) -> int:
 def in_node(taken: TakenImage, volume_node: Any) -> TakenImage:
     """The same image, in another volume node."""
     return replace(taken, node=volume_node)
+
+
+# ---- a frozen image --------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class FrozenRecord:
+    """An image that stays where it was taken, as plain values."""
+
+    #: See TakenImage.about
+    about: Mapping[str, Any]
+    #: (rows, columns) uint8
+    image: np.ndarray
+
+    @property
+    def pose(self) -> np.ndarray:
+        """(4, 4) probe_to_ras at the time of the image; no numbers if that is not known."""
+        try:
+            return np.array(self.about["probe_to_ras"], float).reshape(4, 4)
+        except (LookupError, ValueError, TypeError):
+            return np.full((4, 4), np.nan)
+
+
+def record_frozen(volume_node: Any) -> FrozenRecord | None:
+    """The image in a volume node, if it is one of this module that stays where it was taken."""
+    if volume_node is None or volume_node.GetImageData() is None or not is_frozen(volume_node):
+        return None
+    about = about_image(volume_node)
+    array = Volume.from_vtk(volume_node.GetImageData(), ijk_to_ras(volume_node)).array
+    return FrozenRecord(about, array[0].copy()) if about else None
+
+
+def taken_of(record: FrozenRecord, volume_node: Any) -> TakenImage:
+    """The image of a record for a volume node. Raises SimulationError if it is damaged."""
+    try:
+        return _image_of(record.about, record.about["preset"], record.image, None, volume_node, None)
+    except (ValueError, LookupError, TypeError, AttributeError) as error:
+        raise SimulationError(f"the image of the scene is damaged ({error})") from None
 
 
 # ---- kept apart from a scene -----------------------------------------------------------------------------------------
