@@ -511,6 +511,35 @@ def test_voxels_within_the_head_that_are_no_numbers_are_refused(tmp_path, place,
         Volume.read(tmp_path / "mri.nii.gz")
 
 
+def test_voxels_of_others_stay_beside_a_header(tmp_path):
+    """A user's file whose name looks like ours, voxels of a header with the same stem, and of a copied header."""
+    theirs = tmp_path / "a.0123456789abcdef.raw"
+    theirs.write_bytes(b"the MRI")
+    images = [Volume(numbered((20, 20, 20)) + n, np.eye(4)) for n in range(4)]
+    images[0].write(tmp_path / "a.mhd")
+    images[1].write(tmp_path / "a.nhdr")
+    (tmp_path / "copy.mhd").write_bytes((tmp_path / "a.mhd").read_bytes())
+    images[2].write(tmp_path / "a.mhd")
+    images[3].write(tmp_path / "a.mhd")
+    assert theirs.read_bytes() == b"the MRI"
+    for name, image in (("a.mhd", images[3]), ("a.nhdr", images[1]), ("copy.mhd", images[0])):
+        assert np.array_equal(Volume.read(tmp_path / name).array, image.array)
+    assert len(list(tmp_path.glob("a.*.raw*"))) == 4  # those of images[2] are gone
+    assert not list(tmp_path.glob(".ussim-*"))
+
+
+def test_voxels_that_a_header_names_but_we_did_not_write_stay(tmp_path):
+    image = Volume(numbered((20, 20, 20)), np.eye(4))
+    image.write(tmp_path / "a.mhd")
+    (ours,) = tmp_path.glob("a.*.raw")
+    theirs = tmp_path / "a.0123456789abcdef.raw"
+    ours.rename(theirs)
+    header = tmp_path / "a.mhd"
+    header.write_text(header.read_text().replace(ours.name, theirs.name))
+    Volume(image.array + 1, np.eye(4)).write(header)
+    assert theirs.is_file()
+
+
 @pytest.mark.parametrize("new", ["a.mhd", "a.nhdr"])
 def test_the_voxels_of_another_header_are_not_replaced(new, tmp_path):
     """Both keep them in a file of their own: the labels of a patient replaced her MRI."""
