@@ -94,8 +94,8 @@ def written_whole(path: str | os.PathLike) -> Iterator[Path]:
 
     All of it is on the disk before it replaces anything, so that after a crash or a power cut the file is the old or
     the new one. The voxels of a .mhd or .nhdr get a name of their own, by their content, and the header that names them
-    comes last; those that this program wrote for the header before are removed then, unless another header names them. Raises SimulationError naming `path` if it cannot be
-    written.
+    comes last; those that this program wrote for the header before are removed then, unless another header names them.
+    Raises SimulationError naming `path` if it cannot be written.
     """
     path = Path(path)
     require_place(path)
