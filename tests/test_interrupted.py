@@ -117,3 +117,34 @@ def test_a_fit_that_was_interrupted_goes_on_where_it_was(inputs, tmp_path):
     assert process.returncode == 0, said
     whole = read_json(tmp_path / "whole.json")
     assert np.isclose(resumed["cost_after"], whole["cost_after"], rtol=1e-6)
+
+
+_IN_A_LIBRARY = """
+import sqlite3, sys
+from SlicerUSSim.Command import cli
+
+@cli.main.command()
+def compute():
+    print("begun", flush=True)  # then a library, which knows no signals, computes for ever, as a kernel may
+    sqlite3.connect(":memory:").execute(
+        "WITH RECURSIVE c(x) AS (SELECT 1 UNION ALL SELECT x + 1 FROM c) SELECT count(*) FROM c"
+    ).fetchall()
+
+cli.main(["compute"])
+"""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="signals")
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_the_process_while_a_library_computes(number):
+    with subprocess.Popen(
+        [sys.executable, "-c", _IN_A_LIBRARY], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as process:
+        try:
+            assert process.stdout is not None and process.stdout.readline() == "begun\n"
+            process.send_signal(number)
+            _, said = process.communicate(timeout=120)
+        finally:
+            process.kill()
+    assert process.returncode == 128 + number
+    assert said in ("ussim: interrupted\n", "")

@@ -338,6 +338,82 @@ def test_images_that_are_no_volume_together_are_refused(tmp_path, where, value, 
         Volume.read(tmp_path)
 
 
+def with_pixels(dicom: bytes, pixels: bytes) -> bytes:
+    at = dicom.index(tag(0x7FE0, 0x10)) + 4
+    return dicom[:at] + len(pixels).to_bytes(4, "little") + pixels
+
+
+def with_bits(dicom: bytes, element: int, value: int) -> bytes:
+    at = dicom.index(tag(0x28, element)) + 8
+    return dicom[:at] + value.to_bytes(2, "little") + dicom[at + 2 :]
+
+
+@pytest.mark.parametrize("door", ["folder", "file", "array"])
+@pytest.mark.parametrize("which", ["3.dcm", "*.dcm"])
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda whole: with_pixels(whole, bytes(1000)), r"have 1000 bytes, expected 4000 for 40 rows, 50 columns"),
+        (lambda whole: with_pixels(whole, bytes(3998)), r"have 3998 bytes, expected 4000"),
+        (lambda whole: with_bits(whole, 0x100, 32), r"have 4000 bytes, expected 8000 .* 32 bits \(BitsAllocated\)"),
+        (lambda whole: with_bits(whole, 0x100, 8), r"have 4000 bytes, expected 2000 .* 8 bits \(BitsAllocated\)"),
+    ],
+)
+def test_dicom_pixels_of_another_size_than_its_header_says_are_refused(tmp_path, change, words, which, door):
+    """GDCM reads the missing ones as zeros without a word."""
+    write_dicom(Volume(numbered((6, 40, 50)).astype(np.int16), np.diag([-1.0, -1.0, 2.5, 1.0])), tmp_path)
+    for file in tmp_path.glob(which):
+        file.write_bytes(change(file.read_bytes()))
+    if which == "3.dcm" and "bits" in words:  # it differs from the others, then, which is said first
+        words += r"|has the BitsAllocated \d+, and \d\.dcm 16, expected one in all images"
+    if which == "3.dcm" and door == "array":
+        assert_refused = pytest.raises(SimulationError, match=rf"3\.dcm: its pixels {words}")
+    else:
+        assert_refused = pytest.raises(SimulationError, match=rf"\d\.dcm:?.*({words})")
+    with assert_refused:
+        read_array(tmp_path / "3.dcm") if door == "array" else Volume.read(
+            tmp_path if door == "folder" else tmp_path / "3.dcm"
+        )
+
+
+@pytest.mark.parametrize(("element", "value", "name"), [(0x101, 9, "BitsStored"), (0x103, 0, "PixelRepresentation")])
+def test_slices_whose_pixels_are_stored_otherwise_are_refused(tmp_path, element, value, name):
+    write_dicom(Volume(numbered((6, 40, 50)).astype(np.int16), np.diag([-1.0, -1.0, 2.5, 1.0])), tmp_path)
+    file = tmp_path / "3.dcm"
+    file.write_bytes(with_bits(file.read_bytes(), element, value))
+    with pytest.raises(SimulationError, match=rf"3\.dcm has the {name} {value}, and \d\.dcm \d+, expected one in all"):
+        Volume.read(tmp_path)
+
+
+@pytest.mark.parametrize("open_ended", [False, True])
+def test_the_size_of_a_small_picture_in_a_dicom_file_is_not_that_of_the_image(tmp_path, open_ended):
+    volume = Volume(numbered((6, 40, 50)).astype(np.int16), np.diag([-1.0, -1.0, 2.5, 1.0]))
+    write_dicom(volume, tmp_path)
+
+    def element(group, number, value):
+        return tag(group, number) + len(value).to_bytes(4, "little") + value
+
+    picture = b"".join(
+        element(0x28, number, value.to_bytes(2, "little"))
+        for number, value in ((2, 1), (0x10, 8), (0x11, 8), (0x100, 8))
+    ) + element(0x7FE0, 0x10, bytes(64))
+    if open_ended:
+        item = tag(0xFFFE, 0xE000) + b"\xff" * 4 + picture + tag(0xFFFE, 0xE00D) + bytes(4)
+        icon = tag(0x88, 0x200) + b"\xff" * 4 + item + tag(0xFFFE, 0xE0DD) + bytes(4)
+    else:
+        icon = element(0x88, 0x200, element(0xFFFE, 0xE000, picture))
+    for file in tmp_path.iterdir():
+        whole = file.read_bytes()
+        at = whole.index(tag(0x28, 0x02) + b"\2\0\0\0")
+        file.write_bytes(whole[:at] + icon + whole[at:])
+    np.testing.assert_array_equal(Volume.read(tmp_path).array, volume.array)
+    whole = (tmp_path / "3.dcm").read_bytes()
+    at = whole.rindex(tag(0x7FE0, 0x10)) + 4
+    (tmp_path / "3.dcm").write_bytes(whole[:at] + (1000).to_bytes(4, "little") + bytes(1000))
+    with pytest.raises(SimulationError, match=r"3\.dcm: its pixels have 1000 bytes, expected 4000"):
+        Volume.read(tmp_path)
+
+
 @pytest.mark.parametrize("name", ["image.nii", "image.nii.gz"])
 def test_a_truncated_or_damaged_nifti_file_is_refused(name, tmp_path):
     """ITK reads the missing voxels as 0 without a word."""
@@ -509,6 +585,35 @@ def test_voxels_within_the_head_that_are_no_numbers_are_refused(tmp_path, place,
     message = rf"1 of 336 voxels are not finite numbers, the first at \(i, j, k\) = \({', '.join(map(str, place))}\)"
     with pytest.raises(SimulationError, match=message):
         Volume.read(tmp_path / "mri.nii.gz")
+
+
+def test_voxels_of_others_stay_beside_a_header(tmp_path):
+    """A user's file whose name looks like ours, voxels of a header with the same stem, and of a copied header."""
+    theirs = tmp_path / "a.0123456789abcdef.raw"
+    theirs.write_bytes(b"the MRI")
+    images = [Volume(numbered((20, 20, 20)) + n, np.eye(4)) for n in range(4)]
+    images[0].write(tmp_path / "a.mhd")
+    images[1].write(tmp_path / "a.nhdr")
+    (tmp_path / "copy.mhd").write_bytes((tmp_path / "a.mhd").read_bytes())
+    images[2].write(tmp_path / "a.mhd")
+    images[3].write(tmp_path / "a.mhd")
+    assert theirs.read_bytes() == b"the MRI"
+    for name, image in (("a.mhd", images[3]), ("a.nhdr", images[1]), ("copy.mhd", images[0])):
+        assert np.array_equal(Volume.read(tmp_path / name).array, image.array)
+    assert len(list(tmp_path.glob("a.*.raw*"))) == 4  # those of images[2] are gone
+    assert not list(tmp_path.glob(".ussim-*"))
+
+
+def test_voxels_that_a_header_names_but_we_did_not_write_stay(tmp_path):
+    image = Volume(numbered((20, 20, 20)), np.eye(4))
+    image.write(tmp_path / "a.mhd")
+    (ours,) = tmp_path.glob("a.*.raw")
+    theirs = tmp_path / "a.0123456789abcdef.raw"
+    ours.rename(theirs)
+    header = tmp_path / "a.mhd"
+    header.write_text(header.read_text().replace(ours.name, theirs.name))
+    Volume(image.array + 1, np.eye(4)).write(header)
+    assert theirs.is_file()
 
 
 @pytest.mark.parametrize("new", ["a.mhd", "a.nhdr"])

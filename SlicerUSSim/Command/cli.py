@@ -9,6 +9,7 @@ import contextlib
 import errno
 import os
 import signal
+import socket
 import sys
 import threading
 import warnings
@@ -34,6 +35,10 @@ from SlicerUSSim.Logic.base.version import __version__
 
 #: Errors of a standard output that is a file on a full or broken disk, or closed
 _NO_MORE = {errno.ENOSPC, errno.EDQUOT, errno.EIO, errno.EBADF}
+
+#: Set by handlers of signals, and seconds in which they must run
+_seen = threading.Event()
+_GRACE_S = 2.0
 
 
 class _Commands(click.Group):
@@ -70,6 +75,7 @@ def main() -> None:
     """B-mode ultrasound simulated from a patient's MRI."""
     warnings.showwarning = _show_warning
     if threading.current_thread() is threading.main_thread():
+        _end_even_in_kernels()
         for name in ("SIGTERM", "SIGHUP"):  # Windows has no SIGHUP
             if hasattr(signal, name):
                 signal.signal(getattr(signal, name), _end)
@@ -77,7 +83,43 @@ def main() -> None:
 
 def _end(number: int, _: Any) -> None:
     """End as at Ctrl-C: programs that were started end, too, and temporary files go."""
+    _seen.set()
     raise SystemExit(128 + number)
+
+
+def _interrupt(number: int, frame: Any) -> None:
+    _seen.set()
+    signal.default_int_handler(number, frame)
+
+
+def _end_even_in_kernels() -> None:
+    """End the process at a signal also while it waits for a kernel, where Python's handlers do not run.
+
+    A thread is told of every signal. If the handler has not run some seconds later, the main thread is in a library,
+    and the process ends at once: files are replaced whole or not at all, and the next run removes what is left beside
+    them.
+    """
+    if signal.getsignal(signal.SIGINT) is not signal.default_int_handler:  # ignored, or a program's own
+        return
+    told, tell = socket.socketpair()
+    tell.setblocking(False)
+    signal.set_wakeup_fd(tell.fileno(), warn_on_full_buffer=False)
+    if hasattr(os, "register_at_fork"):  # a fork has no such thread, and would tell this one of its own signals
+        os.register_at_fork(after_in_child=lambda: signal.set_wakeup_fd(-1))
+    signal.signal(signal.SIGINT, _interrupt)
+    threading.Thread(target=_watch, args=(told, tell), name="ussim-signals", daemon=True).start()
+
+
+def _watch(told: socket.socket, _: socket.socket) -> None:
+    ends = {getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)}
+    while number := told.recv(1):
+        if number[0] not in ends:
+            continue
+        if not _seen.wait(_GRACE_S):
+            with contextlib.suppress(OSError):
+                os.write(2, b"ussim: interrupted\n")
+            os._exit(128 + number[0])
+        _seen.clear()
 
 
 def _show_warning(message: Warning | str, category: type[Warning], *_: Any, **__: Any) -> None:

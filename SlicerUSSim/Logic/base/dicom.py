@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from SlicerUSSim.Logic.base.dicom_elements import is_compressed, require_sound_elements
+from SlicerUSSim.Logic.base.dicom_elements import is_compressed, require_sound_elements, require_whole_pixels
 from SlicerUSSim.Logic.base.errors import SimulationError, require
 from SlicerUSSim.Logic.base.headers import MOST_VOXELS, is_dicom, require_held, require_spacing
 from SlicerUSSim.Logic.base.reading import reader
@@ -46,6 +46,13 @@ class _Tag:
 _POSITION, _ORIENTATION = _Tag("0020|0032", 3, "position"), _Tag("0020|0037", 6, "orientation")
 _SPACING = _Tag("0028|0030", 2, "pixel spacing")
 _ROWS, _COLUMNS = _Tag("0028|0010", 1, "number of rows"), _Tag("0028|0011", 1, "number of columns")
+#: How pixels are stored: ITK reads all slices as it reads the first
+_STORED = tuple(
+    _Tag(f"0028|{element}", 1, name)
+    for element, name in (
+        ("0100", "BitsAllocated"), ("0101", "BitsStored"), ("0103", "PixelRepresentation"), ("0002", "SamplesPerPixel")
+    )
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -216,6 +223,8 @@ def _read(series: Series, name: str):
     headers = [_header(file) for file in series.files]
     _require_bounded(series, headers, name)
     _check_slices(series, headers, name)
+    for file in series.files:
+        require_whole_pixels(Path(file))
     reader = sitk.ImageSeriesReader()
     reader.SetFileNames(series.files)
     try:
@@ -295,7 +304,10 @@ def _places(series: Series, headers: list[dict[str, str]], name: str) -> np.ndar
             "rows and columns that are perpendicular and have length 1",
         )
         require_spacing(f"{name}: {Path(file).name}", tuple(_required(file, header, _SPACING, name)))
-        for wanted, tolerance in ((_ORIENTATION, _SAME_AXES), (_SPACING, 1e-3), (_ROWS, 0.0), (_COLUMNS, 0.0)):
+        exact = [(wanted, 0.0) for wanted in (_ROWS, _COLUMNS, *_STORED)]
+        for wanted, tolerance in ((_ORIENTATION, _SAME_AXES), (_SPACING, 1e-3), *exact):
+            if wanted in _STORED and _value(header, wanted.tag) == _value(headers[0], wanted.tag):
+                continue  # all of them may lack one that has a default
             here, there = _required(file, header, wanted, name), _required(*first, wanted, name)
             require(
                 np.abs(here - there).max() <= tolerance,

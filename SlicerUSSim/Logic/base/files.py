@@ -13,7 +13,7 @@ import sys
 import tempfile
 import zlib
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from SlicerUSSim.Logic.base.errors import SimulationError, require, require_path
@@ -25,6 +25,8 @@ _NIFTI2_HEADER = 540
 _PARTIAL = ".ussim-"
 #: Suffixes of headers with voxels in a second file, and endings of that
 _HEADERS, _VOXELS = (".mhd", ".nhdr"), (".raw.gz", ".zraw", ".raw")
+#: Those that are looked through for the names of files
+_MOST_HEADER_BYTES = 2**26
 
 
 def require_place(path: Path) -> None:
@@ -92,8 +94,8 @@ def written_whole(path: str | os.PathLike) -> Iterator[Path]:
 
     All of it is on the disk before it replaces anything, so that after a crash or a power cut the file is the old or
     the new one. The voxels of a .mhd or .nhdr get a name of their own, by their content, and the header that names them
-    comes last; those of the header before are removed then. Raises SimulationError naming `path` if it cannot be
-    written.
+    comes last; those that this program wrote for the header before are removed then, unless another header names them.
+    Raises SimulationError naming `path` if it cannot be written.
     """
     path = Path(path)
     require_place(path)
@@ -127,6 +129,8 @@ def _new_partial_folder(parent: Path) -> Path:
     for old in parent.glob(f"{_PARTIAL}{host}-*-*"):
         number = old.name.split("-")[2]
         if number.isdecimal() and not _is_running(int(number)):
+            with suppress(OSError):
+                _remove_unnamed(old)
             shutil.rmtree(old, ignore_errors=True)
     return Path(tempfile.mkdtemp(prefix=f"{_PARTIAL}{host}-{os.getpid()}-", dir=parent))
 
@@ -173,12 +177,45 @@ def _put_in_place(folder: Path, path: Path) -> None:
         is_own = file.name == path.name or _is_voxels_of(file.name, path)
         require(is_own, f"{path}: would be written as {file.name}; give another name")
     voxels = sorted(file for file in folder.iterdir() if file != main)
-    move_into(path.parent, [*voxels, main])  # the header, which names the voxels, last
-    if path.suffix.lower() in _HEADERS:
-        named = {file.name for file in voxels}
-        for file in path.parent.iterdir():
-            if _is_voxels_of(file.name, path) and file.name not in named:
-                file.unlink(missing_ok=True)
+    if path.suffix.lower() in _HEADERS and path.is_file():
+        _keep_header(path, folder)
+    try:
+        move_into(path.parent, [*voxels, main])  # the header, which names the voxels, last
+    finally:
+        with suppress(OSError):
+            _remove_unnamed(folder)
+
+
+def _keep_header(path: Path, folder: Path) -> None:
+    """Copy a header that is replaced to a folder in `folder`, so that also the run after a killed one finds it."""
+    old = folder / "replaced"
+    old.mkdir()
+    if path.stat().st_size <= _MOST_HEADER_BYTES:
+        shutil.copyfile(path, old / path.name)
+
+
+def _remove_unnamed(folder: Path) -> None:
+    """Remove the voxels beside a partial folder that headers left in it name, and none of the headers beside it does.
+
+    Only those are removed that have the name, by their content, which this program gives.
+    """
+    for header in (*folder.glob("*"), *folder.glob("*/*")):
+        if header.suffix.lower() not in _HEADERS or not header.is_file():
+            continue
+        named = rf"^(?:ElementDataFile\s*=|data file:)[ \t]*({re.escape(header.stem)}\.[^\r\n]*)"
+        for found in re.finditer(os.fsencode(named), header.read_bytes(), re.MULTILINE):
+            voxels = folder.parent / os.fsdecode(found[1]).strip()
+            if _is_voxels_of(voxels.name, header) and voxels.parent == folder.parent and voxels.is_file():
+                is_ours = hash_of_file(voxels)[:16] == voxels.name[len(header.stem) + 1 :][:16]
+                if is_ours and not _is_named(voxels):
+                    voxels.unlink(missing_ok=True)
+
+
+def _is_named(voxels: Path) -> bool:
+    """Whether a header in its folder names a file, or is too large to be looked through."""
+    name = os.fsencode(voxels.name)
+    headers = (file for file in voxels.parent.iterdir() if file.suffix.lower() in _HEADERS and file.is_file())
+    return any(file.stat().st_size > _MOST_HEADER_BYTES or name in file.read_bytes() for file in headers)
 
 
 def _name_by_content(header: Path) -> None:

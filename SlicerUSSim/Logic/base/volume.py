@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from SlicerUSSim.Logic.base.dicom import has_compressed, read_dicom_folder, read_series, series_with
-from SlicerUSSim.Logic.base.dicom_elements import is_compressed
+from SlicerUSSim.Logic.base.dicom_elements import is_compressed, require_whole_pixels
 from SlicerUSSim.Logic.base.errors import SimulationError, require, require_package, require_path
 from SlicerUSSim.Logic.base.files import (
     messages_withheld,
@@ -397,6 +397,8 @@ def _read_by_itk(path: Path):
     try:
         file.ReadImageInformation()
         require_bytes(path, file.GetSize(), file.GetNumberOfComponents())
+        if is_dicom(path):
+            require_whole_pixels(path)
         image = file.Execute()
     except RuntimeError as error:
         reason = why_unreadable(path) or str(error).strip().splitlines()[-1]

@@ -36,6 +36,9 @@ _SITES_PER_CELL, _LEAST_PER_MM3 = 8.0, 4.0
 _LOBE_CHUNKS = 4  # samples of a work-item for elevational side lobes re those for the main beam
 _SLICES = 16  # of a scan line for the interfaces on GPUs, which have more work-items than scan lines
 
+#: Extent of a cell of the lattice along a line of any direction, in its edges: between 1 and the root of 3
+_OBLIQUE = 1.3
+
 
 class Scatterers(Stage):
     """Adds speckle: the scatterers near every ray segment."""
@@ -229,12 +232,20 @@ def sites_per_mm3(settings: SimulationSettings, probe: Probe) -> float:
     return float(np.clip(_SITES_PER_CELL / probe.smallest_cell_mm3(), _LEAST_PER_MM3, PAPER_SITES_PER_MM3))
 
 
-def cells_in_view(settings: SimulationSettings, probe: Probe) -> float:
-    """Cells of the scatterer lattice within the beams of one image in tissue without reflections."""
+def cells_in_view(
+    settings: SimulationSettings, probe: Probe, traced_lines: int, lateral_rays: int, chunk_mm: float
+) -> float:
+    """Cells of the scatterer lattice that are looked at for one image in tissue without reflections.
+
+    Around the strip of each of the `traced_lines`, of which each scan line has `lateral_rays`, and around its parts of
+    `chunk_mm`, these are cells that reach into it: many times those in it where lines are closer than cells.
+    """
+    density = sites_per_mm3(settings, probe)
+    slack = _OBLIQUE * density ** (-1.0 / 3.0)
     depth = np.linspace(0.0, probe.depth_mm, 65)
-    across = 2.0 * settings.beam_cutoff * probe.beam_sigma_mm(depth)[1]
-    width = probe.scan_lines * probe.line_distance_mm(depth)
-    return sites_per_mm3(settings, probe) * float(trapezoid(across * width, depth))
+    height = 2.0 * settings.beam_cutoff * probe.beam_sigma_mm(depth)[1] + slack
+    width = probe.line_distance_mm(depth) / lateral_rays + slack
+    return density * traced_lines * (1.0 + slack / chunk_mm) * float(trapezoid(height * width, depth))
 
 
 def lattice_sites(tissues: np.ndarray, acquisition: np.ndarray) -> np.ndarray:

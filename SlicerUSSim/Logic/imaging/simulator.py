@@ -45,8 +45,9 @@ if TYPE_CHECKING:
 
 #: Beyond all fields
 _FAR_MM = 1e6
-#: Cells of the scatterer lattice per image: about 5 s on two cores, what is not begun, and per second there
-_MANY_CELLS, _MOST_CELLS, _CELLS_PER_S = 5e8, 3e10, 1e8
+#: Cells of the scatterer lattice per image: about 5 s on two cores, what is not begun, and per second there (measured
+#: with tall beams; two to three times as many with low ones)
+_MANY_CELLS, _MOST_CELLS, _CELLS_PER_S = 1.5e8, 1e10, 3e7
 #: How far behind the face bone is looked for, and how much of it says that the face is in a closed skull, mm
 _BEHIND_MM, _BONE_BEHIND_MM = 40.0, 2
 _log = logging.getLogger(__name__)
@@ -488,7 +489,10 @@ class UltrasoundSimulator:
         """
         if not self.settings.scattering:
             return
-        cells = cells_in_view(self.settings, probe)
+        lateral, guard = _traced_lines_for(probe, self.settings)
+        traced = (probe.scan_lines - 1) * lateral + 1 + 2 * guard
+        chunk_mm = CONSTANTS["BLOCK"] * self._sample_mm(probe)
+        cells = cells_in_view(self.settings, probe, traced, lateral, chunk_mm)
         if cells <= _MANY_CELLS:
             return
         density = self.settings.scatterers_per_mm3
@@ -501,7 +505,9 @@ class UltrasoundSimulator:
                 f"the probe needs {automatic:.0f} scatterers per mm³ ({probe.frequency_mhz:g} MHz, elevation aperture "
                 f"{probe.elevation_aperture_mm:g} mm, elevation focus {probe.elevation_focus_mm:g} mm)"
             )
-            remedy = "a smaller elevation aperture, a deeper elevation focus or a smaller depth takes less"
+            remedy = (
+                "a smaller elevation aperture, a deeper elevation focus fewer scan lines or a smaller depth takes less"
+            )
         many = f"{cells:.1e} cells of the lattice per image, about {cells / _CELLS_PER_S:.0f} s on two cores of a CPU"
         require(cells <= _MOST_CELLS, f"{what}: {many}, expected at most {_MOST_CELLS:.0e} cells; {remedy}")
         warnings.warn(f"{what}: {many}; {remedy}", SlowScatterersWarning, stacklevel=3)
