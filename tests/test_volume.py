@@ -667,3 +667,38 @@ def test_a_minc_file_is_not_begun_where_it_may_not_fit(tmp_path, monkeypatch):
     with pytest.raises(SimulationError, match=r"v\.mnc: cannot be written \(may need 8000 bytes, .* 7999 left\)"):
         Volume(np.zeros((20, 20, 20), np.uint8), np.eye(4)).write(tmp_path / "v.mnc")
     assert (Volume.read(tmp_path / "v.mnc").array == 1).all() and len(list(tmp_path.iterdir())) == 1
+
+
+_THREADS = """
+import os, sys, threading
+import numpy as np
+from SlicerUSSim.Logic import Volume
+from SlicerUSSim.Logic.base.files import messages_withheld
+
+entered, both, left = threading.Event(), threading.Barrier(2), threading.Event()
+
+def first():
+    with messages_withheld():
+        entered.set()
+        both.wait()
+        os.write(2, b"of the first\\n")
+    left.set()
+
+def second():
+    entered.wait()
+    with messages_withheld():
+        both.wait()
+        left.wait()
+        os.write(2, b"of the second\\n")
+
+threads = [threading.Thread(target=one) for one in (first, second)]
+for thread in threads: thread.start()
+for thread in threads: thread.join()
+print(os.fstat(2).st_nlink, flush=True)  # 0 of a temporary file
+print("after", file=sys.stderr)
+"""
+
+
+def test_stderr_is_itself_again_after_threads_have_withheld_messages():
+    done = subprocess.run([sys.executable, "-c", _THREADS], capture_output=True, text=True)
+    assert done.stderr == "of the first\nof the second\nafter\n" and done.stdout == "1\n"

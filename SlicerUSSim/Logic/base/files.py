@@ -15,6 +15,8 @@ import zlib
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from threading import Lock
+from typing import IO
 
 from SlicerUSSim.Logic.base.errors import SimulationError, require, require_path
 
@@ -64,23 +66,64 @@ def require_space(path: Path, most_bytes: int) -> None:
 
 @contextmanager
 def messages_withheld() -> Iterator[None]:
-    """Keep what C++ libraries print to stderr in the block, and drop it if the block raises: the error says it all."""
+    """Keep what C++ libraries print to stderr in the block, and drop it if the block raises: the error says it all.
+
+    The process has one stderr: while several threads are in such blocks, what all print is kept, and shown once the
+    last is done unless one of them raised.
+    """
+    _withheld.begin()
+    is_well = False
     try:
-        stderr, printed = os.dup(2), tempfile.TemporaryFile()  # noqa: SIM115 (closed below)
-    except OSError:  # there is no stderr, or no room
         yield
-        return
-    with printed:
-        _flush_stderr()
-        os.dup2(printed.fileno(), 2)
-        try:
-            yield
-        finally:
+        is_well = True
+    finally:
+        _withheld.end(is_well)
+
+
+class _Withheld:
+    """What is printed to stderr while threads are in blocks of messages_withheld."""
+
+    def __init__(self) -> None:
+        self._lock = Lock()
+        self._blocks, self._are_well = 0, True
+        self._stderr = -1
+        self._printed: IO[bytes] | None = None
+
+    def begin(self) -> None:
+        with self._lock:
+            self._blocks += 1
+            if self._blocks > 1:
+                return
+            self._are_well, self._printed = True, None
+            try:
+                self._stderr = os.dup(2)
+            except OSError:  # there is no stderr
+                return
+            try:
+                self._printed = tempfile.TemporaryFile()  # noqa: SIM115 (closed in end)
+            except OSError:  # there is no room
+                os.close(self._stderr)
+                return
             _flush_stderr()
-            os.dup2(stderr, 2)
-            os.close(stderr)
-        printed.seek(0)
-        os.write(2, printed.read())
+            os.dup2(self._printed.fileno(), 2)
+
+    def end(self, is_well: bool) -> None:
+        with self._lock:
+            self._blocks -= 1
+            self._are_well = self._are_well and is_well
+            if self._blocks or self._printed is None:
+                return
+            with self._printed as printed:
+                self._printed = None
+                _flush_stderr()
+                os.dup2(self._stderr, 2)
+                os.close(self._stderr)
+                if self._are_well:
+                    printed.seek(0)
+                    os.write(2, printed.read())
+
+
+_withheld = _Withheld()
 
 
 def _flush_stderr() -> None:
