@@ -597,8 +597,7 @@ class UltrasoundSceneLogic:
 
     def clearOutline(self, model_node) -> None:
         """Empty a model with an outline of this module, which is where a probe was on another patient."""
-        if model_node is not None:
-            require_result(model_node, "outline")
+        if model_node is not None and may_replace_result(model_node):
             model_node.SetAndObservePolyData(None)
 
     def renewSimulator(self) -> None:
