@@ -176,6 +176,28 @@ def test_names_of_patients_stay_out_of_messages_logs_and_files(tmp_path, caplog)
         assert secret not in said
 
 
+@pytest.mark.parametrize("is_verbose", [False, True])
+def test_descriptions_and_names_of_files_are_logged_only_if_asked(tmp_path, caplog, is_verbose):
+    """Both may be names of patients."""
+    caplog.set_level("INFO" if is_verbose else "WARNING")
+    place = tmp_path / "DICOM" / "Doe_Jane"
+    write_dicom(Volume(numbered((6, 40, 50)), np.diag([-1.0, -1.0, 2.5, 1.0])), place)
+    for file in list(place.iterdir()):
+        whole = file.read_bytes()
+        at, text = whole.index(tag(0x10, 0x10)), b"T1 of Jane"
+        series = tag(0x08, 0x103E) + len(text).to_bytes(4, "little") + text
+        file.with_name(f"Doe{file.name}").write_bytes(whole[:at] + series + whole[at:])
+        file.unlink()
+    Volume.read(tmp_path / "DICOM")
+    one = tmp_path / "one.dcm"
+    for file in place.iterdir():
+        file.rename(one if file.name == "Doe3.dcm" else tmp_path / file.name)
+    Volume.read(one)
+    assert "those below it are read, in 1 folder" in caplog.text
+    assert "is one image of a DICOM series, which is read: " in caplog.text
+    assert ("Jane" in caplog.text, "Doe" in caplog.text) == (is_verbose, is_verbose)
+
+
 def of_size(dicom: bytes, rows: int, columns: int, frames: int = 0) -> bytes:
     """A DICOM file that promises another size."""
     content = bytearray(dicom)
