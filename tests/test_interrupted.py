@@ -135,10 +135,18 @@ cli.main(["compute"])
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="signals")
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_ends_the_process_while_a_library_computes(number):
+@pytest.mark.parametrize(
+    ("number", "before"),
+    [
+        (signal.SIGINT, ""),
+        (signal.SIGTERM, ""),
+        # As in the background of a shell script
+        (signal.SIGTERM, "import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)"),
+    ],
+)
+def test_a_signal_ends_the_process_while_a_library_computes(number, before):
     with subprocess.Popen(
-        [sys.executable, "-c", _IN_A_LIBRARY], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        [sys.executable, "-c", before + _IN_A_LIBRARY], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     ) as process:
         try:
             assert process.stdout is not None and process.stdout.readline() == "begun\n"

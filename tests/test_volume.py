@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 import subprocess
 import sys
 from types import SimpleNamespace
 
+import nibabel
 import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
@@ -172,6 +174,28 @@ def test_names_of_patients_stay_out_of_messages_logs_and_files(tmp_path, caplog)
     said += str(error.value).replace(str(tmp_path), "").encode()
     for secret in (b"Jane", b"Rick", b"Number4711"):
         assert secret not in said
+
+
+@pytest.mark.parametrize("is_verbose", [False, True])
+def test_descriptions_and_names_of_files_are_logged_only_if_asked(tmp_path, caplog, is_verbose):
+    """Both may be names of patients."""
+    caplog.set_level("INFO" if is_verbose else "WARNING")
+    place = tmp_path / "DICOM" / "Doe_Jane"
+    write_dicom(Volume(numbered((6, 40, 50)), np.diag([-1.0, -1.0, 2.5, 1.0])), place)
+    for file in list(place.iterdir()):
+        whole = file.read_bytes()
+        at, text = whole.index(tag(0x10, 0x10)), b"T1 of Jane"
+        series = tag(0x08, 0x103E) + len(text).to_bytes(4, "little") + text
+        file.with_name(f"Doe{file.name}").write_bytes(whole[:at] + series + whole[at:])
+        file.unlink()
+    Volume.read(tmp_path / "DICOM")
+    one = tmp_path / "one.dcm"
+    for file in place.iterdir():
+        file.rename(one if file.name == "Doe3.dcm" else tmp_path / file.name)
+    Volume.read(one)
+    assert "those below it are read, in 1 folder" in caplog.text
+    assert "is one image of a DICOM series, which is read: " in caplog.text
+    assert ("Jane" in caplog.text, "Doe" in caplog.text) == (is_verbose, is_verbose)
 
 
 def of_size(dicom: bytes, rows: int, columns: int, frames: int = 0) -> bytes:
@@ -432,6 +456,28 @@ def test_a_truncated_or_damaged_nifti_file_is_refused(name, tmp_path):
             Volume.read(tmp_path / name)
 
 
+@pytest.mark.parametrize("name", ["i.nii.gz", "i.nrrd", "i.nhdr", "i.mha", "i.vti", "i.mgz"])
+def test_a_file_whose_last_bytes_are_missing_is_refused(name, tmp_path):
+    """All voxels may be there, but nothing says so: checksums and ends of files were not looked at."""
+    rng = np.random.default_rng(0)
+    volume = Volume(rng.integers(0, 1000, (20, 21, 22)).astype(np.int16), np.eye(4))
+    if name.endswith(".mgz"):
+        nibabel.save(nibabel.MGHImage(volume.array.T, np.eye(4)), tmp_path / name)  # type: ignore[attr-defined]
+    else:
+        volume.write(tmp_path / name)
+    Volume.read(tmp_path / name)
+    file = next(tmp_path.glob("*.raw*")) if name == "i.nhdr" else tmp_path / name
+    whole = file.read_bytes()
+    for missing in (*range(1, 12), 20):
+        file.write_bytes(whole.rstrip(b"\n" if name == "i.vti" else b"")[:-missing])
+        with pytest.raises(SimulationError, match=re.escape(name)):
+            Volume.read(tmp_path / name)
+    if name not in ("i.vti", "i.mha"):
+        file.write_bytes(whole[:-7] + bytes([whole[-7] ^ 1]) + whole[-6:])  # of the checksum
+        with pytest.raises(SimulationError, match=re.escape(name)):
+            Volume.read(tmp_path / name)
+
+
 def test_metaimage_with_missing_voxels_says_so(tmp_path):
     Volume(numbered((20, 20, 20)), np.eye(4)).write(tmp_path / "image.mhd")
     (voxels,) = tmp_path.glob("image.*.raw")
@@ -630,6 +676,7 @@ def test_the_voxels_of_another_header_are_not_replaced(new, tmp_path):
 
 _FULL = """
 import resource, signal, sys
+import nibabel
 import numpy as np
 from SlicerUSSim.Logic.base.errors import SimulationError
 from SlicerUSSim.Logic.base.volume import Volume
@@ -671,6 +718,7 @@ def test_a_minc_file_is_not_begun_where_it_may_not_fit(tmp_path, monkeypatch):
 
 _THREADS = """
 import os, sys, threading
+import nibabel
 import numpy as np
 from SlicerUSSim.Logic import Volume
 from SlicerUSSim.Logic.base.files import messages_withheld

@@ -39,6 +39,7 @@ _NO_MORE = {errno.ENOSPC, errno.EDQUOT, errno.EIO, errno.EBADF}
 #: Set by handlers of signals, and seconds in which they must run
 _seen = threading.Event()
 _GRACE_S = 2.0
+_WATCHER = "ussim-signals"
 
 
 class _Commands(click.Group):
@@ -99,21 +100,21 @@ def _end_even_in_kernels() -> None:
     and the process ends at once: files are replaced whole or not at all, and the next run removes what is left beside
     them.
     """
-    if signal.getsignal(signal.SIGINT) is not signal.default_int_handler:  # ignored, or a program's own
+    if any(thread.name == _WATCHER for thread in threading.enumerate()):
         return
     told, tell = socket.socketpair()
     tell.setblocking(False)
     signal.set_wakeup_fd(tell.fileno(), warn_on_full_buffer=False)
     if hasattr(os, "register_at_fork"):  # a fork has no such thread, and would tell this one of its own signals
         os.register_at_fork(after_in_child=lambda: signal.set_wakeup_fd(-1))
-    signal.signal(signal.SIGINT, _interrupt)
-    threading.Thread(target=_watch, args=(told, tell), name="ussim-signals", daemon=True).start()
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # not ignored, nor a program's own
+        signal.signal(signal.SIGINT, _interrupt)
+    threading.Thread(target=_watch, args=(told, tell), name=_WATCHER, daemon=True).start()
 
 
 def _watch(told: socket.socket, _: socket.socket) -> None:
-    ends = {getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)}
     while number := told.recv(1):
-        if number[0] not in ends:
+        if signal.getsignal(number[0]) not in (_end, _interrupt):
             continue
         if not _seen.wait(_GRACE_S):
             with contextlib.suppress(OSError):

@@ -83,6 +83,12 @@ class Series:
         return f"{name or self.uid}: {len(self.files)} images of {self.size} ({Path(self.files[0]).name})"
 
     @property
+    def size_text(self) -> str:
+        """Its number and images, without descriptions and names of files, in which names of patients may be."""
+        number = f"series {self.number}: " if self.number else ""
+        return f"{number}{len(self.files)} images of {self.size}"
+
+    @property
     def title(self) -> str:
         """Its description, as far as it can be a name, and its number."""
         description = " ".join(re.sub(r"[^\w+.,() -]", " ", self.description).split())[:_LONGEST_TITLE].strip(" .")
@@ -117,7 +123,9 @@ def read_dicom_folder(folder: Path):
         found = _series_of(folder, recursive=True)
         places = sorted({str(Path(file).parent) for series in found for file in series.files})
         require(bool(found), f"{folder}: has no DICOM series, nor have the folders in it{_other_images(folder)}")
-        _log.warning("%s: has no DICOM images itself; those below it are read, in %s", folder, ", ".join(places[:4]))
+        many = f"{len(places)} folder{'s' * (len(places) != 1)}"
+        _log.warning("%s: has no DICOM images itself; those below it are read, in %s", folder, many)
+        _log.info("%s: in %s", folder, ", ".join(places[:4]))
     stacks = found if len(found) == 1 else [series for series in found if series.is_stack]
     if len(stacks) != 1:
         many = "; ".join(map(str, found[:12])) + ("; ..." if len(found) > 12 else "")
@@ -128,7 +136,8 @@ def read_dicom_folder(folder: Path):
             f"or more parallel images; give the path of one image of the required series: {many}"
         )
     if len(found) > 1:
-        _log.warning("%s: has %d DICOM series; the only volume is read: %s", folder, len(found), stacks[0])
+        _log.warning("%s: has %d DICOM series; the only volume is read: %s", folder, len(found), stacks[0].size_text)
+        _log.info("%s: %s", folder, stacks[0])
     return _read(stacks[0], str(folder))
 
 
@@ -190,7 +199,8 @@ def has_compressed(path: Path) -> bool:
 
 def read_series(series: Series, name: str):
     """The SimpleITK image of a series, which is said."""
-    _log.warning("%s: is one image of a DICOM series, which is read: %s", name, series)
+    _log.warning("%s: is one image of a DICOM series, which is read: %s", name, series.size_text)
+    _log.info("%s: %s", name, series)
     return _read(series, name)
 
 

@@ -112,7 +112,11 @@ def require_complete(path: Path) -> None:
     stored: Any = image.dataobj
     file = Path(image.file_map["image"].filename or path)
     expected = int(stored.offset) + int(np.prod(stored.shape)) * stored.dtype.itemsize
-    found, is_damaged = _bytes_of(file)
+    found, is_damaged, has_end = _bytes_of(file)
+    require(
+        has_end or is_damaged or found < expected,
+        f"{file}: the file is incomplete, its checksum is missing; copy or export it again",
+    )
     require(
         found >= expected and not is_damaged,
         f"{file}: the file is {'damaged' if is_damaged else 'incomplete'}, {found} of {expected} bytes"
@@ -120,30 +124,38 @@ def require_complete(path: Path) -> None:
     )
 
 
+def require_whole_gzip(path: Path) -> None:
+    """Raise SimulationError for a file compressed by gzip, by its suffix, without its end or with another checksum."""
+    _, is_damaged, has_end = _bytes_of(path)
+    require(
+        has_end and not is_damaged,
+        f"{path}: the file is {'damaged' if is_damaged else 'incomplete'}; copy or export it again",
+    )
+
+
 def require_written(path: Path, voxel_bytes: int) -> None:
     """Raise OSError unless a NIfTI file holds what was to be written: ITK does not say that the disk is full."""
-    found, is_damaged = _bytes_of(path, has_end=True)
-    if found < _HEADER_BYTES + voxel_bytes or is_damaged:
+    found, is_damaged, has_end = _bytes_of(path)
+    if found < _HEADER_BYTES + voxel_bytes or is_damaged or not has_end:
         raise OSError("not all voxels are in the file; is the disk full?")
 
 
-def _bytes_of(file: Path, has_end: bool = False) -> tuple[int, bool]:
-    """The bytes of a file, decompressed if it is compressed, and whether they are not those that were compressed.
-
-    With `has_end`, compressed content without its end and checksum counts as damaged, too.
+def _bytes_of(file: Path) -> tuple[int, bool, bool]:
+    """The bytes of a file, decompressed if it is compressed, whether they are not those that were compressed, and
+    whether compressed content has its end and checksum.
     """
-    if file.suffix != ".gz":
-        return file.stat().st_size, False
+    if file.suffix.lower() not in (".gz", ".mgz"):
+        return file.stat().st_size, False, True
     count = 0
     try:
         with gzip.open(file) as content:
             while chunk := content.read1(_CHUNK):
                 count += len(chunk)
     except EOFError:
-        return count, has_end
+        return count, False, False
     except (OSError, zlib.error):  # a checksum that differs, or codes that do not exist
-        return count, True
-    return count, False
+        return count, True, True
+    return count, False, True
 
 
 def check_numbers(path: Path, image) -> tuple[str, ...]:

@@ -25,9 +25,16 @@ from SlicerUSSim.Logic.base.headers import (
     require_readable_name,
     require_sound_header,
     require_spacing,
+    require_whole_nrrd,
 )
 from SlicerUSSim.Logic.base.label_numbers import numbers_of
-from SlicerUSSim.Logic.base.nifti import check_numbers, log_nifti_geometry, require_complete, require_written
+from SlicerUSSim.Logic.base.nifti import (
+    check_numbers,
+    log_nifti_geometry,
+    require_complete,
+    require_whole_gzip,
+    require_written,
+)
 from SlicerUSSim.Logic.base.reading import in_child, is_in_child, reader, starts_like_hdf5
 from SlicerUSSim.Logic.base.segments import flattened, segments_of
 from SlicerUSSim.Logic.base.transforms import LPS_TO_RAS, check_affine, is_singular, nearest_rotation
@@ -411,6 +418,7 @@ def _read_by_itk(path: Path):
             )
         raise SimulationError(f"{path}: cannot be read as an image ({reason})") from None
     require_complete(path)
+    require_whole_nrrd(path)
     is_complex = "complex" in image.GetPixelIDTypeAsString()
     require(not is_complex, f"{path}: holds complex numbers, expected real ones; save its magnitude")
     return image
@@ -460,6 +468,8 @@ def _read_mgh(path: Path) -> tuple[np.ndarray, np.ndarray]:
     """FreeSurfer's MGH and MGZ, whose millimetres are RAS of the scanner."""
     require_package("nibabel", "nibabel", f"{path}: reading MGZ")
     import nibabel
+
+    require_whole_gzip(path)
 
     try:
         image = nibabel.MGHImage.from_filename(path)

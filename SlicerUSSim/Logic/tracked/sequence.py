@@ -21,6 +21,7 @@ import numpy as np
 
 from SlicerUSSim.Logic.base.errors import SimulationError, require, require_package, require_path
 from SlicerUSSim.Logic.base.files import require_small, written_whole
+from SlicerUSSim.Logic.base.headers import require_whole_nrrd
 from SlicerUSSim.Logic.base.own_outputs import MADE_BY
 from SlicerUSSim.Logic.base.reading import reader
 from SlicerUSSim.Logic.base.transforms import check_affine, is_singular
@@ -513,6 +514,7 @@ def _read_nrrd(path: Path) -> tuple[_Pixels, dict[str, str]]:
         array, header = nrrd.read(str(path), index_order="C")
     except (OSError, ValueError, nrrd.NRRDError) as error:
         raise SimulationError(f"{path}: cannot be read as NRRD ({str(error).splitlines()[-1]})") from None
+    require_whole_nrrd(path)
     kinds = list(header.get("kinds", []))[::-1]  # slowest axis first, as the array
     components = 1
     for axis, kind in enumerate(kinds):
