@@ -506,7 +506,7 @@ class UltrasoundSimulator:
                 f"{probe.elevation_aperture_mm:g} mm, elevation focus {probe.elevation_focus_mm:g} mm)"
             )
             remedy = (
-                "a smaller elevation aperture, a deeper elevation focus fewer scan lines or a smaller depth takes less"
+                "a smaller elevation aperture, a deeper elevation focus, fewer scan lines or a smaller depth takes less"
             )
         many = f"{cells:.1e} cells of the lattice per image, about {cells / _CELLS_PER_S:.0f} s on two cores of a CPU"
         require(cells <= _MOST_CELLS, f"{what}: {many}, expected at most {_MOST_CELLS:.0e} cells; {remedy}")
