@@ -21,6 +21,7 @@ from SlicerUSSim.Logic.opencl import runtimes
 from SlicerUSSim.Logic.opencl.device import Device, kernel_folder
 from SlicerUSSim.Logic.opencl.devices import DeviceInfo, choose_device, faster_hint
 from SlicerUSSim.Logic.opencl.layout import shared_source
+from SlicerUSSim.Logic.opencl.limits import lack_of_programs_disk
 from SlicerUSSim.Logic.opencl.pocl import name_unknown_processor, remove_damaged_kernels, require_linker
 from SlicerUSSim.Logic.opencl.runtimes import pocl_of_pip, register_pip_runtimes
 from SlicerUSSim.Logic.probe import pose_looking_at
@@ -412,6 +413,32 @@ def test_too_small_an_address_space_is_named(after):
     done = _in_process(_LIMITED.format(after=after))
     assert done.returncode == 0, done.stderr[-800:]
     assert re.search(r"refused: .*limited to 400 MB \(ulimit -v\), expected at least \d+ MB", done.stdout), done.stdout
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="limits of a process")
+def test_an_address_space_that_other_libraries_have_filled_is_named():
+    """At 1000 to 1100 MB the libraries that are loaded before leave no room for the runtime."""
+    done = _in_process(
+        "import resource\n"
+        "from SlicerUSSim.Logic.opencl import devices\n"
+        "resource.setrlimit(resource.RLIMIT_AS, (1100 * 10**6, resource.RLIM_INFINITY))\n"
+        "devices.list_devices = lambda: []\n"
+        "devices.choose_device()"
+    )
+    assert re.search(r"refused: no OpenCL device found; .*limited to 1100 MB \(ulimit -v\), which may", done.stdout)
+
+
+@pytest.mark.parametrize("is_built", [False, True])
+def test_a_full_disk_on_which_programs_would_be_kept_is_named_before_the_compiler_ends_the_process(
+    tmp_path, monkeypatch, is_built
+):
+    monkeypatch.setattr("shutil.disk_usage", lambda path: SimpleNamespace(free=10**5))
+    if is_built:
+        (tmp_path / "kernels").mkdir()
+        (tmp_path / "kernels" / "all.so").write_bytes(bytes(5 * 10**6))
+        assert lack_of_programs_disk(tmp_path) is None
+    else:
+        assert "is on a full disk (0.1 MB left, expected 4 MB)" in (lack_of_programs_disk(tmp_path / "none") or "")
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="PoCL's wheel is for Linux")

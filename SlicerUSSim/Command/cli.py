@@ -64,6 +64,11 @@ class _Commands(click.Group):
             ctx.exit(128 + signal.SIGINT)
         except Exception as error:
             message = user_message(error)
+            if message is None and isinstance(error, ImportError | MemoryError | OSError):
+                from SlicerUSSim.Logic.opencl.limits import doubt_of_address_space
+
+                doubt = doubt_of_address_space()  # libraries fail in many ways for want of it
+                message = None if doubt is None else f"{type(error).__name__}; {doubt}"
             if message is None:
                 raise
             click.echo(f"ussim: {message}", err=True)

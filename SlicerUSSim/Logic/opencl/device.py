@@ -18,7 +18,7 @@ import numpy as np
 from SlicerUSSim.Logic.base.errors import SimulationError
 from SlicerUSSim.Logic.opencl.devices import DeviceInfo, choose_device
 from SlicerUSSim.Logic.opencl.layout import CONSTANTS, shared_source
-from SlicerUSSim.Logic.opencl.limits import lack_of_address_space, lack_of_disk
+from SlicerUSSim.Logic.opencl.limits import lack_of_address_space, lack_of_disk, lack_of_programs_disk
 from SlicerUSSim.Logic.opencl.runtimes import load_pyopencl
 
 if TYPE_CHECKING:
@@ -51,8 +51,18 @@ class Device:
         if lack is not None:  # Intel's runtime would end the process
             raise SimulationError(f"OpenCL device {info} cannot be opened: {lack}")
         if self._is_pocl:
-            from SlicerUSSim.Logic.opencl.pocl import name_unknown_processor, remove_damaged_kernels, require_linker
+            from SlicerUSSim.Logic.opencl.pocl import (
+                cache_folder,
+                name_unknown_processor,
+                remove_damaged_kernels,
+                require_linker,
+            )
 
+            full = lack_of_programs_disk(cache_folder())
+            if full is not None:
+                raise SimulationError(
+                    f"OpenCL device {info} cannot be opened: {full}; free some of it, or set XDG_CACHE_HOME"
+                )
             require_linker(info.handle.platform.version)
             name_unknown_processor(info.handle)
             remove_damaged_kernels()

@@ -8,6 +8,8 @@ from pathlib import Path
 
 #: Address space in bytes below which runtimes fail, or end the process: measured with PoCL 3.0 and Intel's of 2025
 LEAST_ADDRESS_SPACE = {"Intel": 1_500_000_000, "": 1_000_000_000}
+#: Above which nothing is for want of it: other libraries, which were loaded before a runtime, have taken some
+_ENOUGH_ADDRESS_SPACE = 2_000_000_000
 _LEAST_DISK = 4_000_000  # bytes of the programs of a simulator
 
 
@@ -33,6 +35,17 @@ def lack_of_address_space(platform: str = "") -> str | None:
     )
 
 
+def doubt_of_address_space() -> str | None:
+    """What to say, where something has failed, if this process's address space may be the reason, else None."""
+    limit = address_space()
+    if limit is None or limit >= _ENOUGH_ADDRESS_SPACE:
+        return None
+    return (
+        f"the address space of this process is limited to {limit / 1e6:.0f} MB (ulimit -v), which may be too little: "
+        f"{_ENOUGH_ADDRESS_SPACE / 1e6:.0f} MB are enough"
+    )
+
+
 def lack_of_cache(folder: Path) -> str | None:
     """What to say if the folder in which PoCL keeps programs cannot be made or written, else None: it has no device."""
     try:
@@ -54,3 +67,15 @@ def lack_of_disk(folders: list[Path]) -> str | None:
         if free is not None and free < _LEAST_DISK:
             return f"{folder} is on a full disk ({free / 1e6:.1f} MB left, expected {_LEAST_DISK / 1e6:.0f} MB)"
     return None
+
+
+def lack_of_programs_disk(folder: Path) -> str | None:
+    """What to say if PoCL's programs are neither in its folder nor would fit on the disk, else None.
+
+    Its compiler ends the process where the disk is full.
+    """
+    there = next((part for part in (folder, *folder.parents) if part.exists()), None)
+    if there is None or shutil.disk_usage(there).free >= _LEAST_DISK:
+        return None
+    held = sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
+    return None if held >= _LEAST_DISK else lack_of_disk([folder])
