@@ -416,6 +416,22 @@ def test_too_small_an_address_space_is_named(after):
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="limits of a process")
+def test_a_command_in_an_address_space_without_room_for_numpy_says_so_at_once():
+    """numpy's libraries wait for memory for ever while they are imported, and no signal but SIGKILL ends that."""
+    program = (
+        "import resource, sys\n"
+        "resource.setrlimit(resource.RLIMIT_AS, (300 * 10**6, resource.RLIM_INFINITY))\n"
+        "from SlicerUSSim.Command.cli import main\n"
+        "sys.argv = ['ussim', 'simulate', 'labels.nii.gz', '--pose', 'auto', '-o', 'image.png']\n"
+        "main()\n"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert done.returncode == 2 and done.stderr.splitlines() == [
+        "ussim: the address space of this process is limited to 300 MB (ulimit -v), expected at least 1000 MB"
+    ]
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="limits of a process")
 def test_an_address_space_that_other_libraries_have_filled_is_named():
     """At 1000 to 1100 MB the libraries that are loaded before leave no room for the runtime."""
     done = _in_process(

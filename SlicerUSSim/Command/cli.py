@@ -30,8 +30,9 @@ from SlicerUSSim.Command.simulate import simulate
 from SlicerUSSim.Command.sweep import sweep
 from SlicerUSSim.Command.validate import validate
 from SlicerUSSim.Command.volume import volume
-from SlicerUSSim.Logic.base.errors import is_our_warning, user_message
+from SlicerUSSim.Logic.base.errors import SimulationError, is_our_warning, user_message
 from SlicerUSSim.Logic.base.version import __version__
+from SlicerUSSim.Logic.opencl.limits import address_space, lack_of_address_space
 
 #: Errors of a standard output that is a file on a full or broken disk, or closed
 _NO_MORE = {errno.ENOSPC, errno.EDQUOT, errno.EIO, errno.EBADF}
@@ -39,6 +40,8 @@ _NO_MORE = {errno.ENOSPC, errno.EDQUOT, errno.EIO, errno.EBADF}
 #: Set by handlers of signals, and seconds in which they must run
 _seen = threading.Event()
 _GRACE_S = 2.0
+#: Bytes below which numpy's libraries wait for memory for ever while they are imported
+_LEAST_ADDRESS_SPACE = 500_000_000
 _WATCHER = "ussim-signals"
 
 
@@ -80,6 +83,8 @@ class _Commands(click.Group):
 def main() -> None:
     """B-mode ultrasound simulated from a patient's MRI."""
     warnings.showwarning = _show_warning
+    if (address_space() or _LEAST_ADDRESS_SPACE) < _LEAST_ADDRESS_SPACE:
+        raise SimulationError(str(lack_of_address_space()))
     if threading.current_thread() is threading.main_thread():
         _end_even_in_kernels()
         for name in ("SIGTERM", "SIGHUP"):  # Windows has no SIGHUP
