@@ -36,6 +36,7 @@ from SlicerUSSim.Logic.mrml.nodes import (
     probe_pose,
     write_volume,
 )
+from SlicerUSSim.Logic.mrml.ownership import OWN, claim, is_claimed
 from SlicerUSSim.Logic.mrml.parameter_node import VALUE_PARAMETERS, SceneParameters
 from SlicerUSSim.Logic.mrml.share_nodes import set_shares_node, shares_node
 from SlicerUSSim.Logic.mrml.taken_sequence import SimulatedRecord, record_taken
@@ -294,7 +295,9 @@ def _colours(
 
 
 def _attributes(node) -> dict[str, str]:
-    return {name: node.GetAttribute(name) for name in node.GetAttributeNames() if name.startswith(_OWN)}
+    """Of this module; OWN, which is a reference in scenes, tells whose the node is."""
+    found = {name: node.GetAttribute(name) for name in node.GetAttributeNames() if name.startswith(_OWN)}
+    return {**found, OWN: "1"} if is_claimed(node) else found
 
 
 def _segments(node) -> Iterable[SegmentRecord]:
@@ -377,7 +380,9 @@ def _put(scene, entry: NodeRecord, extra: list[Any]):
         for point in () if entry.points is None else entry.points.tolist():
             node.AddControlPointWorld(*point)
         for name, text in entry.attributes.items():
-            if name.startswith(_OWN):
+            if name == OWN:
+                claim(node)
+            elif name.startswith(_OWN):
                 node.SetAttribute(name, text)
     except BaseException:
         scene.RemoveNode(node)
