@@ -253,6 +253,21 @@ def test_a_scene_is_exported_with_progress_and_cancel_while_images_go_on(page, l
         page.keyboard.press("a")
 
 
+def test_work_that_tells_no_share_is_seen_to_go_on(page, large):
+    """Reading a file of 223 MB stood at 0 % for 15 s."""
+    show = "([name, value]) => window.trame.state.set(name, value)"
+    title, percent, bar = NAMES.messages.progress_title, NAMES.messages.progress_percent, page.locator("#progress")
+    page.evaluate(show, [title, "Open big.nii"])
+    bar.get_by_text("Open big.nii …").wait_for()
+    bar.locator(".v-progress-linear__indeterminate.long").wait_for(state="attached")
+    page.evaluate(show, [percent, 40])
+    bar.get_by_text("Open big.nii 40 %").wait_for()
+    bar.locator(".v-progress-linear__indeterminate.long").wait_for(state="detached")
+    page.evaluate(show, [title, ""])
+    page.evaluate(show, [percent, 0])
+    bar.wait_for(state="detached")
+
+
 def test_a_surface_has_progress_and_can_be_cancelled_while_images_go_on(page, large):
     """A surface held all images for 42 s."""
     page.set_input_files("#open-file", [large / "ball.nii.gz", large / "ball.json"])

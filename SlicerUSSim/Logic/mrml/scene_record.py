@@ -353,7 +353,7 @@ def put_values(parameters: SceneParameters, values: Mapping[str, str]) -> list[s
             value = declared.default if text == "" else declared.from_text("scene", text)
             setattr(parameters, name, value)
         except SimulationError as error:
-            refused.append(str(error))
+            refused.append(str(error).replace(f"scene: {name} is ", f"{declared.label or name} in the scene is ", 1))
     node.EndModify(was_modifying)
     return refused
 
