@@ -893,6 +893,7 @@ def test_a_frozen_image_stays_where_it_was_taken_in_3d_and_in_the_slices():
     from trame.app import get_server
     from trame_slicer.core import SlicerApp
 
+    from SlicerUSSim.Logic.mrml.fitting_nodes import fits
     from SlicerUSSim.Logic.mrml.label_nodes import write_labels
     from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic
     from SlicerUSSim.Logic.mrml.nodes import ijk_to_ras, node_called, node_to_world, set_node_to_world
@@ -926,6 +927,10 @@ def test_a_frozen_image_stays_where_it_was_taken_in_3d_and_in_the_slices():
         body = node_called(app.scene, "Model", "Probe body")
         in_slices = node_to_world(seen) @ ijk_to_ras(seen)
         shown_ids = {view.get_foreground_volume_id() for view in views.slices}
+        views.hide_surface()  # an empty model
+        for name in ("Ultrasound field", "Probe body", "Patient surface"):
+            assert not any(fits(role, node_called(app.scene, "Model", name)) for role in ("sheets", "outline")), name
+        assert not any(fits(role, seen) for role in ("mri", "second_mri", "real", "output"))
         return (
             node_to_world(field), in_slices, node_to_world(output) @ ijk_to_ras(output), node_to_world(body), moved,
             taken, shown_ids == {seen.GetID()},

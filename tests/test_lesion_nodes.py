@@ -339,6 +339,8 @@ def test_a_segmentation_that_was_saved_and_loaded_is_still_segments_own(tmp_path
     assert storage.ReadData(again)
     assert not bench.logic.mayReplace(again)
     again.SetAttribute("SlicerUSSim.made", bench.labels.GetAttribute("SlicerUSSim.made"))  # as the scene's file does
+    assert not bench.logic.mayReplace(again)  # a copy, until the scene's file says that it is the node itself
+    again.SetNodeReferenceID("SlicerUSSim.own", again.GetID())
     assert bench.logic.mayReplace(again)
 
 

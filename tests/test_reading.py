@@ -210,6 +210,14 @@ def test_a_damaged_hdf5_transform_that_ends_the_library_is_one_line(tmp_path):
             assert "pose.h5: " in str(error) and "\n" not in str(error)
 
 
+def test_a_file_that_is_no_image_is_told_in_plain_words(tmp_path):
+    (tmp_path / "scan.dat").write_bytes(b"no image at all")
+    with pytest.raises(SimulationError) as caught:
+        Volume.read(tmp_path / "scan.dat")
+    assert "(its content is of no known format, expected NIfTI, NRRD, " in str(caught.value)
+    assert "sitk" not in str(caught.value) and "ImageIO" not in str(caught.value)
+
+
 @pytest.mark.parametrize("arguments", [["--untrusted", "segment"], ["segment", "--untrusted"], ["segment"]])
 def test_a_command_reads_in_children_when_it_is_told_so(tmp_path, arguments, monkeypatch):
     monkeypatch.delenv(UNTRUSTED, raising=False)

@@ -1105,10 +1105,18 @@ def test_selectors_offer_only_what_fits(session):
     session.panel.refresh()
     ui = session.ui
     assert offered(ui.mriSelector) == ["None", "Head", "FLAIR", "empty"]  # no ultrasound
-    assert offered(ui.secondMriSelector) == ["None", "Head", "FLAIR", "empty"]
+    assert offered(ui.secondMriSelector) == ["None", "FLAIR", "empty"]
+    assert offered(ui.realSelector) == ["None", "FLAIR", "empty"]
     assert offered(ui.outputSelector) == ["None", "Ultrasound", "empty"]
     assert offered(ui.outlineSelector) == ["None", "Ultrasound outline"]
-    assert offered(ui.sheetsSelector) == ["None", "skin"]
+    assert offered(ui.sheetsSelector) == ["None"]
+    sheets = session.add("Model", "sheets")
+    surfels = session.logic_module("mri.sheets.surfels").Surfels(
+        *np.float32([[[0, 0, 0]], [[0, 0, 1]]]), *np.float32([[1], [1], [1]]), kind=np.uint8([1])
+    )
+    sheets.SetAndObservePolyData(session.logic_module("mri.sheets.polydata").as_polydata(surfels))
+    session.panel.refresh()
+    assert offered(ui.sheetsSelector) == ["None", "sheets"] and "sheets" not in offered(ui.outlineSelector)
     assert offered(ui.probeTransformSelector) == ["None", "Probe"]
 
 

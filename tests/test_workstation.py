@@ -1093,6 +1093,7 @@ def test_an_opened_patient_takes_the_place_of_title_notes_and_warnings(page, fil
             answer_new_patient(page, title)
         settled(page)
         assert state(page, NAMES.title) == page.locator("#title").inner_text() == path.name
+        page.wait_for_function("title => document.title === title", arg=f"{path.name} - SlicerUSSim")
         return page.locator("#notesLabel").inner_text()
 
     def as_shown() -> str:

@@ -108,6 +108,12 @@ def test_requests_that_no_browser_sends_leave_no_traceback(labels):
         assert server.answer(f"{socket_of}{upgrade}13\nSec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\n\n\x01hello") != ""
         assert server.answer("GET / HTTP/1.1\nHost: [\n\n").split()[1] in ("400", "403")
         assert server.answer(f"GET / HTTP/1.1\nHost: {host}\nOrigin: http://[x\n\n").split()[1] == "403"
+        for port in ("99999999", "x", "-1"):
+            for path in ("/", f"/?token={token}"):
+                answer = server.page(f"GET {path} HTTP/1.1\nHost: 127.0.0.1:{port}\nConnection: close\n\n")
+                assert answer.split()[1] == "403" and "The request was not understood" in answer
+        for line in (f"GET /{'a' * 9000} HTTP/1.1\nHost: {host}", f"GET / HTTP/1.1\nHost: {host}\nX: {'a' * 9000}"):
+            assert server.answer(f"{line}\n\n").split()[1] == "400"
         assert server.answer(f"GET /?token={token} HTTP/1.1\nHost: {host}\n\n").split()[1] == "303"  # it goes on
     finally:
         log = server.end()

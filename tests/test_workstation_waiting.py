@@ -130,6 +130,49 @@ def test_the_server_ends_within_two_seconds_whatever_it_computes(tmp_path, end):
     assert took < 1.0 + 2.0 * usual and "Traceback" not in errors, (took, usual, errors[-500:])
 
 
+_ENDS_DURING_A_CALL_BACK = """
+import threading, time, types
+import SimpleITK as sitk
+from SlicerUSSim.Command.serve import _run
+from SlicerUSSim.Workstation.tasks import Tasks
+
+begun, tasks = threading.Event(), Tasks(print)
+
+def compute():
+    smooth = sitk.CurvatureFlowImageFilter()
+    smooth.SetNumberOfIterations(10**8)
+    smooth.AddCommand(sitk.sitkProgressEvent, begun.set)  # from C++ back to Python, again and again
+    smooth.Execute(sitk.Image(16, 16, 16, sitk.sitkFloat32))
+
+class Slow:  # Python's end takes a while
+    def __del__(self):
+        time.sleep(0.5)
+
+time.slow = Slow()
+tasks._worker.submit(compute)
+handlers = types.SimpleNamespace(add=lambda function: None)
+_run(
+    types.SimpleNamespace(
+        server=types.SimpleNamespace(
+            controller=types.SimpleNamespace(on_server_bind=handlers, on_server_ready=handlers),
+            start=lambda **options: begun.wait(),
+        ),
+        take_token=lambda port: "token", end_session=lambda: print("session ended"),
+        is_computing=begun.wait() and tasks.are_computing,
+    ),
+    "127.0.0.1", 0, None,
+)
+"""
+
+
+def test_the_server_ends_without_a_word_while_a_library_calls_back():
+    """ "FATAL: exception not rethrown", or an abort."""
+    ended = subprocess.run(
+        [sys.executable, "-c", _ENDS_DURING_A_CALL_BACK], capture_output=True, text=True, timeout=300
+    )
+    assert (ended.returncode, ended.stdout, ended.stderr) == (0, "session ended\n", "")
+
+
 # ---- on the page -----------------------------------------------------------------------------------------------------
 
 
@@ -208,6 +251,21 @@ def test_a_scene_is_exported_with_progress_and_cancel_while_images_go_on(page, l
     assert found is not None and np.array_equal(found.array, wanted.array)
     with new_image(page):  # it goes on after that
         page.keyboard.press("a")
+
+
+def test_work_that_tells_no_share_is_seen_to_go_on(page, large):
+    """Reading a file of 223 MB stood at 0 % for 15 s."""
+    show = "([name, value]) => window.trame.state.set(name, value)"
+    title, percent, bar = NAMES.messages.progress_title, NAMES.messages.progress_percent, page.locator("#progress")
+    page.evaluate(show, [title, "Open big.nii"])
+    bar.get_by_text("Open big.nii …").wait_for()
+    bar.locator(".v-progress-linear__indeterminate.long").wait_for(state="attached")
+    page.evaluate(show, [percent, 40])
+    bar.get_by_text("Open big.nii 40 %").wait_for()
+    bar.locator(".v-progress-linear__indeterminate.long").wait_for(state="detached")
+    page.evaluate(show, [title, ""])
+    page.evaluate(show, [percent, 0])
+    bar.wait_for(state="detached")
 
 
 def test_a_surface_has_progress_and_can_be_cancelled_while_images_go_on(page, large):

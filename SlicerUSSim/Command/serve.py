@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import importlib.util
 import os
 import sys
@@ -307,6 +308,20 @@ def _run(workstation: Workstation, host: str, port: int, tls: ssl.SSLContext | N
         )
     finally:
         workstation.end_session()
+    if workstation.is_computing:
+        end_at_once()
+
+
+def end_at_once() -> None:
+    """End the process, after what is registered for its end, while other threads compute.
+
+    Python ends such a thread when it comes back to Python from C++, as in a report of progress to SimpleITK, whose
+    handlers take that for an exception: the process was aborted with "FATAL: exception not rethrown".
+    """
+    atexit._run_exitfuncs()  # temporary files and programs that were started
+    for stream in (sys.stdout, sys.stderr):
+        stream.flush()
+    os._exit(0)
 
 
 def _usable_port(host: str, port: int | None) -> int:

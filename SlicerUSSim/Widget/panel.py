@@ -13,7 +13,7 @@ import qt
 import slicer
 
 from SlicerUSSim.Logic.base.errors import Cancelled, SimulationError, required
-from SlicerUSSim.Logic.mrml.fitting_nodes import fits
+from SlicerUSSim.Logic.mrml.fitting_nodes import offered
 from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic
 from SlicerUSSim.Logic.mrml.nodes import nodes_of_class
 from SlicerUSSim.Widget.controls import Control, by_widget, part_of, shown_by, usable
@@ -149,8 +149,11 @@ class Panel:
     def _offer_fitting(self, control: Control, widget: Any) -> None:
         """Hide the nodes of a selector's classes that do not fit its role."""
         nodes = {node.GetID(): node for name in control.node_classes for node in nodes_of_class(self.logic.scene, name)}
-        chosen = getattr(self.logic.parameters, control.node)
-        hidden = [key for key, node in nodes.items() if node is not chosen and not fits(control.node, node)]
+        parameters = self.logic.parameters
+        chosen = getattr(parameters, control.node)
+        hidden = [
+            key for key, node in nodes.items() if node is not chosen and not offered(control.node, node, parameters)
+        ]
         model = widget.sortFilterProxyModel()
         if list(model.property("hiddenNodeIDs")) != hidden:
             with _silent(widget):

@@ -25,6 +25,7 @@ from SlicerUSSim.Logic.mrml.fitting_nodes import fits
 from SlicerUSSim.Logic.mrml.labels_before import LabelsBefore
 from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic
 from SlicerUSSim.Logic.mrml.nodes import display_of, nodes_of_class, probe_pose, set_node_to_world
+from SlicerUSSim.Logic.mrml.own_results import SHEETS, mark_as_result
 from SlicerUSSim.Logic.mrml.parameter_node import BY_LOOK
 from SlicerUSSim.Logic.mrml.sequence_nodes import MADE_FROM
 from SlicerUSSim.Logic.mrml.taken_sequence import FrozenRecord
@@ -350,8 +351,10 @@ class PanelPresenter:
             before.labels.restore()
             for role, node in before.nodes.items():
                 setattr(parameters, role, None if node is None or node.GetScene() is None else node)
-            if before.sheets is not None and parameters.sheets is not None:
-                parameters.sheets.SetAndObservePolyData(before.sheets)
+            sheets: Any = parameters.sheets
+            if before.sheets is not None and sheets is not None and sheets.GetPolyData() is not before.sheets:
+                sheets.SetAndObservePolyData(before.sheets)
+                mark_as_result(sheets, SHEETS)
             if made is not before.labels.node:
                 self.logic.scene.RemoveNode(made)
             self._notes, self._notes_of, self._checks = list(before.notes), None, []

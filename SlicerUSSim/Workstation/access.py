@@ -11,6 +11,7 @@ from pathlib import Path
 from urllib.parse import urlsplit
 
 from aiohttp import web
+from aiohttp.http_exceptions import HttpProcessingError
 
 from SlicerUSSim.Logic.base.errors import SimulationError, require
 
@@ -76,6 +77,17 @@ def guard(app: web.Application, token: str, host: str) -> None:
     host : at which the server listens.
     """
     app.middlewares.append(_checker(token, is_loopback(host)))
+    logging.getLogger("aiohttp.server").addFilter(_in_one_line)
+
+
+def _in_one_line(record: logging.LogRecord) -> bool:
+    """Let a request that HTTP does not allow, as one with a long line, leave one line and no traceback in the log."""
+    error = record.exc_info[1] if isinstance(record.exc_info, tuple) else None
+    if isinstance(error, HttpProcessingError):
+        record.msg, record.args = "a request was refused: %.100s", (" ".join(str(error.message).split()),)
+        record.levelno, record.levelname = logging.WARNING, "WARNING"
+        record.exc_info = record.exc_text = None
+    return True
 
 
 def _checker(token: str, is_local: bool):
@@ -130,7 +142,7 @@ def _objection(request: web.Request, token: str, is_local: bool) -> str:
     try:
         host = urlsplit(f"//{request.host}")
         from_where = None if origin is None else urlsplit(origin).netloc
-        name = host.hostname or ""
+        name, _ = host.hostname or "", host.port  # of which neither is known of "[" and of a port above 65535
     except ValueError:
         return "The request was not understood."
     if from_where is not None and from_where != host.netloc:

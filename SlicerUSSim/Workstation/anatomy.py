@@ -26,6 +26,7 @@ from vtkmodules.vtkCommonExecutionModel import vtkTrivialProducer
 
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.base.vtk_data import vtk_matrix
+from SlicerUSSim.Logic.mrml.fitting_nodes import mark_as_drawn
 from SlicerUSSim.Logic.mrml.nodes import composite_of, display_of, node_called, show_in_slice, write_slice
 from SlicerUSSim.Logic.mrml.taken_image import TakenImage
 from SlicerUSSim.Logic.probe.arrays import Probe
@@ -329,6 +330,7 @@ class AnatomyViews:
     def _model(self, name: str):
         model = node_called(self._app.scene, "Model", name)
         model.SetSaveWithScene(False)
+        mark_as_drawn(model)
         display = display_of(model)
         display.SetSaveWithScene(False)
         return model

@@ -29,11 +29,13 @@ def is_metaimage(content: bytes) -> bool:
 def readable_name(name: str, content: bytes) -> str:
     """The name of a file with the ending of its format behind it, if it does not have one already.
 
-    A tracked sequence that is called sweep.dat becomes sweep.dat.mha; a name whose content says nothing stays.
+    A tracked sequence that is called sweep.dat becomes sweep.dat.mha; a name whose content says nothing stays, and that
+    of a scene (.mrb) with a text, which is no scene.
     """
-    endings = _endings(content[:_START])
-    lower = name.lower()
-    if not endings or lower.endswith(endings):
+    start, lower = content[:_START], name.lower()
+    endings = _endings(start)
+    is_no_scene = lower.endswith(".mrb") and endings == _endings_of_text(start)
+    if not endings or is_no_scene or lower.endswith(endings):
         return name
     return f"{name}{endings[0]}"
 

@@ -83,11 +83,20 @@ _EXPORTS = (
     ("zip", "Python script with its files (ZIP)"),
 )
 
+#: In the browser's tab
+_PROGRAM = "SlicerUSSim"
+
 
 def build_page(server: Server, sections: tuple[Section, ...], layout: LayoutManager, keys: tuple[str, ...]) -> None:
     """Build the page of a server. `layout` is that of the anatomy views, `keys` are the keys sent to the server."""
     server.enable_module(MODULE)
-    server.state.trame__title = "SlicerUSSim"
+    server.state.trame__title = _PROGRAM
+
+    @server.state.change(NAMES.title)
+    def show_in_tab(**values: object) -> None:
+        title = values.get(NAMES.title)
+        server.state.trame__title = f"{title} - {_PROGRAM}" if title else _PROGRAM
+
     with VAppLayout(server) as page:
         page.root.theme = "dark"
         with v3.VNavigationDrawer(permanent=True, width=376, disable_resize_watcher=True, disable_route_watcher=True):
@@ -449,8 +458,12 @@ def _status() -> None:
         with html.Div(
             v_if=messages.progress_title, style="display: flex; gap: 8px; align-items: center", id="progress"
         ):
-            html.Span(f"{{{{ {messages.progress_title} }}}} {{{{ {messages.progress_percent} }}}} %")
-            v3.VProgressLinear(model_value=(messages.progress_percent,), color="orange", style="width: 140px")
+            # Readers of files tell no share of what they have done
+            percent = messages.progress_percent
+            html.Span(f"{{{{ {messages.progress_title} }}}} {{{{ {percent} ? {percent} + ' %' : '…' }}}}")
+            v3.VProgressLinear(
+                model_value=(percent,), indeterminate=(f"{percent} === 0",), color="orange", style="width: 140px"
+            )
             v3.VBtn("Cancel", size="x-small", click="trigger('cancel')", id="cancel")
         html.Div(
             """<span id="upload" hidden><span id="upload-text"></span>

@@ -13,7 +13,7 @@ import numpy as np
 from greenlet import getcurrent, greenlet
 
 from SlicerUSSim.Logic.base.errors import Cancelled, SimulationError
-from SlicerUSSim.Logic.mrml.fitting_nodes import fits
+from SlicerUSSim.Logic.mrml.fitting_nodes import offered
 from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic
 from SlicerUSSim.Logic.mrml.nodes import nodes_of_class
 from SlicerUSSim.Widget.controls import Control, Section, by_widget, part_of, shown_by, usable, value_parameter
@@ -232,7 +232,7 @@ class BrowserPanel:
             node
             for name in control.node_classes
             for node in nodes_of_class(scene, name)
-            if node.GetClassName() == name and fits(control.node, node)
+            if node.GetClassName() == name and offered(control.node, node, self._logic.parameters)
         ]
         return [NodeItem("None", None), *(NodeItem(node.GetName(), node.GetID()) for node in found)]
 

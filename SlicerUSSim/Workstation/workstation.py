@@ -143,6 +143,11 @@ class Workstation:
             with suppress(SimulationError):  # the page then says that a new address is to be opened
                 self._session.keep_address(port, token)
 
+    @property
+    def is_computing(self) -> bool:
+        """Whether a thread computes something for the page."""
+        return self._tasks.are_computing
+
     def end_session(self) -> None:
         """Called when the server ends as it should; what was kept of the patient stays."""
         if self._session is not None:

@@ -408,7 +408,9 @@ def _read_by_itk(path: Path):
             require_whole_pixels(path)
         image = file.Execute()
     except RuntimeError as error:
-        reason = why_unreadable(path) or str(error).strip().splitlines()[-1]
+        reason = why_unreadable(path) or str(error).strip().splitlines()[-1].removeprefix("sitk::ERROR: ")
+        if "Unable to determine ImageIO reader" in reason:  # SimpleITK's words
+            reason = "its content is of no known format, expected NIfTI, NRRD, MetaImage, MGH, MINC, VTK or DICOM"
         if "No such file" in reason and path.exists():  # ITK's words for voxels that it could not read
             reason = "its voxels are missing or incomplete; copy or export it again"
         if "orthonormal" in reason:  # ITK's words for the sform of NIfTI

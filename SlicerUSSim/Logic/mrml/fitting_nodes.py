@@ -6,16 +6,43 @@ from collections.abc import Callable
 from typing import Any
 
 from SlicerUSSim.Logic.mrml.landmark_nodes import is_landmarks
-from SlicerUSSim.Logic.mrml.own_results import IMAGE, OUTLINE, SEQUENCE, SHEETS, is_empty, kind_of_result
-from SlicerUSSim.Logic.mrml.parameter_node import NODE_PARAMETERS
+from SlicerUSSim.Logic.mrml.own_results import (
+    IMAGE,
+    OUTLINE,
+    SEQUENCE,
+    is_empty,
+    kind_of_result,
+    may_replace_result,
+)
+from SlicerUSSim.Logic.mrml.ownership import is_claimed
+from SlicerUSSim.Logic.mrml.parameter_node import NODE_PARAMETERS, SceneParameters
+from SlicerUSSim.Logic.mrml.sheet_nodes import holds_sheets
 
 #: Of transforms and models that Slicer keeps for its slice views; they are hidden from editors only as a rule
 _OF_SLICE_VIEWS = ("Volume Slice", "Slice Transform", "Volume Slice Transform")
+#: {role: roles of which a node cannot have one at the same time}
+_OTHERS = {
+    "second_mri": ("mri",),
+    "real": ("mri", "second_mri"),
+}
+#: Attribute of nodes that only views show, which are nobody's data
+_DRAWN = "SlicerUSSim.drawn"
+
+
+def mark_as_drawn(node: Any) -> None:
+    """Record that a node is part of what views draw, such as the probe's body, and fits no role."""
+    node.SetAttribute(_DRAWN, "1")
+
+
+def offered(role: str, node: Any, parameters: SceneParameters) -> bool:
+    """Whether a node can have a role beside the nodes that are chosen for the others."""
+    return fits(role, node) and all(getattr(parameters, other) is not node for other in _OTHERS.get(role, ()))
 
 
 def fits(role: str, node: Any) -> bool:
     """Whether a node can have a role: its class, what it holds, and whether this module made it."""
-    if node.GetHideFromEditors() or (node.GetName() or "").endswith(_OF_SLICE_VIEWS):
+    is_drawn = node.GetAttribute(_DRAWN) is not None
+    if is_drawn or node.GetHideFromEditors() or (node.GetName() or "").endswith(_OF_SLICE_VIEWS):
         return False
     is_of_class = any(node.IsA(name) for name in NODE_PARAMETERS[role])
     return is_of_class and _RULES.get(role, lambda node: True)(node)
@@ -41,14 +68,23 @@ def _holds(sequence_node, class_name: str) -> bool:
 
 
 def _made_as(kind: str) -> Callable[[Any], bool]:
-    """Empty, or holding a result of this kind."""
-    return lambda node: kind_of_result(node) in (kind, "1") or (kind_of_result(node) is None and is_empty(node))
+    """Empty, or holding a result of this kind that may be replaced."""
+
+    def is_own(node) -> bool:
+        if is_empty(node):
+            return kind_of_result(node) in (None, kind, "1")
+        # Items of a sequence are compared when it is replaced
+        if node.IsA("vtkMRMLSequenceNode"):
+            return kind_of_result(node) == kind and is_claimed(node)
+        return kind_of_result(node) == kind and may_replace_result(node)
+
+    return is_own
 
 
 _RULES: dict[str, Callable[[Any], bool]] = {
     "mri": _is_anatomy,
     "second_mri": _is_anatomy,
-    "sheets": lambda node: kind_of_result(node) in (None, SHEETS, "1"),
+    "sheets": holds_sheets,
     "seed": lambda node: not is_landmarks(node),
     "probe_transform": lambda node: kind_of_result(node) is None,
     "output": lambda node: not node.IsA("vtkMRMLLabelMapVolumeNode") and _made_as(IMAGE)(node),

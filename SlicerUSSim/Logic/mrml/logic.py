@@ -513,8 +513,7 @@ class UltrasoundSceneLogic:
             self._check_output(labels_node, output_node)  # nodes may have changed in the meantime
             require_node(probe_transform_node, "vtkMRMLTransformNode", use="probe transform")
         except BaseException:
-            if may_replace_result(output_node):
-                self.clearImage(output_node)  # an image of before would be taken for that of this pose
+            self.clearImage(output_node)  # an image of before would be taken for that of this pose
             raise
         self._taken = taken
         was_modifying = output_node.StartModify()
@@ -586,13 +585,15 @@ class UltrasoundSceneLogic:
                 self._taken = replace(taken, anatomy=self.anatomyOf(labels))
 
     def clearImage(self, output_node) -> None:
-        """Empty a node with an image of this module, which is not of the present patient or pose."""
+        """Empty a node with an image of this module, which is not of the present patient or pose.
+
+        Data of others, which were put in place of the image, are kept.
+        """
         if output_node is None:
             return
-        require_result(output_node, "output")
         if self._taken is not None and self._taken.node is output_node:
             self._taken = None
-        if output_node.GetImageData() is not None:
+        if output_node.GetImageData() is not None and may_replace_result(output_node):
             remove_image(output_node)
 
     def clearOutline(self, model_node) -> None:

@@ -8,6 +8,7 @@ import numpy as np
 
 from SlicerUSSim.Logic.base.errors import SimulationError
 from SlicerUSSim.Logic.mrml.label_nodes import node_labels
+from SlicerUSSim.Logic.mrml.ownership import claim, is_claimed
 
 #: Attribute of a node, saved with the scene: a hash of voxels, place and names as Segment wrote them.
 _MADE = "SlicerUSSim.made"
@@ -16,14 +17,17 @@ _MADE = "SlicerUSSim.made"
 def mark_as_made(labels_node) -> None:
     """Record that the present content of a label map or segmentation node was made by this program."""
     labels_node.SetAttribute(_MADE, content_of(labels_node))
+    claim(labels_node)
 
 
 def may_replace(labels_node) -> bool:
     """Whether a node is new, or has labels that this program made, and nobody has edited since.
 
-    A new one has neither segments nor voxels; segments without voxels are somebody's plan.
+    A new one has neither segments nor voxels; segments without voxels are somebody's plan. A copy of labels is of whom
+    copied them, see ownership.
     """
-    return _is_new(labels_node) or content_of(labels_node) == labels_node.GetAttribute(_MADE)
+    is_own = is_claimed(labels_node) and labels_node.GetAttribute(_MADE) is not None
+    return _is_new(labels_node) or (is_own and content_of(labels_node) == labels_node.GetAttribute(_MADE))
 
 
 def _is_new(labels_node) -> bool:

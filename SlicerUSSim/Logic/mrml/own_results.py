@@ -1,15 +1,26 @@
-"""Marks of nodes that hold results of this module, so that it never overwrites what others made."""
+"""Marks of nodes that hold results of this module, so that it never overwrites what others made.
+
+A result is this module's own as long as three things hold: its node has the kind of the result as an attribute, refers
+to itself (ownership: a copy does not), and has the data that this module wrote, by a hash that is an attribute, too.
+All are saved with the scene, and formats that keep voxels, points and matrices as they are (NRRD, VTK, HDF5) keep the
+hash: results that were saved and loaded are replaced again. Data that the user put in their place, or edited, are the
+user's.
+"""
 
 from __future__ import annotations
 
+import hashlib
+
 import numpy as np
+from vtkmodules.util.numpy_support import vtk_to_numpy
 
 from SlicerUSSim.Logic.base.errors import require
 from SlicerUSSim.Logic.base.vtk_data import matrix_array
 from SlicerUSSim.Logic.mrml.nodes import named, nodes_of_class
+from SlicerUSSim.Logic.mrml.ownership import claim, is_claimed
 
-#: Attribute of a node, saved with the scene: the kind of result; "1" in scenes of earlier versions
-_RESULT = "SlicerUSSim.result"
+#: Attributes of a node, saved with the scene: kind of result ("1" by earlier versions), and a hash of its data
+_RESULT, _DATA = "SlicerUSSim.result", "SlicerUSSim.resultData"
 #: Kinds of results
 IMAGE, OUTLINE, SEQUENCE, SHEETS, FLAP, COMPARED, REGISTRATION = (
     "image", "outline", "sequence", "sheets", "flap", "compared", "registration"
@@ -17,19 +28,35 @@ IMAGE, OUTLINE, SEQUENCE, SHEETS, FLAP, COMPARED, REGISTRATION = (
 
 
 def mark_as_result(node, kind: str) -> None:
-    """Record that a volume, model, sequence or transform node holds a result of this module, of this kind."""
-    if node.GetAttribute(_RESULT) != kind:  # an attribute that is set is a change, which observers hear of
-        node.SetAttribute(_RESULT, kind)
+    """Record that a volume, model, sequence or transform node holds a result of this module, of this kind.
+
+    To be called after its data were written. Of a node outside a scene, an item of a sequence, only the kind is kept.
+    """
+    marks = {_RESULT: kind}
+    if node.GetScene() is not None:
+        marks[_DATA] = _hash_of(node)
+        claim(node)
+    for name, text in marks.items():
+        if node.GetAttribute(name) != text:  # an attribute that is set is a change, which observers hear of
+            node.SetAttribute(name, text)
 
 
 def kind_of_result(node) -> str | None:
-    """The kind of the result in a node; None of a node of others, or an empty one."""
-    return node.GetAttribute(_RESULT)
+    """The kind of the result in a node, or of that of which it is a copy; None of a node with data of others.
+
+    Of a sequence, its items are not compared with what was written.
+    """
+    kind, data = node.GetAttribute(_RESULT), node.GetAttribute(_DATA)
+    if kind is None or data is None or node.IsA("vtkMRMLSequenceNode") or is_empty(node) or _hash_of(node) == data:
+        return kind
+    return None
 
 
 def may_replace_result(node) -> bool:
-    """Whether a volume, model, sequence or transform node is empty, or holds a result of this module."""
-    return node.GetAttribute(_RESULT) is not None or is_empty(node)
+    """Whether a volume, model, sequence or transform node is empty, or holds what this module wrote into it."""
+    return is_empty(node) or (
+        node.GetAttribute(_RESULT) is not None and is_claimed(node) and _hash_of(node) == node.GetAttribute(_DATA)
+    )
 
 
 def require_result(node, use: str) -> None:
@@ -57,3 +84,28 @@ def is_empty(node) -> bool:
         return bool(np.array_equal(matrix_array(node.GetMatrixTransformToParent()), np.eye(4)))
     data = node.GetPolyData() if node.IsA("vtkMRMLModelNode") else node.GetImageData()
     return data is None or data.GetNumberOfPoints() == 0
+
+
+def _hash_of(node) -> str:
+    """Of the voxels, points, items or matrix of a node; not of its place and what else the user may change of it."""
+    found = hashlib.blake2b(digest_size=16)
+    if node.IsA("vtkMRMLSequenceNode"):
+        for number in range(node.GetNumberOfDataNodes()):
+            item = node.GetNthDataNode(number)
+            found.update(f"{node.GetNthIndexValue(number)} {_hash_of(item)} ".encode())
+    elif node.IsA("vtkMRMLTransformNode"):
+        if node.IsA("vtkMRMLLinearTransformNode"):
+            found.update((matrix_array(node.GetMatrixTransformToParent()).round(5) + 0.0).tobytes())
+    elif node.IsA("vtkMRMLModelNode"):
+        data = node.GetPolyData()
+        if data is not None and data.GetNumberOfPoints():
+            points = np.asarray(vtk_to_numpy(data.GetPoints().GetData()), np.float32)
+            found.update(f"{data.GetNumberOfCells()} ".encode())
+            found.update(np.ascontiguousarray(points + np.float32(0.0)).data)  # -0.0, as files in LPS make of 0.0
+    else:
+        image = node.GetImageData()
+        scalars = None if image is None else image.GetPointData().GetScalars()
+        if image is not None and scalars is not None:
+            found.update(f"{image.GetDimensions()} {image.GetScalarTypeAsString()} ".encode())
+            found.update(np.ascontiguousarray(vtk_to_numpy(scalars)).data)
+    return found.hexdigest()

@@ -36,6 +36,7 @@ from SlicerUSSim.Logic.mrml.nodes import (
     probe_pose,
     write_volume,
 )
+from SlicerUSSim.Logic.mrml.ownership import OWN, claim, is_claimed
 from SlicerUSSim.Logic.mrml.parameter_node import VALUE_PARAMETERS, SceneParameters
 from SlicerUSSim.Logic.mrml.share_nodes import set_shares_node, shares_node
 from SlicerUSSim.Logic.mrml.taken_sequence import FrozenRecord, SimulatedRecord, record_frozen, record_taken
@@ -300,7 +301,9 @@ def _colours(
 
 
 def _attributes(node) -> dict[str, str]:
-    return {name: node.GetAttribute(name) for name in node.GetAttributeNames() if name.startswith(_OWN)}
+    """Of this module; OWN, which is a reference in scenes, tells whose the node is."""
+    found = {name: node.GetAttribute(name) for name in node.GetAttributeNames() if name.startswith(_OWN)}
+    return {**found, OWN: "1"} if is_claimed(node) else found
 
 
 def _segments(node) -> Iterable[SegmentRecord]:
@@ -356,7 +359,7 @@ def put_values(parameters: SceneParameters, values: Mapping[str, str]) -> list[s
             value = declared.default if text == "" else declared.from_text("scene", text)
             setattr(parameters, name, value)
         except SimulationError as error:
-            refused.append(str(error))
+            refused.append(str(error).replace(f"scene: {name} is ", f"{declared.label or name} in the scene is ", 1))
     node.EndModify(was_modifying)
     return refused
 
@@ -383,7 +386,9 @@ def _put(scene, entry: NodeRecord, extra: list[Any]):
         for point in () if entry.points is None else entry.points.tolist():
             node.AddControlPointWorld(*point)
         for name, text in entry.attributes.items():
-            if name.startswith(_OWN):
+            if name == OWN:
+                claim(node)
+            elif name.startswith(_OWN):
                 node.SetAttribute(name, text)
     except BaseException:
         scene.RemoveNode(node)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Hashable, Iterable
+from dataclasses import fields
 from typing import Any
 
 import numpy as np
@@ -34,6 +35,13 @@ def sheets_version(model_node) -> Hashable:
     if model_node is None or model_node.GetPolyData() is None:
         return None
     return model_node.GetID(), model_node.GetPolyData().GetMTime(), node_to_world(model_node).tobytes()
+
+
+def holds_sheets(model_node) -> bool:
+    """Whether a model has what surfels_of reads, whoever made it; not the surface of something else."""
+    data = model_node.GetPolyData()
+    arrays = None if data is None else data.GetCellData()
+    return arrays is not None and all(arrays.HasArray(entry.name) for entry in fields(Surfels))
 
 
 def read_sheets(model_node, world_to_labels: np.ndarray, kinds: Iterable[str]) -> Surfels:
