@@ -16,7 +16,7 @@ from SlicerUSSim.Logic.mrml.own_labels import content_of, mark_as_made
 from SlicerUSSim.Logic.mrml.own_results import IMAGE, OUTLINE, REGISTRATION, SEQUENCE, kind_of_result, mark_as_result
 from SlicerUSSim.Logic.mrml.scene_record import SceneRecord, put_nodes, record_nodes
 from tests.conftest import rigid
-from tests.test_scene import Bench, add, cyst, pixels, put
+from tests.test_scene import Bench, add, cyst, pixels, put, save_scene
 
 
 @pytest.fixture
@@ -111,16 +111,8 @@ def test_saved_scenes_know_their_own_results_again(bench, tmp_path, is_imported)
     mark_as_result(registration, REGISTRATION)
     mark_as_made(bench.labels)
     kept = clone(bench.image)
-    bench.scene.SetRootDirectory(str(tmp_path))
     colours = bench.labels.GetNodeReference("tissueColors")
-    for node in (bench.labels, colours, bench.image, kept, outline, registration):
-        node.AddDefaultStorageNode()
-        storage = node.GetStorageNode()
-        storage.SetFileName(str(tmp_path / f"{node.GetName()}.{storage.GetDefaultWriteFileExtension()}"))
-        assert storage.WriteData(node) == 1
-    bench.scene.SetURL(str(tmp_path / "scene.mrml"))
-    assert bench.scene.Commit()
-
+    save_scene(bench.scene, (bench.labels, colours, bench.image, kept, outline, registration), tmp_path)
     scene = slicer.vtkMRMLScene()
     if is_imported:
         for kind in ("ScalarVolume", "Model", "LinearTransform", "LabelMapVolume"):

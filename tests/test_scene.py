@@ -820,6 +820,18 @@ def test_the_mri_is_never_the_output(bench):
 # ---- what the scene remembers ----------------------------------------------------------------------------------------
 
 
+def save_scene(scene, nodes, folder) -> None:
+    """Save a scene as scene.mrml in a folder, with the data of `nodes` beside it, as Slicer does."""
+    scene.SetRootDirectory(str(folder))
+    for node in nodes:
+        node.AddDefaultStorageNode()
+        storage = node.GetStorageNode()
+        storage.SetFileName(str(folder / f"{node.GetName()}.{storage.GetDefaultWriteFileExtension()}"))
+        assert storage.WriteData(node) == 1
+    scene.SetURL(str(folder / "scene.mrml"))
+    assert scene.Commit()
+
+
 def test_a_saved_scene_opens_as_it_was_left(bench, tmp_path):
     names = ("labels", "probe_transform", "output")
     for name, node in zip(names, (bench.labels, bench.probe, bench.image), strict=True):
@@ -829,15 +841,7 @@ def test_a_saved_scene_opens_as_it_was_left(bench, tmp_path):
     bench.logic.parameters.classes = 4
     bench.logic.preset = bench.logic.preset.changed("display", gain_db=7.5)
     image = bench.simulate().image
-    bench.scene.SetRootDirectory(str(tmp_path))
-    for node in (bench.labels, bench.probe, bench.image):
-        node.AddDefaultStorageNode()
-        storage = node.GetStorageNode()
-        storage.SetFileName(str(tmp_path / f"{node.GetName()}.{storage.GetDefaultWriteFileExtension()}"))
-        assert storage.WriteData(node) == 1
-    bench.scene.SetURL(str(tmp_path / "scene.mrml"))
-    assert bench.scene.Commit()
-
+    save_scene(bench.scene, (bench.labels, bench.probe, bench.image), tmp_path)
     scene = slicer.vtkMRMLScene()
     scene.SetURL(str(tmp_path / "scene.mrml"))
     assert scene.Connect()

@@ -95,6 +95,14 @@ def page(browser, url):
     assert not problems
 
 
+def open_patient(page, path: Path) -> None:
+    """Open an MRI or a label map of a new patient in place of the one who is open, and wait for its image."""
+    page.set_input_files("#open-file", path)
+    answer_new_patient(page)
+    page.wait_for_function("name => window.ussim.image?.patient === name", arg=path.name)
+    settled(page)
+
+
 def open_scene(page, path: Path) -> None:
     """Open a scene in place of the patient who is open, which the page asks."""
     before = page.evaluate("window.ussim.images")
@@ -156,10 +164,7 @@ def test_the_workstation_opens_the_scene_of_the_slicer_module(page, module_scene
 
 def test_a_frozen_image_comes_back_with_its_scene(page, files, tmp_path):
     """A live image where the probe is was shown in its place, and said to be "as it was"."""
-    page.set_input_files("#open-file", files / "labels.nii.gz")
-    answer_new_patient(page)
-    page.wait_for_function("window.ussim.image?.patient === 'labels.nii.gz'")
-    settled(page)
+    open_patient(page, files / "labels.nii.gz")
     click(page, "#live")
     page.locator("#frozen").wait_for()
     settled(page)
@@ -169,10 +174,7 @@ def test_a_frozen_image_comes_back_with_its_scene(page, files, tmp_path):
     settled(page)
     moved = state(page, NAMES.pose_matrix)
     shutil.copy(download(page, "mrb"), tmp_path / "frozen.mrb")
-    page.set_input_files("#open-file", files / "head.nii.gz")
-    answer_new_patient(page)
-    page.wait_for_function("window.ussim.image?.patient === 'head.nii.gz'")
-    settled(page)
+    open_patient(page, files / "head.nii.gz")
     open_scene(page, tmp_path / "frozen.mrb")
     assert not errors(page) and page.locator("#frozen").is_visible() and not shown(page, "liveCheckBox")
     again = page.evaluate("window.ussim.image")
@@ -189,10 +191,7 @@ def test_a_frozen_image_comes_back_with_its_scene(page, files, tmp_path):
 
 def test_nothing_of_a_patient_stays_on_the_next_one(page, files, tmp_path):
     """The line "FROZEN: ..." and the outline of the imaged field of the patient before lay over the next one."""
-    page.set_input_files("#open-file", files / "labels.nii.gz")
-    answer_new_patient(page)
-    page.wait_for_function("window.ussim.image?.patient === 'labels.nii.gz'")
-    settled(page)
+    open_patient(page, files / "labels.nii.gz")
     click(page, "#close-patient")
     settled(page)
     assert state(page, NAMES.messages.status) == "" and state(page, NAMES.title) == ""

@@ -32,7 +32,7 @@ from SlicerUSSim.Command.validate import validate
 from SlicerUSSim.Command.volume import volume
 from SlicerUSSim.Logic.base.errors import SimulationError, is_our_warning, user_message
 from SlicerUSSim.Logic.base.version import __version__
-from SlicerUSSim.Logic.opencl.limits import address_space, lack_of_address_space
+from SlicerUSSim.Logic.opencl.limits import address_space, doubt_of_address_space, lack_of_address_space
 
 #: Errors of a standard output that is a file on a full or broken disk, or closed
 _NO_MORE = {errno.ENOSPC, errno.EDQUOT, errno.EIO, errno.EBADF}
@@ -68,8 +68,6 @@ class _Commands(click.Group):
         except Exception as error:
             message = user_message(error)
             if message is None and isinstance(error, ImportError | MemoryError | OSError):
-                from SlicerUSSim.Logic.opencl.limits import doubt_of_address_space
-
                 doubt = doubt_of_address_space()  # libraries fail in many ways for want of it
                 message = None if doubt is None else f"{type(error).__name__}; {doubt}"
             if message is None:

@@ -232,9 +232,12 @@ def _is_no_image(path: str) -> bool:
 
     if not Path(path).is_file():
         return False
+    return _is_zip(path) or Path(path).suffix.lower() in _TEXTS or is_tracked_sequence(path)
+
+
+def _is_zip(path: str) -> bool:
     with Path(path).open("rb") as file:
-        is_zip = file.read(4) == b"PK\x03\x04"
-    return is_zip or Path(path).suffix.lower() in _TEXTS or is_tracked_sequence(path)
+        return file.read(4) == b"PK\x03\x04"
 
 
 def _opened_first(path: str, options: list[str]) -> tuple[tuple[SceneRecord, str] | None, str | None, None]:
@@ -245,9 +248,7 @@ def _opened_first(path: str, options: list[str]) -> tuple[tuple[SceneRecord, str
     from SlicerUSSim.Workstation.content import Kind, content_of
     from SlicerUSSim.Workstation.scene_files import read_scene
 
-    with Path(path).open("rb") as file:
-        is_zip = file.read(4) == b"PK\x03\x04"
-    if not is_zip and content_of(Path(path)).kind is not Kind.SCENE:
+    if not _is_zip(path) and content_of(Path(path)).kind is not Kind.SCENE:
         return None, path, None
     require(not options, f"{path} is a scene, which has a patient and settings, expected no {', '.join(options)}")
     _prepare_libraries()

@@ -247,10 +247,8 @@ class Medium:
         normals on flat interfaces. For them tissues go on beyond the volume, whose ends are no borders."""
         group_of = self.rows["group"].astype(np.uint8)
         group = np.zeros(padded.shape, np.uint8)
-        for label in self.present:  # faster than indices of eight bytes for every voxel
+        for label in {0, *self.present}:  # faster than indices of eight bytes for every voxel
             group |= (padded == label).view(np.uint8) * group_of[label]
-        if group_of[0]:
-            group |= (padded == 0).view(np.uint8) * group_of[0]
         # The coupling medium surrounds the volume even if its label does not occur.
         groups = {int(group_of[label]) for label in (0, *self.present)}
         room = max(_SMOOTHED_VOXELS // padded.size, 2)
