@@ -49,6 +49,9 @@ FLAGS = [
 ]  # fmt: skip
 #: A state that has not come after so long never will, however busy the machine is.
 PATIENCE_S = 180
+#: Trame's own messages that a page could not send since it was left are no faults of the page.
+LEAVING = """addEventListener("beforeunload", () =>
+  addEventListener("unhandledrejection", rejection => rejection.preventDefault()));"""
 POSE = ("right_deg", "front_deg", "rotate_deg", "rock_deg", "tilt_deg", "lift_mm")
 
 
@@ -129,6 +132,7 @@ def opened(browser, address: str, problems: list[str] | None = None) -> Page:
     page = browser.new_page(viewport={"width": 1500, "height": 900})
     if problems is not None:
         page.on("pageerror", lambda error: problems.append(str(error)))
+    page.add_init_script(LEAVING)
     page.set_default_timeout(1000 * PATIENCE_S)
     page.on("websocket", lambda socket: socket.on("framesent", lambda frame: _sent(page, frame)))
     page.goto(address)

@@ -39,6 +39,7 @@ from tests.test_workstation import (
     pytestmark as pytestmark,
     serving,
     settled,
+    shown_errors,
     state,
 )
 
@@ -304,6 +305,7 @@ def test_exports_are_for_whom_has_the_token(page, browser, url):
     found = page.request.get(f"{address}json")
     assert found.status == 200 and found.headers["cache-control"] == "no-store" and "probe" in found.json()
     assert page.request.get(f"{address}../secret").status == 204
+    shown_errors(page)  # the message comes by the page's socket, after the answer
     assert errors(page) == ["the export is '../secret', expected one of the menu"]
     dismiss_messages(page)
     other.close()

@@ -471,14 +471,13 @@ def _read_mgh(path: Path) -> tuple[np.ndarray, np.ndarray]:
     require_package("nibabel", "nibabel", f"{path}: reading MGZ")
     import nibabel
 
-    require_whole_gzip(path)
-
     try:
         image = nibabel.MGHImage.from_filename(path)
         values = np.asarray(image.dataobj)
     except Exception as error:  # nibabel and gzip raise various exceptions for damaged files
         reason = str(error).strip() or type(error).__name__
         raise SimulationError(f"{path}: cannot be read as MGZ ({reason.splitlines()[0]})") from None
+    require_whole_gzip(path)  # afterwards: what is no gzip at all is called so, and gzip's checksum comes at its end
     if values.ndim == 4 and values.shape[3] == 1:
         values = values[..., 0]
     _require_volume(values.shape, str(path))
