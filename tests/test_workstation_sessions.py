@@ -190,6 +190,40 @@ def test_after_kill_9_the_page_reconnects_by_itself_and_restores_all(server, bro
     page.close()
 
 
+def test_a_frozen_image_comes_back_frozen_where_it_was_taken(server, browser, files):
+    """A live image at the probe's pose was shown in its place."""
+    own = server("--labels", str(files / "labels.nii.gz"))
+    page = opened(browser, own.url)
+    settled(page)
+    click(page, "#live")
+    page.locator("#frozen").wait_for()
+    settled(page)
+    image, about = pixels(page), page.evaluate("window.ussim.image")
+    for _ in range(3):
+        page.keyboard.press("d")
+        settled(page)
+    moved = state(page, NAMES.pose_matrix)
+    kept(page)
+    killed_and_started(own, page)
+    reloaded(page)
+    click(page, "#restore-session")
+    page.locator("#session-offer").wait_for(state="detached")
+    settled(page)
+    assert not errors(page) and page.locator("#frozen").is_visible() and not shown(page, "liveCheckBox")
+    again = page.evaluate("window.ussim.image")
+    assert np.array_equal(pixels(page), image) and again["time"] == about["time"]
+    np.testing.assert_allclose(again["pose"], about["pose"], atol=1e-3)
+    now = state(page, NAMES.pose_matrix)
+    np.testing.assert_allclose(*(np.array(text.split(), float) for text in (now, moved)), atol=1e-3)
+    # Going on from there: nothing of it is kept once images are live again
+    click(page, "#live")
+    page.locator("#frozen").wait_for(state="hidden")
+    settled(page)
+    kept(page)
+    eventually(page, lambda: not [path for path in own.sessions.glob("*/frozen-*")])
+    page.close()
+
+
 def sector_rows(page) -> int:
     """Rows that the outline of the imaged field covers in the slice view of the image plane."""
     drawn(page)

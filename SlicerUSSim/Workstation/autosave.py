@@ -31,7 +31,14 @@ from SlicerUSSim.Logic.mrml.scene_record import (
     record_nodes,
     recorded_values,
 )
-from SlicerUSSim.Logic.mrml.taken_sequence import SimulatedRecord, record_taken, version_taken
+from SlicerUSSim.Logic.mrml.taken_sequence import (
+    FrozenRecord,
+    SimulatedRecord,
+    record_frozen,
+    record_taken,
+    version_frozen,
+    version_taken,
+)
 from SlicerUSSim.Widget.presenter import PanelPresenter
 from SlicerUSSim.Workstation.export import MOST_IMAGES, Cine
 from SlicerUSSim.Workstation.opener import Opener
@@ -62,6 +69,9 @@ class _Taken:
     #: Images of Simulate sequence
     simulated: SimulatedRecord | None
     has_simulated: bool
+    #: The image that stays where it was taken
+    frozen: FrozenRecord | None
+    has_frozen: bool
     fit: tuple | None
     has_fit: bool
     #: (time, image) that are new, and whether they begin a loop
@@ -112,6 +122,7 @@ class Autosave:
         self._anatomy_seen: Hashable = None
         self._sequence_seen: Any = None
         self._simulated_seen: Hashable = None
+        self._frozen_seen: Hashable = None
         self._fit_seen: Any = None  # with the preset that Apply replaced; these objects themselves, not their ids
         self._cine_seen = (-1, 0)  # loop, and number of images
         self._number = 0  # of files
@@ -163,13 +174,13 @@ class Autosave:
         page = self._page()
         pose, fit, sequence = self._pose(), self._presenter.fits.kept(), self._opener.opened_sequence
         anatomy = nodes_version(parameters)
-        simulated = version_taken(parameters.image_sequence)
+        simulated, frozen = version_taken(parameters.image_sequence), version_frozen(parameters.output)
         is_new_fit = fit is not None and not _are_same(fit, self._fit_seen)
         is_new_sequence = sequence is not None and sequence is not self._sequence_seen
         cine = self._cine.loop, self._cine.added
         seen = (
             anatomy, tuple(self._opener.sent_files.files.items()), parameters.node.GetMTime(),
-            None if pose is None else pose.tobytes(), fit is not None, sequence is not None, simulated, cine,
+            None if pose is None else pose.tobytes(), fit is not None, sequence is not None, simulated, frozen, cine,
             repr(page), self._presenter.noteLines, tuple(map(id, self._landmarks())),
         )  # fmt: skip
         if seen == self._seen and not is_new_fit and not is_new_sequence:
@@ -177,6 +188,7 @@ class Autosave:
         try:
             record = SceneRecord(record_nodes(parameters)) if anatomy != self._anatomy_seen else None
             made = record_taken(parameters.image_sequence) if simulated != self._simulated_seen else None
+            image = record_frozen(parameters.output) if frozen != self._frozen_seen else None
         except SimulationError as error:
             self._tell(str(error))
             return
@@ -198,12 +210,13 @@ class Autosave:
         taken = _Taken(
             self._opener.patient(), state, record,
             sequence if is_new_sequence else None, sequence is not None, made, simulated is not None,
+            image, frozen is not None,
             (replace(fit[0], simulator=None), fit[1]) if fit is not None and is_new_fit else None,
             fit is not None, self._cine.since(0 if is_new_loop else self._cine_seen[1]), is_new_loop,
             dict(self._opener.sent_files.files),
         )  # fmt: skip
         self._seen, self._anatomy_seen, self._sequence_seen, self._fit_seen = seen, anatomy, sequence, fit
-        self._simulated_seen = simulated
+        self._simulated_seen, self._frozen_seen = simulated, frozen
         self._cine_seen = cine
         self._start(lambda: self._write(taken))
 
@@ -269,13 +282,16 @@ class Autosave:
             self._put("sequence", taken.sequence)
         if taken.simulated is not None:
             self._put("simulated", taken.simulated)
+        if taken.frozen is not None:
+            self._put("frozen", taken.frozen)
         if taken.fit is not None:
             self._put("fit", taken.fit)
         # By their places: another patient may have a file of the same name
         sent = {name: self._sent.get(path) or self._copied(path) for name, path in taken.sent.items()}
         self._files["sent"] = {name: file for name, file in sent.items() if file is not None}
         for part, is_there in (
-            ("sequence", taken.has_sequence), ("simulated", taken.has_simulated), ("fit", taken.has_fit),
+            ("sequence", taken.has_sequence), ("simulated", taken.has_simulated), ("frozen", taken.has_frozen),
+            ("fit", taken.has_fit),
         ):  # fmt: skip
             if not is_there:
                 self._files.pop(part, None)

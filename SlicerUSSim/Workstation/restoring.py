@@ -19,7 +19,7 @@ from SlicerUSSim.Logic.mrml.landmark_nodes import Landmark
 from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic
 from SlicerUSSim.Logic.mrml.nodes import display_of, set_node_to_world
 from SlicerUSSim.Logic.mrml.scene_record import ROLES, SceneRecord, SequenceRecord, put_nodes, put_values
-from SlicerUSSim.Logic.mrml.taken_sequence import SimulatedRecord, put_taken
+from SlicerUSSim.Logic.mrml.taken_sequence import FrozenRecord, SimulatedRecord, put_taken
 from SlicerUSSim.Widget.presenter import PanelPresenter
 from SlicerUSSim.Workstation.export import Cine
 from SlicerUSSim.Workstation.loading import Loading
@@ -235,7 +235,9 @@ def _parts_of(session: KeptSession) -> tuple[SceneRecord, tuple[Fit, Preset | No
     simulated = session.read("simulated")
     made = simulated if isinstance(simulated, SimulatedRecord) else None
     recorded = sequence if isinstance(sequence, SequenceRecord) else None
-    record = SceneRecord(anatomy.nodes, {}, pose, recorded, landmarks=landmarks, simulated=made)
+    frozen = session.read("frozen")
+    image = frozen if isinstance(frozen, FrozenRecord) else None
+    record = SceneRecord(anatomy.nodes, {}, pose, recorded, landmarks=landmarks, simulated=made, frozen=image)
     images = []
     for name in content["files"].get("cine", []):
         for seconds, jpeg in session.read_file(str(name)):

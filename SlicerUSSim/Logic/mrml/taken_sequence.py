@@ -123,9 +123,16 @@ class FrozenRecord:
             return np.full((4, 4), np.nan)
 
 
+def version_frozen(volume_node: Any) -> Hashable:
+    """A value that changes with what record_frozen returns; None if there is nothing."""
+    if volume_node is None or volume_node.GetImageData() is None or not is_frozen(volume_node):
+        return None
+    return volume_node.GetID(), volume_node.GetImageData().GetMTime()
+
+
 def record_frozen(volume_node: Any) -> FrozenRecord | None:
     """The image in a volume node, if it is one of this module that stays where it was taken."""
-    if volume_node is None or volume_node.GetImageData() is None or not is_frozen(volume_node):
+    if version_frozen(volume_node) is None:
         return None
     about = about_image(volume_node)
     array = Volume.from_vtk(volume_node.GetImageData(), ijk_to_ras(volume_node)).array
