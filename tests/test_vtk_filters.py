@@ -11,7 +11,7 @@ import vtkmodules.vtkRenderingOpenGL2  # noqa: F401, makes rendering work at all
 from hypothesis import given, settings, strategies as st
 from scipy.spatial.transform import Rotation
 from vtkmodules.util.numpy_support import vtk_to_numpy
-from vtkmodules.vtkCommonDataModel import vtkDataObject, vtkImageData
+from vtkmodules.vtkCommonDataModel import vtkDataObject, vtkImageData, vtkPolyData
 from vtkmodules.vtkCommonExecutionModel import vtkStreamingDemandDrivenPipeline
 from vtkmodules.vtkCommonMath import vtkMatrix4x4
 from vtkmodules.vtkCommonTransforms import vtkTransform
@@ -41,8 +41,11 @@ from SlicerUSSim.Logic import (
 from SlicerUSSim.Logic.base.vtk_data import vtk_matrix
 from SlicerUSSim.Logic.mri.samples import head_mri
 from SlicerUSSim.Logic.mri.settings import SegmentationSettings
+from SlicerUSSim.Logic.mri.sheets.polydata import as_polydata
+from SlicerUSSim.Logic.probe.shape import outline_polydata
 from SlicerUSSim.Logic.vtk.filters import SegmentationFilter, UltrasoundSimulationFilter
 from tests.conftest import FLUID, SPECKLE, block, example, rigid
+from tests.test_drawn_sheets import plane
 
 PROBE = LinearProbe(20, 30, scan_lines=48, focus_mm=15)
 DISPLAY = DisplaySettings(image_size=(96, 64))
@@ -252,6 +255,8 @@ def test_labels_of_freesurfer_are_read_as_those_of_the_same_tissues():
         (lambda f: f.SetProbeTransform(vtk_matrix(np.diag([2.0, 1, 1, 1]))), "probe transform is not rigid"),
         (lambda f: f.SetTissues(TissueTable({1: SPECKLE})), "label 2 has no tissue"),
         (lambda f: f.SetDevice("abacus"), "abacus"),
+        (lambda f: f.SetSheetsData(outline_polydata(PROBE)), "sheets: has no array 'place' of its cells"),
+        (lambda f: (f.SetSheetsData(sheets_of()), f.SetSheetKinds("wall")), "sheets are of no kind 'wall'"),
     ],
 )
 def test_what_is_wrong_is_one_error_event_and_no_image(break_it, message):
@@ -276,8 +281,45 @@ def test_what_is_wrong_is_one_error_event_and_no_image(break_it, message):
     algorithm.SetProbeTransform(vtkTransform())
     algorithm.SetTissues(TISSUES)
     algorithm.SetDevice(None)
+    algorithm.SetSheetsData(None)
     algorithm.Update()
     assert algorithm.GetErrorMessage() == "" and algorithm.GetOutput().GetNumberOfPoints() == 96 * 64
+
+
+def image_of(algorithm) -> np.ndarray:
+    return Volume.from_vtk(algorithm.GetOutput()).array[0].copy()
+
+
+def sheets_of() -> vtkPolyData:
+    """The falx across the beam, 10 mm deep, as its file has it."""
+    return as_polydata(plane("falx", rigid(np.eye(3), [0, -20, 0])))
+
+
+def test_sheets_of_the_kinds_that_are_chosen_are_drawn():
+    algorithm, tissues = simulation(), TissueTable({**TISSUES}, TissueTable.brain(["white matter"]).membrane)
+    algorithm.SetTissues(tissues)
+    algorithm.Update()
+    without = image_of(algorithm)
+    surface = sheets_of()
+    algorithm.SetSheetsData(surface)
+    assert executes(algorithm)
+    image = image_of(algorithm)
+    surfels = plane("falx", rigid(np.eye(3), [0, -20, 0]))
+    pose = rigid(np.eye(3), [0, -15, 0])
+    expected = UltrasoundSimulator(cyst(), tissues, sheets=surfels)
+    np.testing.assert_array_equal(image, expected.simulate(PROBE, pose, DISPLAY, noise_seed=seed_of_pose(pose)).image)
+    assert image[25:40].mean() > without[25:40].mean() + 10  # 10 of 30 mm deep, in 96 rows
+    algorithm.SetSheetKinds(["sulcus"])
+    algorithm.Update()
+    np.testing.assert_array_equal(image_of(algorithm), without)
+    algorithm.SetSheetKinds("falx")
+    algorithm.Update()
+    np.testing.assert_array_equal(image_of(algorithm), image)
+    assert not executes(algorithm)
+    surface.Initialize()  # in place
+    algorithm.Modified()
+    algorithm.Update()
+    assert "has no array 'place'" in algorithm.GetErrorMessage()
 
 
 def test_a_transform_of_another_kind_is_refused_at_once():

@@ -14,6 +14,7 @@ reported by an ErrorEvent with one line, and by GetErrorMessage; the output is t
 from __future__ import annotations
 
 import logging
+from collections.abc import Iterable
 from dataclasses import asdict
 
 import numpy as np
@@ -40,6 +41,8 @@ from SlicerUSSim.Logic.mri.modality import has_brain_mask, segment_image
 from SlicerUSSim.Logic.mri.pathology import add_tissues
 from SlicerUSSim.Logic.mri.segmentation import Segmentation
 from SlicerUSSim.Logic.mri.settings import SegmentationSettings
+from SlicerUSSim.Logic.mri.sheets.polydata import surfels_of
+from SlicerUSSim.Logic.mri.sheets.surfels import KINDS, Surfels
 from SlicerUSSim.Logic.probe.arrays import Probe
 from SlicerUSSim.Logic.probe.image_grid import ImageGrid
 from SlicerUSSim.Logic.probe.shape import outline_polydata
@@ -300,7 +303,7 @@ class UltrasoundSimulationFilter(_ImageFilter):
     poses (noise.seed_of_pose). Labels are identified by the names from SegmentationFilter (field data "TissueNames");
     without names, by the labels of the table that SetTissues or SetPreset gave; without one, or with labels that it
     lacks, by what they are (tissue.read_label_map): numbers of a known program. A mask or a tumour alone is an error
-    then.
+    then. Between skin and probe the coupling medium fills any gap, unless the settings have a contact_gap_mm.
 
     >>> import numpy as np
     >>> from vtkmodules.vtkCommonTransforms import vtkTransform
@@ -333,6 +336,9 @@ class UltrasoundSimulationFilter(_ImageFilter):
         self._simulator = ReusedSimulator()
         self._frame: Frame | None = None
         self._read: tuple[tuple, tuple[Volume, TissueTable]] | None = None  # labels without names, and their version
+        self._sheets_data: vtkPolyData | None = None
+        self._sheet_kinds: tuple[str, ...] = KINDS
+        self._sheets: tuple[tuple, Surfels] | None = None  # with the version of their surface, and their kinds
         self._placed_outline = vtkTransformPolyDataFilter()
         self._placed_outline.SetInputData(outline_polydata(self._probe))
         self._placed_outline.SetTransform(self._probe_transform)
@@ -385,6 +391,19 @@ class UltrasoundSimulationFilter(_ImageFilter):
         """Texture from the MRI (Segmentation.texture), for settings that use it."""
         self._change("_texture", texture)
 
+    def SetSheetsData(self, surface: vtkPolyData | None) -> None:
+        """Thin sheets (falx, tentorium, sulci, walls of ventricles) as `ussim segment --sheets` writes them to a .vtp.
+
+        They replace the lines that labels have in their place; None: the lines of the labels. What they are made of is
+        said by the table's membrane, without which none are drawn. The surface is not observed: call Modified() of the
+        filter after changing it. A surface of something else is an error of the update.
+        """
+        self._change("_sheets_data", surface)
+
+    def SetSheetKinds(self, kinds: Iterable[str]) -> None:
+        """The kinds of sheets (surfels.KINDS) that are drawn; default: all. Another kind is an error of the update."""
+        self._change("_sheet_kinds", (kinds,) if isinstance(kinds, str) else tuple(kinds))
+
     def SetFieldAlpha(self, on: bool) -> None:
         """Add an alpha component to the image, 255 in the imaged field and 0 outside, for overlays; default off."""
         self._change("_field_alpha", bool(on))
@@ -417,7 +436,9 @@ class UltrasoundSimulationFilter(_ImageFilter):
         self._frame = None
         labels = vtkImageData.GetData(inInfo[0])
         volume, tissues = self._patient(labels)
-        simulator = self._simulator.get(labels.GetMTime(), volume, tissues, self._settings, self._device, self._texture)
+        simulator = self._simulator.get(
+            labels.GetMTime(), volume, tissues, self._settings, self._device, self._texture, self._chosen_sheets()
+        )
         pose = self._pose()
         self._frame = simulator.simulate(self._probe, pose, self._display, noise_seed=seed_of_pose(pose))
         image = vtkImageData.GetData(outInfo, 0)
@@ -454,6 +475,15 @@ class UltrasoundSimulationFilter(_ImageFilter):
         for warning in found.warnings:
             _log.warning("%s", warning)
         return found.labels, found.tissues
+
+    def _chosen_sheets(self) -> Surfels | None:
+        """The sheets of the kinds that are drawn; the same object as long as the surface is the same."""
+        if self._sheets_data is None:
+            return None
+        key = (self._sheets_data, self._sheets_data.GetMTime(), self._sheet_kinds)
+        if self._sheets is None or self._sheets[0] != key:
+            self._sheets = key, surfels_of(self._sheets_data, "sheets").of_kind(*self._sheet_kinds)
+        return self._sheets[1]
 
     def _pose(self) -> np.ndarray:
         return check_rigid("probe transform", matrix_array(self._placed_outline.GetTransform().GetMatrix()))
