@@ -94,8 +94,8 @@ class Device:
             opened = _opened[info] = Device(info)
             if not opened.rounds_divisions:
                 _log.warning(
-                    "%s does not round divisions as IEEE 754 says: its images may differ by a grey level from those of "
-                    "other devices",
+                    "%s does not round divisions as IEEE 754 says: its images may differ from those of other devices: "
+                    "by a grey level, and by more where a ray grazes a voxel",
                     info,
                 )
         return _opened[info]
