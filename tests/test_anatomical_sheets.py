@@ -222,6 +222,12 @@ def test_files_that_are_no_sheets_are_named(tmp_path):
     (tmp_path / "own.ply").write_bytes(text)
     with pytest.raises(SimulationError, match="not as this program wrote it"):
         require_own_surface(tmp_path / "own.ply")
+    # VTK ended the process for a damaged one
+    text = (tmp_path / "own.vtp").read_bytes()
+    for cut in (len(text) // 2, len(text) - 200):
+        (tmp_path / "own.vtp").write_bytes(text[:cut] + b"\xff" * 40 + text[cut + 40 :])
+        with pytest.raises(SimulationError, match="not as this program wrote it"):
+            require_own_surface(tmp_path / "own.vtp")
 
 
 def test_surfels_are_checked_and_chosen_by_kind():
@@ -390,6 +396,13 @@ def test_sheets_are_kept_and_each_can_be_switched_off(tmp_path):
     assert np.array_equal(only.surfels.place, there.place)
     other = Volume(mri.array + np.float32(1.0), mri.ijk_to_ras)
     assert read_kept_sheets(place, key_of(other, found, "t1"), ("falx",)) is None
+    # Half of the arrays would be taken for all
+    key = key_of(mri, found, "t1")
+    assert read_kept_sheets(place, key, ("falx",)) is not None
+    with np.load(place) as file:
+        arrays = dict(file)
+    np.savez_compressed(place, **{**arrays, "structures": arrays["structures"][:5]})
+    assert read_kept_sheets(place, key, ("falx",)) is None
 
 
 def test_a_file_of_others_is_not_replaced_and_no_use_as_kept_sheets(tmp_path):

@@ -5,8 +5,10 @@ from __future__ import annotations
 import inspect
 import json
 import os
+import struct
 import subprocess
 import sys
+import zlib
 
 import numpy as np
 import pytest
@@ -274,6 +276,41 @@ def test_no_command_replaces_a_file_that_it_reads(command, labels, tmp_path):
     Volume.read(labels).write(table)
     result = ussim(command, labels, *more, "--add", f"tumour={table}", "-o", table)
     assert result.exit_code == 2 and own.read_bytes() == before
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="pipes have no names here")
+def test_pipes_and_devices_are_no_outputs_and_endless_inputs_are_refused(labels, tmp_path):
+    """Both waited for ever, or filled the memory."""
+    for name in ("o.png", "o.nii.gz", "o.mha"):
+        os.mkfifo(tmp_path / name)
+        result = ussim("simulate", labels, "--pose", "auto", "-o", tmp_path / name)
+        assert result.exit_code == 2 and f"{tmp_path / name}: is a pipe or a device, expected" in result.stderr
+    result = ussim("simulate", labels, "--pose", "auto", "--preset", "/dev/zero", "-o", tmp_path / "p.png")
+    assert result.exit_code == 2 and "/dev/zero: has more than" in result.stderr
+
+
+def test_a_picture_that_is_too_large_to_be_looked_at_is_not_replaced(labels, tmp_path):
+    header = struct.pack(">IIBBBBB", 60000, 60000, 8, 0, 0, 0, 0)
+    chunks = b"".join(
+        struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+        for kind, data in ((b"IHDR", header), (b"IDAT", zlib.compress(b"")), (b"IEND", b""))
+    )
+    out = tmp_path / "o.png"
+    out.write_bytes(b"\x89PNG\r\n\x1a\n" + chunks)
+    result = ussim("simulate", labels, "--pose", "auto", "-o", out)
+    assert result.exit_code == 2 and "is not as this program wrote it" in result.stderr
+
+
+def test_values_that_are_no_text_and_sweeps_without_end_are_refused(labels, tmp_path):
+    out = tmp_path / "o.nrrd"
+    result = ussim("simulate", labels, "--pose", "auto", "-o", out, "--set", "probe.depth_mm=\udced\udca0")
+    assert result.exit_code == 2 and "expected NAME=VALUE as text" in result.stderr
+    for options, words in (
+        (("--tilt", "nan"), "a sweep tilts over nan degrees"), (("--slide", "inf"), "a sweep slides over inf mm"),
+        (("--tilt", 10, "--frames", 1_000_000), "not in the range 1<=x<=10000"),
+    ):  # fmt: skip
+        result = ussim("volume", labels, "--pose", "auto", "-o", out, *options)
+        assert result.exit_code == 2 and words in result.stderr and not out.exists()
 
 
 @pytest.mark.parametrize("name", ["o.png", "o.mha", "o.mhd", "o.nrrd", "o.nii.gz", "o.vti"])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import os
 import re
 from pathlib import Path
@@ -10,6 +11,7 @@ import numpy as np
 import pytest
 import SimpleITK as sitk
 from hypothesis import given, settings, strategies as st
+from vtkmodules.vtkIOXML import vtkXMLImageDataWriter
 
 from SlicerUSSim.Logic import SimulationError, Volume
 from SlicerUSSim.Logic.tissue import TissueTable
@@ -67,6 +69,10 @@ def refused(path: Path, words: str, read=Volume.read) -> None:
         (b"DimSize = 4 5 6", b"DimSize = 4 5", "DimSize is '4 5', expected 3 numbers above 0"),
         (b"ElementSpacing = 1 1 2", b"ElementSpacing = 1 1 \xff", "is not text"),
         (b"ElementDataFile", b"ElementDataPile", "its header"),
+        (b"LOCAL", b"%n%n.raw 1 9 1", "ElementDataFile is '%n%n.raw 1 9 1', expected a file"),  # went to printf
+        (b"LOCAL", b"%03d%s.raw 1 6 1", "ElementDataFile is '%03d%s.raw 1 6 1', expected a file"),
+        (b"DimSize = 4 5 6", "DimSize = 4 5 \u0666".encode(), "DimSize is '4 5 \u0666', expected whole numbers"),
+        (b"ElementSpacing = 1 1 2", "ElementSpacing = 1 1 \u0662".encode(), "expected 3 numbers"),
     ],
 )
 def test_a_metaimage_that_no_reader_survives_is_refused(tmp_path, old, new, words):
@@ -86,6 +92,44 @@ def test_a_metaimage_that_no_reader_survives_is_refused(tmp_path, old, new, word
 )
 def test_a_vti_that_no_reader_survives_is_refused(tmp_path, old, new, words):
     refused(with_bytes(written(tmp_path, ".vti"), old, new), words)
+
+
+def test_slices_in_numbered_files_are_read(tmp_path):
+    for number, slice_ in enumerate(ARRAY, 1):
+        (tmp_path / f"slice{number:03d}.raw").write_bytes(slice_.tobytes())
+    header = (
+        written(tmp_path, ".mha").read_bytes().partition(b"ElementDataFile")[0].replace(b"Data = True", b"Data = False")
+    )
+    header = header.replace(b"BinaryData = False", b"BinaryData = True")
+    (tmp_path / "image.mhd").write_bytes(header + b"ElementDataFile = slice%03d.raw 1 6 1\n")
+    np.testing.assert_array_equal(Volume.read(tmp_path / "image.mhd").array, ARRAY)
+
+
+@pytest.mark.parametrize("mode", ["Ascii", "Binary", "Appended", "Raw"])
+@pytest.mark.parametrize("compressor", ["None", "ZLib"])
+@pytest.mark.parametrize("bits", [32, 64])
+def test_numbers_in_front_of_the_values_of_a_vti_are_no_more_than_it_holds(tmp_path, mode, compressor, bits):
+    """VTK allocated gigabytes for a file of 1 kB."""
+    path = tmp_path / "image.vti"
+    writer = vtkXMLImageDataWriter()
+    getattr(writer, f"SetDataModeTo{'Appended' if mode == 'Raw' else mode}")()
+    writer.SetEncodeAppendedData(mode != "Raw")
+    getattr(writer, f"SetCompressorTypeTo{compressor}")()
+    writer.SetHeaderType(bits)
+    writer.SetFileName(str(path))
+    writer.SetInputData(Volume(ARRAY, np.diag([1.0, 1.0, 2.0, 1.0])).to_vtk())
+    writer.Write()
+    np.testing.assert_array_equal(Volume.read(path).array, ARRAY)
+    if mode == "Ascii":
+        return
+    many = np.array([10**9] * (1 if compressor == "None" else 3), f"<u{bits // 8}").tobytes()
+    numbers = many if mode == "Raw" else base64.b64encode(many)
+    content = path.read_bytes()
+    place = content.index(b"_", content.index(b"<AppendedData")) + 1 if mode in ("Appended", "Raw") else None
+    if place is None:
+        place = re.search(rb'format="binary"[^>]*>\s*', content).end()
+    path.write_bytes(content[:place] + numbers + content[place + len(numbers) :])
+    refused(path, "bytes, which its")
 
 
 @pytest.mark.parametrize("suffix", [".mha", ".nrrd", ".vti", ".nii"])
@@ -156,6 +200,7 @@ def test_a_transform_that_is_not_text_is_one_line(tmp_path, damage):
     "old, new, words",
     [
         ("0.1 0.2", "inf 0.2", "Parameters of Euler3DTransform has 'inf', expected numbers"),  # ended the process
+        ("0.1 0.2", "\u0663 0.2", "Parameters of Euler3DTransform has '\u0663', expected numbers"),  # ITK saw five
         ("0.1 0.2 ", "", "Euler3DTransform has 4 parameters, expected 6"),  # was made of what lies behind in memory
         ("Parameters: 0.1", "P: 0.1", "expected Transform, Parameters and FixedParameters"),  # was the identity
         ("\nFixedParameters: 0 0 0 0", "", "expected Transform, Parameters and FixedParameters"),  # was the identity

@@ -650,6 +650,35 @@ def test_voxels_of_others_stay_beside_a_header(tmp_path):
     assert not list(tmp_path.glob(".ussim-*"))
 
 
+_WRITERS = """
+import os, sys
+import numpy as np
+from SlicerUSSim.Logic import Volume
+
+path = sys.argv[1]
+volumes = [Volume((np.arange(1320) % n).reshape(12, 11, 10).astype(np.int16), np.eye(4)) for n in (50, 60)]
+for _ in range(15):
+    children = []
+    for first in range(3):
+        child = os.fork()
+        if child == 0:
+            for number in range(4):
+                volumes[(first + number) % 2].write(path)
+            os._exit(0)
+        children.append(child)
+    assert all(os.waitpid(child, 0)[1] == 0 for child in children), "a writer failed"
+    found = Volume.read(path).array
+    assert any(np.array_equal(found, volume.array) for volume in volumes), "halves of two runs"
+"""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="processes are forked")
+def test_runs_that_write_one_header_at_once_leave_the_voxels_that_it_names(tmp_path):
+    """One removed the voxels that another had moved, but not named yet."""
+    subprocess.run([sys.executable, "-c", _WRITERS, str(tmp_path / "a.mhd")], check=True)
+    assert len(list(tmp_path.iterdir())) == 2
+
+
 def test_voxels_that_a_header_names_but_we_did_not_write_stay(tmp_path):
     image = Volume(numbered((20, 20, 20)), np.eye(4))
     image.write(tmp_path / "a.mhd")

@@ -45,6 +45,7 @@ class Changes:
         changes = cls()
         for text in texts:
             name, equals, value = (part.strip() for part in text.partition("="))
+            require(name.isprintable() and value.isprintable(), f"--set is {text!r}, expected NAME=VALUE as text")
             require(name and equals, f"--set is {text!r}, expected NAME=VALUE, such as display.gain_db=3")
             section, _, attribute = name.rpartition(".")
             parameter, place = changes._found(name, section, attribute)

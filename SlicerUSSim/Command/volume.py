@@ -20,7 +20,9 @@ from SlicerUSSim.Logic.base.errors import SimulationError
 @click.option(
     "--slide", type=float, help="Slide the probe across its image plane over this total distance in millimetres."
 )
-@click.option("--frames", type=click.IntRange(1), default=61, show_default=True, help="Number of images in the sweep.")
+@click.option(
+    "--frames", type=click.IntRange(1, 10_000), default=61, show_default=True, help="Number of images in the sweep."
+)
 @click.option("--spacing", type=float, default=0.5, show_default=True, help="Voxel size [mm].")
 @click.option("--like", type=click.Path(), help="Use the voxel grid of this volume, such as the MRI.")
 def volume(

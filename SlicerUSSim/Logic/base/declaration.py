@@ -157,7 +157,7 @@ class Parameter:
         plain = _plain(value)
         # msgspec before 0.22 fails for whole numbers beyond the range of a float.
         if not (isinstance(plain, int) and abs(plain) > _HUGE):
-            with suppress(msgspec.ValidationError):
+            with suppress(msgspec.ValidationError, UnicodeEncodeError):  # a text of a command line may be no Unicode
                 return msgspec.convert(plain, self._accepted, strict=True)
         raise SimulationError(f"{owner}: {self.name} is {short(value)}, expected {self.expected}")
 

@@ -35,6 +35,7 @@ def require_place(path: Path) -> None:
     """Raise SimulationError unless `path` can be a file in an existing folder."""
     require(path.parent.is_dir(), f"{path}: the folder {path.parent} does not exist")
     require(not path.is_dir(), f"{path}: is a folder, expected a file name")
+    require(path.is_file() or not path.exists(), f"{path}: is a pipe or a device, expected the name of a file")
     require(os.access(path.parent, os.W_OK), f"{path}: cannot be written (no permission in {path.parent})")
 
 
@@ -172,7 +173,7 @@ def _new_partial_folder(parent: Path) -> Path:
     for old in parent.glob(f"{_PARTIAL}{host}-*-*"):
         number = old.name.split("-")[2]
         if number.isdecimal() and not _is_running(int(number)):
-            with suppress(OSError):
+            with suppress(OSError), _alone_in(parent):
                 _remove_unnamed(old)
             shutil.rmtree(old, ignore_errors=True)
     return Path(tempfile.mkdtemp(prefix=f"{_PARTIAL}{host}-{os.getpid()}-", dir=parent))
@@ -220,13 +221,35 @@ def _put_in_place(folder: Path, path: Path) -> None:
         is_own = file.name == path.name or _is_voxels_of(file.name, path)
         require(is_own, f"{path}: would be written as {file.name}; give another name")
     voxels = sorted(file for file in folder.iterdir() if file != main)
-    if path.suffix.lower() in _HEADERS and path.is_file():
-        _keep_header(path, folder)
+    with _alone_in(path.parent):
+        if path.suffix.lower() in _HEADERS and path.is_file():
+            _keep_header(path, folder)
+        try:
+            move_into(path.parent, [*voxels, main])  # the header, which names the voxels, last
+        finally:
+            with suppress(OSError):
+                _remove_unnamed(folder)
+
+
+@contextmanager
+def _alone_in(folder: Path) -> Iterator[None]:
+    """Keep other runs of this program from moving and removing files in a folder meanwhile, where that can be.
+
+    Another run may write the same voxels, which have the same name: they are there before the header that names them.
+    """
+    lock = None
     try:
-        move_into(path.parent, [*voxels, main])  # the header, which names the voxels, last
+        import fcntl
+
+        lock = os.open(folder, os.O_RDONLY)
+        fcntl.flock(lock, fcntl.LOCK_EX)
+    except (ImportError, OSError):  # on Windows, and on some network disks
+        pass
+    try:
+        yield
     finally:
-        with suppress(OSError):
-            _remove_unnamed(folder)
+        if lock is not None:
+            os.close(lock)
 
 
 def _keep_header(path: Path, folder: Path) -> None:
@@ -305,7 +328,10 @@ def read_json(path: str | os.PathLike, most_bytes: int = 4 * 2**20):
     require_path(path)
     try:
         require_small(path, most_bytes)
-        text = Path(path).read_text(encoding="utf-8")
+        with open(path, "rb") as file:
+            content = file.read(most_bytes + 1)  # pipes and devices have no size
+        require(len(content) <= most_bytes, f"{path}: has more than {most_bytes} bytes, expected at most as many")
+        text = content.decode("utf-8")
         _check_nesting(path, text)
         return json.loads(text, object_pairs_hook=_distinct, parse_constant=_refused)
     except OSError as error:

@@ -6,11 +6,15 @@ directions of 1e308, and VTK's XML reader allocates what the extent says.
 
 from __future__ import annotations
 
+import base64
 import math
+import mmap
 import os
 import re
+import struct
 import zlib
 from collections.abc import Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from xml.parsers import expat
 
@@ -32,11 +36,15 @@ _MOST = 1e9
 #: The part of a file in which its header ends; sequences have some hundred bytes for every image
 _MOST_HEADER_BYTES = 2**26
 _CHUNK = 2**18  # bytes
+#: Bytes that VTK may allocate for an array, however small its file is; and the longest text of numbers in front of one
+_LEAST_BLOCK, _BLOCK_TEXT = 2**20, 40
 #: Where a VTI file ends, and in which of its last bytes
 _VTI_END, _LAST_BYTES = b"</VTKFile>", 4096
 #: Millimetres that voxels may have along an axis, and those that suggest that the file is in metres
 _SPACING_MM, _LIKE_METRES = (0.01, 50.0), (1e-4, 9e-3)
 _DIMENSIONS = range(2, 5)
+#: Value of ElementDataFile for a file per slice: a pattern with one number, and first, last and step of that
+_NUMBERED_FILES = r"[^%]*%(0?[0-9]{1,2})?d[^%]*?([ \t]+[0-9]{1,9}){0,3}"
 
 
 def require_readable_name(path: str | os.PathLike) -> None:
@@ -132,6 +140,12 @@ def _require_metaimage(path: Path) -> None:
         f"{path}: NDims is {fields.get('NDims', 'missing')[:40]}, expected 2, 3 or 4",
     )
     count = dimensions[0]
+    pattern = fields["ElementDataFile"]
+    require(  # MetaIO hands it to printf
+        "%" not in pattern or re.fullmatch(_NUMBERED_FILES, pattern),
+        f"{path}: ElementDataFile is {pattern[:80]!r}, expected a file, LOCAL, LIST, or a pattern, as 'slice%03d.raw 1 9 "
+        "1'",
+    )
     size = _whole(path, fields, "DimSize")
     require(
         len(size) == count and min(size) > 0,
@@ -182,7 +196,7 @@ def _metaimage_fields(path: Path) -> dict[str, str]:
 def _whole(path: Path, fields: dict[str, str], name: str) -> list[int]:
     text = fields.get(name, "")
     require(
-        re.fullmatch(r"[-+]?\d{1,18}(\s+[-+]?\d{1,18})*", text),
+        re.fullmatch(r"[-+]?[0-9]{1,18}([ \t]+[-+]?[0-9]{1,18})*", text),
         f"{path}: {name} is {text[:80]!r}, expected whole numbers",
     )
     return [int(part) for part in text.split()]
@@ -190,7 +204,7 @@ def _whole(path: Path, fields: dict[str, str], name: str) -> list[int]:
 
 def _require_numbers(path: Path, name: str, text: str, count: int) -> None:
     try:
-        values = [float(part) for part in text.split()]
+        values = [float(part) for part in text.split() if part.isascii()]  # Python reads the digits of all scripts
     except ValueError:
         values = []
     require(
@@ -264,6 +278,94 @@ def _require_vti(path: Path) -> None:
             file.read().rstrip().endswith(_VTI_END),
             f"{path}: is incomplete, expected {_VTI_END.decode()} at its end; copy or export it again",
         )
+    _require_vti_blocks(path)
+
+
+@dataclass
+class _VtiData:
+    """Where a VTI file has the values of its arrays, and how."""
+
+    words: str = "<I"  # struct's format of a number in front of values
+    is_compressed: bool = False
+    #: Beginnings of values within the XML, and places of those behind it
+    inline: list[str] = field(default_factory=list)
+    offsets: list[int] = field(default_factory=list)
+    encoding: str = ""
+
+
+def _require_vti_blocks(path: Path) -> None:
+    """Raise SimulationError if the numbers in front of values promise more than a file can hold: VTK allocates that."""
+    data, size = _vti_data(path), path.stat().st_size
+    length = struct.calcsize(data.words) * (3 if data.is_compressed else 1)
+    starts = [_from_base64(text, length) for text in data.inline]
+    if data.offsets:
+        with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
+            begin = content.find(b"_", content.find(b"<AppendedData")) + 1
+            require(begin > 0, f"{path}: the values behind <AppendedData> do not begin with '_', as VTK writes them")
+            for offset in data.offsets:
+                at = begin + offset
+                require(at < size, f"{path}: an array has the offset {offset}, expected one within the file")
+                is_raw = data.encoding == "raw"
+                text = content[at : at + (length if is_raw else 4 * length)]
+                starts.append(text if is_raw else _from_base64(text.decode("ascii", "replace"), length))
+    for start in starts:
+        if len(start) < length:  # an empty array
+            continue
+        numbers = [number for (number,) in struct.iter_unpack(data.words, start)]
+        promised = numbers[0]
+        if data.is_compressed:
+            blocks, block, last = numbers
+            promised = max(blocks * block, last, blocks)
+        most = size * (_MOST_EXPANSION if data.is_compressed else 1)
+        require(
+            promised <= max(most, _LEAST_BLOCK),
+            f"{path}: an array promises {promised} bytes, which its {size} bytes cannot hold; copy or export it again",
+        )
+
+
+def _vti_data(path: Path) -> _VtiData:
+    found, is_binary = _VtiData(), [False]
+    parser = expat.ParserCreate()
+
+    def started(name: str, attributes: dict[str, str]) -> None:
+        if name == "VTKFile":
+            order = ">" if attributes.get("byte_order") == "BigEndian" else "<"
+            found.words = order + ("Q" if attributes.get("header_type") == "UInt64" else "I")
+            found.is_compressed = "compressor" in attributes
+        elif name == "AppendedData":
+            found.encoding = attributes.get("encoding", "base64")
+        elif attributes.get("format") == "appended":
+            offset = attributes.get("offset", "")
+            require(re.fullmatch("[0-9]{1,18}", offset.strip()), f"{path}: an array has the offset {offset!r:.40}")
+            found.offsets.append(int(offset))
+        is_binary[0] = attributes.get("format") == "binary"
+        if is_binary[0]:
+            found.inline.append("")
+
+    def told(text: str) -> None:
+        if is_binary[0] and len(found.inline[-1]) < _BLOCK_TEXT:
+            found.inline[-1] += text.strip()[:_BLOCK_TEXT]
+
+    def ended(_: str) -> None:
+        is_binary[0] = False
+
+    parser.StartElementHandler, parser.EndElementHandler, parser.CharacterDataHandler = started, ended, told
+    with path.open("rb") as file:
+        while not found.encoding and (chunk := file.read(_CHUNK)):
+            try:
+                parser.Parse(chunk)
+            except expat.ExpatError:  # behind the start of voxels, which are no XML; of others VTK says so
+                break
+    return found
+
+
+def _from_base64(text: str, length: int) -> bytes:
+    """The first bytes of a text in base64; fewer if there are not as many."""
+    text = "".join(text.split())[: 4 * -(-length // 3)]
+    try:
+        return base64.b64decode(text)[:length]
+    except ValueError:
+        return b""
 
 
 def _vti_header(path: Path) -> dict[str, str]:
@@ -295,7 +397,7 @@ def _vti_header(path: Path) -> dict[str, str]:
 
 def _extent(path: Path, text: str, name: str) -> list[int]:
     require(
-        re.fullmatch(r"\s*[-+]?\d{1,9}(\s+[-+]?\d{1,9}){5}\s*", text),
+        re.fullmatch(r"\s*[-+]?[0-9]{1,9}(\s+[-+]?[0-9]{1,9}){5}\s*", text),
         f"{path}: {name} is {text[:80]!r}, expected six numbers",
     )
     values = [int(part) for part in text.split()]

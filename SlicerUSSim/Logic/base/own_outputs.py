@@ -14,8 +14,9 @@ from typing import Any
 
 import numpy as np
 
-from SlicerUSSim.Logic.base.errors import SimulationError, require
+from SlicerUSSim.Logic.base.errors import require
 from SlicerUSSim.Logic.base.files import read_json, write_json
+from SlicerUSSim.Logic.base.reading import in_child
 from SlicerUSSim.Logic.base.volume import MADE_BY, Volume, read_itk_image
 
 _PROGRAM = "SlicerUSSim"
@@ -35,7 +36,7 @@ def require_own(*paths: Path | None) -> None:
     """
     for path in paths:
         require(
-            path is None or not path.exists() or _is_own(path),
+            path is None or not path.exists() or (path.is_file() and _is_own(path)),
             f"{path}: exists and is not as this program wrote it, so it is not replaced; choose another name, or "
             "remove it",
         )
@@ -98,7 +99,7 @@ def _is_own(path: Path) -> bool:
             text, _, last = path.read_text(encoding="utf-8").rpartition(_COMMENT)
             return bool(text) and marked_html(text) == f"{text}{_COMMENT}{last}"
         return _is_own_vti(path) if path.suffix.lower() == ".vti" else _is_own_itk(path)
-    except (OSError, ValueError, SimulationError):
+    except Exception:  # whatever libraries raise for what is none of ours; PIL for an image of too many pixels
         return False
 
 
@@ -109,6 +110,7 @@ def _is_own_png(path: Path) -> bool:
         return image.info.get(_PNG_ENTRY) == mark_of(np.asarray(image))
 
 
+@in_child  # VTK ends the process for some damaged files
 def _is_own_vti(path: Path) -> bool:
     from vtkmodules.util.numpy_support import vtk_to_numpy
     from vtkmodules.vtkIOXML import vtkXMLImageDataReader

@@ -167,7 +167,11 @@ def angles_to_surface(probe_to_ras: np.ndarray, outward_ras) -> tuple[float, flo
 
 
 def slide_sweep(probe_to_ras: np.ndarray, length_mm: float, frames: int) -> list[np.ndarray]:
-    """Poses (4, 4) of a probe that slides across its image plane, `length_mm` in total, centred at `probe_to_ras`."""
+    """Poses (4, 4) of a probe that slides across its image plane, `length_mm` in total, centred at `probe_to_ras`.
+
+    Raises SimulationError for a length that is not finite, and an invalid number of frames.
+    """
+    require(np.isfinite(length_mm), f"a sweep slides over {length_mm} mm, expected a finite number")
     return [probe_to_ras @ elevational_motion(offset_mm=share * length_mm) for share in _shares(frames)]
 
 
@@ -180,7 +184,10 @@ def tilt_sweep(probe_to_ras: np.ndarray, angle_deg: float, frames: int) -> list[
     >>> poses = tilt_sweep(np.eye(4), angle_deg=60, frames=7)
     >>> [round(float(np.rad2deg(np.arcsin(pose[2, 1])))) for pose in poses]
     [-30, -20, -10, 0, 10, 20, 30]
+
+    Raises SimulationError for an angle that is not finite, and an invalid number of frames.
     """
+    require(np.isfinite(angle_deg), f"a sweep tilts over {angle_deg} degrees, expected a finite number")
     return [probe_to_ras @ elevational_motion(angle_deg=share * angle_deg) for share in _shares(frames)]
 
 

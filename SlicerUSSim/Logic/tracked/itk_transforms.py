@@ -31,7 +31,7 @@ _LINEAR = {
     "ScaleSkewVersor3DTransform": 15,
 }
 _COMPOSITE = "CompositeTransform"
-_NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d{1,3})?"
+_NUMBER = r"[-+]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][-+]?[0-9]{1,3})?"
 
 
 def require_sound_text(path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import logging
 import zipfile
@@ -10,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from SlicerUSSim.Logic.base.errors import SimulationError
+from SlicerUSSim.Logic.base.errors import SimulationError, require
 from SlicerUSSim.Logic.base.files import make_folder, written_whole
 from SlicerUSSim.Logic.base.version import __version__
 from SlicerUSSim.Logic.base.volume import Volume
@@ -44,7 +45,10 @@ def read_kept_sheets(path: Path, key: str, kinds: tuple[str, ...]) -> tuple[Surf
                 head = json.loads(str(file["ussim_sheets"]))
                 if head["key"] != key or not _holds(set(head["kinds"]), set(kinds)):
                     continue
-                return Surfels(*(file[entry.name] for entry in fields(Surfels))), file["structures"], place
+                arrays = {entry.name: file[entry.name] for entry in fields(Surfels)}
+                surfels, structures = Surfels(**arrays), file["structures"]
+                require(head.get("arrays") == _hash_of(surfels, structures), "its arrays are not as they were written")
+                return surfels, structures, place
         except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile, SimulationError) as error:
             _log.info("%s: is not used as kept sheets (%s)", place, error)
     return None
@@ -57,7 +61,8 @@ def keep_sheets(path: Path, key: str, kinds: tuple[str, ...], surfels: Surfels, 
     """
     if path.exists() and not _is_ours(path):
         return f"{path} was not written by ussim and stays as it is; the sheets are not kept"
-    head = json.dumps({"key": key, "kinds": kinds, "version": __version__})
+    arrays = _hash_of(surfels, structures)
+    head = json.dumps({"key": key, "kinds": kinds, "version": __version__, "arrays": arrays})
     try:
         _write(path, head, surfels, structures)
         return f"the sheets are kept in {path}"
@@ -76,6 +81,15 @@ def _write(path: Path, head: str, surfels: Surfels, structures: np.ndarray) -> N
     arrays = {entry.name: getattr(surfels, entry.name) for entry in fields(surfels)}
     with written_whole(path) as partial:
         np.savez_compressed(partial, ussim_sheets=np.array(head), structures=structures, **arrays)
+
+
+def _hash_of(surfels: Surfels, structures: np.ndarray) -> str:
+    """Of all arrays and their shapes: half of them would be taken for all."""
+    found = hashlib.sha256()
+    for array in (*(getattr(surfels, entry.name) for entry in fields(surfels)), structures):
+        found.update(f"{array.dtype} {array.shape}".encode())
+        found.update(np.ascontiguousarray(array).tobytes())
+    return found.hexdigest()
 
 
 def _is_ours(path: Path) -> bool:
