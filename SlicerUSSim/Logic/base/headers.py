@@ -143,8 +143,8 @@ def _require_metaimage(path: Path) -> None:
     pattern = fields["ElementDataFile"]
     require(  # MetaIO hands it to printf
         "%" not in pattern or re.fullmatch(_NUMBERED_FILES, pattern),
-        f"{path}: ElementDataFile is {pattern[:80]!r}, expected a file, LOCAL, LIST or numbered files, as 'slice%03d.raw "
-        "1 9 1'",
+        f"{path}: ElementDataFile is {pattern[:80]!r}, expected a file, LOCAL, LIST or numbered files, as "
+        "'slice%03d.raw 1 9 1'",
     )
     size = _whole(path, fields, "DimSize")
     require(
