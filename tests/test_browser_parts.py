@@ -433,13 +433,19 @@ def test_a_cine_keeps_time_and_begins_anew_with_another_size():
         gif(cine.images)
     cine.add(np.zeros((10, 10), np.uint8), 0.0)
     for number in range(4):
-        cine.add(np.full((12, 16), 50 * number, np.uint8), 10.0 + 0.25 * number)
+        about = json.dumps({"time": number, "preset": {"gain": number // 2}}) if number else ""
+        cine.add(np.full((12, 16), 50 * number, np.uint8), 10.0 + 0.25 * number, about)
     told: list[float] = []
-    loop = Image.open(io.BytesIO(gif(cine.images, "whose", told.append)))
+    loop = Image.open(io.BytesIO(gif(cine.images, told.append)))
     assert loop.size == (16, 12) and loop.n_frames == 4 and len(cine) == 4 and told == [0.25, 0.5, 0.75]
     for number in range(3):
         loop.seek(number)
         assert loop.info["duration"] == 250 and np.asarray(loop.convert("L"))[0, 0] == 50 * number
+    loop.seek(0)
+    assert json.loads(loop.info["comment"]) == {
+        "images": [{}, {"time": 1, "preset": 0}, {"time": 2, "preset": 1}, {"time": 3, "preset": 1}],
+        "presets": [{"gain": 0}, {"gain": 1}],
+    }
 
     def cancelled(share: float) -> None:
         raise Cancelled

@@ -102,7 +102,13 @@ def test_an_image_comes_with_patient_time_pose_and_ruler(page):
     assert json.loads(vti.GetOutput().GetFieldData().GetAbstractArray("SlicerUSSim").GetValue(0)) == about
     with new_image(page):
         page.keyboard.press("a")
-    assert "head.nii.gz, 20" in Image.open(download(page, "gif")).info["comment"].decode()
+    loop = Image.open(download(page, "gif"))
+    kept = json.loads(loop.info["comment"])
+    assert len(kept["images"]) >= loop.n_frames > 1  # equal images are one frame
+    last, moved = kept["images"][-1], page.evaluate("window.ussim.image")
+    assert last["patient"] == "head.nii.gz" and kept["presets"][last["preset"]] == about["preset"]
+    np.testing.assert_allclose(last["probe_to_ras"], moved["pose"], atol=1e-3)
+    assert kept["images"][-2]["probe_to_ras"] != last["probe_to_ras"] and kept["images"][-2]["time"] < last["time"]
 
 
 def test_ruler_and_image_change_together(page):

@@ -40,7 +40,7 @@ from SlicerUSSim.Logic.mrml.taken_sequence import (
     version_taken,
 )
 from SlicerUSSim.Widget.presenter import PanelPresenter
-from SlicerUSSim.Workstation.export import MOST_IMAGES, Cine
+from SlicerUSSim.Workstation.export import MOST_IMAGES, Cine, CineImage
 from SlicerUSSim.Workstation.opener import Opener
 from SlicerUSSim.Workstation.session_store import OwnSession
 from SlicerUSSim.Workstation.state import SharedState
@@ -74,8 +74,8 @@ class _Taken:
     has_frozen: bool
     fit: tuple | None
     has_fit: bool
-    #: (time, image) that are new, and whether they begin a loop
-    cine: list[tuple[float, np.ndarray]]
+    #: Images that are new, and whether they begin a loop
+    cine: list[CineImage]
     is_new_loop: bool
     #: {name: where it is} of the files that a page has sent
     sent: dict[str, Path]
@@ -203,7 +203,6 @@ class Autosave:
             "costs": self._shared.now.fit.costs,
             "source": None if source is None else source.to_dict(),
             "lesions": None if files is None else [list(entry) for entry in files],
-            "about": self._cine.about,
             "landmarks": [mark.to_list() for mark in self._landmarks()],
         }
         is_new_loop = self._cine.loop != self._cine_seen[0]
@@ -299,7 +298,10 @@ class Autosave:
             self._chunks = []
         if taken.cine:
             self._number += 1
-            name, images = f"cine-{self._number}", [(seconds, _jpeg(image)) for seconds, image in taken.cine]
+            name, images = (
+                f"cine-{self._number}",
+                [(seconds, _jpeg(image), about) for seconds, image, about in taken.cine],
+            )
             session.write(name, lambda file: write_values(file, images))
             self._chunks.append((name, len(images)))
         while self._chunks and sum(count for _, count in self._chunks[1:]) >= MOST_IMAGES:

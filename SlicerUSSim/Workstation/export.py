@@ -11,7 +11,7 @@ from contextlib import AbstractContextManager
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from PIL import Image
@@ -61,13 +61,22 @@ def frame_file(taken: TakenImage, suffix: str) -> bytes:
         return path.read_bytes()
 
 
+class CineImage(NamedTuple):
+    """One image of a cine loop."""
+
+    #: When it was shown
+    seconds: float
+    #: (rows, columns) uint8
+    image: np.ndarray
+    #: What it is of, as JSON, see TakenImage.about; "" if that is not known
+    about: str = ""
+
+
 class Cine:
     """A cine loop: the last images, as in a scanner."""
 
     def __init__(self) -> None:
-        self._images: deque[tuple[float, np.ndarray]] = deque(maxlen=MOST_IMAGES)
-        #: What the last image is of
-        self.about = ""
+        self._images: deque[CineImage] = deque(maxlen=MOST_IMAGES)
         #: Number of images that were ever added, and of loops that were begun
         self.added = self.loop = 0
 
@@ -76,57 +85,71 @@ class Cine:
 
     def add(self, image: np.ndarray, seconds: float, about: str = "") -> None:
         """Append a (rows, columns) uint8 image with its time and what it is of; another size starts a new loop."""
-        if self._images and self._images[-1][1].shape != image.shape:
+        if self._images and self._images[-1].image.shape != image.shape:
             self.clear()
-        self._images.append((seconds, image))
+        self._images.append(CineImage(seconds, image, about))
         self.added += 1
-        self.about = about
 
     def clear(self) -> None:
         """Forget all images."""
         self._images.clear()
         self.loop += 1
 
-    def since(self, added: int) -> list[tuple[float, np.ndarray]]:
-        """(time, image) of those in the loop that were added after the first `added` images."""
+    def since(self, added: int) -> list[CineImage]:
+        """Those in the loop that were added after the first `added` images."""
         count = min(max(self.added - added, 0), len(self._images))
         return list(self._images)[len(self._images) - count :]
 
-    def restore(self, images: list[tuple[float, np.ndarray]], until: float, about: str = "") -> None:
-        """Begin with (time, image) of an earlier loop, the last of which is moved to the time `until`."""
+    def restore(self, images: list[CineImage], until: float) -> None:
+        """Begin with the images of an earlier loop, the last of which is moved to the time `until`."""
         self.clear()
-        for seconds, image in images:
-            self.add(image, until + seconds - images[-1][0], about)
+        for seconds, image, about in images:
+            self.add(image, until + seconds - images[-1].seconds, about)
 
     @property
-    def images(self) -> list[tuple[float, np.ndarray]]:
-        """(time, image) of all, which are never changed."""
+    def images(self) -> list[CineImage]:
+        """All, which are never changed."""
         return list(self._images)
 
 
-def gif(
-    timed: Sequence[tuple[float, np.ndarray]], about: str = "", progress: Callable[[float], None] = lambda share: None
-) -> bytes:
-    """An animated GIF of (time, image), with the original timing.
+def gif(images: Sequence[CineImage], progress: Callable[[float], None] = lambda share: None) -> bytes:
+    """An animated GIF with the original timing, and what each image is of as a comment (of_images).
 
     `progress` is called with the fraction done before every image, and may raise errors.Cancelled.
     Raises SimulationError for fewer than two images.
     """
-    require(len(timed) > 1, f"the cine loop has {len(timed)} images, expected two or more")
-    times = np.array([seconds for seconds, _ in timed])
+    require(len(images) > 1, f"the cine loop has {len(images)} images, expected two or more")
+    times = np.array([one.seconds for one in images])
     waits = np.clip(np.diff(times, append=times[-1] + 0.2) * 1e3, _SHORTEST_MS, _LONGEST_MS)
 
     def others() -> Iterator[Image.Image]:
-        for number, (_, image) in enumerate(timed[1:], 1):
-            progress(number / len(timed))
-            yield Image.fromarray(image)
+        for number, one in enumerate(images[1:], 1):
+            progress(number / len(images))
+            yield Image.fromarray(one.image)
 
     buffer = io.BytesIO()
-    Image.fromarray(timed[0][1]).save(
+    Image.fromarray(images[0].image).save(
         buffer, "GIF", save_all=True, append_images=others(), duration=waits.round(-1).astype(int).tolist(), loop=0,
-        comment=about.encode(),
+        comment=of_images(images).encode(),
     )  # fmt: skip
     return buffer.getvalue()
+
+
+def of_images(images: Sequence[CineImage]) -> str:
+    """What images are of, as JSON {"images": one for each, "presets": once each, by the images' "preset"}.
+
+    See TakenImage.about; {} for an image of which that is not known.
+    """
+    presets: list[Any] = []
+    about: list[dict[str, Any]] = []
+    for one in images:
+        known = json.loads(one.about) if one.about else {}
+        if "preset" in known:
+            if known["preset"] not in presets[-1:]:
+                presets.append(known["preset"])
+            known["preset"] = len(presets) - 1
+        about.append(known)
+    return json.dumps({"images": about, "presets": presets})
 
 
 class Exports:
@@ -168,9 +191,9 @@ class Exports:
                 content = self._tasks.doAside(lambda: sent.bundle(text, missing, progress))
             return "ultrasound.zip", content, "application/zip"
         if kind == "gif":
-            images, about = self._cine.images, self._cine.about
+            images = self._cine.images
             with self._progress("Export the images") as progress:
-                content = self._tasks.doAside(lambda: gif(images, about, progress))
+                content = self._tasks.doAside(lambda: gif(images, progress))
             return "ultrasound.gif", content, "image/gif"
         require(kind in ("png", *FRAME_SUFFIXES), f"the export is {kind[:20]!r}, expected one of the menu")
         taken = required(self._logic.taken, _NO_IMAGE)

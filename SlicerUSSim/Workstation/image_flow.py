@@ -9,7 +9,7 @@ import numpy as np
 
 from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic
 from SlicerUSSim.Logic.mrml.nodes import node_to_world
-from SlicerUSSim.Logic.mrml.taken_image import TakenImage
+from SlicerUSSim.Logic.mrml.taken_image import TakenImage, about_as_json
 from SlicerUSSim.Logic.probe.arrays import Probe
 from SlicerUSSim.Logic.probe.image_grid import ImageGrid
 from SlicerUSSim.Workstation.anatomy import AnatomyViews
@@ -68,7 +68,7 @@ class ImageFlow:
             self.clear()
             return
         self._simulated.send(taken.image, stamp=self._stamps.computed, **description(taken))
-        self._cine.add(taken.image, perf_counter(), f"{taken.patient}, {taken.time}")
+        self._cine.add(taken.image, perf_counter(), about_as_json(taken.node))
         self._show_in_views()
         if self._tracker.is_on:
             self._tracker.send(taken.volume())

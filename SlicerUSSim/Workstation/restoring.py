@@ -21,7 +21,7 @@ from SlicerUSSim.Logic.mrml.nodes import display_of, set_node_to_world
 from SlicerUSSim.Logic.mrml.scene_record import ROLES, SceneRecord, SequenceRecord, put_nodes, put_values
 from SlicerUSSim.Logic.mrml.taken_sequence import FrozenRecord, SimulatedRecord, put_taken
 from SlicerUSSim.Widget.presenter import PanelPresenter
-from SlicerUSSim.Workstation.export import Cine
+from SlicerUSSim.Workstation.export import Cine, CineImage
 from SlicerUSSim.Workstation.loading import Loading
 from SlicerUSSim.Workstation.opener import Opener, show_all_tissue
 from SlicerUSSim.Workstation.probe_control import ProbeControl
@@ -145,7 +145,7 @@ class Restoring:
         record: SceneRecord,
         kept: Mapping[str, Any],
         fit: tuple[Fit, Preset | None] | None,
-        images: list[tuple[float, np.ndarray]],
+        images: list[CineImage],
     ) -> None:
         parameters: Any = self._logic.parameters
         simulated = None if record.simulated is None else put_taken(self._scene, record.simulated)
@@ -189,7 +189,7 @@ class Restoring:
             self._presenter.fits.restore(*fit, labels)
             with self._shared.changing() as now:
                 now.fit.curve, now.fit.costs = [float(cost) for cost in kept["curve"]], str(kept["costs"])
-        self._cine.restore(images, self._now(), str(kept.get("about", "")))
+        self._cine.restore(images, self._now())
         self._presenter.setNotes(*map(str, kept.get("notes", ())), *refused)
         self._loading.show_restored(is_placed=pose is not None, frozen=record.frozen)
 
@@ -240,8 +240,8 @@ def _parts_of(session: KeptSession) -> tuple[SceneRecord, tuple[Fit, Preset | No
     record = SceneRecord(anatomy.nodes, {}, pose, recorded, landmarks=landmarks, simulated=made, frozen=image)
     images = []
     for name in content["files"].get("cine", []):
-        for seconds, jpeg in session.read_file(str(name)):
-            images.append((float(seconds), _decoded(jpeg)))
+        for seconds, jpeg, *about in session.read_file(str(name)):  # without it in sessions of earlier versions
+            images.append(CineImage(float(seconds), _decoded(jpeg), *map(str, about)))
     fit: Any = session.read("fit")
     return record, fit, images
 

@@ -81,6 +81,11 @@ def write_about(taken: TakenImage) -> None:
     taken.node.RemoveAttribute(_FROZEN)
 
 
+def about_as_json(volume_node) -> str:
+    """What the image in a volume node is of, as write_about keeps it; "" of a volume that is no such image."""
+    return volume_node.GetAttribute(_ABOUT) or ""
+
+
 def about_image(volume_node) -> dict[str, Any]:
     """What the image in a volume node is of, see TakenImage.about; {} of a volume that is no such image."""
     text = volume_node.GetAttribute(_ABOUT)
