@@ -325,11 +325,14 @@ def recorded_images(scene):
 
 def test_real_images_of_a_scene_keep_their_probe_and_registration_whatever_depth_is_set_now():
     """A depth that a user had set since was taken for a wrong calibration, and the registration for none."""
-    logic = segmented()
+    logic = UltrasoundSceneLogic(slicer.vtkMRMLScene())
+    sequences = slicer.vtkSlicerSequencesLogic()  # which also registers the browser's class
+    sequences.SetMRMLScene(logic.scene)
+    logic.parameters.mri = add(logic.scene, "ScalarVolume", "head")
+    write_volume(logic.parameters.mri, head_mri(5.0))
     node, tracked, to_ras = recorded_images(logic.scene)
     write_known_field(node, KnownField(tracked.field, to_ras))
     logic.parameters.real = node
-    assert logic.preset.probe.depth_mm == 60.0
     logic.preset = logic.preset.changed("probe", depth_mm=45.0)
     record = required(written_and_read(record_scene(logic.scene)).sequence, "no sequence")
     np.testing.assert_allclose(record.to_ras, to_ras)
