@@ -22,7 +22,9 @@ from SlicerUSSim.Logic.mri.samples import head_mri  # noqa: E402
 from SlicerUSSim.Logic.mri.settings import SegmentationSettings  # noqa: E402
 from SlicerUSSim.Logic.mri.sheets.polydata import as_polydata  # noqa: E402
 from SlicerUSSim.Logic.mri.sheets.surfels import Surfels  # noqa: E402
+from SlicerUSSim.Logic.mrml.known_field import KnownField, write_known_field  # noqa: E402
 from SlicerUSSim.Logic.mrml.label_nodes import write_labels  # noqa: E402
+from SlicerUSSim.Logic.mrml.landmark_nodes import Landmark, landmarks_of, write_landmarks  # noqa: E402
 from SlicerUSSim.Logic.mrml.lesion_nodes import add_lesion, read_lesions  # noqa: E402
 from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic  # noqa: E402
 from SlicerUSSim.Logic.mrml.nodes import node_to_world, write_volume  # noqa: E402
@@ -37,7 +39,12 @@ from SlicerUSSim.Logic.mrml.scene_record import (  # noqa: E402
     record_scene,
     recorded_values,
 )
-from SlicerUSSim.Logic.mrml.taken_sequence import put_taken  # noqa: E402
+from SlicerUSSim.Logic.mrml.sequence_nodes import add_sequence  # noqa: E402
+from SlicerUSSim.Logic.mrml.taken_image import is_frozen  # noqa: E402
+from SlicerUSSim.Logic.mrml.taken_sequence import put_taken, record_frozen, taken_of  # noqa: E402
+from SlicerUSSim.Logic.probe.image_grid import ImageGrid  # noqa: E402
+from SlicerUSSim.Logic.tracked.images import TrackedImages  # noqa: E402
+from SlicerUSSim.Logic.tracked.sequence import TrackedSequence  # noqa: E402
 
 
 def add(scene, kind: str, name: str = ""):
@@ -234,3 +241,125 @@ def test_images_of_a_sequence_and_a_proposal_there_and_back():
         with pytest.raises(SimulationError, match=r"of a sequence is|images of"):
             put_taken(other.scene, damaged)
     assert other.scene.GetNumberOfNodesByClass("vtkMRMLSequenceNode") == count
+
+
+def live_update(logic: UltrasoundSceneLogic) -> None:
+    chosen = logic.parameters
+    logic.startLiveUpdate(chosen.labels, chosen.probe_transform, chosen.output)
+
+
+@pytest.mark.parametrize("kind", ["LabelMapVolume", "Segmentation"])
+def test_a_scene_tells_a_frozen_image_from_a_live_one_that_was_left_where_it_was_taken(kind):
+    """Both are where the probe is if that has not moved, and the frozen one came back live."""
+    logic = segmented(kind)
+    live_update(logic)
+    output = logic.parameters.output
+    with logic.imageHeld():
+        assert is_frozen(output) and record_scene(logic.scene).frozen is None
+    assert not is_frozen(output) and logic.isLive
+    logic.stopLiveUpdate()
+    taken = required(logic.taken, "no image")
+    logic.preset = logic.preset.changed("display", gain_db=-9.0)
+    with logic.imageHeld():
+        record = required(written_and_read(record_scene(logic.scene)).frozen, "no frozen image")
+    assert np.array_equal(record.image, taken.image) and record.number is None and is_frozen(output)
+    assert np.array_equal(record.pose, taken.probe_to_world)  # with all digits, which the noise of a script follows
+    output.SetAttribute("SlicerUSSim.frozen", "1")  # as scenes of before have it for both
+    assert record_scene(logic.scene).frozen is None
+    logic.parameters.probe_transform.SetMatrixTransformToParent(vtk_matrix(np.eye(4)))
+    assert record_scene(logic.scene).frozen is not None
+
+
+def test_a_restored_image_is_of_the_tissues_beside_it_if_it_was_when_it_was_kept():
+    logic = segmented()
+    live_update(logic)
+    logic.stopLiveUpdate()
+    frozen = required(record_scene(logic.scene).frozen, "no frozen image")
+    for is_of_tissues in (False, True):
+        again = in_new_scene(written_and_read(record_scene(logic.scene)))
+        output = add(again.scene, "ScalarVolume")
+        taken = again.showFrozen(replace(frozen, is_of_tissues=is_of_tissues), output)
+        assert again.areOfTissues() == (is_of_tissues, False)
+        assert (taken.anatomy == again.anatomyOf(again.parameters.labels)) is is_of_tissues
+        again.segment(again.parameters.mri, again.parameters.labels)  # other tissues: without the tumour
+        assert again.areOfTissues() == (False, False)
+
+
+def test_an_image_of_a_simulated_sequence_keeps_its_number_which_is_the_seed_of_its_noise():
+    logic = segmented()
+    parameters, scene = logic.parameters, logic.scene
+    transforms, images = add(scene, "Sequence", "sweep"), add(scene, "Sequence", "sweep ultrasound")
+    pose = node_to_world(parameters.probe_transform)
+    for number in range(2):
+        item = slicer.vtkMRMLLinearTransformNode()
+        item.SetMatrixTransformToParent(vtk_matrix(pose))
+        transforms.SetDataNodeAtValue(item, f"{number}")
+    logic.simulateSequence(parameters.labels, transforms, images)
+    parameters.image_sequence = images
+    taken = logic.showSequenceImage(images, 1, parameters.output)
+    assert logic.areOfTissues() == (True, True)
+    record = required(written_and_read(record_scene(scene)).frozen, "no frozen image")
+    assert record.number == taken.number == 1 and taken_of(record, parameters.output).number == 1
+    again = logic.showFrozen(record, parameters.output)
+    assert again.number == 1 and np.array_equal(again.image, taken.image)
+    logic.simulate(parameters.labels, parameters.probe_transform, parameters.output)
+    logic.holdImage(parameters.output)
+    assert required(record_frozen(parameters.output), "no frozen image").number is None
+
+
+def recorded_images(scene):
+    """(images node, TrackedImages) of a recording whose probe has a depth of 60 mm."""
+    probe = replace(Preset().probe, depth_mm=60.0)
+    grid = ImageGrid.for_probe(probe, None)
+    generator = np.random.default_rng(1)
+    images = (generator.integers(40, 250, (3, grid.rows, grid.columns)) * grid.field(probe)).astype(np.uint8)
+    place = grid.slice_to_probe
+    poses = [np.array([[0, 0, 1, 4.0], [1, 0, 0, 2.0 * n], [0, 1, 0, 30.0], [0, 0, 0, 1]]) for n in range(3)]
+    entries = tuple({"ImageToReference": pose @ place} for pose in poses)
+    sequence = TrackedSequence(images, entries, np.arange(3.0))
+    to_ras = np.array([[0, -1, 0, 5.0], [1, 0, 0, -3.0], [0, 0, 1, 7.0], [0, 0, 0, 1]])
+    tracked = TrackedImages.of(sequence, reference_to_ras=to_ras)
+    _, node = add_sequence(scene, sequence, "sweep", to_ras=to_ras, poses=tracked.poses)
+    return node, tracked, to_ras
+
+
+def test_real_images_of_a_scene_keep_their_probe_and_registration_whatever_depth_is_set_now():
+    """A depth that a user had set since was taken for a wrong calibration, and the registration for none."""
+    logic = UltrasoundSceneLogic(slicer.vtkMRMLScene())
+    sequences = slicer.vtkSlicerSequencesLogic()  # which also registers the browser's class
+    sequences.SetMRMLScene(logic.scene)
+    logic.parameters.mri = add(logic.scene, "ScalarVolume", "head")
+    write_volume(logic.parameters.mri, head_mri(5.0))
+    node, tracked, to_ras = recorded_images(logic.scene)
+    write_known_field(node, KnownField(tracked.field, to_ras))
+    logic.parameters.real = node
+    logic.preset = logic.preset.changed("probe", depth_mm=45.0)
+    record = required(written_and_read(record_scene(logic.scene)).sequence, "no sequence")
+    np.testing.assert_allclose(record.to_ras, to_ras)
+    again = TrackedImages.of(record.sequence, reference_to_ras=record.to_ras, field=record.field)
+    assert again.probe == tracked.probe and np.array_equal(again.mask, tracked.mask) and again.grid == tracked.grid
+    np.testing.assert_allclose(again.poses, tracked.poses, atol=1e-9)
+    # A scene of before has neither, and is where it was all the same
+    node.SetAttribute("SlicerUSSim.field", None)
+    record = required(record_scene(logic.scene).sequence, "no sequence")
+    assert record.field is None and record.to_ras is None
+    np.testing.assert_allclose(TrackedImages.of(record.sequence).poses, tracked.poses, atol=1e-6)
+    for damaged in ("{", '{"probe": {}}', '{"probe": {"kind": "phased"}, "image_to_probe": [1], "to_ras": [2]}'):
+        node.SetAttribute("SlicerUSSim.field", damaged)
+        with pytest.raises(SimulationError, match=r"'sweep': its attribute SlicerUSSim\.field is damaged"):
+            record_scene(logic.scene)
+
+
+def test_what_is_left_of_landmarks_is_kept_with_them():
+    scene = slicer.vtkMRMLScene()
+    marks = [Landmark(n, np.array([3.0 * n, 4.0]), np.array([1.0, 2.0, n]), 0.25 * n) for n in range(3)]
+    node = add(scene, "MarkupsFiducial")
+    write_landmarks(node, marks)
+    assert [mark.left_mm for mark in landmarks_of(scene)] == [0.0, 0.25, 0.5]
+    assert Landmark.of_list(marks[2].to_list()).to_list() == marks[2].to_list()
+    marks[0] = replace(marks[0], left_mm=None)  # one was added after the registration
+    write_landmarks(node, marks)
+    assert [mark.left_mm for mark in landmarks_of(scene)] == [None] * 3
+    assert Landmark.of_list(marks[0].to_list()).left_mm is None
+    with pytest.raises(ValueError, match="expected six or seven numbers"):
+        Landmark.of_list([1, 2, 3, 4, 5])

@@ -25,6 +25,8 @@ from SlicerUSSim.Logic.mri.samples import head_mri
 from SlicerUSSim.Logic.mrml.lesion_nodes import add_lesion
 from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic
 from SlicerUSSim.Logic.mrml.nodes import probe_pose, write_volume
+from SlicerUSSim.Logic.mrml.sequence_nodes import add_sequence
+from SlicerUSSim.Logic.tracked.sequence import TrackedSequence
 from SlicerUSSim.Widget.presenter import PanelPresenter
 from SlicerUSSim.Workstation.scene_files import read_scene
 from SlicerUSSim.Workstation.state import NAMES
@@ -113,9 +115,21 @@ def open_scene(page, path: Path) -> None:
 
 
 def test_the_workstation_opens_the_scene_that_it_saved(page, files, tmp_path):
-    """With tissues, probe, settings, images of a sequence, and the place of the probe."""
+    """With tissues, probe, settings, images of a sequence, and the place of the probe.
+
+    Another depth than that of the images was taken for a wrong calibration, and the page was empty; the registration
+    was "none".
+    """
+    settled(page)  # the recording comes after the first image
+    moved = "1 0 0 0.5 0 1 0 -0.25 0 0 1 1 0 0 0 1"
+    page.evaluate("text => window.trame.trigger('register', [text])", moved)
     page.evaluate("window.trame.trigger('show_number', [1])")
     page.evaluate("window.trame.trigger('set', ['gainSlider', 5])")
+    page.evaluate("window.trame.trigger('set', ['depthSlider', 45])")
+    settled(page)
+    at_1 = state(page, NAMES.pose_matrix), state(page, NAMES.sequence.similarity)
+    registered = state(page, NAMES.registration.registration_text)
+    assert registered.split() == moved.split()
     for _ in range(2):
         with new_image(page):
             page.keyboard.press("d")
@@ -142,6 +156,14 @@ def test_the_workstation_opens_the_scene_that_it_saved(page, files, tmp_path):
     np.testing.assert_allclose(page.evaluate("window.ussim.image.pose"), where, atol=1e-3)
     assert np.array_equal(pixels(page), image)
     assert state(page, NAMES.sequence.length) == 6 and "saved.mrb: a scene" in shown(page, "notesLabel")
+    assert shown(page, "depthSlider") == 45 and page.locator("#frozen").is_hidden()
+    assert state(page, NAMES.registration.registration) == "as it was kept"
+    assert state(page, NAMES.registration.registration_text) == registered
+    page.evaluate("window.trame.trigger('show_number', [1])")
+    settled(page)
+    now = state(page, NAMES.pose_matrix)
+    np.testing.assert_allclose(*(np.array(text.split(), float) for text in (now, at_1[0])), atol=1e-3)
+    assert state(page, NAMES.sequence.similarity) == at_1[1]
     page.evaluate("window.trame.trigger('show_number', [4])")
     settled(page)
     assert re.match(r"cost 0\.\d+", state(page, NAMES.sequence.similarity))
@@ -154,21 +176,36 @@ def test_the_workstation_opens_the_scene_of_the_slicer_module(page, module_scene
     path, image, _ = module_scene
     open_scene(page, path)
     assert not errors(page) and state(page, NAMES.title) == "Ms. Example T1"
-    assert (np.asarray(Image.open(download(page, "png"))) != image).mean() < 0.001  # poses are saved as text
+    assert np.array_equal(np.asarray(Image.open(download(page, "png"))), image)  # of Simulate, which is not live
     assert shown(page, "kindComboBox") == "convex" and state(page, NAMES.sequence.length) == 0
     notes = shown(page, "notesLabel")
     assert "left out, since the simulator does not use them: FLAIR of somebody" in notes
     assert "cyst" in [row["name"] for row in state(page, NAMES.panel.tissues)]
-    assert page.locator("#frozen").is_hidden()
+    assert page.locator("#frozen").is_visible()
+    with new_image(page):
+        click(page, "#live")
+    settled(page)
+    assert (np.asarray(Image.open(download(page, "png"))) != image).mean() < 0.001  # poses are saved as text
 
 
-def test_a_frozen_image_comes_back_with_its_scene(page, files, tmp_path):
-    """A live image where the probe is was shown in its place, and said to be "as it was"."""
+def test_a_frozen_image_comes_back_with_its_scene(page, browser, files, tmp_path):
+    """A live image where the probe is was shown in its place, and said to be "as it was"; also with the probe there."""
     open_patient(page, files / "labels.nii.gz")
     click(page, "#live")
     page.locator("#frozen").wait_for()
+    page.evaluate("window.trame.trigger('set', ['gainSlider', 9])")  # of which it is not
     settled(page)
     image, about = pixels(page), page.evaluate("window.ussim.image")
+
+    def is_frozen_as_it_was(page) -> bool:
+        again = page.evaluate("window.ussim.image")
+        assert not errors(page) and page.locator("#frozen").is_visible() and not shown(page, "liveCheckBox")
+        told = ("patient", "time")
+        assert np.array_equal(pixels(page), image) and all(again[name] == about[name] for name in told)
+        np.testing.assert_allclose(again["pose"], about["pose"], atol=1e-3)
+        return shown(page, "gainSlider") == 9
+
+    shutil.copy(download(page, "mrb"), tmp_path / "still.mrb")
     for _ in range(3):
         page.keyboard.press("d")
     settled(page)
@@ -176,14 +213,16 @@ def test_a_frozen_image_comes_back_with_its_scene(page, files, tmp_path):
     shutil.copy(download(page, "mrb"), tmp_path / "frozen.mrb")
     open_patient(page, files / "head.nii.gz")
     open_scene(page, tmp_path / "frozen.mrb")
-    assert not errors(page) and page.locator("#frozen").is_visible() and not shown(page, "liveCheckBox")
-    again = page.evaluate("window.ussim.image")
-    assert np.array_equal(pixels(page), image) and {name: again[name] for name in ("patient", "time")} == {
-        name: about[name] for name in ("patient", "time")
-    }
-    np.testing.assert_allclose(again["pose"], about["pose"], atol=1e-3)
+    assert is_frozen_as_it_was(page)
     now = state(page, NAMES.pose_matrix)
     np.testing.assert_allclose(*(np.array(text.split(), float) for text in (now, moved)), atol=1e-3)
+    open_scene(page, tmp_path / "still.mrb")
+    assert is_frozen_as_it_was(page)
+    with serving(str(tmp_path / "still.mrb")) as address:  # to which no image came
+        other = opened(browser, address)
+        settled(other)
+        assert is_frozen_as_it_was(other)
+        other.close()
     click(page, "#live")
     page.locator("#frozen").wait_for(state="hidden")
     settled(page)
@@ -275,6 +314,28 @@ def test_a_scene_that_cannot_be_read_changes_nothing_on_the_page(page, module_sc
     assert errors(page)[0].startswith("bad.mrb: names a file outside itself ('passwd')")
     settled(page)
     assert np.array_equal(pixels(page), before) and state(page, NAMES.title) == title
+
+
+def test_real_images_that_cannot_be_used_close_no_patient(page, files, tmp_path):
+    """The patient was closed before it was seen that they have no probe's field."""
+    app = app_of_slicer()
+    logic = UltrasoundSceneLogic(app.scene)
+    logic.parameters.mri = app.scene.AddNewNodeByClass("vtkMRMLScalarVolumeNode", "T1 of a study")
+    write_volume(logic.parameters.mri, head_mri(5.0))
+    images = np.full((2, 60, 80), 100, np.uint8)
+    images[:, 20:40, 10:70] = 0  # two bars, which are no probe's field
+    times = np.arange(2.0)
+    tracked = TrackedSequence(images, ({"ImageToReference": np.diag([0.5, 0.5, 0.5, 1.0])},) * 2, times)
+    _, logic.parameters.real = add_sequence(app.scene, tracked, "bars")
+    assert app.io_manager.write_scene(tmp_path / "bars.mrb")
+    open_patient(page, files / "labels.nii.gz")
+    before = pixels(page)
+    page.set_input_files("#open-file", tmp_path / "bars.mrb")
+    answer_new_patient(page, "The patient of the scene")
+    page.locator(".ussim-error").first.wait_for()
+    settled(page)
+    assert "probe's field" in errors(page)[0]
+    assert state(page, NAMES.title) == "labels.nii.gz" and np.array_equal(pixels(page), before)
 
 
 def test_a_scene_that_this_module_was_not_used_in_is_opened_as_its_mri(page, tmp_path):

@@ -45,7 +45,7 @@ from tests.test_workstation import (
     views,
 )
 from tests.test_workstation_opening import dicom as dicom
-from tests.test_workstation_registration import recording as recording
+from tests.test_workstation_registration import add as add_landmark, recording as recording
 
 
 class Server:
@@ -113,7 +113,7 @@ def killed_and_started(server: Server, page, *other: str) -> None:
     server.start(*other)
 
 
-def test_after_kill_9_the_page_reconnects_by_itself_and_restores_all(server, browser, files):
+def test_after_kill_9_the_page_reconnects_by_itself_and_restores_all(server, browser, files, tmp_path):
     own = server(str(files / "head.nii.gz"), "--sequence", str(files / "sweep.igs.mha"))
     problems: list[str] = []
     page = opened(browser, own.url, problems)
@@ -187,11 +187,31 @@ def test_after_kill_9_the_page_reconnects_by_itself_and_restores_all(server, bro
     # The last Segment was of the program that is gone, which the button says
     assert state(page, NAMES.panel.can)["undoSegmentButton"] is False
     assert not errors(page) and not problems
+    # An image of the sequence is the same one again, in the player too, and the script makes it
+    image = np.asarray(Image.open(download(page, "png")))
+    kept(page)
+    killed_and_started(own, page)
+    reloaded(page)
+    click(page, "#restore-session")
+    page.locator("#session-offer").wait_for(state="detached")
+    settled(page)
+    again = page.evaluate("window.ussim.image")
+    assert {name: again[name] for name in told} == {name: simulated[0][name] for name in told} and again[
+        "sequence"
+    ] == 4
+    assert page.locator("#simulated-text").inner_text() == "Simulated 4 of 6" and page.locator("#frozen").is_visible()
+    assert np.array_equal(bundled(page, tmp_path / "script"), image)
+    page.evaluate("window.trame.trigger('show_simulated', [0])")
+    settled(page)
+    page.evaluate("window.trame.trigger('show_simulated', [3])")
+    settled(page)
+    assert np.array_equal(pixels(page), simulated[1]) and not errors(page)
+    assert np.array_equal(bundled(page, tmp_path / "from the sequence"), image)
     page.close()
 
 
-def test_a_frozen_image_comes_back_frozen_where_it_was_taken(server, browser, files):
-    """A live image at the probe's pose was shown in its place."""
+def test_a_frozen_image_comes_back_frozen_where_it_was_taken(server, browser, files, tmp_path):
+    """A live image at the probe's pose was shown in its place, and then it had no script."""
     own = server("--labels", str(files / "labels.nii.gz"))
     page = opened(browser, own.url)
     settled(page)
@@ -215,6 +235,7 @@ def test_a_frozen_image_comes_back_frozen_where_it_was_taken(server, browser, fi
     np.testing.assert_allclose(again["pose"], about["pose"], atol=1e-3)
     now = state(page, NAMES.pose_matrix)
     np.testing.assert_allclose(*(np.array(text.split(), float) for text in (now, moved)), atol=1e-3)
+    assert np.array_equal(bundled(page, tmp_path / "script"), np.asarray(Image.open(download(page, "png"))))
     # Going on from there: nothing of it is kept once images are live again
     click(page, "#live")
     page.locator("#frozen").wait_for(state="hidden")
@@ -428,11 +449,12 @@ def test_a_dicom_series_and_ultrasound_calibrated_in_the_page_come_back_after_a_
     for name, file in (("calibration", "plus.xml"), ("registration", "registration.txt")):
         page.set_input_files(f"#{name}-file", recording["folder"] / file)
         settled(page)
-    page.evaluate("window.trame.trigger('show_number', [5])")
-    settled(page)
-    page.evaluate("window.trame.trigger('add_landmark', ['200 150', '10, 20.5, 30'])")
+    for number, pixel in ((0, (200.0, 150.0)), (0, (420.0, 160.0)), (3, (300.0, 400.0)), (5, (310.0, 155.0))):
+        add_landmark(page, recording, number, pixel)
+    click(page, "#fit-landmarks")
     settled(page)
     landmarks = state(page, NAMES.registration.landmarks)
+    assert [mark["remaining"] for mark in landmarks] == ["0.00 mm"] * 4
     image = np.asarray(Image.open(download(page, "png")))
     assert np.array_equal(bundled(page, tmp_path / "script"), image)
     assert not errors(page)
@@ -446,7 +468,7 @@ def test_a_dicom_series_and_ultrasound_calibrated_in_the_page_come_back_after_a_
     assert np.array_equal(bundled(page, tmp_path / "again"), image)
     assert state(page, NAMES.registration.recording).startswith("phantom: 6 images")
     assert page.locator("#registration-from").inner_text() == "Registration as it was kept"
-    assert state(page, NAMES.registration.landmarks) == landmarks and landmarks[0]["patient"] == "10.0, 20.5, 30.0"
+    assert state(page, NAMES.registration.landmarks) == landmarks  # with what is left of each
     page.evaluate("window.trame.trigger('show_number', [0])")
     settled(page)
     np.testing.assert_allclose(page.evaluate("window.ussim.image.pose"), recording["poses"][0], atol=0.5)

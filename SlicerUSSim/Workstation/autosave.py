@@ -174,6 +174,7 @@ class Autosave:
         page = self._page()
         pose, fit, sequence = self._pose(), self._presenter.fits.kept(), self._opener.opened_sequence
         anatomy = nodes_version(parameters)
+        of_tissues = self._logic.areOfTissues()
         simulated, frozen = version_taken(parameters.image_sequence), version_frozen(parameters.output)
         is_new_fit = fit is not None and not _are_same(fit, self._fit_seen)
         is_new_sequence = sequence is not None and sequence is not self._sequence_seen
@@ -181,7 +182,7 @@ class Autosave:
         seen = (
             anatomy, tuple(self._opener.sent_files.files.items()), parameters.node.GetMTime(),
             None if pose is None else pose.tobytes(), fit is not None, sequence is not None, simulated, frozen, cine,
-            repr(page), self._presenter.noteLines, tuple(map(id, self._landmarks())),
+            repr(page), self._presenter.noteLines, tuple(map(id, self._landmarks())), of_tissues,
         )  # fmt: skip
         if seen == self._seen and not is_new_fit and not is_new_sequence:
             return
@@ -203,6 +204,7 @@ class Autosave:
             "costs": self._shared.now.fit.costs,
             "source": None if source is None else source.to_dict(),
             "lesions": None if files is None else [list(entry) for entry in files],
+            "of_tissues": list(of_tissues),  # apart from the images, which stay as they are when tissues change
             "landmarks": [mark.to_list() for mark in self._landmarks()],
         }
         is_new_loop = self._cine.loop != self._cine_seen[0]

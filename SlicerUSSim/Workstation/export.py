@@ -218,11 +218,15 @@ class Exports:
         labels: Any = self._logic.parameters.labels
         taken = required(self._logic.taken, _NO_IMAGE)
         require(labels is not None, _NO_IMAGE)
+        source, preset = self._opener.source_of(labels), taken.preset
+        require(
+            taken.anatomy is not None,
+            "it is not known of which tissues the image was taken, expected those that are there; make a new one",
+        )
         require(
             self._logic.anatomyOf(labels) == taken.anatomy,
             "the tissues or sheets have changed since the image was taken, expected those of the image; make a new one",
         )
-        source, preset = self._opener.source_of(labels), taken.preset
         in_labels, moved = pose_in_labels(labels, taken.probe_to_world)
         require(np.allclose(moved, np.eye(4)), f"the transform of {labels.GetName()!r} scales, expected a rigid one")
         names = read_labels(labels, preset.tissues).names

@@ -20,13 +20,14 @@ class Observed:
         self._node: Any = None
         self._tag = 0
 
-    def watch(self, node: Any) -> None:
-        """Observe this node from now on, or none."""
+    def watch(self, node: Any) -> bool:
+        """Observe this node from now on, or none; whether it is another one than before."""
         if node is self._node:
-            return
+            return False
         if self._node is not None:
             self._node.RemoveObserver(self._tag)
         self._node = node
         if node is not None:
             event = getattr(node, self._event, self._event)  # VTK takes its own events by name, MRML's by number
             self._tag = node.AddObserver(event, lambda *_: self._method())
+        return True

@@ -25,6 +25,7 @@ from SlicerUSSim.Logic.mri.samples import demo_mri
 from SlicerUSSim.Logic.mri.settings import SheetSettings
 from SlicerUSSim.Logic.mri.sheets.kept import sheets_beside
 from SlicerUSSim.Logic.mri.sheets.polydata import as_polydata, read_surfels
+from SlicerUSSim.Logic.mrml.known_field import KnownField, write_known_field
 from SlicerUSSim.Logic.mrml.label_nodes import read_labels, write_labels
 from SlicerUSSim.Logic.mrml.lesion_nodes import add_lesion
 from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic
@@ -359,26 +360,45 @@ class Opener:
             raise SimulationError(f"{name!r} has no source file, expected labels of a file (save, open with --labels)")
         return source
 
-    def sequence(self, record: SequenceRecord, probe: Probe | None = None):
+    def sequence(self, record: SequenceRecord):
         """(TrackedImages, sequence browser node, sequence node of the images, all nodes that were made).
 
-        `probe` is that of the images; default: that of the preset at the start, if there was one.
+        The probe of images that were not prepared yet is that of the preset at the start, if there was one.
         """
-        files, preset, scene, tracked = self._files, self._logic.preset, self._scene, record.tracked
-        known = preset.probe if probe is None and files.preset is not None else probe
+        preset, scene, tracked = self._logic.preset, self._scene, record.tracked
         if tracked is None:
-            tracked = self._tasks.doAside(
-                lambda: TrackedImages.of(
-                    record.sequence, path=record.path, reference_to_ras=record.to_ras, beam=preset.probe, probe=known
-                )
-            )
+            tracked = self._prepared(record, preset.probe, is_known=self._files.preset is not None)
         before = {scene.GetNthNode(number) for number in range(scene.GetNumberOfNodes())}
         browser, images = add_sequence(
             scene, record.sequence, record.name, record.path, record.to_ras, tracked.poses,
             self._logic.parameters.probe_transform,
         )  # fmt: skip
+        write_known_field(images, KnownField(tracked.field, np.eye(4) if record.to_ras is None else record.to_ras))
         now = [scene.GetNthNode(number) for number in range(scene.GetNumberOfNodes())]
         return tracked, browser, images, [node for node in now if node not in before]
+
+    def prepared(self, record: SequenceRecord, probe: Probe) -> TrackedImages:
+        """The images of a scene in which the probe was this one at last. Raises SimulationError without its field.
+
+        They are of the probe that was kept with them. In a scene of before it is the present one, unless a user has
+        changed that so that it does not fit to the images: it is looked for in them then, as when they were opened.
+        """
+        try:
+            return self._prepared(record, probe, is_known=True)
+        except Cancelled:
+            raise
+        except SimulationError as error:
+            _log.info("%s: %s; the probe is looked for in the images", record.name, error)
+            return self._prepared(record, probe, is_known=False)
+
+    def _prepared(self, record: SequenceRecord, probe: Probe, *, is_known: bool) -> TrackedImages:
+        """`probe` is that of the images if it is known, and otherwise that of which the geometry alone is not used."""
+        return self._tasks.doAside(
+            lambda: TrackedImages.of(
+                record.sequence, path=record.path, reference_to_ras=record.to_ras, beam=probe,
+                probe=probe if is_known else None, field=record.field,
+            )
+        )  # fmt: skip
 
     @contextmanager
     def uploaded_mask(self, name: str, content: bytes) -> Iterator[tuple[Volume, str]]:

@@ -18,7 +18,6 @@ from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic
 from SlicerUSSim.Logic.mrml.nodes import display_of
 from SlicerUSSim.Logic.mrml.scene_record import SequenceRecord
 from SlicerUSSim.Logic.mrml.sequence_nodes import MADE_FROM, POSES
-from SlicerUSSim.Logic.probe.arrays import Probe
 from SlicerUSSim.Logic.tracked.pose_files import fit_landmarks, read_calibration, read_registration
 from SlicerUSSim.Logic.tracked.sequence import TrackedSequence
 from SlicerUSSim.Widget.presenter import PanelPresenter
@@ -82,7 +81,6 @@ class Registration:
         self._to_ras = np.eye(4)
         self._from = {_CALIBRATION: "", _REGISTRATION: ""}
         self._landmarks: list[Landmark] = []
-        self._remaining: np.ndarray | None = None
         self._nodes: list[Any] = []
         #: Calibration and registration of the ultrasound that is opened next, and where they are from
         self._next_calibration: tuple[dict[str, np.ndarray], str] = ({}, "")
@@ -114,7 +112,7 @@ class Registration:
         calibration, calibrated_by = self._next_calibration
         self._apply(recording, calibration, np.eye(4) if to_ras is None else to_ras)
         self._forget_next()
-        self._landmarks, self._remaining = [], None
+        self._landmarks = []
         self._from = {_CALIBRATION: calibrated_by, _REGISTRATION: source if to_ras is not None else ""}
         self._tell()
         if not replace(recording, sequence=recording.sequence.with_transforms(calibration)).is_calibrated:
@@ -125,11 +123,11 @@ class Registration:
         """Those that were picked."""
         return tuple(self._landmarks)
 
-    def restore(self, record: SequenceRecord, probe: Probe, landmarks: Iterable[Landmark] = ()) -> None:
-        """Use what was kept of a recording, calibrated and in its place; its images are of this probe."""
+    def restore(self, record: SequenceRecord, landmarks: Iterable[Landmark] = ()) -> None:
+        """Use what was kept of a recording, calibrated and in its place; its images are prepared if they can be."""
         place = np.eye(4) if record.to_ras is None else record.to_ras
-        self._apply(Recording(record.sequence, record.name, record.path), {}, place, record, probe)
-        self._landmarks, self._remaining = list(landmarks), None
+        self._apply(Recording(record.sequence, record.name, record.path), {}, place, record)
+        self._landmarks = list(landmarks)
         is_placed = not np.allclose(place, np.eye(4))
         self._from = {_CALIBRATION: "", _REGISTRATION: "as it was kept" if is_placed else ""}
         self._tell()
@@ -137,7 +135,7 @@ class Registration:
     def forget(self) -> None:
         """Forget the recording, which is of another patient; its nodes are removed with him."""
         self.recording, self._calibration, self._to_ras = None, {}, np.eye(4)
-        self._landmarks, self._remaining, self._nodes = [], None, []
+        self._landmarks, self._nodes = [], []
         self._opener.opened_sequence = None
         self._forget_next()
         self._from = {_CALIBRATION: "", _REGISTRATION: ""}
@@ -149,6 +147,7 @@ class Registration:
         with self._presenter.shown():
             recording = self._required()
             self._apply(replace(recording, path=f"{_IMAGE}To{frame}"), self._calibration, self._to_ras)
+            self._left_unknown()
             self._tell()
 
     # ---- calibration and registration --------------------------------------------------------------------------
@@ -195,14 +194,23 @@ class Registration:
         calibration = {**self._calibration, **calibration}
         self._apply(self._required(), calibration, self._to_ras)
         self._from[_CALIBRATION] = "; ".join(filter(None, (self._from[_CALIBRATION], source)))
-        self._remaining = None
+        self._left_unknown()
         self._tell()
 
-    def _register(self, to_ras: np.ndarray, source: str, remaining: np.ndarray | None = None) -> None:
+    def _register(self, to_ras: np.ndarray, source: str, left: np.ndarray | None = None) -> None:
+        """`left`: mm of each landmark, by which it was registered."""
         matrix = check_rigid(_REGISTRATION, to_ras)
         self._apply(self._required(), self._calibration, matrix)
-        self._from[_REGISTRATION], self._remaining = source, remaining
+        self._from[_REGISTRATION] = source
+        self._left_unknown()
+        if left is not None:
+            marks = zip(self._landmarks, left, strict=True)
+            self._landmarks = [replace(mark, left_mm=float(distance)) for mark, distance in marks]
         self._tell()
+
+    def _left_unknown(self) -> None:
+        """What is left of the landmarks is not that of this registration by these any more."""
+        self._landmarks = [replace(mark, left_mm=None) for mark in self._landmarks]
 
     # ---- landmarks ---------------------------------------------------------------------------------------------
 
@@ -263,7 +271,7 @@ class Registration:
         """Remove the landmark with an index from 0."""
         if 0 <= number < len(self._landmarks):
             del self._landmarks[number]
-            self._remaining = None
+            self._left_unknown()
             self._tell()
 
     def fit(self) -> None:
@@ -280,7 +288,7 @@ class Registration:
 
     def _add(self, landmark: Landmark) -> None:
         self._landmarks.append(landmark)
-        self._remaining = None
+        self._left_unknown()
         self._tell()
 
     def _too_early(self, point: np.ndarray | None) -> None:
@@ -302,11 +310,10 @@ class Registration:
         calibration: dict[str, np.ndarray],
         to_ras: np.ndarray,
         kept: SequenceRecord | None = None,
-        probe: Probe | None = None,
     ) -> None:
         """Use these, or raise SimulationError and change nothing.
 
-        `kept` is what is known of the recording, and `probe` that of its images, if they are restored.
+        `kept` is what is known of the recording, if it is restored.
         """
         sequence = recording.sequence.with_transforms(calibration) if calibration else recording.sequence
         made = None
@@ -314,7 +321,7 @@ class Registration:
         record = kept or SequenceRecord(sequence, recording.name, recording.path, to_ras)
         if known.is_calibrated:
             with self._presenter.view.progress("Find the probe's field"):
-                made = self._opener.sequence(record, probe)
+                made = self._opener.sequence(record)
         is_same = self.recording is not None and self.recording.sequence is recording.sequence
         number = self._shared.now.sequence.number if is_same else 0
         old, self._nodes = self._nodes, [] if made is None else made[3]
@@ -369,13 +376,13 @@ class Registration:
 
     def _tell_landmarks(self) -> None:
         lines = []
-        for n, mark in enumerate(self._landmarks):
+        for mark in self._landmarks:
             place = self._comparison.place_of(mark.pixel)
             lines.append(
                 LandmarkLine(
                     f"image {mark.number}: {mark.pixel[0]:.1f}, {mark.pixel[1]:.1f}",
                     ", ".join(f"{value:.1f}" for value in mark.point),
-                    "" if self._remaining is None else f"{self._remaining[n]:.2f} mm",
+                    "" if mark.left_mm is None else f"{mark.left_mm:.2f} mm",
                     f"image {mark.number}",
                     None if place is None else [round(100.0 * share, 2) for share in place],
                 )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -19,13 +20,20 @@ from SlicerUSSim.Logic.mrml.landmark_nodes import Landmark
 from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic
 from SlicerUSSim.Logic.mrml.nodes import display_of, set_node_to_world
 from SlicerUSSim.Logic.mrml.scene_record import ROLES, SceneRecord, SequenceRecord, put_nodes, put_values
-from SlicerUSSim.Logic.mrml.taken_sequence import FrozenRecord, SimulatedRecord, put_taken
+from SlicerUSSim.Logic.mrml.taken_sequence import (
+    FrozenRecord,
+    SimulatedRecord,
+    count_taken,
+    put_taken,
+    read_taken,
+    taken_of,
+)
 from SlicerUSSim.Widget.presenter import PanelPresenter
 from SlicerUSSim.Workstation.export import Cine, CineImage
 from SlicerUSSim.Workstation.loading import Loading
 from SlicerUSSim.Workstation.opener import Opener, show_all_tissue
 from SlicerUSSim.Workstation.probe_control import ProbeControl
-from SlicerUSSim.Workstation.registration import Registration
+from SlicerUSSim.Workstation.registration import Recording, Registration
 from SlicerUSSim.Workstation.scene_files import read_scene
 from SlicerUSSim.Workstation.script import LabelSource
 from SlicerUSSim.Workstation.session_store import KeptSession, SessionStore
@@ -148,6 +156,9 @@ class Restoring:
         images: list[CineImage],
     ) -> None:
         parameters: Any = self._logic.parameters
+        record = self._checked(record, kept)
+        source = kept.get("source")
+        labels_from = None if source is None else LabelSource.from_dict(source)
         simulated = None if record.simulated is None else put_taken(self._scene, record.simulated)
         try:
             made = put_nodes(self._scene, record)
@@ -167,16 +178,15 @@ class Restoring:
         mri, pose = made.get("mri"), record.pose
         if mri is not None:
             show_all_tissue(mri, required(record.nodes["mri"].volume, "the MRI has no voxels"))
-        source = kept.get("source")
-        if labels is not None and source is not None:
-            self._opener.restored(LabelSource.from_dict(source), labels)
+        if labels is not None and labels_from is not None:
+            self._opener.restored(labels_from, labels)
         if parameters.lesions is not None and kept.get("lesions") is not None:
             files = tuple((str(tissue), str(file)) for tissue, file in kept["lesions"])
             self._opener.restore_lesions(parameters.lesions, files)
         if pose is not None:
             self._put_probe(pose)
         if record.sequence is not None:
-            self._registration.restore(record.sequence, preset.probe, record.landmarks)
+            self._registration.restore(record.sequence, record.landmarks)
             self._logic.preset = preset
         parameters.image_sequence = simulated
         if parameters.proposal is not None and display_of(parameters.proposal) is not None:
@@ -191,7 +201,30 @@ class Restoring:
                 now.fit.curve, now.fit.costs = [float(cost) for cost in kept["curve"]], str(kept["costs"])
         self._cine.restore(images, self._now())
         self._presenter.setNotes(*map(str, kept.get("notes", ())), *refused)
-        self._loading.show_restored(is_placed=pose is not None, frozen=record.frozen)
+        frozen = record.frozen
+        if frozen is not None and refused:  # such as kinds of sheets, which the image shows
+            frozen = replace(frozen, is_of_tissues=False)
+        self._loading.show_restored(is_placed=pose is not None, frozen=frozen)
+        if record.simulated is not None and simulated is not None:
+            if record.simulated.are_of_tissues and labels is not None and not refused:
+                self._logic.sequenceIsOfTissues(simulated)
+            with self._shared.changing() as now:
+                now.simulated.length = count_taken(simulated)
+                now.simulated.number = _place_of(frozen, simulated)
+
+    def _checked(self, record: SceneRecord, kept: Mapping[str, Any]) -> SceneRecord:
+        """A record with its real images prepared. Raises SimulationError for what cannot be shown; nothing changes."""
+        preset = UltrasoundSceneLogic.presetOf(str(kept.get("values", {}).get("preset", "")))
+        if record.frozen is not None:
+            taken_of(record.frozen, None)
+        found = record.sequence
+        if found is None or found.tracked is not None:
+            return record
+        if not Recording(found.sequence, found.name, found.path).is_calibrated:
+            return record
+        with self._presenter.view.progress("Find the probe's field"):
+            tracked = self._opener.prepared(found, preset.probe)
+        return replace(record, sequence=replace(found, tracked=tracked))
 
     def _put_probe(self, pose: np.ndarray) -> None:
         parameters: Any = self._logic.parameters
@@ -219,6 +252,15 @@ class Restoring:
             self._loading.show_number(int(page["number"]))
 
 
+def _place_of(frozen: FrozenRecord | None, images_node: Any) -> int:
+    """The number of a frozen image in a sequence; 0 if it is none of its images."""
+    number = None if frozen is None else frozen.number
+    if frozen is None or number is None or number >= count_taken(images_node):
+        return 0
+    is_same = read_taken(images_node, number).time == frozen.about.get("time")
+    return number if is_same else 0
+
+
 def _parts_of(session: KeptSession) -> tuple[SceneRecord, tuple[Fit, Preset | None] | None, list]:
     """(patient and probe, fit, cine loop) of a session. Raises SimulationError for one that is damaged."""
     content = session.content
@@ -232,11 +274,12 @@ def _parts_of(session: KeptSession) -> tuple[SceneRecord, tuple[Fit, Preset | No
         landmarks = tuple(map(Landmark.of_list, content.get("landmarks", ())))
     except (ValueError, TypeError) as error:
         raise SimulationError(f"the session's landmarks are damaged ({error})") from None
+    image_is_of_tissues, are_of_tissues = map(bool, content.get("of_tissues", (False, False)))  # sessions of before
     simulated = session.read("simulated")
-    made = simulated if isinstance(simulated, SimulatedRecord) else None
+    made = replace(simulated, are_of_tissues=are_of_tissues) if isinstance(simulated, SimulatedRecord) else None
     recorded = sequence if isinstance(sequence, SequenceRecord) else None
     frozen = session.read("frozen")
-    image = frozen if isinstance(frozen, FrozenRecord) else None
+    image = replace(frozen, is_of_tissues=image_is_of_tissues) if isinstance(frozen, FrozenRecord) else None
     record = SceneRecord(anatomy.nodes, {}, pose, recorded, landmarks=landmarks, simulated=made, frozen=image)
     images = []
     for name in content["files"].get("cine", []):

@@ -326,7 +326,9 @@ class Workstation:
         parameters = self._logic.parameters
         self._loading.show_title()
         self._probe_node.watch(parameters.probe_transform)
-        self._image_node.watch(parameters.output)
+        taken = self._logic.taken
+        if self._image_node.watch(parameters.output) and taken is not None and taken.node is parameters.output:
+            self._images.image_changed()  # it is in there already, as the frozen one of a scene at the start
         self._probe.draw()
         self._images.tell_frozen()
         if self._logic.isLive:

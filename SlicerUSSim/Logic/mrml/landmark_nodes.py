@@ -12,8 +12,9 @@ import numpy as np
 from SlicerUSSim.Logic.base.errors import SimulationError
 from SlicerUSSim.Logic.mrml.nodes import control_points, named, nodes_of_class
 
-#: Attribute of a markups node: number of the image, column and row of each of its points, as JSON
-_PIXELS = "SlicerUSSim.landmarks"
+#: Attributes of a markups node: number of the image, column and row of each of its points, as JSON; and what is left of
+#: each, without which the registration was not made by them
+_PIXELS, _LEFT = "SlicerUSSim.landmarks", "SlicerUSSim.landmarksLeft"
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,19 +26,22 @@ class Landmark:
     pixel: np.ndarray
     #: (3,) RAS in millimetres
     point: np.ndarray
+    #: Distance in millimetres that is left in the registration by all of them; None: it was not made by these
+    left_mm: float | None = None
 
     def to_list(self) -> list[float]:
-        """Number, column, row, R, A and S, as JSON can hold them."""
-        return [self.number, *map(float, self.pixel), *map(float, self.point)]
+        """Number, column, row, R, A and S, and what is left if it is known, as JSON can hold them."""
+        left = [] if self.left_mm is None else [self.left_mm]
+        return [self.number, *map(float, self.pixel), *map(float, self.point), *left]
 
     @classmethod
     def of_list(cls, values: Sequence[float]) -> Landmark:
         """The inverse of to_list. Raises ValueError or TypeError for something else."""
         number, *rest = values
         numbers = np.array(rest, float)
-        if numbers.shape != (5,) or not np.isfinite(numbers).all():
-            raise ValueError(f"{values}: expected six numbers")
-        return cls(int(number), numbers[:2], numbers[2:])
+        if numbers.shape not in ((5,), (6,)) or not np.isfinite(numbers).all():
+            raise ValueError(f"{values}: expected six or seven numbers")
+        return cls(int(number), numbers[:2], numbers[2:5], float(numbers[5]) if len(numbers) == 6 else None)
 
 
 def is_landmarks(node: Any) -> bool:
@@ -52,6 +56,8 @@ def write_landmarks(node: Any, landmarks: Sequence[Landmark]) -> None:
     for number, landmark in enumerate(landmarks, 1):
         node.AddControlPointWorld(*landmark.point.tolist(), str(number))
     node.SetAttribute(_PIXELS, json.dumps([[mark.number, *map(float, mark.pixel)] for mark in landmarks]))
+    left = [mark.left_mm for mark in landmarks]
+    node.SetAttribute(_LEFT, None if None in left else json.dumps(left))
     node.SetLocked(True)  # a point that is dragged would not be what was registered
     node.EndModify(was_modifying)
 
@@ -62,9 +68,10 @@ def landmarks_of(scene) -> tuple[Landmark, ...]:
         if is_landmarks(node):
             try:
                 pixels, points = json.loads(node.GetAttribute(_PIXELS)), control_points(node)
-                return tuple(
-                    Landmark.of_list([*pixel, *point]) for pixel, point in zip(pixels, points, strict=True)
-                )  # fmt: skip
+                text = node.GetAttribute(_LEFT)
+                left = [[]] * len(pixels) if text is None else [[value] for value in json.loads(text)]
+                parts = zip(pixels, points, left, strict=True)
+                return tuple(Landmark.of_list([*pixel, *point, *rest]) for pixel, point, rest in parts)
             except (ValueError, TypeError):
                 raise SimulationError(
                     f"{named(node)}: its points and the attribute {_PIXELS} do not go together; remove the node"

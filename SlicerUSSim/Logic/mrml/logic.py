@@ -192,12 +192,17 @@ class UltrasoundSceneLogic:
         invalid."""
         text = self.parameters.preset
         if text != self._preset[0]:
-            try:
-                values = json.loads(text or "{}")
-            except ValueError as error:
-                raise SimulationError(f"the scene's preset is not JSON ({error})") from None
-            self._preset = (text, Preset.from_dict(values, "the scene's preset"))
+            self._preset = (text, self.presetOf(text))
         return self._preset[1]
+
+    @staticmethod
+    def presetOf(text: str) -> Preset:
+        """The preset of a scene's text. Raises SimulationError for one that is invalid."""
+        try:
+            values = json.loads(text or "{}")
+        except ValueError as error:
+            raise SimulationError(f"the scene's preset is not JSON ({error})") from None
+        return Preset.from_dict(values, "the scene's preset")
 
     @preset.setter
     def preset(self, preset: Preset) -> None:
@@ -566,23 +571,37 @@ class UltrasoundSceneLogic:
     def imageHeld(self) -> Iterator[None]:
         """While a scene is saved: as if Live ended, so that the image is where it was taken; it goes on after that.
 
-        Saving lays the segments of tissues together into one label map. The image is of them as before.
+        The scene says that the image is live. Saving lays the segments of tissues together into one label map. The
+        images are of them as before.
         """
-        taken, labels = self._taken, self.parameters.labels
-        if taken is None:
-            yield
-            return
-        is_of_labels = labels is not None and self.anatomyOf(labels) == taken.anatomy
-        transform = taken.node.GetParentTransformNode() if self.isLive else None
-        if transform is not None:
-            freeze(taken)
+        taken, labels, images = self._taken, self.parameters.labels, self.parameters.image_sequence
+        is_of_tissues, are_of_tissues = self.areOfTissues()
+        transform = taken.node.GetParentTransformNode() if taken is not None and self.isLive else None
+        if taken is not None and transform is not None:
+            freeze(taken, while_saved=True)
         try:
             yield
         finally:
-            if transform is not None:
+            if taken is not None and transform is not None:
                 follow(taken, transform)
-            if is_of_labels:
+            if taken is not None and is_of_tissues:
                 self._taken = replace(taken, anatomy=self.anatomyOf(labels))
+            if are_of_tissues:
+                self.sequenceIsOfTissues(images)
+
+    def areOfTissues(self) -> tuple[bool, bool]:
+        """(whether the last image, whether those of the chosen sequence) show labels and sheets as they are now."""
+        labels, images = self.parameters.labels, self.parameters.image_sequence
+        if labels is None:
+            return False, False
+        now, (node_id, in_sequence) = self.anatomyOf(labels), self._in_sequence
+        is_known = images is not None and images.GetID() == node_id
+        return self._taken is not None and self._taken.anatomy == now, is_known and in_sequence == now
+
+    def sequenceIsOfTissues(self, images_node) -> None:
+        """Take the images of a sequence for those of the chosen labels and sheets, with which it was restored."""
+        labels = required(self.parameters.labels, "no label map is chosen, expected that of the images")
+        self._in_sequence = images_node.GetID(), self.anatomyOf(labels)
 
     def clearImage(self, output_node) -> None:
         """Empty a node with an image of this module, which is not of the present patient or pose.
@@ -701,11 +720,14 @@ class UltrasoundSceneLogic:
     def showFrozen(self, record: FrozenRecord, output_node) -> TakenImage:
         """Write an image of a scene that was saved into a scalar volume node, where it was taken; it stays there.
 
-        Ends live update. Raises SimulationError for a damaged record, and for an output that this module did not make.
+        The chosen labels and sheets are those of the scene, if the record is of them. Ends live update.
+        Raises SimulationError for a damaged record, and for an output that this module did not make.
         """
         require_node(output_node, "vtkMRMLScalarVolumeNode", use="output")
         require_result(output_node, "output")
-        return self._show_frozen(taken_of(record, output_node), output_node)
+        labels = self.parameters.labels
+        anatomy = self.anatomyOf(labels) if record.is_of_tissues and labels is not None else None
+        return self._show_frozen(replace(taken_of(record, output_node), anatomy=anatomy), output_node)
 
     def showSequenceImage(self, images_node, number: int, output_node) -> TakenImage:
         """Write an image that simulateSequence made into a scalar volume node, where it was taken; it stays there.

@@ -7,7 +7,7 @@ Taking a record copies no voxels: it shares those of the nodes, which are replac
 from __future__ import annotations
 
 from collections.abc import Hashable, Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -23,6 +23,7 @@ from SlicerUSSim.Logic.mri.sheets.polydata import as_polydata, surfels_of
 from SlicerUSSim.Logic.mri.sheets.surfels import Surfels
 from SlicerUSSim.Logic.mrml.craniotomy_nodes import closed_labels, set_closed_labels, show_flap
 from SlicerUSSim.Logic.mrml.fit_nodes import sequence_of
+from SlicerUSSim.Logic.mrml.known_field import known_field
 from SlicerUSSim.Logic.mrml.label_nodes import colour_table, node_labels, read_mask, set_colour_table
 from SlicerUSSim.Logic.mrml.landmark_nodes import Landmark, landmarks_of
 from SlicerUSSim.Logic.mrml.lesion_nodes import tag_of
@@ -39,7 +40,9 @@ from SlicerUSSim.Logic.mrml.nodes import (
 from SlicerUSSim.Logic.mrml.ownership import OWN, claim, is_claimed
 from SlicerUSSim.Logic.mrml.parameter_node import VALUE_PARAMETERS, SceneParameters
 from SlicerUSSim.Logic.mrml.share_nodes import set_shares_node, shares_node
+from SlicerUSSim.Logic.mrml.taken_image import was_live
 from SlicerUSSim.Logic.mrml.taken_sequence import FrozenRecord, SimulatedRecord, record_frozen, record_taken
+from SlicerUSSim.Logic.tracked.field import ImagedField
 from SlicerUSSim.Logic.tracked.images import TrackedImages
 from SlicerUSSim.Logic.tracked.sequence import TrackedSequence
 
@@ -112,6 +115,8 @@ class SequenceRecord:
     to_ras: np.ndarray | None = None
     #: As they were prepared; None: not yet
     tracked: TrackedImages | None = None
+    #: The probe and its place in the images; a user may have changed that of the scene since. None: unknown
+    field: ImagedField | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -193,18 +198,32 @@ def record_scene(scene) -> SceneRecord:
     require("mri" in nodes or "labels" in nodes, "the scene has no volume, expected an MRI, or labels of its tissues")
     real, sequence = parameters.real, None
     if real is not None and real.IsA("vtkMRMLSequenceNode") and real.GetNumberOfDataNodes():
-        sequence = SequenceRecord(sequence_of(real), real.GetName())
+        sequence = _real_images(real)
     transform = parameters.probe_transform
     pose = None if transform is None else probe_pose(transform)
     landmarks = () if sequence is None else landmarks_of(scene)
     others = tuple(_others(scene, parameters))
     frozen = record_frozen(parameters.output)
-    if frozen is not None and pose is not None and np.allclose(frozen.pose, pose, atol=1e-4):
-        frozen = None  # a live one, which a saved scene has where it was taken, too
+    if frozen is not None:
+        is_live = was_live(parameters.output)
+        if is_live is None:  # scenes of before do not tell a live image, which was left where it was taken, too
+            is_live = pose is not None and np.allclose(frozen.pose, pose, atol=1e-4)
+        frozen = None if is_live else frozen
     return SceneRecord(
         nodes, recorded_values(parameters), pose, sequence, others, landmarks, record_taken(parameters.image_sequence),
         frozen,
     )  # fmt: skip
+
+
+def _real_images(images_node: Any) -> SequenceRecord:
+    """Those of a sequence node, registered as they were: together that is where they are in the scene."""
+    sequence, name = sequence_of(images_node), images_node.GetName()
+    known = known_field(images_node, sequence.images.shape[1:])
+    if known is None:
+        return SequenceRecord(sequence, name)
+    to_reference = np.linalg.inv(known.to_ras)
+    before = tuple({way: to_reference @ matrix for way, matrix in entry.items()} for entry in sequence.transforms)
+    return SequenceRecord(replace(sequence, transforms=before), name, to_ras=known.to_ras, field=known.field)
 
 
 def _choose_missing(scene, parameters: SceneParameters) -> None:

@@ -23,6 +23,8 @@ from SlicerUSSim.Logic.probe.image_grid import ImageGrid
 PATIENT = "SlicerUSSim.patient"
 #: Attributes of the image's volume node: what it is of, as JSON, and whether it stays where it was taken
 _ABOUT, _FROZEN = "SlicerUSSim.image", "SlicerUSSim.frozen"
+#: Texts of _FROZEN: of an image that stays, and of a live one while its scene is saved; both were "1" before
+_STAYS, _WHILE_SAVED = "stays", "while saved"
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,7 +79,13 @@ def patient_of(node) -> str:
 
 def write_about(taken: TakenImage) -> None:
     """Keep with the volume node what its image is of; it follows the probe from now on."""
-    taken.node.SetAttribute(_ABOUT, json.dumps(taken.about()))
+    about = {
+        **taken.about(),
+        "probe_to_ras": taken.probe_to_world.tolist(),  # all digits: scripts make the same pixels again
+        "is_empty": taken.is_empty,
+        **({} if taken.number is None else {"number": taken.number}),
+    }
+    taken.node.SetAttribute(_ABOUT, json.dumps(about))
     taken.node.RemoveAttribute(_FROZEN)
 
 
@@ -87,7 +95,10 @@ def about_as_json(volume_node) -> str:
 
 
 def about_image(volume_node) -> dict[str, Any]:
-    """What the image in a volume node is of, see TakenImage.about; {} of a volume that is no such image."""
+    """What the image in a volume node is of, see TakenImage.about; {} of a volume that is no such image.
+
+    With `is_empty`, and the `number` of an image of a sequence.
+    """
     text = volume_node.GetAttribute(_ABOUT)
     try:
         return {} if text is None else json.loads(text)
@@ -100,13 +111,21 @@ def is_frozen(volume_node) -> bool:
     return volume_node.GetAttribute(_FROZEN) is not None
 
 
-def freeze(taken: TakenImage) -> None:
-    """Leave the image of a volume node where it was taken, not under the probe's transform any more."""
+def was_live(volume_node) -> bool | None:
+    """Whether a frozen image of a scene that was saved was live, and frozen while that was done only; None: unknown."""
+    return {_STAYS: False, _WHILE_SAVED: True}.get(volume_node.GetAttribute(_FROZEN))
+
+
+def freeze(taken: TakenImage, *, while_saved: bool = False) -> None:
+    """Leave the image of a volume node where it was taken, not under the probe's transform any more.
+
+    `while_saved`: it is live, and follows the probe again once its scene is saved.
+    """
     node = taken.node
     was_modifying = node.StartModify()
     node.SetAndObserveTransformNodeID(None)
     node.SetIJKToRASMatrix(vtk_matrix(taken.image_to_world))
-    node.SetAttribute(_FROZEN, "1")
+    node.SetAttribute(_FROZEN, _WHILE_SAVED if while_saved else _STAYS)
     node.EndModify(was_modifying)
 
 

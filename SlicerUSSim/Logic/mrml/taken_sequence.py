@@ -113,6 +113,14 @@ class FrozenRecord:
     about: Mapping[str, Any]
     #: (rows, columns) uint8
     image: np.ndarray
+    #: Whether it shows labels and sheets as they were when it was kept
+    is_of_tissues: bool = False
+
+    @property
+    def number(self) -> int | None:
+        """See TakenImage.number."""
+        number = self.about.get("number")
+        return number if type(number) is int and number >= 0 else None
 
     @property
     def pose(self) -> np.ndarray:
@@ -142,7 +150,7 @@ def record_frozen(volume_node: Any) -> FrozenRecord | None:
 def taken_of(record: FrozenRecord, volume_node: Any) -> TakenImage:
     """The image of a record for a volume node. Raises SimulationError if it is damaged."""
     try:
-        return _image_of(record.about, record.about["preset"], record.image, None, volume_node, None)
+        return _image_of(record.about, record.about["preset"], record.image, None, volume_node, record.number)
     except (ValueError, LookupError, TypeError, AttributeError) as error:
         raise SimulationError(f"the image of the scene is damaged ({error})") from None
 
@@ -160,6 +168,8 @@ class SimulatedRecord:
     index: SequenceIndex
     #: (rows, columns) uint8 of each
     images: tuple[np.ndarray, ...]
+    #: Whether they show labels and sheets as they were when they were kept
+    are_of_tissues: bool = False
 
 
 def version_taken(images_node: Any) -> Hashable:

@@ -51,6 +51,7 @@ class TrackedImages:
         beam: Probe | None = None,
         most: int | None = None,
         apart: Sequence[int] = (),
+        field: ImagedField | None = None,
     ) -> TrackedImages:
         """Prepare images of a sequence.
 
@@ -64,6 +65,8 @@ class TrackedImages:
             Without `probe` the probe is estimated too.
         apart : images that are prepared as well, but are not among those of the default choice; see `split`.
         beam : probe whose parameters other than the geometry are used for an estimated probe.
+        field : the probe and its place in the images, if both are known, as of images that were prepared before; what a
+            scanner draws over it is looked for again.
 
         Raises SimulationError for images that do not exist or were not tracked, a skewed calibration, a field that
         cannot be estimated, and images that are entirely black or of one grey level. A calibration that mirrors,
@@ -93,7 +96,8 @@ class TrackedImages:
         for number, image in zip(kept, images, strict=True):
             require(int(image.max()) > 0, f"image {number} of the sequence is black")
         spacing = _pixel_spacing(matrices[0], path)
-        field = _located_field(sequence, images, spacing, probe, beam)
+        if field is None:
+            field = _located_field(sequence, images, spacing, probe, beam)
         seen = visible_part(_as_uint8(spread_images(sequence.images)), field.mask, sequence.coloured)
         require(bool(seen.any()), "nothing of the probe's field is seen in the images")
         for number, image in zip(kept, images, strict=True):
