@@ -52,8 +52,8 @@ def _merged(before: Any, adopted: Any, now: Any, called: tuple[str, ...], kept: 
     if len(sections) == 3 and all(value.get(kind) == now.get(kind) for value in sections for kind in _KINDS):
         found = {}
         for name in dict.fromkeys([*before, *now]):
-            values = (value.get(name, _NONE) for value in (before, adopted, now))
-            value = _merged(*values, _called(called, name, now), kept)
+            was, came, has = (value.get(name, _NONE) for value in (before, adopted, now))
+            value = _merged(was, came, has, _called(called, name, now), kept)
             if value is not _NONE:
                 found[name] = value
         return found
