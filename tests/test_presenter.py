@@ -16,7 +16,9 @@ slicer = pytest.importorskip("slicer", reason="MRML nodes come with slicer-core:
 from SlicerUSSim.Logic.base.declaration import Shown, parameter  # noqa: E402
 from SlicerUSSim.Logic.base.transforms import pose_of_angles  # noqa: E402
 from SlicerUSSim.Logic.mri.samples import head_mri  # noqa: E402
+from SlicerUSSim.Logic.mrml.craniotomy_nodes import set_closed_labels  # noqa: E402
 from SlicerUSSim.Logic.mrml.label_nodes import read_labels, write_labels  # noqa: E402
+from SlicerUSSim.Logic.mrml.lesion_nodes import add_lesion  # noqa: E402
 from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic  # noqa: E402
 from SlicerUSSim.Logic.mrml.nodes import probe_pose, read_volume, set_node_to_world, write_volume  # noqa: E402
 from SlicerUSSim.Logic.mrml.own_labels import content_of  # noqa: E402
@@ -290,7 +292,6 @@ def test_the_notes_say_what_labels_were_recognised_as_and_are_those_of_the_shown
 
 def test_lesions_leave_the_checks_of_the_tissues_under_them_in_the_notes(presenter):
     """The line that half of the brain is missing was gone when a tumour had been laid over the tissues."""
-    from SlicerUSSim.Logic.mrml.lesion_nodes import add_lesion
     from tests.test_label_places import kept, whole_head
 
     scene, parameters = presenter.logic.scene, presenter.logic.parameters
@@ -368,3 +369,85 @@ def test_undo_of_the_first_segment_leaves_no_tissues_and_those_of_others_alone(p
     assert parameters.labels is own and made.GetScene() is None and content_of(own) == content
     presenter.undoSegment()
     assert "Nothing was segmented" in presenter.view.errors[-1]
+
+
+def test_undo_takes_back_the_last_segment_whatever_labels_are_chosen(presenter):
+    """It removed the chosen tissues, and left those that were made last."""
+    parameters = presenter.logic.parameters
+    presenter.segment()
+    first, content = parameters.labels, content_of(parameters.labels)
+    parameters.labels = None
+    presenter.segment()
+    second = parameters.labels
+    parameters.labels = first
+    assert first is not second and presenter.canUndoSegment() == (True, "")
+    presenter.undoSegment()
+    assert parameters.labels is first and first.GetScene() is not None and content_of(first) == content
+    assert second.GetScene() is None and not presenter.view.errors
+    assert not presenter.canUndoSegment()[0]
+
+
+def test_undo_of_tissues_that_are_gone_or_opened_is_refused(presenter):
+    parameters, scene = presenter.logic.parameters, presenter.logic.scene
+    presenter.segment()
+    made = parameters.labels
+    opened = scene.AddNewNodeByClass("vtkMRMLSegmentationNode", "opened")
+    set_closed_labels(opened, made)
+    parameters.labels = opened
+    assert "was opened in 'Head tissues' after Segment" in presenter.canUndoSegment()[1]
+    presenter.undoSegment()
+    assert opened.GetScene() is made.GetScene() is scene and "close it first" in presenter.view.errors.pop()
+    scene.RemoveNode(opened)
+    scene.RemoveNode(made)
+    assert "were removed from the scene" in presenter.canUndoSegment()[1]
+
+
+@pytest.mark.parametrize("kind", ["Segmentation", "LabelMapVolume"])
+def test_undo_empties_a_node_that_was_empty(presenter, kind):
+    parameters, scene = presenter.logic.parameters, presenter.logic.scene
+    parameters.labels = own = scene.AddNewNodeByClass(f"vtkMRML{kind}Node", "mine")
+    presenter.segment()
+    assert parameters.labels is own and content_of(own)
+    presenter.undoSegment()
+    assert parameters.labels is own and not content_of(own) and presenter.logic.mayReplace(own)
+    presenter.segment()
+    assert parameters.labels is own and content_of(own) and not presenter.view.errors
+
+
+def test_lesions_that_were_laid_over_the_tissues_after_segment_end_undo(presenter):
+    """Undo took them away with the tissues, without a word."""
+    parameters, scene = presenter.logic.parameters, presenter.logic.scene
+    presenter.segment()
+    labels, names = _labels_of(parameters.labels, presenter.logic)
+    mask = np.zeros(labels.array.shape, np.uint8)
+    centre = np.argwhere(labels.array == names.index("white matter") + 1).mean(axis=0).astype(int)
+    mask[tuple(slice(at - 2, at + 3) for at in centre)] = 1
+    parameters.lesions = scene.AddNewNodeByClass("vtkMRMLSegmentationNode", "Lesions")
+    add_lesion(parameters.lesions, labels.with_array(mask), "tumour", "tumour.nii.gz")
+    presenter.addTissues()
+    content = content_of(parameters.labels)
+    can, why_not = presenter.canUndoSegment()
+    assert not can and "was changed after Segment, as by lesions laid over it, and is kept" in why_not
+    presenter.undoSegment()
+    assert presenter.view.errors.pop() == why_not and content_of(parameters.labels) == content
+    presenter.segment()  # with the lesions
+    assert presenter.canUndoSegment() == (True, "")
+    presenter.undoSegment()
+    assert content_of(parameters.labels) == content
+
+
+def test_settings_come_back_with_undo_or_it_says_so(presenter):
+    presenter.segment()
+    thin, notes = presenter.value("scene.thin_sulci"), presenter.notes()
+    presenter.setValue("scene.thin_sulci", not thin)
+    presenter.segment()
+    presenter.undoSegment()
+    assert presenter.value("scene.thin_sulci") == thin and presenter.notes() == notes
+    presenter.setValue("scene.thin_sulci", not thin)
+    presenter.segment()
+    presenter.setValue("scene.classes", 4)  # the user's since, and kept
+    presenter.undoSegment()
+    assert presenter.value("scene.thin_sulci") != thin and presenter.value("scene.classes") == 4
+    assert (
+        presenter.notes() == f"{notes}\nUndo left the settings of Segment as they are, since they were changed after it"
+    )

@@ -156,8 +156,37 @@ def test_a_fit_changes_the_preset_only_when_applied_and_can_be_reverted(brain):
     assert after.display.gain_db == found.appearance.after["gain_db"]
     assert after.tissues[3].mu0 == found.appearance.after["white matter.mu0"]
     assert after.tissues[2] == before.tissues[2]
-    own.logic.preset = was
+    assert own.logic.revertFit(found, was) == []
     assert own.logic.preset == before
+
+
+def test_values_that_were_set_after_apply_stay_when_it_is_taken_back(brain):
+    """Revert dropped a tissue's value that was typed in the meantime."""
+    own = Scene(brain)
+    before = own.logic.preset
+    found = own.optimize(free=["gain_db", "white matter.mu0"])
+    was = own.logic.applyFit(found)
+    after, csf = own.logic.preset, before.tissues.tissue("csf")
+    typed = replace(csf, mu0=0.33, sources={})
+    own.logic.preset = replace(after, tissues=after.tissues.with_tissue(typed)).changed("probe", frequency_mhz=3.0)
+    assert own.logic.revertFit(found, was) == ["probe frequency_mhz", "csf mu0"]
+    expected = replace(before, tissues=before.tissues.with_tissue(typed)).changed("probe", frequency_mhz=3.0)
+    assert own.logic.preset == expected and own.logic.preset.display == before.display
+    assert "mu0" not in own.logic.preset.tissues.tissue("csf").sources
+    assert own.logic.preset.tissues.tissue("white matter").sources == before.tissues.tissue("white matter").sources
+
+    own.logic.preset = was  # and a value that the fit set as well
+    own.logic.applyFit(found)
+    own.logic.preset = own.logic.preset.changed("display", gain_db=-7.5)
+    assert own.logic.revertFit(found, was) == ["display gain_db"]
+    assert own.logic.preset == before.changed("display", gain_db=-7.5)
+
+    own.logic.preset = was  # with another probe, whose values are not those of the fit's
+    own.logic.applyFit(found)
+    linear = own.logic.preset.changed("probe", kind="linear").probe
+    own.logic.preset = replace(own.logic.preset, probe=linear)
+    assert own.logic.revertFit(found, was) == ["probe"]
+    assert own.logic.preset == replace(before, probe=linear)
 
 
 def test_images_to_compare_lie_where_the_real_one_does(scene, found):

@@ -167,6 +167,17 @@ def add(page, recording, number: int, pixel: tuple[float, float], off_mm=(0.0, 0
 def test_landmarks_register_and_what_remains_is_told(page, recording):
     page.set_input_files("#calibration-file", recording["folder"] / "plus.xml")
     settled(page)
+    for pixel, point, words in (
+        ("-50 10", "1 2 3", "Landmark in the image has column -50, expected 0 to 623, as the image has 624x512 pixels"),
+        ("10 9999", "1 2 3", "Landmark in the image has row 9999, expected 0 to 511, as the image has 624x512 pixels"),
+        ("10 10", "1e9 0 0", "Landmark in the patient has R 1e+09 mm, expected at most 100000 mm from the origin"),
+    ):
+        page.fill("#landmark-pixel", pixel)
+        page.fill("#landmark-point", point)
+        click(page, "#add-landmark")
+        settled(page)
+        assert errors(page)[-1] == words and not state(page, NAMES.registration.landmarks)
+        assert page.locator("#landmark-pixel").input_value() == pixel  # to be corrected
     add(page, recording, 0, (200.0, 150.0))
     add(page, recording, 0, (420.0, 160.0))
     click(page, "#fit-landmarks")

@@ -177,14 +177,18 @@ class FitPresenter:
             if found.registration is not None:
                 transform = result_called(self._panel.logic.scene, "LinearTransform", _REGISTRATION)
                 panel.logic.writeRegistration(found, labels, transform)
-            self._before = before
+            self._before, self.summary = before, _in_words(found)
         panel.view.refresh()
 
     def revert(self) -> None:
-        """Restore the preset from before apply()."""
+        """Restore the values from before apply(), except those that were changed since, which the summary names."""
         with self._panel.shown():
-            self._panel.logic.preset = required(self._before, "nothing to revert to, apply a fit first")
-            self._before = None
+            before = required(self._before, "nothing to revert to, apply a fit first")
+            found, _ = required(self._fit, "nothing to revert, fit first")
+            kept = self._panel.logic.revertFit(found, before)
+            self._before, self.summary = None, _in_words(found)
+            if kept:
+                self.summary += f"\nRevert kept what was changed after Apply: {', '.join(kept)}"
         self._panel.view.refresh()
 
     # ---- compare -----------------------------------------------------------------------------------------------

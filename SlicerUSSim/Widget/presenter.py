@@ -20,11 +20,12 @@ import numpy as np
 from SlicerUSSim.Logic.base.errors import Cancelled, SimulationError, require, required, user_message
 from SlicerUSSim.Logic.imaging.preset import Preset
 from SlicerUSSim.Logic.mri.segmentation import Segmentation
-from SlicerUSSim.Logic.mri.settings import GEL_MM
+from SlicerUSSim.Logic.mri.settings import GEL_MM, SegmentationSettings
 from SlicerUSSim.Logic.mrml.fitting_nodes import fits
 from SlicerUSSim.Logic.mrml.labels_before import LabelsBefore
 from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic
 from SlicerUSSim.Logic.mrml.nodes import display_of, nodes_of_class, probe_pose, set_node_to_world
+from SlicerUSSim.Logic.mrml.own_labels import content_as_made
 from SlicerUSSim.Logic.mrml.own_results import SHEETS, mark_as_result
 from SlicerUSSim.Logic.mrml.parameter_node import BY_LOOK
 from SlicerUSSim.Logic.mrml.sequence_nodes import MADE_FROM
@@ -71,7 +72,7 @@ class TissueRow:
 
 @dataclass(frozen=True, eq=False)
 class _BeforeSegment:
-    """What the last Segment replaced."""
+    """What a Segment replaced."""
 
     labels: LabelsBefore
     #: {role: chosen node}
@@ -79,6 +80,19 @@ class _BeforeSegment:
     #: vtkPolyData of the sheets
     sheets: Any
     notes: tuple[str, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class _LastSegment:
+    """The last Segment: what it replaced, and what it left."""
+
+    before: _BeforeSegment
+    labels: Any
+    #: Of the labels, see own_labels.content_as_made
+    content: str | None
+    #: {role: chosen node}
+    nodes: dict[str, Any]
+    settings: SegmentationSettings
 
 
 class PanelPresenter:
@@ -103,7 +117,9 @@ class PanelPresenter:
         #: The same of the sheets that were found in it
         self.sheetsFile: Callable[[Any], Path | None] = lambda mri_node: None
         self._busy = False
-        self._before_segment: _BeforeSegment | None = None
+        self._last_segment: _LastSegment | None = None
+        #: {content of labels, see own_labels.content_of: settings by which Segment made them}
+        self._made_by: dict[str | None, SegmentationSettings] = {}
         self._custom_probe: Probe | None = None  # the last one that was none of PROBES
         self._last_image: float | None = None
         self._followed: tuple = ()  # the nodes of the live update
@@ -297,10 +313,7 @@ class PanelPresenter:
             mri = required(parameters.mri, "no MRI chosen, expected a scalar volume")
             if self._notes_of not in (None, mri.GetID()):  # also if this fails: they are about another patient
                 self.setNotes()
-            nodes, notes = (
-                {role: getattr(parameters, role) for role in ("labels", "mask", "sheets")},
-                tuple(self._notes),
-            )
+            nodes, notes, settings = self._chosen_by_segment(), tuple(self._notes), parameters.segmentation
             told = self._forget_other_brain(mri) + self._closed_again()
             before = _BeforeSegment(self._labels_before(), nodes, _data_of(parameters.sheets), notes)
             others, untold = self._second_mri()
@@ -314,7 +327,7 @@ class PanelPresenter:
                     mri, labels, mask_node=parameters.mask, others=others, organs_node=parameters.organs,
                     lesions_node=parameters.lesions, sheets=kinds, sheets_node=sheets,
                     keep_mask_at=self.maskFile(mri), keep_sheets_at=self.sheetsFile(mri), progress=progress,
-                    **asdict(parameters.segmentation),
+                    **asdict(settings),
                 )  # fmt: skip
             told += self._take_sheets(sheets)
             self._notes_of, self._checks = mri.GetID(), _checks(result.warnings)
@@ -326,41 +339,81 @@ class PanelPresenter:
                 parameters.mask = brain = self.logic.writeBrain(result, mri)
                 told.append(f"the brain mask is {brain.GetName()!r}, which Segment uses from now on; edit it as needed")
             self._notes += [*told, *untold]
-            self._before_segment = before
+            content = content_as_made(labels)
+            self._last_segment = _LastSegment(before, labels, content, self._chosen_by_segment(), settings)
+            self._made_by[content] = settings
         self.view.refresh()
+
+    def _chosen_by_segment(self) -> dict[str, Any]:
+        """{role: chosen node} of the nodes that Segment chooses."""
+        return {role: getattr(self.logic.parameters, role) for role in ("labels", "mask", "sheets")}
 
     def canUndoSegment(self) -> tuple[bool, str]:
         """(whether the last Segment can be undone, the reason if not)"""
-        before, labels = self._before_segment, self.logic.parameters.labels
+        last, chosen = self._last_segment, self.logic.parameters.labels
         if self._busy:
             return False, _BUSY
-        if before is None or labels is None:
+        if last is None:
             return False, "Nothing was segmented since the scene was opened"
-        if not self.logic.mayReplace(labels):
-            return False, "The tissues were edited after Segment, and are kept"
+        if last.labels.GetScene() is None:
+            return False, "The tissues of the last Segment were removed from the scene"
+        name = repr(last.labels.GetName())
+        if chosen is not None and chosen is not last.labels and self.logic.closedLabels(chosen) is last.labels:
+            return False, f"The skull was opened in {name} after Segment; close it first"
+        if content_as_made(last.labels) != last.content:
+            return False, f"{name} was changed after Segment, as by lesions laid over it, and is kept"
+        if not self.logic.mayReplace(last.labels):
+            return False, f"{name} was edited after Segment, and is kept"
         return True, ""
 
     def undoSegment(self) -> None:
-        """Go back to the tissues, mask, sheets and notes from before the last Segment."""
+        """Go back to the tissues, mask, sheets, settings and notes from before the last Segment.
+
+        What the user chose or set since then stays, whatever it is; only the node into which Segment wrote is changed,
+        or removed if Segment made it.
+        """
         parameters = self.logic.parameters
         with self.shown():
             can, why_not = self.canUndoSegment()
             require(can, why_not)
-            before = required(self._before_segment, why_not)
-            made: Any = parameters.labels
+            last = required(self._last_segment, why_not)
+            before, self._last_segment = last.before, None
+            are_its_notes = self._labels_said == last.labels.GetID()
             before.labels.restore()
             for role, node in before.nodes.items():
-                setattr(parameters, role, None if node is None or node.GetScene() is None else node)
-            sheets: Any = parameters.sheets
-            if before.sheets is not None and sheets is not None and sheets.GetPolyData() is not before.sheets:
+                if getattr(parameters, role) is last.nodes[role]:
+                    setattr(parameters, role, None if node is None or node.GetScene() is None else node)
+            sheets: Any = before.nodes["sheets"]
+            if (
+                before.sheets is not None
+                and sheets.GetScene() is not None
+                and sheets.GetPolyData() is not before.sheets
+                and self.logic.mayReplaceResult(sheets)
+            ):
                 sheets.SetAndObservePolyData(before.sheets)
                 mark_as_result(sheets, SHEETS)
-            if made is not before.labels.node:
-                self.logic.scene.RemoveNode(made)
-            self._notes, self._notes_of, self._checks = list(before.notes), None, []
-            self._labels_said = None if parameters.labels is None else parameters.labels.GetID()
-            self._before_segment = None
+            if last.labels is not before.labels.node:
+                self.logic.scene.RemoveNode(last.labels)
+            if are_its_notes:
+                self._notes, self._notes_of, self._checks = list(before.notes), None, []
+                self._labels_said = None if parameters.labels is None else parameters.labels.GetID()
+            self._notes += self._settings_undone(last)
         self.view.refresh()
+
+    def _settings_undone(self, last: _LastSegment) -> list[str]:
+        """Go back to the settings by which the tissues before `last` were made; a line about it if they stay."""
+        parameters, before = self.logic.parameters, last.before
+        labels: Any = parameters.labels
+        if labels is None or labels is not before.nodes["labels"]:
+            return []
+        known = self._made_by.get(content_as_made(labels))
+        if known == parameters.segmentation:
+            return []
+        if known is not None and parameters.segmentation == last.settings:
+            parameters.segmentation = known
+            return []
+        why = "they were changed after it" if known is not None else "those of these tissues are not known"
+        return [f"Undo left the settings of Segment as they are, since {why}"]
 
     def _labels_before(self) -> LabelsBefore:
         labels: Any = self.logic.parameters.labels
@@ -594,7 +647,7 @@ class PanelPresenter:
         self.logic.forgetPatient()
         self.view.showStatus("")
         self.fits.forget()
-        self._before_segment = None
+        self._last_segment, self._made_by = None, {}
         self.setNotes()
 
     def setNotes(self, *lines: str) -> None:

@@ -255,7 +255,7 @@ def _fit() -> tuple[Row, ...]:
                 action="fits.apply", enabled="fits.canApply",
             ),
             button(
-                "revertFit", "Revert", "Restore the values from before Apply",
+                "revertFit", "Revert", "Restore the values from before Apply, except those changed since",
                 action="fits.revert", enabled="fits.canRevert",
             ),
         ),

@@ -262,14 +262,15 @@ class Loading:
         return True
 
     def undo_segment(self) -> None:
-        """Go back to the tissues from before the last Segment."""
-        self._presenter.undoSegment()
+        """Go back to the tissues from before the last Segment; others that were chosen since stay as they are."""
+        chosen = self._logic.parameters.labels
+        is_changed = self._changed(self._presenter.undoSegment)
         labels: Any = self._logic.parameters.labels
-        if labels is None:
+        if chosen is not None and labels is None:
             self._logic.clearImage(self._logic.parameters.output)
             self._probe.forget_patient()
             self._views.show_volume(self._logic.parameters.mri)
-        else:
+        elif is_changed:
             self._opener.restored(self._source_before, labels)
             self.labels_ready()
         self.show_title()

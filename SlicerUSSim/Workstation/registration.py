@@ -242,7 +242,8 @@ class Registration:
         def clicked(point: np.ndarray | None) -> None:
             self._end_picking()
             if point is not None:
-                self._add(Landmark(number, pixel, point))
+                with self._presenter.shown():
+                    self._add(Landmark(number, pixel, point))
 
         self._hand.pick(clicked)
         with self._shared.changing() as now:
@@ -279,6 +280,8 @@ class Registration:
         with self._presenter.shown():
             recording = self._required()
             sequence = recording.sequence.with_transforms(self._calibration)
+            for mark in self._landmarks:  # those of a scene, too
+                self._check(mark)
             placed = [
                 (sequence.pose(mark.number, recording.path) @ [*mark.pixel, 0.0, 1.0])[:3] for mark in self._landmarks
             ]
@@ -286,7 +289,13 @@ class Registration:
             matrix, line, remaining = fit_landmarks(np.reshape(placed, (-1, 3)), np.reshape(points, (-1, 3)))
             self._register(matrix, line, remaining)
 
+    def _check(self, landmark: Landmark) -> None:
+        """Raise SimulationError for a landmark outside the recorded images, or far outside any patient."""
+        rows, columns = self._required().sequence.images.shape[1:]
+        landmark.check(columns, rows)
+
     def _add(self, landmark: Landmark) -> None:
+        self._check(landmark)
         self._landmarks.append(landmark)
         self._left_unknown()
         self._tell()

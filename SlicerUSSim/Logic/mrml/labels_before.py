@@ -7,7 +7,7 @@ from typing import Any
 
 from SlicerUSSim.Logic.base.errors import SimulationError
 from SlicerUSSim.Logic.base.volume import Volume
-from SlicerUSSim.Logic.mrml.label_nodes import read_labels, write_labels
+from SlicerUSSim.Logic.mrml.label_nodes import empty, read_labels, write_labels
 from SlicerUSSim.Logic.mrml.own_labels import content_of, mark_as_made
 from SlicerUSSim.Logic.mrml.share_nodes import read_shares, write_shares
 from SlicerUSSim.Logic.mrml.taken_image import PATIENT
@@ -45,8 +45,11 @@ class LabelsBefore:
         return self.node is not None and content_of(self.node) != self._content
 
     def restore(self) -> None:
-        """Write the copy into the node, as this module's own; an empty one is left as it is."""
-        if self._kept is None or not self.is_changed:
+        """Write the copy into the node, as this module's own; one that was empty is emptied again."""
+        if not self.is_changed:
+            return
+        if self._kept is None:
+            empty(self.node)
             return
         labels, names, shares, patient = self._kept
         write_labels(self.node, labels, names, self.node)

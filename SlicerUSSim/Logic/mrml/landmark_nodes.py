@@ -9,7 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from SlicerUSSim.Logic.base.errors import SimulationError
+from SlicerUSSim.Logic.base.errors import SimulationError, require
+from SlicerUSSim.Logic.base.transforms import MOST_MM
 from SlicerUSSim.Logic.mrml.nodes import control_points, named, nodes_of_class
 
 #: Attributes of a markups node: number of the image, column and row of each of its points, as JSON; and what is left of
@@ -28,6 +29,23 @@ class Landmark:
     point: np.ndarray
     #: Distance in millimetres that is left in the registration by all of them; None: it was not made by these
     left_mm: float | None = None
+
+    def check(self, columns: int, rows: int) -> None:
+        """Raise SimulationError for a pixel outside an image of this size, or a point farther than MOST_MM.
+
+        The centre of the first pixel is at 0, so that the image begins half a pixel before.
+        """
+        for name, value, count in zip(("column", "row"), self.pixel, (columns, rows), strict=True):
+            require(
+                -0.5 <= value <= count - 0.5,
+                f"Landmark in the image has {name} {value:g}, expected 0 to {count - 1}, as the image has "
+                f"{columns}x{rows} pixels",
+            )
+        for name, value in zip("RAS", self.point, strict=True):
+            require(
+                abs(value) <= MOST_MM,
+                f"Landmark in the patient has {name} {value:g} mm, expected at most {MOST_MM:g} mm from the origin",
+            )
 
     def to_list(self) -> list[float]:
         """Number, column, row, R, A and S, and what is left if it is known, as JSON can hold them."""

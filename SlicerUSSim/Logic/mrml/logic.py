@@ -18,6 +18,7 @@ from SlicerUSSim.Logic.base.settings import SimulationSettings
 from SlicerUSSim.Logic.base.transforms import check_rigid
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.base.vtk_data import matrix_array
+from SlicerUSSim.Logic.fitting.adopted import taken_back, with_fit
 from SlicerUSSim.Logic.fitting.held_out import predict
 from SlicerUSSim.Logic.fitting.search import Progress
 from SlicerUSSim.Logic.fitting.settings import FitSettings
@@ -875,14 +876,13 @@ class UltrasoundSceneLogic:
     def applyFit(self, found: Fit) -> Preset:
         """Adopt probe, display and tissues of a fit in the preset; returns the previous preset, for reverting."""
         before = self.preset
-        tissues = before.tissues
-        changed = set(found.appearance.parameters.varied())
-        if found.speckle is not None:  # which gives tissues a texture
-            changed |= {tissue.name for tissue in found.speckle.tissues.all_tissues() if tissue.texture_db > 0.0}
-        for name in sorted(changed):
-            tissues = tissues.with_tissue(found.appearance.tissues.tissue(name))
-        self.preset = replace(before, probe=found.tracked.probe, display=found.appearance.display, tissues=tissues)
+        self.preset = with_fit(before, found)
         return before
+
+    def revertFit(self, found: Fit, before: Preset) -> list[str]:
+        """Take back what applyFit adopted in the preset `before`; returns names of values changed since, which stay."""
+        self.preset, kept = taken_back(before, with_fit(before, found), self.preset)
+        return kept
 
     def writeRegistration(self, found: Fit, labels_node, transform_node) -> None:
         """Write the registration's correction into a linear transform: the last parent of the tracking.

@@ -7,7 +7,8 @@ import hashlib
 import numpy as np
 
 from SlicerUSSim.Logic.base.errors import SimulationError
-from SlicerUSSim.Logic.mrml.label_nodes import node_labels
+from SlicerUSSim.Logic.base.volume import Volume
+from SlicerUSSim.Logic.mrml.label_nodes import node_labels, overlapping_segments
 from SlicerUSSim.Logic.mrml.ownership import claim, is_claimed
 
 #: Attribute of a node, saved with the scene: a hash of voxels, place and names as Segment wrote them.
@@ -20,14 +21,19 @@ def mark_as_made(labels_node) -> None:
     claim(labels_node)
 
 
+def content_as_made(labels_node) -> str | None:
+    """content_of a node when mark_as_made was called with it last; None if it never was, or with a node copied."""
+    return labels_node.GetAttribute(_MADE) if is_claimed(labels_node) else None
+
+
 def may_replace(labels_node) -> bool:
     """Whether a node is new, or has labels that this program made, and nobody has edited since.
 
     A new one has neither segments nor voxels; segments without voxels are somebody's plan. A copy of labels is of whom
     copied them, see ownership.
     """
-    is_own = is_claimed(labels_node) and labels_node.GetAttribute(_MADE) is not None
-    return _is_new(labels_node) or (is_own and content_of(labels_node) == labels_node.GetAttribute(_MADE))
+    made = content_as_made(labels_node)
+    return _is_new(labels_node) or (made is not None and content_of(labels_node) == made)
 
 
 def _is_new(labels_node) -> bool:
@@ -38,19 +44,36 @@ def _is_new(labels_node) -> bool:
 
 
 def content_of(labels_node) -> str:
-    """A hash of voxels, position and names, the same after saving and loading; "" if no voxel has a label."""
+    """A hash of voxels, position and names, the same after saving and loading; "" if no voxel has a label.
+
+    Where segments overlap, the voxels of each count, since those below others are as much somebody's work. Without
+    overlaps, as Segment writes its results, the hash is that of earlier versions, which knew the topmost segment of
+    every voxel only: what these made is known again. What they made with overlaps is taken for its user's, and kept.
+    """
     try:
         volume, names = node_labels(labels_node)
     except SimulationError:  # no segments, or none with a voxel
         return ""
-    found = np.argwhere(volume.array)
-    if not found.size:
+    if not volume.array.any():
         return ""
-    # Only the part with labels, since segmentations are stored cropped.
-    low, high = found.min(axis=0), found.max(axis=0) + 1
+    content = hashlib.sha256()
+    _add(content, volume, sorted(names.items()))
+    if labels_node.IsA("vtkMRMLSegmentationNode"):
+        for number, segment in enumerate(overlapping_segments(labels_node)):
+            _add(content, segment, number)
+    return content.hexdigest()
+
+
+def _add(content, volume: Volume, about: object) -> None:
+    """Add the voxels of a volume that are not 0, their place and something `about` them to a hash.
+
+    Only the part with such voxels counts, since segmentations are stored cropped.
+    """
+    # Per axis, and not np.argwhere, whose result is 24 bytes for every voxel found
+    spans = [np.flatnonzero(volume.array.any(axis=tuple({0, 1, 2} - {axis}))) for axis in range(3)]
+    low, high = np.array([(span[0], span[-1] + 1) if span.size else (0, 0) for span in spans]).T
     part = volume.array[tuple(slice(a, b) for a, b in zip(low, high, strict=True))]
     place = volume.ijk_to_ras.copy()
     place[:3, 3] = (volume.ijk_to_ras @ [*low[::-1], 1])[:3]
-    content = hashlib.sha256(repr((part.shape, (place.round(3) + 0.0).tolist(), sorted(names.items()))).encode())
+    content.update(repr((part.shape, (place.round(3) + 0.0).tolist(), about)).encode())
     content.update(part.astype(np.int32).tobytes())
-    return content.hexdigest()
