@@ -317,24 +317,22 @@ def test_a_scene_that_cannot_be_read_changes_nothing_on_the_page(page, module_sc
 
 
 def test_real_images_that_cannot_be_used_close_no_patient(page, files, tmp_path):
-    """The patient was closed before it was seen that they have no probe's field."""
+    """The patient was closed before it was seen that they show nothing."""
     app = app_of_slicer()
     logic = UltrasoundSceneLogic(app.scene)
     logic.parameters.mri = app.scene.AddNewNodeByClass("vtkMRMLScalarVolumeNode", "T1 of a study")
     write_volume(logic.parameters.mri, head_mri(5.0))
-    images = np.full((2, 60, 80), 100, np.uint8)
-    images[:, 20:40, 10:70] = 0  # two bars, which are no probe's field
-    times = np.arange(2.0)
+    images, times = np.zeros((2, 60, 80), np.uint8), np.arange(2.0)
     tracked = TrackedSequence(images, ({"ImageToReference": np.diag([0.5, 0.5, 0.5, 1.0])},) * 2, times)
-    _, logic.parameters.real = add_sequence(app.scene, tracked, "bars")
-    assert app.io_manager.write_scene(tmp_path / "bars.mrb")
+    _, logic.parameters.real = add_sequence(app.scene, tracked, "black")
+    assert app.io_manager.write_scene(tmp_path / "black.mrb")
     open_patient(page, files / "labels.nii.gz")
     before = pixels(page)
-    page.set_input_files("#open-file", tmp_path / "bars.mrb")
+    page.set_input_files("#open-file", tmp_path / "black.mrb")
     answer_new_patient(page, "The patient of the scene")
     page.locator(".ussim-error").first.wait_for()
     settled(page)
-    assert "probe's field" in errors(page)[0]
+    assert "image 0 of the sequence is black" in errors(page)[0]
     assert state(page, NAMES.title) == "labels.nii.gz" and np.array_equal(pixels(page), before)
 
 

@@ -349,6 +349,8 @@ class Registration:
         for node in old:
             if node.GetScene() is not None:
                 node.GetScene().RemoveNode(node)
+        if made is not None and self._logic.scene.GetFirstNodeByName(recording.name) is None:
+            made[2].SetName(recording.name)  # which its nodes of before had, and scenes give back
 
     def _choose_poses(self, browser: Any, old: list[Any]) -> None:
         """Let Simulate sequence use the poses of the images, instead of those before, or of none."""
