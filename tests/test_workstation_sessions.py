@@ -106,11 +106,26 @@ def reloaded(page) -> None:
     settled(page)
 
 
+def restore(page) -> None:
+    """Take the session that is offered, and wait until the page shows it."""
+    click(page, "#restore-session")
+    page.locator("#session-offer").wait_for(state="detached")
+    settled(page)
+
+
 def killed_and_started(server: Server, page, *other: str) -> None:
     page.evaluate("window.before = true")
     server.kill()
     page.locator("#connection-lost").wait_for()
     server.start(*other)
+
+
+def crashed_and_restored(server: Server, page) -> None:
+    """Kill the server once the present state is on the disk, start it again and take the session."""
+    kept(page)
+    killed_and_started(server, page)
+    reloaded(page)
+    restore(page)
 
 
 def test_after_kill_9_the_page_reconnects_by_itself_and_restores_all(server, browser, files, tmp_path):
@@ -159,9 +174,7 @@ def test_after_kill_9_the_page_reconnects_by_itself_and_restores_all(server, bro
     offer.wait_for()
     assert offer.inner_text().startswith("Restore the session of ") and "(head.nii.gz)?" in offer.inner_text()
     assert pose(page) != was["sliders"]  # nothing is restored unasked
-    click(page, "#restore-session")
-    page.locator("#session-offer").wait_for(state="detached")
-    settled(page)
+    restore(page)
     assert not errors(page)
     np.testing.assert_allclose(page.evaluate("window.ussim.image.pose"), was["pose"], atol=1e-3)
     assert np.array_equal(pixels(page), was["pixels"])
@@ -189,12 +202,7 @@ def test_after_kill_9_the_page_reconnects_by_itself_and_restores_all(server, bro
     assert not errors(page) and not problems
     # An image of the sequence is the same one again, in the player too, and the script makes it
     image = np.asarray(Image.open(download(page, "png")))
-    kept(page)
-    killed_and_started(own, page)
-    reloaded(page)
-    click(page, "#restore-session")
-    page.locator("#session-offer").wait_for(state="detached")
-    settled(page)
+    crashed_and_restored(own, page)
     again = page.evaluate("window.ussim.image")
     assert {name: again[name] for name in told} == {name: simulated[0][name] for name in told} and again[
         "sequence"
@@ -223,12 +231,7 @@ def test_a_frozen_image_comes_back_frozen_where_it_was_taken(server, browser, fi
         page.keyboard.press("d")
         settled(page)
     moved = state(page, NAMES.pose_matrix)
-    kept(page)
-    killed_and_started(own, page)
-    reloaded(page)
-    click(page, "#restore-session")
-    page.locator("#session-offer").wait_for(state="detached")
-    settled(page)
+    crashed_and_restored(own, page)
     assert not errors(page) and page.locator("#frozen").is_visible() and not shown(page, "liveCheckBox")
     again = page.evaluate("window.ussim.image")
     assert np.array_equal(pixels(page), image) and again["time"] == about["time"]
@@ -263,9 +266,7 @@ def test_slices_are_in_the_image_plane_at_start_and_after_a_session_is_restored(
     killed_and_started(own, page)
     reloaded(page)
     assert sector_rows(page) > 50
-    click(page, "#restore-session")
-    page.locator("#session-offer").wait_for(state="detached")
-    settled(page)
+    restore(page)
     assert sector_rows(page) > 50
     page.close()
 

@@ -220,9 +220,12 @@ def _put_in_place(folder: Path, path: Path) -> None:
     for file in folder.iterdir():
         is_own = file.name == path.name or _is_voxels_of(file.name, path)
         require(is_own, f"{path}: would be written as {file.name}; give another name")
+    if path.suffix.lower() not in _HEADERS:
+        move_into(path.parent, [main])
+        return
     voxels = sorted(file for file in folder.iterdir() if file != main)
     with _alone_in(path.parent):
-        if path.suffix.lower() in _HEADERS and path.is_file():
+        if path.is_file():
             _keep_header(path, folder)
         try:
             move_into(path.parent, [*voxels, main])  # the header, which names the voxels, last
@@ -313,10 +316,14 @@ def hash_of_file(path: Path) -> str:
     return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
-def require_small(path: str | os.PathLike, most_bytes: int = 16 * 2**20) -> None:
-    """Raise SimulationError for a file that is larger than any of its kind, before all of it is read."""
+def read_small(path: str | os.PathLike, most_bytes: int = 16 * 2**20) -> bytes:
+    """The content of a file. Raises SimulationError for one that is larger than any of its kind, before all is read."""
     size = Path(path).stat().st_size
     require(size <= most_bytes, f"{path}: has {size} bytes, expected at most {most_bytes}")
+    with open(path, "rb") as file:
+        content = file.read(most_bytes + 1)  # pipes and devices have no size
+    require(len(content) <= most_bytes, f"{path}: has more than {most_bytes} bytes, expected at most as many")
+    return content
 
 
 def read_json(path: str | os.PathLike, most_bytes: int = 4 * 2**20):
@@ -327,11 +334,7 @@ def read_json(path: str | os.PathLike, most_bytes: int = 4 * 2**20):
     """
     require_path(path)
     try:
-        require_small(path, most_bytes)
-        with open(path, "rb") as file:
-            content = file.read(most_bytes + 1)  # pipes and devices have no size
-        require(len(content) <= most_bytes, f"{path}: has more than {most_bytes} bytes, expected at most as many")
-        text = content.decode("utf-8")
+        text = read_small(path, most_bytes).decode("utf-8")
         _check_nesting(path, text)
         return json.loads(text, object_pairs_hook=_distinct, parse_constant=_refused)
     except OSError as error:

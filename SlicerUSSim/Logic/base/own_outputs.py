@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -35,11 +36,22 @@ def require_own(*paths: Path | None) -> None:
     file is never replaced. None stands for an output that was not asked for.
     """
     for path in paths:
-        require(
-            path is None or not path.exists() or (path.is_file() and _is_own(path)),
-            f"{path}: exists and is not as this program wrote it, so it is not replaced; choose another name, or "
-            "remove it",
-        )
+        if path is not None:
+            require_known(path, _is_own)
+
+
+def require_known(path: Path, is_own: Callable[[Path], bool]) -> None:
+    """Raise SimulationError for a file that exists, and of which `is_own` is False or raises anything."""
+    if not path.exists():
+        return
+    try:
+        is_known = path.is_file() and is_own(path)
+    except Exception:  # whatever libraries raise for what is none of ours; PIL for an image of too many pixels
+        is_known = False
+    require(
+        is_known,
+        f"{path}: exists and is not as this program wrote it, so it is not replaced; choose another name, or remove it",
+    )
 
 
 def mark_of(array: np.ndarray) -> str:
@@ -86,21 +98,18 @@ def _mark_of_values(values: dict) -> str:
 
 
 def _is_own(path: Path) -> bool:
-    """Whether a file has a mark that fits its content; False for a folder, and for what cannot be read."""
-    try:
-        with path.open("rb") as file:
-            start = file.read(16)
-        if start.startswith(b"\x89PNG"):
-            return _is_own_png(path)
-        if start.startswith(b"{"):
-            values = read_json(path, _MOST_JSON_BYTES)
-            return values.pop(MARK, None) == _mark_of_values(values)
-        if start.lower().startswith((b"<!doctype", b"<html")):
-            text, _, last = path.read_text(encoding="utf-8").rpartition(_COMMENT)
-            return bool(text) and marked_html(text) == f"{text}{_COMMENT}{last}"
-        return _is_own_vti(path) if path.suffix.lower() == ".vti" else _is_own_itk(path)
-    except Exception:  # whatever libraries raise for what is none of ours; PIL for an image of too many pixels
-        return False
+    """Whether a file has a mark that fits its content. Raises what its library does for one that cannot be read."""
+    with path.open("rb") as file:
+        start = file.read(16)
+    if start.startswith(b"\x89PNG"):
+        return _is_own_png(path)
+    if start.startswith(b"{"):
+        values = read_json(path, _MOST_JSON_BYTES)
+        return values.pop(MARK, None) == _mark_of_values(values)
+    if start.lower().startswith((b"<!doctype", b"<html")):
+        text, _, last = path.read_text(encoding="utf-8").rpartition(_COMMENT)
+        return bool(text) and marked_html(text) == f"{text}{_COMMENT}{last}"
+    return _is_own_vti(path) if path.suffix.lower() == ".vti" else _is_own_itk(path)
 
 
 def _is_own_png(path: Path) -> bool:

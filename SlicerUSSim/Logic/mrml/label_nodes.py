@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import slicer
+from scipy import ndimage
 from vtkmodules.vtkCommonCore import vtkIntArray, vtkStringArray
 from vtkmodules.vtkCommonMath import vtkMatrix4x4
 
@@ -218,9 +219,8 @@ def _overlap(masks: list[Volume]) -> bool:
         first = to_grid[:3, 3].round().astype(int)
         if not np.allclose(to_grid[:3, :3], np.eye(3), atol=1e-4) or not np.allclose(to_grid[:3, 3], first, atol=1e-2):
             return True
-        spans = [np.flatnonzero(mask.array.any(axis=tuple({0, 1, 2} - {axis}))) for axis in range(3)]
-        part = mask.array[tuple(slice(span[0], span[-1] + 1) for span in spans)]
-        found.append((first[::-1] + [span[0] for span in spans], part))
+        (box,) = ndimage.find_objects(mask.array)
+        found.append((first[::-1] + [side.start for side in box], mask.array[box]))
     low = np.min([corner for corner, _ in found], axis=0)
     high = np.max([corner + part.shape for corner, part in found], axis=0)
     taken = np.zeros(high - low, bool)

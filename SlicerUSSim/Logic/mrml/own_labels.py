@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 
 import numpy as np
+from scipy import ndimage
 
 from SlicerUSSim.Logic.base.errors import SimulationError
 from SlicerUSSim.Logic.base.volume import Volume
@@ -69,11 +70,9 @@ def _add(content, volume: Volume, about: object) -> None:
 
     Only the part with such voxels counts, since segmentations are stored cropped.
     """
-    # Per axis, and not np.argwhere, whose result is 24 bytes for every voxel found
-    spans = [np.flatnonzero(volume.array.any(axis=tuple({0, 1, 2} - {axis}))) for axis in range(3)]
-    low, high = np.array([(span[0], span[-1] + 1) if span.size else (0, 0) for span in spans]).T
-    part = volume.array[tuple(slice(a, b) for a, b in zip(low, high, strict=True))]
+    boxes = ndimage.find_objects((volume.array != 0).view(np.uint8)) or [(slice(0, 0),) * 3]
+    part = volume.array[boxes[0]]
     place = volume.ijk_to_ras.copy()
-    place[:3, 3] = (volume.ijk_to_ras @ [*low[::-1], 1])[:3]
+    place[:3, 3] = (volume.ijk_to_ras @ [*(side.start for side in reversed(boxes[0])), 1])[:3]
     content.update(repr((part.shape, (place.round(3) + 0.0).tolist(), about)).encode())
     content.update(part.astype(np.int32).tobytes())

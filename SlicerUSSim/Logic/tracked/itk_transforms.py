@@ -11,7 +11,7 @@ import re
 from pathlib import Path
 
 from SlicerUSSim.Logic.base.errors import require
-from SlicerUSSim.Logic.base.files import require_small
+from SlicerUSSim.Logic.base.files import read_small
 
 #: Parameters of the linear kinds in three dimensions
 _LINEAR = {
@@ -36,8 +36,7 @@ _NUMBER = r"[-+]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][-+]?[0-9]{1,3})?"
 
 def require_sound_text(path: Path) -> None:
     """Raise SimulationError unless a text file holds one linear transform, or a chain of them, with all its numbers."""
-    require_small(path)
-    content = path.read_bytes()
+    content = read_small(path)
     require(_is_text(content), f"{path}: is not a text, expected an ITK transform")
     fields = [
         (name.strip(), value.strip())

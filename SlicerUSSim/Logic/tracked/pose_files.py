@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import logging
 import os
 import re
@@ -10,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from SlicerUSSim.Logic.base.errors import SimulationError, require, required
-from SlicerUSSim.Logic.base.files import read_json, require_small, write_json, written_whole
+from SlicerUSSim.Logic.base.files import read_json, read_small, write_json, written_whole
 from SlicerUSSim.Logic.base.reading import in_child, reader, starts_like_hdf5
 from SlicerUSSim.Logic.base.transforms import (
     LPS_TO_RAS,
@@ -76,9 +77,8 @@ def read_matrix(path: str | os.PathLike) -> np.ndarray:
 
 def _numbers(path: Path) -> np.ndarray:
     """(4, 4) of sixteen numbers in a text file."""
-    require_small(path)
     try:
-        numbers = np.array(path.read_text().replace(",", " ").split(), float)
+        numbers = np.array(read_small(path).decode().replace(",", " ").split(), float)
     except (ValueError, UnicodeDecodeError):
         raise SimulationError(f"{path}: is not a pose, expected 16 numbers by rows, JSON or an ITK transform") from None
     require(numbers.size == 16, f"{path}: has {numbers.size} numbers, expected 16 (a 4x4 matrix by rows)")
@@ -292,9 +292,8 @@ def _read_xfm(path: Path) -> np.ndarray:
 
 def _mni_text(path: Path, first_words: str) -> str:
     require(path.is_file(), f"{path}: no such file")
-    require_small(path)
     try:
-        text = path.read_text()
+        text = io.StringIO(read_small(path).decode(), newline=None).read()  # all kinds of line ends
     except UnicodeDecodeError:
         text = ""
     require(text.lstrip().startswith(first_words), f"{path}: does not start with {first_words!r}")

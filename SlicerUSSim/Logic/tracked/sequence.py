@@ -20,7 +20,7 @@ from typing import NamedTuple
 import numpy as np
 
 from SlicerUSSim.Logic.base.errors import SimulationError, require, require_package, require_path
-from SlicerUSSim.Logic.base.files import require_small, written_whole
+from SlicerUSSim.Logic.base.files import read_small, written_whole
 from SlicerUSSim.Logic.base.headers import require_whole_nrrd
 from SlicerUSSim.Logic.base.own_outputs import MADE_BY
 from SlicerUSSim.Logic.base.reading import reader
@@ -343,8 +343,7 @@ def read_coordinate_definitions(path: str | os.PathLike) -> dict[str, np.ndarray
 
     path = Path(path)
     try:
-        require_small(path)
-        root = ElementTree.parse(path).getroot()
+        root = ElementTree.fromstring(read_small(path))
     except OSError as error:
         raise SimulationError(f"{path}: cannot be read ({error.strerror})") from None
     except ElementTree.ParseError as error:

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from SlicerUSSim.Logic.base.errors import SimulationError, require
+from SlicerUSSim.Logic.base.errors import require
 from SlicerUSSim.Logic.base.files import messages_withheld, written_whole
-from SlicerUSSim.Logic.base.own_outputs import mark_of
+from SlicerUSSim.Logic.base.own_outputs import mark_of, require_known
 from SlicerUSSim.Logic.base.reading import in_child
 from SlicerUSSim.Logic.mri.sheets.surfels import KINDS, Surfels
 
@@ -128,17 +128,7 @@ def as_polydata(surfels: Surfels, signs: tuple[float, float, float] = (1.0, 1.0,
 
 def require_own_surface(path: Path) -> None:
     """Raise SimulationError for a file that exists and is not as write_surfels wrote it, before it is replaced."""
-    require(
-        not path.exists() or (path.is_file() and _can_be_own(path)),
-        f"{path}: exists and is not as this program wrote it, so it is not replaced; choose another name, or remove it",
-    )
-
-
-def _can_be_own(path: Path) -> bool:
-    try:
-        return _is_own(path)
-    except SimulationError:  # no surface, or a damaged one
-        return False
+    require_known(path, _is_own)
 
 
 @in_child  # VTK ends the process for some damaged files
