@@ -292,13 +292,12 @@ inline float gain_on_membrane(__constant const Acquisition *acquisition, __globa
 }
 
 #ifdef UNEVEN
-// By how much tissue varies at LANES places in the patient, as factors of amplitudes. `uneven` are words of the tissue
-// at each place, [word][lane].
-inline floatn unevenness(uint seed, const float *uneven, int has_specks, floatn x, floatn y, floatn z) {
-  floatn level = LOAD_LANES(uneven + 2 * LANES);
+// By how much tissue varies at LANES places in the patient, as factors of amplitudes. `words` are those of the tissue
+// at each place.
+inline floatn unevenness(uint seed, const floatn *words, int has_specks, floatn x, floatn y, floatn z) {
+  floatn level = words[2];
   // g: normal numbers at the corners of lattice cells, with trilinear weights, over the root of the weights' squares
-  const floatn per_mm = LOAD_LANES(uneven);
-  const floatn px = x * per_mm, py = y * per_mm, pz = z * per_mm;
+  const floatn px = x * words[0], py = y * words[0], pz = z * words[0];
   const floatn ix = floor(px), iy = floor(py), iz = floor(pz);
   const floatn fx = px - ix, fy = py - iy, fz = pz - iz;
   const uintn key = TO_UINTN(TO_INTN(ix)) * axis_step(0) + TO_UINTN(TO_INTN(iy)) * axis_step(1) +
@@ -312,17 +311,16 @@ inline floatn unevenness(uint seed, const float *uneven, int has_specks, floatn 
   }
   const floatn squares = fma(fx, fx, (1.0f - fx) * (1.0f - fx)) * fma(fy, fy, (1.0f - fy) * (1.0f - fy)) *
                          fma(fz, fz, (1.0f - fz) * (1.0f - fz));
-  level = fma(LOAD_LANES(uneven + LANES), sum / sqrt(squares), level);
+  level = fma(words[1], sum / sqrt(squares), level);
   if (has_specks) {  // which fill the cell that they are in
-    const floatn cells = LOAD_LANES(uneven + 3 * LANES);
-    const floatn sx = x * cells, sy = y * cells, sz = z * cells;
+    const floatn sx = x * words[3], sy = y * words[3], sz = z * words[3];
     const floatn jx = floor(sx), jy = floor(sy), jz = floor(sz);
     const uintn place = TO_UINTN(TO_INTN(jx)) * axis_step(0) + TO_UINTN(TO_INTN(jy)) * axis_step(1) +
                         TO_UINTN(TO_INTN(jz)) * axis_step(2);
     const floatn drawn = TO_FLOATN(hash_mixn(place ^ (seed + 0xB5297A4Du)) >> 16) + 0.5f;
     const floatn rx = sx - jx - 0.5f, ry = sy - jy - 0.5f, rz = sz - jz - 0.5f;
     const floatn near = fmax(1.0f - 4.0f * fma(rx, rx, fma(ry, ry, rz * rz)), 0.0f);
-    level += drawn < LOAD_LANES(uneven + 4 * LANES) ? LOAD_LANES(uneven + 5 * LANES) * near : (floatn)(0.0f);
+    level += drawn < words[4] ? words[5] * near : (floatn)(0.0f);
   }
   return exp2_fast(clamp(level, (floatn)(-30.0f), (floatn)(30.0f)));
 }
@@ -449,14 +447,29 @@ inline void scatter_batch(__constant const Acquisition *acquisition, __global co
 
 #ifdef UNEVEN
   for (int i = 0; i < n; i += LANES) {
-    float places[3][LANES], words[UNEVEN_WORDS * LANES];
-    int has_specks = 0;
+    float places[3][LANES];
+    int several_tissues = 0;
     for (int lane = 0; lane < LANES; lane++) {
       const int at = min(i + lane, n - 1);
+      several_tissues |= label_[at] ^ label_[i];
       for (int axis = 0; axis < 3; axis++) places[axis][lane] = place_[axis * BATCH + chosen[at]];
-      __global const float *uneven = sites + 3 * MAX_TISSUES + UNEVEN_WORDS * label_[at];
-      for (int word = 0; word < 6; word++) words[word * LANES + lane] = uneven[word];
-      has_specks |= uneven[3] > 0.0f;
+    }
+    __global const float *uneven = sites + 3 * MAX_TISSUES, *here = uneven + UNEVEN_WORDS * label_[i];
+    floatn words[6];
+    int has_specks = here[3] > 0.0f;
+    if (several_tissues) {
+      float words_[6][LANES];
+      for (int lane = 0; lane < LANES; lane++) {
+        here = uneven + UNEVEN_WORDS * label_[min(i + lane, n - 1)];
+        for (int word = 0; word < 6; word++) words_[word][lane] = here[word];
+        has_specks |= here[3] > 0.0f;
+      }
+      for (int word = 0; word < 6; word++) words[word] = LOAD_LANES(words_[word]);
+    } else if (here[0] == 0.0f && !has_specks) {
+      STORE_LANES((floatn)(1.0f), uneven_ + i);
+      continue;
+    } else {
+      for (int word = 0; word < 6; word++) words[word] = here[word];
     }
     STORE_LANES(unevenness(acquisition->seed, words, has_specks, LOAD_LANES(places[0]), LOAD_LANES(places[1]),
                            LOAD_LANES(places[2])),
