@@ -26,7 +26,7 @@ from SlicerUSSim.Logic import (
 from SlicerUSSim.Logic.base.files import write_json
 from SlicerUSSim.Logic.fitting import TextureReference, measure_realism, neighbours_of, speckle_widths, texture_misfit
 from SlicerUSSim.Logic.fitting.grey_statistics import grey_of_tissues, level_by_depth
-from SlicerUSSim.Logic.fitting.realism import BLURRED, NEIGHBOURS, REAL, UNIFORM, blurred
+from SlicerUSSim.Logic.fitting.realism import BLURRED, LEVELLED, NEIGHBOURS, REAL, UNIFORM, blurred
 from SlicerUSSim.Logic.fitting.sheet_contrast import line_contrast, sheet_points, wall_points
 from SlicerUSSim.Logic.fitting.speckle_width import log_speckle_correlation
 from SlicerUSSim.Logic.mri.samples import head_mri
@@ -222,12 +222,17 @@ def test_realism_of_the_images_themselves_is_perfect_and_controls_are_not(twin):
         tracked, {"itself": tracked.images}, twin.simulator, neighbours=neighbours_of(sequence, tracked)
     )
     assert found.mean("itself")["sum"] == 0.0
-    assert set(found.costs) == {"itself", UNIFORM, BLURRED, NEIGHBOURS}
-    for control in (UNIFORM, BLURRED, NEIGHBOURS):
+    assert set(found.costs) == {"itself", UNIFORM, LEVELLED, BLURRED, NEIGHBOURS}
+    for control in (UNIFORM, LEVELLED, BLURRED, NEIGHBOURS):
         assert found.mean(control)["paper"] > 0.05
     assert found.mean(BLURRED)["t2"] > 2 * found.mean(NEIGHBOURS)["t2"]
     real, uniform = (np.mean([i[tracked.mask].mean() for i in found.images[name]]) for name in (REAL, UNIFORM))
     assert uniform == pytest.approx(real, abs=1.0)  # at its best gain
+    assert found.mean(LEVELLED)["paper"] < found.mean(UNIFORM)["paper"]
+    for levelled, real in zip(found.images[LEVELLED], found.images[REAL], strict=True):
+        inside = ndimage.binary_erosion(tracked.mask, iterations=40)
+        means = [ndimage.gaussian_filter(image.astype(float), 25)[inside] for image in (levelled, real)]
+        assert np.abs(means[0] - means[1]).mean() < 3.0  # but for what is clipped at black
     plain = json.loads(json.dumps(found.to_dict(), allow_nan=False))
     assert plain["costs"]["itself"]["mean"]["sum"] == 0.0
     assert {title.split()[0] for title, _, _ in found.tables()} >= {"Costs", "Width", "Local", "Grey", "Mean"}
@@ -248,7 +253,15 @@ def test_command_says_numbers_with_controls(twin, tmp_path):
     ]  # fmt: skip
     done = CliRunner().invoke(main, list(map(str, arguments)))
     assert done.exit_code == 0, done.output
-    for words in ("simulated", "uniform tissue", "real neighbours", "real, blurred", "T1", "Width of the speckle"):
+    for words in (
+        "simulated",
+        "uniform tissue",
+        "real neighbours",
+        "uniform, real level",
+        "real, blurred",
+        "T1",
+        "Width of the speckle",
+    ):
         assert words in done.output
     assert json.loads((tmp_path / "realism.json").read_text())["costs"]["simulated"]["mean"]["sum"] >= 0.0
     assert (tmp_path / "realism.png").stat().st_size > 10_000

@@ -5,7 +5,9 @@ is closer by the paper's cost than any. So the same numbers are given for
 
 - *real neighbours*: the images before and after in the recording, the floor that nothing needs to go below;
 - *real, blurred* by 2 pixels: what a cost that sees speckle must refuse;
-- *uniform tissue*: one tissue instead of all, at the gain that gives it the real images' mean grey level.
+- *uniform tissue*: one tissue instead of all, at the gain that gives it the real images' mean grey level;
+- *uniform, real level*: its speckle on the real images' own local mean (Gaussian, sigma 5 mm): what other speckle
+  costs where the level of everything is known.
 """
 
 from __future__ import annotations
@@ -24,7 +26,13 @@ from SlicerUSSim.Logic.base.own_outputs import save_marked_png
 from SlicerUSSim.Logic.base.settings import DisplaySettings
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.fitting.appearance import AppearanceModel
-from SlicerUSSim.Logic.fitting.grey_statistics import TissueGrey, grey_of_tissues, histogram_misfit, level_by_depth
+from SlicerUSSim.Logic.fitting.grey_statistics import (
+    TissueGrey,
+    grey_of_tissues,
+    histogram_misfit,
+    less_local_mean,
+    level_by_depth,
+)
 from SlicerUSSim.Logic.fitting.image_similarity import Similarity, similarity
 from SlicerUSSim.Logic.fitting.sheet_contrast import LineContrast, line_contrast, sheet_points, wall_points
 from SlicerUSSim.Logic.fitting.speckle_width import SpeckleWidth, extrema_density_cm2, speckle_widths
@@ -38,6 +46,8 @@ from SlicerUSSim.Logic.tracked.sequence import TrackedSequence
 
 #: Names of the sources that are always there
 REAL, NEIGHBOURS, BLURRED, UNIFORM = "real", "real neighbours", "real, blurred", "uniform tissue"
+LEVELLED = "uniform, real level"
+_CONTROLS = (REAL, NEIGHBOURS, BLURRED, UNIFORM, LEVELLED)
 #: Sigma of the blurred control, pixels
 BLUR_PIXELS = 2.0
 #: Between which the gain of the uniform control is looked for
@@ -205,7 +215,7 @@ def measure_realism(
     Raises SimulationError for numbers or shapes that differ, and for a name of a control.
     """
     for name, images in simulated.items():
-        require(name not in (REAL, NEIGHBOURS, BLURRED, UNIFORM), f"{name!r} is the name of a control, expected others")
+        require(name not in _CONTROLS, f"{name!r} is the name of a control, expected others")
         require(
             len(images) == len(tracked.images),
             f"{len(images)} images of {name} and {len(tracked.images)} real ones, expected equal numbers",
@@ -213,6 +223,9 @@ def measure_realism(
     sources: dict[str, list[np.ndarray]] = {REAL: list(tracked.images)}
     sources |= {name: list(images) for name, images in simulated.items()}
     sources[UNIFORM] = uniform_control(simulator, tracked, display or DisplaySettings())
+    sources[LEVELLED] = [
+        at_level_of(image, real, tracked) for image, real in zip(sources[UNIFORM], tracked.images, strict=True)
+    ]
     sources[BLURRED] = [blurred(image) for image in tracked.images]
     spacing = tracked.grid.pixel_spacing_mm
     references = [TextureReference(image, spacing, tracked.mask) for image in tracked.images]
@@ -267,6 +280,14 @@ def blurred(image: np.ndarray) -> np.ndarray:
     """(rows, columns) uint8 blurred by a Gaussian of 2 pixels."""
     smooth = ndimage.gaussian_filter(np.asarray(image, np.float32), BLUR_PIXELS)
     return np.clip(np.rint(smooth), 0, 255).astype(np.uint8)
+
+
+def at_level_of(image: np.ndarray, real: np.ndarray, tracked: TrackedImages) -> np.ndarray:
+    """(rows, columns) uint8 image with the local mean (less_local_mean) of a real one instead of its own."""
+    levelled = real + (
+        less_local_mean(image, tracked.grid, tracked.mask) - less_local_mean(real, tracked.grid, tracked.mask)
+    )
+    return np.clip(np.rint(levelled), 0, 255).astype(np.uint8)
 
 
 def uniform_tissues(simulator: UltrasoundSimulator) -> tuple[Volume, TissueTable]:
