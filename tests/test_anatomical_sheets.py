@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy import ndimage
 from scipy.spatial import KDTree
 
 from SlicerUSSim.Logic import Segmentation, SimulationError, Volume, segment_mri
@@ -20,6 +21,7 @@ from SlicerUSSim.Logic.mri.atlas import mni152
 from SlicerUSSim.Logic.mri.atlas_registration import AtlasFit
 from SlicerUSSim.Logic.mri.sheets import KINDS, Surfels, find_sheets, on_voxels
 from SlicerUSSim.Logic.mri.sheets.ependyma import ependyma
+from SlicerUSSim.Logic.mri.sheets.falx import falx
 from SlicerUSSim.Logic.mri.sheets.head import Head
 from SlicerUSSim.Logic.mri.sheets.heights import settled
 from SlicerUSSim.Logic.mri.sheets.kept import key_of, read_kept_sheets
@@ -335,6 +337,31 @@ def test_a_grid_too_coarse_for_the_reach_and_no_surfels():
 
 
 # ---- whole heads ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("use_intensity", [True, False])
+def test_a_falx_that_enhances_as_white_matter_does_is_no_white_matter(use_intensity):
+    """Between hemispheres 10 mm apart, off the middle between them. Of a real one, a third of the places were taken for
+    white matter, and what was found was 3 mm aside."""
+    x, y, z = np.mgrid[-30:31, -110:76, -30:89].astype(float).transpose(0, 3, 2, 1)
+    csf, grey, white = 20.0, 100.0, 140.0
+    in_brain = ((x / 70.0) ** 2 + ((y + 18.0) / 90.0) ** 2 + ((z - 10.0) / 75.0) ** 2) < 1.0
+    at = 1.5 + 0.5 * np.sin(y / 30.0)
+    image = np.select([np.abs(x) > 9.0, np.abs(x) > 6.0], [white, grey], csf)
+    image[(z < 0.0) & (np.abs(x) < 9.0)] = white  # below the free edge, where the falx meets it
+    image[np.abs(x - at) < 1.0] = white + 60.0
+    image = ndimage.gaussian_filter(np.where(in_brain, image, 0.0), 0.7).astype(np.float32)
+    matrix = np.diag([1.0, 1.0, 1.0, 1.0])
+    matrix[:3, 3] = -30.0, -110.0, -30.0
+    fit = AtlasFit(np.eye(4), 1.0, None)  # type: ignore[arg-type]
+    head = Head(Volume(image, matrix), in_brain, csf, grey, white, 6.0, True, fit)
+    found = falx(head, use_intensity=use_intensity)
+    _, v, w = found.place.T
+    inner = (v > -80) & (v < 50) & (w > 40) & (w < 70)
+    away = found.place[inner, 0] - (1.5 + 0.5 * np.sin(v[inner] / 30.0) if use_intensity else 0.0)
+    assert inner.sum() > 1000
+    assert np.median(np.abs(away)) < 0.4
+    assert np.percentile(np.abs(away), 90) < 1.0
 
 
 def test_what_cannot_be_found_is_said_before_the_search():

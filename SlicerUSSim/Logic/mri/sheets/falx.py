@@ -6,6 +6,7 @@ import numpy as np
 from scipy import ndimage
 
 from SlicerUSSim.Logic.mri.coarse import largest_component
+from SlicerUSSim.Logic.mri.distances import distance_to
 from SlicerUSSim.Logic.mri.sheets.head import Head
 from SlicerUSSim.Logic.mri.sheets.heights import patches, settled
 from SlicerUSSim.Logic.mri.sheets.surfels import Surfels
@@ -20,6 +21,8 @@ FREE_EDGE = (
 _WINDOWS_MM, _SMOOTHINGS_MM = (6.0, 4.0, 3.0, 2.0), (8.0, 6.0, 5.0, 4.0)
 #: Distance to white matter counts up to this; fluid and enhancement count so many mm of it
 _FARTHEST_MM, _EVIDENCE_MM = 6.0, 1.5
+#: Half the thickness of the thinnest white matter that counts, and what is added when it is grown back, for the grid
+_THIN_MM, _ROUNDING_MM = 1.5, 0.3
 #: Distance to white matter in the fissure, after smoothing
 _FISSURE_MM, _FISSURE_SIGMA = 1.8, 2.0
 #: Thickness of the falx; and its confidence by its place in the head alone, reached so far above the free edge, mm
@@ -36,7 +39,7 @@ def falx(head: Head, use_intensity: bool = True) -> Surfels:
     def sampled(array: np.ndarray) -> np.ndarray:
         return head.at(flat, array).reshape(points.shape[:3])
 
-    distance = sampled(np.maximum(head.white_distance, 0.0))
+    distance = sampled(_distance_to_thick_white(head))
     inside = sampled((head.depth > -1.0).astype(np.float32)) > 0.5
     evidence = sampled(_evidence(head)) if use_intensity else np.zeros_like(distance)
     relief = np.minimum(distance, _FARTHEST_MM) + _EVIDENCE_MM * np.where(distance > 0.5, evidence, 0.0)
@@ -59,6 +62,21 @@ def falx(head: Head, use_intensity: bool = True) -> Surfels:
     seen = np.clip(on_sheet(evidence), 0.0, 1.0)
     confidence = np.clip(above / _EDGE_MM, 0.3, 1.0) * (_SURE + (1.0 - _SURE) * seen)
     return Surfels.of("falx", place[kept], normal[kept], _THICKNESS_MM, confidence[kept], area[kept])
+
+
+def _distance_to_thick_white(head: Head) -> np.ndarray:
+    """(k, j, i) float32 mm to white matter of at least 3 mm, 0 in it; far from the midsagittal plane 0.
+
+    A falx that enhances faintly, and the rims of one that does brightly, are as bright as white matter, but thinner.
+    """
+    result = np.zeros(head.brain.shape, np.float32)
+    x, _, _ = head.in_atlas
+    box = ndimage.find_objects((np.abs(x) < _X_MM + _FARTHEST_MM).astype(np.uint8))[0]
+    spacing = head.image.spacing_mm
+    inner = distance_to(~head.white_matter[box], spacing) > _THIN_MM
+    thick = head.white_matter[box] & (distance_to(inner, spacing) <= _THIN_MM + _ROUNDING_MM)
+    result[box] = np.maximum(distance_to(thick, spacing), 0.0)
+    return result
 
 
 def _evidence(head: Head) -> np.ndarray:

@@ -128,11 +128,16 @@ class Head:
         return -distance_to(hull, self.image.spacing_mm)[n:-n, n:-n, n:-n]
 
     @cached_property
-    def white_distance(self) -> np.ndarray:
-        """(k, j, i) float32 mm to the white matter, 0 or less in it."""
+    def white_matter(self) -> np.ndarray:
+        """(k, j, i) bool, by intensity: the largest connected part."""
         smooth = self.smoothed(0.5)
         inside = (smooth > 0.5 * (self.grey + self.white)) & (smooth < self.white + 4.0 * self.noise) & self.brain
-        return distance_to(largest_component(inside), self.image.spacing_mm)
+        return largest_component(inside)
+
+    @cached_property
+    def white_distance(self) -> np.ndarray:
+        """(k, j, i) float32 mm to the white matter, 0 or less in it."""
+        return distance_to(self.white_matter, self.image.spacing_mm)
 
     def around(self, region: np.ndarray, margin_mm: float) -> tuple[Head, np.ndarray]:
         """(the part of the head that holds a region (k, j, i), the region there)."""

@@ -30,12 +30,14 @@ def settled(
     smoothings : standard deviations in rows and columns by which the heights of each step are smoothed; places where
         the relief stands out count more.
     """
-    height = np.zeros(relief.shape[:2], np.float32)
+    height, step = np.zeros(relief.shape[:2], np.float32), float(offsets[1] - offsets[0])
     sure = np.zeros_like(height)
     for window, smoothing in zip(windows_mm, smoothings, strict=True):
-        near = usable & (np.abs(offsets - height[..., None]) <= window)
+        # The windows' ends lie between steps: on a plateau of the relief, whole steps would pull to one side
+        share = np.clip((window - np.abs(offsets - height[..., None])) / step + 0.5, 0.0, 1.0)
+        near = usable & (share > 0.0)
         top = np.where(near, relief, -np.inf).max(axis=2, keepdims=True)
-        weight = np.where(near, np.exp((relief - np.where(np.isfinite(top), top, 0.0)) / softness), 0.0)
+        weight = np.where(near, share * np.exp((relief - np.where(np.isfinite(top), top, 0.0)) / softness), 0.0)
         total = np.maximum(weight.sum(axis=2), 1e-9)
         middle = (weight * offsets).sum(axis=2) / total
         spread = np.sqrt((weight * (offsets - middle[..., None]) ** 2).sum(axis=2) / total)
