@@ -1,6 +1,6 @@
 """The pictures of docs/sheets.md: sheets and structures on planes of an MRI, along the axes of the atlas.
 
-    python benchmarks/sheet_pictures.py docs/images [colin27 remind022 mni152] [--keep FOLDER]
+    python benchmarks/sheet_pictures.py docs/images [colin27 remind022 mni152] [FILE=CONTRAST ...] [--keep FOLDER]
 
 Colin27 needs Debian's mricron-data, and ReMIND-022 ../shared; what is not there is left out.
 """
@@ -90,7 +90,11 @@ def main() -> None:
         "mni152": (None, "t1"),
     }
     for name in arguments.what:
-        file, contrast = heads[name]
+        if "=" in name:
+            path, contrast = name.split("=")
+            file, name = Path(path), Path(path).name.split(".")[0].lower()
+        else:
+            file, contrast = heads[name]
         if file is not None and not file.exists():
             continue
         mri = demo_mri()[0] if file is None else Volume.read(file)

@@ -1,6 +1,6 @@
 """The numbers of docs/sheets.md: how near sheets are to what the images show, each with a control.
 
-    python benchmarks/sheets.py [remind022 turned shifted colin27 mni152] [--keep FOLDER]
+    python benchmarks/sheets.py [remind022 turned shifted colin27 mni152] [FILE=CONTRAST ...] [--keep FOLDER]
 
 ReMIND-022 needs ../shared, Colin27 Debian's mricron-data; what is not there is left out. About four minutes in all.
 """
@@ -155,6 +155,27 @@ def segmented(arguments, name: str, mri: Volume, **options) -> Segmentation:
     return segment_mri(mri, keep_mask_at=keep_at, **options)
 
 
+def dura(head: Head, surfels: Surfels) -> None:
+    """Falx and tentorium against those that enhance."""
+    here = surfels.of_kind("falx")
+    without = falx(head, use_intensity=False)
+    flat = head.to_atlas(here.place) * [0, 1, 1]
+    controls = {
+        "with contrast": here, "without using it": without, "mirrored": mirrored(head, here),
+        "x = 0 of the atlas": moved(here, head.from_atlas(flat)),
+        "3 mm aside": moved(here, here.place + 3 * here.normal),
+    }  # fmt: skip
+    sheet_errors("falx", head, falx_shown(head), controls)
+    here = surfels.of_kind("tentorium")
+    flat = head.to_atlas(here.place)
+    flat[:, 2] = tentorium_height(flat[:, 0], flat[:, 1])
+    controls = {
+        "found": here, "of the template": moved(here, head.from_atlas(flat)), "mirrored": mirrored(head, here),
+        "3 mm aside": moved(here, here.place + 3 * here.normal),
+    }  # fmt: skip
+    sheet_errors("tentorium", head, tentorium_shown(head), controls)
+
+
 def remind(arguments) -> None:
     t1, t2 = (Volume.read(SHARED / f"remind022/{name}.nii.gz") for name in ("t1_contrast", "t2"))
     found = segmented(arguments, "remind022", t1, contrast="t1gd")
@@ -164,23 +185,7 @@ def remind(arguments) -> None:
     sulci = sheets.surfels.of_kind("sulcus")
     coverage("ReMIND-022", head, sheets.surfels.of_kind("sulcus", "falx", "tentorium"))
     t2_confirms(head, sulci, other)
-    here = sheets.surfels.of_kind("falx")
-    without = falx(head, use_intensity=False)
-    flat = head.to_atlas(here.place) * [0, 1, 1]
-    controls = {
-        "with contrast": here, "without using it": without, "mirrored": mirrored(head, here),
-        "x = 0 of the atlas": moved(here, head.from_atlas(flat)),
-        "3 mm aside": moved(here, here.place + 3 * here.normal),
-    }  # fmt: skip
-    sheet_errors("falx", head, falx_shown(head), controls)
-    here = sheets.surfels.of_kind("tentorium")
-    flat = head.to_atlas(here.place)
-    flat[:, 2] = tentorium_height(flat[:, 0], flat[:, 1])
-    controls = {
-        "found": here, "of the template": moved(here, head.from_atlas(flat)), "mirrored": mirrored(head, here),
-        "3 mm aside": moved(here, here.place + 3 * here.normal),
-    }  # fmt: skip
-    sheet_errors("tentorium", head, tentorium_shown(head), controls)
+    dura(head, sheets.surfels)
     # The same walls and sulci from the T2 alone
     by_t2 = segment_mri(other, contrast="t2", mask=found.brain.mask)
     again = timed("ReMIND-022's T2", other, by_t2, "t2", kinds=["sulcus", "ependyma"]).surfels
@@ -317,6 +322,17 @@ def colin(arguments) -> None:
         )
 
 
+def other(file: Path, contrast: str) -> None:
+    """Another head: its visible CSF, and with contrast agent its falx and tentorium."""
+    mri = Volume.read(file)
+    found = segment_mri(mri, contrast=contrast)
+    sheets = timed(file.name, mri, found, contrast)
+    head = Head.of(mri, found, contrast)
+    coverage(file.name, head, sheets.surfels.of_kind("sulcus", "falx", "tentorium"))
+    if head.is_enhanced:
+        dura(head, sheets.surfels)
+
+
 def mni(arguments) -> None:
     mri = demo_mri()[0]
     found = segment_mri(mri)
@@ -335,6 +351,10 @@ def main() -> None:
     arguments = parser.parse_args()
     steps = {"remind022": remind, "turned": turned, "shifted": shifted, "colin27": colin, "mni152": mni}
     for name in arguments.what:
+        if "=" in name:
+            file, contrast = name.split("=")
+            other(Path(file), contrast)
+            continue
         is_there = {"colin27": (COLIN27 / "ch2.nii.gz").exists(), "mni152": True}.get(
             name, (SHARED / "remind022").is_dir()
         )
