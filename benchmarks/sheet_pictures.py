@@ -2,6 +2,7 @@
 
     python benchmarks/sheet_pictures.py docs/images [colin27 remind022 mni152] [FILE=CONTRAST ...] [--keep FOLDER]
 
+With --views PICTURE also a view of every head through a craniotomy, by its labels alone and, below, with the sheets.
 Colin27 needs Debian's mricron-data, and ReMIND-022 ../shared; what is not there is left out.
 """
 
@@ -15,11 +16,15 @@ import matplotlib.pyplot as plt
 import numpy as np
 from brain_extraction import SHARED
 from matplotlib.lines import Line2D
+from PIL import Image
 
-from SlicerUSSim.Logic import Volume, segment_mri
+from SlicerUSSim.Logic import Segmentation, TissueTable, UltrasoundSimulator, Volume, segment_mri
+from SlicerUSSim.Logic.base.own_outputs import save_marked_png
 from SlicerUSSim.Logic.mri import demo_mri
+from SlicerUSSim.Logic.mri.pathology import add_tissues
 from SlicerUSSim.Logic.mri.sheets import KINDS, STRUCTURES, Sheets, find_sheets
 from SlicerUSSim.Logic.mri.sheets.head import Head
+from SlicerUSSim.Logic.probe import PROBES, craniotomy_pose
 from SlicerUSSim.Logic.verification.brain_phantoms import COLIN27
 
 #: Axis of MNI152 (0 is x) and place in mm of every plane
@@ -78,17 +83,33 @@ def draw(path: Path, head: Head, sheets: Sheets) -> None:
     print(f"{path}: {path.stat().st_size / 1000:.0f} kB")
 
 
+def view(found: Segmentation, sheets: Sheets) -> np.ndarray:
+    """(rows, columns) uint8: one image by the labels alone, below it one with sheets and structures."""
+    probe = PROBES["neonatal"]
+    pose = craniotomy_pose(found.brain.mask, probe)
+    added = add_tissues(found.labels, found.tissue_names, sheets.masks(), has_brain_mask=True)
+    images = []
+    for labels, names, surfels in (
+        (found.labels, found.tissue_names, None), (added.labels, added.tissue_names, sheets.surfels)
+    ):  # fmt: skip
+        simulator = UltrasoundSimulator(labels, TissueTable.brain(names), sheets=surfels)
+        images.append(np.pad(simulator.simulate(probe, pose).image, 4))
+    return np.vstack(images)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=str(__doc__).splitlines()[0])
     parser.add_argument("folder", type=Path)
     parser.add_argument("what", nargs="*", default=["colin27", "remind022", "mni152"])
     parser.add_argument("--keep", type=Path, help="folder for brain masks")
+    parser.add_argument("--views", type=Path, help="picture of ultrasound images of the heads")
     arguments = parser.parse_args()
     heads: dict[str, tuple[Path | None, str]] = {
         "colin27": (COLIN27 / "ch2.nii.gz", "t1"),
         "remind022": (SHARED / "remind022/t1_contrast.nii.gz", "t1gd"),
         "mni152": (None, "t1"),
     }
+    columns: list[np.ndarray] = []
     for name in arguments.what:
         if "=" in name:
             path, contrast = name.split("=")
@@ -106,6 +127,10 @@ def main() -> None:
         for line in sheets.notes:
             print(f"{name}: {line}")
         draw(arguments.folder / f"sheets-{name}.jpg", Head.of(mri, found, contrast), sheets)
+        if arguments.views:
+            columns.append(view(found, sheets))
+    if arguments.views:
+        save_marked_png(arguments.views, Image.fromarray(np.hstack(columns)))
 
 
 if __name__ == "__main__":
