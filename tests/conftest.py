@@ -15,6 +15,7 @@ import pytest
 
 from SlicerUSSim.Logic import LinearProbe, SimulationSettings, Tissue, TissueTable, UltrasoundSimulator, Volume
 from SlicerUSSim.Logic.tissue.presets import TISSUES
+from tests.remembered import segment_once
 from tests.shared_data import SHARED as SHARED, needs_shared as needs_shared
 
 hypothesis.settings.register_profile("ussim", deadline=None, derandomize=True, max_examples=50)
@@ -80,6 +81,15 @@ def _unchanged_locale():
     before = locale.setlocale(locale.LC_ALL)
     yield
     locale.setlocale(locale.LC_ALL, before)
+
+
+@pytest.fixture(scope="module")
+def segmented_once():
+    """Commands and scenes segment the same image with the same arguments once for all tests (tests.remembered)."""
+    with pytest.MonkeyPatch.context() as patch:
+        for module in ("Logic.mri.modality", "Command.whole_line"):
+            patch.setattr(f"SlicerUSSim.{module}.segment_mri", segment_once)
+        yield
 
 
 @pytest.fixture(scope="session")

@@ -23,6 +23,8 @@ from SlicerUSSim.Logic.probe.arrays import PROBES
 from SlicerUSSim.Logic.tracked.pose_files import read_pose, write_pose
 from SlicerUSSim.Logic.tracked.sequence import TrackedSequence
 
+pytestmark = pytest.mark.usefixtures("segmented_once")
+
 
 def ussim(*arguments):
     return CliRunner().invoke(main, [str(a) for a in arguments])

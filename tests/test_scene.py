@@ -43,6 +43,8 @@ from SlicerUSSim.Logic.probe.image_grid import ImageGrid  # noqa: E402
 from SlicerUSSim.Logic.probe.placement import pose_in_slice  # noqa: E402
 from tests.conftest import FLUID, SPECKLE, block, example, rigid  # noqa: E402
 
+pytestmark = pytest.mark.usefixtures("segmented_once")
+
 PRESET = Preset(
     LinearProbe(20, 30, scan_lines=48, focus_mm=15),
     DisplaySettings(image_size=(96, 64)),

@@ -21,6 +21,8 @@ from tests.test_craniotomy_nodes import TURN  # noqa: E402
 from tests.test_lesion_nodes import HEAD, Scene  # noqa: E402
 from tests.test_lesion_proposals import CENTRE, brain, needs_atlas  # noqa: E402
 
+pytestmark = pytest.mark.usefixtures("segmented_once")
+
 
 def some_surfels() -> Surfels:
     """Squares of all kinds, at random places with random normals."""
