@@ -18,7 +18,6 @@ from SlicerUSSim.Logic import (
     TrackedSequence,
     UltrasoundSimulator,
     Volume,
-    segment_mri,
 )
 from SlicerUSSim.Logic.base.files import write_json
 from SlicerUSSim.Logic.fitting import tracked_fit
@@ -29,6 +28,7 @@ from SlicerUSSim.Logic.probe.placement import tilt_sweep
 from SlicerUSSim.Logic.tracked import TrackedImages, read_pose, write_pose
 from SlicerUSSim.Logic.verification.twins import make_twin
 from tests.conftest import SHARED, example, needs_shared
+from tests.remembered import segment_once
 
 
 def ussim(*arguments):
@@ -39,7 +39,7 @@ def ussim(*arguments):
 def folder(tmp_path_factory):
     """A twin on disk, as examples/write_twin.py writes one."""
     place = tmp_path_factory.mktemp("twin")
-    segmentation = segment_mri(head_mri(2.0))
+    segmentation = segment_once(head_mri(2.0))
     probe = PhasedProbe(70.0, 50.0, scan_lines=80)
     twin = make_twin(segmentation.labels, TissueTable.brain(segmentation.tissue_names), 3, probe=probe)
     twin.simulator.medium.labels.write(place / "labels.nii.gz")

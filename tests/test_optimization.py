@@ -33,13 +33,14 @@ from SlicerUSSim.Logic.probe.beam import FWHM_PER_SIGMA
 from SlicerUSSim.Logic.probe.image_grid import ImageGrid
 from SlicerUSSim.Logic.tissue.tissue import Tissue
 from SlicerUSSim.Logic.verification.twins import make_twin
+from tests.remembered import segment_once
 
 SMALL = PhasedProbe(70.0, 50.0, scan_lines=80)
 
 
 @pytest.fixture(scope="module")
 def brain():
-    segmentation = segment_mri(head_mri(2.0))
+    segmentation = segment_once(head_mri(2.0))
     return segmentation.labels, TissueTable.brain(segmentation.tissue_names)
 
 

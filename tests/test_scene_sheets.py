@@ -67,6 +67,7 @@ def bench_with_probe() -> tuple[Scene, object]:
     return bench, presenter
 
 
+@pytest.mark.slow
 def test_segment_finds_sheets_and_images_show_them_as_those_of_the_command():
     bench, presenter = bench_with_probe()
     parent = bench.add("LinearTransform", "to world")
@@ -111,6 +112,7 @@ def test_segment_finds_sheets_and_images_show_them_as_those_of_the_command():
     assert parameters.sheets is None and "of an earlier Segment, are not shown any more" in presenter.notes()
 
 
+@pytest.mark.slow
 def test_sheets_of_a_user_are_kept_and_a_model_of_something_else_is_one_line():
     bench, presenter = bench_with_probe()
     parameters = bench.logic.parameters
@@ -154,7 +156,7 @@ def test_the_settings_of_sheets_name_what_can_be_found():
 # ---- organs of a CT --------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("kind", ["LabelMapVolume", "Segmentation"])
+@pytest.mark.parametrize("kind", [pytest.param("LabelMapVolume", marks=pytest.mark.slow), "Segmentation"])
 def test_organs_of_a_ct_are_laid_over_its_tissues_wherever_their_node_lies(kind):
     bench, phantom = Scene(), lower_chest((4.0, 4.0, 4.0))
     write_volume(bench.mri, phantom.ct)
@@ -221,6 +223,7 @@ def test_a_point_shown_in_a_view_proposes_a_lesion_that_is_laid_over_the_tissues
 
 
 @needs_atlas
+@pytest.mark.slow
 def test_a_proposal_without_a_point_is_discarded_and_a_named_one_is_taken_at_the_users_word():
     bench, presenter, _ = proposing()
     parameters = bench.logic.parameters

@@ -26,6 +26,7 @@ slicer = pytest.importorskip("slicer", reason="MRML nodes come with slicer-core:
 pytest.importorskip("PySide6", reason="the panel is tested on Qt for Python: pip install PySide6-Essentials")
 
 from tests import slicer_stand_in as stand_in  # noqa: E402
+from tests.remembered import once  # noqa: E402
 from tests.shared_data import SHARED, needs_shared  # noqa: E402
 from tests.slicer_factory import load_source_as_module  # noqa: E402
 
@@ -98,6 +99,9 @@ class Session:
 
     def segmented(self):
         """The same with its tissues, a coarse probe for speed, and the first image."""
+        modality = self.logic_module("mri.modality")
+        if not hasattr(self.module, "segment_once"):  # of the same head in all tests
+            self.module.segment_once = modality.segment_mri = once(modality.segment_mri)
         self.parameters.mri = self.head()
         self.ui.scanLinesSpinBox.setValue(48)
         self.ui.segmentButton.click()
