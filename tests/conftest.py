@@ -7,6 +7,7 @@ import locale
 import os
 import sys
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import hypothesis
@@ -15,6 +16,7 @@ import pytest
 
 from SlicerUSSim.Logic import LinearProbe, SimulationSettings, Tissue, TissueTable, UltrasoundSimulator, Volume
 from SlicerUSSim.Logic.tissue.presets import TISSUES
+from SlicerUSSim.Logic.verification.ct_phantoms import CtPhantom, lower_chest
 from tests.remembered import segment_once
 from tests.shared_data import SHARED as SHARED, needs_shared as needs_shared
 
@@ -52,6 +54,12 @@ def simulator(
     """A simulator for labels 1, 2, ... with `coupling` around them, without the probe's own ring-down."""
     table = TissueTable({0: coupling, **dict(enumerate(tissues, 1))}, membrane)
     return UltrasoundSimulator(labels, table, SimulationSettings(**{"ring_down": False, **settings}))
+
+
+@cache
+def coarse_chest() -> CtPhantom:
+    """A CT of the lower chest in voxels of 4 mm, which nobody changes."""
+    return lower_chest((4.0, 4.0, 4.0))
 
 
 def example(name: str):

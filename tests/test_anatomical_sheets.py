@@ -366,6 +366,7 @@ def template_head() -> tuple[Volume, Segmentation]:
     return coarse, segment_mri(coarse)
 
 
+@pytest.mark.slow
 def test_sheets_are_kept_and_each_can_be_switched_off(tmp_path):
     mri, found = template_head()
     shares: list[float] = []
@@ -405,6 +406,7 @@ def test_sheets_are_kept_and_each_can_be_switched_off(tmp_path):
     assert read_kept_sheets(place, key, ("falx",)) is None
 
 
+@pytest.mark.slow
 def test_a_file_of_others_is_not_replaced_and_no_use_as_kept_sheets(tmp_path):
     mri, found = template_head()
     place = tmp_path / "head.sheets.npz"

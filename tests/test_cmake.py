@@ -131,6 +131,7 @@ def test_the_built_module_loads_from_its_own_folder(build):
 
 @needs_cmake
 @needs_slicer
+@pytest.mark.slow
 def test_the_installed_module_simulates_beside_other_extensions_with_its_own_kernels(installed):
     """Another extension's Logic on sys.path is not affected."""
     package = installed / "SlicerUSSim"

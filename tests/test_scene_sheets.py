@@ -16,7 +16,7 @@ from SlicerUSSim.Logic.mri.sheets.finding import ALL_KINDS  # noqa: E402
 from SlicerUSSim.Logic.mrml.label_nodes import write_labels  # noqa: E402
 from SlicerUSSim.Logic.mrml.nodes import node_to_world, write_volume  # noqa: E402
 from SlicerUSSim.Logic.mrml.sheet_nodes import read_sheets, sheets_version, write_sheets  # noqa: E402
-from SlicerUSSim.Logic.verification.ct_phantoms import lower_chest  # noqa: E402
+from tests.conftest import coarse_chest  # noqa: E402
 from tests.test_craniotomy_nodes import TURN  # noqa: E402
 from tests.test_lesion_nodes import HEAD, Scene  # noqa: E402
 from tests.test_lesion_proposals import CENTRE, brain, needs_atlas  # noqa: E402
@@ -158,7 +158,7 @@ def test_the_settings_of_sheets_name_what_can_be_found():
 
 @pytest.mark.parametrize("kind", [pytest.param("LabelMapVolume", marks=pytest.mark.slow), "Segmentation"])
 def test_organs_of_a_ct_are_laid_over_its_tissues_wherever_their_node_lies(kind):
-    bench, phantom = Scene(), lower_chest((4.0, 4.0, 4.0))
+    bench, phantom = Scene(), coarse_chest()
     write_volume(bench.mri, phantom.ct)
     liver = Volume((phantom.organs.array == 5).astype(np.uint8), np.linalg.inv(TURN) @ phantom.organs.ijk_to_ras)
     assert liver.array.sum() > 1000

@@ -387,6 +387,7 @@ def test_every_node_selector_has_the_scene_and_the_classes_of_its_role(session):
         assert widget.property("addEnabled") == bool(control.new_node)
 
 
+@pytest.mark.slow
 def test_every_value_of_the_panel_accepts_both_ends_of_its_range(session):
     preset_module = session.logic_module("imaging.preset")
     presenter = session.panel.presenter
@@ -772,6 +773,7 @@ def with_real_image(session, gain_db: float = 9.0):
     return session
 
 
+@pytest.mark.slow
 def test_the_panel_fits_compares_applies_and_reverts(session):
     assert not session.ui.fitButton.isEnabled() and "Segment" in session.ui.fitButton.toolTip()
     with_real_image(session)
@@ -854,6 +856,7 @@ def test_errors_of_a_fit_are_one_line(session):
     assert len(session.app.errors) == 6 and not any("\n" in message for message in session.app.errors)
 
 
+@pytest.mark.slow
 def test_the_panel_predicts_images_that_are_not_fitted(session):
     with_real_image(session)
     ui = session.ui
@@ -918,6 +921,7 @@ def test_reloading_the_module_brings_new_code(module):
         module.__dict__.update(again.__dict__ | {"app": module.app})
 
 
+@pytest.mark.slow
 def test_the_panel_looks_as_it_should(session, tmp_path):
     """A figure of the panel with all sections open, in which every control is completely visible."""
     session.segmented()
