@@ -331,6 +331,7 @@ def test_segment_names_and_colours_tissues_where_the_mri_is(kind):
     assert frame.image.mean() > 15 and np.mean(frame.image != direct.image) < 0.02
 
 
+@pytest.mark.slow
 def test_a_mask_can_be_a_segmentation_on_another_grid():
     scene = slicer.vtkMRMLScene()
     logic, mri = UltrasoundSceneLogic(scene), head_mri(3.0)
