@@ -93,17 +93,26 @@ def test_two_results_are_compared_row_by_row():
     assert re.search(r"segmentation +30.00 ms +12.00 ms +2.50x", text)
 
 
-@pytest.fixture(scope="module")
-def brief(tmp_path_factory):
-    path = tmp_path_factory.mktemp("bench") / "bench.json"
+class _Device:
+    """In place of the numpy model, which takes long: the simulator itself."""
+
+    timings_ms: dict = {"ray tree": 1.0}  # noqa: RUF012
+
+    def __init__(self, simulator) -> None:
+        self.simulator = simulator
+
+    def simulate(self, probe, pose):
+        return self.simulator.simulate(probe, pose).image
+
+
+@pytest.mark.parametrize("model", [_Device, pytest.param(None, marks=pytest.mark.slow)], ids=["device", "numpy"])
+def test_the_command_prints_every_stage_and_keeps_the_numbers(monkeypatch, tmp_path, model):
+    if model is not None:
+        monkeypatch.setattr(suite, "NumpyModel", model)
+    path = tmp_path / "bench.json"
     outcome = CliRunner().invoke(
         main, ["bench", "--brief", "--repeat", "2", "--device", choose_device()[0].index, "--json", str(path)]
     )
-    return outcome, path
-
-
-def test_the_command_prints_every_stage_and_keeps_the_numbers(brief):
-    outcome, path = brief
     assert outcome.exit_code == 0, outcome.output
     numbers = json.loads(path.read_text())
     (device,) = numbers["devices"].values()

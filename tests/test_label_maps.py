@@ -134,10 +134,8 @@ def test_probabilities_of_a_lesion_in_place_of_an_mri_get_the_hint(tmp_path, mon
         )
 
 
-@pytest.mark.parametrize(
-    "largest, spacing",
-    [(1.0, 2), pytest.param(255.0, 2, marks=pytest.mark.slow), pytest.param(1.0, 1, marks=pytest.mark.slow)],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("largest, spacing", [(1.0, 2), (255.0, 2), (1.0, 1)])
 def test_probabilities_of_a_tissue_in_place_of_an_mri_get_the_hint(tmp_path, monkeypatch, mni, largest, spacing):
     """A map of grey matter was "a small head, a wrong voxel size, or no head", or a T2 by its order of brightness."""
     monkeypatch.chdir(tmp_path)

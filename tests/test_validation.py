@@ -23,9 +23,10 @@ from SlicerUSSim.Logic.verification.validation import ORIENTATIONS, PROBES, Outc
 #: Checks that take longer than some seconds
 _LONG = ("beams behind cysts", "beams in folds", "beams in heads", "beams past strong tissue", "compounding",
          "curved mirrors", "cyst contrast", "flanks and lines", "flat layers", "frequency downshift", "oblique walls",
-         "planes along diagonals", "planes in small maps", "planes with edges", "rough sheets", "slice thickness",
-         "small curved walls", "sparse speckle", "speckle correlation", "speckle everywhere", "thickness of sheets",
-         "turned planes", "uneven tissue", "walls and lines", "walls near ends")  # fmt: skip
+         "planes along diagonals", "planes in small maps", "planes with edges", "rough planes", "rough sheets",
+         "slice thickness", "small curved walls", "sparse speckle", "speckle correlation", "speckle everywhere",
+         "thickness of sheets", "thin sulci", "turned planes", "uneven tissue", "walls and lines",
+         "walls near ends")  # fmt: skip
 #: Every check in every orientation once: the quick tests have the oblique one of all but the long checks
 CASES = [
     pytest.param(
