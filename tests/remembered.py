@@ -13,8 +13,11 @@ import logging
 import pickle
 from collections import OrderedDict
 from collections.abc import Callable
+from functools import cache
+from typing import TYPE_CHECKING
 
-from SlicerUSSim.Logic import Segmentation, segment_mri
+if TYPE_CHECKING:
+    from SlicerUSSim.Logic import Segmentation
 
 _KEPT = 12  # results
 _LOGGER = "SlicerUSSim"
@@ -75,5 +78,13 @@ def once(segment: Callable[..., Segmentation]) -> Callable[..., Segmentation]:
     return segment_once
 
 
-#: segment_mri, as tests that are not about segmentation call it
-segment_once = once(segment_mri)
+@cache
+def _shared() -> Callable[..., Segmentation]:
+    from SlicerUSSim.Logic import segment_mri  # not before: tests of the module import nothing of the package
+
+    return once(segment_mri)
+
+
+def segment_once(mri, **options) -> Segmentation:
+    """segment_mri, as tests that are not about segmentation call it."""
+    return _shared()(mri, **options)

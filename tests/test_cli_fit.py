@@ -126,6 +126,7 @@ def test_sweep_replaces_only_what_it_wrote(name, folder, tmp_path):
     assert out.read_bytes() == before and not field.exists()
 
 
+@pytest.mark.slow
 def test_a_state_is_not_resumed_with_other_images_or_another_mri(folder, tmp_path):
     state, few = tmp_path / "state.json", ("--evaluations", 4, "--restarts", 0, "--free", "gain_db")
 

@@ -284,11 +284,13 @@ def test_bounds_are_kept(twin):
 # ---- the same again, and going on ------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_the_same_problem_gives_the_same_answer(twin):
     one, other = (optimise(twin, ["display"], max_evaluations=60, restarts=1) for _ in range(2))
     assert one.after == other.after and one.history == other.history
 
 
+@pytest.mark.slow
 def test_an_interrupted_run_is_resumed_without_computing_again(twin):
     reached = []
 
@@ -340,6 +342,7 @@ def hybrid(labels: Volume, tissues, mri: Volume) -> UltrasoundSimulator:
     return UltrasoundSimulator(labels, tissues, SimulationSettings(mri_modulation_db=3.0), texture=texture)
 
 
+@pytest.mark.slow
 def test_a_state_is_refused_if_any_input_is_another_and_the_line_says_which(twin):
     medium, mri = twin.simulator.medium, head_mri(2.0)
     start = hybrid(medium.labels, medium.tissues, mri)

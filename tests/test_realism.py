@@ -237,6 +237,7 @@ def test_realism_of_the_images_themselves_is_perfect_and_controls_are_not(twin):
         measure_realism(tracked, {"one": tracked.images[:1]}, twin.simulator)
 
 
+@pytest.mark.slow
 def test_command_says_numbers_with_controls(twin, tmp_path):
     twin.simulator.medium.labels.write(tmp_path / "labels.nii.gz")
     twin.simulator.medium.tissues.write(tmp_path / "labels.json")
