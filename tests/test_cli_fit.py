@@ -196,7 +196,8 @@ def test_images_of_a_sweep_have_noise_by_their_number(folder, tmp_path):
     assert np.array_equal(last, images[2]) and not np.array_equal(images[1], images[2])
 
 
-@pytest.mark.parametrize("has_given_map", [pytest.param(False, marks=pytest.mark.slow), True])
+@pytest.mark.slow
+@pytest.mark.parametrize("has_given_map", [False, True])
 def test_the_saved_transform_puts_the_images_where_the_fit_found_them(folder, tmp_path, monkeypatch, has_given_map):
     fits = []
     monkeypatch.setattr(tracked_fit, "_ROUNDS", ((8.0, 60), (4.0, 40)))  # how well: test_registration
@@ -223,6 +224,7 @@ def test_the_saved_transform_puts_the_images_where_the_fit_found_them(folder, tm
     assert np.allclose(poses(read_pose(tmp_path / "saved.json")), fitted, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_a_volume_with_landmarks_is_cut_where_the_probe_looked(folder, tmp_path):
     """Data as in RESECT: ultrasound as NIfTI in its own frame, landmarks in MRI and ultrasound as .tag."""
     sequence = TrackedSequence.read(folder / "tracked.igs.mha")
@@ -259,6 +261,7 @@ def test_a_volume_with_landmarks_is_cut_where_the_probe_looked(folder, tmp_path)
     assert both.exit_code == 2 and "--cut-tilt and --cut-slide are both given" in both.output
 
 
+@pytest.mark.slow
 def test_images_that_are_not_fitted_are_predicted_beside_controls(folder):
     """The fit is that without them."""
     pytest.importorskip("matplotlib", reason="reports need matplotlib: pip install '.[demo]'")
@@ -359,6 +362,7 @@ def test_a_real_sequence_is_fitted_with_a_plus_calibration(folder, tmp_path):
     assert result["cost_after"] < 0.8 * result["cost_before"]
 
 
+@pytest.mark.slow
 def test_the_example_writes_a_twin_that_optimize_reads(mni, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr("sys.argv", ["write_twin.py", str(tmp_path), "--seed", "4"])
     example("write_twin").main()

@@ -215,6 +215,7 @@ def twin():
     return make_twin(segmentation.labels, TissueTable.brain(segmentation.tissue_names), 3, probe=probe)
 
 
+@pytest.mark.slow
 def test_realism_of_the_images_themselves_is_perfect_and_controls_are_not(twin):
     tracked = TrackedImages.of(twin.sequence(), probe=twin.probe)
     sequence = twin.sequence()

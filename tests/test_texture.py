@@ -27,6 +27,8 @@ from SlicerUSSim.Logic.verification.measurement import correlation, level_db, re
 from tests.conftest import SPECKLE, block, rigid
 from tests.remembered import segment_once
 
+pytestmark = pytest.mark.usefixtures("segmented_once")
+
 PROBE = LinearProbe(36, 46, scan_lines=145, focus_mm=25, elevation_focus_mm=25)
 POSE = rigid(np.eye(3), [0, -23, 0])
 DIM = replace(SPECKLE, name="dim", mu0=0.25 * SPECKLE.mu0, sigma0=0.25 * SPECKLE.sigma0)
