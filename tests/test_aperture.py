@@ -502,6 +502,7 @@ def screen_levels_db(found, probe, pose, lines, depths) -> np.ndarray:
     return level(np.stack(np.meshgrid(lines, depths, indexing="ij"), -1))
 
 
+@pytest.mark.slow
 def test_axes_that_come_together_and_apart_create_no_power():
     """Behind large sulci, lines have the power of their own beams: 0.6 dB RMS, by distances alone 1.2, without 1.4."""
     phantom, scale = folds(), np.diag([1.6, 1.6, 1.6, 1.0])
