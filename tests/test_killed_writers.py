@@ -109,7 +109,7 @@ print("steps", steps)
 """
 
 
-@pytest.mark.parametrize("how", ["kill", "fail", "EIO"])
+@pytest.mark.parametrize("how", ["kill", *(pytest.param(how, marks=pytest.mark.slow) for how in ("fail", "EIO"))])
 @pytest.mark.parametrize(
     "name",
     [
