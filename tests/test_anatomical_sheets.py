@@ -337,6 +337,7 @@ def test_a_grid_too_coarse_for_the_reach_and_no_surfels():
 # ---- whole heads ----------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_what_cannot_be_found_is_said_before_the_search():
     mri = head_mri(spacing_mm=3.0)
     found = segment_mri(mri)

@@ -179,6 +179,7 @@ def test_right_behind_opaque_tissue_its_edge_is_as_wide_as_the_beam(top_mm, rms_
 
 @pytest.mark.parametrize("name", ["bone", pytest.param("lossy plate", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("top_mm", [20.0, pytest.param(26.0, marks=pytest.mark.slow)])
+@pytest.mark.slow
 def test_frames_do_not_step_where_strong_tissue_ends_near_a_depth_at_which_beams_are_known(name, top_mm):
     """As the probe comes nearer in steps of 0.1 mm, 2 mm behind a plate's edge: up to 25 dB before."""
     plates = {

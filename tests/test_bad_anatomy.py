@@ -44,6 +44,7 @@ def refused(*arguments: object) -> str:
 
 
 @needs_atlas
+@pytest.mark.slow
 def test_the_command_refuses_seeds_outside_the_brain_and_in_csf_and_writes_nothing(tmp_path):
     maps = tissue_maps("mni152")
     assert maps is not None

@@ -237,6 +237,7 @@ def test_a_program_that_is_not_needed_is_said(monkeypatch):
 
 @needs_nilearn
 @pytest.mark.parametrize("size", [pytest.param(0.7, marks=pytest.mark.slow), 0.76])
+@pytest.mark.slow
 def test_a_small_head_is_no_skull_stripped_brain(head, size):
     """The atlas was spread over the whole of it, and its scalp became grey and white matter."""
     mri, _ = head
@@ -412,6 +413,7 @@ def test_a_body_is_refused_at_once():
 
 
 @needs_nilearn
+@pytest.mark.slow
 def test_half_a_head_is_refused_with_the_part_that_is_missing(head):
     mri = head[0]
     half = Volume(mri.array[:, :, : mri.array.shape[2] // 2], mri.ijk_to_ras)
@@ -435,6 +437,7 @@ def test_a_head_without_its_neck_on_a_constant_background_is_not_taken_for_a_str
      pytest.param(lambda a: np.flip(a, 1), "top and its face is where the header says back", marks=pytest.mark.slow),
      pytest.param(lambda a: np.swapaxes(a, 0, 1), "its top is where the header says front", marks=pytest.mark.slow)],
 )  # fmt: skip
+@pytest.mark.slow
 def test_a_turned_head_is_refused_with_where_its_top_is_and_how_to_turn_it(head, change, message):
     turned = Volume(np.ascontiguousarray(change(head[0].array)), head[0].ijk_to_ras)
     with pytest.raises(SimulationError, match=message + ".*correct the orientation in its header") as caught:
@@ -670,6 +673,7 @@ def test_a_mask_that_was_asked_for_by_name_is_said_to_be(head, found, monkeypatc
 
 
 @needs_nilearn
+@pytest.mark.slow
 def test_an_edited_kept_mask_is_used_and_said_and_never_overwritten(head, found, tmp_path):
     import SimpleITK as sitk
 

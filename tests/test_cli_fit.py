@@ -340,6 +340,7 @@ def test_black_images_and_a_sequence_that_is_none_are_refused(folder, tmp_path):
 
 
 @needs_shared
+@pytest.mark.slow
 def test_a_real_sequence_is_fitted_with_a_plus_calibration(folder, tmp_path):
     """Geometry estimated from real images, tracking from Plus: a block of muscle replaces the unknown phantom."""
     (tmp_path / "plus.xml").write_text(

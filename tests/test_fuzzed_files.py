@@ -214,7 +214,7 @@ def test_every_format_is_read_before_it_is_damaged(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=[pytest.mark.slow] * (name in ("IM", "dcms"))) for name in FORMATS]
+    "name", [pytest.param(name, marks=[pytest.mark.slow] * (name in ("IM", "dcm", "dcms"))) for name in FORMATS]
 )
 def test_a_damaged_file_is_read_or_refused_in_one_line(name, tmp_path_factory):
     file, folder = FORMATS[name], tmp_path_factory.mktemp("fuzz")

@@ -105,6 +105,7 @@ def test_one_seed_grows_the_lesion_and_not_what_is_outside(kind):
 
 
 @needs_atlas
+@pytest.mark.slow
 def test_a_lesion_is_proposed_without_a_seed_and_none_in_a_healthy_brain():
     segmentation, true = brain("low")
     (proposal,) = propose_lesions(segmentation)

@@ -107,7 +107,8 @@ def test_net_fall_with_depth_and_relative_echogenicity_are_recovered(twin, resul
     assert spread.is_determined is False or abs(truth - spread.value) < 3.0
 
 
-@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [0, 1])
 def test_attenuation_and_echogenicity_are_recovered_when_the_display_is_known(brain, seed):
     twin = make_twin(*brain, seed, probe=SMALL, display_is_known=True)
     result = optimise(twin, ["white matter"])

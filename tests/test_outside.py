@@ -83,6 +83,7 @@ def test_a_skull_is_smooth_where_its_outer_table_is_not_to_be_seen():
     assert not (found.labels == 5)[patch].any()
 
 
+@pytest.mark.slow
 def test_a_head_that_the_image_cuts_is_said_to_be():
     """The probe looked through where there is no bone, and nothing said so."""
     mri, brain, _ = round_head(COARSE_MM)
@@ -173,6 +174,7 @@ def test_a_brain_without_a_head_is_refused_before_it_is_segmented(tmp_path):
     assert "segmented" not in done.stderr and not (tmp_path / "labels.nii.gz").exists()
 
 
+@pytest.mark.slow
 def test_the_segmentation_has_what_is_outside_after_its_own_labels():
     mri, brain, _ = round_head(COARSE_MM)
     mask = mri.with_array(brain.astype(np.uint8))

@@ -478,6 +478,7 @@ def test_names_of_lesions_are_known(name, tissue):
     assert tissue_named(name).name == tissue
 
 
+@pytest.mark.slow
 def test_the_texture_of_the_mri_is_certain_in_a_lesion_and_follows_its_intensity():
     mri = head_mri(3.0)
     segmentation = segment_mri(mri)

@@ -124,6 +124,7 @@ def test_frames_are_chosen_by_number(scene):
         scene.optimize(frames=[9])
 
 
+@pytest.mark.slow
 def test_images_that_are_not_fitted_are_predicted(scene):
     found = scene.optimize(validate=[1], max_evaluations=60)
     assert found.tracked.numbers == [0, 2] and found.prediction is not None

@@ -230,8 +230,9 @@ def test_the_table_has_a_line_per_label_whose_shares_and_millilitres_add_up():
 
 
 @pytest.mark.parametrize("unit", [1.0, 0.01, 1e-6])
+@pytest.mark.slow
 def test_the_table_has_means_and_deviations_in_every_unit(unit):
-    head = head_mri(4.0)
+    head = head_mri(3.0)
     result = segment_mri(head.with_array((head.array * np.float64(unit)).astype(np.float32)))
     lines = result.table().splitlines()[1:]
     assert len(lines) == len(result.means) == 3 and len(set(map(len, lines))) == 1
@@ -397,6 +398,7 @@ def test_the_brain_of_another_patient_is_refused_as_second_mri(mni):
         segment_mri(mni[0], contrast="t1", others={"t1gd": Volume.read(COLIN27)})
 
 
+@pytest.mark.slow
 def test_a_label_map_is_refused_as_second_mri(mni):
     t1 = mni[0]
     labels = t1.with_array(np.digitize(t1.array, [20, 60, 90]).astype(np.uint8))

@@ -32,6 +32,7 @@ def brain() -> TissueMaps:
     return maps.coarser(2)
 
 
+@pytest.mark.slow
 def test_a_tumours_rim_that_enhances_in_a_t1_without_contrast_agent_is_said_with_the_remedy():
     case = phantom(with_ring_tumour(brain()), "t1gd", bias=0.0)
     told = segment_mri(case.mri, contrast="t1", mask=case.mask).warnings

@@ -110,7 +110,7 @@ def test_an_echo_that_was_not_there_is_farther_from_its_limit_than_any_other(kin
         ("attenuation and time", {"reference_speed_m_s": 1560.0}),
         ("mirroring", {"reflections": False}),
         pytest.param("curved mirrors", {"reflection_spreading": False}, marks=pytest.mark.slow),
-        ("reverberation", {"max_ray_depth": 1}),
+        pytest.param("reverberation", {"max_ray_depth": 1}, marks=pytest.mark.slow),
         ("interface width", {"elevational_rays": 1}),
         ("specular echoes", {"interface_reflection": "energy"}),
         pytest.param("slice thickness", {"beam_cutoff": 0.8}, marks=pytest.mark.slow),

@@ -352,6 +352,7 @@ def test_segmentation_labels_as_the_function_does_and_names_travel():
     assert algorithm._simulator._simulator.medium.tissues[1].name == "white matter"
 
 
+@pytest.mark.slow
 def test_segmentation_has_the_declared_defaults_and_refuses_when_it_updates():
     segmentation = SegmentationFilter()
     assert segmentation._values == asdict(SegmentationSettings())
