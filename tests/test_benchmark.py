@@ -93,22 +93,8 @@ def test_two_results_are_compared_row_by_row():
     assert re.search(r"segmentation +30.00 ms +12.00 ms +2.50x", text)
 
 
-class _Device:
-    """In place of the numpy model, which takes long: the simulator itself."""
-
-    timings_ms: dict = {"ray tree": 1.0}  # noqa: RUF012
-
-    def __init__(self, simulator) -> None:
-        self.simulator = simulator
-
-    def simulate(self, probe, pose):
-        return self.simulator.simulate(probe, pose).image
-
-
-@pytest.mark.parametrize("model", [_Device, pytest.param(None, marks=pytest.mark.slow)], ids=["device", "numpy"])
-def test_the_command_prints_every_stage_and_keeps_the_numbers(monkeypatch, tmp_path, model):
-    if model is not None:
-        monkeypatch.setattr(suite, "NumpyModel", model)
+@pytest.mark.slow
+def test_the_command_prints_every_stage_and_keeps_the_numbers(tmp_path):
     path = tmp_path / "bench.json"
     outcome = CliRunner().invoke(
         main, ["bench", "--brief", "--repeat", "2", "--device", choose_device()[0].index, "--json", str(path)]
@@ -125,7 +111,6 @@ def test_the_command_prints_every_stage_and_keeps_the_numbers(monkeypatch, tmp_p
     assert numbers["wrong"] == [] and "WRONG" not in outcome.output
 
 
-@pytest.mark.slow
 def test_a_wrong_image_is_told_and_exits_with_1(monkeypatch, tmp_path):
     class Wrong:
         timings_ms: dict = {"ray tree": 1.0}  # noqa: RUF012

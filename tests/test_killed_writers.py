@@ -117,7 +117,7 @@ print("steps", steps)
         "p.h5",
         "p.txt",
         "s.vtp",
-        "v.mnc",
+        pytest.param("v.mnc", marks=pytest.mark.slow),
         "v.nii.gz",
         "v.nrrd",
         "v.mha",
