@@ -7,6 +7,7 @@ import locale
 import os
 import sys
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import hypothesis
@@ -15,6 +16,8 @@ import pytest
 
 from SlicerUSSim.Logic import LinearProbe, SimulationSettings, Tissue, TissueTable, UltrasoundSimulator, Volume
 from SlicerUSSim.Logic.tissue.presets import TISSUES
+from SlicerUSSim.Logic.verification.ct_phantoms import CtPhantom, lower_chest
+from tests.remembered import segment_once
 from tests.shared_data import SHARED as SHARED, needs_shared as needs_shared
 
 hypothesis.settings.register_profile("ussim", deadline=None, derandomize=True, max_examples=50)
@@ -53,6 +56,12 @@ def simulator(
     return UltrasoundSimulator(labels, table, SimulationSettings(**{"ring_down": False, **settings}))
 
 
+@cache
+def coarse_chest() -> CtPhantom:
+    """A CT of the lower chest in voxels of 4 mm, which nobody changes."""
+    return lower_chest((4.0, 4.0, 4.0))
+
+
 def example(name: str):
     """The module examples/`name`.py."""
     path = Path(__file__).parents[1] / "examples" / f"{name}.py"
@@ -80,6 +89,15 @@ def _unchanged_locale():
     before = locale.setlocale(locale.LC_ALL)
     yield
     locale.setlocale(locale.LC_ALL, before)
+
+
+@pytest.fixture(scope="module")
+def segmented_once():
+    """Commands and scenes segment the same image with the same arguments once for all tests (tests.remembered)."""
+    with pytest.MonkeyPatch.context() as patch:
+        for module in ("Logic.mri.modality", "Command.whole_line"):
+            patch.setattr(f"SlicerUSSim.{module}.segment_mri", segment_once)
+        yield
 
 
 @pytest.fixture(scope="session")

@@ -339,7 +339,7 @@ def test_a_grid_too_coarse_for_the_reach_and_no_surfels():
 # ---- whole heads ----------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("use_intensity", [True, False])
+@pytest.mark.parametrize("use_intensity", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_a_falx_that_enhances_as_white_matter_does_is_no_white_matter(use_intensity):
     """Between hemispheres 10 mm apart, off the middle between them. Of a real one, a third of the places were taken for
     white matter, and what was found was 3 mm aside."""
@@ -364,6 +364,7 @@ def test_a_falx_that_enhances_as_white_matter_does_is_no_white_matter(use_intens
     assert np.percentile(np.abs(away), 90) < 1.0
 
 
+@pytest.mark.slow
 def test_what_cannot_be_found_is_said_before_the_search():
     mri = head_mri(spacing_mm=3.0)
     found = segment_mri(mri)
@@ -393,6 +394,7 @@ def template_head() -> tuple[Volume, Segmentation]:
     return coarse, segment_mri(coarse)
 
 
+@pytest.mark.slow
 def test_sheets_are_kept_and_each_can_be_switched_off(tmp_path):
     mri, found = template_head()
     shares: list[float] = []
@@ -432,6 +434,7 @@ def test_sheets_are_kept_and_each_can_be_switched_off(tmp_path):
     assert read_kept_sheets(place, key, ("falx",)) is None
 
 
+@pytest.mark.slow
 def test_a_file_of_others_is_not_replaced_and_no_use_as_kept_sheets(tmp_path):
     mri, found = template_head()
     place = tmp_path / "head.sheets.npz"

@@ -177,8 +177,9 @@ def test_right_behind_opaque_tissue_its_edge_is_as_wide_as_the_beam(top_mm, rms_
     assert np.sqrt(np.mean((level - waves)[lit] ** 2)) < rms_db
 
 
-@pytest.mark.parametrize("name", ["bone", "lossy plate"])
-@pytest.mark.parametrize("top_mm", [20.0, 26.0])
+@pytest.mark.parametrize("name", ["bone", pytest.param("lossy plate", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("top_mm", [20.0, pytest.param(26.0, marks=pytest.mark.slow)])
+@pytest.mark.slow
 def test_frames_do_not_step_where_strong_tissue_ends_near_a_depth_at_which_beams_are_known(name, top_mm):
     """As the probe comes nearer in steps of 0.1 mm, 2 mm behind a plate's edge: up to 25 dB before."""
     plates = {
@@ -502,6 +503,7 @@ def screen_levels_db(found, probe, pose, lines, depths) -> np.ndarray:
     return level(np.stack(np.meshgrid(lines, depths, indexing="ij"), -1))
 
 
+@pytest.mark.slow
 def test_axes_that_come_together_and_apart_create_no_power():
     """Behind large sulci, lines have the power of their own beams: 0.6 dB RMS, by distances alone 1.2, without 1.4."""
     phantom, scale = folds(), np.diag([1.6, 1.6, 1.6, 1.0])

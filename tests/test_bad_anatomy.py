@@ -24,7 +24,7 @@ from SlicerUSSim.Logic.probe.placement import pose_looking_at  # noqa: E402
 from SlicerUSSim.Logic.tissue.own_files import write_label_files  # noqa: E402
 from SlicerUSSim.Logic.tissue.table import TissueTable  # noqa: E402
 from SlicerUSSim.Logic.verification.brain_phantoms import phantom, tissue_maps  # noqa: E402
-from SlicerUSSim.Logic.verification.ct_phantoms import lower_chest  # noqa: E402
+from tests.conftest import coarse_chest  # noqa: E402
 from tests.test_craniotomy import NAMES, head  # noqa: E402, F401
 from tests.test_craniotomy_nodes import TURN, Bench  # noqa: E402
 from tests.test_lesion_nodes import Scene  # noqa: E402
@@ -44,6 +44,7 @@ def refused(*arguments: object) -> str:
 
 
 @needs_atlas
+@pytest.mark.slow
 def test_the_command_refuses_seeds_outside_the_brain_and_in_csf_and_writes_nothing(tmp_path):
     maps = tissue_maps("mni152")
     assert maps is not None
@@ -115,7 +116,7 @@ def test_a_craniotomy_off_the_head_is_one_line_at_every_door(head, tmp_path, wha
 
 def wrong_image(what: str) -> tuple[Volume, str]:
     """(image, contrast as which it is given)"""
-    ct = lower_chest((4.0, 4.0, 4.0)).ct
+    ct = coarse_chest().ct
     values = ct.array.astype(np.float32)
     if what == "a CT in 8 bits":
         return ct.with_array(np.clip((values + 1000.0) / 8.0, 0, 255).astype(np.uint8)), "ct"
@@ -127,7 +128,14 @@ def wrong_image(what: str) -> tuple[Volume, str]:
 
 
 @pytest.mark.parametrize(
-    "what", ["a CT in 8 bits", "a CT in 1/mm", "a CT 5000 too high", "an MRI called CT", "a CT called MRI"]
+    "what",
+    [
+        "a CT in 8 bits",
+        pytest.param("a CT in 1/mm", marks=pytest.mark.slow),
+        pytest.param("a CT 5000 too high", marks=pytest.mark.slow),
+        "an MRI called CT",
+        "a CT called MRI",
+    ],
 )
 def test_a_ct_in_another_unit_and_an_mri_called_ct_are_one_line_at_every_door(tmp_path, what):
     image, contrast = wrong_image(what)

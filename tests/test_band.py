@@ -77,6 +77,7 @@ def test_without_downshift_the_compensation_is_in_proportion_to_depth():
     np.testing.assert_allclose(rise, np.broadcast_to(0.1 * 2 * 0.5 * 3.0 * depth, rise.shape), atol=0.02)
 
 
+@pytest.mark.slow
 def test_numpy_follows_the_band_after_large_losses():
     """The mean frequency falls to a quarter, and the spectrum's centre below zero."""
     probe = replace(PROBES["matrix"], scan_lines=24, depth_mm=60.0, frequency_mhz=6.0)

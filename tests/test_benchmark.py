@@ -93,17 +93,12 @@ def test_two_results_are_compared_row_by_row():
     assert re.search(r"segmentation +30.00 ms +12.00 ms +2.50x", text)
 
 
-@pytest.fixture(scope="module")
-def brief(tmp_path_factory):
-    path = tmp_path_factory.mktemp("bench") / "bench.json"
+@pytest.mark.slow
+def test_the_command_prints_every_stage_and_keeps_the_numbers(tmp_path):
+    path = tmp_path / "bench.json"
     outcome = CliRunner().invoke(
         main, ["bench", "--brief", "--repeat", "2", "--device", choose_device()[0].index, "--json", str(path)]
     )
-    return outcome, path
-
-
-def test_the_command_prints_every_stage_and_keeps_the_numbers(brief):
-    outcome, path = brief
     assert outcome.exit_code == 0, outcome.output
     numbers = json.loads(path.read_text())
     (device,) = numbers["devices"].values()

@@ -236,7 +236,8 @@ def test_a_program_that_is_not_needed_is_said(monkeypatch):
 
 
 @needs_nilearn
-@pytest.mark.parametrize("size", [0.7, 0.76])
+@pytest.mark.parametrize("size", [pytest.param(0.7, marks=pytest.mark.slow), 0.76])
+@pytest.mark.slow
 def test_a_small_head_is_no_skull_stripped_brain(head, size):
     """The atlas was spread over the whole of it, and its scalp became grey and white matter."""
     mri, _ = head
@@ -412,6 +413,7 @@ def test_a_body_is_refused_at_once():
 
 
 @needs_nilearn
+@pytest.mark.slow
 def test_half_a_head_is_refused_with_the_part_that_is_missing(head):
     mri = head[0]
     half = Volume(mri.array[:, :, : mri.array.shape[2] // 2], mri.ijk_to_ras)
@@ -435,6 +437,7 @@ def test_a_head_without_its_neck_on_a_constant_background_is_not_taken_for_a_str
      pytest.param(lambda a: np.flip(a, 1), "top and its face is where the header says back", marks=pytest.mark.slow),
      pytest.param(lambda a: np.swapaxes(a, 0, 1), "its top is where the header says front", marks=pytest.mark.slow)],
 )  # fmt: skip
+@pytest.mark.slow
 def test_a_turned_head_is_refused_with_where_its_top_is_and_how_to_turn_it(head, change, message):
     turned = Volume(np.ascontiguousarray(change(head[0].array)), head[0].ijk_to_ras)
     with pytest.raises(SimulationError, match=message + ".*correct the orientation in its header") as caught:
@@ -670,6 +673,7 @@ def test_a_mask_that_was_asked_for_by_name_is_said_to_be(head, found, monkeypatc
 
 
 @needs_nilearn
+@pytest.mark.slow
 def test_an_edited_kept_mask_is_used_and_said_and_never_overwritten(head, found, tmp_path):
     import SimpleITK as sitk
 
@@ -788,6 +792,7 @@ def test_the_share_of_a_lesion_outside_the_mask_is_found_on_another_grid():
 
 
 @needs_nilearn
+@pytest.mark.slow
 def test_a_mask_that_cuts_the_vertex_is_said_and_a_whole_one_is_not(head, found):
     mri = head[0]
     whole = found.result.mask.array > 0
@@ -805,6 +810,7 @@ def test_a_mask_that_cuts_the_vertex_is_said_and_a_whole_one_is_not(head, found)
 
 
 @needs_nilearn
+@pytest.mark.slow
 def test_masks_that_take_skull_in_or_lie_below_the_cortex_everywhere_are_said(head):
     mri, brain = head
     distance = refinement.signed_distance(brain, mri.spacing_mm, 25.0)
@@ -822,6 +828,7 @@ def test_masks_that_take_skull_in_or_lie_below_the_cortex_everywhere_are_said(he
 
 
 @needs_nilearn
+@pytest.mark.slow
 def test_a_shifted_or_turned_mask_is_called_so_and_gives_no_hint_to_contrast_agent(head):
     mri, brain = head
     step = round(20.0 / mri.spacing_mm[0])
@@ -851,6 +858,7 @@ def test_a_mask_without_the_ventricles_is_said(head):
 
 
 @needs_nilearn
+@pytest.mark.slow
 def test_false_voxels_away_from_the_brain_and_labels_in_a_mask_are_said(head):
     mri, brain = head
     rng = np.random.default_rng(0)
@@ -924,6 +932,7 @@ def test_inverted_intensities_are_refused_at_once(head):
 
 
 @needs_nilearn
+@pytest.mark.slow
 def test_a_second_method_is_announced_and_the_progress_never_goes_back(head, monkeypatch, caplog):
     mri = head[0]
     monkeypatch.setattr(brain_module, "_SURE", 1.1)
@@ -1004,14 +1013,19 @@ def test_a_lesion_given_as_the_brain_is_refused(others):
     lesion = np.zeros(mri.array.shape, np.uint8)
     middle = tuple(n // 2 for n in lesion.shape)
     lesion[tuple(slice(n - 2, n + 2) for n in middle)] = 1
-    half = mri.with_array((mri.array > 20).astype(np.uint8))
-    half.array[..., half.array.shape[2] // 2 :] = 0
-    assert any("expected" in line for line in given_brain(half, mri).warnings)
     with pytest.raises(
         SimulationError, match=r"mask has 4.1 ml, 0.\d% of what .* \(1000 to 1900 ml.*--add tumour=FILE"
     ):
         volumes = {"t2": mri.with_array(255.0 - mri.array)} if others else {}
         segment_mri(mri, mask=mri.with_array(lesion), others=volumes)
+
+
+@pytest.mark.slow
+def test_half_a_brain_given_as_the_brain_is_said():
+    mri = head_mri(4.0)
+    half = mri.with_array((mri.array > 20).astype(np.uint8))
+    half.array[..., half.array.shape[2] // 2 :] = 0
+    assert any("expected" in line for line in given_brain(half, mri).warnings)
 
 
 def test_masks_of_an_infant_of_a_part_and_of_a_small_image_are_taken():

@@ -23,6 +23,8 @@ from SlicerUSSim.Logic.probe.arrays import PROBES
 from SlicerUSSim.Logic.tracked.pose_files import read_pose, write_pose
 from SlicerUSSim.Logic.tracked.sequence import TrackedSequence
 
+pytestmark = pytest.mark.usefixtures("segmented_once")
+
 
 def ussim(*arguments):
     return CliRunner().invoke(main, [str(a) for a in arguments])
@@ -89,7 +91,7 @@ def test_demo_writes_everything_it_promises(head, tmp_path):
     assert abs((np.linalg.inv(pose) @ [*centre_ras, 1])[2]) < 1e-3
 
 
-@pytest.mark.parametrize("command", ["demo", "simulate"])
+@pytest.mark.parametrize("command", [pytest.param("demo", marks=pytest.mark.slow), "simulate"])
 def test_a_probe_that_places_itself_looks_at_what_was_added(command, head, tmp_path):
     """On the other side of the brain than the usual view, 20 mm behind it: it was not in the image."""
     mri = Volume.read(head)
@@ -469,20 +471,22 @@ def test_an_mri_gives_its_simulator_the_shares_of_voxels_and_labels_have_none(he
     assert textures[0].volume_share.max() > 0.4 and textures[1] is None
 
 
-def test_set_changes_the_tissues_of_labels_and_of_an_mri(head, labels, tmp_path):
+@pytest.mark.parametrize("of", [pytest.param("labels", marks=pytest.mark.slow), "an MRI"])
+def test_set_changes_the_tissues_of_labels_and_of_an_mri(of, head, labels, tmp_path):
+    source = labels if of == "labels" else head
+
     def image(source, *options):
         out = tmp_path / "image.png"
         result = ussim("simulate", source, "--pose", "auto", "-o", out, *options)
         assert result.exit_code == 0, result.output
         return np.asarray(Image.open(out)).astype(float)
 
-    for source in (labels, head):
-        plain = image(source)
-        louder = image(source, "--set", "white matter.mu0=1.0", "--set", "membrane.thickness_mm=0.5")
-        assert louder.mean() > plain.mean() + 1
-        smaller = image(source, "--set", "probe.depth_mm=60", "--set", "display.image_size=100,120")
-        assert smaller.shape == (100, 120)
-    for source, name in ((labels, "liver"), (head, "liver"), (head, "lver")):
+    plain = image(source)
+    louder = image(source, "--set", "white matter.mu0=1.0", "--set", "membrane.thickness_mm=0.5")
+    assert louder.mean() > plain.mean() + 1
+    smaller = image(source, "--set", "probe.depth_mm=60", "--set", "display.image_size=100,120")
+    assert smaller.shape == (100, 120)
+    for name in ("liver", "lver"):
         result = ussim("simulate", source, "--pose", "auto", "-o", tmp_path / "o.png", "--set", f"{name}.mu0=1")
         assert result.exit_code == 2 and f"--set: no tissue '{name}', expected " in result.stderr
         assert not (tmp_path / "o.png").exists()
@@ -519,6 +523,7 @@ def test_a_tracked_sweep_given_as_an_mri_is_called_what_it_is(command, tmp_path)
     assert result.exit_code == 2 and "is a sequence of tracked ultrasound images, expected an MRI" in result.stderr
 
 
+@pytest.mark.slow
 def test_the_demo_replaces_only_files_that_it_wrote_itself(head, tmp_path):
     pytest.importorskip("matplotlib", reason="pictures need matplotlib: pip install '.[demo]'")
     out = tmp_path / "out"
@@ -559,6 +564,7 @@ main(sys.argv[1:])
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="no limit of the size of files")
+@pytest.mark.slow
 def test_the_demo_on_a_full_disk_names_its_own_folder_and_leaves_nothing(head, tmp_path):
     """It named a file in a hidden folder that was gone, and left an empty one."""
     pytest.importorskip("matplotlib", reason="pictures need matplotlib: pip install '.[demo]'")

@@ -18,7 +18,6 @@ from SlicerUSSim.Logic import (
     TrackedSequence,
     UltrasoundSimulator,
     Volume,
-    segment_mri,
 )
 from SlicerUSSim.Logic.base.files import write_json
 from SlicerUSSim.Logic.fitting import tracked_fit
@@ -29,6 +28,7 @@ from SlicerUSSim.Logic.probe.placement import tilt_sweep
 from SlicerUSSim.Logic.tracked import TrackedImages, read_pose, write_pose
 from SlicerUSSim.Logic.verification.twins import make_twin
 from tests.conftest import SHARED, example, needs_shared
+from tests.remembered import segment_once
 
 
 def ussim(*arguments):
@@ -39,7 +39,7 @@ def ussim(*arguments):
 def folder(tmp_path_factory):
     """A twin on disk, as examples/write_twin.py writes one."""
     place = tmp_path_factory.mktemp("twin")
-    segmentation = segment_mri(head_mri(2.0))
+    segmentation = segment_once(head_mri(2.0))
     probe = PhasedProbe(70.0, 50.0, scan_lines=80)
     twin = make_twin(segmentation.labels, TissueTable.brain(segmentation.tissue_names), 3, probe=probe)
     twin.simulator.medium.labels.write(place / "labels.nii.gz")
@@ -126,6 +126,7 @@ def test_sweep_replaces_only_what_it_wrote(name, folder, tmp_path):
     assert out.read_bytes() == before and not field.exists()
 
 
+@pytest.mark.slow
 def test_a_state_is_not_resumed_with_other_images_or_another_mri(folder, tmp_path):
     state, few = tmp_path / "state.json", ("--evaluations", 4, "--restarts", 0, "--free", "gain_db")
 
@@ -195,7 +196,8 @@ def test_images_of_a_sweep_have_noise_by_their_number(folder, tmp_path):
     assert np.array_equal(last, images[2]) and not np.array_equal(images[1], images[2])
 
 
-@pytest.mark.parametrize("has_given_map", [pytest.param(False, marks=pytest.mark.slow), True])
+@pytest.mark.slow
+@pytest.mark.parametrize("has_given_map", [False, True])
 def test_the_saved_transform_puts_the_images_where_the_fit_found_them(folder, tmp_path, monkeypatch, has_given_map):
     fits = []
     monkeypatch.setattr(tracked_fit, "_ROUNDS", ((8.0, 60), (4.0, 40)))  # how well: test_registration
@@ -222,6 +224,7 @@ def test_the_saved_transform_puts_the_images_where_the_fit_found_them(folder, tm
     assert np.allclose(poses(read_pose(tmp_path / "saved.json")), fitted, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_a_volume_with_landmarks_is_cut_where_the_probe_looked(folder, tmp_path):
     """Data as in RESECT: ultrasound as NIfTI in its own frame, landmarks in MRI and ultrasound as .tag."""
     sequence = TrackedSequence.read(folder / "tracked.igs.mha")
@@ -258,6 +261,7 @@ def test_a_volume_with_landmarks_is_cut_where_the_probe_looked(folder, tmp_path)
     assert both.exit_code == 2 and "--cut-tilt and --cut-slide are both given" in both.output
 
 
+@pytest.mark.slow
 def test_images_that_are_not_fitted_are_predicted_beside_controls(folder):
     """The fit is that without them."""
     pytest.importorskip("matplotlib", reason="reports need matplotlib: pip install '.[demo]'")
@@ -336,6 +340,7 @@ def test_black_images_and_a_sequence_that_is_none_are_refused(folder, tmp_path):
 
 
 @needs_shared
+@pytest.mark.slow
 def test_a_real_sequence_is_fitted_with_a_plus_calibration(folder, tmp_path):
     """Geometry estimated from real images, tracking from Plus: a block of muscle replaces the unknown phantom."""
     (tmp_path / "plus.xml").write_text(
@@ -358,6 +363,7 @@ def test_a_real_sequence_is_fitted_with_a_plus_calibration(folder, tmp_path):
     assert result["cost_after"] < 0.8 * result["cost_before"]
 
 
+@pytest.mark.slow
 def test_the_example_writes_a_twin_that_optimize_reads(mni, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr("sys.argv", ["write_twin.py", str(tmp_path), "--seed", "4"])
     example("write_twin").main()

@@ -120,6 +120,7 @@ def test_a_10_mm_cyst_is_about_35_db_down(name):
     assert -42.0 < level_db(np.concatenate(inside)) - level_db(np.concatenate(outside)) < -30.0
 
 
+@pytest.mark.slow
 def test_lobes_of_a_beam_out_of_focus_fall_off_as_steeply_as_those_of_its_apertures():
     """A black strip at 20 mm, the focus at 54 mm: lobes fall by 8 dB per millimetre. Lines and nodes, as wide as the
     main beam, made them 1.1 dB brighter there."""

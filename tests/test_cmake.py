@@ -131,6 +131,7 @@ def test_the_built_module_loads_from_its_own_folder(build):
 
 @needs_cmake
 @needs_slicer
+@pytest.mark.slow
 def test_the_installed_module_simulates_beside_other_extensions_with_its_own_kernels(installed):
     """Another extension's Logic on sys.path is not affected."""
     package = installed / "SlicerUSSim"
@@ -141,6 +142,7 @@ def test_the_installed_module_simulates_beside_other_extensions_with_its_own_ker
 
 @needs_cmake
 @needs_slicer
+@pytest.mark.slow
 def test_a_build_without_source_files_loads_too(build, tmp_path):
     """CTK_COMPILE_PYTHON_SCRIPT_KEEP_ONLY_PYC: .pyc files in the place of .py files."""
     folder = shutil.copytree(build / MODULES, tmp_path / "compiled")

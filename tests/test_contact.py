@@ -93,6 +93,7 @@ def test_a_phased_array_half_in_the_air_has_a_quarter_of_its_amplitude_everywher
 
 
 @pytest.mark.parametrize("harmonic", [False, True])
+@pytest.mark.slow
 def test_the_model_in_numpy_has_the_same_dark_lines(harmonic):
     from dataclasses import replace
 

@@ -167,6 +167,7 @@ def image(tmp_path, *arguments) -> tuple[np.ndarray, str]:
     return np.asarray(Image.open(picture), float), done.stderr
 
 
+@pytest.mark.slow
 def test_the_beam_reaches_the_brain_through_the_opening_and_not_through_the_skull(head, tmp_path):
     write_label_files(tmp_path / "head.nii.gz", head, TissueTable.brain().for_names(NAMES))
     (tmp_path / "pose.json").write_text(json.dumps(TOP.tolist()))

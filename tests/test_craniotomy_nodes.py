@@ -238,6 +238,7 @@ def test_gel_is_between_skin_and_probe_as_in_the_commands_unless_the_user_says_o
     assert brain.logic.settings(brain.whole).contact_gap_mm is None
 
 
+@pytest.mark.slow
 def test_a_view_is_placed_in_an_opening_that_is_there_and_said_to_be_elsewhere_otherwise(head):  # noqa: F811
     bench = Bench(head)
 

@@ -105,6 +105,7 @@ def test_a_displaced_ball_is_found_again_and_a_true_one_is_left_alone():
     assert same.cost_after <= same.cost_before
 
 
+@pytest.mark.slow
 def test_a_fit_deforms_before_it_fits_and_says_so():
     tracked, made = tracked_on(labels(4.0)), simulator(labels(), 2)
     free = ["gain_db"]

@@ -195,7 +195,9 @@ def test_profiles_name_every_kernel():
     assert sim.device.take_profile() == {}
 
 
-@pytest.mark.parametrize(("lanes", "chunk"), [(1, 64), (1, 16), (8, 64), (16, 64)])
+@pytest.mark.parametrize(
+    ("lanes", "chunk"), [(1, 16), *(pytest.param(lanes, 64, marks=pytest.mark.slow) for lanes in (1, 8, 16))]
+)
 def test_how_a_device_splits_the_work_does_not_change_the_image(lanes, chunk):
     """GPUs take one value and 16 samples at a time, processors vectors and 64."""
     solid = block(lambda x, y, z: np.where(y > 3, 0, 1), half_mm=(12, 12, 12))

@@ -35,6 +35,7 @@ phased = st.builds(PhasedProbe, st.floats(50, 100), st.floats(50, 180))
 
 
 @given(st.one_of(convex, linear, phased))
+@pytest.mark.slow
 def test_geometry_is_found_from_the_image(probe):
     if isinstance(probe, ConvexProbe):  # with a smaller radius it is classified as a phased array
         assume(probe.radius_mm > 0.08 * (probe.radius_mm + probe.depth_mm))

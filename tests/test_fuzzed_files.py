@@ -213,7 +213,9 @@ def test_every_format_is_read_before_it_is_damaged(tmp_path):
         assert file.read(file.of(path)) is not None
 
 
-@pytest.mark.parametrize("name", FORMATS)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[pytest.mark.slow] * (name in ("IM", "dcm", "dcms"))) for name in FORMATS]
+)
 def test_a_damaged_file_is_read_or_refused_in_one_line(name, tmp_path_factory):
     file, folder = FORMATS[name], tmp_path_factory.mktemp("fuzz")
     path = folder / file.name

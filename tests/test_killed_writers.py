@@ -109,7 +109,7 @@ print("steps", steps)
 """
 
 
-@pytest.mark.parametrize("how", ["kill", "fail", "EIO"])
+@pytest.mark.parametrize("how", ["kill", *(pytest.param(how, marks=pytest.mark.slow) for how in ("fail", "EIO"))])
 @pytest.mark.parametrize(
     "name",
     [
@@ -117,7 +117,7 @@ print("steps", steps)
         "p.h5",
         "p.txt",
         "s.vtp",
-        "v.mnc",
+        pytest.param("v.mnc", marks=pytest.mark.slow),
         "v.nii.gz",
         "v.nrrd",
         "v.mha",

@@ -22,6 +22,8 @@ from tests.conftest import rigid  # noqa: E402
 from tests.test_pathology import ball, empty, moved  # noqa: E402
 from tests.test_presenter import PlainView  # noqa: E402
 
+pytestmark = pytest.mark.usefixtures("segmented_once")
+
 HEAD = head_mri(3.0)
 PLACE = np.array([30.0, 10.0, 35.0])
 KINDS = ["LabelMapVolume", "Segmentation"]

@@ -90,7 +90,7 @@ def core(proposal: Proposal) -> np.ndarray:
 
 
 @needs_atlas
-@pytest.mark.parametrize("kind", ["ring", "low"])
+@pytest.mark.parametrize("kind", [pytest.param("ring", marks=pytest.mark.slow), "low"])
 def test_one_seed_grows_the_lesion_and_not_what_is_outside(kind):
     segmentation, true = brain(kind)
     before = segmentation.labels.array.copy()
@@ -105,6 +105,7 @@ def test_one_seed_grows_the_lesion_and_not_what_is_outside(kind):
 
 
 @needs_atlas
+@pytest.mark.slow
 def test_a_lesion_is_proposed_without_a_seed_and_none_in_a_healthy_brain():
     segmentation, true = brain("low")
     (proposal,) = propose_lesions(segmentation)
@@ -167,6 +168,7 @@ def test_proposals_are_files_of_their_own_that_are_not_replaced_once_edited(tmp_
 
 
 @needs_atlas
+@pytest.mark.slow
 def test_what_grows_grows_also_under_a_name_unless_the_name_contradicts_its_look():
     ring, _ = brain("ring")
     rim = (CENTRE[0] + 13.0, *CENTRE[1:])
@@ -201,6 +203,7 @@ def test_only_lesions_are_grown(name):
 
 
 @needs_atlas
+@pytest.mark.slow
 def test_a_refused_seed_writes_nothing_and_earlier_proposals_are_told(tmp_path):
     maps = tissue_maps("mni152")
     assert maps is not None

@@ -334,6 +334,7 @@ def test_devices_prints_its_table_alone():
     assert "ussim: debug: OpenCL devices: " in result.stderr
 
 
+@pytest.mark.slow
 def test_demo_prints_the_path_of_its_figure(files, tmp_path):
     pytest.importorskip("matplotlib", reason="pictures need matplotlib: pip install '.[demo]'")
     out = tmp_path / "demo"

@@ -14,7 +14,7 @@ from SlicerUSSim.Logic.probe.placement import craniotomy_pose, pose_looking_at, 
 COLIN27 = Path("/usr/share/mricron/templates/ch2bet.nii.gz")
 
 
-@pytest.fixture(scope="module", params=["MNI152", "Colin27"])
+@pytest.fixture(scope="module", params=["MNI152", pytest.param("Colin27", marks=pytest.mark.slow)])
 def view(request):
     """(frame, labels under the probe) of the demo's view, averaged over seeds to look through the speckle."""
     if request.param == "MNI152":
@@ -30,8 +30,9 @@ def view(request):
     probe = PhasedProbe(80, 90, scan_lines=196)
     pose = craniotomy_pose(segmentation.labels, probe)
     images = []
+    simulator = UltrasoundSimulator(segmentation.labels, table)
     for seed in range(4):
-        simulator = UltrasoundSimulator(segmentation.labels, table, SimulationSettings(seed=seed))
+        simulator.settings = SimulationSettings(seed=seed)
         frame = simulator.simulate(probe, pose)
         images.append(frame.image)
     labels = slice_under_probe(segmentation.labels, frame.grid, pose, order=0)

@@ -47,6 +47,7 @@ def grey_share(case: BrainPhantom, where: np.ndarray, contrast: str) -> float:
 
 
 @pytest.mark.parametrize("contrast", ["t1", "t2"])
+@pytest.mark.slow
 def test_nuclei_nearly_as_bright_as_white_matter_are_grey_by_their_place(contrast):
     maps, nuclei, ball = bright_nuclei()
     case = phantom(maps, contrast, noise=0.03, bias=0.1)

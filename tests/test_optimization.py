@@ -33,13 +33,14 @@ from SlicerUSSim.Logic.probe.beam import FWHM_PER_SIGMA
 from SlicerUSSim.Logic.probe.image_grid import ImageGrid
 from SlicerUSSim.Logic.tissue.tissue import Tissue
 from SlicerUSSim.Logic.verification.twins import make_twin
+from tests.remembered import segment_once
 
 SMALL = PhasedProbe(70.0, 50.0, scan_lines=80)
 
 
 @pytest.fixture(scope="module")
 def brain():
-    segmentation = segment_mri(head_mri(2.0))
+    segmentation = segment_once(head_mri(2.0))
     return segmentation.labels, TissueTable.brain(segmentation.tissue_names)
 
 
@@ -106,7 +107,8 @@ def test_net_fall_with_depth_and_relative_echogenicity_are_recovered(twin, resul
     assert spread.is_determined is False or abs(truth - spread.value) < 3.0
 
 
-@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [0, 1])
 def test_attenuation_and_echogenicity_are_recovered_when_the_display_is_known(brain, seed):
     twin = make_twin(*brain, seed, probe=SMALL, display_is_known=True)
     result = optimise(twin, ["white matter"])
@@ -283,11 +285,13 @@ def test_bounds_are_kept(twin):
 # ---- the same again, and going on ------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_the_same_problem_gives_the_same_answer(twin):
     one, other = (optimise(twin, ["display"], max_evaluations=60, restarts=1) for _ in range(2))
     assert one.after == other.after and one.history == other.history
 
 
+@pytest.mark.slow
 def test_an_interrupted_run_is_resumed_without_computing_again(twin):
     reached = []
 
@@ -339,6 +343,7 @@ def hybrid(labels: Volume, tissues, mri: Volume) -> UltrasoundSimulator:
     return UltrasoundSimulator(labels, tissues, SimulationSettings(mri_modulation_db=3.0), texture=texture)
 
 
+@pytest.mark.slow
 def test_a_state_is_refused_if_any_input_is_another_and_the_line_says_which(twin):
     medium, mri = twin.simulator.medium, head_mri(2.0)
     start = hybrid(medium.labels, medium.tissues, mri)

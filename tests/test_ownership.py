@@ -21,6 +21,8 @@ from SlicerUSSim.Logic.mrml.scene_record import SceneRecord, put_nodes, record_n
 from tests.conftest import rigid
 from tests.test_scene import Bench, add, cyst, pixels, put, save_scene
 
+pytestmark = pytest.mark.usefixtures("segmented_once")
+
 
 @pytest.fixture
 def bench():

@@ -31,6 +31,8 @@ from SlicerUSSim.Logic.tissue.presets import TISSUES, colour_of
 
 from .conftest import SHARED, block, needs_shared, rigid
 
+pytestmark = pytest.mark.usefixtures("segmented_once")
+
 #: White matter around the origin in a margin that is not the patient
 BRAIN = block(lambda x, y, z: np.where(x**2 + y**2 + z**2 < 24**2, 1, 0))
 CENTRE, RADIUS = np.array([4.0, -3.0, 2.0]), 8.0
@@ -476,6 +478,7 @@ def test_names_of_lesions_are_known(name, tissue):
     assert tissue_named(name).name == tissue
 
 
+@pytest.mark.slow
 def test_the_texture_of_the_mri_is_certain_in_a_lesion_and_follows_its_intensity():
     mri = head_mri(3.0)
     segmentation = segment_mri(mri)

@@ -30,6 +30,8 @@ from SlicerUSSim.Widget.controls import by_widget, part_of, shown_by, usable  # 
 from SlicerUSSim.Widget.presenter import TISSUE_COLUMNS, PanelPresenter  # noqa: E402
 from SlicerUSSim.Widget.sections import CUSTOM_PROBE, panel_sections  # noqa: E402
 
+pytestmark = pytest.mark.usefixtures("segmented_once")
+
 
 class PlainView:
     """Records all calls; its event loop is a list."""

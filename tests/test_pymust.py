@@ -254,9 +254,9 @@ HALF = 2.0 * np.sqrt(np.log(2.0))
 @pytest.mark.parametrize(
     ("mhz", "f_number", "pitch_mm", "elements", "focus", "depths"),
     [
-        (5.0, 2.5, 0.3, 40, 30.0, (12.0, 20.0, 25.0, 30.0, 34.0, 39.0)),
+        pytest.param(5.0, 2.5, 0.3, 40, 30.0, (12.0, 20.0, 25.0, 30.0, 34.0, 39.0), marks=pytest.mark.slow),
         # beam.CURVED was chosen with the case above; it was kept because these, looked at too, agreed:
-        (7.5, 1.5, 0.2, 50, 20.0, (8.0, 14.0, 20.0, 26.0)),
+        pytest.param(7.5, 1.5, 0.2, 50, 20.0, (8.0, 14.0, 20.0, 26.0), marks=pytest.mark.slow),
         pytest.param(3.5, 2.5, 0.35, 57, 50.0, (20.0, 50.0, 65.0), marks=pytest.mark.slow),
     ],
 )

@@ -14,6 +14,7 @@ from dataclasses import replace
 from typing import Any, get_args, get_origin
 
 import numpy as np
+import pytest
 from hypothesis import HealthCheck, event, given, settings, strategies as st
 from scipy.spatial.transform import Rotation
 
@@ -108,12 +109,28 @@ def built(owner: type, chosen: dict[str, Any]) -> Any:
     return None
 
 
-@settings(
-    max_examples=int(os.environ.get("USSIM_FUZZ", "60")), deadline=None, derandomize=True, database=None,
-    suppress_health_check=list(HealthCheck),
-)  # fmt: skip
+def drawn(examples: int) -> settings:
+    """So many scenes, the same every time."""
+    return settings(
+        max_examples=examples, deadline=None, derandomize=True, database=None,
+        suppress_health_check=list(HealthCheck),
+    )  # fmt: skip
+
+
+@drawn(6)
 @given(st.data())
 def test_valid_values_give_a_finite_image_twice_or_are_refused_in_one_line(data):
+    _simulate_twice(data)
+
+
+@pytest.mark.slow
+@drawn(int(os.environ.get("USSIM_FUZZ", "60")))
+@given(st.data())
+def test_many_valid_values_give_a_finite_image_twice_or_are_refused_in_one_line(data):
+    _simulate_twice(data)
+
+
+def _simulate_twice(data) -> None:
     array = data.draw(st.sampled_from([LinearProbe, ConvexProbe, PhasedProbe]))
     probe = built(array, data.draw(some(array)))
     chosen = built(SimulationSettings, data.draw(some(SimulationSettings)))

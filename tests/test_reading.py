@@ -179,6 +179,7 @@ def same(a: object, b: object) -> bool:
     return np.array_equal(a, b) if isinstance(a, np.ndarray) else a == b
 
 
+@pytest.mark.slow
 def test_what_is_read_in_a_child_is_what_is_read_here(tmp_path, monkeypatch):
     for path, read in written(tmp_path):
         here = read(path)

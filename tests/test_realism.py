@@ -20,7 +20,6 @@ from SlicerUSSim.Logic import (
     TissueTable,
     TrackedSequence,
     UltrasoundSimulator,
-    segment_mri,
     similarity,
 )
 from SlicerUSSim.Logic.base.files import write_json
@@ -34,6 +33,7 @@ from SlicerUSSim.Logic.probe import ImageGrid
 from SlicerUSSim.Logic.tracked import TrackedImages
 from SlicerUSSim.Logic.verification.twins import make_twin
 from tests.conftest import SHARED, SPECKLE, block, needs_shared, rigid
+from tests.remembered import segment_once
 
 SPACING = 0.2, 0.2
 GRID = ImageGrid(300, 240, -24.0, 0.0, SPACING)
@@ -210,11 +210,12 @@ def test_contrast_of_a_wall_is_above_the_tissue_and_not_above_the_fluid():
 
 @pytest.fixture(scope="module")
 def twin():
-    segmentation = segment_mri(head_mri(2.0))
+    segmentation = segment_once(head_mri(2.0))
     probe = PhasedProbe(70.0, 50.0, scan_lines=128)
     return make_twin(segmentation.labels, TissueTable.brain(segmentation.tissue_names), 3, probe=probe)
 
 
+@pytest.mark.slow
 def test_realism_of_the_images_themselves_is_perfect_and_controls_are_not(twin):
     tracked = TrackedImages.of(twin.sequence(), probe=twin.probe)
     sequence = twin.sequence()
@@ -242,6 +243,7 @@ def test_realism_of_the_images_themselves_is_perfect_and_controls_are_not(twin):
         measure_realism(tracked, {"one": tracked.images[:1]}, twin.simulator)
 
 
+@pytest.mark.slow
 def test_command_says_numbers_with_controls(twin, tmp_path):
     twin.simulator.medium.labels.write(tmp_path / "labels.nii.gz")
     twin.simulator.medium.tissues.write(tmp_path / "labels.json")

@@ -59,6 +59,7 @@ def test_an_offset_of_four_millimetres_and_degrees_is_found_back(twin):
     assert found.shift_mm == pytest.approx(4.0, abs=1.2) and found.turn_deg == pytest.approx(4.0, abs=1.2)
 
 
+@pytest.mark.slow
 def test_poses_in_place_are_not_made_worse(twin):
     found = register_poses(
         twin.simulator, PROBE, twin.poses[:2], twin.references[:2], display=twin.true_display, max_evaluations=40
@@ -137,6 +138,7 @@ def test_poses_that_fit_exactly_are_returned_although_the_coarse_search_leaves_t
     assert found.shift_mm == pytest.approx(0.0, abs=1e-12) and found.turn_deg == pytest.approx(0.0, abs=1e-4)
 
 
+@pytest.mark.slow
 def test_the_cost_found_is_that_of_images_at_the_corrected_poses():
     """At oblique poses, where correction @ pose and pose @ correction lie apart; costs by plain simulations."""
     seen, rotation = cysts()

@@ -43,6 +43,8 @@ from SlicerUSSim.Logic.probe.image_grid import ImageGrid  # noqa: E402
 from SlicerUSSim.Logic.probe.placement import pose_in_slice  # noqa: E402
 from tests.conftest import FLUID, SPECKLE, block, example, rigid  # noqa: E402
 
+pytestmark = pytest.mark.usefixtures("segmented_once")
+
 PRESET = Preset(
     LinearProbe(20, 30, scan_lines=48, focus_mm=15),
     DisplaySettings(image_size=(96, 64)),
@@ -329,6 +331,7 @@ def test_segment_names_and_colours_tissues_where_the_mri_is(kind):
     assert frame.image.mean() > 15 and np.mean(frame.image != direct.image) < 0.02
 
 
+@pytest.mark.slow
 def test_a_mask_can_be_a_segmentation_on_another_grid():
     scene = slicer.vtkMRMLScene()
     logic, mri = UltrasoundSceneLogic(scene), head_mri(3.0)

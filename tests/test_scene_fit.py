@@ -17,7 +17,6 @@ from SlicerUSSim.Logic import (  # noqa: E402
     SimulationError,
     TissueTable,
     Volume,
-    segment_mri,
 )
 from SlicerUSSim.Logic.base.errors import Cancelled  # noqa: E402
 from SlicerUSSim.Logic.base.vtk_data import vtk_matrix  # noqa: E402
@@ -30,13 +29,14 @@ from SlicerUSSim.Logic.mrml.label_nodes import write_labels  # noqa: E402
 from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic  # noqa: E402
 from SlicerUSSim.Logic.mrml.nodes import ijk_to_ras, node_to_world, nodes_of_class, read_volume, write_volume  # noqa: E402
 from SlicerUSSim.Logic.verification.twins import make_twin  # noqa: E402
+from tests.remembered import segment_once  # noqa: E402
 
 PROBE = PhasedProbe(70.0, 50.0, scan_lines=80)
 
 
 @pytest.fixture(scope="module")
 def brain():
-    segmentation = segment_mri(head_mri(2.0))
+    segmentation = segment_once(head_mri(2.0))
     return segmentation, make_twin(
         segmentation.labels, TissueTable.brain(segmentation.tissue_names), 3, probe=PROBE, frames=3
     )
@@ -124,6 +124,7 @@ def test_frames_are_chosen_by_number(scene):
         scene.optimize(frames=[9])
 
 
+@pytest.mark.slow
 def test_images_that_are_not_fitted_are_predicted(scene):
     found = scene.optimize(validate=[1], max_evaluations=60)
     assert found.tracked.numbers == [0, 2] and found.prediction is not None

@@ -46,6 +46,8 @@ from SlicerUSSim.Logic.probe.image_grid import ImageGrid  # noqa: E402
 from SlicerUSSim.Logic.tracked.images import TrackedImages  # noqa: E402
 from SlicerUSSim.Logic.tracked.sequence import TrackedSequence  # noqa: E402
 
+pytestmark = pytest.mark.usefixtures("segmented_once")
+
 
 def add(scene, kind: str, name: str = ""):
     return scene.AddNewNodeByClass(f"vtkMRML{kind}Node", name or kind)

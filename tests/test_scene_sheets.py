@@ -16,10 +16,12 @@ from SlicerUSSim.Logic.mri.sheets.finding import ALL_KINDS  # noqa: E402
 from SlicerUSSim.Logic.mrml.label_nodes import write_labels  # noqa: E402
 from SlicerUSSim.Logic.mrml.nodes import node_to_world, write_volume  # noqa: E402
 from SlicerUSSim.Logic.mrml.sheet_nodes import read_sheets, sheets_version, write_sheets  # noqa: E402
-from SlicerUSSim.Logic.verification.ct_phantoms import lower_chest  # noqa: E402
+from tests.conftest import coarse_chest  # noqa: E402
 from tests.test_craniotomy_nodes import TURN  # noqa: E402
 from tests.test_lesion_nodes import HEAD, Scene  # noqa: E402
 from tests.test_lesion_proposals import CENTRE, brain, needs_atlas  # noqa: E402
+
+pytestmark = pytest.mark.usefixtures("segmented_once")
 
 
 def some_surfels() -> Surfels:
@@ -65,6 +67,7 @@ def bench_with_probe() -> tuple[Scene, object]:
     return bench, presenter
 
 
+@pytest.mark.slow
 def test_segment_finds_sheets_and_images_show_them_as_those_of_the_command():
     bench, presenter = bench_with_probe()
     parent = bench.add("LinearTransform", "to world")
@@ -109,6 +112,7 @@ def test_segment_finds_sheets_and_images_show_them_as_those_of_the_command():
     assert parameters.sheets is None and "of an earlier Segment, are not shown any more" in presenter.notes()
 
 
+@pytest.mark.slow
 def test_sheets_of_a_user_are_kept_and_a_model_of_something_else_is_one_line():
     bench, presenter = bench_with_probe()
     parameters = bench.logic.parameters
@@ -152,9 +156,9 @@ def test_the_settings_of_sheets_name_what_can_be_found():
 # ---- organs of a CT --------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("kind", ["LabelMapVolume", "Segmentation"])
+@pytest.mark.parametrize("kind", [pytest.param("LabelMapVolume", marks=pytest.mark.slow), "Segmentation"])
 def test_organs_of_a_ct_are_laid_over_its_tissues_wherever_their_node_lies(kind):
-    bench, phantom = Scene(), lower_chest((4.0, 4.0, 4.0))
+    bench, phantom = Scene(), coarse_chest()
     write_volume(bench.mri, phantom.ct)
     liver = Volume((phantom.organs.array == 5).astype(np.uint8), np.linalg.inv(TURN) @ phantom.organs.ijk_to_ras)
     assert liver.array.sum() > 1000
@@ -219,6 +223,7 @@ def test_a_point_shown_in_a_view_proposes_a_lesion_that_is_laid_over_the_tissues
 
 
 @needs_atlas
+@pytest.mark.slow
 def test_a_proposal_without_a_point_is_discarded_and_a_named_one_is_taken_at_the_users_word():
     bench, presenter, _ = proposing()
     parameters = bench.logic.parameters

@@ -29,6 +29,7 @@ from SlicerUSSim.Logic.mri.segmentation import estimate_noise
 from SlicerUSSim.Logic.verification.brain_phantoms import part_of, phantom, tissue_maps
 from SlicerUSSim.Logic.verification.brain_scores import scores
 from tests.conftest import rigid
+from tests.remembered import segment_once
 
 COLIN27 = Path("/usr/share/mricron/templates/ch2bet.nii.gz")
 
@@ -214,7 +215,7 @@ def test_noise_is_estimated_beside_edges(sigma):
 def test_classes_are_named_by_contrast(contrast, order):
     head = head_mri(2.0)
     mri = head.with_array(np.where(head.array > 0, 160 - head.array, 0)) if contrast == "t2" else head
-    result = segment_mri(mri, contrast=contrast)
+    result = segment_once(mri, contrast=contrast)
     assert result.tissue_names == order
     assert (np.diff(result.means) > 0).all()
 
@@ -229,8 +230,9 @@ def test_the_table_has_a_line_per_label_whose_shares_and_millilitres_add_up():
 
 
 @pytest.mark.parametrize("unit", [1.0, 0.01, 1e-6])
+@pytest.mark.slow
 def test_the_table_has_means_and_deviations_in_every_unit(unit):
-    head = head_mri(2.0)
+    head = head_mri(3.0)
     result = segment_mri(head.with_array((head.array * np.float64(unit)).astype(np.float32)))
     lines = result.table().splitlines()[1:]
     assert len(lines) == len(result.means) == 3 and len(set(map(len, lines))) == 1
@@ -248,7 +250,7 @@ def test_the_table_leaves_out_tissues_that_were_covered_wholly():
 
 
 def test_posteriors_sum_to_one_inside_and_agree_with_the_labels():
-    result = segment_mri(head_mri(2.0))
+    result = segment_once(head_mri(2.0))
     posteriors = result.posteriors
     inside = result.labels.array > 0
     assert posteriors.shape == (3, *inside.shape) and posteriors.dtype == np.float32
@@ -277,6 +279,7 @@ def test_thin_sulci_are_found_on_their_middle_and_only_there():
     assert not (segment_mri(mri, mask=mask).labels.array == 4).any()
 
 
+@pytest.mark.slow
 def test_bias_correction_saves_the_classes_of_a_shaded_image():
     head = head_mri(2.0)
     shade = np.linspace(0.72, 1.28, head.array.shape[0])[:, None, None].astype(np.float32)
@@ -309,7 +312,7 @@ def test_the_field_found_with_the_tissues_is_the_one_that_was_applied():
 
 def test_a_brain_of_which_two_thirds_are_white_matter_keeps_its_grey():
     """Starts with less white matter once put both means into the one peak: 110 and 110 instead of 85 and 110."""
-    np.testing.assert_allclose(segment_mri(head_mri(2.0)).means, [40, 85, 110], atol=2)
+    np.testing.assert_allclose(segment_once(head_mri(2.0)).means, [40, 85, 110], atol=2)
 
 
 @pytest.mark.parametrize(
@@ -364,6 +367,7 @@ def test_the_parts_of_one_brain_lie_in_the_same_places_in_any_contrast_and_those
 
 
 @pytest.mark.parametrize("is_cropped", [False, True])
+@pytest.mark.slow
 def test_a_second_mri_may_lack_a_part_of_the_brain_and_what_it_lacks_is_said(mni, is_cropped):
     """Whether it was cropped there, or has zeros."""
     t1 = mni[0]
@@ -385,6 +389,7 @@ def test_a_second_mri_may_lack_a_part_of_the_brain_and_what_it_lacks_is_said(mni
 
 
 @pytest.mark.skipif(not COLIN27.exists(), reason="Debian's mricron-data is not installed")
+@pytest.mark.slow
 def test_the_brain_of_another_patient_is_refused_as_second_mri(mni):
     """Both are skull-stripped, in one space, and alike as wholes."""
     with pytest.raises(
@@ -393,6 +398,7 @@ def test_the_brain_of_another_patient_is_refused_as_second_mri(mni):
         segment_mri(mni[0], contrast="t1", others={"t1gd": Volume.read(COLIN27)})
 
 
+@pytest.mark.slow
 def test_a_label_map_is_refused_as_second_mri(mni):
     t1 = mni[0]
     labels = t1.with_array(np.digitize(t1.array, [20, 60, 90]).astype(np.uint8))
@@ -405,6 +411,7 @@ def test_a_label_map_is_refused_as_second_mri(mni):
         segment_mri(t1, contrast="t1", others={"t2": parts})
 
 
+@pytest.mark.slow
 def test_the_map_of_one_tissue_is_refused_as_second_mri(mni):
     t1 = mni[0]
     grey = t1.with_array(np.clip(1.0 - np.abs(t1.array - 60.0) / 30.0, 0.0, 1.0).astype(np.float32))
@@ -415,6 +422,7 @@ def test_the_map_of_one_tissue_is_refused_as_second_mri(mni):
         segment_mri(t1, contrast="t1", others={"t2": bent})
 
 
+@pytest.mark.slow
 def test_a_small_whole_brain_is_led_by_the_atlas(mni):
     matrix = mni[0].ijk_to_ras.copy()
     matrix[:3, :3] *= (620.0 / 1886.0) ** (1.0 / 3.0)
@@ -423,7 +431,7 @@ def test_a_small_whole_brain_is_led_by_the_atlas(mni):
     assert any("expected 1000 to 1900 ml of an adult" in line for line in found.warnings)
 
 
-@pytest.mark.parametrize("axis", [0, 2])
+@pytest.mark.parametrize("axis", [pytest.param(0, marks=pytest.mark.slow), 2])
 def test_thick_slices_of_a_turned_head_are_registered(mni, axis):
     """A T2 of 5 mm slices, turned by 10 degrees: a smoothed first level led 30 mm away."""
     t1 = mni[0]
@@ -458,7 +466,7 @@ def test_less_sure_posteriors_shrink_log_odds_and_change_no_label():
     np.testing.assert_allclose(after, 0.9 * before, atol=1e-3)
 
 
-@pytest.mark.parametrize("seed", [0, 3])
+@pytest.mark.parametrize("seed", [0, pytest.param(3, marks=pytest.mark.slow)])
 def test_a_fifth_of_the_field_of_one_persons_phantom_is_left_at_most(seed):
     """Colin27, whose grey and white matter differ from place to place; degree 3 and even weights left 20 to 21 %."""
     maps = tissue_maps("colin27")
@@ -476,7 +484,12 @@ def test_a_fifth_of_the_field_of_one_persons_phantom_is_left_at_most(seed):
 
 
 @pytest.mark.parametrize(
-    ("part", "bias", "least"), [("quarter", 0.0, 0.95), ("quarter", 0.2, 0.94), ("part of a coronal slab", 0.2, 0.94)]
+    ("part", "bias", "least"),
+    [
+        ("quarter", 0.0, 0.95),
+        pytest.param("quarter", 0.2, 0.94, marks=pytest.mark.slow),
+        pytest.param("part of a coronal slab", 0.2, 0.94, marks=pytest.mark.slow),
+    ],
 )
 def test_white_matter_of_a_part_of_a_brain_is_not_taken_for_a_bias_field(part, bias, least):
     """N4 made a field of 20 % in a quarter of a brain without any: a Dice of 0.88 with and without a field."""
@@ -496,6 +509,7 @@ def test_white_matter_of_a_part_of_a_brain_is_not_taken_for_a_bias_field(part, b
         assert left.std() < 0.4 * true.std()
 
 
+@pytest.mark.slow
 def test_thin_sulci_are_not_looked_for_in_slices_thicker_than_they_are(mni):
     """In slices of 5 mm, leptomeninges had 1.5 times the volume that they have in those of 1 mm."""
     t1 = mni[0]
@@ -513,6 +527,7 @@ def test_thin_sulci_are_not_looked_for_in_slices_thicker_than_they_are(mni):
     assert not any("across which" in line for line in segment_mri(thick, others={"t1gd": t1}).warnings)
 
 
+@pytest.mark.slow
 def test_a_lesion_that_is_bright_in_a_flair_needs_four_classes_which_is_said(mni):
     """It was grey matter without a word."""
     t1 = mni[0]

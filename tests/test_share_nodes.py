@@ -19,6 +19,8 @@ from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic  # noqa: E402
 from SlicerUSSim.Logic.mrml.nodes import node_to_world, nodes_of_class, read_volume, write_volume  # noqa: E402
 from tests.test_pathology import ball, empty, moved  # noqa: E402
 
+pytestmark = pytest.mark.usefixtures("segmented_once")
+
 KINDS = ["LabelMapVolume", "Segmentation"]
 MRI = head_mri(3.0)
 LESION = ball(moved(empty((2.0, 2.0, 2.0), np.eye(3), 20), 30.0, 10.0, 35.0), 8.0, np.array([30.0, 10.0, 35.0]))

@@ -26,6 +26,7 @@ slicer = pytest.importorskip("slicer", reason="MRML nodes come with slicer-core:
 pytest.importorskip("PySide6", reason="the panel is tested on Qt for Python: pip install PySide6-Essentials")
 
 from tests import slicer_stand_in as stand_in  # noqa: E402
+from tests.remembered import once  # noqa: E402
 from tests.shared_data import SHARED, needs_shared  # noqa: E402
 from tests.slicer_factory import load_source_as_module  # noqa: E402
 
@@ -98,6 +99,9 @@ class Session:
 
     def segmented(self):
         """The same with its tissues, a coarse probe for speed, and the first image."""
+        modality = self.logic_module("mri.modality")
+        if not hasattr(self.module, "segment_once"):  # of the same head in all tests
+            self.module.segment_once = modality.segment_mri = once(modality.segment_mri)
         self.parameters.mri = self.head()
         self.ui.scanLinesSpinBox.setValue(48)
         self.ui.segmentButton.click()
@@ -383,6 +387,7 @@ def test_every_node_selector_has_the_scene_and_the_classes_of_its_role(session):
         assert widget.property("addEnabled") == bool(control.new_node)
 
 
+@pytest.mark.slow
 def test_every_value_of_the_panel_accepts_both_ends_of_its_range(session):
     preset_module = session.logic_module("imaging.preset")
     presenter = session.panel.presenter
@@ -768,6 +773,7 @@ def with_real_image(session, gain_db: float = 9.0):
     return session
 
 
+@pytest.mark.slow
 def test_the_panel_fits_compares_applies_and_reverts(session):
     assert not session.ui.fitButton.isEnabled() and "Segment" in session.ui.fitButton.toolTip()
     with_real_image(session)
@@ -850,6 +856,7 @@ def test_errors_of_a_fit_are_one_line(session):
     assert len(session.app.errors) == 6 and not any("\n" in message for message in session.app.errors)
 
 
+@pytest.mark.slow
 def test_the_panel_predicts_images_that_are_not_fitted(session):
     with_real_image(session)
     ui = session.ui
@@ -914,6 +921,7 @@ def test_reloading_the_module_brings_new_code(module):
         module.__dict__.update(again.__dict__ | {"app": module.app})
 
 
+@pytest.mark.slow
 def test_the_panel_looks_as_it_should(session, tmp_path):
     """A figure of the panel with all sections open, in which every control is completely visible."""
     session.segmented()

@@ -107,6 +107,7 @@ def test_dark_images_have_no_speckle_to_fit(tracked):
     assert with_estimated_map(PLAIN, dark) == (PLAIN, False)
 
 
+@pytest.mark.slow
 def test_command_fits_the_speckle(tracked, tmp_path):
     LABELS.write(tmp_path / "labels.nii.gz")
     TISSUES.write(tmp_path / "labels.json")

@@ -25,6 +25,9 @@ from SlicerUSSim.Logic.mri.samples import head_mri
 from SlicerUSSim.Logic.tissue.texture import volume_shares
 from SlicerUSSim.Logic.verification.measurement import correlation, level_db, region_level_db
 from tests.conftest import SPECKLE, block, rigid
+from tests.remembered import segment_once
+
+pytestmark = pytest.mark.usefixtures("segmented_once")
 
 PROBE = LinearProbe(36, 46, scan_lines=145, focus_mm=25, elevation_focus_mm=25)
 POSE = rigid(np.eye(3), [0, -23, 0])
@@ -244,7 +247,7 @@ def test_shares_of_voxels_follow_from_the_image():
 
 
 def test_a_segmentation_knows_the_shares_of_its_voxels():
-    segmentation = segment_mri(head_mri(2.0))
+    segmentation = segment_once(head_mri(2.0))
     known = segmentation.texture()
     assert known.volume_share is not None and 0.01 < (known.volume_share > 0).mean() < 0.4
     assert known.volume_share.max() <= 0.5

@@ -32,6 +32,7 @@ def brain() -> TissueMaps:
     return maps.coarser(2)
 
 
+@pytest.mark.slow
 def test_a_tumours_rim_that_enhances_in_a_t1_without_contrast_agent_is_said_with_the_remedy():
     case = phantom(with_ring_tumour(brain()), "t1gd", bias=0.0)
     told = segment_mri(case.mri, contrast="t1", mask=case.mask).warnings
@@ -39,6 +40,7 @@ def test_a_tumours_rim_that_enhances_in_a_t1_without_contrast_agent_is_said_with
     assert not any("t1gd" in line for line in segment_mri(case.mri, contrast="t1gd", mask=case.mask).warnings)
 
 
+@pytest.mark.slow
 def test_a_t1_in_which_nothing_enhances_is_said_not_to_be_after_contrast_agent():
     case = phantom(brain(), "t1")
     told = segment_mri(case.mri, contrast="t1gd", mask=case.mask).warnings
@@ -123,6 +125,7 @@ def test_a_mask_says_why_it_does_not_fit():
     assert given_brain(Volume(inside, np.eye(4)), mri).method == "given"
 
 
+@pytest.mark.slow
 def test_an_mri_as_z_scores_gets_the_labels_of_the_mri():
     """The usual preparation for neural networks: the field, which multiplies, was fitted to negative intensities."""
     maps = brain()

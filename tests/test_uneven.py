@@ -27,6 +27,7 @@ from SlicerUSSim.Logic.verification.numpy_model.echoes import unevenness
 from SlicerUSSim.Logic.verification.validation.speckle import one_line_on
 from tests.conftest import SPECKLE, block, rigid
 
+TURN = np.array([[0.36, 0.48, -0.8], [-0.8, 0.6, 0.0], [0.48, 0.64, 0.6]])
 PROBE = LinearProbe(36, 46, scan_lines=145, focus_mm=25, elevation_focus_mm=25)
 POSE = rigid(np.eye(3), [0, -23, 0])
 SOLID = block(lambda x, y, z: np.ones_like(x), half_mm=(30, 30, 12))
@@ -49,8 +50,8 @@ def factors(row: np.ndarray, places: np.ndarray, seed=3) -> np.ndarray:
     return unevenness(seed, np.repeat(row, len(places)), places.astype(np.float32))
 
 
-@pytest.mark.parametrize("probe", [PROBE, PhasedProbe(70, 40, scan_lines=60)])
-@pytest.mark.parametrize("turn", [np.eye(3), np.array([[0.36, 0.48, -0.8], [-0.8, 0.6, 0.0], [0.48, 0.64, 0.6]])])
+@pytest.mark.parametrize("probe", [PROBE, pytest.param(PhasedProbe(70, 40, scan_lines=60), marks=pytest.mark.slow)])
+@pytest.mark.parametrize("turn", [pytest.param(np.eye(3), marks=pytest.mark.slow), TURN], ids=["aligned", "turned"])
 def test_the_kernels_draw_the_unevenness_that_numpy_draws(probe, turn):
     probe = replace(probe, depth_mm=20.0, scan_lines=40)
     labels = block(lambda x, y, z: 1 + (x > 2.0) + (np.hypot(x, y) < 3.0), half_mm=(24, 24, 8))
@@ -65,7 +66,14 @@ def test_the_kernels_draw_the_unevenness_that_numpy_draws(probe, turn):
     assert (np.abs(image.astype(int) - plain) > 10).mean() > 0.15
 
 
-@pytest.mark.parametrize("changes", [{}, {"texture_db": 0.0}, {"specks_per_mm3": 0.0, "texture_db": 8.0}])
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {},
+        pytest.param({"texture_db": 0.0}, marks=pytest.mark.slow),
+        pytest.param({"specks_per_mm3": 0.0, "texture_db": 8.0}, marks=pytest.mark.slow),
+    ],
+)
 def test_mean_power_is_kept(changes):
     """Against the same scatterers without, so that the draw of the speckle does not count."""
     uneven = replace(UNEVEN, **changes)
@@ -83,9 +91,9 @@ def test_mean_power_is_kept(changes):
 @pytest.mark.parametrize(
     "values",
     [
-        {"texture_db": 3.0},
-        {"texture_db": 8.0},
-        {"specks_per_mm3": 0.05, "speck_db": 14.0},
+        pytest.param({"texture_db": 3.0}, marks=pytest.mark.slow),
+        pytest.param({"texture_db": 8.0}, marks=pytest.mark.slow),
+        pytest.param({"specks_per_mm3": 0.05, "speck_db": 14.0}, marks=pytest.mark.slow),
         {"texture_db": 4.0, "specks_per_mm3": 0.02, "speck_db": 12.0},
     ],
 )

@@ -47,6 +47,8 @@ from SlicerUSSim.Logic.vtk.filters import SegmentationFilter, UltrasoundSimulati
 from tests.conftest import FLUID, SPECKLE, block, example, rigid
 from tests.test_drawn_sheets import plane
 
+pytestmark = pytest.mark.usefixtures("segmented_once")
+
 PROBE = LinearProbe(20, 30, scan_lines=48, focus_mm=15)
 DISPLAY = DisplaySettings(image_size=(96, 64))
 TISSUES = TissueTable({0: FLUID, 1: SPECKLE, 2: FLUID})
@@ -350,6 +352,7 @@ def test_segmentation_labels_as_the_function_does_and_names_travel():
     assert algorithm._simulator._simulator.medium.tissues[1].name == "white matter"
 
 
+@pytest.mark.slow
 def test_segmentation_has_the_declared_defaults_and_refuses_when_it_updates():
     segmentation = SegmentationFilter()
     assert segmentation._values == asdict(SegmentationSettings())
@@ -418,6 +421,7 @@ def pixels(example, scene, path) -> np.ndarray:
     return np.asarray(Image.open(path).convert("RGB")).astype(int)
 
 
+@pytest.mark.slow
 def test_the_example_shows_mri_outline_and_ultrasound_in_one_window(rendered, tmp_path):
     example, scene = rendered
     picture = pixels(example, scene, tmp_path / "window.png")
@@ -443,6 +447,7 @@ def test_the_example_shows_mri_outline_and_ultrasound_in_one_window(rendered, tm
         assert shown == pytest.approx(true, abs=12), column
 
 
+@pytest.mark.slow
 def test_moving_the_transform_moves_the_picture(rendered, tmp_path):
     example, scene = rendered
     before = pixels(example, scene, tmp_path / "before.png")
@@ -494,6 +499,7 @@ def seen_along_z(actor, pose: np.ndarray, size: tuple[int, int]) -> np.ndarray:
     return vtk_to_numpy(scalars).reshape(size[1], size[0], 3)[::-1, :, 0]
 
 
+@pytest.mark.slow
 def test_another_mri_is_registered_and_classified_with_the_first():
     from SlicerUSSim.Logic import segment_mri
     from SlicerUSSim.Logic.mri import SegmentationSettings, head_mri

@@ -13,6 +13,17 @@ from SlicerUSSim.Logic.verification.numpy_model.elementary import dot, exp, f32,
 OF_BOTH, _OF_BEFORE, _OF_BEHIND = (1.0, 1.0, 0.0), (2.0, 0.0, -65535.0), (0.0, 2.0, 65535.0)
 TWO_GROUPS, _MOSTLY_TWO = 0.9999, 0.97  # sums of both indicators
 _FARTHEST_DIFFERENCE = 0.75  # of D from 0
+# Nodes (i, j, k) of the stencil of D: a cell, and those beside it along each axis
+_NODES = np.array(
+    [
+        (i, j, k)
+        for i in (-1, 0, 1, 2)
+        for j in (-1, 0, 1, 2)
+        for k in (-1, 0, 1, 2)
+        if sum(n in (-1, 2) for n in (i, j, k)) < 2
+    ]
+)
+_NODE_AT = {(int(i), int(j), int(k)): n for n, (i, j, k) in enumerate(_NODES)}
 
 
 @dataclass
@@ -186,13 +197,14 @@ class SmoothGrid:
         (fx, fy, fz), (gx, gy, gz) = f.T, (f32(1) - f).T
         of_before, of_behind, added = (f32(value) for value in way)
 
-        def node(i, j, k):
-            at = here + np.array([i, j, k]) @ self.steps
-            return of_before * f32(self.smooth[before, at]) - of_behind * f32(self.smooth[behind, at]) + added
+        # All nodes of the stencil at once: (nodes, n)
+        at = here + (_NODES @ self.steps)[:, None]
+        first, second = (self.smooth[group, at].astype(np.float32) for group in (before, behind))
+        nodes = of_before * first - of_behind * second + added
 
         def row(j, k, shift=0):
             """D at the position's i + shift on a row of the stencil."""
-            return gx * node(shift, j, k) + fx * node(shift + 1, j, k)
+            return gx * nodes[_NODE_AT[shift, j, k]] + fx * nodes[_NODE_AT[shift + 1, j, k]]
 
         rows = {(j, k): row(j, k) for k in (0, 1) for j in (0, 1)}
         wy, wz = (gy, fy), (gz, fz)
@@ -202,8 +214,7 @@ class SmoothGrid:
                 weight = wy[j] * wz[k]
                 difference = difference + weight * rows[j, k]
                 right, left = right + weight * row(j, k, 1), left + weight * row(j, k, -1)
-                at = here + np.array([0, j, k]) @ self.steps
-                near, far = (f32(self.smooth[before, n]) + f32(self.smooth[behind, n]) for n in (at, at + 1))
+                near, far = (first[n] + second[n] for n in (_NODE_AT[0, j, k], _NODE_AT[1, j, k]))
                 both = both + weight * (gx * near + fx * far)
         ahead = behind_ = above = below = f32(0)
         for n in (0, 1):

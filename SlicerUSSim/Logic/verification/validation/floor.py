@@ -24,6 +24,7 @@ _PROBES: dict[str, Probe] = {
     ),
 }
 _DEPTHS_MM = (20.0, 30.0, 40.0)
+_BEHIND_MM = 12.0  # imaged behind the centre of the cyst
 _SEEDS = 24
 
 
@@ -58,13 +59,14 @@ def cyst_contrast(rotation: np.ndarray, device) -> Outcome:
 
 def _contrast_db(probe: Probe, depth: float, rotation: np.ndarray, device) -> float:
     phantom = round_cyst(rotation, depth_mm=depth, radius_mm=_RADIUS_MM)
+    probe = replace(probe, depth_mm=depth + _BEHIND_MM)  # deeper samples are not looked at
     apart = float(probe.line_distance_mm(depth))
     middle, near = probe.scan_lines // 2, round(_WITHIN_MM / apart)
     far = min(round(12.0 / apart), middle)
     inside, outside = [], []
+    simulator = UltrasoundSimulator(phantom.labels, phantom.tissues, device=device)
     for seed in range(_SEEDS):
-        settings = SimulationSettings(seed=seed, interfaces=False)
-        simulator = UltrasoundSimulator(phantom.labels, phantom.tissues, settings, device)
+        simulator.settings = SimulationSettings(seed=seed, interfaces=False)
         window = depth_window(simulator.simulate(probe, phantom.probe_to_ras), depth, 1.0)
         inside.append(window[middle - near : middle + near + 1])
         outside += [window[middle - far : middle - far + 2 * near], window[middle + far - 2 * near : middle + far]]
