@@ -22,7 +22,6 @@ from tests.test_workstation import (
     dismiss_messages,
     errors,
     eventually,
-    files as files,
     new_image,
     open_section,
     opened,
