@@ -187,7 +187,7 @@ def test_a_tracked_sequence_is_recognised_under_any_name(page, files, tmp_path):
         sequence.write(written)
         sent = {"name": name, "mimeType": "application/octet-stream", "buffer": written.read_bytes()}
         said = answered(page, sent)
-        assert said.startswith(f"{name}: ") and f"{len(sequence)} images of" in said, said
+        assert said.startswith(name) and f"{len(sequence)} images of" in said, said
         assert "compared with head.nii.gz" in said and not errors(page), said
         assert state(page, NAMES.sequence.length) == 6 and state(page, NAMES.title) == "head.nii.gz"
         assert ("is read as" in said) == (name in ("sweep.dat", "sweep"))
