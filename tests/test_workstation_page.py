@@ -137,6 +137,7 @@ def test_sliders_and_buttons_have_names(page):
     assert sliders.count() > 8
 
 
+@pytest.mark.slow
 def test_axe_finds_nothing_wrong(page):
     for title in ("Probe", "Tissues", "Rays", "Tracked ultrasound", "Fit to real ultrasound"):
         open_section(page, title)

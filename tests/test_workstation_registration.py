@@ -166,6 +166,7 @@ def add(page, recording, number: int, pixel: tuple[float, float], off_mm=(0.0, 0
     settled(page)
 
 
+@pytest.mark.slow
 def test_landmarks_register_and_what_remains_is_told(page, recording):
     page.set_input_files("#calibration-file", recording["folder"] / "plus.xml")
     settled(page)

@@ -276,10 +276,10 @@ def changed(path: Path, to: Path, pattern: str, text: str, **more: bytes) -> Pat
     "name",
     [
         "/etc/passwd",
-        "../../other.nrrd",
-        "%2Fetc%2Fpasswd",
+        pytest.param("../../other.nrrd", marks=pytest.mark.slow),
+        pytest.param("%2Fetc%2Fpasswd", marks=pytest.mark.slow),
         "Data/..%252F..%252F..%252Fother.nrrd",
-        "file:///etc/passwd",
+        pytest.param("file:///etc/passwd", marks=pytest.mark.slow),
     ],
 )
 def test_a_scene_that_names_files_elsewhere_is_refused(module_scene, tmp_path, name):
@@ -289,6 +289,7 @@ def test_a_scene_that_names_files_elsewhere_is_refused(module_scene, tmp_path, n
         read_scene(path)
 
 
+@pytest.mark.slow
 def test_a_bundle_with_files_outside_or_headers_of_others_is_refused(module_scene, tmp_path):
     bad = changed(module_scene[0], tmp_path / "bad.mrb", "<MRML", "<MRML", **{"../outside.txt": b"1"})
     with pytest.raises(SimulationError, match=r"has a file outside its folder, 'outside\.txt'"):

@@ -223,7 +223,7 @@ def test_a_new_patient_clears_image_ruler_and_cost_at_once_and_the_probe_is_plac
         page.keyboard.press("Shift+ArrowLeft")
     settled(page)
     moved = pose(page)
-    other = Volume.read(files / "head.nii.gz")
+    other = Volume.read(files / "labels.nii.gz")
     shift = np.eye(4)
     shift[:3, 3] = [0.0, 9.0, -13.0]
     Volume(other.array, shift @ other.ijk_to_ras).write(tmp_path / "other.nii.gz")
