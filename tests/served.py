@@ -12,11 +12,9 @@ import multiprocessing
 import os
 import pickle
 import runpy
-import signal
 import sys
 import tempfile
 from collections.abc import Callable
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -36,14 +34,17 @@ class Served:
     Parameters
     ----------
     state : folder in which it keeps its session.
+
+    Raises AssertionError with what it has said if it does not serve.
     """
 
     def __init__(self, *arguments: object, state: Path | str) -> None:
         if not _segmented:
             _segmented.append(tempfile.TemporaryDirectory(prefix="ussim-segmented-"))
-        with tempfile.NamedTemporaryFile("r", prefix="ussim-errors-", delete=False) as file:
-            self._errors = Path(file.name)
-        said, out = _CONTEXT.Pipe(duplex=False)
+        self._folder = tempfile.TemporaryDirectory(prefix="ussim-served-")
+        self._errors = Path(self._folder.name) / "errors"
+        self._errors.touch()
+        self._said, out = _CONTEXT.Pipe(duplex=False)
         self.process = _CONTEXT.Process(
             target=_serve,
             args=([*map(str, arguments)], str(state), out, str(self._errors), _segmented[0].name),
@@ -51,12 +52,10 @@ class Served:
         )
         self.process.start()
         out.close()
-        with os.fdopen(os.dup(said.fileno()), closefd=True) as lines:
+        with os.fdopen(os.dup(self._said.fileno())) as lines:  # the pipe stays: it may say more
             self.url = lines.readline().strip()
-        self._said = said  # a server must not write into a closed pipe
         if not self.url.startswith("http"):
-            self.end()
-            raise AssertionError(self.errors)
+            raise AssertionError(self.end())
 
     @property
     def errors(self) -> str:
@@ -68,20 +67,20 @@ class Served:
         return self.process.exitcode is None
 
     def kill(self) -> None:
-        os.kill(self.process.pid, signal.SIGKILL)
-        self.process.join()
-
-    def end(self, patience_s: float = 20.0) -> None:
-        """End it as at Ctrl-C, or at once if it does not end."""
-        self.process.terminate()
-        self.process.join(patience_s)
+        """End it by a signal that it cannot hear."""
         self.process.kill()
         self.process.join()
-        self._said.close()
 
-    def __del__(self) -> None:
-        with suppress(OSError):
-            self._errors.unlink()
+    def end(self, patience_s: float = 20.0) -> str:
+        """End it as at Ctrl-C, or at once if it does not end; returns what it has written to its standard error."""
+        if not self._said.closed:
+            self.process.terminate()
+            self.process.join(patience_s)
+            self.kill()
+            self._said.close()
+            self._text = self.errors
+            self._folder.cleanup()
+        return self._text
 
 
 def refused(*arguments: object) -> str:
