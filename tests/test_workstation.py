@@ -746,7 +746,8 @@ def test_images_are_exported_as_they_are_seen_with_their_place(page):
 
 
 @pytest.mark.slow
-def test_the_script_gives_the_same_image_pixel_by_pixel(page, tmp_path):
+def test_the_script_gives_the_same_image_pixel_by_pixel(page, files, tmp_path):
+    shutil.copy(files / "head.nii.gz", tmp_path)  # for the script, if the page has opened it
     expected = np.asarray(Image.open(download(page, "png")))
     assert np.array_equal(run_again(script_of(page), tmp_path), expected)
 
@@ -1002,7 +1003,8 @@ def test_a_file_that_cannot_be_read_is_said_and_changes_nothing(page, name, cont
 
 
 @pytest.mark.slow
-def test_a_mask_opened_on_the_page_is_laid_over_the_tissues_as_what_the_user_says(page, tmp_path):
+def test_a_mask_opened_on_the_page_is_laid_over_the_tissues_as_what_the_user_says(page, files, tmp_path):
+    shutil.copy(files / "head.nii.gz", tmp_path)  # for the script, if the page has opened it
     mri = head_mri(2.0)
     index = np.indices(mri.array.shape)[::-1].reshape(3, -1)
     points = (mri.ijk_to_ras[:3, :3] @ index + mri.ijk_to_ras[:3, 3:]).reshape(3, *mri.array.shape)
