@@ -598,6 +598,7 @@ def test_the_script_of_labels_with_lesions_of_a_page_simulates_the_same_image_be
     assert not np.array_equal(without.image, frame.image)
 
 
+@pytest.mark.slow
 def test_the_script_of_an_opened_head_simulates_the_same_image(tmp_path):
     axis = np.arange(-60.0, 61.0, 2.0)
     radius = np.sqrt(sum(place**2 for place in np.meshgrid(axis, axis, axis)))
@@ -1006,6 +1007,7 @@ def test_a_view_stands_in_the_plane_that_it_is_called_at_start_and_after_a_file_
     assert run_in_loop(scenario)
 
 
+@pytest.mark.slow
 def test_a_scene_is_written_again_after_nodes_are_gone(tmp_path):
     """It named the folder of the last one as the file of a node that was gone, and was refused."""
     from trame_slicer.core import SlicerApp
