@@ -14,8 +14,21 @@ import hypothesis
 import numpy as np
 import pytest
 
-from SlicerUSSim.Logic import LinearProbe, SimulationSettings, Tissue, TissueTable, UltrasoundSimulator, Volume
+from SlicerUSSim.Logic import (
+    LinearProbe,
+    PhasedProbe,
+    SimulationSettings,
+    Tissue,
+    TissueTable,
+    UltrasoundSimulator,
+    Volume,
+    segment_mri,
+)
+from SlicerUSSim.Logic.mri.samples import head_mri
+from SlicerUSSim.Logic.probe.image_grid import ImageGrid
+from SlicerUSSim.Logic.probe.placement import craniotomy_pose, tilt_sweep
 from SlicerUSSim.Logic.tissue.presets import TISSUES
+from SlicerUSSim.Logic.tracked.sequence import TrackedSequence
 from SlicerUSSim.Logic.verification.ct_phantoms import CtPhantom, lower_chest
 from tests.remembered import segment_once
 from tests.shared_data import SHARED as SHARED, needs_shared as needs_shared
@@ -113,3 +126,25 @@ def mni():
     return tuple(
         Volume.read(folder / f"mni_icbm152_{kind}_tal_nlin_sym_09a_converted.nii.gz") for kind in ("t1", "gm", "wm")
     )
+
+
+@pytest.fixture(scope="session")
+def files(tmp_path_factory) -> Path:
+    """A head, its labels, and a sequence of images of it with more gain; tests write into folders of their own."""
+    folder = tmp_path_factory.mktemp("patient")
+    mri = head_mri(2.0)
+    mri.write(folder / "head.nii.gz")
+    segmentation = segment_mri(mri, thin_sulci=True)
+    segmentation.labels.write(folder / "labels.nii.gz")
+    tissues = TissueTable.brain(segmentation.tissue_names)
+    tissues.write(folder / "labels.json")
+    probe = PhasedProbe(field_of_view_deg=75.0, depth_mm=70.0, scan_lines=96)
+    poses = tilt_sweep(craniotomy_pose(segmentation.labels, probe), 20.0, 6)
+    louder = tissues.replace("white matter", mu0=0.6)
+    images = [frame.image for frame in UltrasoundSimulator(segmentation.labels, louder).sweep(probe, poses)]
+    to_probe = ImageGrid.for_probe(probe, None).image_to_probe
+    transforms = tuple({"ImageToProbe": to_probe, "ProbeToReference": pose} for pose in poses)
+    TrackedSequence(np.stack(images), transforms, 0.1 * np.arange(6)).write(folder / "sweep.igs.mha")
+    Volume(np.ones((4, 4, 4), np.uint8), np.diag([5.0, 5, 5, 1]) + 300 * np.eye(4, k=3)).write(folder / "far.nii.gz")
+    (folder / "broken.nii.gz").write_bytes(b"this is no image")
+    return folder

@@ -8,9 +8,8 @@ import io
 import json
 import re
 import selectors
-import subprocess
-import sys
 import threading
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -85,6 +84,7 @@ from SlicerUSSim.Workstation.state import (  # noqa: E402
     TissueLine,
 )
 from SlicerUSSim.Workstation.tasks import AtMost, Tasks  # noqa: E402
+from tests.served import run_script  # noqa: E402
 from tests.test_label_places import in_order  # noqa: E402
 
 
@@ -102,6 +102,13 @@ def run_in_loop(coroutine_function):
 
 
 def run_in(loop: asyncio.AbstractEventLoop, coroutine_function):
+    if asyncio._get_running_loop() is None:
+        return _run_in(loop, coroutine_function)
+    with ThreadPoolExecutor(1) as thread:  # the loop of a browser's client runs in this one
+        return thread.submit(_run_in, loop, coroutine_function).result()
+
+
+def _run_in(loop: asyncio.AbstractEventLoop, coroutine_function):
     asyncio.set_event_loop(loop)
     try:
         return loop.run_until_complete(asyncio.wait_for(coroutine_function(), 180))
@@ -495,12 +502,15 @@ NASTY = ["it's", 'a "b"', "back\\slash\\", "two\nlines", "'''", '"""', "\\N{x} {
 def run_again(script: str, folder) -> np.ndarray:
     """The (rows, columns) image written by a script."""
     (folder / "again.py").write_text(script, encoding="utf-8")
-    done = subprocess.run([sys.executable, "again.py"], cwd=folder, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
+    run_script(folder / "again.py")
     return read_array(folder / "image.nrrd")[0][0]
 
 
-@pytest.mark.parametrize("nasty", ["", "'", '"', "\\", "\n", '"""', "'''\\"], ids=repr)
+@pytest.mark.parametrize(
+    "nasty",
+    ["", *(pytest.param(text, marks=pytest.mark.slow) for text in ("'", '"', "\\", "\n", '"""')), "'''\\"],
+    ids=repr,
+)
 def test_the_script_of_a_label_map_simulates_the_same_image_whatever_files_and_tissues_are_called(
     head, tmp_path, nasty
 ):
@@ -588,6 +598,7 @@ def test_the_script_of_labels_with_lesions_of_a_page_simulates_the_same_image_be
     assert not np.array_equal(without.image, frame.image)
 
 
+@pytest.mark.slow
 def test_the_script_of_an_opened_head_simulates_the_same_image(tmp_path):
     axis = np.arange(-60.0, 61.0, 2.0)
     radius = np.sqrt(sum(place**2 for place in np.meshgrid(axis, axis, axis)))
@@ -996,6 +1007,7 @@ def test_a_view_stands_in_the_plane_that_it_is_called_at_start_and_after_a_file_
     assert run_in_loop(scenario)
 
 
+@pytest.mark.slow
 def test_a_scene_is_written_again_after_nodes_are_gone(tmp_path):
     """It named the folder of the last one as the file of a node that was gone, and was refused."""
     from trame_slicer.core import SlicerApp

@@ -20,7 +20,7 @@ from SlicerUSSim.Logic import (
 )
 from SlicerUSSim.Logic.fitting import AppearanceModel, FreeParameters, speckle_widths
 from SlicerUSSim.Logic.imaging.grey_map import GREY_MAPS, TABLE_SIZE, estimate_grey_map, grey_table, slope_at
-from SlicerUSSim.Logic.probe import ImageGrid, probe_from_dict
+from SlicerUSSim.Logic.probe import ImageGrid, Probe, probe_from_dict
 from SlicerUSSim.Logic.tracked import TrackedImages
 from SlicerUSSim.Logic.verification.numpy_model import NumpyModel
 from tests.conftest import SHARED, SPECKLE, block, needs_shared, rigid, simulator
@@ -45,16 +45,45 @@ def solid():
     return simulator(block(lambda x, y, z: np.ones_like(x), (40, 40, 12)), EVEN)
 
 
+class EchoesOnce(NumpyModel):
+    """Computes the baseband signal of a probe once: what is done to the image does not change it."""
+
+    def __init__(self, made: UltrasoundSimulator) -> None:
+        super().__init__(made)
+        self._signals: dict[Probe, np.ndarray] = {}
+        for name in list(self._twins)[: list(self._twins).index("pulse") + 1]:
+            self._twins[name] = self._once(self._twins[name])
+
+    def _once(self, twin):
+        def run(frame) -> None:
+            if frame.probe in self._signals:
+                frame.iq = self._signals[frame.probe].copy()
+                return
+            twin(frame)
+            if hasattr(frame, "iq"):  # of the last of them
+                self._signals[frame.probe] = frame.iq.copy()
+
+        return run
+
+
+@pytest.fixture(scope="module")
+def model(small):
+    return EchoesOnce(small)
+
+
 @pytest.mark.parametrize(
     "changes",
     [{}, {"smoothing_axial_mm": 0.0, "smoothing_lateral_deg": 0.0}, {"edge_enhancement": 0.0},
      {"grey_map": "linear", "map_dark": 1.0}, {"smoothing_axial_mm": 2.5}],
 )  # fmt: skip
-@pytest.mark.parametrize("probe", [SMALL, ConvexProbe(20.0, 40.0, 12.0, scan_lines=24, frequency_mhz=4.0)])
-def test_the_kernels_do_what_numpy_does(small, probe, changes):
+@pytest.mark.parametrize(
+    "probe",
+    [SMALL, pytest.param(ConvexProbe(20.0, 40.0, 12.0, scan_lines=24, frequency_mhz=4.0), marks=pytest.mark.slow)],
+)
+def test_the_kernels_do_what_numpy_does(small, model, probe, changes):
     display = replace(EVERYTHING, **changes)
     image = small.simulate(probe, POSE, display).image
-    difference = np.abs(image.astype(int) - NumpyModel(small).simulate(probe, POSE, display))
+    difference = np.abs(image.astype(int) - model.simulate(probe, POSE, display))
     assert (difference <= 2).mean() > 0.97 and image.max() > 60
     assert (
         np.abs(image.astype(int) - small.simulate(probe, POSE, DisplaySettings(noise_db=-30.0)).image) > 8
@@ -98,7 +127,7 @@ def test_smoothing_fills_the_black_between_grains(solid):
     assert below[1] < 0.75 * below[0]
 
 
-@pytest.mark.parametrize("number", [1, 5, 8])
+@pytest.mark.parametrize("number", [5, *(pytest.param(n, marks=pytest.mark.slow) for n in (1, 8))])
 def test_a_slider_changes_the_level_at_its_depth_and_not_elsewhere(solid, number):
     probe, pose = LinearProbe(30, 40, scan_lines=91), rigid(np.eye(3), [0, -30, 0])
     display = DisplaySettings(noise_db=None, tgc_db_cm_mhz=0.0)
@@ -148,7 +177,10 @@ def shown_speckle(slopes, seed=0, pixel_mm=0.2) -> np.ndarray:
     return np.interp(1.0 + level / 60.0, np.linspace(0, 1, TABLE_SIZE), table).round().astype(np.uint8)
 
 
-@pytest.mark.parametrize("slopes", [(1.0, 1.0, 1.0), (0.5, 0.75, 1.6), (0.25, 0.7, 0.9)])
+@pytest.mark.parametrize(
+    "slopes",
+    [(0.5, 0.75, 1.6), *(pytest.param(s, marks=pytest.mark.slow) for s in ((1.0, 1.0, 1.0), (0.25, 0.7, 0.9)))],
+)
 def test_the_grey_map_is_found_in_images_alone(slopes):
     found = estimate_grey_map([shown_speckle(slopes, seed) for seed in range(4)], (0.2, 0.2))
     for grey in (45.0, 60.0, 80.0, 100.0, 160.0, 180.0):
@@ -166,6 +198,7 @@ def test_a_grey_map_needs_several_levels():
 
 
 @needs_shared
+@pytest.mark.slow
 def test_the_grey_maps_of_two_scanners_are_those_found_by_trial():
     """A brain, and a spine phantom as the control: another scanner, another map."""
     greys = (15, 30, 45, 60, 80, 100, 160, 200)
@@ -188,6 +221,7 @@ def test_the_grey_maps_of_two_scanners_are_those_found_by_trial():
     np.testing.assert_allclose(found, (0.54, 0.55, 0.62, 0.71, 0.81, 0.93, 1.14, 1.35), atol=0.12)
 
 
+@pytest.mark.slow
 def test_fits_find_what_the_console_does(solid):
     """Smoothing, map and a slider of the true image, from their defaults, each free by its own name."""
     probe, pose = LinearProbe(24, 30, scan_lines=64), rigid(np.eye(3), [0, -30, 0])

@@ -6,7 +6,6 @@ import base64
 import contextlib
 import io
 import json
-import os
 import re
 import shutil
 import socket
@@ -27,16 +26,15 @@ pyigtl = pytest.importorskip("pyigtl", reason="OpenIGTLink comes with pyigtl: pi
 
 from playwright.sync_api import Page, sync_playwright  # noqa: E402
 
-from SlicerUSSim.Logic import PhasedProbe, TissueTable, UltrasoundSimulator, Volume, segment_mri  # noqa: E402
+from SlicerUSSim.Logic import PhasedProbe, TissueTable, Volume  # noqa: E402
 from SlicerUSSim.Logic.base.errors import required  # noqa: E402
 from SlicerUSSim.Logic.base.volume import read_array  # noqa: E402
 from SlicerUSSim.Logic.mri.samples import head_mri  # noqa: E402
-from SlicerUSSim.Logic.probe.image_grid import ImageGrid  # noqa: E402
-from SlicerUSSim.Logic.probe.placement import craniotomy_pose, pose_looking_at, tilt_sweep  # noqa: E402
+from SlicerUSSim.Logic.probe.placement import pose_looking_at  # noqa: E402
 from SlicerUSSim.Logic.tissue.own_files import write_label_files  # noqa: E402
-from SlicerUSSim.Logic.tracked.sequence import TrackedSequence  # noqa: E402
 from SlicerUSSim.Logic.verification.brain_phantoms import phantom, tissue_maps, with_low_grade_tumour  # noqa: E402
 from SlicerUSSim.Workstation.state import NAMES  # noqa: E402
+from tests.served import Served, refused, run_script  # noqa: E402
 from tests.test_label_maps import head  # noqa: E402
 from tests.test_lesion_proposals import CENTRE, needs_atlas  # noqa: E402
 
@@ -61,46 +59,13 @@ POSE = ("right_deg", "front_deg", "rotate_deg", "rock_deg", "tilt_deg", "lift_mm
 @contextlib.contextmanager
 def serving(*arguments: str):
     """The URL printed by `ussim serve`, while it runs."""
-    state = tempfile.mkdtemp(prefix="ussim-state-")  # of its own: it offers no session of another server
-    server = subprocess.Popen(
-        [sys.executable, "-m", "SlicerUSSim.Command.cli", "serve", "--port", "0", *arguments],
-        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-        env={**os.environ, "PYTHONUNBUFFERED": "1", "XDG_STATE_HOME": state},
-    )  # fmt: skip
-    try:
-        url = server.stdout.readline().strip()
-        assert url.startswith("http"), server.stderr.read()
-        yield url
-        assert server.poll() is None, server.stderr.read()
-    finally:
-        server.terminate()
-        with contextlib.suppress(subprocess.TimeoutExpired):
-            server.wait(10)
-        server.kill()
-        server.communicate()
-        shutil.rmtree(state, ignore_errors=True)
-
-
-@pytest.fixture(scope="module")
-def files(tmp_path_factory) -> Path:
-    """A head, its labels, and a sequence of images of it with more gain."""
-    folder = tmp_path_factory.mktemp("patient")
-    mri = head_mri(2.0)
-    mri.write(folder / "head.nii.gz")
-    segmentation = segment_mri(mri, thin_sulci=True)
-    segmentation.labels.write(folder / "labels.nii.gz")
-    tissues = TissueTable.brain(segmentation.tissue_names)
-    tissues.write(folder / "labels.json")
-    probe = PhasedProbe(field_of_view_deg=75.0, depth_mm=70.0, scan_lines=96)
-    poses = tilt_sweep(craniotomy_pose(segmentation.labels, probe), 20.0, 6)
-    louder = tissues.replace("white matter", mu0=0.6)
-    images = [frame.image for frame in UltrasoundSimulator(segmentation.labels, louder).sweep(probe, poses)]
-    to_probe = ImageGrid.for_probe(probe, None).image_to_probe
-    transforms = tuple({"ImageToProbe": to_probe, "ProbeToReference": pose} for pose in poses)
-    TrackedSequence(np.stack(images), transforms, 0.1 * np.arange(6)).write(folder / "sweep.igs.mha")
-    Volume(np.ones((4, 4, 4), np.uint8), np.diag([5.0, 5, 5, 1]) + 300 * np.eye(4, k=3)).write(folder / "far.nii.gz")
-    (folder / "broken.nii.gz").write_bytes(b"this is no image")
-    return folder
+    with tempfile.TemporaryDirectory(prefix="ussim-state-") as state:  # of its own: it offers no other one's session
+        server = Served("--port", "0", *arguments, state=state)
+        try:
+            yield server.url
+            assert server.is_running, server.errors
+        finally:
+            server.end()
 
 
 @pytest.fixture(scope="module")
@@ -167,15 +132,36 @@ def first_page(browser, url):
 
 
 @pytest.fixture
-def page(first_page):
-    """The page with the probe at a craniotomy and no messages."""
+def page(first_page, files):
+    """The page with the head, its sequence, the probe at a craniotomy, and no messages."""
     page, problems = first_page
     dismiss_messages(page)
     page.mouse.move(600, 500)  # away from what shows tips
+    settled(page)  # the sequence comes after the first image
+    open_head(page, files)
     page.evaluate("window.trame.trigger('press', ['placeButton'])")
     settled(page)
     yield page
     assert not problems
+
+
+def open_head(page: Page, files: Path) -> None:
+    """Open the head and its sequence again, unless they are open as they were."""
+    is_as_it_was = shown(page, "lesionsSelector") is None and state(page, NAMES.sequence.length) == 6
+    if state(page, NAMES.title) != "head.nii.gz" or not is_as_it_was:
+        open_new_patient(page, files / "head.nii.gz", files / "sweep.igs.mha")
+        eventually(page, lambda: state(page, NAMES.sequence.length) == 6)
+        settled(page)
+
+
+def open_new_patient(page: Page, *files: Path) -> None:
+    """Open files of a new patient, whether one is open or not, and wait for the image."""
+    is_one_open = state(page, NAMES.title) != ""
+    page.set_input_files("#open-file", files)
+    if is_one_open:
+        answer_new_patient(page)
+    page.wait_for_function("name => window.ussim.image?.patient === name", arg=files[0].name)
+    settled(page)
 
 
 def state(page: Page, name):
@@ -358,8 +344,7 @@ def script_of(page: Page) -> str:
 def run_again(script: str, folder: Path) -> np.ndarray:
     """The (rows, columns) image that a script writes in a folder."""
     (folder / "again.py").write_text(script)
-    done = subprocess.run([sys.executable, "again.py"], cwd=folder, capture_output=True, text=True, timeout=PATIENCE_S)
-    assert done.returncode == 0, done.stderr
+    run_script(folder / "again.py")
     return read_array(folder / "image.nrrd")[0][0]
 
 
@@ -545,6 +530,7 @@ def test_keys_and_sliders_move_the_probe(page):
 # ---- tissues, settings -----------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_segment_labels_the_mri_anew_and_says_what_it_cannot(page):
     before = pixels(page)
     for on in (False, True):
@@ -686,6 +672,7 @@ def fit(page: Page, evaluations: int) -> None:
     click(page, "#fitButton")
 
 
+@pytest.mark.slow
 def test_a_fit_shows_its_costs_and_is_applied_and_reverted(page):
     page.evaluate("window.trame.trigger('show_number', [2])")
     settled(page)
@@ -713,6 +700,7 @@ def test_a_fit_shows_its_costs_and_is_applied_and_reverted(page):
     assert cost(page) == pytest.approx(before, abs=0.02)
 
 
+@pytest.mark.slow
 def test_a_fit_is_cancelled_and_nothing_changes(page):
     summary, gain = shown(page, "fitLabel"), shown(page, "gainSlider")
     fit(page, 100_000)
@@ -724,6 +712,7 @@ def test_a_fit_is_cancelled_and_nothing_changes(page):
     assert not errors(page)
 
 
+@pytest.mark.slow
 def test_a_fit_goes_on_when_the_browser_is_closed_and_its_result_is_there_after(page, browser, url):
     other = opened(browser, url)
     set_state(other, NAMES.panel.values, {**state(other, NAMES.panel.values), "fitLabel": ""})
@@ -756,7 +745,9 @@ def test_images_are_exported_as_they_are_seen_with_their_place(page):
     )
 
 
-def test_the_script_gives_the_same_image_pixel_by_pixel(page, tmp_path):
+@pytest.mark.slow
+def test_the_script_gives_the_same_image_pixel_by_pixel(page, files, tmp_path):
+    shutil.copy(files / "head.nii.gz", tmp_path)  # for the script, if the page has opened it
     expected = np.asarray(Image.open(download(page, "png")))
     assert np.array_equal(run_again(script_of(page), tmp_path), expected)
 
@@ -774,6 +765,7 @@ def round_head(folder: Path) -> Volume:
 
 
 @pytest.mark.parametrize("source", ["disc:50", "mask", "curve"])
+@pytest.mark.slow
 def test_the_workstation_begins_with_the_opening_of_its_option(browser, tmp_path, source):
     labels, given = round_head(tmp_path), source
     if source == "mask":
@@ -797,6 +789,7 @@ def test_the_workstation_begins_with_the_opening_of_its_option(browser, tmp_path
 
 
 @pytest.mark.parametrize("what", ["a craniotomy off the head", "an MRI called CT"])
+@pytest.mark.slow
 def test_bad_anatomy_is_one_line_in_the_page_which_goes_on(browser, files, tmp_path, what):
     round_head(tmp_path)
     arguments, words = [str(files / "head.nii.gz"), "--ct"], "expected Hounsfield units"
@@ -818,6 +811,7 @@ def test_bad_anatomy_is_one_line_in_the_page_which_goes_on(browser, files, tmp_p
         page.close()
 
 
+@pytest.mark.slow
 def test_a_craniotomy_is_opened_and_closed_in_the_page(browser, tmp_path):
     round_head(tmp_path)
     with serving("--labels", str(tmp_path / "labels.nii.gz")) as address:
@@ -842,6 +836,7 @@ def test_a_craniotomy_is_opened_and_closed_in_the_page(browser, tmp_path):
 
 
 @needs_atlas
+@pytest.mark.slow
 def test_a_click_in_a_lesion_proposes_it_and_accept_lays_it_over_the_tissues(browser, tmp_path):
     maps = with_low_grade_tumour(required(tissue_maps("mni152"), "no atlas"), CENTRE, 14.0).coarser(2)
     image = phantom(maps, "flair", noise=0.03, bias=0.0)
@@ -882,6 +877,7 @@ def test_a_click_in_a_lesion_proposes_it_and_accept_lays_it_over_the_tissues(bro
         page.close()
 
 
+@pytest.mark.slow
 def test_the_workstation_finds_sheets_and_its_script_has_them(browser, tmp_path):
     head_mri(2.0).write(tmp_path / "head.nii.gz")
     with serving(str(tmp_path / "head.nii.gz"), "--sheets", "auto", "--no-sheet", "ependyma") as address:
@@ -961,6 +957,7 @@ def test_a_tracker_moves_the_probe_and_gets_every_image_with_its_matrix(page, tr
 # ---- more than one page, reload, errors ------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_two_tabs_show_and_drive_the_same_workstation(page, browser, url):
     other = opened(browser, url)
     before = pose(page)
@@ -1005,7 +1002,9 @@ def test_a_file_that_cannot_be_read_is_said_and_changes_nothing(page, name, cont
     eventually(page, lambda: not errors(page))
 
 
-def test_a_mask_opened_on_the_page_is_laid_over_the_tissues_as_what_the_user_says(page, tmp_path):
+@pytest.mark.slow
+def test_a_mask_opened_on_the_page_is_laid_over_the_tissues_as_what_the_user_says(page, files, tmp_path):
+    shutil.copy(files / "head.nii.gz", tmp_path)  # for the script, if the page has opened it
     mri = head_mri(2.0)
     index = np.indices(mri.array.shape)[::-1].reshape(3, -1)
     points = (mri.ijk_to_ras[:3, :3] @ index + mri.ijk_to_ras[:3, 3:]).reshape(3, *mri.array.shape)
@@ -1032,6 +1031,7 @@ def test_a_mask_opened_on_the_page_is_laid_over_the_tissues_as_what_the_user_say
     assert np.array_equal(run_again(script_of(page), tmp_path), expected)
 
 
+@pytest.mark.slow
 def test_masks_whose_files_are_doubtful_are_added_with_what_to_check_in_the_notes(page, tmp_path):
     distance = np.sqrt(((np.indices((40, 40, 40)) - 19.5) ** 2).sum(axis=0))
     place = np.eye(4)
@@ -1066,7 +1066,8 @@ def test_latency_is_measured_on_request(page):
     click(page, "#show-latency")
 
 
-def test_another_mri_takes_the_place_of_the_first(page, files):
+@pytest.mark.slow
+def test_another_mri_takes_the_place_of_the_first(page, files, tmp_path):
     content = (files / "head.nii.gz").read_bytes()
     with new_image(page):
         page.set_input_files("#open-file", {"name": "again.nii.gz", "mimeType": "application/gzip", "buffer": content})
@@ -1078,14 +1079,15 @@ def test_another_mri_takes_the_place_of_the_first(page, files):
     assert page.locator("#labelsSelector option:checked").inner_text().strip() == "again.nii.gz tissues"
     assert shown(page, "lesionsSelector") is None  # of the patient before
     elsewhere = Volume.read(files / "head.nii.gz")
-    Volume(elsewhere.array, elsewhere.ijk_to_ras + 400.0 * np.eye(4, k=3)).write(files / "elsewhere.nii.gz")
+    Volume(elsewhere.array, elsewhere.ijk_to_ras + 400.0 * np.eye(4, k=3)).write(tmp_path / "elsewhere.nii.gz")
     with new_image(page):
-        page.set_input_files("#open-file", files / "elsewhere.nii.gz")
+        page.set_input_files("#open-file", tmp_path / "elsewhere.nii.gz")
         answer_new_patient(page)
     settled(page)
     assert not errors(page) and pixels(page).mean() > 5  # the probe is placed on the patient in another frame
 
 
+@pytest.mark.slow
 def test_an_opened_patient_takes_the_place_of_title_notes_and_warnings(page, files, tmp_path):
     aseg = head()
     aseg.write(tmp_path / "aseg.nii.gz")
@@ -1124,6 +1126,7 @@ def test_an_opened_patient_takes_the_place_of_title_notes_and_warnings(page, fil
     assert "share" in notes and "aseg" not in notes and not errors(page)
 
 
+@pytest.mark.slow
 def test_a_label_map_is_opened_together_with_its_table(page, files, tmp_path):
     labels = Volume.read(files / "labels.nii.gz")
     names = TissueTable.read(files / "labels.json").names()[1:]
@@ -1162,6 +1165,7 @@ def test_a_label_map_is_opened_together_with_its_table(page, files, tmp_path):
 # ---- who may come in, and how it is started --------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_from_other_computers_only_the_token_opens_the_door(browser, files):
     import urllib.error
     import urllib.request
@@ -1237,15 +1241,7 @@ def test_a_server_on_loopback_refuses_pages_of_other_sites(url):
 )
 def test_what_cannot_be_served_is_said_in_one_line(files, arguments, message):
     names = {name: files / f"{name}.nii.gz" for name in ("broken", "head", "far")}
-    arguments = [text.format(**names) for text in arguments]
-    done = subprocess.run(
-        [sys.executable, "-m", "SlicerUSSim.Command.cli", "serve", *arguments],
-        capture_output=True,
-        text=True,
-        timeout=PATIENCE_S,
-    )
-    assert done.returncode == 2 and done.stdout == ""
-    assert done.stderr.startswith("ussim: ") and message in done.stderr and len(done.stderr.strip().splitlines()) == 1
+    assert message in refused(*(text.format(**names) for text in arguments))
 
 
 def test_a_port_that_is_taken_is_said():

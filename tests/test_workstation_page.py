@@ -17,7 +17,6 @@ from tests.test_workstation import (  # noqa: E402
     dismiss_messages,
     errors,
     eventually,
-    files as files,
     open_section,
     opened,
     pose,
@@ -138,6 +137,7 @@ def test_sliders_and_buttons_have_names(page):
     assert sliders.count() > 8
 
 
+@pytest.mark.slow
 def test_axe_finds_nothing_wrong(page):
     for title in ("Probe", "Tissues", "Rays", "Tracked ultrasound", "Fit to real ultrasound"):
         open_section(page, title)
@@ -155,6 +155,7 @@ def test_axe_finds_nothing_wrong(page):
     assert not wrong, "\n".join(map(str, wrong[:30]))
 
 
+@pytest.mark.slow
 def test_a_question_is_asked_of_everyone(page, files):
     """Of screen readers and keyboards, too, within four sizes of the window."""
     sent = files / "head.nii.gz"
@@ -189,7 +190,11 @@ def test_a_question_is_asked_of_everyone(page, files):
 # ---- room ------------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("size", SIZES, ids=lambda size: f"{size[0]}x{size[1]}")
+@pytest.mark.parametrize(
+    "size",
+    [SIZES[0], *(pytest.param(size, marks=pytest.mark.slow) for size in SIZES[1:-1]), SIZES[-1]],
+    ids=lambda size: f"{size[0]}x{size[1]}",
+)
 def test_nothing_is_cut_off(page, size):
     width, height = size
     page.set_viewport_size({"width": width, "height": height})

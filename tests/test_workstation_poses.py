@@ -22,7 +22,6 @@ from tests.test_workstation import (
     dismiss_messages,
     errors,
     eventually,
-    files as files,
     new_image,
     open_section,
     opened,
@@ -104,7 +103,9 @@ def test_keys_typed_in_the_fields_do_not_move_the_probe(page):
     settled(page)
 
 
-@pytest.mark.parametrize("suffix", POSE_SUFFIXES)
+@pytest.mark.parametrize(
+    "suffix", [*POSE_SUFFIXES[:2], *(pytest.param(suffix, marks=pytest.mark.slow) for suffix in POSE_SUFFIXES[2:])]
+)
 def test_a_pose_is_saved_and_opened_again(page, suffix, tmp_path):
     with new_image(page):
         page.keyboard.press("d")
@@ -155,6 +156,7 @@ def test_a_preset_carries_the_pose_if_it_is_wanted(page, tmp_path):
     assert not errors(page)
 
 
+@pytest.mark.slow
 def test_without_a_patient_there_is_no_pose(page, files):
     click(page, "#close-patient")
     page.wait_for_function("window.ussim.image === null")

@@ -29,9 +29,9 @@ from tests.test_workstation import (
     drawn,
     errors,
     eventually,
-    files as files,
     first_page as first_page,
     in_view,
+    open_new_patient,
     opened,
     picture,
     pytestmark as pytestmark,
@@ -80,10 +80,12 @@ def url(files):
 
 
 @pytest.fixture
-def page(first_page, recording):
-    """The page with the recording as it is in its file."""
+def page(first_page, recording, files):
+    """The page with the head, its labels, and the recording as it is in its file."""
     page, problems = first_page
     dismiss_messages(page)
+    if state(page, NAMES.title) != "labels.nii.gz":
+        open_new_patient(page, files / "labels.nii.gz")
     page.set_input_files("#open-file", recording["folder"] / "phantom.igs.mha")
     settled(page)
     yield page
@@ -164,6 +166,7 @@ def add(page, recording, number: int, pixel: tuple[float, float], off_mm=(0.0, 0
     settled(page)
 
 
+@pytest.mark.slow
 def test_landmarks_register_and_what_remains_is_told(page, recording):
     page.set_input_files("#calibration-file", recording["folder"] / "plus.xml")
     settled(page)
@@ -204,6 +207,7 @@ def test_landmarks_register_and_what_remains_is_told(page, recording):
     assert 0 < cost(page) < 0.5
 
 
+@pytest.mark.slow
 def test_a_landmark_is_picked_in_the_real_image_and_in_a_slice(page, recording):
     page.set_input_files("#calibration-file", recording["folder"] / "plus.xml")
     settled(page)
@@ -266,6 +270,7 @@ def test_transforms_without_ultrasound_and_of_other_kinds_are_said(page, recordi
     assert errors(page)[-1].startswith("registration.txt: a 4x4 matrix, expected tracked ultrasound first")
 
 
+@pytest.mark.slow
 def test_a_transform_without_ultrasound_is_asked_and_is_a_pose_or_of_the_ultrasound_that_comes_next(
     browser, recording, files, tmp_path
 ):
@@ -355,6 +360,7 @@ def phantom(tmp_path_factory) -> dict:
 
 
 @needs_shared
+@pytest.mark.slow
 def test_a_real_recording_of_a_spine_phantom_is_calibrated_registered_and_compared(browser, phantom):
     """SpinePhantomFreehand of Plus, whose file has no calibration and the frame of its tracker."""
     folder, sequence = phantom["folder"], phantom["sequence"]

@@ -2,14 +2,9 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
-import os
-import signal
 import socket
 import stat
-import subprocess
-import sys
 import zipfile
 from pathlib import Path
 
@@ -22,8 +17,8 @@ pytest.importorskip("playwright", reason="browser tests need playwright: pip ins
 
 from SlicerUSSim.Logic.base.volume import Volume, read_array
 from SlicerUSSim.Workstation.state import NAMES
+from tests.served import Served, run_script
 from tests.test_workstation import (
-    PATIENCE_S,
     answer_new_patient,
     browser as browser,
     click,
@@ -31,9 +26,9 @@ from tests.test_workstation import (
     drawn,
     errors,
     eventually,
-    files as files,
     loaded,
     new_image,
+    open_new_patient,
     opened,
     picture,
     pixels,
@@ -56,29 +51,17 @@ class Server:
             self.port = free.getsockname()[1]
         self.sessions = folder / "slicerussim" / "sessions"
         self._folder, self._arguments = folder, arguments
-        self.url = ""
         self.start()
 
     def start(self, *other: str) -> None:
-        self.process = subprocess.Popen(
-            [sys.executable, "-m", "SlicerUSSim.Command.cli", "serve", "--port", str(self.port),
-             *(other or self._arguments)],
-            stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-            env={**os.environ, "PYTHONUNBUFFERED": "1", "XDG_STATE_HOME": str(self._folder)},
-        )  # fmt: skip
-        self.url = self.process.stdout.readline().strip()
-        assert self.url.startswith("http"), self.process.stderr.read()
+        self._process = Served("--port", self.port, *(other or self._arguments), state=self._folder)
+        self.url = self._process.url
 
     def kill(self) -> None:
-        self.process.send_signal(signal.SIGKILL)
-        self.process.communicate()
+        self._process.kill()
 
     def end(self) -> None:
-        self.process.terminate()
-        with contextlib.suppress(subprocess.TimeoutExpired):
-            self.process.wait(20)
-        self.process.kill()
-        self.process.communicate()
+        self._process.end()
 
 
 @pytest.fixture
@@ -128,6 +111,7 @@ def crashed_and_restored(server: Server, page) -> None:
     restore(page)
 
 
+@pytest.mark.slow
 def test_after_kill_9_the_page_reconnects_by_itself_and_restores_all(server, browser, files, tmp_path):
     own = server(str(files / "head.nii.gz"), "--sequence", str(files / "sweep.igs.mha"))
     problems: list[str] = []
@@ -256,6 +240,7 @@ def sector_rows(page) -> int:
     return int(np.ptp(rows)) if rows.size else 0
 
 
+@pytest.mark.slow
 def test_slices_are_in_the_image_plane_at_start_and_after_a_session_is_restored(server, browser, files):
     """They were not until the probe had moved."""
     own = server("--labels", str(files / "labels.nii.gz"))
@@ -271,6 +256,7 @@ def test_slices_are_in_the_image_plane_at_start_and_after_a_session_is_restored(
     page.close()
 
 
+@pytest.mark.slow
 def test_the_folder_is_for_the_user_alone_and_holds_this_patient_only(server, browser, files, tmp_path):
     own = server("--labels", str(files / "labels.nii.gz"))
     page = opened(browser, own.url)
@@ -283,10 +269,7 @@ def test_the_folder_is_for_the_user_alone_and_holds_this_patient_only(server, br
     assert parts == {"lock", "address.json", "state.json", "anatomy", "cine"}
     assert all(stat.S_IMODE(path.stat().st_mode) == 0o600 for path in session.iterdir())
     first = [path.name for path in session.glob("anatomy-*")]
-    page.set_input_files("#open-file", files / "head.nii.gz")
-    answer_new_patient(page)
-    page.wait_for_function("window.ussim.image?.patient === 'head.nii.gz'")
-    settled(page)
+    open_new_patient(page, files / "head.nii.gz")
     kept(page)
     assert json.loads((session / "state.json").read_text())["patient"] == "head.nii.gz"
     assert len(list(session.glob("anatomy-*"))) == 1 and not (session / first[0]).exists()
@@ -308,6 +291,7 @@ def test_the_folder_is_for_the_user_alone_and_holds_this_patient_only(server, br
     assert not session.exists()  # nothing is left of one without a patient
 
 
+@pytest.mark.slow
 def test_a_session_is_never_put_onto_another_patient(server, browser, files, tmp_path):
     own = server(str(files / "head.nii.gz"))
     page = opened(browser, own.url)
@@ -329,6 +313,7 @@ def test_a_session_is_never_put_onto_another_patient(server, browser, files, tmp
     page.close()
 
 
+@pytest.mark.slow
 def test_what_is_discarded_or_damaged_changes_nothing(server, browser, files):
     own = server("--labels", str(files / "labels.nii.gz"))
     page = opened(browser, own.url)
@@ -353,6 +338,7 @@ def test_what_is_discarded_or_damaged_changes_nothing(server, browser, files):
     page.close()
 
 
+@pytest.mark.slow
 def test_a_new_server_with_another_token_is_said_and_not_trusted(server, browser, files):
     """After an end as it should be the token is a new one; the cookie is sent to no server that cannot prove itself."""
     own = server("--labels", str(files / "labels.nii.gz"))
@@ -385,22 +371,17 @@ def bundled(page, folder: Path) -> np.ndarray:
     folder.mkdir()
     with zipfile.ZipFile(download(page, "zip")) as archive:
         archive.extractall(folder)
-    done = subprocess.run(
-        [sys.executable, "image.py"], cwd=folder, capture_output=True, text=True, timeout=PATIENCE_S, check=False
-    )
-    assert done.returncode == 0, done.stderr
+    run_script(folder / "image.py")
     return read_array(folder / "image.nrrd")[0][0]
 
 
+@pytest.mark.slow
 def test_scripts_run_after_uploads_also_of_files_with_one_name_and_after_a_restart(server, browser, files, tmp_path):
     """They read files that nobody had any more."""
     own = server("--labels", str(files / "labels.nii.gz"))
     page = opened(browser, own.url)
     settled(page)
-    page.set_input_files("#open-file", files / "head.nii.gz")
-    answer_new_patient(page)
-    page.wait_for_function("window.ussim.image?.patient === 'head.nii.gz'")
-    settled(page)
+    open_new_patient(page, files / "head.nii.gz")
     mri = Volume.read(files / "head.nii.gz")
     middle = np.array(mri.array.shape) // 2
     for number, tissue in enumerate(("tumour", "cyst")):
@@ -435,6 +416,7 @@ def test_scripts_run_after_uploads_also_of_files_with_one_name_and_after_a_resta
     page.close()
 
 
+@pytest.mark.slow
 def test_a_dicom_series_and_ultrasound_calibrated_in_the_page_come_back_after_a_crash(
     server, browser, files, dicom, recording, tmp_path
 ):

@@ -26,7 +26,6 @@ from SlicerUSSim.Logic.tracked.sequence import TrackedSequence
 from SlicerUSSim.Workstation.scene_files import read_scene
 from SlicerUSSim.Workstation.state import NAMES
 from tests.test_workstation import (
-    answer_new_patient,
     browser as browser,
     click,
     cost,
@@ -34,10 +33,11 @@ from tests.test_workstation import (
     download,
     errors,
     eventually,
-    files as files,
     first_page as first_page,
     fit,
     new_image,
+    open_head,
+    open_new_patient,
     pixels,
     pose,
     pytestmark as pytestmark,
@@ -59,9 +59,12 @@ def url(files):
 
 
 @pytest.fixture
-def page(first_page):
+def page(first_page, files):
+    """The page with a patient, live images, the probe at a craniotomy, and no messages."""
     page, problems = first_page
     dismiss_messages(page)
+    if state(page, NAMES.title) == "":
+        open_new_patient(page, files / "head.nii.gz")
     page.mouse.move(600, 500)
     if not shown(page, "liveCheckBox"):
         click(page, "#live")
@@ -72,6 +75,13 @@ def page(first_page):
     assert not problems
 
 
+@pytest.fixture
+def head_page(page, files):
+    """The page with the head and its sequence."""
+    open_head(page, files)
+    return page
+
+
 def lift_off(page) -> None:
     """Beyond the volume of the patient."""
     page.evaluate("() => { for (let n = 0; n < 100; n++) window.trame.trigger('key', ['+', true]); }")
@@ -80,7 +90,8 @@ def lift_off(page) -> None:
 # ---- what an image is of ---------------------------------------------------------------------------------------------
 
 
-def test_an_image_comes_with_patient_time_pose_and_ruler(page):
+def test_an_image_comes_with_patient_time_pose_and_ruler(head_page):
+    page = head_page
     image = page.evaluate("window.ussim.image")
     assert image["patient"] == "head.nii.gz" and image["ruler"]["h"] == pytest.approx(70, rel=0.02)
     assert np.shape(image["pose"]) == (4, 4) and image["time"].startswith("20")
@@ -129,7 +140,10 @@ def test_ruler_and_image_change_together(page):
         assert of_image == of_ruler and ratio == pytest.approx(of_pixels, rel=0.02)
 
 
-def test_a_frozen_image_stays_where_it_was_taken_in_every_export(page, tmp_path):
+@pytest.mark.slow
+def test_a_frozen_image_stays_where_it_was_taken_in_every_export(head_page, files, tmp_path):
+    page = head_page
+    shutil.copy(files / "head.nii.gz", tmp_path)  # for the script, if the page has opened it
     assert page.locator("#frozen").is_hidden()
     click(page, "#live")
     page.locator("#frozen").wait_for()
@@ -178,7 +192,8 @@ def test_a_live_image_is_saved_where_it_was_taken_and_follows_the_probe_after_th
     assert page.locator("#frozen").is_hidden()
 
 
-def test_while_a_fit_runs_the_image_is_marked_frozen(page):
+def test_while_a_fit_runs_the_image_is_marked_frozen(head_page):
+    page = head_page
     fit(page, 100_000)
     page.locator("#cancel").wait_for()
     page.locator("#frozen").wait_for()
@@ -187,8 +202,9 @@ def test_while_a_fit_runs_the_image_is_marked_frozen(page):
     settled(page)
 
 
-def test_the_cost_is_blank_where_the_probe_sees_nothing(page):
+def test_the_cost_is_blank_where_the_probe_sees_nothing(head_page):
     """A black image had a lower cost than a real one."""
+    page = head_page
     page.evaluate("window.trame.trigger('show_number', [2])")
     settled(page)
     assert 0 < cost(page) < 1
@@ -201,12 +217,13 @@ def test_the_cost_is_blank_where_the_probe_sees_nothing(page):
     assert 0 < cost(page) < 1
 
 
-def test_a_new_patient_clears_image_ruler_and_cost_at_once_and_the_probe_is_placed_anew(page, files, tmp_path):
+def test_a_new_patient_clears_image_ruler_and_cost_at_once_and_the_probe_is_placed_anew(head_page, files, tmp_path):
+    page = head_page
     for _ in range(6):
         page.keyboard.press("Shift+ArrowLeft")
     settled(page)
     moved = pose(page)
-    other = Volume.read(files / "head.nii.gz")
+    other = Volume.read(files / "labels.nii.gz")
     shift = np.eye(4)
     shift[:3, 3] = [0.0, 9.0, -13.0]
     Volume(other.array, shift @ other.ijk_to_ras).write(tmp_path / "other.nii.gz")
@@ -218,10 +235,7 @@ def test_a_new_patient_clears_image_ruler_and_cost_at_once_and_the_probe_is_plac
           if (window.looking) setTimeout(look, 5); };
         window.looking = true; look(); }"""
     )
-    page.set_input_files("#open-file", tmp_path / "other.nii.gz")
-    answer_new_patient(page)
-    page.wait_for_function("window.ussim.image?.patient === 'other.nii.gz'")
-    settled(page)
+    open_new_patient(page, tmp_path / "other.nii.gz")
     seen = page.evaluate("() => { window.looking = false; return window.cleared; }")
     assert ["other.nii.gz", None, 0, ""] in seen, seen[-5:]
     late = [entry for entry in seen if entry[0] == "other.nii.gz" and entry[1] == "head.nii.gz"]
@@ -241,14 +255,12 @@ def nodes_of_scene(bundle: Path) -> list[str]:
         return [*archive.namelist(), *re.findall(r'name="([^"]*)"', text)]
 
 
+@pytest.mark.slow
 def test_a_saved_scene_holds_this_patient_only_and_a_patient_can_be_closed(page, files, tmp_path):
     """A scene held 21 files of three patients."""
     for name in ("second", "third"):
         shutil.copy(files / "head.nii.gz", tmp_path / f"{name}.nii.gz")
-        page.set_input_files("#open-file", tmp_path / f"{name}.nii.gz")
-        answer_new_patient(page)
-        page.wait_for_function(f"window.ussim.image?.patient === '{name}.nii.gz'")
-        settled(page)
+        open_new_patient(page, tmp_path / f"{name}.nii.gz")
     held = nodes_of_scene(download(page, "mrb"))
     assert any("third.nii.gz" in name for name in held)
     assert not [name for name in held if "second" in name or "head.nii" in name or "sweep" in name], held
@@ -264,11 +276,9 @@ def test_a_saved_scene_holds_this_patient_only_and_a_patient_can_be_closed(page,
     assert not errors(page)
 
 
+@pytest.mark.slow
 def test_the_last_segment_is_undone_on_the_page(page, files):
-    page.set_input_files("#open-file", files / "head.nii.gz")
-    answer_new_patient(page)
-    page.wait_for_function("window.ussim.image?.patient === 'head.nii.gz'")
-    settled(page)
+    open_new_patient(page, files / "head.nii.gz")
     notes, before = shown(page, "notesLabel"), np.asarray(Image.open(download(page, "png")))
     thin = shown(page, "thinSulciCheckBox")
     page.evaluate("on => window.trame.trigger('set', ['thinSulciCheckBox', on])", not thin)
@@ -283,6 +293,7 @@ def test_the_last_segment_is_undone_on_the_page(page, files):
     settled(page)
 
 
+@pytest.mark.slow
 def test_an_upload_shows_how_far_it_is_can_be_cancelled_and_images_go_on(page, files):
     """Of 216 MB nothing was shown for 49 s, and no image came meanwhile."""
     session = page.context.new_cdp_session(page)
@@ -307,12 +318,10 @@ def test_an_upload_shows_how_far_it_is_can_be_cancelled_and_images_go_on(page, f
     assert state(page, NAMES.title) == before and not errors(page)
 
 
+@pytest.mark.slow
 def test_cancel_ends_a_segmentation_within_a_second_and_images_go_on(page, tmp_path):
     head_mri(1.0).write(tmp_path / "fine.nii.gz")
-    page.set_input_files("#open-file", tmp_path / "fine.nii.gz")
-    answer_new_patient(page)
-    page.wait_for_function("window.ussim.image?.patient === 'fine.nii.gz'")
-    settled(page)
+    open_new_patient(page, tmp_path / "fine.nii.gz")
     notes = shown(page, "notesLabel")
     page.evaluate("window.trame.trigger('set', ['skullStripComboBox', 'atlas'])")
     page.evaluate("window.trame.trigger('set', ['maskSelector', ''])")
@@ -331,12 +340,10 @@ def test_cancel_ends_a_segmentation_within_a_second_and_images_go_on(page, tmp_p
 # ---- images of a sequence --------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_the_images_of_simulate_sequence_are_shown_and_played_where_they_were_taken(page, files, tmp_path):
     """The page made images that it could not show."""
-    page.set_input_files("#open-file", files / "head.nii.gz")
-    answer_new_patient(page)
-    page.wait_for_function("window.ussim.image?.patient === 'head.nii.gz'")
-    page.set_input_files("#open-file", files / "sweep.igs.mha")
+    open_new_patient(page, files / "head.nii.gz", files / "sweep.igs.mha")
     eventually(page, lambda: state(page, NAMES.sequence.length) == 6)
     settled(page)
     assert page.locator("#simulated-player").count() == 0
@@ -384,18 +391,13 @@ def test_the_images_of_simulate_sequence_are_shown_and_played_where_they_were_ta
         page.keyboard.press("a")
     assert page.evaluate("window.ussim.image.sequence") is None and page.locator("#frozen").is_hidden()
     # Those of a patient go with him
-    page.set_input_files("#open-file", files / "labels.nii.gz")
-    answer_new_patient(page)
-    page.wait_for_function("window.ussim.image?.patient === 'labels.nii.gz'")
-    settled(page)
+    open_new_patient(page, files / "labels.nii.gz")
     assert page.locator("#simulated-player").count() == 0 and not errors(page)
 
 
+@pytest.mark.slow
 def test_slices_are_in_the_image_plane_right_after_a_file_was_opened(page, files):
-    page.set_input_files("#open-file", files / "head.nii.gz")
-    answer_new_patient(page)
-    page.wait_for_function("window.ussim.image?.patient === 'head.nii.gz'")
-    settled(page)
+    open_new_patient(page, files / "head.nii.gz")
     assert sector_rows(page) > 50  # and the probe has not been moved
 
 

@@ -32,9 +32,9 @@ from tests.test_workstation import (
     dismiss_messages,
     download,
     errors,
-    files as files,
     first_page as first_page,
     new_image,
+    open_new_patient,
     pixels,
     pytestmark as pytestmark,
     serving,
@@ -106,7 +106,7 @@ def test_images_do_not_wait_for_what_needs_no_device():
     assert run_in_loop(scenario) == (["an image"], ["an image", "a surface"])
 
 
-@pytest.mark.parametrize("end", [signal.SIGTERM, signal.SIGINT])
+@pytest.mark.parametrize("end", [signal.SIGTERM, pytest.param(signal.SIGINT, marks=pytest.mark.slow)])
 def test_the_server_ends_within_two_seconds_whatever_it_computes(tmp_path, end):
     """It took 110 s while it extracted a brain."""
     mri = head_mri(1.0)
@@ -184,10 +184,12 @@ def url(files):
 
 
 @pytest.fixture
-def page(first_page):
+def page(first_page, files):
     page, problems = first_page
     page.mouse.move(600, 500)
     settled(page)
+    if state(page, NAMES.title) != "labels.nii.gz":
+        open_new_patient(page, files / "labels.nii.gz")
     yield page
     assert not problems and not errors(page)
 
@@ -228,6 +230,7 @@ def large(tmp_path_factory, files):
     return folder
 
 
+@pytest.mark.slow
 def test_a_scene_is_exported_with_progress_and_cancel_while_images_go_on(page, large, files, tmp_path):
     """No image came while the scene was compressed, and nothing was shown."""
     page.set_input_files("#open-file", large / "noise.nrrd")
@@ -254,7 +257,7 @@ def test_a_scene_is_exported_with_progress_and_cancel_while_images_go_on(page, l
         page.keyboard.press("a")
 
 
-def test_work_that_tells_no_share_is_seen_to_go_on(page, large):
+def test_work_that_tells_no_share_is_seen_to_go_on(page):
     """Reading a file of 223 MB stood at 0 % for 15 s."""
     show = "([name, value]) => window.trame.state.set(name, value)"
     title, percent, bar = NAMES.messages.progress_title, NAMES.messages.progress_percent, page.locator("#progress")
@@ -269,6 +272,7 @@ def test_work_that_tells_no_share_is_seen_to_go_on(page, large):
     bar.wait_for(state="detached")
 
 
+@pytest.mark.slow
 def test_a_surface_has_progress_and_can_be_cancelled_while_images_go_on(page, large):
     """A surface held all images for 42 s."""
     page.set_input_files("#open-file", [large / "ball.nii.gz", large / "ball.json"])
@@ -285,6 +289,7 @@ def test_a_surface_has_progress_and_can_be_cancelled_while_images_go_on(page, la
     assert abs(state(page, NAMES.pose)["lift_mm"]) < 5
 
 
+@pytest.mark.slow
 def test_a_surface_of_a_patient_who_was_closed_meanwhile_is_not_shown(page, large):
     page.set_input_files("#open-file", [large / "ball.nii.gz", large / "ball.json"])
     answer_new_patient(page)
