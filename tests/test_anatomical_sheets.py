@@ -444,6 +444,7 @@ def test_a_file_of_others_is_not_replaced_and_no_use_as_kept_sheets(tmp_path):
     assert place.read_text() == "mine"
 
 
+@pytest.mark.slow
 def test_a_search_can_be_cancelled():
     mri, found = template_head()
 

@@ -212,6 +212,7 @@ def _level_of(piece, depth: float) -> float:
     return 20.0 * np.log10(piece["attenuation"] * np.exp(-piece["decay_per_mm"] * along))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", PROBES)
 def test_the_penumbra_of_bone_is_that_of_its_aperture_and_has_no_steps(kind):
     """Behind the straight edge of a plate, as the probe slides past it: the visible part u of the aperture leaves u^3.
@@ -308,6 +309,7 @@ def test_nothing_in_or_before_a_lossy_plate_is_brightened_and_what_has_passed_it
         assert -np.log(past["attenuation"]) > 1.0 > 2.0 * past["loss"]  # what is there has come past it
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("attenuation", [5.0, 10.0, 30.0])
 def test_what_passes_a_very_lossy_plate_is_heard_once(attenuation):
     """At its slanted edge, in an oblique grid: the level of a line's beam and of what comes through the plate itself.

@@ -40,6 +40,7 @@ def in_band(attenuation: float, probe: Probe, depth_mm: np.ndarray) -> np.ndarra
     return 10 * np.log10((spectrum * 10 ** (-0.1 * loss_db)).sum(axis=1) / spectrum.sum())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", WIDE)
 def test_levels_are_those_of_a_band_wise_sum_down_to_the_full_depth(name):
     """The frequency stopped at half of the pulse's, which made the far field 6 to 17 dB too dark."""

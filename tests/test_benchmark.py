@@ -111,6 +111,7 @@ def test_the_command_prints_every_stage_and_keeps_the_numbers(tmp_path):
     assert numbers["wrong"] == [] and "WRONG" not in outcome.output
 
 
+@pytest.mark.slow
 def test_a_wrong_image_is_told_and_exits_with_1(monkeypatch, tmp_path):
     class Wrong:
         timings_ms: dict = {"ray tree": 1.0}  # noqa: RUF012

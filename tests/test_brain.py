@@ -252,6 +252,7 @@ def test_a_small_head_is_no_skull_stripped_brain(head, size):
         assert shown.stripped is None and shown.alignment.size == pytest.approx(0.93 * size, rel=0.06)
 
 
+@pytest.mark.slow
 @needs_nilearn
 @pytest.mark.parametrize("value", [0.0, -3.0])
 def test_voxels_without_data_are_no_brain_and_that_is_said(head, found, value):
@@ -309,6 +310,7 @@ def test_an_ultrasound_volume_is_refused_as_one_at_once(opening_deg):
         find_brain(fan(opening_deg, background=3.0))
 
 
+@pytest.mark.slow
 @needs_shared
 @pytest.mark.parametrize("name", ["brain_sweep", "liver_sweep"])
 def test_a_real_ultrasound_sweep_is_refused_as_one(name):
@@ -536,6 +538,7 @@ def test_a_program_gets_a_copy_of_1_mm_along_lps_and_its_mask_comes_back_on_the_
     assert dice(mask, turned.array > 60) > 0.97
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("largest_turn_deg", [45.0, 1.0])
 def test_robex_is_given_a_head_that_lies_at_its_atlas(tmp_path, monkeypatch, largest_turn_deg):
     """Its own registration is half of its time, and takes a third of that where nothing is left to be found."""
@@ -848,6 +851,7 @@ def test_a_shifted_or_turned_mask_is_called_so_and_gives_no_hint_to_contrast_age
     assert not given_brain(mri.with_array(tight.astype(np.uint8)), mri).takes_in_more
 
 
+@pytest.mark.slow
 @needs_nilearn
 def test_a_mask_without_the_ventricles_is_said(head):
     mri, brain = head

@@ -193,6 +193,7 @@ def found_by_product(case: BrainPhantom, contrast: str = "t1") -> dict[str, floa
     return scores(found.labels.array, dict(enumerate(found.tissue_names, start=1)), case)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", BRAINS)
 def test_segmentation_is_better_than_a_plain_mixture_and_near_the_true_thresholds_at_2_mm(name):
     case = phantom(small(name), noise=0.03, bias=0.0)

@@ -215,6 +215,7 @@ def live_scene(head, tasks: Tasks):
     return logic, labels, transform, output
 
 
+@pytest.mark.slow
 def test_changes_that_come_while_an_image_is_computed_bring_one_more_of_the_last_pose(head):
     async def scenario():
         errors, reports = [], []
@@ -506,6 +507,7 @@ def run_again(script: str, folder) -> np.ndarray:
     return read_array(folder / "image.nrrd")[0][0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "nasty",
     ["", *(pytest.param(text, marks=pytest.mark.slow) for text in ("'", '"', "\\", "\n", '"""')), "'''\\"],

@@ -122,6 +122,7 @@ def test_slicer_is_asked_for_the_module_and_its_test(record):
     assert record["NAME"] == ["USSim", "SlicerUSSim"] and record["TEST"] == ["USSim.py"]
 
 
+@pytest.mark.slow
 @needs_cmake
 @needs_slicer
 def test_the_built_module_loads_from_its_own_folder(build):

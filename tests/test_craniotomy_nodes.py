@@ -119,6 +119,7 @@ def test_an_opening_follows_the_probe(head):  # noqa: F811
     assert bench.presenter.notes().count("craniotomy: ") == 1
 
 
+@pytest.mark.slow
 def test_the_beam_reaches_the_brain_through_it_alone(head):  # noqa: F811
     bench = Bench(head)
     image = bench.add("ScalarVolume", "image")

@@ -89,6 +89,7 @@ def test_labels_texture_and_sheets_move_together():
     np.testing.assert_array_equal(made.medium.labels.array, volume.array)
 
 
+@pytest.mark.slow
 def test_a_displaced_ball_is_found_again_and_a_true_one_is_left_alone():
     tracked = tracked_on(labels(4.0))
     found, patient = find_deformation(simulator(labels(), 2), tracked, PLAIN)

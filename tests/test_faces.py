@@ -82,6 +82,7 @@ def test_every_declared_name_is_there_and_is_that_of_its_module(package):
     assert dir(face) == face.__all__ == sorted(declared(package))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("package", FACES)
 def test_a_name_is_the_same_when_the_module_it_comes_from_was_imported_first(package):
     needs_scene_libraries(package)

@@ -113,6 +113,7 @@ def test_a_lesion_is_proposed_without_a_seed_and_none_in_a_healthy_brain():
     assert propose_lesions(brain("healthy")[0]) == ()
 
 
+@pytest.mark.slow
 @needs_atlas
 @pytest.mark.parametrize(
     ("seed", "words"),

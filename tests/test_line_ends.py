@@ -20,6 +20,7 @@ LINEAR = LinearProbe(30, 40, scan_lines=101, focus_mm=25, elevation_focus_mm=25)
 PLAIN = {"beam": "ray", "side_lobes": False, "scatterers_per_mm3": 30.0, "wavefront_curvature": False}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["phased", "convex", "linear", "neonatal", "cardiac", "linear_15", "matrix"])
 def test_the_last_samples_of_a_line_are_as_bright_as_those_before(name):
     """They were 2 to 3.6 dB darker: of half the pulse there were no echoes."""

@@ -56,6 +56,7 @@ def test_nuclei_nearly_as_bright_as_white_matter_are_grey_by_their_place(contras
     assert elsewhere < inside - 0.2  # of the same intensity, where no nucleus is
 
 
+@pytest.mark.slow
 def test_white_matter_beside_a_nucleus_stays_white():
     maps, nuclei, ball = bright_nuclei()
     case = phantom(maps, noise=0.03, bias=0.0)

@@ -260,6 +260,7 @@ def test_of_a_probe_it_reads_only_what_a_user_gives():
                 assert node.attr in fields, f"{path.name}: probe.{node.attr}"
 
 
+@pytest.mark.slow
 def test_nothing_is_computed_on_the_device(small_image):
     """While the numpy model draws it, the device refuses to work."""
     assert small_image.max() > 100

@@ -143,6 +143,7 @@ def test_the_commands_label_what_is_outside_and_put_the_probe_on_the_skin(tmp_pa
         assert done.exit_code == 2 and message in done.stderr
 
 
+@pytest.mark.slow
 def test_what_is_outside_keeps_its_tissue_beside_a_table_of_more_tissues(tmp_path):
     """Label 4 of the table was that of the skin, too, which became a tumour."""
     mri, brain, _ = round_head(COARSE_MM)
@@ -189,6 +190,7 @@ def test_the_segmentation_has_what_is_outside_after_its_own_labels():
     assert whole.notes[-1].startswith("outside the brain: skin")
 
 
+@pytest.mark.slow
 def test_the_filter_labels_what_is_outside():
     pytest.importorskip("vtkmodules")
     from SlicerUSSim.Logic.vtk import SegmentationFilter
@@ -204,6 +206,7 @@ def test_the_filter_labels_what_is_outside():
     np.testing.assert_array_equal(Volume.from_vtk(segmentation.GetOutputDataObject(0)).array, found.labels.array)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("names", "message"),
     [

@@ -509,6 +509,7 @@ def files(tmp_path_factory):
     return folder
 
 
+@pytest.mark.slow
 def test_segment_writes_added_tissues_and_says_what_it_added(files, tmp_path):
     out = tmp_path / "labels.nii.gz"
     adding = ("--add", f"tumour={files / 'tumour.nii.gz'}", "--add", f"cyst={files / 'cyst.nrrd'}")

@@ -166,6 +166,7 @@ def test_a_preset_has_scan_lines_finer_than_its_beam_and_penetrates_its_depth(na
     assert 0.003 < fwhm_mm(probe, probe.focus_mm) / probe.depth_mm < 0.03
 
 
+@pytest.mark.slow
 @each_preset
 def test_a_preset_resolves_at_its_focus_what_its_aperture_and_band_say(name):
     """The speckle of the simulated image has the size of the beam: neighbours correlate as exp(-d^2 / 4 sigma^2)."""

@@ -68,6 +68,7 @@ def test_poses_in_place_are_not_made_worse(twin):
     assert len(found.history) <= 40
 
 
+@pytest.mark.slow
 def test_settings_of_the_simulator_stay_when_it_is_cancelled(twin):
     before = twin.simulator.settings
 

@@ -920,6 +920,7 @@ def test_a_preset_in_the_scene_that_is_none_is_refused(bench):
         bench.simulate()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["LabelMapVolume", "Segmentation"])
 def test_hybrid_scatterers_take_the_texture_of_the_last_segmentation(kind):
     scene = slicer.vtkMRMLScene()

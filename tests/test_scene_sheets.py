@@ -156,6 +156,7 @@ def test_the_settings_of_sheets_name_what_can_be_found():
 # ---- organs of a CT --------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", [pytest.param("LabelMapVolume", marks=pytest.mark.slow), "Segmentation"])
 def test_organs_of_a_ct_are_laid_over_its_tissues_wherever_their_node_lies(kind):
     bench, phantom = Scene(), coarse_chest()
@@ -244,6 +245,7 @@ def test_a_proposal_without_a_point_is_discarded_and_a_named_one_is_taken_at_the
     assert parameters.proposal is None and "proposal: no lesion proposed" in presenter.notes()
 
 
+@pytest.mark.slow
 @needs_atlas
 @pytest.mark.parametrize(
     ("seed", "words"),

@@ -69,6 +69,7 @@ def brain_of(share: dict[str, float], noise: float, seed: int) -> np.ndarray:
     return (values + rng.normal(0, noise, len(values))).astype(np.float32)
 
 
+@pytest.mark.slow
 def test_mni_with_five_percent_noise_is_better_than_with_free_variances(mni, truth):
     """The mixture with a variance per class and no mixed ones had 0.83, and 0.82 in white matter."""
     mri, mask = mni[0], mni[0].with_array((mni[0].array > 0).astype(np.uint8))
@@ -431,6 +432,7 @@ def test_a_small_whole_brain_is_led_by_the_atlas(mni):
     assert any("expected 1000 to 1900 ml of an adult" in line for line in found.warnings)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("axis", [pytest.param(0, marks=pytest.mark.slow), 2])
 def test_thick_slices_of_a_turned_head_are_registered(mni, axis):
     """A T2 of 5 mm slices, turned by 10 degrees: a smoothed first level led 30 mm away."""
@@ -466,6 +468,7 @@ def test_less_sure_posteriors_shrink_log_odds_and_change_no_label():
     np.testing.assert_allclose(after, 0.9 * before, atol=1e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, pytest.param(3, marks=pytest.mark.slow)])
 def test_a_fifth_of_the_field_of_one_persons_phantom_is_left_at_most(seed):
     """Colin27, whose grey and white matter differ from place to place; degree 3 and even weights left 20 to 21 %."""

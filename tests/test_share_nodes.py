@@ -138,6 +138,7 @@ def test_shares_are_hidden_saved_and_removed_with_their_labels(tmp_path):
     assert left.GetName().startswith("others")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_live_image_has_the_shares_of_labels_that_are_made_anew(kind):
     """One was computed between labels and shares, and kept."""

@@ -41,6 +41,7 @@ def half_width(pattern: np.ndarray) -> float:
     return float(np.interp(-0.5 * pattern[0], -pattern[at - 1 : at + 1], X[at - 1 : at + 1]))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("apodization", [0.0, 0.3, 0.6, 1.0])
 def test_apodisation_widens_the_main_lobe_as_diffraction_does(apodization):
     """The receive beam within 1 %; the two-way beam within 3 %, beside the 5 % by which Gaussians are narrower."""

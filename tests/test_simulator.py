@@ -289,6 +289,7 @@ def test_the_membrane_fades_where_the_beam_meets_it_obliquely(spacing_mm, expone
     assert 10 * np.log10(powers[1] / powers[0]) == pytest.approx(10 * np.log10(cosine ** (2 * exponent - 1)), abs=1.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("thickness_mm", [6.0, 10.0, 99.0])
 @pytest.mark.parametrize("tilt_deg", [3.0, 6.0, 12.0])
 def test_the_membrane_on_a_flat_border_has_no_steps(tilt_deg, thickness_mm):

@@ -129,6 +129,7 @@ def test_from_the_sources():
     assert_loaded_from(load(folder), folder / "USSim.py", folder, ROOT / "kernels")
 
 
+@pytest.mark.slow
 @needs_slicer
 def test_from_a_folder_of_another_name(tmp_path):
     folder = tmp_path / "SlicerUSSim-main" / "xyz"
@@ -137,6 +138,7 @@ def test_from_a_folder_of_another_name(tmp_path):
     assert_loaded_from(load(folder), folder / "USSim.py", folder, folder.parent / "kernels")
 
 
+@pytest.mark.slow
 @needs_slicer
 def test_from_a_wheel(wheel):
     folder = wheel / "SlicerUSSim"
@@ -145,12 +147,14 @@ def test_from_a_wheel(wheel):
     assert result["shown"][-1] == "Test passed"
 
 
+@pytest.mark.slow
 @needs_slicer
 def test_the_folder_counts_where_a_wheel_is_installed_too(wheel):
     folder = ROOT / "SlicerUSSim"
     assert_loaded_from(load(folder, site=wheel), folder / "USSim.py", folder, ROOT / "kernels")
 
 
+@pytest.mark.slow
 @needs_slicer
 def test_the_folder_counts_where_another_version_was_imported_first(stale_wheel):
     folder = ROOT / "SlicerUSSim"
@@ -159,6 +163,7 @@ def test_the_folder_counts_where_another_version_was_imported_first(stale_wheel)
     assert_loaded_from(result, folder / "USSim.py", folder, ROOT / "kernels")
 
 
+@pytest.mark.slow
 @needs_slicer
 def test_the_first_of_two_module_paths_counts(wheel):
     """As for every module of Slicer."""

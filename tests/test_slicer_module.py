@@ -309,6 +309,7 @@ def test_the_parameter_node_has_the_declared_defaults_and_both_sides_read_what_t
     assert typed.filter_radius == 4 and typed.real is parameters.real
 
 
+@pytest.mark.slow
 def test_the_modules_own_test_passes(module):
     module.app.testing = True
     slicer.mrmlScene = slicer.vtkMRMLScene()
@@ -810,6 +811,7 @@ def test_the_panel_fits_compares_applies_and_reverts(session):
     assert not session.app.errors
 
 
+@pytest.mark.slow
 def test_blinking_goes_on_until_it_is_switched_off(session):
     with_real_image(session).ui.fitButton.click()
     composite = session.scene.GetFirstNodeByClass("vtkMRMLSliceCompositeNode")

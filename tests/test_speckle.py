@@ -132,6 +132,7 @@ def test_a_pulse_loses_less_than_its_centre_frequency():
     assert frequencies[0] - frequencies[1] == pytest.approx(-0.65, abs=0.06)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["phased", "cardiac"])
 def test_speckle_near_the_point_where_all_lines_of_a_phased_array_begin_has_its_level(name):
     """Formerly 11 dB above it, and 9 dB below it some millimetres deeper."""

@@ -50,6 +50,7 @@ def factors(row: np.ndarray, places: np.ndarray, seed=3) -> np.ndarray:
     return unevenness(seed, np.repeat(row, len(places)), places.astype(np.float32))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("probe", [PROBE, pytest.param(PhasedProbe(70, 40, scan_lines=60), marks=pytest.mark.slow)])
 @pytest.mark.parametrize("turn", [pytest.param(np.eye(3), marks=pytest.mark.slow), TURN], ids=["aligned", "turned"])
 def test_the_kernels_draw_the_unevenness_that_numpy_draws(probe, turn):

@@ -134,6 +134,7 @@ def test_wrong_physics_fails_the_check_of_its_phenomenon(monkeypatch, check, wro
 # ---- the report -----------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_the_report_holds_every_row_and_its_pictures(tmp_path):
     report = validate(tmp_path / "out", only=["sub-voxel", "thin sheet", "shadow"])
     assert not report.failed

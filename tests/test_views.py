@@ -21,6 +21,7 @@ def test_the_command_knows_the_views():
     assert tuple(VIEWS) == STANDARD_VIEWS
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", VIEWS)
 @pytest.mark.parametrize("is_open, radius", [(False, 78.0), (True, 60.0)])
 def test_a_view_is_square_to_the_skin_or_the_brain(head, name, is_open, radius):  # noqa: F811
@@ -32,6 +33,7 @@ def test_a_view_is_square_to_the_skin_or_the_brain(head, name, is_open, radius):
     assert np.linalg.det(pose[:3, :3]) == pytest.approx(1.0)
 
 
+@pytest.mark.slow
 def test_left_and_right_front_and_back_are_where_they_are_in_such_images(head):  # noqa: F811
     right, left, coronal, sagittal = (view_pose(head, NAMES, name) for name in VIEWS)
     assert right[0, 3] > 70 and left[0, 3] < -70  # RAS: the right is positive
@@ -47,6 +49,7 @@ def test_a_view_that_is_none_and_labels_without_a_brain_are_refused(head):  # no
         view_pose(head.with_array(np.where(head.array > 2, head.array, 0).astype(np.uint8)), NAMES, "temporal")
 
 
+@pytest.mark.slow
 def test_the_command_stands_where_a_view_is_seen_from(head, tmp_path):  # noqa: F811
     path = tmp_path / "head.nii.gz"
     write_label_files(path, head, TissueTable.brain().for_names(NAMES))
@@ -62,6 +65,7 @@ def test_the_command_stands_where_a_view_is_seen_from(head, tmp_path):  # noqa: 
     assert done.exit_code == 2 and "temple" in done.stderr
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["fontanelle", "temporal"])
 def test_with_an_opening_of_a_file_a_view_is_in_it_or_said_to_be_elsewhere(head, tmp_path, name):  # noqa: F811
     path, mask, out = tmp_path / "head.nii.gz", tmp_path / "mask.nii.gz", tmp_path / "out.png"

@@ -329,6 +329,7 @@ def test_a_transform_of_another_kind_is_refused_at_once():
         UltrasoundSimulationFilter().SetProbeTransform("up")
 
 
+@pytest.mark.slow
 def test_segmentation_labels_as_the_function_does_and_names_travel():
     mri = head_mri(3.0)
     segmentation = SegmentationFilter()

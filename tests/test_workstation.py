@@ -382,6 +382,7 @@ def test_the_page_shows_image_ruler_focus_marks_and_the_anatomy_around_the_probe
         assert picture(page, view.bounding_box()).std() > 10
 
 
+@pytest.mark.slow
 def test_slice_views_show_the_field_outlined_and_the_image_blended_in(page):
     box = views(page)[1].bounding_box()
     drawn(page)
@@ -446,6 +447,7 @@ def test_the_probe_slides_over_the_surface_where_the_mouse_drags_it_in_a_slice(p
     assert (pixels(page) != image).mean() > 0.2
 
 
+@pytest.mark.slow
 def test_the_probes_body_is_taken_in_3d_and_slides_swings_or_rotates(page):
     drawn(page)
     box = views(page)[0].bounding_box()
@@ -470,6 +472,7 @@ def test_the_probes_body_is_taken_in_3d_and_slides_swings_or_rotates(page):
     assert abs(slid["right_deg"] - before["right_deg"]) + abs(slid["front_deg"] - before["front_deg"]) > 3
 
 
+@pytest.mark.slow
 def test_dragging_beside_the_probe_turns_the_camera_and_not_the_probe(page):
     before, view = pose(page), views(page)[0]
     drawn(page)
@@ -973,6 +976,7 @@ def test_two_tabs_show_and_drive_the_same_workstation(page, browser, url):
     assert pose(page)["rock_deg"] - before["rock_deg"] == pytest.approx(12, abs=0.9)
 
 
+@pytest.mark.slow
 def test_a_reloaded_page_shows_what_there_was(page):
     image = pixels(page)
     page.reload()

@@ -83,6 +83,7 @@ def answered(page, sent, *titles: str) -> str:
 # ---- what is recognised and said -------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_an_mri_is_a_new_patient_or_the_second_contrast_of_this_one_as_the_user_says(page, files, tmp_path):
     shutil.copy(files / "head.nii.gz", tmp_path / "other.nii.gz")
     before = shown(page, "labelsSelector")
@@ -180,6 +181,7 @@ def test_a_ct_is_recognised_and_segmented_as_one(page, tmp_path):
     assert "bone" in {row["name"] for row in state(page, NAMES.panel.tissues)}
 
 
+@pytest.mark.slow
 def test_a_tracked_sequence_is_recognised_under_any_name(page, files, tmp_path):
     sequence = TrackedSequence.read(files / "sweep.igs.mha")
     for name in ("sweep.mha", "sweep.seq.nrrd", "sweep.nrrd", "sweep.dat", "sweep"):

@@ -108,6 +108,7 @@ def shown_pose(page, number: int) -> np.ndarray:
     return np.array(page.evaluate("window.ussim.image.pose"))
 
 
+@pytest.mark.slow
 def test_ultrasound_without_a_calibration_asks_for_it_and_is_compared_with_it(page, recording):
     said = state(page, NAMES.opened)[0]
     assert said.endswith(
@@ -255,6 +256,7 @@ def test_a_landmark_is_picked_in_the_real_image_and_in_a_slice(page, recording):
     assert len(state(page, NAMES.registration.landmarks)) == 1 and not errors(page)
 
 
+@pytest.mark.slow
 def test_transforms_without_ultrasound_and_of_other_kinds_are_said(page, recording, files):
     page.set_input_files("#calibration-file", files / "far.nii.gz")
     settled(page)

@@ -173,6 +173,7 @@ def test_the_workstation_opens_the_scene_that_it_saved(page, files, tmp_path):
     assert not errors(page) and "is kept" not in shown(page, "notesLabel")
 
 
+@pytest.mark.slow
 def test_the_workstation_opens_the_scene_of_the_slicer_module(page, module_scene):
     path, image, _ = module_scene
     open_scene(page, path)
@@ -272,6 +273,7 @@ def changed(path: Path, to: Path, pattern: str, text: str, **more: bytes) -> Pat
     return to
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name",
     [

@@ -90,6 +90,7 @@ def lift_off(page) -> None:
 # ---- what an image is of ---------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_an_image_comes_with_patient_time_pose_and_ruler(head_page):
     page = head_page
     image = page.evaluate("window.ussim.image")

@@ -257,6 +257,7 @@ def test_a_scene_is_exported_with_progress_and_cancel_while_images_go_on(page, l
         page.keyboard.press("a")
 
 
+@pytest.mark.slow
 def test_work_that_tells_no_share_is_seen_to_go_on(page):
     """Reading a file of 223 MB stood at 0 % for 15 s."""
     show = "([name, value]) => window.trame.state.set(name, value)"
