@@ -31,6 +31,7 @@ POSE = rigid(np.eye(3), [0.0, -6.0, 0.0])
 EVERYTHING = DisplaySettings(
     smoothing_axial_mm=0.15, smoothing_lateral_deg=0.6, edge_enhancement=0.8, grey_map="soft", map_dark=0.7,
     depth_gain_2_db=4.0, depth_gain_7_db=-6.0, line_gain_1_db=-9.0, line_gain_4_db=3.0, noise_db=-30.0,
+    near_gain_db=-14.0,
 )  # fmt: skip
 
 
@@ -139,6 +140,16 @@ def test_a_slider_changes_the_level_at_its_depth_and_not_elsewhere(solid, number
     np.testing.assert_allclose(change[(np.abs(depth - middle) > 5.1) & (depth < 40.0)], 0.0, atol=1e-3)
 
 
+def test_the_near_gain_is_that_of_the_face_and_fades_with_depth(solid):
+    probe, pose = LinearProbe(30, 40, scan_lines=91), rigid(np.eye(3), [0, -30, 0])
+    display = DisplaySettings(noise_db=None, tgc_db_cm_mhz=0.0)
+    frames = [solid.simulate(probe, pose, d) for d in (display, replace(display, near_gain_db=-20.0))]
+    depth = np.arange(frames[0].envelope.shape[1]) * frames[0].sample_interval_mm
+    change = 20 * np.log10(frames[1].envelope / frames[0].envelope).mean(axis=0)
+    for mm, share in ((0.0, 1.0), (6.0, np.exp(-1.0)), (18.0, np.exp(-3.0)), (36.0, np.exp(-6.0))):
+        np.testing.assert_allclose(change[np.abs(depth - mm) < 0.05], -20.0 * share, atol=0.2)
+
+
 def test_gain_by_line_goes_from_left_to_right(solid):
     probe, pose = LinearProbe(30, 40, scan_lines=101), rigid(np.eye(3), [0, -30, 0])
     plain, dark = (
@@ -240,7 +251,7 @@ def test_fits_find_what_the_console_does(solid):
 
 def test_names_stand_for_what_is_not_on_request(solid):
     names = FreeParameters.of(["display"], TissueTable({1: EVEN}), DisplaySettings()).names
-    assert names == ["gain_db", "dynamic_range_db", "tgc_db_cm_mhz", "noise_db"]
+    assert names == ["gain_db", "dynamic_range_db", "tgc_db_cm_mhz", "near_gain_db", "noise_db"]
     sliders = FreeParameters.of(["sliders"], TissueTable({1: EVEN}), DisplaySettings()).names
     assert sliders == [f"depth_gain_{n}_db" for n in range(1, 9)]
     assert FreeParameters.of(["map"], TissueTable({1: EVEN}), DisplaySettings()).names == [

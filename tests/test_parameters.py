@@ -18,7 +18,7 @@ def of(free) -> FreeParameters:
 
 def test_groups_stand_for_all_of_their_own():
     # The others are on request only: they compete with attenuation, or with each other
-    together = ["gain_db", "dynamic_range_db", "tgc_db_cm_mhz", "noise_db"]
+    together = ["gain_db", "dynamic_range_db", "tgc_db_cm_mhz", "near_gain_db", "noise_db"]
     assert of(["display"]).names == together and of("tgc_reach").names == ["tgc_reach"]
     assert of(["White-Matter"]).names == [f"white matter.{name}" for name in TISSUE_BOUNDS]
     assert of(["gain_db", "leptomeninges.mu0"]).names == ["gain_db", "leptomeninges.mu0"]
@@ -30,14 +30,15 @@ def test_groups_stand_for_all_of_their_own():
 def test_bounds_are_those_of_the_documentation():
     """docs/optimization.md says them in words."""
     expected = {
-        "gain_db": (-30, 30), "dynamic_range_db": (30, 90), "tgc_db_cm_mhz": (0, 1.2), "noise_db": (-120, -30),
+        "gain_db": (-30, 30), "dynamic_range_db": (30, 90), "tgc_db_cm_mhz": (0, 1.2),
+        "near_gain_db": (-40, 10), "noise_db": (-120, -30),
         "white matter.attenuation_db_cm_mhz": (0.1, 1.2), "white matter.mu0": (0.02, 1.5),
         "white matter.mu1": (-1, 1.5), "white matter.sigma0": (0.02, 1),
     }  # fmt: skip
     assert {p.name: (p.low, p.high) for p in of(["display", "white matter"])} == expected
 
 
-@given(st.lists(st.floats(0, 1), min_size=8, max_size=8))
+@given(st.lists(st.floats(0, 1), min_size=9, max_size=9))
 def test_positions_and_values_are_inverse(units):
     parameters = of(["display", "white matter"])
     tissues, display = parameters.apply(np.array(units), TISSUES, DISPLAY)

@@ -198,6 +198,13 @@ class DisplaySettings(Declared):
         bounds=(0, 1), shown=Shown(0, 1, 0.01, is_slider=True), option="tgc-reach",
         fit=Fit(0.1, 1.0, tolerance=0.1, on_request=True),
     )  # fmt: skip
+    near_gain_db: float = parameter(
+        0.0, "Near gain",
+        "Gain at the face; by 6 mm deeper 1 / e of it is left: near the face a scanner listens with fewer elements, and "
+        "consoles have a control of their own for it",
+        unit="dB", bounds=(-60, 60), shown=Shown(-40, 20, 0.5, is_slider=True), option="near-gain",
+        fit=Fit(-40, 10, tolerance=3.0),
+    )  # fmt: skip
     noise_db: float | None = parameter(
         -80.0, "Noise",
         "Amplifier noise before TGC, relative to tissue of unit scatterer variance; panels: -150 for none",
