@@ -200,7 +200,7 @@ class DisplaySettings(Declared):
     )  # fmt: skip
     near_gain_db: float = parameter(
         0.0, "Near gain",
-        "Gain at the face, of which 1 / e is left 6 mm deeper: near the face a scanner listens with fewer elements, and "
+        "Gain at the face; 6 mm deeper 1 / e of it is left: near the face a scanner listens with fewer elements, and "
         "consoles have a control for it",
         unit="dB", bounds=(-60, 60), shown=Shown(-40, 20, 0.5, is_slider=True), option="near-gain",
         fit=Fit(-40, 10, tolerance=3.0),
