@@ -67,7 +67,7 @@ def test_optimize_writes_result_report_preset_and_state(folder):
     result = json.loads((folder / "result.json").read_text())
     assert result["cost_after"] < result["cost_before"] and len(result["images"]) == 3
     names = [parameter["name"] for parameter in result["parameters"]]
-    assert names[-1] == "white matter.mu0" and len(names) == 5
+    assert names[-1] == "white matter.mu0" and len(names) == 6
     assert result["parameters"][-1]["low"] == 0.1
     assert re.search(r"cost [\d.]+ -> [\d.]+", done.output) and "wrote" in done.output
     preset = Preset.read(folder / "preset.json")

@@ -516,6 +516,7 @@ def test_keys_and_sliders_move_the_probe(page):
     settled(page)
     assert pose(page)["front_deg"] != before["front_deg"]
     slider = page.locator("#slider-pose-lift_mm").locator("xpath=ancestor::*[contains(@class,'v-slider')]").first
+    slider.scroll_into_view_if_needed()
     box = slider.bounding_box()
     with new_image(page):
         page.mouse.click(box["x"] + 0.5 * box["width"], box["y"] + 0.5 * box["height"])
