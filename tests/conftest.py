@@ -33,6 +33,8 @@ from SlicerUSSim.Logic.verification.ct_phantoms import CtPhantom, lower_chest
 from tests.remembered import segment_once
 from tests.shared_data import SHARED as SHARED, needs_shared as needs_shared
 
+_LOCALE = locale.setlocale(locale.LC_ALL)
+
 hypothesis.settings.register_profile("ussim", deadline=None, derandomize=True, max_examples=50)
 hypothesis.settings.load_profile("ussim")
 
@@ -99,9 +101,9 @@ def _own_state(tmp_path_factory):
 @pytest.fixture(autouse=True)
 def _unchanged_locale():
     """ITK's DICOM writer, which some tests use, sets the C locale, in which Python reads text files as ASCII."""
-    before = locale.setlocale(locale.LC_ALL)
+    locale.setlocale(locale.LC_ALL, _LOCALE)  # fixtures of other scopes use that writer, too
     yield
-    locale.setlocale(locale.LC_ALL, before)
+    locale.setlocale(locale.LC_ALL, _LOCALE)
 
 
 @pytest.fixture(scope="module")

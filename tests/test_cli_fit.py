@@ -280,7 +280,7 @@ def test_images_that_are_not_fitted_are_predicted_beside_controls(folder):
     )
     assert 0.5 < found["of_uniform"] < 1.5  # the phantom looks nearly uniform here
     assert "fitted: images 0, 2   predicted: images 1" in done.output
-    assert "Images that were not fitted" in report.read_text()
+    assert "Images that were not fitted" in report.read_text("utf-8")
     assert optimize(folder, *plain).exit_code == 0
     alone = json.loads((folder / "result.json").read_text())
     assert alone["cost_after"] == result["cost_after"] and "prediction" not in alone
