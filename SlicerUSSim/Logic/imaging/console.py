@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 #: Sigmas at which a Gaussian of the smoothing is cut off, and samples or lines that it has to either side at most
 _CUT_OFF, _MOST_TAPS = 2.6, 128
 #: Depth by which the near gain falls to 1 / e; on a real sweep of a brain 5 and 8 mm are as good
-NEAR_GAIN_MM = 6.0
+_NEAR_GAIN_MM = 6.0
 #: Of edge enhancement: samples of a line and lines in the mean to either side, and the mean's half length in mm
 _EDGE_SAMPLES, _EDGE_LINES, _EDGE_MM = 4, 1, 0.5
 
@@ -189,7 +189,7 @@ def gains_along(display: DisplaySettings, depth_mm: np.ndarray, image_depth_mm: 
     """(samples,) dB of the eight sliders of the gain by depth, straight between their middles, and of the near gain."""
     sliders = [getattr(display, f"depth_gain_{n}_db") for n in range(1, 9)]
     places = (np.arange(8) + 0.5) / 8.0 * image_depth_mm
-    near = display.near_gain_db * np.exp(-np.maximum(depth_mm, 0.0) / NEAR_GAIN_MM)
+    near = display.near_gain_db * np.exp(-np.maximum(depth_mm, 0.0) / _NEAR_GAIN_MM)
     return np.interp(depth_mm, places, sliders) + near
 
 

@@ -162,8 +162,8 @@ def b_mode(frame: TwinFrame) -> None:
     tgc_db = tgc_db - neper_db * Beam(record).gain_of_band(tgc_db / neper_db).astype(float)
     sliders = [getattr(display, f"depth_gain_{n}_db") for n in range(1, 9)]
     middles = (np.arange(8) + 0.5) * frame.probe.depth_mm / 8.0
-    tgc_db = tgc_db + np.interp(np.maximum(below, 0) * float(record["sample_mm"]), middles, sliders)
-    tgc_db = tgc_db + display.near_gain_db * np.exp(-np.maximum(below, 0) * float(record["sample_mm"]) / 6.0)
+    depth_mm = np.maximum(below, 0) * float(record["sample_mm"])
+    tgc_db = tgc_db + np.interp(depth_mm, middles, sliders) + display.near_gain_db * np.exp(-depth_mm / 6.0)
     across = np.linspace(0.0, 4.0, len(iq))
     knots = [getattr(display, f"line_gain_{n}_db") for n in range(1, 6)]
     tgc_db = tgc_db + np.interp(across, np.arange(5), knots)[:, None]
