@@ -327,11 +327,15 @@ class Registration:
         sequence = recording.sequence.with_transforms(calibration) if calibration else recording.sequence
         made = None
         known = replace(recording, sequence=sequence)
-        record = kept or SequenceRecord(sequence, recording.name, recording.path, to_ras)
+        before, opened = self.recording, self._opener.opened_sequence
+        is_same = before is not None and before.sequence is recording.sequence
+        field = None  # of the images, which another place in the patient does not change
+        if is_same and before.path == recording.path and calibration is self._calibration and opened is not None:
+            field = None if opened.tracked is None else opened.tracked.field
+        record = kept or SequenceRecord(sequence, recording.name, recording.path, to_ras, field=field)
         if known.is_calibrated:
             with self._presenter.view.progress("Find the probe's field"):
                 made = self._opener.sequence(record)
-        is_same = self.recording is not None and self.recording.sequence is recording.sequence
         number = self._shared.now.sequence.number if is_same else 0
         old, self._nodes = self._nodes, [] if made is None else made[3]
         self.recording, self._calibration, self._to_ras = recording, calibration, to_ras
@@ -341,7 +345,8 @@ class Registration:
         else:
             tracked, browser, images, _ = made
             record = replace(record, tracked=tracked)
-            self._logic.preset = replace(self._logic.preset, probe=tracked.probe)
+            if field is None:  # else a user may have changed it since
+                self._logic.preset = replace(self._logic.preset, probe=tracked.probe)
             self._logic.parameters.real = images
             self._comparison.take(tracked, browser, number)
             self._choose_poses(browser, old)
