@@ -328,10 +328,13 @@ class Registration:
         made = None
         known = replace(recording, sequence=sequence)
         before, opened = self.recording, self._opener.opened_sequence
-        is_same = before is not None and before.sequence is recording.sequence
-        field = None  # of the images, which another place in the patient does not change
-        if is_same and before.path == recording.path and calibration is self._calibration and opened is not None:
-            field = None if opened.tracked is None else opened.tracked.field
+        is_same, field = False, None
+        if before is not None and before.sequence is recording.sequence:
+            is_same = True
+            # Another place in the patient does not change the field of the images
+            is_field_same = before.path == recording.path and calibration is self._calibration
+            if is_field_same and opened is not None and opened.tracked is not None:
+                field = opened.tracked.field
         record = kept or SequenceRecord(sequence, recording.name, recording.path, to_ras, field=field)
         if known.is_calibrated:
             with self._presenter.view.progress("Find the probe's field"):
