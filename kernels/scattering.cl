@@ -182,6 +182,15 @@ inline void add_echo(Echoes *sum, int part, int bin, float between, float right,
 }
 #endif
 
+// Of a label by drawn_label
+#ifdef FOUND
+#define TISSUE_OF(label) ((label) & LABEL_MASK)
+#define IS_ON_MEMBRANE(label) ((label) == MEMBRANE_LABEL || ((label) & ON_SHEET))
+#else
+#define TISSUE_OF(label) (label)
+#define IS_ON_MEMBRANE(label) ((label) == MEMBRANE_LABEL)
+#endif
+
 // The sheet (sheets.clh) at the voxel nearest to a scatterer at fraction `at` of a cell, its plane 0 for none; and the
 // offset from it
 typedef struct {
@@ -222,7 +231,8 @@ inline int is_in_sheet(__constant const Acquisition *acquisition, const Piece *p
 }
 
 // The label of a scatterer at fraction `at` of the cell of voxels at `corner`, which contains a border, a sheet or the
-// membrane; `random` are random bits of the scatterer. With TEXTURE, also its gain.
+// membrane; with ON_SHEET if it is in a sheet of the dura's own tissue. `random` are random bits of the scatterer. With
+// TEXTURE, also its gain.
 inline int drawn_label(__constant const Acquisition *acquisition, __global const ushort *corner,
                        __global const uint *planes, __global const uint *texture, const Piece *piece, float3 at,
                        uint random, float *gain) {
@@ -239,7 +249,7 @@ inline int drawn_label(__constant const Acquisition *acquisition, __global const
   if ((hash_mix(random) & 255u) < ((known >> 8) & 255u)) label = known & LABEL_MASK;
 #endif
   if (corner[0] & NO_MEMBRANE) return label;
-  int is_membrane = 0;
+  int is_membrane = 0, sheet_tissue = MEMBRANE_LABEL;
   if (acquisition->sheet_label >= 0) {
     float3 offset, normal;
     const Sheet sheet = nearest_sheet(acquisition, planes, at, &offset);
@@ -249,6 +259,7 @@ inline int drawn_label(__constant const Acquisition *acquisition, __global const
     if (label == acquisition->sheet_label && drawn_plane) label = label_beside_sheet(drawn_plane);
 #ifdef FOUND
     if (sheet.look && !is_membrane) return label;
+    if (is_dura(sheet.look)) sheet_tissue = acquisition->dura_label | ON_SHEET;
 #endif
   }
   if (!is_membrane) {
@@ -260,7 +271,7 @@ inline int drawn_label(__constant const Acquisition *acquisition, __global const
     if (fabs(blend(near_z, far_z, at.z) - 127.5f) >= acquisition->membrane_reach) return label;
   }
   *gain = 1.0f;
-  return MEMBRANE_LABEL;
+  return is_membrane ? sheet_tissue : MEMBRANE_LABEL;
 }
 
 // A scatterer of the membrane is the brighter the more squarely the beam meets the sheet. Its normal is that of the
@@ -454,13 +465,13 @@ inline void scatter_batch(__constant const Acquisition *acquisition, __global co
       several_tissues |= label_[at] ^ label_[i];
       for (int axis = 0; axis < 3; axis++) places[axis][lane] = place_[axis * BATCH + chosen[at]];
     }
-    __global const float *uneven = sites + 3 * MAX_TISSUES, *here = uneven + UNEVEN_WORDS * label_[i];
+    __global const float *uneven = sites + 3 * MAX_TISSUES, *here = uneven + UNEVEN_WORDS * TISSUE_OF(label_[i]);
     floatn words[6];
     int has_specks = here[3] > 0.0f;
     if (several_tissues) {
       float words_[6][LANES];
       for (int lane = 0; lane < LANES; lane++) {
-        here = uneven + UNEVEN_WORDS * label_[min(i + lane, n - 1)];
+        here = uneven + UNEVEN_WORDS * TISSUE_OF(label_[min(i + lane, n - 1)]);
         for (int word = 0; word < 6; word++) words_[word][lane] = here[word];
         has_specks |= here[3] > 0.0f;
       }
@@ -478,14 +489,14 @@ inline void scatter_batch(__constant const Acquisition *acquisition, __global co
 #endif
 
   for (int i = 0; i < n; i++) {
-    const int j = chosen[i], label = label_[i];
+    const int j = chosen[i], label = TISSUE_OF(label_[i]);
     const float2 site = vload2(label, sites);
     float strength = (random_[j] >> 16) + 0.5f < site.x ? site.y : 0.0f;
 #ifdef LOBES
     if (strength == 0.0f) continue;
     strength *= lobe_at(acquisition, piece->lobes, path_[j], away_[j]);
 #endif
-    if (label == MEMBRANE_LABEL) {
+    if (IS_ON_MEMBRANE(label_[i])) {
       const int here = voxel_[j];
       strength *=
           gain_on_membrane(acquisition, voxels + here, planes + (acquisition->sheet_label < 0 ? 0 : PLANE_WORDS * here),

@@ -41,6 +41,7 @@ if TYPE_CHECKING:
     from SlicerUSSim.Logic.base import Volume
     from SlicerUSSim.Logic.imaging import Preset, UltrasoundSimulator
     from SlicerUSSim.Logic.mri import Added
+    from SlicerUSSim.Logic.mri.sheets import Surfels
     from SlicerUSSim.Logic.probe import Probe
     from SlicerUSSim.Logic.tissue import TissueTable
 
@@ -238,7 +239,7 @@ def open_examination(patient: PatientOptions, pose: np.ndarray | str | None = No
         added = Additions.read(patient.additions, tissues.names()).on(
             labels, tissues.names_by_label(), has_brain_mask=False
         )
-        tissues = changes.to_tissues(added.table(tissues))
+        tissues = changes.to_tissues(_with_dura(added.table(tissues), sheets.read, tissues))
         placed = _placed(patient, craniotomy, preset, added, labels, pose)
         simulator = UltrasoundSimulator(placed.labels, tissues, placed.settings, patient.device, sheets=sheets.read)
         return Examination(simulator, preset.probe, preset.display, is_labels, placed.probe_to_ras)
@@ -265,12 +266,20 @@ def open_examination(patient: PatientOptions, pose: np.ndarray | str | None = No
         of_brain = segmentation.brain_names if isinstance(segmentation, Segmentation) else segmentation.tissue_names
         labels, names = _numbered_as(tissues, labels, names, len(of_brain), patient.tissues or "tissues")
     added = additions.on(labels, names, has_brain_mask=not is_ct)
+    known = tissues
     tissues = tissues.for_names(added.tissue_names) if table is None else added.table(tissues)
+    tissues = _with_dura(tissues, surfels, known)
     texture = texture_below(segmentation.texture(), volume, segmentation.labels, added.labels)
     tissues = changes.to_tissues(tissues)
     placed = _placed(patient, craniotomy, preset, added, segmentation.labels, pose)
     simulator = UltrasoundSimulator(placed.labels, tissues, placed.settings, patient.device, texture, surfels)
     return Examination(simulator, preset.probe, preset.display, is_labels, placed.probe_to_ras)
+
+
+def _with_dura(tissues: TissueTable, surfels: Surfels | None, known: TissueTable) -> TissueTable:
+    from SlicerUSSim.Logic.tissue.sheet_looks import with_dura
+
+    return tissues if surfels is None else with_dura(tissues, surfels.kinds(), known)
 
 
 @dataclass(frozen=True, eq=False)

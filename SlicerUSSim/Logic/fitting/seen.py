@@ -11,6 +11,7 @@ from SlicerUSSim.Logic.base.settings import DisplaySettings
 from SlicerUSSim.Logic.fitting.parameters import ATTENUATION, TISSUES, Bounds, FreeParameters
 from SlicerUSSim.Logic.imaging.simulator import UltrasoundSimulator
 from SlicerUSSim.Logic.probe.placement import slice_under_probe
+from SlicerUSSim.Logic.tissue.sheet_looks import DURA, DURA_KINDS, dura_label
 from SlicerUSSim.Logic.tracked.images import TrackedImages
 
 _log = logging.getLogger(__name__)
@@ -20,6 +21,8 @@ _LEAST_SHARE = 0.002
 #: Mean path through a tissue, mm, from which its attenuation shows: at 5 MHz a change by the parameter's tolerance,
 #: 0.1 dB/(cm MHz), then changes what lies behind by 0.3 dB.
 _LEAST_PATH_MM = 3.0
+#: Surfels are 1 mm apart: a sheet that crosses an image has some this near to its plane.
+_BESIDE_MM = 1.0
 
 
 def shares(simulator: UltrasoundSimulator, tracked: TrackedImages) -> dict[str, float]:
@@ -35,19 +38,35 @@ def shares(simulator: UltrasoundSimulator, tracked: TrackedImages) -> dict[str, 
     return found
 
 
+def _shows_dura(simulator: UltrasoundSimulator, tracked: TrackedImages) -> bool:
+    """Whether a sheet of the dura that was found in the MRI crosses the imaged field of one of the images."""
+    medium = simulator.medium
+    if medium.sheets is None or dura_label(medium.tissues) < 0:
+        return False
+    place = medium.sheets.of_kind(*DURA_KINDS).place
+    for pose in tracked.poses:
+        across, down, aside = ((place - pose[:3, 3]) @ pose[:3, :3]).T
+        if (tracked.probe.holds(across, down) & (np.abs(aside) < _BESIDE_MM)).any():
+            return True
+    return False
+
+
 def parameters_seen(
     free: Iterable[str] | Mapping[str, Bounds | None], simulator: UltrasoundSimulator, tracked: TrackedImages
 ) -> dict[str, Bounds | None]:
     """The free parameters with "tissues" replaced by those that the images can show.
 
-    These are the echogenicity of every tissue in the imaged fields and of the membrane, and the attenuation of tissues
-    through which the beams pass for some millimetres. Other names stay as they are.
+    These are the echogenicity of every tissue in the imaged fields, of the membrane, and of the dura where sheets of it
+    were found there, and the attenuation of tissues through which the beams pass for some millimetres. Other names stay
+    as they are.
     """
     entries = dict(free) if isinstance(free, Mapping) else dict.fromkeys([free] if isinstance(free, str) else free)
     if TISSUES not in entries or entries[TISSUES] is not None:
         return entries
     table = simulator.medium.tissues
-    membrane = None if table.membrane is None else table.membrane.tissue.name
+    thin = {DURA} if _shows_dura(simulator, tracked) else set()
+    if table.membrane is not None:
+        thin.add(table.membrane.tissue.name)
     part, depth = shares(simulator, tracked), tracked.probe.depth_mm
     chosen: dict[str, Bounds | None] = {}
     left_out = []
@@ -55,7 +74,7 @@ def parameters_seen(
         tissue = str(parameter.tissue)
         share = part.get(tissue, 0.0)
         is_path = parameter.attribute == ATTENUATION
-        shows = share * depth >= _LEAST_PATH_MM if is_path else share >= _LEAST_SHARE or tissue == membrane
+        shows = share * depth >= _LEAST_PATH_MM if is_path else share >= _LEAST_SHARE or tissue in thin
         if shows:
             chosen[parameter.name] = None
         else:

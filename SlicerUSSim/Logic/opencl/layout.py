@@ -19,6 +19,7 @@ CONSTANTS = {
     "GROUP_MASK": 0x7F,
     "SAME_GROUP": 0x80,  # added to the acoustic group of a voxel: all eight voxels of this cell have the same group
     "MEMBRANE_LABEL": 63,
+    "ON_SHEET": 0x40,  # added to the label of a scatterer in a sheet of the dura's own tissue (scattering.cl)
     "MAX_TISSUES": 64,
     # Of the Gaussians that smooth the indicators of acoustic groups (borders.py), in voxels: at full resolution, and
     # after that at half the resolution. The variances are those of the Gaussians that they resemble near their centre:
@@ -76,6 +77,7 @@ ACQUISITION = np.dtype(
             "sheet_label",
             _INT,
         ),  # of the membrane's own tissue, a sheet where it is thin; -1: no sheets; 64: none of labels
+        ("dura_label", _INT),  # of the tissue of falx and tentorium that were found, if sheets have it
         ("sheet_reach_mm", _FLOAT),  # half the thickness of such a sheet
         ("membrane_gain", _FLOAT),  # of the amplitude of its scatterers at normal incidence
         ("membrane_exponent", _FLOAT),  # of the cosine of incidence by which it falls

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
 
 from SlicerUSSim.Logic.base.errors import SimulationError
 from SlicerUSSim.Logic.tissue.presets import TISSUES
-from SlicerUSSim.Logic.tissue.table import TissueTable
+from SlicerUSSim.Logic.tissue.table import MAX_LABEL, TissueTable
 from SlicerUSSim.Logic.tissue.tissue import Tissue
 
 
@@ -19,14 +20,19 @@ class SheetLook:
     #: Of the layer of scatterers, mm
     least_thickness_mm: float
     most_thickness_mm: float
-    #: Their level re those of the membrane, dB
+    #: Their level re those of that tissue, dB
     level_db: float
+    #: Whether these are of the tissue DURA of the table, and otherwise of the membrane's
+    is_dura: bool
     #: Amplitude reflection coefficient of the layer where the beam meets it squarely and it is smooth
     reflection: float
 
 
+#: Name of the tissue of falx and tentorium
+DURA = "falx"
 #: The tissue of each kind; None: that of the membrane
-_TISSUES = {"sulcus": None, "falx": "falx", "tentorium": "falx", "ependyma": None}
+_TISSUES = {"sulcus": None, "falx": DURA, "tentorium": DURA, "ependyma": None}
+DURA_KINDS = tuple(kind for kind, name in _TISSUES.items() if name == DURA)
 #: Most of a layer that is drawn, mm: dura is 0.3 to 0.8 mm (Protasoni et al., J. Neurosurg. 114(6), 2011); a sulcus is
 #: as wide as it was found, up to the fluid that voxels of 1 mm show as such
 _MOST_MM = {"sulcus": 1.5, "falx": 0.8, "tentorium": 0.8, "ependyma": 0.0}
@@ -38,15 +44,37 @@ def looks_of(tissues: TissueTable) -> dict[str, SheetLook]:
     membrane = tissues.membrane
     if membrane is None:
         return {}
-    around = _tissue(tissues, "grey matter")
+    around, has_dura = _tissue(tissues, "grey matter"), dura_label(tissues) >= 0
     result = {}
     for kind, name in _TISSUES.items():
         tissue = membrane.tissue if name is None else _tissue(tissues, name)
-        # Re the membrane's by the presets: where a fit changes the membrane's level, that of the dura follows.
-        level_db = 0.0 if name is None else 10.0 * np.log10(TISSUES[name].scatterer_variance / _OWN_VARIANCE)
+        is_dura, level_db = name == DURA and has_dura, 0.0
+        if name is not None and not is_dura:
+            # Re the membrane's by the presets: where a fit changes the membrane's level, that of the dura follows.
+            level_db = 10.0 * np.log10(TISSUES[name].scatterer_variance / _OWN_VARIANCE)
         most = max(_MOST_MM[kind], membrane.thickness_mm)
-        result[kind] = SheetLook(membrane.thickness_mm, most, float(level_db), _of_layer(tissue, around))
+        result[kind] = SheetLook(membrane.thickness_mm, most, float(level_db), is_dura, _of_layer(tissue, around))
     return result
+
+
+def dura_label(tissues: TissueTable) -> int:
+    """The first label of the tissue of falx and tentorium, which need not have voxels; -1 where the table has none."""
+    return next((label for label, tissue in tissues.items() if tissue.name == DURA), -1)
+
+
+def with_dura(tissues: TissueTable, kinds: Iterable[str], known: TissueTable | None = None) -> TissueTable:
+    """The table with the tissue of falx and tentorium, under a label without voxels, where sheets are of these `kinds`.
+
+    With it, their level is that of a tissue of their own, which a fit changes, and not tied to the membrane's. Its
+    parameters are those in the table `known`, or else the preset's. Unchanged if it is there, or no label is left.
+    """
+    is_wanted = not set(kinds).isdisjoint(DURA_KINDS)
+    label = max(tissues, default=0) + 1
+    if not is_wanted or dura_label(tissues) >= 0 or label > MAX_LABEL:
+        return tissues
+    other = dura_label(known) if known is not None else -1
+    tissue = known[other] if known is not None and other >= 0 else TISSUES[DURA]
+    return TissueTable({**tissues, label: tissue}, tissues.membrane)
 
 
 def _tissue(tissues: TissueTable, name: str) -> Tissue:

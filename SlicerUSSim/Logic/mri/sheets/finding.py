@@ -18,6 +18,7 @@ from SlicerUSSim.Logic.mri.segmentation import Segmentation
 from SlicerUSSim.Logic.mri.sheets.callosum import corpus_callosum
 from SlicerUSSim.Logic.mri.sheets.ependyma import ependyma
 from SlicerUSSim.Logic.mri.sheets.falx import falx
+from SlicerUSSim.Logic.mri.sheets.falx_of_part import falx_of_part
 from SlicerUSSim.Logic.mri.sheets.head import Head, require_contrast
 from SlicerUSSim.Logic.mri.sheets.kept import keep_sheets, key_of, read_kept_sheets
 from SlicerUSSim.Logic.mri.sheets.regions import ventricles
@@ -35,7 +36,7 @@ ALL_KINDS = (*KINDS, *STRUCTURES)
 #: Those that only contrast agent shows
 _ENHANCING = ("choroid plexus", "vessels")
 #: Those that are found without an atlas, in a part of a brain
-_WITHOUT_ATLAS = ("sulcus", "ependyma")
+_WITHOUT_ATLAS = ("sulcus", "falx", "ependyma")
 #: A sulcus this near to the falx or the tentorium and as parallel to it is the fissure in which that lies, mm
 _SAME_MM, _SAME_COSINE = 2.0, 0.7
 #: About how long each step takes
@@ -80,7 +81,7 @@ def find_sheets(
     ----------
     mri : the image from which `segmentation` was made.
     segmentation : led by the atlas. Without, as of a part of a brain, only sulci and walls of wide deep fluid are
-        found.
+        found, and a falx that stands out of the sulci (falx_of_part.py).
     contrast : of the MRI: "t1", "t1gd" or "t2".
     kinds : what is looked for, of ALL_KINDS. Without contrast agent no vessels and no choroid plexus are found.
     keep_at : file in which they are kept and from which they are read again; see kept.sheets_beside.
@@ -145,10 +146,17 @@ def _found(head: Head, mri: Volume, wanted: tuple[str, ...], report: Callable[[f
     found: dict[str, Surfels] = {}
     masks: dict[str, np.ndarray] = {}
     in_ventricles = np.zeros(head.brain.shape, bool)
-    if {"sulcus", "ependyma", *_ENHANCING} & set(wanted):
+    is_whole = head.registered is not None
+    if {"sulcus", "ependyma", *_ENHANCING} & set(wanted) or (not is_whole and "falx" in wanted):
         in_ventricles = ventricles(head)
         finished("ventricles")
-    if {"falx", "tentorium", "vessels"} & set(wanted):  # the apex of the tentorium is below the falx
+    all_sulci = None
+    if not is_whole and "falx" in wanted:
+        all_sulci = sulci(head, in_ventricles)
+        finished("sulcus")
+        found["falx"] = falx_of_part(head, all_sulci)
+        finished("falx")
+    elif {"falx", "tentorium", "vessels"} & set(wanted):  # the apex of the tentorium is below the falx
         found["falx"] = falx(head)
         finished("falx")
     if {"tentorium", "vessels"} & set(wanted):
@@ -156,8 +164,10 @@ def _found(head: Head, mri: Volume, wanted: tuple[str, ...], report: Callable[[f
         finished("tentorium")
     dura = Surfels.joined(list(found.values()))
     if "sulcus" in wanted:
-        found["sulcus"] = _beside(sulci(head, in_ventricles), dura.of_kind(*(set(KINDS) & set(wanted))))
-        finished("sulcus")
+        if all_sulci is None:
+            all_sulci = sulci(head, in_ventricles)
+            finished("sulcus")
+        found["sulcus"] = _beside(all_sulci, dura.of_kind(*(set(KINDS) & set(wanted))))
     if "ependyma" in wanted:
         found["ependyma"] = ependyma(head, in_ventricles)
         finished("ependyma")

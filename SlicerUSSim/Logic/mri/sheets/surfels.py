@@ -73,6 +73,10 @@ class Surfels:
         """The surfels of a mask or of indices."""
         return Surfels(*(getattr(self, entry.name)[which] for entry in fields(self)))
 
+    def kinds(self) -> tuple[str, ...]:
+        """Names of the kinds that there are, in the order of KINDS."""
+        return tuple(KINDS[number] for number in np.unique(self.kind))
+
     def of_kind(self, *kinds: str) -> Surfels:
         """The surfels of some kinds only. Raises SimulationError for a name that is not in KINDS."""
         for name in kinds:

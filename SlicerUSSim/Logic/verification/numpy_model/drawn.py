@@ -31,9 +31,11 @@ class DrawnPlanes:
     is_drawn: np.ndarray
     gradient: np.ndarray
     distance: np.ndarray
-    #: Half the thickness, mm; amplitude of scatterers; reflection coefficient; label beside
+    #: Half the thickness, mm; amplitude of scatterers, and whether they are of the dura's tissue; reflection
+    #: coefficient; label beside
     half: np.ndarray
     level: np.ndarray
+    is_dura: np.ndarray
     reflection: np.ndarray
     beside: np.ndarray
     #: Whether a scatterer of the cell that starts at a voxel may lie in a sheet
@@ -67,8 +69,8 @@ class DrawnPlanes:
         return cls(
             found.labels, found.closed, spread(np.ones(len(plane))) > 0, spread(gradient),
             spread(((look & 2047) - 1024) / 64.0), spread((look >> 11 & 255) / 128.0),
-            spread(10.0 ** (0.25 * ((look >> 19 & 255) - 192) / 20.0)), spread(0.008 * (look >> 28)),
-            spread(plane >> 26), near_cell.ravel(),
+            spread(10.0 ** (0.25 * ((look >> 19 & 255) - 192) / 20.0)), spread(look >> 27 & 1) > 0,
+            spread(0.008 * (look >> 28)), spread(plane >> 26), near_cell.ravel(),
         )  # fmt: skip
 
 

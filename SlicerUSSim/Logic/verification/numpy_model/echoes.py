@@ -326,7 +326,7 @@ def drawn_labels(
         beside = near_cell & (label == acquisition["sheet_label"])
         beside &= labels.sheets.gradient.reshape(-1, 3)[corner].any(axis=1)
         label[beside] = labels.sheets.beside.ravel()[corner[beside]]
-    level = np.ones(len(label), np.float32)
+    level, is_dura = np.ones(len(label), np.float32), np.zeros(len(label), bool)
     if drawn is not None:
         # Where the kernel looks: the cells that the device flags
         looked_at = drawn.near_cell[here] | _has_membrane(acquisition, corners)
@@ -339,9 +339,10 @@ def drawn_labels(
         thin[has_plane] = inside[has_plane]
         normal[has_plane] = across[has_plane]
         level[has_plane] = drawn.level[at][has_plane]
+        is_dura[has_plane] = drawn.is_dura[at][has_plane]
         beside = looked_at & (label == acquisition["sheet_label"]) & drawn.is_drawn[corner]
         label[beside] = drawn.beside[corner[beside]].astype(int)
-    label[thin] = CONSTANTS["MEMBRANE_LABEL"]
+    label[thin] = np.where(is_dura[thin], acquisition["dura_label"], CONSTANTS["MEMBRANE_LABEL"])
     normal = normal[thin]
     size = np.maximum(np.sqrt((normal**2).sum(axis=1)), f32(1e-6))
     cosine = np.maximum(np.abs(normal @ direction) / size, f32(1e-6))
