@@ -165,8 +165,8 @@ def _region_at(
 
 
 def _depth(inside: np.ndarray, spacing_mm: np.ndarray) -> np.ndarray:
-    """(k, j, i) distance from what is not inside, also beyond the window."""
-    padded = ndimage.distance_transform_edt(np.pad(inside, 1), sampling=spacing_mm.tolist())
+    """(k, j, i) distance from what is not inside. Beyond the window it goes on as at its end: an image may be thin."""
+    padded = ndimage.distance_transform_edt(np.pad(inside, 1, mode="edge"), sampling=spacing_mm.tolist())
     return cast(np.ndarray, padded)[1:-1, 1:-1, 1:-1]
 
 

@@ -17,6 +17,8 @@ from SlicerUSSim.Logic.mri.coarse import largest_component
 from SlicerUSSim.Logic.mri.sheets.falx import thick_white_matter
 from SlicerUSSim.Logic.mri.sheets.head import Head
 from SlicerUSSim.Logic.mri.sheets.heights import patches
+from SlicerUSSim.Logic.mri.sheets.regions import ventricles
+from SlicerUSSim.Logic.mri.sheets.sulcal import sulci
 from SlicerUSSim.Logic.mri.sheets.surfels import Surfels
 
 #: The plane's normal is this near to left and right: heads are turned in scanners
@@ -79,55 +81,63 @@ class _Fissure:
         return bool(reach >= _LEAST_DEEP_MM and self.depth[self.inside].min() <= _AT_HULL_MM)
 
 
-def falx_of_part(head: Head, sulci: Surfels) -> Surfels:
-    """Surfels 1 mm apart on the falx; none where no fissure of the `sulci` is deep enough, as in one hemisphere.
+def falx_of_part(head: Head, surfels: Surfels) -> Surfels:
+    """Surfels 1 mm apart on the falx; none where no fissure of the sulci (`surfels`) is deep enough.
 
     Its free edge is not seen: it is taken 5 mm above the end of the fissure.
     """
+    fissure = _fissure(head, surfels)
+    return Surfels.joined([]) if fissure is None else _above_free_edge(fissure)
+
+
+def fissure_of_part(head: Head) -> np.ndarray:
+    """(n, 3) RAS mm of points 1 mm apart between the hemispheres, down to the end of the fissure; none if not found."""
+    fissure = _fissure(head, sulci(head, ventricles(head)))
+    return np.zeros((0, 3)) if fissure is None else fissure.place[fissure.inside]
+
+
+def _fissure(head: Head, surfels: Surfels) -> _Fissure | None:
     white = thick_white_matter(head)
-    for plane in _planes(sulci):
-        fissure = _fissure_at(head, sulci, plane, white)
-        if fissure.is_between_hemispheres:
-            return _above_free_edge(fissure)
-    return Surfels.joined([])
+    found = (_fissure_at(head, surfels, plane, white) for plane in _planes(surfels))
+    return next((fissure for fissure in found if fissure.is_between_hemispheres), None)
 
 
-def _planes(sulci: Surfels) -> Iterator[_Plane]:
+def _planes(surfels: Surfels) -> Iterator[_Plane]:
     """Planes across left and right, those with most sulci first."""
-    weight = sulci.area * sulci.confidence
-    some = np.linspace(0, len(sulci) - 1, min(_TRIED, len(sulci))).astype(int)
-    tried = [_plane_at(sulci, weight, sulci.place[n], sulci.normal[n]) for n in some]
+    weight = surfels.area * surfels.confidence
+    some = np.linspace(0, len(surfels) - 1, min(_TRIED, len(surfels))).astype(int)
+    tried = [_plane_at(surfels, weight, surfels.place[n], surfels.normal[n]) for n in some]
     tried = [plane for plane in tried if plane.normal[0] >= np.cos(np.radians(_MOST_TURN_DEG))]
     chosen: list[_Plane] = []
     for plane in sorted(tried, key=lambda plane: -plane.amount):
         if all(plane.is_apart(other) for other in chosen):
             chosen.append(plane)
-            yield _refined(sulci, weight, plane)
+            yield _refined(surfels, weight, plane)
         if len(chosen) == _LOOKED_AT:
             return
 
 
-def _plane_at(sulci: Surfels, weight: np.ndarray, middle: np.ndarray, normal: np.ndarray) -> _Plane:
+def _plane_at(surfels: Surfels, weight: np.ndarray, middle: np.ndarray, normal: np.ndarray) -> _Plane:
     normal = np.asarray(normal, float) * (1.0 if normal[0] >= 0.0 else -1.0)
-    is_near = np.abs((sulci.place - middle) @ normal) < _NEAR_MM
-    inside = is_near & (np.abs(sulci.normal @ normal) > np.cos(np.radians(_NEAR_DEG)))
+    is_near = np.abs((surfels.place - middle) @ normal) < _NEAR_MM
+    inside = is_near & (np.abs(surfels.normal @ normal) > np.cos(np.radians(_NEAR_DEG)))
     return _Plane(np.asarray(middle, float), normal, inside, float(weight[inside].sum()))
 
 
-def _refined(sulci: Surfels, weight: np.ndarray, plane: _Plane) -> _Plane:
+def _refined(surfels: Surfels, weight: np.ndarray, plane: _Plane) -> _Plane:
     """The plane of least squares through the sulci in it."""
     for _ in range(3):
         if np.count_nonzero(plane.inside) < 3:
             return plane
-        points, share = sulci.place[plane.inside].astype(float), weight[plane.inside]
+        points, share = surfels.place[plane.inside].astype(float), weight[plane.inside]
         middle = np.average(points, axis=0, weights=share)
         rows = np.linalg.svd((points - middle) * np.sqrt(share)[:, None], full_matrices=False)[2]
-        plane = _plane_at(sulci, weight, middle, rows[2])
+        plane = _plane_at(surfels, weight, middle, rows[2])
     return plane
 
 
-def _fissure_at(head: Head, sulci: Surfels, plane: _Plane, white: np.ndarray) -> _Fissure:
-    chosen, axes = sulci.chosen(plane.inside), plane.axes
+def _fissure_at(head: Head, surfels: Surfels, plane: _Plane, white: np.ndarray) -> _Fissure:
+    chosen, axes = surfels.chosen(plane.inside), plane.axes
     local = (chosen.place - plane.middle) @ axes.T  # (n, 3): height, forward, upward
     low = np.floor(local[:, 1:].min(axis=0)) - _SMOOTHING_MM
     high = np.ceil(local[:, 1:].max(axis=0)) + _SMOOTHING_MM

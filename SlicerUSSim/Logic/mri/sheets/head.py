@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -83,6 +84,20 @@ class Head:
         noise = float(segmentation.standard_deviations[names.index("white matter")])
         csf, grey, white = means
         return cls(grid, inside, csf, grey, white, noise, contrast == "t1gd", segmentation.atlas)
+
+    @classmethod
+    def of_part(
+        cls, image: Volume, brain: np.ndarray, means: Sequence[float], noise: float, is_enhanced: bool
+    ) -> Head:  # fmt: skip
+        """The head in which an atlas does not lead: `image` without bias field, (k, j, i) bool `brain` on its grid.
+
+        `means` are those of CSF, grey and white matter, which rise.
+        """
+        csf, grey, white = map(float, means)
+        grid = _working_grid(image)
+        if grid is not image:
+            brain = on_grid(image.with_array(brain.astype(np.float32)), grid) > 0.5
+        return cls(grid, brain, csf, grey, white, noise, is_enhanced, None)
 
     @property
     def atlas(self) -> AtlasFit:
