@@ -377,8 +377,8 @@ def test_what_cannot_be_found_is_said_before_the_search():
     with pytest.raises(SimulationError, match="expected one grid"):
         find_sheets(Volume(mri.array[1:], mri.ijk_to_ras), found, contrast="t1")
     without_atlas = replace(found, evidence=replace(found.evidence, atlas=None))
-    with pytest.raises(SimulationError, match="falx, vessels cannot be found without an atlas"):
-        find_sheets(mri, without_atlas, contrast="t1", kinds=["falx", "vessels"])
+    with pytest.raises(SimulationError, match="tentorium, vessels cannot be found without an atlas"):
+        find_sheets(mri, without_atlas, contrast="t1", kinds=["tentorium", "vessels"])
     with pytest.raises(SimulationError, match="expected the order of t2"):
         find_sheets(mri, found, contrast="t2")
 

@@ -12,7 +12,8 @@ from SlicerUSSim.Command.sheets import DrawnSheets
 from SlicerUSSim.Logic import SimulationError, TissueTable, UltrasoundSimulator, Volume
 from SlicerUSSim.Logic.mri.sheets import Surfels
 from SlicerUSSim.Logic.mri.sheets.polydata import write_surfels
-from SlicerUSSim.Logic.tissue.sheet_looks import looks_of
+from SlicerUSSim.Logic.tissue.presets import TISSUES
+from SlicerUSSim.Logic.tissue.sheet_looks import looks_of, with_dura
 from SlicerUSSim.Logic.verification.phantoms import layered
 from SlicerUSSim.Logic.verification.validation import sulci
 
@@ -83,6 +84,50 @@ def test_dura_has_a_coherent_echo_that_is_seen_square_only():
     wall, of_wall = grey(layers=[sulci._GREY, fluid])
     border = level_db(UltrasoundSimulator(wall.labels, of_wall, mirror), wall.probe_to_ras, 0.0, seeds=1)
     assert square == pytest.approx(border, abs=1.5)
+
+
+def test_dura_is_a_tissue_of_its_own_whose_level_a_fit_can_change():
+    """The level of falx and tentorium was tied to that of the membrane, which a fit may push below all tissue."""
+    phantom, tissues = grey()
+    surfels = Surfels.joined([plane(kind, phantom.probe_to_ras, at) for kind, at in (("falx", 15.0), ("sulcus", 8.0))])
+    simulator = UltrasoundSimulator(phantom.labels, tissues, sulci._SETTINGS, sheets=surfels)
+    table = simulator.medium.tissues
+    assert table.tissue("falx") == TISSUES["falx"] and "falx" not in tissues.names()
+
+    def change_db(depth_mm: float, **changed) -> float:
+        """By how much the level about this depth changes with the mu0 of tissues."""
+        power = []
+        for values in (table, louder(table, changed)):
+            with simulator.with_tissues(values):
+                frame = simulator.simulate(sulci._PROBE, phantom.probe_to_ras)
+            depth = (np.arange(frame.iq.shape[1]) + 0.5) * frame.sample_interval_mm
+            power.append((np.abs(frame.iq[:, np.abs(depth - depth_mm) < 0.3]) ** 2).mean())
+        return float(10.0 * np.log10(power[1] / power[0]))
+
+    def louder(values: TissueTable, changed: dict[str, float]) -> TissueTable:
+        for name, factor in changed.items():
+            tissue = values.tissue(name)
+            values = values.replace(name, mu0=factor * tissue.mu0, sigma0=factor * tissue.sigma0)
+        return values
+
+    own = {"falx": 4.0}
+    assert change_db(15.0, **own) == pytest.approx(12.0, abs=1.0) and abs(change_db(8.0, **own)) < 0.1
+    other = {tissues.membrane.tissue.name: 4.0}
+    assert abs(change_db(15.0, **other)) < 0.1 and change_db(8.0, **other) > 6.0
+    # What a user has set stays, also as a preset's that has no voxels of it
+    own_falx = replace(TISSUES["falx"], mu0=0.7)
+    assert with_dura(tissues, ["falx"], tissues.with_tissue(own_falx)).tissue("falx") == own_falx
+    assert with_dura(tissues, ["sulcus", "ependyma"]) is tissues
+
+
+def test_a_table_without_a_label_that_is_there_is_refused_also_with_dura():
+    phantom, tissues = grey()
+    array = phantom.labels.array.copy()
+    array[0, 0, 0] = 5
+    with pytest.raises(SimulationError, match="label 5 has no tissue"):
+        UltrasoundSimulator(
+            phantom.labels.with_array(array), tissues, sulci._SETTINGS, sheets=plane("falx", phantom.probe_to_ras)
+        )
 
 
 def test_without_sheets_nothing_changes():

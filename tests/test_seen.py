@@ -10,6 +10,7 @@ import pytest
 
 from SlicerUSSim.Logic import TissueTable, UltrasoundSimulator, Volume
 from SlicerUSSim.Logic.fitting.seen import parameters_seen, shares
+from SlicerUSSim.Logic.mri.sheets import Surfels
 from SlicerUSSim.Logic.probe import PROBES, ImageGrid
 from tests.conftest import rigid
 
@@ -45,6 +46,17 @@ def test_only_what_the_images_show_is_free(patient):
         "display", "grey matter.echogenicity_db", "grey matter.attenuation_db_cm_mhz", "white matter.echogenicity_db",
         "white matter.attenuation_db_cm_mhz", "tumour.echogenicity_db", "leptomeninges.echogenicity_db",
     ]  # fmt: skip
+
+
+@pytest.mark.parametrize(("aside_mm", "is_free"), [(0.0, True), (9.0, False)])
+def test_the_dura_that_was_found_in_an_image_is_free(patient, aside_mm, is_free):
+    simulator, tracked = patient
+    x, y = (values.ravel() for values in np.meshgrid(np.arange(20.0, 40.0), np.arange(15.0, 30.0)))
+    place = np.stack([x, y, np.full_like(x, 30.0 + aside_mm)], axis=1)
+    falx = Surfels.of("falx", place, np.broadcast_to(np.array([0.0, 1.0, 0.0]), place.shape), 0.5, 1.0, 1.0)
+    drawn = UltrasoundSimulator(simulator.medium.labels, simulator.medium.tissues, sheets=falx)
+    names = set(parameters_seen(["tissues"], drawn, tracked)) - set(parameters_seen(["tissues"], *patient))
+    assert names == ({"falx.echogenicity_db"} if is_free else set())
 
 
 def test_other_names_and_their_bounds_stay(patient):

@@ -26,7 +26,7 @@ from SlicerUSSim.Logic.imaging.sheets import sheet_planes
 from SlicerUSSim.Logic.mri.sheets.surfels import Surfels
 from SlicerUSSim.Logic.opencl.device import Device, divisible
 from SlicerUSSim.Logic.opencl.layout import CONSTANTS, TISSUE
-from SlicerUSSim.Logic.tissue.sheet_looks import looks_of
+from SlicerUSSim.Logic.tissue.sheet_looks import looks_of, with_dura
 from SlicerUSSim.Logic.tissue.table import MAX_LABEL, TissueTable
 from SlicerUSSim.Logic.tissue.tissue import Membrane
 
@@ -79,9 +79,10 @@ class Medium:
         #: Labels that occur, the most frequent first
         self.present = np.argsort(-counts, kind="stable")[: np.count_nonzero(counts)]
         self.dims = np.array(array.shape[::-1]) + 2 * _PAD
-        self._check(tissues)
         #: As given, or None
         self.sheets = sheets if sheets is not None and len(sheets) else None
+        self._check(tissues)
+        tissues = self._with_dura(tissues)
         #: uint16 [k][j][i]: label, flags and fluid distance; uint8 [k][j][i]: acoustic groups; and their indicators
         self.voxel_buffer: Buffer
         self.group_buffer: Buffer
@@ -110,6 +111,7 @@ class Medium:
         self.tissue_buffer = device.upload(self.rows)
         #: Counts the changes of tissues
         self.version = 0
+        #: As given; with falx and tentorium that were found, also their tissue
         self.tissues = tissues
         _log.debug(
             "acoustic medium: %s voxels, labels %s, %d acoustic groups of which %d smoothed, %s membrane, %s texture, "
@@ -144,6 +146,7 @@ class Medium:
     def set_tissues(self, tissues: TissueTable) -> None:
         """Change tissue parameters; voxels are uploaded only for a new membrane position or new acoustic groups."""
         self._check(tissues)
+        tissues = self._with_dura(tissues)
         groups_before, closed_before = self.rows["group"], self.found
         self.rows = self._tissue_rows(tissues)
         new_membrane = _membrane_shape(tissues) != _membrane_shape(self.tissues)
@@ -160,6 +163,10 @@ class Medium:
         self.device.write(self.tissue_buffer, self.rows)
         self.version += 1
         self.tissues = tissues
+
+    def _with_dura(self, tissues: TissueTable) -> TissueTable:
+        """The table with the tissue of falx and tentorium, if these were found and it has none."""
+        return tissues if self.sheets is None else with_dura(tissues, self.sheets.kinds())
 
     def _check(self, tissues: TissueTable) -> None:
         missing = [int(label) for label in sorted(self.present) if label not in tissues]

@@ -101,6 +101,7 @@ from SlicerUSSim.Logic.mrml.taken_image import (
 from SlicerUSSim.Logic.mrml.taken_sequence import FrozenRecord, in_node, read_taken, taken_of, write_taken
 from SlicerUSSim.Logic.probe.placement import pose_in_slice
 from SlicerUSSim.Logic.tissue.label_maps import LabelledTissues
+from SlicerUSSim.Logic.tissue.sheet_looks import with_dura
 from SlicerUSSim.Logic.tissue.table import TissueTable
 from SlicerUSSim.Logic.tissue.texture import Texture
 
@@ -1073,6 +1074,8 @@ class UltrasoundSceneLogic:
     ) -> UltrasoundSimulator:
         """Uses the device and no node; called within the work."""
         tissues = preset.tissues.for_names(patient.names)
+        if sheets is not None:
+            tissues = with_dura(tissues, sheets.kinds(), preset.tissues)
         return self._simulators.get(
             patient.version, patient.labels, tissues, preset.settings, self.device, texture, sheets
         )

@@ -68,13 +68,9 @@ def with_dura(tissues: TissueTable, kinds: Iterable[str], known: TissueTable | N
     With it, their level is that of a tissue of their own, which a fit changes, and not tied to the membrane's. Its
     parameters are those in the table `known`, or else the preset's. Unchanged if it is there, or no label is left.
     """
-    is_wanted = not set(kinds).isdisjoint(DURA_KINDS)
-    label = max(tissues, default=0) + 1
-    if not is_wanted or dura_label(tissues) >= 0 or label > MAX_LABEL:
+    if set(kinds).isdisjoint(DURA_KINDS) or dura_label(tissues) >= 0 or len(tissues) > MAX_LABEL:
         return tissues
-    other = dura_label(known) if known is not None else -1
-    tissue = known[other] if known is not None and other >= 0 else TISSUES[DURA]
-    return TissueTable({**tissues, label: tissue}, tissues.membrane)
+    return tissues.with_tissue(TISSUES[DURA] if known is None else _tissue(known, DURA))
 
 
 def _tissue(tissues: TissueTable, name: str) -> Tissue:

@@ -115,7 +115,7 @@ def find_sheets(
     notes += [first] if first else []
     if contrast != "t1gd" and set(_ENHANCING) & set(wanted):
         notes.append("no vessels and no choroid plexus are looked for: only a T1 with contrast agent shows them")
-    notes += _lines(surfels, structures, wanted)
+    notes += _lines(surfels, structures, wanted, is_whole=segmentation.atlas is not None)
     for line in notes:
         _log.info("%s", line)
     report(1.0)
@@ -205,14 +205,25 @@ def _labels(mri: Volume, head: Head, masks: dict[str, np.ndarray]) -> Volume:
     return Volume(labels, mri.ijk_to_ras, label_names=names)
 
 
-def _lines(surfels: Surfels, structures: Volume, wanted: tuple[str, ...]) -> list[str]:
+def _lines(surfels: Surfels, structures: Volume, wanted: tuple[str, ...], *, is_whole: bool) -> list[str]:
     lines = []
     for kind in KINDS:
         if kind in wanted:
             part = surfels.of_kind(kind)
-            lines.append(f"{kind}: {len(part)} surfels, {part.area.sum() / 100.0:.0f} cm²")
+            lines.append(f"{kind}: {len(part)} surfels, {part.area.sum() / 100.0:.0f} cm²{_how(part, kind, is_whole)}")
     for number, name in enumerate(STRUCTURES, 1):
         count = int((structures.array == number).sum())
         if name in wanted and (count or name == "corpus callosum"):
             lines.append(f"{name}: {count * structures.voxel_ml:.1f} ml")
     return lines
+
+
+def _how(found: Surfels, kind: str, is_whole: bool) -> str:
+    """What a user should know about a falx that no atlas leads."""
+    if kind != "falx" or is_whole:
+        return ""
+    if not len(found):
+        return ", since no straight sulcus is as deep as the fissure between the hemispheres"
+    return (
+        ", without an atlas, by the straight sulcus that is as deep as the fissure between the hemispheres: look at it"
+    )
