@@ -2,7 +2,8 @@
 
 One column for the real image, one for every source, and one for a picture of another program (--other NAME=FILE), in
 equal millimetres: the whole field, a part of it at its own pixels, and the same magnified. LABELS is a label map; the
-PRESET has probe, display and tissues, as of `ussim optimize --save-preset`. --credit is written below.
+PRESET has probe, display and tissues, as of `ussim optimize --save-preset`; a third file has sheets, as of `ussim
+segment --sheets`. --credit is written below.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from PIL import Image, ImageDraw
 
 from SlicerUSSim.Logic import Preset, TrackedSequence, UltrasoundSimulator, Volume
 from SlicerUSSim.Logic.fitting.tracked_fit import simulated
+from SlicerUSSim.Logic.mri.sheets.polydata import read_surfels
 from SlicerUSSim.Logic.tracked import TrackedImages
 
 _GAP, _HEAD, _MAGNIFIED = 6, 18, 3
@@ -25,7 +27,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("sequence", type=Path)
     parser.add_argument("--image", type=int, required=True)
-    parser.add_argument("--source", action="append", default=[], help="NAME=LABELS,PRESET")
+    parser.add_argument("--source", action="append", default=[], help="NAME=LABELS,PRESET[,SHEETS]")
     parser.add_argument("--other", help="NAME=FILE: a picture with the real image's pixel size, pasted as it is")
     parser.add_argument("--other-at", type=int, nargs=2, default=(0, 0), help="column and row of its face in FILE")
     parser.add_argument("--part", type=int, nargs=4, required=True, help="columns and rows from the field's corner")
@@ -36,14 +38,15 @@ def main() -> None:
     columns: list[tuple[str, np.ndarray]] = []
     for text in options.source:
         name, files = text.split("=", 1)
-        labels, preset_file = files.split(",")
+        labels, preset_file, *sheets = files.split(",")
         preset = Preset.read(preset_file)
         tracked = TrackedImages.of(sequence, [options.image], probe=preset.probe)
         if not columns:
             real = np.where(tracked.mask, tracked.images[0], 0).astype(np.uint8)
             columns.append((f"real, image {options.image}", real))
             shown = tracked
-        simulator = UltrasoundSimulator(Volume.read(labels), preset.tissues, preset.settings)
+        surfels = read_surfels(sheets[0]) if sheets else None
+        simulator = UltrasoundSimulator(Volume.read(labels), preset.tissues, preset.settings, sheets=surfels)
         (image,) = simulated(simulator, tracked, preset.tissues, preset.display)
         columns.append((name, np.where(tracked.mask, image, 0).astype(np.uint8)))
     if options.other:
