@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -16,6 +18,7 @@ from SlicerUSSim.Logic.mri.sheets.finding import ALL_KINDS  # noqa: E402
 from SlicerUSSim.Logic.mrml.label_nodes import write_labels  # noqa: E402
 from SlicerUSSim.Logic.mrml.nodes import node_to_world, write_volume  # noqa: E402
 from SlicerUSSim.Logic.mrml.sheet_nodes import read_sheets, sheets_version, write_sheets  # noqa: E402
+from SlicerUSSim.Logic.tissue.presets import TISSUES  # noqa: E402
 from tests.conftest import coarse_chest  # noqa: E402
 from tests.test_craniotomy_nodes import TURN  # noqa: E402
 from tests.test_lesion_nodes import HEAD, Scene  # noqa: E402
@@ -110,6 +113,36 @@ def test_segment_finds_sheets_and_images_show_them_as_those_of_the_command():
     presenter.setValue("scene.sheet_find", False)
     presenter.segment()
     assert parameters.sheets is None and "of an earlier Segment, are not shown any more" in presenter.notes()
+
+
+def test_the_tissue_of_the_falx_that_is_drawn_is_in_the_panel_and_changes_images():
+    bench, presenter = bench_with_probe()
+    presenter.segment()
+    presenter.placeProbe()
+    pose = node_to_world(bench.logic.parameters.probe_transform)
+    x, z = (values.ravel() for values in np.meshgrid(np.arange(-20.0, 20.0), np.arange(-20.0, 20.0)))
+    place = np.stack([x, np.full_like(x, 30.0), z], axis=1) @ pose[:3, :3].T + pose[:3, 3]
+    plane = Surfels.of("falx", place, np.broadcast_to(pose[:3, 1], place.shape), 0.8, 1.0, 1.0)
+    assert "falx" not in bench.logic.tissues(bench.logic.parameters.labels).names()
+    mine = bench.add("Model", "mine")
+    write_sheets(mine, plane, bench.mri)
+    bench.logic.parameters.sheets = mine
+
+    def image() -> np.ndarray:
+        presenter.simulate()
+        assert not presenter.view.errors, presenter.view.errors
+        return bench.logic.lastFrame.image.astype(int)
+
+    before = image()
+    assert "falx" in bench.logic.tissues(bench.logic.parameters.labels).names()
+    tissues = bench.logic.preset.tissues
+    falx = TISSUES["falx"]
+    louder = replace(falx, mu0=8.0 * falx.mu0, sigma0=8.0 * falx.sigma0)
+    bench.logic.preset = replace(bench.logic.preset, tissues=tissues.with_tissue(louder))
+    change = image() - before
+    near = np.abs(np.arange(len(change))[:, None] * bench.logic.lastFrame.grid.pixel_spacing_mm[1] - 30.0) < 1.5
+    near = np.broadcast_to(near, change.shape)
+    assert change[near].mean() > 5.0 and np.abs(change[~near]).mean() < 0.3
 
 
 @pytest.mark.slow

@@ -26,6 +26,7 @@ from SlicerUSSim.Logic.mrml.label_nodes import read_labels
 from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic
 from SlicerUSSim.Logic.mrml.nodes import nodes_of_class, pose_in_labels
 from SlicerUSSim.Logic.mrml.taken_image import TakenImage
+from SlicerUSSim.Logic.tissue.sheet_looks import with_dura
 from SlicerUSSim.Workstation.opener import FILE, Opener
 from SlicerUSSim.Workstation.script import LabelSource, python_script
 from SlicerUSSim.Workstation.tasks import Tasks
@@ -229,11 +230,11 @@ class Exports:
         )
         in_labels, moved = pose_in_labels(labels, taken.probe_to_world)
         require(np.allclose(moved, np.eye(4)), f"the transform of {labels.GetName()!r} scales, expected a rigid one")
-        names = read_labels(labels, preset.tissues).names
         sheets = self._shown_sheets(source)
-        text = python_script(
-            source, replace(preset, tissues=preset.tissues.for_names(names)), in_labels, sheets, taken.number
-        )
+        shown = KINDS if isinstance(sheets, str) else sheets
+        tissues = preset.tissues.for_names(read_labels(labels, preset.tissues).names)
+        tissues = with_dura(tissues, shown, preset.tissues)
+        text = python_script(source, replace(preset, tissues=tissues), in_labels, sheets, taken.number)
         needed = (*source.missing, *((sheets,) if isinstance(sheets, str) and not os.path.isabs(sheets) else ()))
         return text, tuple(dict.fromkeys(needed))
 

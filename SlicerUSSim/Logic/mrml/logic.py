@@ -213,8 +213,15 @@ class UltrasoundSceneLogic:
         self.parameters.preset = text
 
     def tissues(self, labels_node) -> TissueTable:
-        """The tissues of a label map or segmentation by name, from the preset's table or else the tissue presets."""
-        return self.preset.tissues.for_names(self._patient(labels_node).names)
+        """The tissues of a label map or segmentation by name, from the preset's table or else the tissue presets.
+
+        With that of falx and tentorium, if images show such sheets.
+        """
+        try:
+            sheets = self._sheets_of(labels_node)
+        except SimulationError:  # what is chosen has no sheets, which an image will tell
+            sheets = None
+        return _tissues_of(self.preset, self._patient(labels_node).names, sheets)
 
     def settings(self, labels_node) -> SimulationSettings:
         """The preset's settings, with gel between skin and probe (GEL_MM) where labels have skin and nobody says more.
@@ -1073,9 +1080,7 @@ class UltrasoundSceneLogic:
         self, patient: Patient, preset: Preset, texture: Texture | None, sheets: Surfels | None
     ) -> UltrasoundSimulator:
         """Uses the device and no node; called within the work."""
-        tissues = preset.tissues.for_names(patient.names)
-        if sheets is not None:
-            tissues = with_dura(tissues, sheets.kinds(), preset.tissues)
+        tissues = _tissues_of(preset, patient.names, sheets)
         return self._simulators.get(
             patient.version, patient.labels, tissues, preset.settings, self.device, texture, sheets
         )
@@ -1124,3 +1129,9 @@ def _in_frame_of(volume_node, node) -> Volume:
     """A volume in the own frame of another node, before its parent transform."""
     volume = read_volume(volume_node, "second MRI")
     return Volume(volume.array, np.linalg.inv(node_to_world(node)) @ node_to_world(volume_node) @ volume.ijk_to_ras)
+
+
+def _tissues_of(preset: Preset, names: Sequence[str], sheets: Surfels | None) -> TissueTable:
+    """The tissues of labels with these names, and of the sheets."""
+    tissues = preset.tissues.for_names(names)
+    return tissues if sheets is None else with_dura(tissues, sheets.kinds(), preset.tissues)

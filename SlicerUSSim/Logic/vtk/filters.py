@@ -49,6 +49,7 @@ from SlicerUSSim.Logic.probe.shape import outline_polydata
 from SlicerUSSim.Logic.tissue.label_advice import MRI_SCRIPT, SCRIPT
 from SlicerUSSim.Logic.tissue.label_findings import NoPatientError
 from SlicerUSSim.Logic.tissue.label_maps import read_label_map
+from SlicerUSSim.Logic.tissue.sheet_looks import with_dura
 from SlicerUSSim.Logic.tissue.table import MAX_LABEL, TissueTable
 from SlicerUSSim.Logic.tissue.texture import Texture
 
@@ -435,9 +436,11 @@ class UltrasoundSimulationFilter(_ImageFilter):
     def RequestData(self, request, inInfo, outInfo):  # noqa: N803
         self._frame = None
         labels = vtkImageData.GetData(inInfo[0])
-        volume, tissues = self._patient(labels)
+        (volume, tissues), sheets = self._patient(labels), self._chosen_sheets()
+        if sheets is not None:
+            tissues = with_dura(tissues, sheets.kinds(), self._tissues)
         simulator = self._simulator.get(
-            labels.GetMTime(), volume, tissues, self._settings, self._device, self._texture, self._chosen_sheets()
+            labels.GetMTime(), volume, tissues, self._settings, self._device, self._texture, sheets
         )
         pose = self._pose()
         self._frame = simulator.simulate(self._probe, pose, self._display, noise_seed=seed_of_pose(pose))
