@@ -19,8 +19,6 @@ _CSF, _GREY, _WHITE = range(len(TISSUES))
 #: Of two tissues, the share at which a voxel counts as the second; of tissue in CSF that is bright, as in T2, where
 #: oedema may be half-way to it
 _MIDDLE, _MIDDLE_BRIGHT = 0.5, 0.35
-#: From the fissure between the hemispheres, whose points are 1 mm apart, to its sides
-_FISSURE_MM = 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,6 +43,8 @@ class Evidence:
     atlas: AtlasFit | None
     #: Whether a bias field was found, and removed
     had_field: bool = False
+    #: (k, j, i) bool: around the fissure between the hemispheres, as found without an atlas; None: not looked for
+    fissure: np.ndarray | None = None
 
     @property
     def grid(self) -> Volume:
@@ -156,37 +156,11 @@ class Evidence:
     def is_between_hemispheres(self, window: tuple[slice, slice, slice]) -> np.ndarray:
         """(k, j, i) bool in a window: at the midline, where the atlas expects no white matter: fissure and falx.
 
-        Without an atlas, where the deepest straight sulcus is, if that is the fissure (sheets/falx_of_part.py).
+        Without an atlas, where the fissure was found.
         """
         if self.sideways_mm is None or self.expected is None:
-            return self._fissure[window]
+            if self.fissure is not None:
+                return self.fissure[window]
+            return np.zeros([part.stop - part.start for part in window], bool)
         near = np.abs(self.sideways_mm[window]) < max(0.75 * float(self.spacing_mm.max()), 1.0)
         return near & (self.expected[_WHITE][window] < _MIDDLE)
-
-    @cached_property
-    def _fissure(self) -> np.ndarray:
-        """(k, j, i) bool: around the fissure between the hemispheres, as it is found without an atlas."""
-        from SlicerUSSim.Logic.mri.sheets.falx_of_part import fissure_of_part
-        from SlicerUSSim.Logic.mri.sheets.head import Head
-
-        result = np.zeros(self.inside.shape, bool)
-        channel = self.channel("t1", "t1gd", "t2")
-        if channel is None:
-            return result
-        sign = np.float32(-1.0 if self.contrasts[channel] == "t2" else 1.0)
-        means = sign * self.means[:, channel]
-        if not means[0] < means[1] < means[2]:
-            return result
-        head = Head.of_part(
-            Volume(sign * self.images[channel], self.ijk_to_ras), self.inside, means,
-            float(self.deviations[channel]), self.contrasts[channel] == "t1gd",
-        )  # fmt: skip
-        places = fissure_of_part(head)
-        if not len(places):
-            return result
-        ijk = places @ np.linalg.inv(self.ijk_to_ras)[:3, :3].T + np.linalg.inv(self.ijk_to_ras)[:3, 3]
-        index = np.rint(ijk[:, ::-1]).astype(int)
-        index = index[((index >= 0) & (index < result.shape)).all(axis=1)]
-        result[tuple(index.T)] = True
-        away = ndimage.distance_transform_edt(~result, sampling=self.spacing_mm.tolist())
-        return np.asarray(away) < _FISSURE_MM + 0.5 * float(self.spacing_mm.max())

@@ -13,6 +13,7 @@ from SlicerUSSim.Logic.base.errors import SimulationError, either, require
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.mri.lesions.doubts import why_no_lesion
 from SlicerUSSim.Logic.mri.lesions.evidence import Evidence
+from SlicerUSSim.Logic.mri.lesions.fissure import with_fissure
 from SlicerUSSim.Logic.mri.lesions.growth import Region, distance_from, grow, smoothed, with_foot
 from SlicerUSSim.Logic.mri.lesions.looks import (
     SNAP_MM,
@@ -91,7 +92,7 @@ def grow_lesion(segmentation: Segmentation, seed_ras_mm: Sequence[float], tissue
 
     Takes 1 to 4 seconds.
     """
-    evidence = segmentation.evidence
+    evidence = with_fissure(segmentation.evidence)
     named = None if tissue is None else lesion_tissue(tissue)
     seed = require_in_image(segmentation.labels, seed_ras_mm)
     index = _require_in_brain(evidence, seed)
@@ -282,7 +283,7 @@ def _require_in_brain(evidence: Evidence, seed: np.ndarray) -> np.ndarray:
 
 def proposal_of(segmentation: Segmentation, grown: Grown, seed: np.ndarray, named: str | None) -> Proposal:
     """The parts of a region, and what belongs to it."""
-    evidence = segmentation.evidence
+    evidence = with_fissure(segmentation.evidence)
     inside = grown.in_box(evidence)
     parts: dict[str, np.ndarray] = {}
     if named is not None:
