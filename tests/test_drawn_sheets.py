@@ -118,6 +118,9 @@ def test_dura_is_a_tissue_of_its_own_whose_level_a_fit_can_change():
     own_falx = replace(TISSUES["falx"], mu0=0.7)
     assert with_dura(tissues, ["falx"], tissues.with_tissue(own_falx)).tissue("falx") == own_falx
     assert with_dura(tissues, ["sulcus", "ependyma"]) is tissues
+    # Not under the next label, which is another tissue's in label maps for which a preset with it is used
+    label = table.label_of("falx")
+    assert label == 62 and max(tissues) < label
 
 
 def test_a_table_without_a_label_that_is_there_is_refused_also_with_dura():

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
 import pytest
 from scipy import ndimage
 from scipy.spatial import KDTree
+from scipy.spatial.transform import Rotation
 
-from SlicerUSSim.Logic import Segmentation, Volume, segment_mri
+from SlicerUSSim.Logic import Segmentation, SimulationError, Volume, segment_mri
+from SlicerUSSim.Logic.mri.lesions.fissure import with_fissure
+from SlicerUSSim.Logic.mri.lesions.growth import grow
 from SlicerUSSim.Logic.mri.lesions.seeded import grow_lesion
 from SlicerUSSim.Logic.mri.sheets import Surfels, find_sheets
 from SlicerUSSim.Logic.mri.sheets.falx_of_part import falx_of_part
@@ -80,12 +84,37 @@ def test_sulci_of_one_hemisphere_are_no_falx():
     assert len(falx_in(empty, np.ones((20, 20, 20), bool))) == 0
 
 
-def test_a_head_that_lies_on_its_side_has_none():
-    """A plane across front and back is no falx."""
+@pytest.mark.parametrize(
+    ("axis", "degrees", "is_falx"),
+    [("z", 20.0, True), ("y", 10.0, True), ("z", 90.0, False), ("y", 40.0, False), ("y", 180.0, False)],
+    ids=["turned", "rolled", "across front and back", "as steep as the tentorium", "from below, as cisterns"],
+)
+def test_a_plane_that_does_not_divide_left_from_right_from_above_is_none(axis, degrees, is_falx):
     image, brain = slab()
-    turned = image.ijk_to_ras.copy()
-    turned[:3, :3] = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
-    assert len(falx_in(Volume(image.array, turned), brain)) == 0
+    turn = np.eye(4)
+    turn[:3, :3] = Rotation.from_euler(axis, degrees, degrees=True).as_matrix()
+    assert (len(falx_in(Volume(image.array, turn @ image.ijk_to_ras), brain)) > 100) == is_falx
+
+
+@pytest.mark.parametrize("thick", [2, 3])
+def test_thin_images_are_refused_or_have_none(thick):
+    image, brain = slab()
+    mask = image.with_array(brain.astype(np.uint8))
+    thin, inside = (Volume(np.ascontiguousarray(v.array[:, :thick]), v.ijk_to_ras) for v in (image, mask))
+    segmentation = replace(segment_mri(image, mask=mask, bias_correction=False), labels=thin.with_array(inside.array))
+    evidence = segmentation.evidence
+    cut = replace(
+        evidence, images=evidence.images[:, :, :thick], inside=evidence.inside[:, :thick], shape=thin.array.shape
+    )
+    assert with_fissure(cut).fissure.shape == cut.inside.shape
+    if thick == 2:
+        with pytest.raises(SimulationError, match="2 voxels of 1 mm thick, expected at least 3"):
+            falx_in(thin, inside.array > 0)
+    likeness = np.where(np.hypot(*np.ogrid[-20:20, -20:20]) < 8.0, 1.0, 0.0)[:, None].repeat(thick, 1)
+    region = grow(
+        likeness.astype(np.float32), np.ones(likeness.shape, bool), np.array([20, 1, 20]), np.ones(3), largest_mm=70.0
+    )
+    assert region is not None and 0.5 < region.inside.sum() / (likeness > 0.5).sum() < 1.3
 
 
 def test_find_sheets_has_the_falx_of_a_part_and_not_twice():

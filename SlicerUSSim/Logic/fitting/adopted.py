@@ -8,6 +8,7 @@ from typing import Any
 
 from SlicerUSSim.Logic.fitting.tracked_fit import Fit
 from SlicerUSSim.Logic.imaging.preset import Preset
+from SlicerUSSim.Logic.tissue.sheet_looks import DURA, DURA_KINDS, with_dura
 
 #: Of a section that has no such value
 _NONE = object()
@@ -22,6 +23,8 @@ def with_fit(preset: Preset, found: Fit) -> Preset:
     changed = set(found.appearance.parameters.varied())
     if found.speckle is not None:  # which gives tissues a texture
         changed |= {tissue.name for tissue in found.speckle.tissues.all_tissues() if tissue.texture_db > 0.0}
+    if DURA in changed:  # of sheets that were found: under the label that it has in images
+        tissues = with_dura(tissues, DURA_KINDS)
     for name in sorted(changed):
         tissues = tissues.with_tissue(found.appearance.tissues.tissue(name))
     return replace(preset, probe=found.tracked.probe, display=found.appearance.display, tissues=tissues)

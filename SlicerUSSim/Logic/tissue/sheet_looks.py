@@ -68,9 +68,12 @@ def with_dura(tissues: TissueTable, kinds: Iterable[str], known: TissueTable | N
     With it, their level is that of a tissue of their own, which a fit changes, and not tied to the membrane's. Its
     parameters are those in the table `known`, or else the preset's. Unchanged if it is there, or no label is left.
     """
-    if set(kinds).isdisjoint(DURA_KINDS) or dura_label(tissues) >= 0 or len(tissues) > MAX_LABEL:
+    # The last free label: the next one may be another tissue's in label maps for which a preset is used
+    label = next((label for label in range(MAX_LABEL, 0, -1) if label not in tissues), None)
+    if set(kinds).isdisjoint(DURA_KINDS) or dura_label(tissues) >= 0 or label is None:
         return tissues
-    return tissues.with_tissue(TISSUES[DURA] if known is None else _tissue(known, DURA))
+    tissue = TISSUES[DURA] if known is None else _tissue(known, DURA)
+    return TissueTable({**tissues, label: tissue}, tissues.membrane)
 
 
 def _tissue(tissues: TissueTable, name: str) -> Tissue:

@@ -11,7 +11,7 @@ from scipy import ndimage
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.mri.lesions.evidence import Evidence
 from SlicerUSSim.Logic.mri.sheets.falx_of_part import fissure_of_part
-from SlicerUSSim.Logic.mri.sheets.head import Head
+from SlicerUSSim.Logic.mri.sheets.head import LEAST_VOXELS, Head
 
 #: From the fissure, whose points are 1 mm apart, to its sides
 _SIDE_MM = 1.0
@@ -42,6 +42,8 @@ def _fissure(evidence: Evidence) -> np.ndarray:
         return result
     image = Volume(sign * evidence.images[channel], evidence.ijk_to_ras)
     head = Head.of_part(image, inside, means.tolist(), float(evidence.deviations[channel]), contrast == "t1gd")
+    if min(head.brain.shape) < LEAST_VOXELS:
+        return result
     places = fissure_of_part(head)
     index = np.rint((places @ image.ras_to_ijk[:3, :3].T + image.ras_to_ijk[:3, 3])[:, ::-1]).astype(int)
     index = index[((index >= 0) & (index < inside.shape)).all(axis=1)]

@@ -65,7 +65,7 @@ def grow(
     if largest_mm > _FINE_REACH_MM and step.max() > 1:
         return _on_coarse(likeness, allowed, seed, spacing_mm, step, largest_mm)
     smooth = smoothed(likeness, allowed, spacing_mm)
-    steepness = np.sqrt(sum(slope**2 for slope in np.gradient(smooth, *spacing_mm.tolist())))
+    steepness = _steepness(smooth, spacing_mm)
     distance = distance_from(seed, likeness.shape, spacing_mm)
     best: Region | None = None
     for level in _LEVELS:
@@ -82,6 +82,13 @@ def grow(
         if best is None or slope > best.slope:
             best = Region(inside, float(level), slope, radius)
     return best
+
+
+def _steepness(values: np.ndarray, spacing_mm: np.ndarray) -> np.ndarray:
+    """(k, j, i) magnitude of the gradient, per mm; across a single voxel nothing changes."""
+    axes = [axis for axis, size in enumerate(values.shape) if size > 1]
+    slopes = (np.gradient(values, float(spacing_mm[axis]), axis=axis) for axis in axes)
+    return np.sqrt(sum((slope**2 for slope in slopes), np.zeros_like(values)))
 
 
 def _on_coarse(

@@ -21,8 +21,9 @@ from SlicerUSSim.Logic.mri.sheets.regions import ventricles
 from SlicerUSSim.Logic.mri.sheets.sulcal import sulci
 from SlicerUSSim.Logic.mri.sheets.surfels import Surfels
 
-#: The plane's normal is this near to left and right: heads are turned in scanners
-_MOST_TURN_DEG = 35.0
+#: The plane's normal is this near to left and right, and to the axial plane: heads are turned in scanners. Those of the
+#: leaves of the tentorium are steeper
+_MOST_TURN_DEG, _MOST_ROLL_DEG = 30.0, 20.0
 #: Sulci within this distance and angle of a plane are in it; another plane is this much farther away or turned
 _NEAR_MM, _NEAR_DEG, _APART_MM, _APART_DEG = 3.0, 35.0, 10.0, 30.0
 #: Places of sulci at which planes are tried, and planes of most sulci that are looked at
@@ -31,8 +32,9 @@ _TRIED, _LOOKED_AT = 800, 6
 _STEP_MM, _SMOOTHING_MM, _LEAST_COVER = 1.0, 4.0, 0.12
 #: The fissure begins at most so far below the hull or the end of the image, and gaps as long are bridged
 _TOP_MM, _GAP_MM = 8.0, 8.0
-#: How deep the deepest tenth of it reaches at least, and how near to the hull the highest part
-_LEAST_DEEP_MM, _AT_HULL_MM = 30.0, 3.0
+#: How deep the deepest tenth of it reaches at least, and how near to the hull it comes; there the hull is not below it,
+#: as below cisterns: upwards its depth grows by less than this, per mm
+_LEAST_DEEP_MM, _AT_HULL_MM, _FROM_BELOW = 30.0, 3.0, 0.5
 #: From the end of the fissure up to the free edge: 3 mm at the back of MNI152 and 16 mm in front (falx.FREE_EDGE); and
 #: how far it is below the top there, but at the back, where fissure and falx end together
 _FREE_MM, _WIDEST_MM = 5.0, 42.0
@@ -57,6 +59,12 @@ class _Plane:
         up /= np.linalg.norm(up)
         return np.stack([self.normal, np.cross(up, self.normal), up])
 
+    @property
+    def is_across(self) -> bool:
+        """Whether it may divide left from right."""
+        turn, roll = np.cos(np.radians(_MOST_TURN_DEG)), np.sin(np.radians(_MOST_ROLL_DEG))
+        return bool(self.normal[0] >= turn and abs(self.normal[2]) <= roll)
+
     def is_apart(self, other: _Plane) -> bool:
         is_turned = abs(self.normal @ other.normal) < np.cos(np.radians(_APART_DEG))
         return bool(is_turned or abs((self.middle - other.middle) @ other.normal) > _APART_MM)
@@ -78,7 +86,8 @@ class _Fissure:
             return False
         deepest = np.where(self.inside, self.depth, 0.0).max(axis=0)
         reach = np.percentile(deepest[deepest > 0.0], 90.0) if (deepest > 0.0).any() else 0.0
-        return bool(reach >= _LEAST_DEEP_MM and self.depth[self.inside].min() <= _AT_HULL_MM)
+        at_hull = self.inside & (self.depth <= _AT_HULL_MM) & (np.gradient(self.depth, axis=0) < _FROM_BELOW * _STEP_MM)
+        return bool(reach >= _LEAST_DEEP_MM and at_hull.any())
 
 
 def falx_of_part(head: Head, surfels: Surfels) -> Surfels:
@@ -93,7 +102,12 @@ def falx_of_part(head: Head, surfels: Surfels) -> Surfels:
 def fissure_of_part(head: Head) -> np.ndarray:
     """(n, 3) RAS mm of points 1 mm apart between the hemispheres, down to the end of the fissure; none if not found."""
     fissure = _fissure(head, sulci(head, ventricles(head)))
-    return np.zeros((0, 3)) if fissure is None else fissure.place[fissure.inside]
+    if fissure is None:
+        return np.zeros((0, 3))
+    # Some millimetres farther down, where it fades
+    down = np.zeros((2 * round(_FREE_MM / _STEP_MM) + 1, 1), bool)
+    down[: len(down) // 2 + 1] = True
+    return fissure.place[np.asarray(ndimage.binary_dilation(fissure.inside, down)).astype(bool)]
 
 
 def _fissure(head: Head, surfels: Surfels) -> _Fissure | None:
@@ -107,12 +121,14 @@ def _planes(surfels: Surfels) -> Iterator[_Plane]:
     weight = surfels.area * surfels.confidence
     some = np.linspace(0, len(surfels) - 1, min(_TRIED, len(surfels))).astype(int)
     tried = [_plane_at(surfels, weight, surfels.place[n], surfels.normal[n]) for n in some]
-    tried = [plane for plane in tried if plane.normal[0] >= np.cos(np.radians(_MOST_TURN_DEG))]
+    tried = [plane for plane in tried if plane.is_across]
     chosen: list[_Plane] = []
     for plane in sorted(tried, key=lambda plane: -plane.amount):
         if all(plane.is_apart(other) for other in chosen):
             chosen.append(plane)
-            yield _refined(surfels, weight, plane)
+            better = _refined(surfels, weight, plane)
+            if better.is_across:
+                yield better
         if len(chosen) == _LOOKED_AT:
             return
 

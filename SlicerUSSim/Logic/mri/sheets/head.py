@@ -20,6 +20,8 @@ from SlicerUSSim.Logic.mri.segmentation import Segmentation
 #: Voxels of the grid on which sheets are looked for; an image whose voxels differ by less than the share from the
 #: nearest of these stays as it is
 _FINEST_MM, _COARSEST_MM, _NEAR = 0.8, 1.0, 0.15
+#: Along each axis of that grid
+LEAST_VOXELS = 3
 #: Around the brain
 _MARGIN_MM = 10.0
 #: Across which sulci are closed, so that depth is counted from the hull of the brain
@@ -137,6 +139,12 @@ class Head:
         """
         radius = _HULL_MM / float(self.spacing.mean())
         n = 2 * int(radius) + 2
+        thinnest = min(self.brain.shape)
+        require(
+            thinnest >= LEAST_VOXELS,
+            f"the image is {thinnest} voxels of {self.image.spacing_mm.min():.2g} mm thick, expected at least "
+            f"{LEAST_VOXELS} to find sheets in it",
+        )
         # On another grid than the image's, the outermost voxels are outside.
         inner = self.brain[1:-1, 1:-1, 1:-1]
         hull = closed(np.pad(inner, n + 1, mode="edge"), radius)
