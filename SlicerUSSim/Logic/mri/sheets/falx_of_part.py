@@ -26,8 +26,8 @@ from SlicerUSSim.Logic.mri.sheets.surfels import Surfels
 _MOST_TURN_DEG, _MOST_ROLL_DEG = 30.0, 20.0
 #: Sulci within this distance and angle of a plane are in it; another plane is this much farther away or turned
 _NEAR_MM, _NEAR_DEG, _APART_MM, _APART_DEG = 3.0, 35.0, 10.0, 30.0
-#: Places of sulci at which planes are tried, and planes of most sulci that are looked at
-_TRIED, _LOOKED_AT = 800, 6
+#: Places of sulci at which planes are tried, planes of most sulci that are looked at, and fewest surfels in one
+_TRIED, _LOOKED_AT, _LEAST_SULCI = 800, 6, 30
 #: Grid of the height field; standard deviation by which heights are smoothed, and least share that sulci cover of it
 _STEP_MM, _SMOOTHING_MM, _LEAST_COVER = 1.0, 4.0, 0.12
 #: The fissure begins at most so far below the hull or the end of the image, and gaps as long are bridged
@@ -127,7 +127,7 @@ def _planes(surfels: Surfels) -> Iterator[_Plane]:
         if all(plane.is_apart(other) for other in chosen):
             chosen.append(plane)
             better = _refined(surfels, weight, plane)
-            if better.is_across:
+            if better.is_across and np.count_nonzero(better.inside) >= _LEAST_SULCI:
                 yield better
         if len(chosen) == _LOOKED_AT:
             return
@@ -143,7 +143,7 @@ def _plane_at(surfels: Surfels, weight: np.ndarray, middle: np.ndarray, normal: 
 def _refined(surfels: Surfels, weight: np.ndarray, plane: _Plane) -> _Plane:
     """The plane of least squares through the sulci in it."""
     for _ in range(3):
-        if np.count_nonzero(plane.inside) < 3:
+        if np.count_nonzero(plane.inside) < _LEAST_SULCI:
             return plane
         points, share = surfels.place[plane.inside].astype(float), weight[plane.inside]
         middle = np.average(points, axis=0, weights=share)
