@@ -12,12 +12,11 @@ import logging
 
 import numpy as np
 from brain_extraction import SHARED
-from scipy import ndimage
 from scipy.spatial import KDTree
 
 from SlicerUSSim.Logic import SimulationError, Volume, segment_mri
 from SlicerUSSim.Logic.mri.sheets import find_sheets
-from SlicerUSSim.Logic.verification.brain_phantoms import COLIN27
+from SlicerUSSim.Logic.verification.brain_phantoms import COLIN27, cut_to, part_box
 
 #: From and to, of the brain's extent along R, A and S
 PARTS = {
@@ -39,30 +38,13 @@ PARTS = {
 _MARGIN = 8
 
 
-def cut(volume: Volume, mask: Volume, part: tuple[tuple[float, float], ...]) -> Volume:
-    """A part of a volume on the grid of the brain mask, along its voxels."""
-    box = ndimage.find_objects((mask.array > 0).astype(np.uint8))[0]
-    inside = list(box)
-    for ras, (low, high) in enumerate(part):
-        column = int(np.abs(mask.ijk_to_ras[ras, :3]).argmax())
-        if mask.ijk_to_ras[ras, column] < 0.0:
-            low, high = 1.0 - high, 1.0 - low
-        side = box[2 - column]
-        size = side.stop - side.start
-        start = side.start + int(low * size) - (_MARGIN if low == 0.0 else 0)
-        stop = side.start + int(high * size) + (_MARGIN if high == 1.0 else 0)
-        inside[2 - column] = slice(max(start, 0), min(stop, volume.array.shape[2 - column]))
-    matrix = volume.ijk_to_ras.copy()
-    matrix[:3, 3] = (matrix @ [*(axis.start for axis in reversed(inside)), 1.0])[:3]
-    return Volume(np.ascontiguousarray(volume.array[tuple(inside)]), matrix)
-
-
 def compare(name: str, mri: Volume, contrast: str) -> None:
     whole = segment_mri(mri, contrast=contrast)
     mask = whole.brain.mask
     truth = find_sheets(mri, whole, contrast=contrast, kinds=["falx"]).surfels
     for title, part in PARTS.items():
-        image, inside = cut(mri, mask, part), cut(mask, mask, part)
+        box = part_box(mask, part, _MARGIN)
+        image, inside = cut_to(mri, box), cut_to(mask, box)
         try:
             segmentation = segment_mri(image, mask=inside, contrast=contrast)
         except SimulationError as error:

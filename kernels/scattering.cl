@@ -249,7 +249,7 @@ inline int drawn_label(__constant const Acquisition *acquisition, __global const
   if ((hash_mix(random) & 255u) < ((known >> 8) & 255u)) label = known & LABEL_MASK;
 #endif
   if (corner[0] & NO_MEMBRANE) return label;
-  int is_membrane = 0, sheet_tissue = MEMBRANE_LABEL;
+  int is_membrane = 0, tissue = MEMBRANE_LABEL;
   if (acquisition->sheet_label >= 0) {
     float3 offset, normal;
     const Sheet sheet = nearest_sheet(acquisition, planes, at, &offset);
@@ -259,7 +259,7 @@ inline int drawn_label(__constant const Acquisition *acquisition, __global const
     if (label == acquisition->sheet_label && drawn_plane) label = label_beside_sheet(drawn_plane);
 #ifdef FOUND
     if (sheet.look && !is_membrane) return label;
-    if (is_dura(sheet.look)) sheet_tissue = acquisition->dura_label | ON_SHEET;
+    if (is_dura(sheet.look)) tissue = acquisition->dura_label | ON_SHEET;
 #endif
   }
   if (!is_membrane) {
@@ -271,7 +271,7 @@ inline int drawn_label(__constant const Acquisition *acquisition, __global const
     if (fabs(blend(near_z, far_z, at.z) - 127.5f) >= acquisition->membrane_reach) return label;
   }
   *gain = 1.0f;
-  return is_membrane ? sheet_tissue : MEMBRANE_LABEL;
+  return tissue;
 }
 
 // A scatterer of the membrane is the brighter the more squarely the beam meets the sheet. Its normal is that of the

@@ -19,7 +19,7 @@ from SlicerUSSim.Logic.mri.sheets import Surfels, find_sheets
 from SlicerUSSim.Logic.mri.sheets.falx_of_part import falx_of_part
 from SlicerUSSim.Logic.mri.sheets.head import Head
 from SlicerUSSim.Logic.mri.sheets.sulcal import sulci
-from SlicerUSSim.Logic.verification.brain_phantoms import COLIN27
+from SlicerUSSim.Logic.verification.brain_phantoms import COLIN27, cut_to, part_box
 
 FLUID, GREY, WHITE, NOISE = 20.0, 100.0, 140.0, 4.0
 #: Top of the corpus callosum and of the brain, and the deep end of other sulci, S mm
@@ -166,18 +166,8 @@ def test_the_falx_of_a_part_is_that_of_the_whole_head(part, is_there):
     """Control: the falx by the atlas; and parts that have none."""
     mri, whole = colin27()
     mask = whole.brain.mask
-    box = ndimage.find_objects((mask.array > 0).astype(np.uint8))[0]
-    cut = []
-    for ras, (low, high) in zip((2, 1, 0), reversed(part), strict=True):  # along k, j, i
-        column = int(np.abs(mri.ijk_to_ras[ras, :3]).argmax())
-        if mri.ijk_to_ras[ras, column] < 0.0:
-            low, high = 1.0 - high, 1.0 - low
-        side = box[2 - column]
-        size = side.stop - side.start
-        cut.append(slice(side.start + int(low * size), side.start + int(high * size)))
-    matrix = mri.ijk_to_ras.copy()
-    matrix[:3, 3] = (matrix @ [cut[2].start, cut[1].start, cut[0].start, 1.0])[:3]
-    image, inside = (Volume(np.ascontiguousarray(volume.array[tuple(cut)]), matrix) for volume in (mri, mask))
+    box = part_box(mask, part)
+    image, inside = cut_to(mri, box), cut_to(mask, box)
     segmentation = segment_mri(image, mask=inside)
     assert segmentation.atlas is None
     found = find_sheets(image, segmentation, contrast="t1", kinds=("falx",)).surfels

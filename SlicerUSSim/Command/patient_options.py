@@ -41,7 +41,6 @@ if TYPE_CHECKING:
     from SlicerUSSim.Logic.base import Volume
     from SlicerUSSim.Logic.imaging import Preset, UltrasoundSimulator
     from SlicerUSSim.Logic.mri import Added
-    from SlicerUSSim.Logic.mri.sheets import Surfels
     from SlicerUSSim.Logic.probe import Probe
     from SlicerUSSim.Logic.tissue import TissueTable
 
@@ -194,6 +193,7 @@ def open_examination(patient: PatientOptions, pose: np.ndarray | str | None = No
     import logging  # imported here to keep --help fast
 
     from SlicerUSSim.Logic.base.volume import Volume
+    from SlicerUSSim.Logic.imaging.found_sheets import with_their_tissue
     from SlicerUSSim.Logic.imaging.simulator import UltrasoundSimulator
     from SlicerUSSim.Logic.mri.outside import require_findable
     from SlicerUSSim.Logic.mri.pathology import texture_below
@@ -239,7 +239,7 @@ def open_examination(patient: PatientOptions, pose: np.ndarray | str | None = No
         added = Additions.read(patient.additions, tissues.names()).on(
             labels, tissues.names_by_label(), has_brain_mask=False
         )
-        tissues = changes.to_tissues(_with_dura(added.table(tissues), sheets.read, tissues))
+        tissues = changes.to_tissues(with_their_tissue(added.table(tissues), sheets.read))
         placed = _placed(patient, craniotomy, preset, added, labels, pose)
         simulator = UltrasoundSimulator(placed.labels, tissues, placed.settings, patient.device, sheets=sheets.read)
         return Examination(simulator, preset.probe, preset.display, is_labels, placed.probe_to_ras)
@@ -268,18 +268,12 @@ def open_examination(patient: PatientOptions, pose: np.ndarray | str | None = No
     added = additions.on(labels, names, has_brain_mask=not is_ct)
     known = tissues
     tissues = tissues.for_names(added.tissue_names) if table is None else added.table(tissues)
-    tissues = _with_dura(tissues, surfels, known)
+    tissues = with_their_tissue(tissues, surfels, known)
     texture = texture_below(segmentation.texture(), volume, segmentation.labels, added.labels)
     tissues = changes.to_tissues(tissues)
     placed = _placed(patient, craniotomy, preset, added, segmentation.labels, pose)
     simulator = UltrasoundSimulator(placed.labels, tissues, placed.settings, patient.device, texture, surfels)
     return Examination(simulator, preset.probe, preset.display, is_labels, placed.probe_to_ras)
-
-
-def _with_dura(tissues: TissueTable, surfels: Surfels | None, known: TissueTable) -> TissueTable:
-    from SlicerUSSim.Logic.tissue.sheet_looks import with_dura
-
-    return tissues if surfels is None else with_dura(tissues, surfels.kinds(), known)
 
 
 @dataclass(frozen=True, eq=False)

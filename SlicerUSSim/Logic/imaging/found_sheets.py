@@ -13,7 +13,8 @@ from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.mri.sheets.surfels import KINDS, Surfels
 from SlicerUSSim.Logic.mri.sheets.voxels import on_voxels
 from SlicerUSSim.Logic.opencl.layout import CONSTANTS
-from SlicerUSSim.Logic.tissue.sheet_looks import SheetLook
+from SlicerUSSim.Logic.tissue.sheet_looks import SheetLook, with_dura
+from SlicerUSSim.Logic.tissue.table import TissueTable
 
 #: Fluid around a sheet, along its normal, is a gap as narrow as a sheet up to here on either side; from here on it is
 #: a cistern, whose walls are two lines. A sheet of labels may lie this far beside a sheet that was found.
@@ -72,6 +73,11 @@ def found_sheets(
     words, half = _words(planes.kind[entry], distance, normal, thickness, confidence, grid, looks)
     words[:, 0] |= tissue_beside(labels, voxels, fluids).astype(np.uint32) << np.uint32(26)
     return FoundSheets(labels, voxels, words, np.abs(distance) <= half + half_diagonal, closed)
+
+
+def with_their_tissue(tissues: TissueTable, sheets: Surfels | None, known: TissueTable | None = None) -> TissueTable:
+    """The table with the tissue of falx and tentorium where `sheets` has them, see sheet_looks.with_dura."""
+    return tissues if sheets is None else with_dura(tissues, sheets.kinds(), known)
 
 
 def _with_margin(grid: Volume) -> Volume:

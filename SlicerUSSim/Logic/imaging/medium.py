@@ -21,12 +21,12 @@ from scipy import special
 from SlicerUSSim.Logic.base.errors import SimulationError, require
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.imaging.borders import smoothed_indicators, smoothed_members
-from SlicerUSSim.Logic.imaging.found_sheets import FoundSheets, cells_around, found_sheets
+from SlicerUSSim.Logic.imaging.found_sheets import FoundSheets, cells_around, found_sheets, with_their_tissue
 from SlicerUSSim.Logic.imaging.sheets import sheet_planes
 from SlicerUSSim.Logic.mri.sheets.surfels import Surfels
 from SlicerUSSim.Logic.opencl.device import Device, divisible
 from SlicerUSSim.Logic.opencl.layout import CONSTANTS, TISSUE
-from SlicerUSSim.Logic.tissue.sheet_looks import looks_of, with_dura
+from SlicerUSSim.Logic.tissue.sheet_looks import looks_of
 from SlicerUSSim.Logic.tissue.table import MAX_LABEL, TissueTable
 from SlicerUSSim.Logic.tissue.tissue import Membrane
 
@@ -82,7 +82,7 @@ class Medium:
         #: As given, or None
         self.sheets = sheets if sheets is not None and len(sheets) else None
         self._check(tissues)
-        tissues = self._with_dura(tissues)
+        tissues = with_their_tissue(tissues, self.sheets)
         #: uint16 [k][j][i]: label, flags and fluid distance; uint8 [k][j][i]: acoustic groups; and their indicators
         self.voxel_buffer: Buffer
         self.group_buffer: Buffer
@@ -146,7 +146,7 @@ class Medium:
     def set_tissues(self, tissues: TissueTable) -> None:
         """Change tissue parameters; voxels are uploaded only for a new membrane position or new acoustic groups."""
         self._check(tissues)
-        tissues = self._with_dura(tissues)
+        tissues = with_their_tissue(tissues, self.sheets)
         groups_before, closed_before = self.rows["group"], self.found
         self.rows = self._tissue_rows(tissues)
         new_membrane = _membrane_shape(tissues) != _membrane_shape(self.tissues)
@@ -163,10 +163,6 @@ class Medium:
         self.device.write(self.tissue_buffer, self.rows)
         self.version += 1
         self.tissues = tissues
-
-    def _with_dura(self, tissues: TissueTable) -> TissueTable:
-        """The table with the tissue of falx and tentorium, if these were found and it has none."""
-        return tissues if self.sheets is None else with_dura(tissues, self.sheets.kinds())
 
     def _check(self, tissues: TissueTable) -> None:
         missing = [int(label) for label in sorted(self.present) if label not in tissues]

@@ -23,6 +23,7 @@ from SlicerUSSim.Logic.fitting.held_out import predict
 from SlicerUSSim.Logic.fitting.search import Progress
 from SlicerUSSim.Logic.fitting.settings import FitSettings
 from SlicerUSSim.Logic.fitting.tracked_fit import Fit, fit
+from SlicerUSSim.Logic.imaging.found_sheets import with_their_tissue
 from SlicerUSSim.Logic.imaging.frame import Frame
 from SlicerUSSim.Logic.imaging.noise import seed_of_pose
 from SlicerUSSim.Logic.imaging.preset import Preset
@@ -101,7 +102,6 @@ from SlicerUSSim.Logic.mrml.taken_image import (
 from SlicerUSSim.Logic.mrml.taken_sequence import FrozenRecord, in_node, read_taken, taken_of, write_taken
 from SlicerUSSim.Logic.probe.placement import pose_in_slice
 from SlicerUSSim.Logic.tissue.label_maps import LabelledTissues
-from SlicerUSSim.Logic.tissue.sheet_looks import with_dura
 from SlicerUSSim.Logic.tissue.table import TissueTable
 from SlicerUSSim.Logic.tissue.texture import Texture
 
@@ -1133,5 +1133,4 @@ def _in_frame_of(volume_node, node) -> Volume:
 
 def _tissues_of(preset: Preset, names: Sequence[str], sheets: Surfels | None) -> TissueTable:
     """The tissues of labels with these names, and of the sheets."""
-    tissues = preset.tissues.for_names(names)
-    return tissues if sheets is None else with_dura(tissues, sheets.kinds(), preset.tissues)
+    return with_their_tissue(preset.tissues.for_names(names), sheets, preset.tissues)

@@ -8,7 +8,7 @@ scan, 7 % a poor one.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -219,22 +219,34 @@ def part_of(case: BrainPhantom, part: str) -> BrainPhantom:
     Raises SimulationError for an unknown part.
     """
     require(part in PARTS, f"part is {part!r}, expected one of {', '.join(PARTS)}")
-    box = ndimage.find_objects((case.mask.array > 0).astype(np.uint8))[0]
-    matrix = case.mri.ijk_to_ras
-    inside = list(box)
-    for ras, (low, high) in enumerate(PARTS[part]):
-        column = int(np.abs(matrix[ras, :3]).argmax())
-        if matrix[ras, column] < 0.0:
+    box = part_box(case.mask, PARTS[part])
+    mri, mask, truth = (cut_to(volume, box) for volume in (case.mri, case.mask, case.truth))
+    return replace(case, name=f"{case.name}, {part}", mri=mri, mask=mask, truth=truth, bias=case.bias[box])
+
+
+def part_box(mask: Volume, part: Sequence[tuple[float, float]], margin: int = 0) -> tuple[slice, ...]:
+    """(k, j, i) voxels of a part of a brain: from and to, of the extent of its `mask` along R, A and S.
+
+    With a margin in voxels around the brain where the part reaches its end.
+    """
+    whole = ndimage.find_objects((mask.array > 0).astype(np.uint8))[0]
+    inside = list(whole)
+    for row, (low, high) in zip(mask.ijk_to_ras, part, strict=False):
+        column = int(np.abs(row[:3]).argmax())
+        if row[column] < 0.0:
             low, high = 1.0 - high, 1.0 - low
-        side, size = box[2 - column], box[2 - column].stop - box[2 - column].start
-        inside[2 - column] = slice(side.start + int(low * size), side.start + int(high * size))
-    k, j, i = inside
-    moved = matrix.copy()
-    moved[:3, 3] = (matrix @ [i.start, j.start, k.start, 1.0])[:3]
-    mri, mask, truth = (
-        Volume(np.ascontiguousarray(volume.array[k, j, i]), moved) for volume in (case.mri, case.mask, case.truth)
-    )
-    return replace(case, name=f"{case.name}, {part}", mri=mri, mask=mask, truth=truth, bias=case.bias[k, j, i])
+        side, size = whole[2 - column], whole[2 - column].stop - whole[2 - column].start
+        start = side.start + int(low * size) - (margin if low == 0.0 else 0)
+        stop = side.start + int(high * size) + (margin if high == 1.0 else 0)
+        inside[2 - column] = slice(max(start, 0), min(stop, mask.array.shape[2 - column]))
+    return tuple(inside)
+
+
+def cut_to(volume: Volume, box: tuple[slice, ...]) -> Volume:
+    """A volume's voxels in a box (k, j, i), where they are in the patient."""
+    matrix = volume.ijk_to_ras.copy()
+    matrix[:3, 3] = (matrix @ [*(side.start for side in reversed(box)), 1.0])[:3]
+    return Volume(np.ascontiguousarray(volume.array[box]), matrix)
 
 
 def phantom(

@@ -31,6 +31,7 @@ from SlicerUSSim.Logic.base.settings import DisplaySettings, SimulationSettings
 from SlicerUSSim.Logic.base.transforms import check_rigid
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.base.vtk_data import matrix_array, set_scalars
+from SlicerUSSim.Logic.imaging.found_sheets import with_their_tissue
 from SlicerUSSim.Logic.imaging.frame import Frame
 from SlicerUSSim.Logic.imaging.noise import seed_of_pose
 from SlicerUSSim.Logic.imaging.preset import Preset
@@ -49,7 +50,6 @@ from SlicerUSSim.Logic.probe.shape import outline_polydata
 from SlicerUSSim.Logic.tissue.label_advice import MRI_SCRIPT, SCRIPT
 from SlicerUSSim.Logic.tissue.label_findings import NoPatientError
 from SlicerUSSim.Logic.tissue.label_maps import read_label_map
-from SlicerUSSim.Logic.tissue.sheet_looks import with_dura
 from SlicerUSSim.Logic.tissue.table import MAX_LABEL, TissueTable
 from SlicerUSSim.Logic.tissue.texture import Texture
 
@@ -437,8 +437,7 @@ class UltrasoundSimulationFilter(_ImageFilter):
         self._frame = None
         labels = vtkImageData.GetData(inInfo[0])
         (volume, tissues), sheets = self._patient(labels), self._chosen_sheets()
-        if sheets is not None:
-            tissues = with_dura(tissues, sheets.kinds(), self._tissues)
+        tissues = with_their_tissue(tissues, sheets, self._tissues)
         simulator = self._simulator.get(
             labels.GetMTime(), volume, tissues, self._settings, self._device, self._texture, sheets
         )

@@ -147,26 +147,22 @@ def _found(head: Head, mri: Volume, wanted: tuple[str, ...], report: Callable[[f
     masks: dict[str, np.ndarray] = {}
     in_ventricles = np.zeros(head.brain.shape, bool)
     is_whole = head.registered is not None
-    if {"sulcus", "ependyma", *_ENHANCING} & set(wanted) or (not is_whole and "falx" in wanted):
+    by_sulci = not is_whole and "falx" in wanted
+    if {"sulcus", "ependyma", *_ENHANCING} & set(wanted) or by_sulci:
         in_ventricles = ventricles(head)
         finished("ventricles")
-    all_sulci = None
-    if not is_whole and "falx" in wanted:
+    all_sulci = Surfels.joined([])
+    if "sulcus" in wanted or by_sulci:
         all_sulci = sulci(head, in_ventricles)
         finished("sulcus")
-        found["falx"] = falx_of_part(head, all_sulci)
-        finished("falx")
-    elif {"falx", "tentorium", "vessels"} & set(wanted):  # the apex of the tentorium is below the falx
-        found["falx"] = falx(head)
+    if {"falx", "tentorium", "vessels"} & set(wanted):  # the apex of the tentorium is below the falx
+        found["falx"] = falx(head) if is_whole else falx_of_part(head, all_sulci)
         finished("falx")
     if {"tentorium", "vessels"} & set(wanted):
         found["tentorium"] = tentorium(head, found["falx"])
         finished("tentorium")
     dura = Surfels.joined(list(found.values()))
     if "sulcus" in wanted:
-        if all_sulci is None:
-            all_sulci = sulci(head, in_ventricles)
-            finished("sulcus")
         found["sulcus"] = _beside(all_sulci, dura.of_kind(*(set(KINDS) & set(wanted))))
     if "ependyma" in wanted:
         found["ependyma"] = ependyma(head, in_ventricles)

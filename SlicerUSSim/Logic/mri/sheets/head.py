@@ -80,12 +80,8 @@ class Head:
         part = _part(mri, box)
         inside = segmentation.brain.mask.array[box] > 0
         image = part.with_array(np.float32(sign) * _without_field(part, segmentation.corrected[box], inside))
-        grid = _working_grid(image)
-        if grid is not image:
-            inside = on_grid(part.with_array(inside.astype(np.float32)), grid) > 0.5
         noise = float(segmentation.standard_deviations[names.index("white matter")])
-        csf, grey, white = means
-        return cls(grid, inside, csf, grey, white, noise, contrast == "t1gd", segmentation.atlas)
+        return replace(cls.of_part(image, inside, means, noise, contrast == "t1gd"), registered=segmentation.atlas)
 
     @classmethod
     def of_part(
