@@ -2,9 +2,10 @@
 
 In the order in which they can be told apart: the grey map from the real images alone; then smoothing and texture by the
 costs of texture T1 + T2 / 2 (texture_costs.py), to which the paper's cost is nearly blind. T2 counts grains and has no
-gradient, so the search uses none; it is short, since few parameters are left. The probe's bandwidth and
-aperture by the width of the real speckle are a start that is taken only with T2 (point_spread.py): widths alone do not
-tell them from smoothing and texture. Its frequency stays, since no image tells it from the bandwidth.
+gradient, so the search uses none; it is short, since few parameters are left. They see the width of the speckle only to
+a quarter of it, so that the smoothing is found once more, by them and the width (speckle_width.py). The probe's
+bandwidth and aperture by the width of the real speckle are a start that is taken only with T2 (point_spread.py): widths
+alone do not tell them from smoothing and texture. Its frequency stays, since no image tells it from the bandwidth.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from SlicerUSSim.Logic.base.settings import DisplaySettings
 from SlicerUSSim.Logic.fitting.appearance import AppearanceModel
 from SlicerUSSim.Logic.fitting.parameters import DISPLAY_BOUNDS
 from SlicerUSSim.Logic.fitting.point_spread import PointSpread, point_spread
-from SlicerUSSim.Logic.fitting.speckle_width import speckle_widths
+from SlicerUSSim.Logic.fitting.speckle_width import SpeckleWidth, speckle_widths, width_misfit
 from SlicerUSSim.Logic.fitting.texture_costs import TextureMisfit, TextureReference
 from SlicerUSSim.Logic.imaging.grey_map import estimate_grey_map
 from SlicerUSSim.Logic.imaging.simulator import UltrasoundSimulator
@@ -38,6 +39,8 @@ _START, _STEP = (0.06, 0.25), (0.04, 0.12)
 #: Factors of the texture's deviation that are tried, and evaluations of the smoothing for each
 _FACTORS, _EVALUATIONS = (1.0, 0.5, 1.4, 0.0), (24, 14, 14, 14)
 _MOST_TEXTURE_DB = 8.0
+#: Evaluations of the smoothing with the width of the speckle, and what a width that is wrong by a factor of e adds
+_WIDTH_EVALUATIONS, _WIDTH_WEIGHT = 16, 0.25
 #: Depths at which the width of the real speckle is measured, parts of the image depth
 _WIDTH_DEPTHS = (0.33, 0.5, 0.7, 0.92)
 
@@ -111,10 +114,30 @@ def fit_speckle(
     references = [TextureReference(image, spacing, tracked.mask) for image in tracked.images]
     with simulator.with_tissues(tissues):
         model = AppearanceModel(simulator, tracked.probe, tracked.poses, {}, tracked.grid)
-    done, total = 0, sum(_EVALUATIONS)
+    done, total = 0, sum(_EVALUATIONS) + _WIDTH_EVALUATIONS
 
     def misfit(table: TissueTable, shown: DisplaySettings) -> TextureMisfit:
         return _mean([r.misfit(model.image(n, table, shown)) for n, r in enumerate(references)])
+
+    def search(
+        cost: Callable[[DisplaySettings], float], start: np.ndarray, evaluations: int
+    ) -> tuple[DisplaySettings, float]:  # fmt: skip
+        """The smoothing of the least cost near this one, and the cost."""
+
+        def evaluated(values: np.ndarray) -> float:
+            nonlocal done
+            done += 1
+            if progress is not None:
+                progress(min(done / total, 1.0))
+            value = cost(_smoothed(display, values))
+            return value if np.isfinite(value) else 10.0
+
+        simplex = np.array([start, start + [_STEP[0], 0.0], start + [0.0, _STEP[1]]])
+        found = optimize.minimize(
+            evaluated, start, method="Nelder-Mead",
+            options={"initial_simplex": simplex, "maxfev": evaluations, "xatol": 1e-3, "fatol": 1e-4},
+        )  # fmt: skip
+        return _smoothed(display, found.x), float(found.fun)
 
     before = misfit(tissues, display)
     if not np.isfinite(before.total):
@@ -129,27 +152,38 @@ def fit_speckle(
         if factor != 1.0:
             model.anchor(table)
 
-        def cost(values: np.ndarray, table: TissueTable = table) -> float:
-            nonlocal done
-            done += 1
-            if progress is not None:
-                progress(min(done / total, 1.0))
-            total_misfit = misfit(table, _smoothed(display, values)).total
-            return total_misfit if np.isfinite(total_misfit) else 10.0
+        def cost(shown: DisplaySettings, table: TissueTable = table) -> float:
+            return misfit(table, shown).total
 
-        simplex = np.array([start, start + [_STEP[0], 0.0], start + [0.0, _STEP[1]]])
-        found = optimize.minimize(
-            cost, start, method="Nelder-Mead",
-            options={"initial_simplex": simplex, "maxfev": evaluations, "xatol": 1e-3, "fatol": 1e-4},
-        )  # fmt: skip
-        shown = _smoothed(display, found.x)
-        candidates.append((float(found.fun), factor, shown, table, misfit(table, shown)))
-        start = np.array([getattr(shown, name) for name in _NAMES])
-        _log.info("texture x %.2g: T1 + T2 / 2 is %.3f with smoothing %.3f mm, %.2f degrees", factor, found.fun, *start)
+        shown, value = search(cost, start, evaluations)
+        candidates.append((value, factor, shown, table, misfit(table, shown)))
+        start = _smoothing(shown)
+        _log.info("texture x %.2g: T1 + T2 / 2 is %.3f with smoothing %.3f mm, %.2f degrees", factor, value, *start)
     # The table as it is, with nothing smoothed, is a candidate as well
     candidates.append((before.total, 1.0, display, tissues, before))
     _, factor, shown, table, after = min(candidates, key=lambda candidate: candidate[0])
+
+    real = _widths(tracked, tracked.images)
+
+    def with_widths(shown: DisplaySettings) -> float:
+        images = [model.image(n, table, shown) for n in range(len(references))]
+        wrong = width_misfit(_widths(tracked, images), real)
+        textures = _mean([r.misfit(image) for r, image in zip(references, images, strict=True)])
+        return textures.total + _WIDTH_WEIGHT * wrong
+
+    model.anchor(table)
+    first = with_widths(shown)
+    if np.isfinite(first):  # else no width can be measured, in the real or the simulated images
+        other, value = search(with_widths, _smoothing(shown), _WIDTH_EVALUATIONS)
+        if value < first:
+            shown, after = other, misfit(table, other)
+            _log.info("with the width of the speckle: smoothing %.3f mm, %.2f degrees", *_smoothing(shown))
     return SpeckleFit(shown, table, factor, before, after, True)
+
+
+def _widths(tracked: TrackedImages, images: Sequence[np.ndarray]) -> list[SpeckleWidth]:
+    depths = [share * tracked.probe.depth_mm for share in _WIDTH_DEPTHS]
+    return speckle_widths(images, tracked.probe, tracked.grid, depths, tracked.mask)
 
 
 def with_point_spread(
@@ -161,9 +195,7 @@ def with_point_spread(
     texture of `first` and with `display`'s levels, and is taken if T1 + T2 / 2 is lower and T2, the number of grains,
     not higher.
     """
-    depths = [share * tracked.probe.depth_mm for share in _WIDTH_DEPTHS]
-    widths = speckle_widths(tracked.images, tracked.probe, tracked.grid, depths, tracked.mask)
-    spread = point_spread(widths, tracked.probe)
+    spread = point_spread(_widths(tracked, tracked.images), tracked.probe)
     other = replace(tracked, probe=spread.of(tracked.probe))
     if other.probe == tracked.probe:
         return replace(first, spread=spread), tracked
@@ -181,6 +213,10 @@ def with_point_spread(
     if not is_better:
         return replace(first, spread=spread), tracked
     return replace(found, texture_factor=first.texture_factor, before=first.before, spread=spread), other
+
+
+def _smoothing(display: DisplaySettings) -> np.ndarray:
+    return np.array([getattr(display, name) for name in _NAMES])
 
 
 def _smoothed(display: DisplaySettings, values: Sequence[float] | np.ndarray) -> DisplaySettings:

@@ -116,6 +116,14 @@ def speckle_widths(
     return result
 
 
+def width_misfit(widths: Sequence[SpeckleWidth], reference: Sequence[SpeckleWidth]) -> float:
+    """Mean |log ratio| of widths, axial and lateral, at depths where both are known; NaN without one."""
+    both = zip(widths, reference, strict=True)
+    ratios = np.log([(a.axial_mm / b.axial_mm, a.lateral_mm / b.lateral_mm) for a, b in both])
+    known = np.abs(ratios[np.isfinite(ratios)])
+    return float(known.mean()) if known.size else float("nan")
+
+
 def extrema_density_cm2(image: np.ndarray, grid: ImageGrid, inside: np.ndarray) -> float:
     """Local maxima of an image (rows, columns) per square centimetre of `inside` (rows, columns) bool.
 
@@ -213,10 +221,14 @@ def _fitted(values: np.ndarray, step_mm: float, pixel_mm: float, reach_mm: float
     last = min(lags, max(int(low[0]), 4)) if low.size else lags
     distance, measured = np.arange(last + 1) * step_mm, measured[: last + 1]
 
+    varying = measured - measured.mean()
+
     def misfit(log_sigma: float) -> float:
+        # Of the best A and B, by linear regression
         law = _law_in_pixels(distance, np.exp(log_sigma), pixel_mm)
-        basis = np.stack([law, np.ones_like(law)], axis=1)
-        return float(((basis @ np.linalg.lstsq(basis, measured, rcond=None)[0] - measured) ** 2).sum())
+        law -= law.mean()
+        power = law @ law
+        return float(varying @ varying - ((law @ varying) ** 2 / power if power > 0.0 else 0.0))
 
     bounds = np.log(0.25 * step_mm), np.log(reach_mm)
     best = float(np.exp(optimize.fminbound(misfit, *bounds)))
@@ -227,7 +239,14 @@ def _law_in_pixels(distance: np.ndarray, sigma: float, pixel_mm: float) -> np.nd
     """The law as pixels show it, each the mean over its size: convolved with a triangle of that half width."""
     offsets, weights = _triangle()
     at = np.abs(distance[:, None] + pixel_mm * offsets)
-    return log_speckle_correlation(at, sigma) @ weights
+    return np.interp(at / sigma, *_law()) @ weights
+
+
+@cache
+def _law() -> tuple[np.ndarray, np.ndarray]:
+    """(sigmas, correlation): the law as a table, since the dilogarithm takes most of the time."""
+    sigmas = np.linspace(0.0, 8.0, 8001)  # beyond it is zero
+    return sigmas, log_speckle_correlation(sigmas, 1.0)
 
 
 @cache
