@@ -16,6 +16,7 @@ from SlicerUSSim.Logic.tissue.presets import TISSUES
 from SlicerUSSim.Logic.tissue.sheet_looks import looks_of, with_dura
 from SlicerUSSim.Logic.verification.phantoms import layered
 from SlicerUSSim.Logic.verification.validation import sulci
+from tests.conftest import block
 
 
 def plane(kind: str, probe_to_ras: np.ndarray, depth_mm: float = 15.0, confidence: float = 1.0) -> Surfels:
@@ -136,7 +137,7 @@ def test_a_table_without_a_label_that_is_there_is_refused_also_with_dura():
 def test_without_sheets_nothing_changes():
     phantom, tissues = grey(layers=[sulci._GREY, sulci._CSF])
     none = plane("sulcus", phantom.probe_to_ras).of_kind("falx")
-    away = plane("sulcus", phantom.probe_to_ras, depth_mm=500.0)
+    away = plane("sulcus", phantom.probe_to_ras, depth_mm=150.0)
     images = [
         UltrasoundSimulator(phantom.labels, tissues, sheets=sheets).simulate(sulci._PROBE, phantom.probe_to_ras).iq
         for sheets in (None, none, away)
@@ -148,6 +149,31 @@ def test_without_sheets_nothing_changes():
         for s in (None, plane("ependyma", phantom.probe_to_ras))
     ]
     assert np.array_equal(images[0], images[1])
+
+
+def test_sheets_of_another_patient_are_refused():
+    """They would be drawn as walls and sulci that this patient does not have."""
+    labels = block(lambda x, y, z: 1 + (x * x + y * y + z * z < 100.0), half_mm=(30, 30, 30))
+    tissues = TissueTable.brain(["white matter", "csf"])
+    normal = np.random.default_rng(1).normal(size=(600, 3)).astype(np.float32)
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+
+    def walls(x_mm: float) -> Surfels:
+        place = 10.0 * normal + np.array([x_mm, 0.0, 0.0], np.float32)
+        return Surfels.of("ependyma", place, normal, 0.4, 1.0, 1.0)
+
+    matrix = labels.ijk_to_ras.copy()
+    matrix[:3, 3] -= 30.0
+    with_air = Volume(np.pad(labels.array, 30), matrix)
+
+    UltrasoundSimulator(labels, tissues, sheets=walls(1.0))  # a voxel beside
+    UltrasoundSimulator(with_air, tissues, sheets=walls(1.0))
+    with pytest.raises(SimulationError, match=r"only \d+% of the sheets' walls of ventricles lie where fluid"):
+        UltrasoundSimulator(labels, tissues, sheets=walls(14.0))
+    with pytest.raises(SimulationError, match=r"only \d+% of the sheets are beside labelled tissue, expected those"):
+        UltrasoundSimulator(with_air, tissues, sheets=walls(45.0))
+    with pytest.raises(SimulationError, match="the sheets lie 9[0-9]+ mm outside the labels, expected those that were"):
+        UltrasoundSimulator(labels, tissues, sheets=walls(1000.0))
 
 
 def test_a_wall_is_drawn_once():

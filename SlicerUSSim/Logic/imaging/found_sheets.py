@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from SlicerUSSim.Logic.base.errors import require
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.mri.sheets.surfels import KINDS, Surfels
 from SlicerUSSim.Logic.mri.sheets.voxels import on_voxels
@@ -21,6 +22,11 @@ from SlicerUSSim.Logic.tissue.table import TissueTable
 _WIDE_MM, _STEP_MM, _BESIDE_MM = 2.0, 0.5, 1.0
 #: Least distance from a sheet within which nothing else draws a line, mm
 _OWN_MM = 1.0
+#: Sheets are another patient's if fewer of so many walls of ventricles lie within this of fluid beside tissue, mm or a
+#: voxel. Of four heads 0.67 to 0.90 of their own walls do and 0.03 to 0.25 of the others'.
+_LEAST_WALLS, _LEAST_ON_WALLS, _NEAR_MM = 200, 0.45, 1.5
+#: Or if fewer of those in the volume are beside labelled tissue, or none is within this of the volume, mm
+_LEAST_LABELLED, _FAR_MM = 0.4, 100.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,8 +60,11 @@ def found_sheets(
     padded : (k, j, i) uint8 labels with a margin of one voxel around `grid`.
     fluids : labels of which gaps consist, without the coupling medium.
     looks : by kind.
+
+    Raises SimulationError for sheets that are not of this patient.
     """
     grid = _with_margin(grid)
+    _require_of_patient(surfels, padded, grid, fluids)
     extent = _fluid_beside(surfels, padded, grid, fluids)
     is_gap = np.isin(surfels.kind, [KINDS.index(kind) for kind in ("sulcus", "falx", "tentorium")])
     is_wide = is_gap & (extent >= _WIDE_MM - 1e-6).any(axis=1)
@@ -78,6 +87,37 @@ def found_sheets(
 def with_their_tissue(tissues: TissueTable, sheets: Surfels | None, known: TissueTable | None = None) -> TissueTable:
     """The table with the tissue of falx and tentorium where `sheets` has them, see sheet_looks.with_dura."""
     return tissues if sheets is None else with_dura(tissues, sheets.kinds(), known)
+
+
+def _require_of_patient(surfels: Surfels, padded: np.ndarray, grid: Volume, fluids: tuple[int, ...]) -> None:
+    """Raise SimulationError for sheets that do not fit these labels: they would be drawn as this patient's anatomy."""
+    if not len(surfels):
+        return
+    expected = "expected those that were found in this patient's MRI"
+    matrix, last = grid.ras_to_ijk, np.array(padded.shape[::-1]) - 1.0
+    at = surfels.place @ matrix[:3, :3].T + matrix[:3, 3]
+    apart = (np.clip(at, 0.0, last) - at) @ grid.ijk_to_ras[:3, :3].T
+    away_mm = np.linalg.norm(apart, axis=1)
+    require(away_mm.min() <= _FAR_MM, f"the sheets lie {away_mm.min():.0f} mm outside the labels, {expected}")
+
+    inside = surfels.chosen(away_mm == 0.0)
+    near = max(_NEAR_MM, float(grid.spacing_mm.max()))
+    is_fluid, is_tissue, is_labelled = np.zeros((3, len(inside)), bool)
+    for step in np.arange(-near, near + 1e-6, _STEP_MM):
+        label = padded.ravel()[_index(grid, inside.place + step * inside.normal, padded.shape)]
+        outside = np.isin(label, (0, *fluids))
+        is_fluid |= outside
+        is_tissue |= ~outside
+        is_labelled |= label != 0
+    share = is_labelled.mean() if len(inside) else 1.0
+    require(share >= _LEAST_LABELLED, f"only {share:.0%} of the sheets are beside labelled tissue, {expected}")
+    walls = is_labelled & (inside.kind == KINDS.index("ependyma"))
+    if np.count_nonzero(walls) >= _LEAST_WALLS and np.isin(padded, fluids).any():
+        share = (is_fluid & is_tissue)[walls].mean()
+        require(
+            share >= _LEAST_ON_WALLS,
+            f"only {share:.0%} of the sheets' walls of ventricles lie where fluid of the labels ends, {expected}",
+        )
 
 
 def _with_margin(grid: Volume) -> Volume:

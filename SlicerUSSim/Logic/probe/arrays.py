@@ -48,7 +48,7 @@ class Probe(Beam):
     >>> from dataclasses import replace
     >>> from SlicerUSSim.Logic.probe import PROBES
     >>> ", ".join(PROBES)
-    'phased, convex, linear, microconvex, abdominal, cardiac, neonatal, linear_15, burr_hole, hockey_stick, matrix'
+    'phased, convex, linear, microconvex, abdominal, cardiac, transcranial, neonatal, linear_15, burr_hole, hockey_stick, matrix'
     >>> replace(PROBES["convex"], frequency_mhz=3.5).depth_mm
     100.0
     """
@@ -450,6 +450,11 @@ PROBES: dict[str, Probe] = {
         field_of_view_deg=90.0, depth_mm=160.0, frequency_mhz=2.7, fractional_bandwidth=0.74,
         band_mhz=(1.7, 3.7), aperture_mm=19.2,
         elevation_aperture_mm=14.0, elevation_focus_mm=60.0,
+    ),
+    "transcranial": PhasedProbe(  # for the temporal bone
+        field_of_view_deg=90.0, depth_mm=140.0, frequency_mhz=2.0, fractional_bandwidth=0.6,
+        band_mhz=(1.4, 2.6), aperture_mm=19.2, focus_mm=70.0,
+        elevation_aperture_mm=14.0, elevation_focus_mm=70.0,
     ),
     "neonatal": ConvexProbe(  # for the anterior fontanelle
         radius_mm=11.0, field_of_view_deg=110.0, depth_mm=80.0, frequency_mhz=7.5, fractional_bandwidth=0.6,
