@@ -142,6 +142,17 @@ def test_a_markup_that_would_be_read_otherwise_is_refused(change, message, head,
         file_opening(head, NAMES, str(path))
 
 
+def test_an_open_curve_is_closed_and_that_is_said(head, tmp_path, caplog):
+    points = [{"position": [x, y, 78.0]} for x, y in ((-20, -10), (20, -10), (20, 10), (-20, 10))]
+    path, found = tmp_path / "curve.mrk.json", []
+    for kind in ("ClosedCurve", "Curve"):
+        markup = {"type": kind, "coordinateSystem": "LPS", "controlPoints": points}
+        path.write_text(json.dumps({"markups": [markup]}))
+        found.append(file_opening(head, NAMES, str(path)))
+        assert ("is an open curve; the polygon is closed" in caplog.text) is (kind == "Curve")
+    np.testing.assert_array_equal(*found)
+
+
 def test_the_probe_stands_on_the_brain_in_the_opening_of_a_file(head, tmp_path):
     """It stood under closed bone, and showed the brain all the same."""
     write_label_files(tmp_path / "head.nii.gz", head, TissueTable.brain().for_names(NAMES))

@@ -18,6 +18,7 @@ from SlicerUSSim.Logic import (
     segment_mri,
 )
 from SlicerUSSim.Logic.base.errors import Cancelled
+from SlicerUSSim.Logic.base.files import write_json
 from SlicerUSSim.Logic.base.neighbourhood import largest_around
 from SlicerUSSim.Logic.mri import head_mri
 from SlicerUSSim.Logic.mri.ct_unit import looks_like_ct
@@ -348,3 +349,29 @@ def test_the_spinous_process_casts_a_shadow(spine_found):
     middle, side = len(level) // 2, len(level) // 16
     at = slice(int(45.0 / mm), int(60.0 / mm))
     assert np.median(level[middle - 3 : middle + 3, at]) < np.median(level[:side, at]) - 20.0
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--craniotomy", "auto"], "--craniotomy is auto, which opens a head that was found in an MRI, and this is a"),
+        (["--pose", "auto"], "--pose is auto, which is on a head, and the image is a CT"),
+    ],
+)
+def test_what_a_ct_has_not_is_said(tmp_path, spine, capsys, options, message):
+    spine.ct.write(tmp_path / "ct.nii.gz")
+    write_json(tmp_path / "pose.json", {"probe_to_ras": np.eye(4).tolist()})
+    given = ["simulate", tmp_path / "ct.nii.gz", "--ct", "--pose", tmp_path / "pose.json", "-o", tmp_path / "x.png"]
+    with pytest.raises(SystemExit) as ended:
+        cli([*map(str, given), *options])
+    assert ended.value.code == 2
+    assert message in capsys.readouterr().err.replace("\n", " ")
+
+
+def test_a_view_of_a_label_map_without_a_brain_is_said(tmp_path, spine, spine_found, capsys):
+    spine_found.labels.write(tmp_path / "labels.nii.gz")
+    TissueTable.named(spine_found.tissue_names).write(tmp_path / "labels.json")
+    with pytest.raises(SystemExit) as ended:
+        cli(["simulate", str(tmp_path / "labels.nii.gz"), "--pose", "auto", "-o", str(tmp_path / "x.png")])
+    assert ended.value.code == 0
+    assert "no tissue of a brain is labelled: the probe stands on top of what is" in capsys.readouterr().err

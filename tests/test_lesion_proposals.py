@@ -106,6 +106,23 @@ def test_one_seed_grows_the_lesion_and_not_what_is_outside(kind):
 
 @needs_atlas
 @pytest.mark.slow
+def test_a_point_beside_what_is_proposed_is_said():
+    segmentation, _ = brain("ring")
+    assert not any("beside what is proposed" in line for line in grow_lesion(segmentation, CENTRE).warnings)
+    is_said = set()
+    for away in (14.0, 15.0, 16.0, 17.0):  # the rim's radius is 12 mm
+        point = np.add(CENTRE, [0.0, 0.0, away])
+        found = grow_lesion(segmentation, point)
+        matrix = found.labels.ijk_to_ras
+        places = np.argwhere(found.labels.array > 0)[:, ::-1] @ matrix[:3, :3].T + matrix[:3, 3]
+        apart = np.linalg.norm(places - point, axis=1).min()
+        is_said.add(any("mm beside what is proposed" in line for line in found.warnings))
+        assert any("mm beside what is proposed" in line for line in found.warnings) == (apart >= 2.0)
+    assert is_said == {False, True}
+
+
+@needs_atlas
+@pytest.mark.slow
 def test_a_lesion_is_proposed_without_a_seed_and_none_in_a_healthy_brain():
     segmentation, true = brain("low")
     (proposal,) = propose_lesions(segmentation)

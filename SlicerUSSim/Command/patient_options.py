@@ -224,6 +224,10 @@ def open_examination(patient: PatientOptions, pose: np.ndarray | str | None = No
         require_no_map(patient.mri_or_labels, patient.maps, patient.organs)
     if is_labels:
         require_no_mri_options(patient.mri_or_labels, "leave it out, or use --mri if it is one")
+    require(
+        not (is_ct and craniotomy.is_wanted),
+        f"--craniotomy is {patient.craniotomy}, which opens a head that was found in an MRI, and this is a CT (--ct)",
+    )
     split_also(patient.also)
     if patient.segmentation["outside"] and not is_ct:
         require_findable(
@@ -292,6 +296,7 @@ def _placed(
     """The probe at its pose on a patient; `before` are the labels without what --add laid over them."""
     from SlicerUSSim.Logic.mri.craniotomy import default_pose, middle_of
     from SlicerUSSim.Logic.mri.views import opened_view_pose, view_pose
+    from SlicerUSSim.Logic.tissue.brain_orders import BRAIN_TISSUES
 
     labels, names, settings = added.labels, added.tissue_names, preset.settings
     whole, at = labels, None
@@ -301,6 +306,8 @@ def _placed(
     if isinstance(pose, str):
         target = added.centre_ras(before)
         if pose == AUTO:
+            if not set(names) & {*BRAIN_TISSUES, "brain"}:
+                note("--pose is auto, and no tissue of a brain is labelled: the probe stands on top of what is")
             pose = default_pose(
                 labels, names, preset.probe, is_open=craniotomy.is_wanted, opening_ras=at, target_ras=target
             )

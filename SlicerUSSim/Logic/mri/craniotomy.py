@@ -6,6 +6,7 @@ what was laid over it, and air stay.
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -21,6 +22,8 @@ from SlicerUSSim.Logic.mri.outside import OUTSIDE
 from SlicerUSSim.Logic.probe.arrays import Probe
 from SlicerUSSim.Logic.probe.placement import craniotomy_pose, sample
 from SlicerUSSim.Logic.probe.surface import PatientSurface
+
+_log = logging.getLogger(__name__)
 
 #: What an opening removes
 REMOVED = tuple(name for name in OUTSIDE if name != "air")
@@ -261,4 +264,6 @@ def polygon_of_file(path: str) -> np.ndarray:
     require(kind in _POLYGONS, f"{path}: is a markup of type {kind!r}, expected one of {', '.join(_POLYGONS)}")
     require(frame in ("LPS", "RAS"), f"{path}: coordinateSystem is {frame!r}, expected LPS or RAS")
     require(unit == "mm", f"{path}: coordinateUnits is {unit!r}, expected mm")
+    if kind == "Curve":
+        _log.warning("%s: is an open curve; the polygon is closed from its last point to its first", path)
     return points if frame == "RAS" else points @ LPS_TO_RAS[:3, :3]

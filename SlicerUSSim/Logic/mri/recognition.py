@@ -316,7 +316,7 @@ def _check_size(image: CoarseImage, mri: Volume) -> None:
     if not _LEAST_HEAD_ML <= millilitres <= _MOST_HEAD_ML:
         _require_no_ct(mri)
     extent = np.ptp(np.argwhere(inside), axis=0)[::-1] * image.spacing_mm
-    size = " x ".join(f"{mm:.0f}" for mm in extent)
+    size = " x ".join(f"{mm + image.spacing_mm:.0f}" for mm in extent)
     is_half = all(low <= mm <= high for mm, (low, high) in zip(np.sort(extent), _HALF_A_BRAIN_MM, strict=True))
     is_half &= _HALF_A_BRAIN_ML[0] <= millilitres <= _HALF_A_BRAIN_ML[1]
     known = "a whole brain: it may be half a brain" if is_half else "a head"

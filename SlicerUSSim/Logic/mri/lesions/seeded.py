@@ -48,6 +48,8 @@ _LEAST_PART_ML = 0.1
 _BORDER_VOXELS, _MOST_BLOBS = 2, 4
 #: Share of the border of fluid along which a rim enhances, if it is necrosis, and the rim's largest distance
 _LEAST_ENCLOSED, _RIM_MM = 0.5, 4.0
+#: A point this far beside what is proposed is said to be so
+_BESIDE_MM = 2.0
 #: Distance from an enhancing region in which oedema begins
 _OEDEMA_MM = 4.0
 
@@ -310,6 +312,9 @@ def proposal_of(segmentation: Segmentation, grown: Grown, seed: np.ndarray, name
         elif name != "oedema":
             labels[part] = len(tissues) or 1
     warnings = []
+    beside = _distance_mm(evidence, labels, seed)
+    if beside >= _BESIDE_MM:
+        warnings.append(f"the point is {beside:.0f} mm beside what is proposed: look whether that is meant")
     if evidence.atlas is None:
         warnings.append("without an atlas, the other hemisphere was not compared: look whether it is healthy tissue")
     if named is None and grown.look.name not in ("enhancing", "fluid") and "oedema" not in tissues:
@@ -321,6 +326,13 @@ def proposal_of(segmentation: Segmentation, grown: Grown, seed: np.ndarray, name
         seed,
         tuple(warnings),
     )
+
+
+def _distance_mm(evidence: Evidence, labels: np.ndarray, seed: np.ndarray) -> float:
+    """From a point, (3,) RAS mm, to the nearest voxel of a proposal, (k, j, i) on the box of the evidence."""
+    voxels = np.argwhere(labels > 0)
+    places = voxels[:, ::-1] @ evidence.ijk_to_ras[:3, :3].T + evidence.ijk_to_ras[:3, 3]
+    return float(np.linalg.norm(places - seed, axis=1).min())
 
 
 def _necrosis_in(evidence: Evidence, grown: Grown) -> np.ndarray:
