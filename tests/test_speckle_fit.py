@@ -22,6 +22,7 @@ from SlicerUSSim.Logic import (
 from SlicerUSSim.Logic.base.files import write_json
 from SlicerUSSim.Logic.fitting import fit, fit_speckle
 from SlicerUSSim.Logic.fitting.speckle_fit import with_estimated_map, with_preset_texture
+from SlicerUSSim.Logic.fitting.speckle_width import speckle_widths, width_misfit
 from SlicerUSSim.Logic.probe import ImageGrid, tilt_sweep
 from SlicerUSSim.Logic.tracked import TrackedImages
 from tests.conftest import block, rigid
@@ -66,6 +67,15 @@ def test_smoothing_and_texture_are_found_by_the_costs_of_texture(tracked):
     assert found.display.smoothing_axial_mm == pytest.approx(0.12, abs=0.05)
     assert found.display.smoothing_lateral_deg == pytest.approx(0.5, abs=0.25)
     assert found.texture_factor in (0.5, 1.0, 1.4)  # not 0: the true tissue is uneven
+    made, depths = simulator(found.tissues), (15.0, 23.0, 32.0, 41.0)
+    display = replace(found.display, image_size=TRUE.image_size)
+    images = [made.simulate(PROBE, pose, display).image for pose in tracked[1].poses]
+    real, simulated = (speckle_widths(i, PROBE, tracked[1].grid, depths) for i in (tracked[1].images, images))
+    assert width_misfit(simulated, real) < 0.07
+    unlike = [replace(width, lateral_mm=1.2 * width.lateral_mm) for width in real]
+    assert width_misfit(unlike, real) == pytest.approx(0.5 * np.log(1.2))
+    unknown = [replace(width, axial_mm=np.nan, lateral_mm=np.nan) for width in real]
+    assert np.isnan(width_misfit(unknown, real))
 
 
 def test_fit_with_speckle_beats_the_fit_without(tracked):

@@ -104,17 +104,18 @@ def fit_speckle(
     display: DisplaySettings,
     progress: Callable[[float], None] | None = None,
     factors: Sequence[float] = _FACTORS,
+    by_width: bool = True,
 ) -> SpeckleFit:
     """Fit smoothing and texture at these levels of tissues and display, which should fit the images already.
 
-    `factors` of the texture are tried; `progress` gets the part done. Raises SimulationError if no patch of the images
-    is bright enough in both.
+    `factors` of the texture are tried; `by_width`, the smoothing is found once more with the width of the speckle;
+    `progress` gets the part done. Raises SimulationError if no patch of the images is bright enough in both.
     """
     spacing = tracked.grid.pixel_spacing_mm
     references = [TextureReference(image, spacing, tracked.mask) for image in tracked.images]
     with simulator.with_tissues(tissues):
         model = AppearanceModel(simulator, tracked.probe, tracked.poses, {}, tracked.grid)
-    done, total = 0, sum(_EVALUATIONS) + _WIDTH_EVALUATIONS
+    done, total = 0, sum(_EVALUATIONS) + by_width * _WIDTH_EVALUATIONS
 
     def misfit(table: TissueTable, shown: DisplaySettings) -> TextureMisfit:
         return _mean([r.misfit(model.image(n, table, shown)) for n, r in enumerate(references)])
@@ -163,6 +164,8 @@ def fit_speckle(
     candidates.append((before.total, 1.0, display, tissues, before))
     _, factor, shown, table, after = min(candidates, key=lambda candidate: candidate[0])
 
+    if not by_width:
+        return SpeckleFit(shown, table, factor, before, after, True)
     real = _widths(tracked, tracked.images)
 
     def with_widths(shown: DisplaySettings) -> float:
@@ -200,7 +203,7 @@ def with_point_spread(
     if other.probe == tracked.probe:
         return replace(first, spread=spread), tracked
     try:
-        found = fit_speckle(simulator, other, first.tissues, display, factors=(1.0,))
+        found = fit_speckle(simulator, other, first.tissues, display, factors=(1.0,), by_width=False)
     except SimulationError as error:  # with that probe an image would take minutes, or is dark
         _log.info("the point spread function by the width of the speckle cannot be tried: %s", error)
         return replace(first, spread=spread), tracked

@@ -47,8 +47,8 @@ class Probe(Beam):
 
     >>> from dataclasses import replace
     >>> from SlicerUSSim.Logic.probe import PROBES
-    >>> ", ".join(PROBES)
-    'phased, convex, linear, microconvex, abdominal, cardiac, transcranial, neonatal, linear_15, burr_hole, hockey_stick, matrix'
+    >>> " ".join(PROBES)
+    'phased convex linear microconvex abdominal cardiac transcranial neonatal linear_15 burr_hole hockey_stick matrix'
     >>> replace(PROBES["convex"], frequency_mhz=3.5).depth_mm
     100.0
     """
