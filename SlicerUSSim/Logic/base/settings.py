@@ -180,7 +180,7 @@ class DisplaySettings(Declared):
 
     gain_db: float = parameter(
         0.0, "Gain", "Brightness of all echoes", unit="dB", bounds=(-200, 200),
-        shown=Shown(-40, 40, 0.5, is_slider=True), option="gain", fit=Fit(-30, 40, tolerance=1.5),
+        shown=Shown(-40, 40, 0.5, is_slider=True), option="gain", fit=Fit(-30, 30, tolerance=1.5),
     )  # fmt: skip
     dynamic_range_db: float = parameter(
         55.0, "Dynamic range", "Range of echo levels between black and white", unit="dB", bounds=(1, 200),
