@@ -50,7 +50,9 @@ def moved_away(twin, shift, turn) -> tuple[np.ndarray, np.ndarray, list[np.ndarr
 def test_an_offset_of_four_millimetres_and_degrees_is_found_back(twin):
     offset, middle, poses = moved_away(twin, (2.4, -2.0, 2.5), (2.0, 2.8, -2.0))
     with twin.simulator.with_tissues(twin.true_tissues):
-        found = register_poses(twin.simulator, PROBE, poses, twin.references, display=twin.true_display)
+        found = register_poses(
+            twin.simulator, PROBE, poses, twin.references, display=twin.true_display, max_evaluations=420
+        )
     left = found.correction @ np.linalg.inv(offset)
     assert np.linalg.norm((left @ [*middle, 1.0])[:3] - middle) < 1.0
     assert rotation_deg(left) < 1.0
