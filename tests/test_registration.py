@@ -203,13 +203,16 @@ def test_six_numbers_are_a_rigid_matrix(values):
     assert matrix[:3, 3].tolist() == values[:3]
 
 
-def test_bad_input_is_one_line(twin):
+def test_bad_input_is_one_line():
+    seen, _ = cysts()
+    display = DisplaySettings(image_size=(96, 96))
+    image = np.full((96, 96), 100, np.uint8)
     for change, message in (
-        ({"references": twin.references[:1]}, "1 reference images and 2 poses"),
+        ({"references": [image]}, "1 reference images and 2 poses"),
         ({"range_mm": 0}, "range_mm is 0"),
         ({"range_deg": 400}, "range_deg is 400"),
         ({"poses": [np.diag([2.0, 1, 1, 1])] * 2}, "pose 0"),
     ):
-        arguments = {"poses": twin.poses[:2], "references": twin.references[:2], **change}
+        arguments = {"poses": [np.eye(4)] * 2, "references": [image] * 2, "max_evaluations": 2, **change}
         with pytest.raises(SimulationError, match=message):
-            register_poses(twin.simulator, PROBE, display=twin.true_display, **arguments)
+            register_poses(seen, SMALL, display=display, **arguments)
