@@ -28,11 +28,12 @@ _LONG = ("beams behind cysts", "beams in folds", "beams in heads", "beams past s
          "thickness of sheets", "thin sulci", "uneven tissue", "walls and lines",
          "walls near ends")  # fmt: skip
 #: Those of them that the tests have aligned and oblique alone, and `ussim validate` diagonal, too: of speckle and beams
-#: in tissue whose steps of voxels echo nothing, and of planes and walls that the check itself turns in their voxels
+#: in tissue whose steps of voxels echo nothing, of sheets re smooth ones in the same voxels, and of planes and walls
+#: that the check itself turns in their voxels
 _IN_TWO = ("beams behind cysts", "beams in folds", "beams past strong tissue", "compounding", "cyst contrast",
            "flanks and lines", "flat layers", "frequency downshift", "planes along diagonals", "planes in small maps",
-           "planes with edges", "slice thickness", "small curved walls", "sparse speckle", "speckle correlation",
-           "speckle everywhere", "thin sulci", "uneven tissue")  # fmt: skip
+           "planes with edges", "rough sheets", "slice thickness", "small curved walls", "sparse speckle",
+           "speckle correlation", "speckle everywhere", "thin sulci", "uneven tissue")  # fmt: skip
 #: Every check in its orientations once: the quick tests have the oblique one of all but the long checks
 CASES = [
     pytest.param(
