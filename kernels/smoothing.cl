@@ -1,6 +1,6 @@
 // Smoothing of the indicators of acoustic groups (borders.py): a separable Gaussian. Beyond the volume its outermost
-// voxels are repeated. One work-item computes LANES voxels of a row; global size (columns / LANES rounded up, rows,
-// planes).
+// voxels are repeated. One work-item computes LANES voxels of a row; global size (columns / LANES rounded up, rows or
+// more, planes).
 //
 // With MEMBERSHIP a voxel belongs to a second group by the share that the segmentation gives it: a border at the
 // half-level between voxels instead of their steps.
@@ -60,6 +60,7 @@ __kernel void smooth_rows(__global const uchar *groups, MEMBERSHIP_PARAMETERS in
                           int reach, int columns, int rows, int planes, int first, __global float *partial) {
   // The last vector of a row starts earlier: voxels shared with the previous vector are computed twice.
   const int column = min((int)get_global_id(0) * LANES, columns - LANES), row = get_global_id(1);
+  if (row >= rows) return;
   const int plane = clamp((int)get_global_id(2) + first, 0, planes - 1);
   __global const uchar *from = groups + ((size_t)plane * rows + row) * columns;
   const int is_inside = column >= reach && column + LANES + reach <= columns;
@@ -97,6 +98,7 @@ __kernel void smooth_rows(__global const uchar *groups, MEMBERSHIP_PARAMETERS in
 __kernel void smooth_columns(__global const float *from, __constant const float *taps, int reach, int columns, int rows,
                              __global float *to) {
   const int column = min((int)get_global_id(0) * LANES, columns - LANES), row = get_global_id(1);
+  if (row >= rows) return;
   const size_t plane = (size_t)get_global_id(2) * rows;
   floatn sum = 0.0f;
   for (int k = -reach; k <= reach; k++)
@@ -108,6 +110,7 @@ __kernel void smooth_columns(__global const float *from, __constant const float 
 __kernel void smooth_planes(__global const float *from, __constant const float *taps, int reach, int columns, int rows,
                             int first, ulong offset, __global ushort *smooth) {
   const int column = min((int)get_global_id(0) * LANES, columns - LANES), row = get_global_id(1);
+  if (row >= rows) return;
   const size_t plane = get_global_id(2), size = (size_t)rows * columns, here = (size_t)row * columns + column;
   floatn sum = 0.0f;
   for (int k = 0; k <= 2 * reach; k++) sum += taps[k] * LOAD_LANES(from + (plane + k) * size + here);
@@ -115,11 +118,13 @@ __kernel void smooth_planes(__global const float *from, __constant const float *
 }
 
 // Means of two voxels along each axis: half the resolution. `columns`, `rows` and `planes` are those of `smooth`, whose
-// last voxels are repeated; the planes of the result start at `first`, each clamped.
+// last voxels are repeated; the planes of the result start at `first`, each clamped. Global size (columns of the result
+// or more, rows, planes).
 ONE_BY_ONE
 __kernel void halve(__global const ushort *smooth, ulong offset, int columns, int rows, int planes, int first,
                     __global float *to) {
-  const int column = get_global_id(0), row = get_global_id(1);
+  const int column = get_global_id(0), row = get_global_id(1), halved = (columns + 1) / 2;
+  if (column >= halved) return;
   const int plane = clamp((int)get_global_id(2) + first, 0, (planes + 1) / 2 - 1);
   int sum = 0;
   for (int n = 0; n < 8; n++) {
@@ -127,7 +132,7 @@ __kernel void halve(__global const ushort *smooth, ulong offset, int columns, in
     const int k = min(2 * plane + (n >> 2), planes - 1);
     sum += smooth[offset + ((size_t)k * rows + j) * columns + i];
   }
-  to[((size_t)get_global_id(2) * get_global_size(1) + row) * get_global_size(0) + column] = sum * (0.125f / 65535.0f);
+  to[((size_t)get_global_id(2) * get_global_size(1) + row) * halved + column] = sum * (0.125f / 65535.0f);
 }
 
 // Along i, within planes of floats.
@@ -135,6 +140,7 @@ ONE_BY_ONE
 __kernel void smooth_halved_rows(__global const float *from, __constant const float *taps, int reach, int columns,
                                  int rows, __global float *to) {
   const int column = min((int)get_global_id(0) * LANES, columns - LANES);
+  if ((int)get_global_id(1) >= rows) return;
   __global const float *row = from + ((size_t)get_global_id(2) * rows + get_global_id(1)) * columns;
   const int is_inside = column >= reach && column + LANES + reach <= columns;
   floatn sum = 0.0f;
@@ -142,9 +148,11 @@ __kernel void smooth_halved_rows(__global const float *from, __constant const fl
   STORE_LANES(sum, to + (row - from) + column);
 }
 
-// Indicators sum to one, so the last group needs no Gaussian. One work-item computes one voxel.
-__kernel void smooth_rest(__global ushort *all, ulong offset, int group, int groups) {
-  const size_t voxel = get_global_id(0), voxels = get_global_size(0);
+// Indicators sum to one, so the last group needs no Gaussian. One work-item computes one voxel; global size voxels or
+// more.
+__kernel void smooth_rest(__global ushort *all, ulong offset, ulong voxels, int group, int groups) {
+  const size_t voxel = get_global_id(0);
+  if (voxel >= voxels) return;
   __global ushort *smooth = all + offset;
   int rest = 65535;
   for (int n = 0; n < groups; n++) rest -= n == group ? 0 : smooth[n * voxels + voxel];

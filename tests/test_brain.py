@@ -453,6 +453,7 @@ def test_none_takes_everything_brighter_than_the_background():
 
 
 @needs_nilearn
+@pytest.mark.slow
 def test_a_ct_head_whose_air_is_0_is_told_from_an_mri_by_its_brain_without_contrast(head, found):
     mri, inside = head
     rng = np.random.default_rng(0)

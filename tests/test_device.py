@@ -211,6 +211,33 @@ def test_how_a_device_splits_the_work_does_not_change_the_image(lanes, chunk):
     assert (difference <= 1).mean() > 0.999
 
 
+def test_pocl_takes_the_same_groups_for_label_maps_and_lines_of_any_number(monkeypatch):
+    """It compiles a kernel for every size of its groups: seconds for every new patient, where they followed the map."""
+    device = Device.get()
+    if "Portable Computing Language" not in device.info.platform:
+        pytest.skip("another runtime chooses groups itself")
+    sizes: dict[str, set] = {}
+    run = Device.run
+
+    def noting(self, kernel, *arguments, **options):
+        def told(queue, global_size, local_size, *given):
+            sizes.setdefault(kernel.function_name, set()).add((local_size, len(global_size)))
+            assert all(size % part == 0 for size, part in zip(global_size, local_size, strict=True))
+            return kernel(queue, global_size, local_size, *given)
+
+        run(self, told, *arguments, **options)
+
+    monkeypatch.setattr(Device, "run", noting)
+    for half_mm, lines in (((14, 15, 9), 40), ((16, 17, 11), 47), ((19, 13, 12.5), 53), ((15.5, 18.5, 10.5), 61)):
+        labels = block(lambda x, y, z: 1 + (x + y > 3) + (y > 5), half_mm)
+        probe = LinearProbe(18, 24, scan_lines=lines, focus_mm=12, elevation_focus_mm=12)
+        simulator(labels, SPECKLE, SPECKLE, SPECKLE).simulate(probe, rigid(np.eye(3), [0, -12, 0]))
+    assert {"smooth_rows", "halve", "smooth_rest", "scan_convert"} <= sizes.keys()
+    of_map = {name: found for name, found in sizes.items() if name.startswith(("smooth", "halve"))}
+    assert all(len(found) == 1 for found in of_map.values()), of_map
+    assert all(len(found) <= 3 for found in sizes.values()), sizes
+
+
 def test_importing_the_interface_imports_nothing_heavy():
     code = (
         "import sys, SlicerUSSim.Logic as L; from SlicerUSSim.Command.cli import main; L.SimulationError; "

@@ -107,16 +107,6 @@ def test_net_fall_with_depth_and_relative_echogenicity_are_recovered(twin, resul
     assert spread.is_determined is False or abs(truth - spread.value) < 3.0
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("seed", [0, 1])
-def test_attenuation_and_echogenicity_are_recovered_when_the_display_is_known(brain, seed):
-    twin = make_twin(*brain, seed, probe=SMALL, display_is_known=True)
-    result = optimise(twin, ["white matter"])
-    found, true = white(result.tissues), white(twin.true_tissues)
-    assert found.attenuation_db_cm_mhz == pytest.approx(true.attenuation_db_cm_mhz, abs=0.1)
-    assert variance_db(found) == pytest.approx(variance_db(true), abs=1.5)
-
-
 def test_it_says_what_cannot_be_known(result):
     found = result.identifiability
     assert not found["white matter.mu1"].is_determined  # only Var shows
@@ -130,7 +120,7 @@ def test_it_says_what_cannot_be_known(result):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("seed", range(3))
 def test_restarts_reach_the_fit_and_its_interval_holds_the_truth(brain, seed):
     """Along the parameters restarts stopped in the valley of TGC and attenuation: 8 of 25 reached the fit's cost."""
     twin = make_twin(*brain, seed, probe=SMALL)

@@ -75,8 +75,10 @@ def probe() -> LinearProbe:
 
 def channels(param, lateral_mm, depth_mm, strength, delays) -> np.ndarray:
     """(samples, elements) analytic signals of point scatterers."""
+    options = pymust.utils.Options()
+    options.dBThresh = -60  # of frequencies: the signals are those of its default, -100, but for 1e-6 of them
     rf, _ = pymust.simus(
-        np.asarray(lateral_mm) * 1e-3, np.asarray(depth_mm) * 1e-3, np.asarray(strength), delays, param
+        np.asarray(lateral_mm) * 1e-3, np.asarray(depth_mm) * 1e-3, np.asarray(strength), delays, param, options
     )
     return hilbert(rf, axis=0)
 
@@ -149,6 +151,14 @@ def focused_lines(lateral_mm, depth_mm, strength, lines_mm, along_mm) -> np.ndar
     return np.array(image).T
 
 
+def both_sides(values: np.ndarray) -> np.ndarray:
+    """Values at places along the last axis, which begin at the middle of the aperture, and at those of the other side.
+
+    The aperture and its delays are symmetric, and so is the echo of a point.
+    """
+    return np.concatenate([values[..., :0:-1], values], axis=-1)
+
+
 def focused_probe() -> LinearProbe:
     return replace(probe(), width_mm=20.0, scan_lines=201, aperture_mm=ELEMENTS * PITCH_MM, focus_mm=FOCUS_MM)
 
@@ -158,10 +168,11 @@ def focused_probe() -> LinearProbe:
 )
 def test_a_focused_transmit_beam_is_as_wide_at_and_away_from_its_focus(depth):
     """Not just before the focus (20 to 25 mm): there the near field of a real aperture has ripples of 20 %."""
-    lines = np.arange(-2.0, 2.01, 0.1)
+    lines = np.arange(0.0, 2.01, 0.1)
     image = focused_lines(np.zeros(1), np.full(1, depth), np.ones(1), lines, depth + np.arange(-0.4, 0.41, 0.02))
+    lines, echo = np.union1d(-lines, lines), both_sides(np.abs(image).max(axis=0))
     width = float(focused_probe().beam_sigma_mm(depth)[0]) * FWHM_PER_SIGMA  # which `ussim validate` finds in the image
-    assert width == pytest.approx(full_width(lines, np.abs(image).max(axis=0)), rel=0.15)
+    assert width == pytest.approx(full_width(lines, echo), rel=0.15)
 
 
 @pytest.mark.parametrize(("depth", "tolerance"), [(15.0, 0.1), (30.0, 0.1), (45.0, 0.2)])
@@ -206,9 +217,9 @@ def correlation_length(pairs, spacing: float) -> float:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("depth", [12.0, 30.0, 39.0])
+@pytest.mark.parametrize("depth", [12.0, 30.0])
 def test_focused_speckle_has_the_same_correlation_lengths(scatterers, depth):
-    """Within 15 %."""
+    """Within 15 %. The test after next has the lateral length within 10 %, at more depths, of the echo of a point."""
     array = focused_probe()
     along = depth + np.arange(-3, 3, 0.04)
     near = [values[abs(scatterers[1] - depth) < 5.0] for values in scatterers]
@@ -264,7 +275,7 @@ def test_speckle_correlates_as_of_a_focused_wave_in_and_away_from_its_focus(
     mhz, f_number, pitch_mm, elements, focus, depths
 ):
     """Within 10 %: the phase of our beam has the curvature for it. `ussim validate` finds the length in images."""
-    param, spacing, lateral = array_of(mhz, f_number, pitch_mm, elements), 0.1, np.arange(-3.5, 3.51, 0.1)
+    param, spacing, lateral = array_of(mhz, f_number, pitch_mm, elements), 0.1, np.arange(0.0, 3.51, 0.1)
     delays = pymust.txdelay(0.0, focus * 1e-3, param)
     ours = LinearProbe(
         20.0, 80.0, frequency_mhz=mhz, aperture_mm=elements * pitch_mm, receive_f_number=f_number, focus_mm=focus
@@ -275,7 +286,7 @@ def test_speckle_correlates_as_of_a_focused_wave_in_and_away_from_its_focus(
             beamformed(channels(param, [-x], [depth], [1.0], delays), param, delays, [0.0], along)[:, 0]
             for x in lateral
         ]
-        found = half_correlation(np.array(lines).T, spacing)
+        found = half_correlation(both_sides(np.array(lines).T), spacing)
         assert float(ours.speckle_sigma_mm(depth)) * HALF == pytest.approx(found, rel=0.1), f"{depth} mm"
 
 

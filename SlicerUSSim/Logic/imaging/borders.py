@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from SlicerUSSim.Logic.opencl.device import Device, Workspace
+from SlicerUSSim.Logic.opencl.device import Device, Workspace, divisible
 from SlicerUSSim.Logic.opencl.layout import CONSTANTS
 
 if TYPE_CHECKING:
@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 #: Standard deviations at which the Gaussians are cut off; layers are found by the tails of the second
 WIDE_CUT, HALVED_CUT = 2.5, 3.5
 _SLAB = 48  # planes at a time, to limit the memory between the passes
+_ROWS, _VOXELS = 8, 16  # in a group with PoCL
 
 
 def smoothed_indicators(
@@ -51,7 +52,8 @@ def smoothed_indicators(
     if last < fields:
         rest = device.kernels("smoothing.cl")["smooth_rest"]
         for count, offset in ((voxels, 0), (halved, fields * voxels)):
-            device.run(rest, (count,), smooth, np.uint64(offset), np.int32(last), np.int32(fields))
+            sizes = np.uint64(offset), np.uint64(count), np.int32(last), np.int32(fields)
+            device.run(rest, (divisible(count),), smooth, *sizes)
     return smooth
 
 
@@ -88,18 +90,21 @@ def _smooth(
     reach = int(along_k[1])
     slab = min(_SLAB, planes)
     partial = [workspace.get(name, 4 * columns * rows * (slab + 2 * reach)) for name in ("rows", "columns")]
-    across, shape = -(-columns // lanes), (np.int32(columns), np.int32(rows))
+    plane, shape = (-(-columns // lanes), divisible(rows, _ROWS)), (np.int32(columns), np.int32(rows))
+    group_size = 1, _ROWS, 1
     for first in range(0, planes, slab):
         count = min(slab, planes - first)
         around = count + 2 * reach
         device.run(
-            kernels["smooth_rows"], (across, rows, around), *groups, np.int32(group), *along_i, *shape,
-            np.int32(planes), np.int32(first - reach), partial[0],
+            kernels["smooth_rows"], (*plane, around), *groups, np.int32(group), *along_i, *shape,
+            np.int32(planes), np.int32(first - reach), partial[0], group=group_size,
         )  # fmt: skip
-        device.run(kernels["smooth_columns"], (across, rows, around), partial[0], *along_j, *shape, partial[1])
         device.run(
-            kernels["smooth_planes"], (across, rows, count), partial[1], *along_k, *shape, np.int32(first),
-            np.uint64(offset), smooth,
+            kernels["smooth_columns"], (*plane, around), partial[0], *along_j, *shape, partial[1], group=group_size
+        )
+        device.run(
+            kernels["smooth_planes"], (*plane, count), partial[1], *along_k, *shape, np.int32(first),
+            np.uint64(offset), smooth, group=group_size,
         )  # fmt: skip
 
 
@@ -110,18 +115,19 @@ def _smooth_halved(device: Device, workspace: Workspace, dims, offset: int, to_o
     scalar, kernels = device.kernels("smoothing.cl"), device.kernels("smoothing.cl", lanes)
     taps = gaussian_taps(CONSTANTS["HALVED_SIGMA"], HALVED_CUT)
     reach, tap_buffer = np.int32(len(taps) // 2), device.upload(taps)
-    around, across, shape = planes + 2 * int(reach), -(-columns // lanes), (np.int32(columns), np.int32(rows))
+    around, shape = planes + 2 * int(reach), (np.int32(columns), np.int32(rows))
     partial = [workspace.get(name, 4 * columns * rows * around) for name in ("halved", "halved rows")]
     device.run(
-        scalar["halve"], (columns, rows, around), smooth, np.uint64(offset), *(np.int32(n) for n in dims), -reach,
-        partial[0],
+        scalar["halve"], (divisible(columns, _VOXELS), rows, around), smooth, np.uint64(offset),
+        *(np.int32(n) for n in dims), -reach, partial[0], group=(_VOXELS, 1, 1),
     )  # fmt: skip
-    size = across, rows, around
-    device.run(kernels["smooth_halved_rows"], size, partial[0], tap_buffer, reach, *shape, partial[1])
-    device.run(kernels["smooth_columns"], size, partial[1], tap_buffer, reach, *shape, partial[0])
+    plane, group = (-(-columns // lanes), divisible(rows, _ROWS)), (1, _ROWS, 1)
+    size = *plane, around
+    device.run(kernels["smooth_halved_rows"], size, partial[0], tap_buffer, reach, *shape, partial[1], group=group)
+    device.run(kernels["smooth_columns"], size, partial[1], tap_buffer, reach, *shape, partial[0], group=group)
     device.run(
-        kernels["smooth_planes"], (across, rows, planes), partial[0], tap_buffer, reach, *shape, np.int32(0),
-        np.uint64(to_offset), smooth,
+        kernels["smooth_planes"], (*plane, planes), partial[0], tap_buffer, reach, *shape, np.int32(0),
+        np.uint64(to_offset), smooth, group=group,
     )  # fmt: skip
 
 

@@ -169,17 +169,21 @@ class Device:
         )
 
     def run(
-        self, kernel: Kernel, global_size: tuple[int, ...], *arguments, heavy: bool = False, few: bool = False
-    ) -> None:
+        self, kernel: Kernel, global_size: tuple[int, ...], *arguments, heavy: bool = False, few: bool = False,
+        group: tuple[int, ...] | None = None,
+    ) -> None:  # fmt: skip
         """Enqueue a kernel; its event is kept if `profiling` is on.
 
         `heavy` is for work-items with large private arrays: on a processor each is then a separate group, since PoCL
         keeps the arrays of a group on the stack of one thread, and a stack overflow would end the process. `few` is
         for long work-items of which there are at most some thousand: PoCL puts hundreds of them into one group, which
-        one core computes while the others wait, so that each is a separate group there.
+        one core computes while the others wait, so that each is a separate group there. `group` is PoCL's group where
+        it is not to follow from the global size, which it divides.
         """
-        apart = self.info.kind != "GPU" and (heavy or (few and self._is_pocl))
-        local_size = (1,) * len(global_size) if apart else None
+        if self.info.kind != "GPU" and (heavy or (few and self._is_pocl)):
+            local_size = (1,) * len(global_size)
+        else:
+            local_size = (group or pocl_group(global_size)) if self._is_pocl else None
         _require_not_forked()
         with self._lock:
             event = kernel(self.queue, global_size, local_size, *arguments)
@@ -298,10 +302,20 @@ def _require_not_forked() -> None:
         )
 
 
-def divisible(count: int) -> int:
+def divisible(count: int, by: int = 1024) -> int:
     """The next larger global size that a runtime can divide into groups: of a prime number of work-items, it makes one
     group, which one core computes, or a group of each."""
-    return -(-count // 1024) * 1024
+    return -(-count // by) * by
+
+
+def pocl_group(global_size: tuple[int, ...]) -> tuple[int, ...]:
+    """The work-items of a group with PoCL: 64, 8 or 1 along the first axis.
+
+    PoCL compiles a kernel anew for every size of its groups, for some tenths of a second. Left to itself it takes the
+    largest divisors of the global size, so that every label map of another shape had its kernels compiled.
+    """
+    first = next(size for size in (64, 8, 1) if global_size[0] % size == 0)
+    return (first, *(1 for _ in global_size[1:]))
 
 
 def _was_cached(program: Program) -> bool:

@@ -18,7 +18,7 @@ from SlicerUSSim.Logic.verification.phantoms import (
     folds,
     speed_cyst,
 )
-from SlicerUSSim.Logic.verification.validation.beam_levels import along_line, beam_of_line, levels_db
+from SlicerUSSim.Logic.verification.validation.beam_levels import along_line, beam_of_line, levels_db, undisturbed
 from SlicerUSSim.Logic.verification.validation.checks import PROBES, Check, Outcome, Row
 from SlicerUSSim.Logic.verification.validation.pictures import Curve, Plot, draw_plots
 from SlicerUSSim.Logic.verification.wave import speckle_power
@@ -202,10 +202,9 @@ def _wave_behind_db(
 
     `speeds` are of the object and around it; `loss_db` is both ways, through a plate.
     """
-    beam = partial(
-        speckle_power, depths_mm=np.array(depths_mm), frequency_mhz=5.0, aperture_mm=12.0, f_number=2.5, focus_mm=30.0,
-        reference_m_s=REFERENCE_SPEED_M_S,
-    )  # fmt: skip
+    fields = {"frequency_mhz": 5.0, "aperture_mm": 12.0, "f_number": 2.5, "focus_mm": 30.0,
+              "reference_m_s": REFERENCE_SPEED_M_S}  # fmt: skip
+    beam = partial(speckle_power, depths_mm=np.array(depths_mm), **fields)
 
     def is_inside(x, depth):
         if shape == "ball":
@@ -219,7 +218,7 @@ def _wave_behind_db(
         return np.where(is_inside(x, depth), inside, around)
 
     if speeds is None:
-        powers = [beam(None, nepers_per_mm=nepers), beam(None)]
+        powers = [beam(None, nepers_per_mm=nepers), undisturbed(speckle_power, tuple(depths_mm), **fields)]
     else:
         powers = [beam(partial(speed, inside=inside, around=speeds[1])) for inside in speeds]
     return float(10.0 * np.log10(np.mean(powers[0] / powers[1])))

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
-from typing import TypeVar
+from functools import lru_cache
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -14,6 +14,7 @@ from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.imaging.simulator import UltrasoundSimulator
 from SlicerUSSim.Logic.probe.arrays import PhasedProbe, Probe
 from SlicerUSSim.Logic.tissue.table import TissueTable
+from SlicerUSSim.Logic.verification.wave import Map
 
 _Result = TypeVar("_Result")
 
@@ -93,10 +94,30 @@ def along_line(probe: Probe, position: float, to_ijk: np.ndarray) -> Callable[[n
 
 def beam_of_line(
     propagated: Callable[..., _Result], probe: Probe, position: float, depths_mm: np.ndarray, reference_m_s: float
-) -> Callable[..., _Result]:
+) -> Callable[[Map | None], _Result]:
     """A function of verification.wave with the beam of a line; its argument is the speed of sound, or None."""
-    return partial(
-        propagated, depths_mm=depths_mm, frequency_mhz=probe.frequency_mhz, aperture_mm=probe.aperture_mm,
-        f_number=probe.receive_f_number, focus_mm=probe.focus_mm, reference_m_s=reference_m_s,
-        steering_rad=position if isinstance(probe, PhasedProbe) else 0.0,
-    )  # fmt: skip
+    fields = {
+        "frequency_mhz": probe.frequency_mhz, "aperture_mm": probe.aperture_mm, "f_number": probe.receive_f_number,
+        "focus_mm": probe.focus_mm, "reference_m_s": reference_m_s,
+        "steering_rad": float(position) if isinstance(probe, PhasedProbe) else 0.0,
+    }  # fmt: skip
+
+    def beam(speed: Map | None) -> _Result:
+        if speed is None:
+            return undisturbed(propagated, tuple(depths_mm), **fields)
+        return propagated(speed, depths_mm=depths_mm, **fields)
+
+    return beam
+
+
+def undisturbed(propagated: Callable[..., _Result], depths_mm: tuple[float, ...], **beam: float) -> _Result:
+    """`propagated`, a function of verification.wave, without a medium: the same for many lines and views."""
+    return _undisturbed(propagated, depths_mm, **beam)
+
+
+@lru_cache(maxsize=512)
+def _undisturbed(propagated: Callable[..., Any], depths_mm: tuple[float, ...], **beam: float) -> Any:
+    found = propagated(None, depths_mm=np.array(depths_mm), **beam)
+    for array in found if isinstance(found, tuple) else (found,):
+        array.flags.writeable = False
+    return found

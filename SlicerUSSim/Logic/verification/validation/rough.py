@@ -22,7 +22,7 @@ from SlicerUSSim.Logic.verification.validation.beams import BEHIND
 from SlicerUSSim.Logic.verification.validation.checks import Check, Outcome, Row
 from SlicerUSSim.Logic.verification.validation.pictures import Curve, Plot, draw_plots
 
-_DEPTH_MM = 25.0
+_DEPTH_MM, _IMAGED_MM = 25.0, 40.0  # of the sheet, and of images: deeper samples are not looked at
 _SILENT = SimulationSettings(scattering=False, specular_exponent=0.0, ring_down=False, side_lobes=False)
 _LOUD = replace(_SILENT, scattering=True)
 _GREY, _PIA = (replace(TISSUES[name], attenuation_db_cm_mhz=0.0) for name in ("grey matter", "leptomeninges"))
@@ -51,7 +51,7 @@ def _shipped_at(name: str, frequency_mhz: float) -> Probe:
     """A shipped probe, focused at the sheet, with a middle line."""
     shipped = PROBES[name]
     return replace(shipped, focus_mm=_DEPTH_MM, elevation_focus_mm=_DEPTH_MM, frequency_mhz=frequency_mhz,
-                   scan_lines=shipped.scan_lines // 2 * 2 + 1)  # fmt: skip
+                   scan_lines=shipped.scan_lines // 2 * 2 + 1, depth_mm=min(shipped.depth_mm, _IMAGED_MM))  # fmt: skip
 
 
 def _shipped() -> list[tuple[str, Probe]]:
