@@ -153,7 +153,7 @@ def test_a_preset_is_a_probe_that_could_be_built(name):
         assert 0.2 * probe.depth_mm < focus < 0.8 * probe.depth_mm
         assert 1.5 < focus / size < 10.0
     low, high = (probe.frequency_mhz * (1.0 + side * probe.fractional_bandwidth / 2.0) for side in (-1, 1))
-    assert 1.5 < low < high < 20.0
+    assert 1.2 < low < high < 20.0
 
 
 @each_preset
