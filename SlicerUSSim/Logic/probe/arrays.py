@@ -453,7 +453,7 @@ PROBES: dict[str, Probe] = {
     ),
     "transcranial": PhasedProbe(  # for the temporal bone
         field_of_view_deg=90.0, depth_mm=140.0, frequency_mhz=2.0, fractional_bandwidth=0.6,
-        band_mhz=(1.4, 2.6), aperture_mm=19.2, focus_mm=70.0,
+        band_mhz=(1.4, 2.6), aperture_mm=19.2, receive_f_number=1.5, focus_mm=70.0,
         elevation_aperture_mm=14.0, elevation_focus_mm=70.0,
     ),
     "neonatal": ConvexProbe(  # for the anterior fontanelle
