@@ -117,8 +117,14 @@ def fit_speckle(
         model = AppearanceModel(simulator, tracked.probe, tracked.poses, {}, tracked.grid)
     done, total = 0, sum(_EVALUATIONS) + by_width * _WIDTH_EVALUATIONS
 
+    def images_of(table: TissueTable, shown: DisplaySettings) -> list[np.ndarray]:
+        return [model.image(n, table, shown) for n in range(len(references))]
+
+    def texture_of(images: Sequence[np.ndarray]) -> TextureMisfit:
+        return _mean([r.misfit(image) for r, image in zip(references, images, strict=True)])
+
     def misfit(table: TissueTable, shown: DisplaySettings) -> TextureMisfit:
-        return _mean([r.misfit(model.image(n, table, shown)) for n, r in enumerate(references)])
+        return texture_of(images_of(table, shown))
 
     def search(
         cost: Callable[[DisplaySettings], float], start: np.ndarray, evaluations: int
@@ -169,10 +175,8 @@ def fit_speckle(
     real = _widths(tracked, tracked.images)
 
     def with_widths(shown: DisplaySettings) -> float:
-        images = [model.image(n, table, shown) for n in range(len(references))]
-        wrong = width_misfit(_widths(tracked, images), real)
-        textures = _mean([r.misfit(image) for r, image in zip(references, images, strict=True)])
-        return textures.total + _WIDTH_WEIGHT * wrong
+        images = images_of(table, shown)
+        return texture_of(images).total + _WIDTH_WEIGHT * width_misfit(_widths(tracked, images), real)
 
     model.anchor(table)
     first = with_widths(shown)

@@ -312,7 +312,7 @@ def proposal_of(segmentation: Segmentation, grown: Grown, seed: np.ndarray, name
         elif name != "oedema":
             labels[part] = len(tissues) or 1
     warnings = []
-    beside = _distance_mm(evidence, labels, seed)
+    beside = float(distance_from(evidence.index_of(seed), labels.shape, evidence.spacing_mm)[labels > 0].min())
     if beside >= _BESIDE_MM:
         warnings.append(f"the point is {beside:.0f} mm beside what is proposed: look whether that is meant")
     if evidence.atlas is None:
@@ -326,13 +326,6 @@ def proposal_of(segmentation: Segmentation, grown: Grown, seed: np.ndarray, name
         seed,
         tuple(warnings),
     )
-
-
-def _distance_mm(evidence: Evidence, labels: np.ndarray, seed: np.ndarray) -> float:
-    """From a point, (3,) RAS mm, to the nearest voxel of a proposal, (k, j, i) on the box of the evidence."""
-    voxels = np.argwhere(labels > 0)
-    places = voxels[:, ::-1] @ evidence.ijk_to_ras[:3, :3].T + evidence.ijk_to_ras[:3, 3]
-    return float(np.linalg.norm(places - seed, axis=1).min())
 
 
 def _necrosis_in(evidence: Evidence, grown: Grown) -> np.ndarray:

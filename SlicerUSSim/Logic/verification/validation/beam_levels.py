@@ -110,13 +110,9 @@ def beam_of_line(
     return beam
 
 
-def undisturbed(propagated: Callable[..., _Result], depths_mm: tuple[float, ...], **beam: float) -> _Result:
-    """`propagated`, a function of verification.wave, without a medium: the same for many lines and views."""
-    return _undisturbed(propagated, depths_mm, **beam)
-
-
 @lru_cache(maxsize=512)
-def _undisturbed(propagated: Callable[..., Any], depths_mm: tuple[float, ...], **beam: float) -> Any:
+def undisturbed(propagated: Callable[..., Any], depths_mm: tuple[float, ...], **beam: float) -> Any:
+    """`propagated`, a function of verification.wave, without a medium: the same for many lines and views."""
     found = propagated(None, depths_mm=np.array(depths_mm), **beam)
     for array in found if isinstance(found, tuple) else (found,):
         array.flags.writeable = False
