@@ -8,7 +8,7 @@
 // Buffers: planes uint2 [k][j][i] (sheets.clh); quantiles, segments, segment_counts, hits, hit_counts as in
 // raytracing.cl.
 
-#include "common.clh"
+#include "hits.clh"
 #include "sheets.clh"
 
 #define SLACK 0.75f  // of a step, from its middle, in which a crossing counts
@@ -25,7 +25,7 @@ __kernel void sheet_hits(__constant const Acquisition *acquisition, __global con
   for (int index = 0; index < segments_of_line; index++) {
     __global const Segment *segment = segments + line * MAX_SEGMENTS + index;
     const float3 start = vload3(0, segment->start), direction = vload3(0, segment->direction);
-    const float3 lateral = vload3(0, segment->lateral), elevational = vload3(0, segment->elevational);
+    const float3 elevational = vload3(0, segment->elevational);
     const float3 at_start = affine_point(m, start), step = affine_vector(m, direction);
     const float3 aside = quantile * affine_vector(m, elevational);
     const int steps = (int)ceil(segment->length_mm / stride);
@@ -51,32 +51,10 @@ __kernel void sheet_hits(__constant const Acquisition *acquisition, __global con
                                gradient.x * m[1] + gradient.y * m[5] + gradient.z * m[9],
                                gradient.x * m[2] + gradient.y * m[6] + gradient.z * m[10]);
       normal *= (dot3(normal, direction) > 0.0f ? -1.0f : 1.0f) / length3(normal);
-      const float cos_in = clamp(-dot3(normal, direction), 0.01f, 1.0f), path = segment->path_mm + along;
-      const float4 tube = tube_after(vload4(0, segment->tube), along);
-      const float reflection = reflection_of_look(words.y), phase = acquisition->membrane_phase * cos_in;
-      const float offset = quantile * elevation_sigma(acquisition, path);
-      if (count < MAX_HITS) {
-        Hit hit;
-        vstore3(start + along * direction + offset * elevational, 0, hit.position);
-        vstore3(normal, 0, hit.normal);
-        hit.path_mm = path;
-        hit.depth_mm = segment->depth_mm + along * segment->depth_per_mm;
-        hit.weight = segment->weight;
-        hit.attenuation = segment->attenuation * exp_fast(-segment->decay_per_mm * along);
-        hit.loss = segment->loss + segment->loss_per_mm * along;
-        hit.cos_incidence = cos_in;
-        hit.reflectance = reflection * reflection;
-        hit.lateral_slope = segment->depth_per_mm * tube.x * slope_along(lateral, direction, normal);
-        hit.elevational_slope = segment->depth_per_mm * tube.z * slope_along(elevational, direction, normal);
-        hit.curvature = 0.0f;
-        hit.elevational_mm = offset;
-        hit.echo = hit.weight * hit.attenuation * (acquisition->interface_is_energy ? hit.reflectance : reflection) *
-                   exp2_scalar(max(acquisition->specular_exponent * log2_scalar(cos_in), -100.0f)) *
-                   acquisition->interface_gain / (rays * tube.x * tube.z) * exp_fast(-0.5f * phase * phase);
-        hit.reflections = segment->reflections;
-        hit.label_before = hit.label_behind = segment->label;
-        hits[slot * MAX_HITS + count] = hit;
-      }
+      const float phase = acquisition->membrane_phase * clamp(-dot3(normal, direction), 0.01f, 1.0f);
+      if (count < MAX_HITS)
+        hits[slot * MAX_HITS + count] = hit_on_segment(acquisition, segment, along, quantile, normal,
+                                                       reflection_of_look(words.y), exp_fast(-0.5f * phase * phase));
       count++;
     }
   }

@@ -1,4 +1,4 @@
-"""Host code of kernels/raytracing.cl and sheet_hits.cl: the ray tree of every scan line."""
+"""Host code of kernels/raytracing.cl, sheet_hits.cl and face_hits.cl: the ray tree of every scan line."""
 
 from __future__ import annotations
 
@@ -32,6 +32,7 @@ class RayTracer(Stage):
         super().__init__(device)
         self.kernel = device.kernels("raytracing.cl")["trace"]
         self._sheet_hits = device.kernels("sheet_hits.cl")["sheet_hits"]
+        self._face_hits = device.kernels("face_hits.cl")["face_hits"]
         self._losses = device.kernels("downshift.cl", device.lanes)["losses"]
         self.workspace = Workspace(device)
         self._quantile_key: tuple | None = None
@@ -89,6 +90,11 @@ class RayTracer(Stage):
             self.device.run(
                 self._sheet_hits, (traced, rays), frame.acquisition_buffer, medium.sheet_buffer, self._quantiles,
                 tree.segments, tree.segment_counts, tree.hits, tree.hit_counts, heavy=True,
+            )  # fmt: skip
+        if acquisition["face_reflection"] and acquisition["max_ray_depth"]:
+            self.device.run(
+                self._face_hits, (traced, rays), frame.acquisition_buffer, self._quantiles, tree.segments,
+                tree.segment_counts, tree.hits, tree.hit_counts, heavy=True,
             )  # fmt: skip
         lines, samples = frame.line_shape
         frame.losses = get("losses", lines * (samples // CONSTANTS["LOSS_STEP"] + 1) * 12)

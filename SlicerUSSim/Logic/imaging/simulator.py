@@ -435,6 +435,9 @@ class UltrasoundSimulator:
         acquisition["apex_radius_mm"] = 0.0 if probe.is_linear else probe.apex_radius_mm
         for name, value in steering_fields(probe).items():
             acquisition[name] = value
+        acquisition["face_reflection"] = probe.face_reflection
+        acquisition["face_half_mm"] = 0.5 * probe.face_mm
+        acquisition["face_half_height_mm"] = 0.5 * probe.elevation_aperture_mm
         acquisition["first_line"] = probe.first_line
         acquisition["line_spacing"] = probe.line_spacing
         acquisition["frequency_mhz"] = probe.received_mhz

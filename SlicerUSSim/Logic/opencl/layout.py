@@ -99,6 +99,9 @@ ACQUISITION = np.dtype(
         ("start_mm", _FLOAT),  # displayed depth at which a parallel line in the middle leaves the face
         ("top_mm", _FLOAT),  # of the imaged field
         ("bottom_mm", _FLOAT),
+        ("face_reflection", _FLOAT),  # of the amplitude by the probe's face; 0: none
+        ("face_half_mm", _FLOAT),  # half the size of the face, laterally and elevationally
+        ("face_half_height_mm", _FLOAT),
         # wave and beam (Probe.beam_sigma_mm)
         ("frequency_mhz", _FLOAT),
         ("fractional_bandwidth", _FLOAT),

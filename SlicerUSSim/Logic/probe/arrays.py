@@ -64,6 +64,12 @@ class Probe(Beam):
         0.0, "Ring-down level", "Of the reverberation at the face, re tissue of unit scatterer variance", unit="dB",
         bounds=(-100, 100),
     )  # fmt: skip
+    face_reflection: float = parameter(
+        0.25, "Face reflection",
+        "Amplitude that the face reflects of what bone or gas send back to it, which shows them again at twice their "
+        "depth; 0: none",
+        bounds=(0, 1),
+    )  # fmt: skip
 
     #: Name of the kind in a preset, and a description for tool tips
     kind: ClassVar[str]

@@ -62,6 +62,9 @@ def acquisition_record(
         "line_spacing": spacing,
         "scan_lines": probe.scan_lines,
         **_steering(probe),
+        "face_reflection": probe.face_reflection,
+        "face_half_mm": 0.5 * _face_mm(probe),
+        "face_half_height_mm": 0.5 * probe.elevation_aperture_mm,
         "traced_mm": _steering(probe)["depth_mm"] + behind * step + medium.voxel_mm,
         "frequency_mhz": _received_mhz(probe),
         "fractional_bandwidth": _received_bandwidth(probe),
@@ -368,6 +371,14 @@ def harmonic_level(probe: Probe, depth: np.ndarray) -> np.ndarray:
 
 def _is_parallel(probe: Probe) -> bool:
     return isinstance(probe, LinearProbe) and not probe.trapezoid_deg
+
+
+def _face_mm(probe: Probe) -> float:
+    if isinstance(probe, LinearProbe):
+        return probe.width_mm
+    if isinstance(probe, PhasedProbe):
+        return probe.aperture_mm
+    return max(2.0 * probe.radius_mm * np.sin(np.deg2rad(0.5 * probe.field_of_view_deg)), probe.aperture_mm)
 
 
 def _steering(probe: Probe) -> dict[str, float]:

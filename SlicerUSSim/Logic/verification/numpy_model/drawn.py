@@ -103,14 +103,16 @@ def sheet_hits(
                 if along[n] < last + voxel_mm:
                     continue
                 last = along[n]
-                hits.append(
-                    _hit(acquisition, beam, segment, quantile, along[n], gradient[n] @ matrix[:, :3], reflection[n])
-                )
+                normal = gradient[n] @ matrix[:, :3]
+                hits.append(segment_hit(acquisition, beam, segment, quantile, along[n], normal, reflection[n]))
+                phase = acquisition["membrane_phase"] * hits[-1]["cos_incidence"]
+                hits[-1]["echo"] *= np.exp(-0.5 * phase**2)
                 hit_lines.append(line)
     return np.array(hits, HIT), np.array(hit_lines, int)
 
 
-def _hit(acquisition, beam: Beam, segment, quantile, along, normal, reflection) -> np.ndarray:
+def segment_hit(acquisition, beam: Beam, segment, quantile, along, normal, reflection) -> np.ndarray:
+    """The layout.HIT where a ray meets a smooth surface at a length along a segment (kernels/hits.clh)."""
     hit = np.zeros((), HIT)
     direction, depth_per_mm = segment["direction"], segment["depth_per_mm"]
     normal = normal / np.linalg.norm(normal)
@@ -129,7 +131,6 @@ def _hit(acquisition, beam: Beam, segment, quantile, along, normal, reflection) 
     hit["echo"] = (
         hit["weight"] * hit["attenuation"] * echo * cosine ** acquisition["specular_exponent"]
         * acquisition["interface_gain"] / (acquisition["elevational_rays"] * tube[0] * tube[2])
-        * np.exp(-0.5 * (acquisition["membrane_phase"] * cosine) ** 2)
     )  # fmt: skip
     hit["reflections"], hit["label_before"], hit["label_behind"] = (
         segment[n] for n in ("reflections", "label", "label")

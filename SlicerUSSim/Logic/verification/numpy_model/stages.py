@@ -23,6 +23,7 @@ from SlicerUSSim.Logic.verification.numpy_model.acquisition import (
 from SlicerUSSim.Logic.verification.numpy_model.aperture import Screens
 from SlicerUSSim.Logic.verification.numpy_model.beam import Beam
 from SlicerUSSim.Logic.verification.numpy_model.drawn import sheet_hits
+from SlicerUSSim.Logic.verification.numpy_model.face import face_hits
 from SlicerUSSim.Logic.verification.numpy_model.echoes import (
     add_interfaces,
     frequencies_along,
@@ -80,6 +81,8 @@ def ray_tree(frame: TwinFrame) -> None:
     if frame.labels.drawn is not None:
         hits, lines = sheet_hits(record, frame.labels.drawn, quantiles, frame.segments, frame.segment_lines)
         frame.hits, frame.hit_lines = np.concatenate([frame.hits, hits]), np.concatenate([frame.hit_lines, lines])
+    hits, lines = face_hits(record, quantiles, frame.segments, frame.segment_lines)
+    frame.hits, frame.hit_lines = np.concatenate([frame.hits, hits]), np.concatenate([frame.hit_lines, lines])
     frame.frequencies = frequencies_along(record, frame.segments, frame.segment_lines)
 
 
