@@ -486,6 +486,34 @@ def test_a_full_disk_on_which_programs_would_be_kept_is_named_before_the_compile
         assert "is on a full disk (0.1 MB left, expected 4 MB)" in (lack_of_programs_disk(tmp_path / "none") or "")
 
 
+_SIGNALLED = """
+import os, signal, threading, time
+from SlicerUSSim.Logic.opencl.device import Device
+signal.signal(signal.SIGINT, signal.SIG_IGN)
+device, ended = Device.get("pocl"), threading.Event()
+def send():
+    while not ended.wait(0.002):
+        os.kill(os.getpid(), signal.SIGINT)
+thread = threading.Thread(target=send)
+thread.start()
+try:
+    for name in ("beam.cl", "smoothing.cl", "side_lobes.cl"):
+        device.kernels(name)
+finally:
+    ended.set()
+    thread.join()
+print("built")
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="PoCL's wheel is for Linux")
+def test_a_build_goes_on_at_signals_that_the_process_ignores(tmp_path):
+    """As Ctrl-C is in the background of a script: the compiler's own handler removed the file it was writing."""
+    done = _in_process(_SIGNALLED, OCL_ICD_VENDORS=_only_pocl(tmp_path), POCL_CACHE_DIR=str(tmp_path / "programs"))
+    assert done.returncode == 0, done.stderr[-800:]
+    assert done.stdout == "built\n"
+
+
 @pytest.mark.skipif(sys.platform != "linux", reason="PoCL's wheel is for Linux")
 def test_a_cache_that_cannot_be_written_is_named(tmp_path):
     """PoCL has no device then; without this: "no OpenCL device found; run: pip install"."""

@@ -49,7 +49,7 @@ def test_without_a_face_and_where_nothing_comes_back_to_it_there_is_no_image():
     level = peak(simulator, probe, DEPTH_MM)[1]
     assert peak(simulator, replace(probe, face_reflection=0.0), 2.0 * DEPTH_MM)[1] < level - 100.0
     assert peak(simulator, probe, 3.0 * DEPTH_MM - 2.0)[1] < level - 100.0  # once
-    # At 35 degrees reflected rays pass beside the face, at 12 degrees they meet it so obliquely that their echo vanishes
+    # At 35 degrees reflected rays pass beside the face, at 12 they meet it so obliquely that their echo vanishes
     assert peak(plate(35.0), probe, 2.0 * DEPTH_MM)[1] < level - 100.0
     assert peak(plate(12.0), probe, 2.0 * DEPTH_MM)[1] < level - 60.0
 
@@ -66,5 +66,5 @@ def test_the_numpy_model_has_the_same_image(name):
 
 def test_a_face_reflects_no_more_than_all():
     for wrong in (-0.1, 1.5, float("nan")):
-        with pytest.raises(SimulationError, match="face_reflection is .*, expected a number between 0 and 1"):
+        with pytest.raises(SimulationError, match=r"face_reflection is .*, expected a number between 0 and 1"):
             replace(PROBES["linear"], face_reflection=wrong)

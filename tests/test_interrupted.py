@@ -156,3 +156,32 @@ def test_a_signal_ends_the_process_while_a_library_computes(number, before):
             process.kill()
     assert process.returncode == 128 + number
     assert said in ("ussim: interrupted\n", "")
+
+
+_IN_AN_IMPORT = """
+import sys, time
+import click
+from SlicerUSSim.Command import cli
+
+@cli.main.command()
+def load():
+    import loaded
+    print("imported", flush=True)
+    time.sleep(60)
+
+sys.argv = ["ussim", "load"]
+cli.main()
+"""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="signals")
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_during_an_import_waits_for_its_end(number, tmp_path):
+    """VTK's modules, and others in C, end the process by SIGSEGV where what they import raises KeyboardInterrupt."""
+    (tmp_path / "loaded.py").write_text(f"import signal\nsignal.raise_signal({int(number)})\nsum(range(10**5))\n")
+    done = subprocess.run(
+        [sys.executable, "-c", _IN_AN_IMPORT], capture_output=True, text=True,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path), os.environ.get("PYTHONPATH", "")])},
+    )  # fmt: skip
+    assert done.returncode == 128 + number and done.stdout == "imported\n"
+    assert done.stderr == ("ussim: interrupted\n" if number == signal.SIGINT else "")

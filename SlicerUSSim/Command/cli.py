@@ -9,7 +9,6 @@ import contextlib
 import errno
 import os
 import signal
-import socket
 import sys
 import threading
 import warnings
@@ -26,6 +25,7 @@ from SlicerUSSim.Command.progress import note
 from SlicerUSSim.Command.realism import realism
 from SlicerUSSim.Command.segment import segment
 from SlicerUSSim.Command.serve import serve
+from SlicerUSSim.Command.signals import end_at_signals
 from SlicerUSSim.Command.simulate import simulate
 from SlicerUSSim.Command.sweep import sweep
 from SlicerUSSim.Command.validate import validate
@@ -37,12 +37,8 @@ from SlicerUSSim.Logic.opencl.limits import address_space, doubt_of_address_spac
 #: Errors of a standard output that is a file on a full or broken disk, or closed
 _NO_MORE = {errno.ENOSPC, errno.EDQUOT, errno.EIO, errno.EBADF}
 
-#: Set by handlers of signals, and seconds in which they must run
-_seen = threading.Event()
-_GRACE_S = 2.0
 #: Bytes below which numpy's libraries wait for memory for ever while they are imported
 _LEAST_ADDRESS_SPACE = 500_000_000
-_WATCHER = "ussim-signals"
 
 
 class _Commands(click.Group):
@@ -84,51 +80,7 @@ def main() -> None:
     if (address_space() or _LEAST_ADDRESS_SPACE) < _LEAST_ADDRESS_SPACE:
         raise SimulationError(str(lack_of_address_space()))
     if threading.current_thread() is threading.main_thread():
-        _end_even_in_kernels()
-        for name in ("SIGTERM", "SIGHUP"):  # Windows has no SIGHUP
-            if hasattr(signal, name):
-                signal.signal(getattr(signal, name), _end)
-
-
-def _end(number: int, _: Any) -> None:
-    """End as at Ctrl-C: programs that were started end, too, and temporary files go."""
-    _seen.set()
-    raise SystemExit(128 + number)
-
-
-def _interrupt(number: int, frame: Any) -> None:
-    _seen.set()
-    signal.default_int_handler(number, frame)
-
-
-def _end_even_in_kernels() -> None:
-    """End the process at a signal also while it waits for a kernel, where Python's handlers do not run.
-
-    A thread is told of every signal. If the handler has not run some seconds later, the main thread is in a library,
-    and the process ends at once: files are replaced whole or not at all, and the next run removes what is left beside
-    them.
-    """
-    if any(thread.name == _WATCHER for thread in threading.enumerate()):
-        return
-    told, tell = socket.socketpair()
-    tell.setblocking(False)
-    signal.set_wakeup_fd(tell.fileno(), warn_on_full_buffer=False)
-    if hasattr(os, "register_at_fork"):  # a fork has no such thread, and would tell this one of its own signals
-        os.register_at_fork(after_in_child=lambda: signal.set_wakeup_fd(-1))
-    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # not ignored, nor a program's own
-        signal.signal(signal.SIGINT, _interrupt)
-    threading.Thread(target=_watch, args=(told, tell), name=_WATCHER, daemon=True).start()
-
-
-def _watch(told: socket.socket, _: socket.socket) -> None:
-    while number := told.recv(1):
-        if signal.getsignal(number[0]) not in (_end, _interrupt):
-            continue
-        if not _seen.wait(_GRACE_S):
-            with contextlib.suppress(OSError):
-                os.write(2, b"ussim: interrupted\n")
-            os._exit(128 + number[0])
-        _seen.clear()
+        end_at_signals()
 
 
 def _show_warning(message: Warning | str, category: type[Warning], *_: Any, **__: Any) -> None:

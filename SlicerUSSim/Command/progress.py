@@ -16,14 +16,13 @@ if TYPE_CHECKING:
 
 #: Seconds until the first line about something slow where there is no terminal
 _FIRST_LINE_S = 2.0
+_shown: list[_Bar] = []
 
 
 def note(text: str) -> None:
     """Write a line to stderr, above a progress bar."""
-    if "tqdm" in sys.modules:
-        from tqdm import tqdm
-
-        tqdm.write(text, file=sys.stderr)
+    if _shown:
+        _shown[-1].bar.write(text, file=sys.stderr)
     else:
         click.echo(text, err=True)
 
@@ -48,11 +47,15 @@ class _Bar:
         self.bar.set_description_str(name, refresh=False)
 
     def __enter__(self) -> Self:
+        if not self.bar.disable:
+            _shown.append(self)
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
+        if self in _shown:
+            _shown.remove(self)
         self.bar.close()
 
     def _reach(self, share: float) -> None:

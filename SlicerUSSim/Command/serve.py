@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import atexit
 import importlib.util
 import os
 import sys
@@ -25,6 +24,7 @@ from SlicerUSSim.Command.sequence_options import (
     transform_option,
 )
 from SlicerUSSim.Command.sheets import AUTO, NONE, DrawnSheets, drawn_sheets_option, no_sheet_option
+from SlicerUSSim.Command.signals import end_at_once
 from SlicerUSSim.Logic.base.errors import SimulationError, require
 from SlicerUSSim.Logic.mri.settings import CT, SegmentationSettings
 
@@ -311,18 +311,6 @@ def _run(workstation: Workstation, host: str, port: int, tls: ssl.SSLContext | N
         workstation.end_session()
     if workstation.is_computing:
         end_at_once()
-
-
-def end_at_once() -> None:
-    """End the process, after what is registered for its end, while other threads compute.
-
-    Python ends such a thread when it comes back to Python from C++, as in a report of progress to SimpleITK, whose
-    handlers take that for an exception: the process was aborted with "FATAL: exception not rethrown".
-    """
-    atexit._run_exitfuncs()  # temporary files and programs that were started
-    for stream in (sys.stdout, sys.stderr):
-        stream.flush()
-    os._exit(0)
 
 
 def _usable_port(host: str, port: int | None) -> int:

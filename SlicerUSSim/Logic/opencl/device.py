@@ -53,6 +53,7 @@ class Device:
         if self._is_pocl:
             from SlicerUSSim.Logic.opencl.pocl import (
                 cache_folder,
+                keep_signals,
                 name_unknown_processor,
                 remove_damaged_kernels,
                 require_linker,
@@ -69,6 +70,8 @@ class Device:
         try:
             self.context = cl.Context([info.handle])
             self.queue = cl.CommandQueue(self.context, properties=cl.command_queue_properties.PROFILING_ENABLE)
+            if self._is_pocl:
+                keep_signals(cl, self.context)
         except cl.Error as error:
             raise SimulationError(f"OpenCL device {info} cannot be opened: {error}") from None
         self.lanes = _vector_lanes(info)

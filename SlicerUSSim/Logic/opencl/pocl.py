@@ -1,4 +1,4 @@
-"""Workarounds for PoCL 3.0: a processor name that its compiler supports, and checks for a linker and of its cache.
+"""Workarounds for PoCL 3.0: a processor name that its compiler supports, signals, checks for a linker and of its cache.
 
 LLVM 14 calls a processor it does not know "generic" (AMD Zen 5, for instance). PoCL passes that name to clang, which
 rejects it: "unknown target CPU 'generic'" (pocl/pocl issue 1049, open since 2022). Zen 4 it takes for Zen 3, which has
@@ -15,8 +15,10 @@ import logging
 import os
 import re
 import shutil
+import signal
 import struct
 import sys
+import threading
 from pathlib import Path
 
 from SlicerUSSim.Logic.base.errors import require
@@ -36,6 +38,7 @@ _UNKNOWN = "generic"
 # Names that LLVM 14 also gives to later processors, which have AVX-512
 _WITHOUT_AVX512 = ("znver1", "znver2", "znver3")
 _DEVICE_STRUCT_BYTES = 4096
+_NOTHING = "__kernel void nothing() {}"
 _NOT_NAMED = "PoCL's compiler calls this processor %s, and that cannot be changed: %s; kernels may not build"
 
 
@@ -87,6 +90,22 @@ def require_linker(version: str) -> None:
         "PoCL, the OpenCL runtime in use, links its kernels with `ld` and libgcc, which are not installed; on Debian "
         "and Ubuntu run: sudo apt-get install gcc libc6-dev",
     )
+
+
+def keep_signals(cl, context) -> None:
+    """Give signals back the handlers that they had before PoCL's compiler took them.
+
+    At its first build LLVM installs handlers that remove the files being written, also for signals that are ignored,
+    and keeps them: Ctrl-C then fails a build in a process that ignores it, or meets a compiler that is ending. `cl` is
+    pyopencl. The compiler asks for them once in a process, hence a build of nothing.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        return  # only the main thread can set handlers
+    cl.Program(context, _NOTHING).build(cache_dir=False)
+    for number in signal.valid_signals() & {signal.SIGINT, signal.SIGTERM, getattr(signal, "SIGHUP", signal.SIGINT)}:
+        handler = signal.getsignal(number)
+        if handler is not None:  # None: not of Python
+            signal.signal(number, handler)
 
 
 def remove_damaged_kernels(folder: Path | None = None) -> int:

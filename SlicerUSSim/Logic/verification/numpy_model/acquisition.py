@@ -376,7 +376,7 @@ def _is_parallel(probe: Probe) -> bool:
 def _face_mm(probe: Probe) -> float:
     if isinstance(probe, LinearProbe):
         return probe.width_mm
-    if isinstance(probe, PhasedProbe):
+    if not isinstance(probe, ConvexProbe):
         return probe.aperture_mm
     return max(2.0 * probe.radius_mm * np.sin(np.deg2rad(0.5 * probe.field_of_view_deg)), probe.aperture_mm)
 

@@ -27,7 +27,7 @@ def face_hits(
             aside, along = np.zeros(3), _length_to_face(start, direction, radius)
             for _ in range(2):
                 if along >= 0.0:
-                    sigma = beam.elevation_sigma(np.float32(segment["path_mm"] + along))
+                    sigma = beam.elevation_sigma(np.asarray(segment["path_mm"] + along, np.float32))
                     aside = quantile * float(sigma) * (segment["elevational"] @ turn)
                     along = _length_to_face(start + aside, direction, radius)
             at = start + aside + along * direction

@@ -23,7 +23,6 @@ from SlicerUSSim.Logic.verification.numpy_model.acquisition import (
 from SlicerUSSim.Logic.verification.numpy_model.aperture import Screens
 from SlicerUSSim.Logic.verification.numpy_model.beam import Beam
 from SlicerUSSim.Logic.verification.numpy_model.drawn import sheet_hits
-from SlicerUSSim.Logic.verification.numpy_model.face import face_hits
 from SlicerUSSim.Logic.verification.numpy_model.echoes import (
     add_interfaces,
     frequencies_along,
@@ -32,6 +31,7 @@ from SlicerUSSim.Logic.verification.numpy_model.echoes import (
     scatterer_lines,
 )
 from SlicerUSSim.Logic.verification.numpy_model.elementary import f32, gaussian, hash_mix
+from SlicerUSSim.Logic.verification.numpy_model.face import face_hits
 from SlicerUSSim.Logic.verification.numpy_model.floor import (
     add_lateral_lobes,
     lines_of_a_path,
