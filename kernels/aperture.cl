@@ -552,41 +552,57 @@ inline float mean_loss(const Lines *lines) {
   return losses / fmax(all, 1e-6f);
 }
 
-// One work-item computes one depth of one screen line. Global size (screen lines, depths): at one depth all lines have
-// about as many points, and compilers that make vectors of neighbouring work-items need alike ones.
-__kernel void screens(__constant const Acquisition *acquisition, __global const float *sums, int with_level,
-                      int all_soft, __global float *screens_, __global float *shades, __global float *spreads) {
-  const int line = get_global_id(0), node = get_global_id(1), nodes = acquisition->screen_depths;
-  const float path = (node + 1) * acquisition->screen_step, pitch = acquisition->fan_pitch;
-  const Axis axis = axis_of(acquisition, line);
-  Lines lines;
-  find_lines(acquisition, sums, path, axis, &lines);
+// Means over an aperture by power: lateral position of its points, extra path, and nepers; the slope of the extra path
+// across it, and the deflection in the elevational direction in mm.
+typedef struct {
+  float x, delay, loss, slope, rise;
+} Means;
 
-  // Means over the aperture by power, and the slope of the delay across it.
+inline Means means_over(__constant const Acquisition *acquisition, const Lines *lines, float path) {
+  const float pitch = acquisition->fan_pitch;
   float all = 0.0f, first = 0.0f, second = 0.0f, delays = 0.0f, moments = 0.0f, losses = 0.0f;
   float row_lift[ROWS];
   for (int row = 0; row < ROWS; row++) {
     float row_power = 0.0f;
     row_lift[row] = 0.0f;
-    for (int i = 0; i < lines.count; i++) {
-      const float passed = lines.passed[row][i] * lines.kept[row][i], x = lines.x[i], delay = lines.delay[row][i];
+    for (int i = 0; i < lines->count; i++) {
+      const float passed = lines->passed[row][i] * lines->kept[row][i], x = lines->x[i];
+      const float delay = lines->delay[row][i];
       // A little is left of what tissue stops, so that there is always a mean.
-      const float power = ROW_WEIGHT(row) * (lines.weight[i] * (passed * passed + LEFT_FOR_MEANS) + 1e-6f);
+      const float power = ROW_WEIGHT(row) * (lines->weight[i] * (passed * passed + LEFT_FOR_MEANS) + 1e-6f);
       row_power += power;
-      row_lift[row] += power * lines.lift[row][i];
+      row_lift[row] += power * lines->lift[row][i];
       delays += power * delay;
       first += power * x;
       second += power * x * x;
       moments += power * x * delay;
-      losses += power * lines.loss[row][i];
+      losses += power * lines->loss[row][i];
     }
     all += row_power;
     row_lift[row] /= row_power;
   }
-  const float mean_x = first / all, mean_delay = delays / all;
-  const float spread = second / all - mean_x * mean_x, common = moments / all - mean_x * mean_delay;
-  const float slope = clamp(common / (spread + 0.02f * pitch * pitch), -STEEPEST, STEEPEST);
-  const float rise = clamp(row_lift[2] - row_lift[0], -STEEPEST * path, STEEPEST * path);
+  Means means;
+  means.x = first / all;
+  means.delay = delays / all;
+  means.loss = losses / all;
+  const float spread = second / all - means.x * means.x, common = moments / all - means.x * means.delay;
+  means.slope = clamp(common / (spread + 0.02f * pitch * pitch), -STEEPEST, STEEPEST);
+  means.rise = clamp(row_lift[2] - row_lift[0], -STEEPEST * path, STEEPEST * path);
+  return means;
+}
+
+// One work-item computes one depth of one screen line. Global size (screen lines, depths): at one depth all lines have
+// about as many points, and compilers that make vectors of neighbouring work-items need alike ones.
+__kernel void screens(__constant const Acquisition *acquisition, __global const float *sums, int with_level,
+                      int all_soft, __global float *screens_, __global float *shades, __global float *spreads) {
+  const int line = get_global_id(0), node = get_global_id(1), nodes = acquisition->screen_depths;
+  const float path = (node + 1) * acquisition->screen_step;
+  const Axis axis = axis_of(acquisition, line);
+  Lines lines;
+  find_lines(acquisition, sums, path, axis, &lines);
+
+  const Means means = means_over(acquisition, &lines, path);
+  float slope = means.slope, rise = means.rise;
   float4 found = (float4)(0.0f, 0.0f, 1.0f, 0.0f);
   float exit_shade = 0.0f, away = NO_END;
   int is_inside = 0;  // strong tissue
@@ -595,8 +611,13 @@ __kernel void screens(__constant const Acquisition *acquisition, __global const 
     const float depth = all_soft ? path : depth_outside(acquisition, sums, path, axis);
     is_inside = depth < path;
     if (depth != path) find_lines(acquisition, sums, depth, axis, &lines);
-    const float loss = depth != path ? mean_loss(&lines) : losses / all;
-    found = level_and_spread(acquisition, &lines, depth, mean_delay, loss);
+    if (is_inside) {  // and goes on as before it: within bone, the lines that are left say nothing of a direction
+      const Means before = means_over(acquisition, &lines, depth);
+      slope = before.slope;
+      rise = before.rise * path / depth;
+    }
+    const float loss = depth != path ? mean_loss(&lines) : means.loss;
+    found = level_and_spread(acquisition, &lines, depth, means.delay, loss);
     exit_shade = found.y;
     // Behind the last end of strong tissue on this axis, or on one beside it, between which lines may meet it
     float behind = 0.0f;
@@ -607,7 +628,7 @@ __kernel void screens(__constant const Acquisition *acquisition, __global const 
     }
     if (behind != 0.0f) {
       find_lines(acquisition, sums, behind, axis, &lines);
-      exit_shade = level_and_spread(acquisition, &lines, behind, mean_delay, loss).w;
+      exit_shade = level_and_spread(acquisition, &lines, behind, means.delay, loss).w;
       // The part u of an aperture leaves u^3 of the power of speckle, in a beam 1 / u times as wide; but the edge of a
       // plate right in front of a point cuts a beam that is in focus: u. A beam is made of the visible aperture from
       // the distance on at which the cone of its lines is wider than a Fresnel zone, 4 F^2 wavelengths.
@@ -617,10 +638,10 @@ __kernel void screens(__constant const Acquisition *acquisition, __global const 
       found.y = blend(found.w, found.y, far);
     }
   }
-  const float4 screen = (float4)(losses / all + found.x + found.y, mean_delay - slope * mean_x, slope * path, rise);
+  const float4 screen = (float4)(means.loss + found.x + found.y, means.delay - slope * means.x, slope * path, rise);
   vstore4(screen, line * nodes + node, screens_);
   const float signed_away = is_inside ? -fmax(away, 1e-3f) : away;
-  vstore4((float4)(found.y, exit_shade, losses / all, signed_away), line * nodes + node, shades);
+  vstore4((float4)(found.y, exit_shade, means.loss, signed_away), line * nodes + node, shades);
   vstore2((float2)(found.z, 1.0f), line * nodes + node, spreads);
 }
 

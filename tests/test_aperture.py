@@ -639,3 +639,22 @@ def test_a_plane_mirror_leaves_beams_as_they_are(tilt_deg):
     level += 2 * 0.1 * tissue.attenuation_db_cm_mhz * 5.0 * tree.segments["path_mm"][first]
     assert len(level) > 150
     assert np.ptp(level[10:-10]) < 1.0
+
+
+@pytest.mark.parametrize("half_mm", [3.0, 4.0])
+def test_lines_do_not_leave_bone_that_they_run_along(half_mm):
+    """A wide bright streak beside a craniotomy: within bone, delays in front of it grew into a deflection of 3 mm."""
+    labels = block(
+        lambda x, y, z: np.where(y < -16, np.where(x < 0, 3, 2), np.where(np.abs(x) < half_mm, 1, 3)),
+        half_mm=(30, 40, 10),
+    )
+    bone, fluid, brain = (TissueTable.brain((name,))[1] for name in ("skull", "csf", "white matter"))
+    found = UltrasoundSimulator(
+        labels, TissueTable({0: brain, 1: bone, 2: fluid, 3: brain}), SimulationSettings(max_ray_depth=0)
+    )
+    tree = found.trace(PROBES["phased"], FACE)
+    met = np.unique(tree.segment_line[tree.segments["label"] == 1])
+    assert len(met) > 10
+    behind = np.isin(tree.segment_line, met) & (tree.segments["path_mm"] > 14) & (tree.segments["label"] != 1)
+    left = (tree.segments["attenuation"] * tree.segments["weight"])[behind]  # of 8 mm of bone
+    assert 20.0 * np.log10(left.max()) < -15.0  # it was -6 and -4

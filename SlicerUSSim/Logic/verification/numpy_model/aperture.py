@@ -282,18 +282,12 @@ class Screens:
 
     def _beam(self, sums: np.ndarray, axis: Axis, beside: list[Axis], path: float) -> tuple[float, ...]:
         """The nine values of one depth of one line; `beside` are the axes on which strong tissue may end before it."""
-        fields, pitch = self.fields, self.fields["fan_pitch"]
-        x, open_, delay, loss, kept, passed, lift = self._lines(sums, axis, path)
-        power = _WEIGHTS[:, None] * (open_ * ((kept * passed) ** 2 + 0.01) + 1e-6)
-        share = power / power.sum()
-        mean_x, mean_delay = (share * x).sum(), (share * delay).sum()
-        spread, common = (share * x**2).sum() - mean_x**2, (share * x * delay).sum() - mean_x * mean_delay
-        slope = np.clip(common / (spread + 0.02 * pitch**2), -0.1, 0.1)
-        row_lift = (power * lift).sum(axis=1) / power.sum(axis=1)
-        rise = np.clip(row_lift[2] - row_lift[0], -0.1 * path, 0.1 * path)
-        lost = (share * loss).sum()
-
+        fields = self.fields
+        mean_x, mean_delay, slope, rise, lost = self._means(sums, axis, path)
         depth = self._depth_outside(sums, axis, path)
+        if depth < path:
+            _, _, slope, rise, _ = self._means(sums, axis, depth)
+            rise *= path / depth
         more, shade, width, near = self._level(sums, axis, depth, lost if depth == path else None)
         end_shade, away = shade, _NO_END
         ends = (self._end_between(sums, each, path - fields["screen_step"], path) for each in beside)
@@ -306,6 +300,18 @@ class Screens:
             away = -max(away, 1e-3)
         delays = mean_delay - slope * mean_x, slope * path, rise
         return lost + more + shade, *delays, shade, end_shade, lost, away, width
+
+    def _means(self, sums: np.ndarray, axis: Axis, path: float) -> tuple[float, ...]:
+        """Means by power of the points' positions and of the extra path; its slope; elevational deflection; nepers."""
+        x, open_, delay, loss, kept, passed, lift = self._lines(sums, axis, path)
+        power = _WEIGHTS[:, None] * (open_ * ((kept * passed) ** 2 + 0.01) + 1e-6)
+        share = power / power.sum()
+        mean_x, mean_delay = (share * x).sum(), (share * delay).sum()
+        spread, common = (share * x**2).sum() - mean_x**2, (share * x * delay).sum() - mean_x * mean_delay
+        slope = np.clip(common / (spread + 0.02 * self.fields["fan_pitch"] ** 2), -0.1, 0.1)
+        row_lift = (power * lift).sum(axis=1) / power.sum(axis=1)
+        rise = np.clip(row_lift[2] - row_lift[0], -0.1 * path, 0.1 * path)
+        return mean_x, mean_delay, slope, rise, (share * loss).sum()
 
     def _lines(self, sums: np.ndarray, axis: Axis, depth: float) -> tuple[np.ndarray, ...]:
         """Lateral positions and weights (points,) of the lines to a depth of an axis; (rows, points) sums along them.
