@@ -1,4 +1,4 @@
-"""ReMIND-022's tumour, grown from one seed, in ultrasound through three craniotomies: docs/images/tumour-craniotomies.jpg.
+"""ReMIND-022's tumour, grown from one seed, in ultrasound through three craniotomies.
 
     python benchmarks/tumour_pictures.py PICTURE [--mask FILE]
 
@@ -16,7 +16,13 @@ import numpy as np
 from brain_extraction import SHARED
 
 from SlicerUSSim.Logic import (
-    DisplaySettings, SimulationSettings, TissueTable, UltrasoundSimulator, Volume, grow_lesion, segment_mri,
+    DisplaySettings,
+    SimulationSettings,
+    TissueTable,
+    UltrasoundSimulator,
+    Volume,
+    grow_lesion,
+    segment_mri,
 )  # fmt: skip
 from SlicerUSSim.Logic.mri.craniotomy import disc_opening, opened, without_outside
 from SlicerUSSim.Logic.mri.pathology import add_tissues

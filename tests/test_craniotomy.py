@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 
 import numpy as np
 import pytest
@@ -63,6 +64,14 @@ def test_a_polygon_of_slicer_opens_what_lies_under_it(head, tmp_path):
         json.dumps({"markups": [{"type": "ClosedCurve", "coordinateSystem": "LPS", "controlPoints": points}]})
     )
     np.testing.assert_array_equal(opened(head, NAMES, file_opening(head, NAMES, str(path)))[0].array, direct.array)
+
+
+def test_a_polygon_far_from_the_patient_is_said(head, caplog):
+    corners = np.array([[-20.0, -10.0, 78.0], [20.0, -10.0, 78.0], [20.0, 10.0, 78.0], [-20.0, 10.0, 78.0]])
+    polygon_opening(head, NAMES, corners)
+    assert "from the patient" not in caplog.text
+    polygon_opening(head, NAMES, corners + [0.0, 0.0, 40.0])
+    assert re.search(r"the points of the polygon lie \d\d mm from the patient", caplog.text)
 
 
 def test_a_mask_on_another_grid_opens_where_it_is_not_0(head, tmp_path):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from functools import cache
 
 import numpy as np
@@ -54,6 +55,14 @@ def test_what_hangs_on_a_region_by_a_thin_bridge_stays_out():
     likeness = (true | other | bridge).astype(np.float32)
     region = grow(likeness, np.ones_like(true), np.array([25, 17, 25]), np.ones(3), largest_mm=24.0)
     assert region is not None and (region.inside & other).sum() == 0 and dice(region.inside, true) > 0.9
+
+
+def test_the_radius_of_a_region_ends_at_its_own_border():
+    """A sheet along the axes, or two voxels, had that of a ball, since their depth went on beyond their box."""
+    sheet = np.zeros((40, 40, 40), bool)
+    sheet[8:32, 19:22, 8:32] = True
+    region = grow(sheet.astype(np.float32), np.ones_like(sheet), np.array([20, 20, 20]), np.ones(3), largest_mm=24.0)
+    assert region is not None and region.radius_mm < 3.0
 
 
 def test_a_region_stays_where_it_is_allowed_and_within_reach():
@@ -251,6 +260,29 @@ def test_a_seed_that_is_no_point_is_refused_with_an_example(text):
     with pytest.raises(SimulationError, match=r"--seed is .*expected R,A,S in mm"):
         split_seeds([text])
     assert split_seeds(["1,-2.5,3=Edema"]) == [((1.0, -2.5, 3.0), "oedema")]
+
+
+def test_seeds_are_points_of_a_file_of_slicer(tmp_path):
+    path = tmp_path / "points.mrk.json"
+
+    def write(kind: str, *points: tuple[float, float, float], status: str = "defined") -> str:
+        placed = [{"position": list(point), "positionStatus": status} for point in points]
+        path.write_text(
+            json.dumps({"markups": [{"type": kind, "coordinateSystem": "LPS", "controlPoints": placed}]}),
+        )
+        return str(path)
+
+    text = write("Fiducial", (-1.0, 2.5, 3.0), (4.0, 5.0, 6.0))
+    assert split_seeds([text]) == [((1.0, -2.5, 3.0), None), ((-4.0, -5.0, 6.0), None)]
+    assert split_seeds([f"{text}=Edema"])[1] == ((-4.0, -5.0, 6.0), "oedema")
+    with pytest.raises(
+        SimulationError, match=r"points\.mrk\.json: is a markup of type 'Line', expected"
+    ):
+        split_seeds([write("Line", (0.0, 0.0, 0.0), (1.0, 1.0, 1.0))])
+    with pytest.raises(SimulationError, match=r"points\.mrk\.json: has no point that was placed"):
+        split_seeds([write("Fiducial", (0.0, 0.0, 0.0), status="undefined")])
+    with pytest.raises(SimulationError, match=r"none\.mrk\.json: cannot be read \(No such file"):
+        split_seeds([str(tmp_path / "none.mrk.json")])
 
 
 # ---- scene -----------------------------------------------------------------------------------------------------------

@@ -54,7 +54,9 @@ class Craniotomy:
             return cls(DISC, diameter)
         from pathlib import Path
 
-        require(Path(text).is_file(), f"--craniotomy is {text!r}, expected none, auto, disc:MM, or a file")
+        require(
+            Path(text).is_file(), f"--craniotomy is {text!r} (no such file), expected none, auto, disc:MM, or a file"
+        )
         return cls(text)
 
     @property

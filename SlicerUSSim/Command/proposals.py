@@ -17,11 +17,11 @@ if TYPE_CHECKING:
     from SlicerUSSim.Logic.mri.lesions.proposal import Proposal
 
 seed_option = click.option(
-    "--seed", "seeds", multiple=True, metavar="R,A,S[=TISSUE]",
-    help="Propose the lesion around a point, RAS mm in the frame of the MRI: masks beside the labels, which stay as "
-    "they are; --add lays them over. With a tissue (tumour, oedema, necrosis, cyst, haematoma, cavity, enhancing) it "
-    "is proposed as that, also where it looks like a vessel, a ventricle or the other side; not where it has no border "
-    "or looks as that tissue cannot. May be repeated.",
+    "--seed", "seeds", multiple=True, metavar="R,A,S|FILE[=TISSUE]",
+    help="Propose the lesion around a point, RAS mm in the frame of the MRI, or around each point of a .mrk.json file "
+    "of 3D Slicer: masks beside the labels, which stay as they are; --add lays them over. With a tissue (tumour, "
+    "oedema, necrosis, cyst, haematoma, cavity, enhancing) it is proposed as that, also where it looks like a vessel, "
+    "a ventricle or the other side; not where it has no border or looks as that tissue cannot. May be repeated.",
 )  # fmt: skip
 propose_option = click.option(
     "--propose",
@@ -31,20 +31,19 @@ propose_option = click.option(
 
 
 def split_seeds(texts: Iterable[str]) -> list[tuple[tuple[float, ...], str | None]]:
-    """[((R, A, S) mm, tissue)] of the values of --seed; None for the tissue: by its look.
+    """[((R, A, S) mm, tissue)] of the values of --seed, one for each point; None for the tissue: by its look.
 
-    Raises SimulationError for a value that is not R,A,S or R,A,S=TISSUE, and for a tissue that is no lesion.
+    Raises SimulationError for a value that is not R,A,S or a file of points, without or with =TISSUE, and for a tissue
+    that is no lesion.
     """
     seeds = []
     for text in texts:
-        numbers, _, tissue = text.partition("=")
-        try:
-            point = tuple(float(number) for number in numbers.split(","))
-        except ValueError:
-            point = ()
+        place, _, tissue = text.partition("=")
+        points = _points_of(place)
         require(
-            len(point) == 3 and ("=" not in text or bool(tissue.strip())),
-            f"--seed is {text!r}, expected R,A,S in mm, such as 31.5,-20,42, or with a tissue 31.5,-20,42=oedema",
+            bool(points) and ("=" not in text or bool(tissue.strip())),
+            f"--seed is {text!r}, expected R,A,S in mm, such as 31.5,-20,42, or a .mrk.json file of 3D Slicer, and "
+            "with a tissue 31.5,-20,42=oedema",
         )
         if tissue:
             from SlicerUSSim.Logic.base.errors import about_file
@@ -52,8 +51,23 @@ def split_seeds(texts: Iterable[str]) -> list[tuple[tuple[float, ...], str | Non
 
             with about_file(f"--seed {text}"):
                 tissue = lesion_tissue(tissue.strip())
-        seeds.append((point, tissue or None))
+        seeds += [(point, tissue or None) for point in points]
     return seeds
+
+
+def _points_of(place: str) -> list[tuple[float, ...]]:
+    """The point R,A,S, or those of a file; empty for another text."""
+    if place.lower().endswith(".json"):
+        from SlicerUSSim.Logic.mri.markups import markup_points
+
+        _, points = markup_points(place, ("Fiducial",), "a list of points")
+        require(len(points) > 0, f"{place}: has no point that was placed, expected one in each lesion")
+        return [tuple(map(float, point)) for point in points]
+    try:
+        point = tuple(float(number) for number in place.split(","))
+    except ValueError:
+        return []
+    return [point] if len(point) == 3 else []
 
 
 def require_seeds(seeds: Iterable[str], mri: Volume, labels_path: Path) -> None:

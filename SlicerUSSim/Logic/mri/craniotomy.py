@@ -12,12 +12,12 @@ from pathlib import Path
 
 import numpy as np
 from scipy import ndimage
+from scipy.spatial import cKDTree
 
 from SlicerUSSim.Logic.base.errors import require
-from SlicerUSSim.Logic.base.files import read_json
-from SlicerUSSim.Logic.base.transforms import LPS_TO_RAS
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.mri.distances import distance_to
+from SlicerUSSim.Logic.mri.markups import markup_points
 from SlicerUSSim.Logic.mri.outside import OUTSIDE
 from SlicerUSSim.Logic.probe.arrays import Probe
 from SlicerUSSim.Logic.probe.placement import craniotomy_pose, sample
@@ -37,6 +37,8 @@ _POLYGONS = ("ClosedCurve", "Curve", "Fiducial")
 DIAMETERS_MM, _MOST_ML = (5.0, 150.0), 500.0
 #: Half of what an opening removes must be so near to the brain, mm
 _NEAR_BRAIN_MM = 30.0
+#: A polygon that was drawn on the skin or the brain is so near to them, mm: half of its points
+_NEAR_POLYGON_MM = 15.0
 #: A face needs so much more room than it is wide, mm
 ROOM_MM = 10.0
 
@@ -91,6 +93,13 @@ def polygon_opening(labels: Volume, names: Sequence[str], points_ras: np.ndarray
             f"the sides of the polygon from point {first} and from point {second} cross, expected points in their "
             "order around the opening",
         )
+    patient = np.argwhere(labels.array > 0)[:, ::-1] @ labels.ijk_to_ras[:3, :3].T + labels.ijk_to_ras[:3, 3]
+    away = float(np.median(cKDTree(patient).query(points_ras)[0]))
+    if away > _NEAR_POLYGON_MM:
+        _log.warning(
+            "the points of the polygon lie %.0f mm from the patient, %.0f or less of one that was drawn there; what is "
+            "below them is opened: look whether it belongs to this patient", away, _NEAR_POLYGON_MM,
+        )  # fmt: skip
     inside = points_in_poly(places[..., [0, 2]].reshape(-1, 2), outline).reshape(labels.array.shape)
     radius = 0.5 * float(np.ptp(outline, axis=0).max())
     return inside & (places[..., 1] < _deepest(labels, names, inside, places[..., 1], radius))
@@ -249,21 +258,7 @@ def polygon_of_file(path: str) -> np.ndarray:
 
     Raises SimulationError for another file, and for several markups, another kind, frame or unit.
     """
-    values = read_json(path)
-    try:
-        markup, *others = values["markups"]
-        placed = [point for point in markup["controlPoints"] if point.get("positionStatus", "defined") == "defined"]
-        points = np.array([point["position"] for point in placed], float).reshape(-1, 3)
-    except (KeyError, IndexError, TypeError, ValueError):
-        require(False, f"{path}: has no points, expected a markup of 3D Slicer (.mrk.json), such as a closed curve")
-        raise
-    require(not others, f"{path}: has {len(others) + 1} markups, expected one")
-    kind, frame, unit = (
-        markup.get(*entry) for entry in (("type", ""), ("coordinateSystem", "LPS"), ("coordinateUnits", "mm"))
-    )
-    require(kind in _POLYGONS, f"{path}: is a markup of type {kind!r}, expected one of {', '.join(_POLYGONS)}")
-    require(frame in ("LPS", "RAS"), f"{path}: coordinateSystem is {frame!r}, expected LPS or RAS")
-    require(unit == "mm", f"{path}: coordinateUnits is {unit!r}, expected mm")
+    kind, points = markup_points(path, _POLYGONS, "a closed curve")
     if kind == "Curve":
         _log.warning("%s: is an open curve; the polygon is closed from its last point to its first", path)
-    return points if frame == "RAS" else points @ LPS_TO_RAS[:3, :3]
+    return points

@@ -26,6 +26,9 @@ _NEAR_MM = 2.5
 #: Farthest and lowest at which a border has its foot, and thickness of the shell beyond it that is the surroundings
 _FOOT_MM, _FOOT_LEVEL, _SHELL_MM = 2.5, 0.25, 3.0
 
+#: Least share of a region of blocks that its voxels have: what is less is on the mean of blocks alone
+_LEAST_OF_BLOCKS = 0.25
+
 
 @dataclass(frozen=True, eq=False)
 class Region:
@@ -115,6 +118,8 @@ def _on_coarse(
     if not count:
         return None
     inside = cast(np.ndarray, ndimage.binary_fill_holes(parts == np.bincount(parts.ravel())[1:].argmax() + 1))
+    if inside.sum() < _LEAST_OF_BLOCKS * found.inside.sum() * step.prod():
+        return None
     return Region(inside, found.level, found.slope, found.radius_mm)
 
 
@@ -155,7 +160,8 @@ def _region_at(
     parts, _ = ndimage.label(above)  # type: ignore[misc]
     counts = np.bincount(parts[near])
     number = int(counts[1:].argmax()) + 1
-    box = ndimage.find_objects(parts)[number - 1]
+    # With a voxel around it, or the depth would go on beyond the box as it does beyond the window
+    box = tuple(slice(max(part.start - 1, 0), part.stop + 1) for part in ndimage.find_objects(parts)[number - 1])
     above, distance = parts[box] == number, distance[box]
     depth = _depth(above, spacing_mm)
     bridge = float(np.clip(_BRIDGE_SHARE * depth[distance <= _NEAR_MM].max(), _LEAST_BRIDGE_MM, _MOST_BRIDGE_MM))
