@@ -718,8 +718,8 @@ __kernel void trace(__constant const Acquisition *acquisition, __global const us
         under.path = path;
         under.depth = depth;
         under.log_attenuation = log_attenuation + under.excess;
+        under.loss = loss - under.excess;
         under.excess = 0.0f;
-        under.loss = loss;
         under.from = under.given_from = path;
         under.label = other;
         under.blind_until = blind_until;

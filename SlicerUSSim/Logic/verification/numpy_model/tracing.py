@@ -592,8 +592,8 @@ class Tracer:
         new = below.strong == _NOT_STRONG
         below.front, below.front_weight = self._front(below), np.where(new, below.weight, below.front_weight)
         below.weight, below.log_attenuation = below.front_weight, log_attenuation[goes_below] + below.excess
+        below.loss, below.since_path = rays.loss[goes_below] - below.excess, path_of_all[goes_below]
         below.strong[:], below.excess = _UNDER, 0.0 * below.excess
-        below.loss, below.since_path = rays.loss[goes_below], path_of_all[goes_below]
         below.given_from = below.since_path
 
         ahead = np.flatnonzero(~bent)
