@@ -44,7 +44,7 @@ def main() -> None:
     mask = None if arguments.mask is None else Volume.read(arguments.mask)
     found = segment_mri(mri, contrast="t1gd", others={"t2": Volume.read(folder / "t2.nii.gz")}, mask=mask, outside=True)
     middle = truth.ijk_to_ras[:3] @ np.append(np.argwhere(truth.array > 0).mean(axis=0)[::-1], 1.0)
-    proposal = grow_lesion(found, middle)
+    proposal = grow_lesion(found, middle.tolist())
     print(proposal.message)
     masks = [(name, proposal.mask(name), "proposal") for name in proposal.tissues]
     with_tumour = add_tissues(found.labels, found.tissue_names, masks, has_brain_mask=True)

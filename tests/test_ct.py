@@ -181,6 +181,8 @@ def test_an_offset_is_removed_and_said(spine, spine_found, offset):
         (lambda a: np.clip(a, -160, 240), "cut off"),
         (lambda a: (np.clip(a, -160, 240) + 160) / 400.0 * 255.0, "for an MRI leave --ct out"),
         (lambda a: a * 4.0, "expected Hounsfield units"),
+        (lambda a: np.minimum(a, 400.0), "values end at 400, which .* voxels have: the CT was cut to a window"),
+        (lambda a: a + 200.0, r"air is at -80\d, expected -1000: the values are \+(199|200|201) from"),
         (lambda a: np.full_like(a, 7), r"CT is constant \(7\)"),
         (lambda a: np.where(a > 900, np.nan, a), "not finite numbers.*by -1000"),
         (lambda a: np.minimum(a, -950.0 + 0.001 * a), "air alone"),
@@ -190,6 +192,13 @@ def test_an_offset_is_removed_and_said(spine, spine_found, offset):
 def test_what_is_no_ct_is_refused_with_what_it_is(spine, change, message):
     with pytest.raises(SimulationError, match=message):
         segment_ct(spine.ct.with_array(change(spine.ct.array.astype(np.float32))))
+
+
+def test_soft_tissue_where_there_is_none_is_said(spine):
+    """Of values that are 100 too low, cut at -1024 as scanners do, most was labelled fat without a word."""
+    found = segment_ct(spine.ct.with_array(np.maximum(spine.ct.array.astype(np.float32) - 100.0, -1024.0)))
+    assert any("most soft tissue is at -" in line for line in found.warnings)
+    assert not any("most soft tissue" in line for line in segment_ct(spine.ct).warnings)
 
 
 def test_an_mri_called_ct_is_refused():

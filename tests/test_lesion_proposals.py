@@ -275,9 +275,7 @@ def test_seeds_are_points_of_a_file_of_slicer(tmp_path):
     text = write("Fiducial", (-1.0, 2.5, 3.0), (4.0, 5.0, 6.0))
     assert split_seeds([text]) == [((1.0, -2.5, 3.0), None), ((-4.0, -5.0, 6.0), None)]
     assert split_seeds([f"{text}=Edema"])[1] == ((-4.0, -5.0, 6.0), "oedema")
-    with pytest.raises(
-        SimulationError, match=r"points\.mrk\.json: is a markup of type 'Line', expected"
-    ):
+    with pytest.raises(SimulationError, match=r"points\.mrk\.json: is a markup of type 'Line', expected"):
         split_seeds([write("Line", (0.0, 0.0, 0.0), (1.0, 1.0, 1.0))])
     with pytest.raises(SimulationError, match=r"points\.mrk\.json: has no point that was placed"):
         split_seeds([write("Fiducial", (0.0, 0.0, 0.0), status="undefined")])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import json
 import re
 import shutil
 from pathlib import Path
@@ -110,6 +111,25 @@ def ball(mri: Volume, radius_mm: float = 12.0) -> Volume:
     points = (mri.ijk_to_ras[:3, :3] @ index + mri.ijk_to_ras[:3, 3:]).reshape(3, *mri.array.shape)
     inside = radius_mm**2 > ((points.T - [30, 10, 40]) ** 2).sum(axis=-1).T
     return mri.with_array(inside.astype(np.uint8))
+
+
+def test_points_of_slicer_are_an_opening_or_the_point_of_a_lesion(page, tmp_path):
+    """They were taken for presets: "has '@schema', expected probe, display, ..."."""
+    points = [{"position": [x, y, 60.0]} for x, y in ((-10, -10), (10, -10), (10, 10))]
+    for kind, name, selector, deed in (
+        ("ClosedCurve", "hole.mrk.json", "openingSelector", "chosen as the opening of a craniotomy"),
+        ("Fiducial", "lesion.mrk.json", "seedSelector", "the last one is chosen as the point of a lesion"),
+    ):
+        markup = {"type": kind, "coordinateSystem": "LPS", "controlPoints": points}
+        (tmp_path / name).write_text(json.dumps({"@schema": "markups", "markups": [markup]}))
+        said = answered(page, tmp_path / name)
+        assert said.startswith(f"{name}: points of 3D Slicer: {deed}") and not errors(page)
+        titles = {item["value"]: item["title"] for item in state(page, NAMES.panel.nodes)[selector]}
+        assert titles[shown(page, selector)] == name
+    (tmp_path / "none.mrk.json").write_text(json.dumps({"markups": [{"type": "Fiducial", "controlPoints": []}]}))
+    page.set_input_files("#open-file", tmp_path / "none.mrk.json")
+    eventually(page, lambda: "none.mrk.json: has no point that was placed" in " ".join(errors(page)))
+    dismiss_messages(page)
 
 
 @pytest.mark.slow

@@ -41,6 +41,7 @@ class Kind(Enum):
     TABLE = "a table of labels"
     TRANSFORM = "a transform"
     POSE = "a pose of the probe"
+    POINTS = "points of 3D Slicer"
 
 
 @dataclass(frozen=True)
@@ -143,6 +144,8 @@ _TRANSFORMS = {".xml": "a configuration of Plus", ".tag": "landmarks of MNI"}
 def _of_json(path: Path) -> Content:
     values = read_json(path)
     if isinstance(values, dict):
+        if "markups" in values:
+            return Content(Kind.POINTS, "points of 3D Slicer")
         if has_probe(values):
             return Content(Kind.PRESET, "a preset (probe, display, settings)")
         if "probe_to_ras" in values:

@@ -20,6 +20,7 @@ from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.imaging.preset import Preset
 from SlicerUSSim.Logic.mri.craniotomy import is_open, polygon_of_file
 from SlicerUSSim.Logic.mri.kept_mask import mask_beside
+from SlicerUSSim.Logic.mri.markups import markup_points
 from SlicerUSSim.Logic.mri.masks import with_label_names
 from SlicerUSSim.Logic.mri.samples import demo_mri
 from SlicerUSSim.Logic.mri.settings import SheetSettings
@@ -52,7 +53,7 @@ _log = logging.getLogger(__name__)
 #: Kinds of files in the order in which those of one parcel are opened: settings, a patient, what is laid on him
 _ORDER = (
     Kind.SCENE, Kind.PRESET, Kind.MRI, Kind.CT, Kind.LABELS, Kind.LESIONS, Kind.MASK, Kind.SHEETS, Kind.SEQUENCE,
-    Kind.TRANSFORM, Kind.POSE, Kind.TABLE,
+    Kind.TRANSFORM, Kind.POSE, Kind.POINTS, Kind.TABLE,
 )  # fmt: skip
 #: Parcels whose names of files are known
 _MOST_PARCELS = 8
@@ -206,8 +207,16 @@ class Opener:
         """A node with the opening of a file: a closed curve through the points of a .mrk.json, or a mask."""
         if not _is_json(Path(path)):
             return self._label_map(is_open(self._volume(path), path), path, ["opening"])
-        node = self._scene.AddNewNodeByClass("vtkMRMLMarkupsClosedCurveNode", Path(path).name)
-        for point in polygon_of_file(path):
+        return self._markups("vtkMRMLMarkupsClosedCurveNode", path, polygon_of_file(path))
+
+    def points(self, path: str):
+        """A node with the list of points of a .mrk.json."""
+        _, points = markup_points(path, ("Fiducial",), "a list of points")
+        return self._markups("vtkMRMLMarkupsFiducialNode", path, points)
+
+    def _markups(self, kind: str, path: str, points: np.ndarray):
+        node = self._scene.AddNewNodeByClass(kind, Path(path).name)
+        for point in points:
             node.AddControlPointWorld(*point)
         node.SetAttribute(FILE, self._place(path))
         return node

@@ -9,6 +9,8 @@ from typing import Any
 from SlicerUSSim.Logic.base.dicom import FoundSeries
 from SlicerUSSim.Logic.base.errors import Cancelled, SimulationError, require
 from SlicerUSSim.Logic.imaging.preset import Preset
+from SlicerUSSim.Logic.mri.craniotomy import POLYGONS
+from SlicerUSSim.Logic.mri.markups import markup_points
 from SlicerUSSim.Logic.mri.modality import has_brain_mask
 from SlicerUSSim.Logic.mri.pathology import LESIONS
 from SlicerUSSim.Logic.mri.settings import CT, MRI_CONTRASTS
@@ -66,6 +68,7 @@ class Opening:
             Kind.PRESET: self._preset,
             Kind.TRANSFORM: self._transform,
             Kind.POSE: self._pose,
+            Kind.POINTS: self._points,
         }
 
     def open(self, files: Mapping[str, bytes], meant: str = "") -> None:
@@ -310,6 +313,17 @@ class Opening:
     def _pose(self, upload: Upload, beside: list[Upload]) -> tuple[str, Callable[[], object]]:
         pose = self._tasks.doAside(lambda: read_pose(upload.path))
         return "the probe is moved there", lambda: self._poses.set(pose)
+
+    def _points(self, upload: Upload, beside: list[Upload]) -> tuple[str, Callable[[], object]]:
+        path, parameters = upload.path, self._logic.parameters
+        kind, points = self._tasks.doAside(lambda: markup_points(path, POLYGONS, "a closed curve or a list of points"))
+        require(len(points) > 0, f"{upload.name}: has no point that was placed, expected one or more")
+        if kind == "Fiducial":
+            deed = "the last one is chosen as the point of a lesion; Craniotomy has them, too, for an opening"
+            return deed, lambda: setattr(parameters, "seed", self._opener.points(path))
+        return "chosen as the opening of a craniotomy", lambda: setattr(
+            parameters, "opening", self._opener.opening(path)
+        )
 
     def _scene(self, upload: Upload, beside: list[Upload]) -> tuple[str, Callable[[], object]]:
         opened = self.open_scene

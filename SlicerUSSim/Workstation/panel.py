@@ -25,6 +25,8 @@ from SlicerUSSim.Workstation.tasks import Tasks
 
 #: End of the presenter's messages about the frame rate, and the least time between two of them on a page.
 _RATE, _STATUS_EVERY_S = "images per second", 1.0
+#: The class of all markups, of which there is no node itself
+_MARKUPS = "vtkMRMLMarkupsNode"
 #: Maximum number of points of the cost curve on the page.
 _CURVE_POINTS = 150
 
@@ -232,7 +234,8 @@ class BrowserPanel:
             node
             for name in control.node_classes
             for node in nodes_of_class(scene, name)
-            if node.GetClassName() == name and offered(control.node, node, self._logic.parameters)
+            # A label map is a volume, too, and is chosen elsewhere; of markups there is no node but of its kinds
+            if name in (node.GetClassName(), _MARKUPS) and offered(control.node, node, self._logic.parameters)
         ]
         return [NodeItem("None", None), *(NodeItem(node.GetName(), node.GetID()) for node in found)]
 

@@ -12,7 +12,6 @@ from pathlib import Path
 
 import numpy as np
 from scipy import ndimage
-from scipy.spatial import cKDTree
 
 from SlicerUSSim.Logic.base.errors import require
 from SlicerUSSim.Logic.base.volume import Volume
@@ -32,7 +31,7 @@ _BELOW = 1.0
 #: Where the brain may begin under the probe, or under a polygon, mm: a probe on the brain has the skull behind its face
 _BRAIN_MM = (-40.0, 60.0)
 #: Markups of 3D Slicer whose points are a polygon
-_POLYGONS = ("ClosedCurve", "Curve", "Fiducial")
+POLYGONS = ("ClosedCurve", "Curve", "Fiducial")
 #: Diameters of discs, mm; and more than a craniotomy removes, ml
 DIAMETERS_MM, _MOST_ML = (5.0, 150.0), 500.0
 #: Half of what an opening removes must be so near to the brain, mm
@@ -94,7 +93,7 @@ def polygon_opening(labels: Volume, names: Sequence[str], points_ras: np.ndarray
             "order around the opening",
         )
     patient = np.argwhere(labels.array > 0)[:, ::-1] @ labels.ijk_to_ras[:3, :3].T + labels.ijk_to_ras[:3, 3]
-    away = float(np.median(cKDTree(patient).query(points_ras)[0]))
+    away = float(np.median([np.linalg.norm(patient - point, axis=1).min() for point in points_ras]))
     if away > _NEAR_POLYGON_MM:
         _log.warning(
             "the points of the polygon lie %.0f mm from the patient, %.0f or less of one that was drawn there; what is "
@@ -258,7 +257,7 @@ def polygon_of_file(path: str) -> np.ndarray:
 
     Raises SimulationError for another file, and for several markups, another kind, frame or unit.
     """
-    kind, points = markup_points(path, _POLYGONS, "a closed curve")
+    kind, points = markup_points(path, POLYGONS, "a closed curve")
     if kind == "Curve":
         _log.warning("%s: is an open curve; the polygon is closed from its last point to its first", path)
     return points

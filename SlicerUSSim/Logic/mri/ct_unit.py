@@ -18,6 +18,15 @@ _LEAST_TISSUE, _LEAST_AIR, _MOST_BETWEEN = 0.55, 0.01, 0.15
 _BETWEEN_HU = (-700.0, -250.0)
 #: From this share on, one number that is not air's is a background or the end of a window
 _ONE_NUMBER = 0.2
+#: Numbers below this one and above that of a table or a padding may be air's; within the first width around the most
+#: frequent one lies so much of what is within the second, lungs being broad; that is so much of the image; and how far
+#: from -1000 it may be
+_MAYBE_AIR_HU, _PEAK_HU, _NEAR_PEAK_HU = (-1300.0, -500.0), 30.0, 120.0
+_LEAST_OF_PEAK, _LEAST_OF_IMAGE, _MOST_OFF_HU = 0.85, 0.05, 50.0
+#: Bone begins here; an image whose largest number is below it and is had by so many voxels was cut to a window
+_BONE_HU, _MOST_AT_TOP = 700.0, 50
+#: Between fat and water
+_NO_TISSUE_HU = (-75.0, -15.0)
 #: Least noise of air
 _LEAST_NOISE_HU = 2.0
 _EXPECTED = "expected Hounsfield units (air -1000, water 0, bone 1000)"
@@ -31,11 +40,19 @@ def hounsfield_offset(ct: Volume) -> tuple[float, str | None, str | None]:
     """
     values = _sample(ct.array)
     low, high = float(values.min()), float(values.max())
+    level = _air_level(values)
+    require(
+        level is None or abs(level + 1000.0) <= _MOST_OFF_HU,
+        f"air is at {level or 0.0:.0f}, expected -1000: the values are {(level or 0.0) + 1000.0:+.0f} from Hounsfield "
+        "units; subtract that, or apply the intercept of the CT's header",
+    )
     if _is_hounsfield(values):
-        return 0.0, None, None
+        _require_whole_range(ct.array, 0.0)
+        return 0.0, None, _doubt_of_tissue(values)
     if float(np.mean(values > -0.5)) > 0.999:  # nothing is below 0
         for offset in _OFFSETS:
             if _is_offset(values, offset):
+                _require_whole_range(ct.array, offset)
                 line = (
                     f"values are {offset:.0f} above Hounsfield units (air is at {offset - 1000.0:.0f}; the rescale "
                     f"intercept was not applied): {offset:.0f} is subtracted"
@@ -61,6 +78,7 @@ def hounsfield_offset(ct: Volume) -> tuple[float, str | None, str | None]:
     # A part of a body without air around it, with lung or not: fat is below water, which nothing of an MRI is
     has_fat = float(np.mean(values < -50.0)) > 0.005
     if is_tissue >= _LEAST_TISSUE and has_fat and low > -1100.0:
+        _require_whole_range(ct.array, 0.0)
         return 0.0, None, "no air is in the image, so that it is not checked that its numbers are Hounsfield units"
     darkest = float(np.percentile(values, 5.0))
     require(
@@ -70,6 +88,44 @@ def hounsfield_offset(ct: Volume) -> tuple[float, str | None, str | None]:
         "a CT apply the slope and intercept of its header",
     )
     raise AssertionError
+
+
+def _air_level(values: np.ndarray) -> float | None:
+    """The number of what seems to be air: the place of a narrow peak of what is far below soft tissue, or None."""
+    dark = values[(values > _MAYBE_AIR_HU[0]) & (values < _MAYBE_AIR_HU[1])]
+    if dark.size < _LEAST_OF_IMAGE * values.size:
+        return None
+    counts, edges = np.histogram(dark, bins=np.arange(_MAYBE_AIR_HU[0], _MAYBE_AIR_HU[1] + 10.0, 10.0))
+    counts = np.convolve(counts, np.ones(3), mode="same")
+    level = float(edges[int(counts.argmax())]) + 5.0
+    peak, near = (int(np.sum(np.abs(dark - level) < width)) for width in (_PEAK_HU, _NEAR_PEAK_HU))
+    is_narrow = peak >= _LEAST_OF_PEAK * near and peak >= _LEAST_OF_IMAGE * values.size
+    return float(np.median(dark[np.abs(dark - level) < _PEAK_HU])) if is_narrow else None
+
+
+def _doubt_of_tissue(values: np.ndarray) -> str | None:
+    """What to say where most soft tissue lies between fat and water, as in a CT with an offset, else None."""
+    soft = values[(values > _TISSUE_HU[0] - 100.0) & (values < _TISSUE_HU[1])]
+    counts, edges = np.histogram(soft, bins=np.arange(_TISSUE_HU[0] - 100.0, _TISSUE_HU[1] + 10.0, 10.0))
+    counts = np.convolve(counts, np.ones(3), mode="same")
+    most = float(edges[int(counts.argmax())]) + 5.0
+    if not _NO_TISSUE_HU[0] < most < _NO_TISSUE_HU[1]:
+        return None
+    return (
+        f"most soft tissue is at {most:.0f}, where there is none (fat is at -100, muscle at 50): if the values have an "
+        "offset, tissues are wrong"
+    )
+
+
+def _require_whole_range(array: np.ndarray, offset: float) -> None:
+    """Raise SimulationError if bone was cut off at the top: of an uncut image one voxel has the largest number."""
+    top = array.max()
+    count = int(np.count_nonzero(array == top))
+    require(
+        float(top) - offset >= _BONE_HU or count <= _MOST_AT_TOP,
+        f"values end at {float(top) - offset:g}, which {count} voxels have: the CT was cut to a window, and bone, from "
+        f"{_BONE_HU:.0f} on, cannot be told from blood with contrast agent; {_EXPECTED}, uncut",
+    )
 
 
 def looks_like_ct(volume: Volume) -> bool:
