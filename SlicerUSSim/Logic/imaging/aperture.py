@@ -49,13 +49,15 @@ class Aperture(Stage):
         frame.screens, frame.spreads = get("screens", lines * depths * 16), get("spreads", lines * depths * 8)
         frame.beams = get("beams", traced * (1 + depths) * 32)
         shades = get("shades", lines * depths * 16)
+        frame.reflects = True
         if not fields["aperture_beams"]:
             return
         acoustics = get("acoustics", len(frame.medium.rows) * 16)
         rows = acoustic_rows(frame.medium.rows, fields)
         self.device.write(acoustics, rows)
         sums = get("sums", int(np.prod(fan)) * int(fields["fan_depths"]) * 16)
-        all_soft = np.int32(are_soft(rows[frame.medium.present]))
+        frame.reflects = not are_soft(rows[frame.medium.present])
+        all_soft = np.int32(not frame.reflects)
         self.device.run(
             self._fans, fan, frame.acquisition_buffer, frame.medium.voxel_buffer, acoustics, all_soft, sums, few=True
         )

@@ -91,7 +91,7 @@ class RayTracer(Stage):
                 self._sheet_hits, (traced, rays), frame.acquisition_buffer, medium.sheet_buffer, self._quantiles,
                 tree.segments, tree.segment_counts, tree.hits, tree.hit_counts, heavy=True,
             )  # fmt: skip
-        if acquisition["face_reflection"] and acquisition["max_ray_depth"]:
+        if frame.reflects and acquisition["face_reflection"] and acquisition["max_ray_depth"]:
             self.device.run(
                 self._face_hits, (traced, rays), frame.acquisition_buffer, self._quantiles, tree.segments,
                 tree.segment_counts, tree.hits, tree.hit_counts, heavy=True,

@@ -78,6 +78,8 @@ class DeviceFrame(FrameInputs):
 
     acquisition_buffer: Buffer
     medium: Medium
+    #: Whether a border of its tissues may reflect rays
+    reflects: bool = field(init=False)
     #: What soft tissue does to beams: float4 [screen line][depth] of aperture.cl
     screens: Buffer = field(init=False)
     #: The same of the traced lines, from the face on: float4 [traced line][1 + depth]
