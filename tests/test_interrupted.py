@@ -38,6 +38,14 @@ COMMANDS = {
 }
 
 
+@pytest.fixture(autouse=True)
+def heard():
+    """Where tests run in the background of a script, SIGINT is ignored, also by the processes that they start."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
 @pytest.fixture(scope="module")
 def inputs(tmp_path_factory) -> dict[str, bytes]:
     """{name: content} of a patient, a pose, and a twin's images."""
