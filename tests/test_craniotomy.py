@@ -14,6 +14,7 @@ from SlicerUSSim.Command.cli import main
 from SlicerUSSim.Logic import SimulationError, Volume
 from SlicerUSSim.Logic.mri.craniotomy import disc_opening, file_opening, mask_opening, opened, polygon_opening
 from SlicerUSSim.Logic.mri.outside import OUTSIDE
+from SlicerUSSim.Logic.mri.views import view_pose
 from SlicerUSSim.Logic.probe.placement import pose_looking_at
 from SlicerUSSim.Logic.tissue.own_files import write_label_files
 from SlicerUSSim.Logic.tissue.table import TissueTable
@@ -213,7 +214,7 @@ def test_the_beam_reaches_the_brain_through_the_opening_and_not_through_the_skul
     [
         ("disc:x", "--craniotomy is 'disc:x', expected disc: and a diameter from 5 to 150 mm"),
         ("disc:3", "expected disc: and a diameter from 5 to 150 mm"),
-        ("hole.nii", "--craniotomy is 'hole.nii', expected none, auto, disc:MM, or a file"),
+        ("hole.nii", "--craniotomy is 'hole.nii' (no such file), expected none, auto, disc:MM, or a file"),
     ],
 )
 def test_another_value_is_one_line(value, message, head, tmp_path):
@@ -232,3 +233,14 @@ def test_a_polygon_whose_sides_cross_is_refused_and_a_bent_one_is_not(head):
     bent = np.insert(square, 2, [5.0, 0.0, 80.0], axis=0)  # not convex
     assert 0 < polygon_opening(head, NAMES, bent).sum() < polygon_opening(head, NAMES, square).sum()
     assert polygon_opening(head, NAMES, np.repeat(square, 2, axis=0)).any()  # points twice
+
+
+def test_a_spine_has_no_craniotomy_and_no_views_of_a_head(head):
+    """A back was opened as skin, scalp and skull, and a probe stood on the fontanelle of a spine."""
+    names = ["muscle" if name == "grey matter" else name for name in NAMES]
+    with pytest.raises(
+        SimulationError, match=r"no tissue of a brain \(they have .*muscle.*\), expected those"
+    ):
+        opened(head, names, np.ones(head.array.shape, bool))
+    with pytest.raises(SimulationError, match="no tissue of a brain"):
+        view_pose(head, names, "fontanelle")

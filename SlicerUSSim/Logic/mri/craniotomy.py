@@ -30,6 +30,8 @@ REMOVED = tuple(name for name in OUTSIDE if name != "air")
 _BELOW = 1.0
 #: Where the brain may begin under the probe, or under a polygon, mm: a probe on the brain has the skull behind its face
 _BRAIN_MM = (-40.0, 60.0)
+#: What a head has, and what a body has that is no head's; fluid is in spines, too
+_OF_BRAIN, _OF_BODY = ("grey matter", "white matter", "brain"), ("muscle", "bone", "liver", "kidney")
 #: Markups of 3D Slicer whose points are a polygon
 POLYGONS = ("ClosedCurve", "Curve", "Fiducial")
 #: Diameters of discs, mm; and more than a craniotomy removes, ml
@@ -45,6 +47,14 @@ ROOM_MM = 10.0
 def without_outside(labels: Volume, names: Sequence[str]) -> Volume:
     """The labels, 1, 2, ... called `names`, without what lies outside the brain."""
     return labels.with_array(np.where(_is_any(labels, names, OUTSIDE), 0, labels.array))
+
+
+def require_brain(names: Sequence[str]) -> None:
+    """Raise SimulationError if tissues are those of a body without a brain, as of a spine or an abdomen."""
+    require(
+        not set(_OF_BRAIN).isdisjoint(names) or set(_OF_BODY).isdisjoint(names),
+        f"the labels have no tissue of a brain (they have {', '.join(names)}), expected those of a head",
+    )
 
 
 def disc_opening(labels: Volume, names: Sequence[str], probe_to_ras: np.ndarray, diameter_mm: float) -> np.ndarray:
@@ -175,8 +185,9 @@ def default_pose(
 def opened(labels: Volume, names: Sequence[str], opening: np.ndarray) -> tuple[Volume, float]:
     """(labels with the opening, ml that were removed).
 
-    Raises SimulationError if nothing outside the brain lies in the opening.
+    Raises SimulationError if nothing outside the brain lies in the opening, and for labels without a brain.
     """
+    require_brain(names)
     removed = opening & _is_any(labels, names, REMOVED)
     require(
         bool(removed.any()),

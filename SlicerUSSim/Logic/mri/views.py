@@ -9,7 +9,7 @@ import numpy as np
 
 from SlicerUSSim.Logic.base.errors import require
 from SlicerUSSim.Logic.base.volume import Volume
-from SlicerUSSim.Logic.mri.craniotomy import without_outside
+from SlicerUSSim.Logic.mri.craniotomy import require_brain, without_outside
 from SlicerUSSim.Logic.probe.placement import pose_looking_at, sample
 from SlicerUSSim.Logic.probe.surface import PatientSurface
 
@@ -73,6 +73,7 @@ def view_pose(labels: Volume, names: Sequence[str], view: str, *, is_open: bool 
     otherwise. Raises SimulationError for an unknown view, and for labels without a brain.
     """
     require(view in VIEWS, f"view is {view!r}, expected one of {', '.join(VIEWS)}")
+    require_brain(names)
     brain = without_outside(labels, names)
     inside = np.argwhere(brain.array > 0)
     require(inside.size > 0, "the labels have no brain, expected one to look at")
