@@ -238,9 +238,7 @@ def test_a_polygon_whose_sides_cross_is_refused_and_a_bent_one_is_not(head):
 def test_a_spine_has_no_craniotomy_and_no_views_of_a_head(head):
     """A back was opened as skin, scalp and skull, and a probe stood on the fontanelle of a spine."""
     names = ["muscle" if name == "grey matter" else name for name in NAMES]
-    with pytest.raises(
-        SimulationError, match=r"no tissue of a brain \(they have .*muscle.*\), expected those"
-    ):
+    with pytest.raises(SimulationError, match=r"no tissue of a brain \(they have .*muscle.*\), expected those"):
         opened(head, names, np.ones(head.array.shape, bool))
     with pytest.raises(SimulationError, match="no tissue of a brain"):
         view_pose(head, names, "fontanelle")

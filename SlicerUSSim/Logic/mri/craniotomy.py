@@ -102,6 +102,9 @@ def polygon_opening(labels: Volume, names: Sequence[str], points_ras: np.ndarray
             f"the sides of the polygon from point {first} and from point {second} cross, expected points in their "
             "order around the opening",
         )
+    inside = points_in_poly(places[..., [0, 2]].reshape(-1, 2), outline).reshape(labels.array.shape)
+    radius = 0.5 * float(np.ptp(outline, axis=0).max())
+    deepest = _deepest(labels, names, inside, places[..., 1], radius)
     patient = np.argwhere(labels.array > 0)[:, ::-1] @ labels.ijk_to_ras[:3, :3].T + labels.ijk_to_ras[:3, 3]
     away = float(np.median([np.linalg.norm(patient - point, axis=1).min() for point in points_ras]))
     if away > _NEAR_POLYGON_MM:
@@ -109,9 +112,7 @@ def polygon_opening(labels: Volume, names: Sequence[str], points_ras: np.ndarray
             "the points of the polygon lie %.0f mm from the patient, %.0f or less of one that was drawn there; what is "
             "below them is opened: look whether it belongs to this patient", away, _NEAR_POLYGON_MM,
         )  # fmt: skip
-    inside = points_in_poly(places[..., [0, 2]].reshape(-1, 2), outline).reshape(labels.array.shape)
-    radius = 0.5 * float(np.ptp(outline, axis=0).max())
-    return inside & (places[..., 1] < _deepest(labels, names, inside, places[..., 1], radius))
+    return inside & (places[..., 1] < deepest)
 
 
 def file_opening(labels: Volume, names: Sequence[str], path: str) -> np.ndarray:
