@@ -5,7 +5,7 @@ import sys
 
 
 def run() -> None:
-    """The command; Ctrl-C while it is imported, or once more before it is, is one line or the process's end, too."""
+    """The command. Ctrl-C while it is imported is one line after that; a second one ends the process at once."""
     pressed = []
 
     def press(number: int, _: object) -> None:
