@@ -113,6 +113,7 @@ def ball(mri: Volume, radius_mm: float = 12.0) -> Volume:
     return mri.with_array(inside.astype(np.uint8))
 
 
+@pytest.mark.slow
 def test_points_of_slicer_are_an_opening_or_the_point_of_a_lesion(page, tmp_path):
     """They were taken for presets: "has '@schema', expected probe, display, ..."."""
     points = [{"position": [x, y, 60.0]} for x, y in ((-10, -10), (10, -10), (10, 10))]
