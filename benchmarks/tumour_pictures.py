@@ -23,7 +23,7 @@ from SlicerUSSim.Logic import (
     Volume,
     grow_lesion,
     segment_mri,
-)  # fmt: skip
+)
 from SlicerUSSim.Logic.mri.craniotomy import disc_opening, opened, without_outside
 from SlicerUSSim.Logic.mri.pathology import add_tissues
 from SlicerUSSim.Logic.probe import PROBES, pose_looking_at
@@ -48,10 +48,9 @@ def main() -> None:
     print(proposal.message)
     masks = [(name, proposal.mask(name), "proposal") for name in proposal.tissues]
     with_tumour = add_tissues(found.labels, found.tissue_names, masks, has_brain_mask=True)
-    probe = PROBES["microconvex"]
+    brain, probe = without_outside(found.labels, found.tissue_names), PROBES["microconvex"]
     figure, axes = plt.subplots(3, len(_OPENINGS), figsize=(13.0, 8.6), facecolor="black")
     for column, (name, outward) in zip(axes.T, _OPENINGS.items(), strict=True):
-        brain = without_outside(found.labels, found.tissue_names)
         pose = pose_looking_at(surface_point(brain, middle, outward), middle, lateral_ras=(0.0, 1.0, 0.0))
         for shown, (labels, names) in zip(
             column, ((found.labels, found.tissue_names), (with_tumour.labels, with_tumour.tissue_names)), strict=False

@@ -9,12 +9,6 @@
 
 #include "hits.clh"
 
-// A vector in RAS in the probe frame.
-inline float3 to_probe(__constant const float *m, float3 v) {
-  return (float3)(m[0] * v.x + m[4] * v.y + m[8] * v.z, m[1] * v.x + m[5] * v.y + m[9] * v.z,
-                  m[2] * v.x + m[6] * v.y + m[10] * v.z);
-}
-
 // Length along a ray in the probe frame at which it meets the surface of the face from in front; -1 if it does not.
 inline float length_to_face(float3 start, float3 direction, float radius) {
   if (radius == 0.0f) return direction.y < -1e-4f ? -start.y / direction.y : -1.0f;
@@ -38,9 +32,9 @@ __kernel void face_hits(__constant const Acquisition *acquisition, __global cons
   for (int index = 0; index < segments_of_line; index++) {
     __global const Segment *segment = segments + line * MAX_SEGMENTS + index;
     if (segment->reflections == 0) continue;
-    const float3 start = to_probe(m, vload3(0, segment->start) - origin);
-    const float3 direction = to_probe(m, vload3(0, segment->direction));
-    const float3 elevational = to_probe(m, vload3(0, segment->elevational));
+    const float3 start = transposed_vector(m, vload3(0, segment->start) - origin);
+    const float3 direction = transposed_vector(m, vload3(0, segment->direction));
+    const float3 elevational = transposed_vector(m, vload3(0, segment->elevational));
     float along = length_to_face(start, direction, radius);
     float3 aside = (float3)(0.0f);
     for (int n = 0; n < 2 && along >= 0.0f; n++) {  // the ray's offset changes slowly along the segment
@@ -53,8 +47,8 @@ __kernel void face_hits(__constant const Acquisition *acquisition, __global cons
     const float3 normal =
         radius == 0.0f ? (float3)(0.0f, 1.0f, 0.0f) : (float3)(at.x / radius, (at.y + radius) / radius, 0.0f);
     if (count < MAX_HITS)
-      hits[slot * MAX_HITS + count] = hit_on_segment(acquisition, segment, along, quantile, affine_vector(m, normal),
-                                                     acquisition->face_reflection, 1.0f);
+      hits[slot * MAX_HITS + count] =
+          hit_on_segment(acquisition, segment, along, quantile, affine_vector(m, normal), acquisition->face_reflection);
     count++;
   }
   hit_counts[slot] = count;

@@ -47,14 +47,14 @@ __kernel void sheet_hits(__constant const Acquisition *acquisition, __global con
           along > segment->length_mm)
         continue;
       last = along;
-      float3 normal = (float3)(gradient.x * m[0] + gradient.y * m[4] + gradient.z * m[8],
-                               gradient.x * m[1] + gradient.y * m[5] + gradient.z * m[9],
-                               gradient.x * m[2] + gradient.y * m[6] + gradient.z * m[10]);
+      float3 normal = transposed_vector(m, gradient);
       normal *= (dot3(normal, direction) > 0.0f ? -1.0f : 1.0f) / length3(normal);
-      const float phase = acquisition->membrane_phase * clamp(-dot3(normal, direction), 0.01f, 1.0f);
-      if (count < MAX_HITS)
-        hits[slot * MAX_HITS + count] = hit_on_segment(acquisition, segment, along, quantile, normal,
-                                                       reflection_of_look(words.y), exp_fast(-0.5f * phase * phase));
+      if (count < MAX_HITS) {
+        Hit hit = hit_on_segment(acquisition, segment, along, quantile, normal, reflection_of_look(words.y));
+        const float phase = acquisition->membrane_phase * hit.cos_incidence;
+        hit.echo *= exp_fast(-0.5f * phase * phase);
+        hits[slot * MAX_HITS + count] = hit;
+      }
       count++;
     }
   }

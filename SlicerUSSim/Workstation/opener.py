@@ -20,7 +20,6 @@ from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.imaging.preset import Preset
 from SlicerUSSim.Logic.mri.craniotomy import is_open, polygon_of_file
 from SlicerUSSim.Logic.mri.kept_mask import mask_beside
-from SlicerUSSim.Logic.mri.markups import markup_points
 from SlicerUSSim.Logic.mri.masks import with_label_names
 from SlicerUSSim.Logic.mri.samples import demo_mri
 from SlicerUSSim.Logic.mri.settings import SheetSettings
@@ -209,9 +208,8 @@ class Opener:
             return self._label_map(is_open(self._volume(path), path), path, ["opening"])
         return self._markups("vtkMRMLMarkupsClosedCurveNode", path, polygon_of_file(path))
 
-    def points(self, path: str):
-        """A node with the list of points of a .mrk.json."""
-        _, points = markup_points(path, ("Fiducial",), "a list of points")
+    def points(self, path: str, points: np.ndarray):
+        """A node with the list of points, (n, 3) RAS mm, of a file."""
         return self._markups("vtkMRMLMarkupsFiducialNode", path, points)
 
     def _markups(self, kind: str, path: str, points: np.ndarray):

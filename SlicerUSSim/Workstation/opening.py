@@ -320,10 +320,8 @@ class Opening:
         require(len(points) > 0, f"{upload.name}: has no point that was placed, expected one or more")
         if kind == "Fiducial":
             deed = "the last one is chosen as the point of a lesion; Craniotomy has them, too, for an opening"
-            return deed, lambda: setattr(parameters, "seed", self._opener.points(path))
-        return "chosen as the opening of a craniotomy", lambda: setattr(
-            parameters, "opening", self._opener.opening(path)
-        )
+            return deed, lambda: setattr(parameters, "seed", self._opener.points(path, points))
+        return "chosen as the opening of a craniotomy", self._loading.reading_opening(path)
 
     def _scene(self, upload: Upload, beside: list[Upload]) -> tuple[str, Callable[[], object]]:
         opened = self.open_scene

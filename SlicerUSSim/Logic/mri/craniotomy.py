@@ -105,8 +105,10 @@ def polygon_opening(labels: Volume, names: Sequence[str], points_ras: np.ndarray
     inside = points_in_poly(places[..., [0, 2]].reshape(-1, 2), outline).reshape(labels.array.shape)
     radius = 0.5 * float(np.ptp(outline, axis=0).max())
     deepest = _deepest(labels, names, inside, places[..., 1], radius)
-    patient = np.argwhere(labels.array > 0)[:, ::-1] @ labels.ijk_to_ras[:3, :3].T + labels.ijk_to_ras[:3, 3]
-    away = float(np.median([np.linalg.norm(patient - point, axis=1).min() for point in points_ras]))
+    filled = labels.array > 0
+    patient = places[filled & ~np.asarray(ndimage.binary_erosion(filled), bool)]  # the nearest place is on the surface
+    drawn = (points_ras - middle) @ pose[:3, :3]
+    away = float(np.median([np.linalg.norm(patient - point, axis=1).min() for point in drawn]))
     if away > _NEAR_POLYGON_MM:
         _log.warning(
             "the points of the polygon lie %.0f mm from the patient, %.0f or less of one that was drawn there; what is "

@@ -38,21 +38,26 @@ def hounsfield_offset(ct: Volume) -> tuple[float, str | None, str | None]:
 
     Raises SimulationError for numbers that are no CT's, with what they are: an MRI, a window of a CT, a wrong unit.
     """
-    values = _sample(ct.array)
+    found = _offset_of(_sample(ct.array))
+    _require_whole_range(ct.array, found[0])
+    return found
+
+
+def _offset_of(values: np.ndarray) -> tuple[float, str | None, str | None]:
+    """hounsfield_offset, of a sample of the numbers."""
     low, high = float(values.min()), float(values.max())
     level = _air_level(values)
-    require(
-        level is None or abs(level + 1000.0) <= _MOST_OFF_HU,
-        f"air is at {level or 0.0:.0f}, expected -1000: the values are {(level or 0.0) + 1000.0:+.0f} from Hounsfield "
-        "units; subtract that, or apply the intercept of the CT's header",
-    )
+    if level is not None:
+        require(
+            abs(level + 1000.0) <= _MOST_OFF_HU,
+            f"air is at {level:.0f}, expected -1000: the values are {level + 1000.0:+.0f} from Hounsfield units; "
+            "subtract that, or apply the intercept of the CT's header",
+        )
     if _is_hounsfield(values):
-        _require_whole_range(ct.array, 0.0)
         return 0.0, None, _doubt_of_tissue(values)
     if float(np.mean(values > -0.5)) > 0.999:  # nothing is below 0
         for offset in _OFFSETS:
             if _is_offset(values, offset):
-                _require_whole_range(ct.array, offset)
                 line = (
                     f"values are {offset:.0f} above Hounsfield units (air is at {offset - 1000.0:.0f}; the rescale "
                     f"intercept was not applied): {offset:.0f} is subtracted"
@@ -78,7 +83,6 @@ def hounsfield_offset(ct: Volume) -> tuple[float, str | None, str | None]:
     # A part of a body without air around it, with lung or not: fat is below water, which nothing of an MRI is
     has_fat = float(np.mean(values < -50.0)) > 0.005
     if is_tissue >= _LEAST_TISSUE and has_fat and low > -1100.0:
-        _require_whole_range(ct.array, 0.0)
         return 0.0, None, "no air is in the image, so that it is not checked that its numbers are Hounsfield units"
     darkest = float(np.percentile(values, 5.0))
     require(
@@ -95,20 +99,21 @@ def _air_level(values: np.ndarray) -> float | None:
     dark = values[(values > _MAYBE_AIR_HU[0]) & (values < _MAYBE_AIR_HU[1])]
     if dark.size < _LEAST_OF_IMAGE * values.size:
         return None
-    counts, edges = np.histogram(dark, bins=np.arange(_MAYBE_AIR_HU[0], _MAYBE_AIR_HU[1] + 10.0, 10.0))
-    counts = np.convolve(counts, np.ones(3), mode="same")
-    level = float(edges[int(counts.argmax())]) + 5.0
+    level = _mode(dark, *_MAYBE_AIR_HU)
     peak, near = (int(np.sum(np.abs(dark - level) < width)) for width in (_PEAK_HU, _NEAR_PEAK_HU))
     is_narrow = peak >= _LEAST_OF_PEAK * near and peak >= _LEAST_OF_IMAGE * values.size
     return float(np.median(dark[np.abs(dark - level) < _PEAK_HU])) if is_narrow else None
 
 
+def _mode(values: np.ndarray, low: float, high: float) -> float:
+    """The most frequent of the values between two numbers, in bins of 10, with their neighbours."""
+    counts, edges = np.histogram(values, bins=np.arange(low, high + 10.0, 10.0))
+    return float(edges[int(np.convolve(counts, np.ones(3), mode="same").argmax())]) + 5.0
+
+
 def _doubt_of_tissue(values: np.ndarray) -> str | None:
     """What to say where most soft tissue lies between fat and water, as in a CT with an offset, else None."""
-    soft = values[(values > _TISSUE_HU[0] - 100.0) & (values < _TISSUE_HU[1])]
-    counts, edges = np.histogram(soft, bins=np.arange(_TISSUE_HU[0] - 100.0, _TISSUE_HU[1] + 10.0, 10.0))
-    counts = np.convolve(counts, np.ones(3), mode="same")
-    most = float(edges[int(counts.argmax())]) + 5.0
+    most = _mode(values, _TISSUE_HU[0] - 100.0, _TISSUE_HU[1])
     if not _NO_TISSUE_HU[0] < most < _NO_TISSUE_HU[1]:
         return None
     return (

@@ -102,7 +102,7 @@ def keep_signals(cl, context) -> None:
     if threading.current_thread() is not threading.main_thread():
         return  # only the main thread can set handlers
     cl.Program(context, _NOTHING).build(cache_dir=False)
-    for number in signal.valid_signals() & {signal.SIGINT, signal.SIGTERM, getattr(signal, "SIGHUP", signal.SIGINT)}:
+    for number in {signal.SIGINT, signal.SIGTERM, getattr(signal, "SIGHUP", signal.SIGINT)}:  # Windows has no SIGHUP
         handler = signal.getsignal(number)
         if handler is not None:  # None: not of Python
             signal.signal(number, handler)
