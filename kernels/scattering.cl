@@ -274,13 +274,15 @@ inline int drawn_label(__constant const Acquisition *acquisition, __global const
   return tissue;
 }
 
-// A scatterer of the membrane is the brighter the more squarely the beam meets the sheet. Its normal is that of the
+// A scatterer of the membrane is the brighter the more squarely the beam meets the sheet; one of falx and tentorium
+// that were found by Lambert's law, but for a part that is the same from all sides. Its normal is that of the
 // fitted plane, or the gradient of the fluid distance: from lines of two voxels along i, first those of the near plane,
 // then of the far.
 inline float gain_on_membrane(__constant const Acquisition *acquisition, __global const ushort *corner,
                               __global const uint *planes, const Piece *piece, float3 at) {
   float3 normal, offset;
   float level = acquisition->membrane_gain;
+  int of_dura = 0;
   Sheet sheet;
   sheet.plane = 0u;
   if (acquisition->sheet_label >= 0) sheet = nearest_sheet(acquisition, planes, at, &offset);
@@ -296,9 +298,14 @@ inline float gain_on_membrane(__constant const Acquisition *acquisition, __globa
 #ifdef FOUND
   } else if (sheet.look) {
     level *= level_of_look(sheet.look);
+    of_dura = is_dura(sheet.look);
 #endif
   }
   const float cosine = fabs(dot3(normal, piece->direction)) / fmax(length3(normal), 1e-6f);
+  if (of_dura) {
+    const float isotropic = acquisition->dura_isotropic;
+    return level * sqrt(isotropic + (1.0f - isotropic) * cosine * cosine);
+  }
   return level * exp2_scalar(max(acquisition->membrane_exponent * log2_scalar(fmax(cosine, 1e-6f)), -100.0f));
 }
 

@@ -37,7 +37,7 @@ from SlicerUSSim.Logic.opencl.layout import ACQUISITION, CONSTANTS
 from SlicerUSSim.Logic.probe.arrays import Probe
 from SlicerUSSim.Logic.probe.beam import CURVED, NOMINAL_SPEED_M_S
 from SlicerUSSim.Logic.probe.image_grid import ImageGrid
-from SlicerUSSim.Logic.tissue.sheet_looks import dura_label
+from SlicerUSSim.Logic.tissue.sheet_looks import DURA_ISOTROPIC, dura_label
 from SlicerUSSim.Logic.tissue.table import TissueTable
 from SlicerUSSim.Logic.tissue.texture import Texture
 
@@ -424,6 +424,7 @@ class UltrasoundSimulator:
         acquisition["membrane_reach"] = medium.membrane_reach
         acquisition["sheet_label"] = medium.sheet_label
         acquisition["dura_label"] = dura_label(medium.tissues)
+        acquisition["dura_isotropic"] = DURA_ISOTROPIC
         membrane = medium.tissues.membrane
         if membrane is not None:
             acquisition["sheet_reach_mm"] = 0.5 * membrane.thickness_mm

@@ -81,6 +81,7 @@ ACQUISITION = np.dtype(
         ("sheet_reach_mm", _FLOAT),  # half the thickness of such a sheet
         ("membrane_gain", _FLOAT),  # of the amplitude of its scatterers at normal incidence
         ("membrane_exponent", _FLOAT),  # of the cosine of incidence by which it falls
+        ("dura_isotropic", _FLOAT),  # part of the power of falx and tentorium that were found that does not fall
         ("membrane_phase", _FLOAT),  # deviation of the echo's phase by its roughness, radians at normal incidence
         # probe and pose
         ("probe_to_ras", _FLOAT, 12),

@@ -30,6 +30,9 @@ class SheetLook:
 
 #: Name of the tissue of falx and tentorium
 DURA = "falx"
+#: Part of the power of its scatterers that is the same from all sides; the rest falls with the angle of incidence i by
+#: Lambert's law, as cos^2 i (measured on a real falx, docs/physics.md#sheets-found-in-the-mri)
+DURA_ISOTROPIC = 0.1
 #: The tissue of each kind; None: that of the membrane
 _TISSUES = {"sulcus": None, "falx": DURA, "tentorium": DURA, "ependyma": None}
 DURA_KINDS = tuple(kind for kind, name in _TISSUES.items() if name == DURA)

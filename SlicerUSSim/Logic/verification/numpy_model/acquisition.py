@@ -51,6 +51,7 @@ def acquisition_record(
         if medium.drawn
         else -1,
         "dura_label": next((n for n, tissue in medium.tissues.items() if tissue.name == "falx"), -1),
+        "dura_isotropic": 0.1,
         "sheet_reach_mm": membrane.thickness_mm / 2.0 if membrane else 0.0,
         "membrane_gain": np.exp(membrane.diffuse_db * np.log(10.0) / 20.0) if membrane else 0.0,
         "membrane_exponent": membrane.diffuse_exponent if membrane else 0.0,

@@ -346,7 +346,10 @@ def drawn_labels(
     normal = normal[thin]
     size = np.maximum(np.sqrt((normal**2).sum(axis=1)), f32(1e-6))
     cosine = np.maximum(np.abs(normal @ direction) / size, f32(1e-6))
-    gain[thin] = level[thin] * acquisition["membrane_gain"] * cosine ** acquisition["membrane_exponent"]
+    falls = cosine ** acquisition["membrane_exponent"]
+    isotropic = acquisition["dura_isotropic"]
+    falls = np.where(is_dura[thin], np.sqrt(isotropic + (f32(1.0) - isotropic) * cosine**2), falls)
+    gain[thin] = level[thin] * acquisition["membrane_gain"] * falls
     return label, gain
 
 

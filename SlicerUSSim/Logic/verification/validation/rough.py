@@ -83,7 +83,7 @@ def coherent_part(rotation: np.ndarray, device) -> Outcome:
         "border": (UltrasoundSimulator(wall.labels, tissues, _SILENT, device), wall, tissues),
         "dura": (
             UltrasoundSimulator(
-                around.labels, in_tissue, _SILENT, device, sheets=_plane_of_dura(around.probe_to_ras)
+                around.labels, in_tissue, _SILENT, device, sheets=plane_of_dura(around.probe_to_ras, _DEPTH_MM)
             ),
             around,
             in_tissue,
@@ -142,10 +142,11 @@ def _diffuse_rows(phantom: Phantom, tissues: TissueTable, device) -> list[Row]:
     return rows
 
 
-def _plane_of_dura(probe_to_ras: np.ndarray) -> Surfels:
+def plane_of_dura(probe_to_ras: np.ndarray, depth_mm: float) -> Surfels:
+    """A plane of falx across the beam, 0.4 mm thick."""
     across = np.arange(-12.0, 12.0, 0.4)
     x, z = (grid.ravel() for grid in np.meshgrid(across, across))
-    place = np.stack([x, np.full_like(x, _DEPTH_MM), z], axis=1) @ probe_to_ras[:3, :3].T + probe_to_ras[:3, 3]
+    place = np.stack([x, np.full_like(x, depth_mm), z], axis=1) @ probe_to_ras[:3, :3].T + probe_to_ras[:3, 3]
     return Surfels.of("falx", place, np.broadcast_to(probe_to_ras[:3, 1], place.shape), 0.4, 1.0, 0.16)
 
 
