@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 from scipy import ndimage
+from scipy.spatial.transform import Rotation
 
 from SlicerUSSim.Command.cli import main
 from SlicerUSSim.Logic import (
@@ -26,9 +27,10 @@ from SlicerUSSim.Logic.base.files import write_json
 from SlicerUSSim.Logic.fitting import TextureReference, measure_realism, neighbours_of, speckle_widths, texture_misfit
 from SlicerUSSim.Logic.fitting.grey_statistics import grey_of_tissues, level_by_depth
 from SlicerUSSim.Logic.fitting.realism import BLURRED, LEVELLED, NEIGHBOURS, REAL, UNIFORM, blurred
-from SlicerUSSim.Logic.fitting.sheet_contrast import line_contrast, sheet_points, wall_points
+from SlicerUSSim.Logic.fitting.sheet_contrast import line_contrast, sheet_points, surfel_points, wall_points
 from SlicerUSSim.Logic.fitting.speckle_width import log_speckle_correlation
 from SlicerUSSim.Logic.mri.samples import head_mri
+from SlicerUSSim.Logic.mri.sheets import Surfels
 from SlicerUSSim.Logic.probe import ImageGrid
 from SlicerUSSim.Logic.tracked import TrackedImages
 from SlicerUSSim.Logic.verification.twins import make_twin
@@ -197,6 +199,30 @@ def test_contrast_and_width_of_a_sheet(contrast, sigma_mm):
     nothing = np.clip(60 + noise, 0, 255).astype(np.uint8)
     for line in line_contrast([nothing], [sheet_points(labels, [1], GRID)], PROBE, GRID, inside):
         assert line.contrast == pytest.approx(line.chance, abs=3.0)
+
+
+def test_the_line_of_a_sheet_that_was_found_is_where_it_crosses_the_image():
+    """A plane at 45 degrees to the beam, oblique to the image: as the line that labels have there."""
+    pose = rigid(Rotation.from_euler("xyz", (20, -30, 50), degrees=True).as_matrix(), [5.0, -3.0, 12.0])
+    normal = np.array([1.0, -1.0, 0.8]) / np.linalg.norm([1.0, -1.0, 0.8])
+    u = np.array([1.0, 1.0, 0.0]) / np.sqrt(2.0)
+    a, b = (grid.ravel() for grid in np.meshgrid(np.arange(-30.0, 30.0, 0.5), np.arange(-8.0, 8.0, 0.5)))
+    place = np.array([0.0, 30.0, 0.0]) + a[:, None] * u + b[:, None] * np.cross(normal, u)
+    surfels = Surfels.of("falx", place @ pose[:3, :3].T + pose[:3, 3], (pose[:3, :3] @ normal)[None] + 0 * place,
+                         0.4, 1.0, 0.25)  # fmt: skip
+    points = surfel_points(surfels, pose, GRID)
+    assert len(points.place) > 50
+    x, depth = points.place.T
+    assert np.abs((depth - 30.0 - x) / np.sqrt(2.0)).max() < 0.6
+    np.testing.assert_allclose(np.abs(points.normal @ np.array([1.0, -1.0]) / np.sqrt(2.0)), 1.0, atol=1e-5)
+    rows, columns = np.indices((300, 240)) * 0.2
+    away = (rows - 30.0 - (columns - 24.0)) / np.sqrt(2.0)
+    image = np.clip(60 + 80.0 * np.exp(-0.5 * (away / 0.5) ** 2), 0, 255).astype(np.uint8)
+    (line,) = line_contrast([image], [points], PROBE, GRID, np.ones(image.shape, bool))
+    assert line.angle_deg == (30, 60) and line.contrast == pytest.approx(80.0, rel=0.15)
+    # A sheet in the image plane has no line.
+    flat = Surfels.of("falx", place @ pose[:3, :3].T + pose[:3, 3], pose[:3, 2][None] + 0 * place, 0.4, 1.0, 0.25)
+    assert len(surfel_points(flat, pose, GRID).place) == 0
 
 
 def test_contrast_of_a_wall_is_above_the_tissue_and_not_above_the_fluid():

@@ -34,10 +34,18 @@ from SlicerUSSim.Logic.fitting.grey_statistics import (
     level_by_depth,
 )
 from SlicerUSSim.Logic.fitting.image_similarity import Similarity, similarity
-from SlicerUSSim.Logic.fitting.sheet_contrast import LineContrast, line_contrast, sheet_points, wall_points
+from SlicerUSSim.Logic.fitting.sheet_contrast import (
+    LineContrast,
+    LinePoints,
+    line_contrast,
+    sheet_points,
+    surfel_points,
+    wall_points,
+)
 from SlicerUSSim.Logic.fitting.speckle_width import SpeckleWidth, extrema_density_cm2, speckle_widths
 from SlicerUSSim.Logic.fitting.texture_costs import TextureMisfit, TextureReference
 from SlicerUSSim.Logic.imaging.grey_map import EstimatedMap, estimate_grey_map
+from SlicerUSSim.Logic.imaging.medium import Medium
 from SlicerUSSim.Logic.imaging.simulator import UltrasoundSimulator
 from SlicerUSSim.Logic.probe.placement import slice_under_probe
 from SlicerUSSim.Logic.tissue.table import TissueTable
@@ -238,7 +246,7 @@ def measure_realism(
     if neighbours is not None:
         costs[NEIGHBOURS] = [cost(image, n) for n, others in enumerate(neighbours) for image in others]
     regions = [slice_under_probe(simulator.medium.labels, tracked.grid, pose, order=0) for pose in tracked.poses]
-    looks = {name: _looks_of(images, tracked, regions, simulator.medium.tissues) for name, images in sources.items()}
+    looks = {name: _looks_of(images, tracked, regions, simulator.medium) for name, images in sources.items()}
     return Realism(tracked.numbers, costs, looks, sources)
 
 
@@ -330,7 +338,7 @@ def uniform_control(
 
 
 def _looks_of(
-    images: Sequence[np.ndarray], tracked: TrackedImages, regions: Sequence[np.ndarray], tissues: TissueTable
+    images: Sequence[np.ndarray], tracked: TrackedImages, regions: Sequence[np.ndarray], medium: Medium
 ) -> Looks:
     probe, grid, mask = tracked.probe, tracked.grid, tracked.mask & tracked.grid.field(tracked.probe)
     depths = [share * probe.depth_mm for share in _DEPTH_SHARES]
@@ -339,16 +347,18 @@ def _looks_of(
     for depth in depths:
         where = mask & (np.abs(away - depth) <= 8.0)
         maxima.append(_mean([extrema_density_cm2(image, grid, where) for image in images]))
-    names = {label: tissue.name for label, tissue in tissues.items() if label}
-    lines = {}
+    names, sheets = {label: tissue.name for label, tissue in medium.tissues.items() if label}, medium.sheets
+    lines: dict[str, list[LinePoints]] = {}
     for wanted, points_of in ((_WALLS, wall_points), (_SHEETS, sheet_points)):
         for name in wanted:
             chosen = [label for label, other in names.items() if other == name]
             if chosen:
-                points = [points_of(region, chosen, grid) for region in regions]
-                found = line_contrast(images, points, probe, grid, mask)
-                if found:
-                    lines[name] = found
+                lines[name] = [points_of(region, chosen, grid) for region in regions]
+    for name in _SHEETS:
+        of_kind = None if sheets is None else sheets.of_kind(name)
+        if of_kind:
+            lines[f"{name} that was found"] = [surfel_points(of_kind, pose, grid) for pose in tracked.poses]
+    contrasts = {name: line_contrast(images, points, probe, grid, mask) for name, points in lines.items()}
     band_mm, level = level_by_depth(images, probe, grid, mask)
     return Looks(
         speckle_widths(images, probe, grid, depths, mask),
@@ -356,7 +366,7 @@ def _looks_of(
         grey_of_tissues(images, regions, names, grid, mask),
         band_mm,
         level,
-        lines,
+        {name: found for name, found in contrasts.items() if found},
         _grey_map_of(images, tracked),
     )
 

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import ndimage
 
+from SlicerUSSim.Logic.mri.sheets.surfels import Surfels
 from SlicerUSSim.Logic.probe.arrays import Probe
 from SlicerUSSim.Logic.probe.image_grid import ImageGrid
 
@@ -25,6 +26,8 @@ _ALONG_MM = np.linspace(-1.0, 1.0, 7)
 #: How far beside a line `chance` is measured
 _ASIDE_MM = 7.0
 _LEAST_POINTS = 12
+#: How far from the image plane pieces of sheets count, mm
+_SLICE_MM = 0.7
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,6 +83,19 @@ def sheet_points(labels: np.ndarray, chosen: Sequence[int], grid: ImageGrid) -> 
     bend = xx * normal[..., 0] ** 2 + 2.0 * yx * normal[..., 0] * normal[..., 1] + yy * normal[..., 1] ** 2
     ridge = inside & (bend < 0.0) & (np.abs(slope) < 0.6 * max(pixel) * np.abs(bend))
     return _points(ridge, normal, grid, is_wall=False)
+
+
+def surfel_points(surfels: Surfels, probe_to_ras: np.ndarray, grid: ImageGrid) -> LinePoints:
+    """Where sheets that were found in the MRI cross the image plane of a probe at a pose (4, 4)."""
+    inverse = np.linalg.inv(probe_to_ras)
+    place = surfels.place @ inverse[:3, :3].T + inverse[:3, 3]
+    normal = (surfels.normal @ inverse[:3, :3].T)[:, :2]
+    size = np.linalg.norm(normal, axis=1)
+    # A sheet nearly in the plane has no line there.
+    chosen = (np.abs(place[:, 2]) < _SLICE_MM) & (size > 0.5)
+    pixel = (place[:, :2] - [grid.left_mm, grid.top_mm]) / grid.pixel_spacing_mm
+    chosen &= (pixel >= 0.0).all(axis=1) & (pixel < [grid.columns, grid.rows]).all(axis=1)
+    return LinePoints(place[chosen, :2], normal[chosen] / size[chosen, None], is_wall=False)
 
 
 def line_contrast(

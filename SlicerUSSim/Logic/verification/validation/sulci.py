@@ -86,7 +86,7 @@ def _predicted_db(kind: str) -> np.ndarray:
 
 
 def thin_sulci(rotation: np.ndarray, device) -> Outcome:
-    """Level against angle of a sulcus one and a half voxels thick, of a falx, and of a ventricle's wall as a control."""
+    """Level against angle of a sulcus of one and a half voxels, of a falx, and of a ventricle's wall as a control."""
     rows, curves = [], []
     for spacing, kind in itertools.product((0.5, 1.0), ("sulcus", "wall", DURA)):
         predicted, levels = _predicted_db(kind), []
