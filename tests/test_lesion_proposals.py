@@ -283,6 +283,37 @@ def test_seeds_are_points_of_a_file_of_slicer(tmp_path):
         split_seeds([str(tmp_path / "none.mrk.json")])
 
 
+@pytest.mark.parametrize(("named", "sign"), [("LPS", -1.0), ("1", -1.0), ("RAS", 1.0), ("0", 1.0)])
+def test_seeds_are_points_of_a_list_of_slicer_before_5(named, sign, tmp_path):
+    """The frame by its name, or as 4.10 numbered them; a label may have a comma, in quotes."""
+    path = tmp_path / "F.fcsv"
+    head = f"# Markups fiducial file version = 4.11\n# CoordinateSystem = {named}\n"
+    columns = "# columns = id,x,y,z,ow,ox,oy,oz,vis,sel,lock,label,desc,associatedNodeID\n"
+    rows = '1,-1.5,2.5,3,0,0,0,1,1,1,0,"F-1, rim",,\n2,4,5,6.25,0,0,0,1,1,1,0,F-2,,vtkMRMLScalarVolumeNode1\n'
+    path.write_text(head + columns + rows)
+    assert split_seeds([str(path)]) == [((-1.5 * sign, 2.5 * sign, 3.0), None), ((4.0 * sign, 5.0 * sign, 6.25), None)]
+    path.write_text(head)
+    with pytest.raises(SimulationError, match=r"F\.fcsv: has no point that was placed"):
+        split_seeds([str(path)])
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("1,2,3,4\n", "names no CoordinateSystem"),
+        ("# CoordinateSystem = IJK\n1,2,3,4\n", "CoordinateSystem is 'IJK', expected one of RAS, LPS, 0, 1"),
+        ("# CoordinateSystem = RAS\n1,2,3\n", "has a row without x, y and z"),
+        ("# CoordinateSystem = RAS\n1,2,x,3\n", "has a row without x, y and z"),
+        ("# CoordinateSystem = RAS\n1,2,nan,3\n", "has a point that is not finite"),
+        ("\xff\xfe", "is no text"),
+    ],
+)
+def test_a_list_of_points_that_is_none_is_refused(text, message, tmp_path):
+    (tmp_path / "F.fcsv").write_bytes(text.encode("latin-1"))
+    with pytest.raises(SimulationError, match=message):
+        split_seeds([str(tmp_path / "F.fcsv=oedema")])
+
+
 # ---- scene -----------------------------------------------------------------------------------------------------------
 
 

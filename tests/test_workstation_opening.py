@@ -127,6 +127,8 @@ def test_points_of_slicer_are_an_opening_or_the_point_of_a_lesion(page, tmp_path
         assert said.startswith(f"{name}: points of 3D Slicer: {deed}") and not errors(page)
         titles = {item["value"]: item["title"] for item in state(page, NAMES.panel.nodes)[selector]}
         assert titles[shown(page, selector)] == name
+    (tmp_path / "old.fcsv").write_text("# CoordinateSystem = LPS\nF-1,-10,-10,60\n")
+    assert answered(page, tmp_path / "old.fcsv").startswith("old.fcsv: points of 3D Slicer: the last one is chosen")
     (tmp_path / "none.mrk.json").write_text(json.dumps({"markups": [{"type": "Fiducial", "controlPoints": []}]}))
     page.set_input_files("#open-file", tmp_path / "none.mrk.json")
     eventually(page, lambda: "none.mrk.json: has no point that was placed" in " ".join(errors(page)))

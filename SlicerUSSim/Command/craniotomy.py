@@ -25,7 +25,7 @@ craniotomy_option = click.option(
     "--craniotomy", default=NONE, show_default=True, metavar="none|auto|disc:MM|FILE",
     help="Opening in skin and skull of a whole head (--outside, or a label map with them), filled with the coupling "
     "medium: a disc of this diameter under the probe, auto (as wide as the probe's face needs), the mask in FILE, or "
-    "the polygon of a .mrk.json file of 3D Slicer. With --pose auto the probe then stands on the brain.",
+    "the polygon through points of 3D Slicer (.mrk.json, .fcsv). With --pose auto the probe then stands on the brain.",
 )  # fmt: skip
 
 

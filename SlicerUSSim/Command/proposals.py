@@ -18,10 +18,10 @@ if TYPE_CHECKING:
 
 seed_option = click.option(
     "--seed", "seeds", multiple=True, metavar="R,A,S|FILE[=TISSUE]",
-    help="Propose the lesion around a point, RAS mm in the frame of the MRI, or around each point of a .mrk.json file "
-    "of 3D Slicer: masks beside the labels, which stay as they are; --add lays them over. With a tissue (tumour, "
-    "oedema, necrosis, cyst, haematoma, cavity, enhancing) it is proposed as that, also where it looks like a vessel, "
-    "a ventricle or the other side; not where it has no border or looks as that tissue cannot. May be repeated.",
+    help="Propose the lesion around a point, RAS mm in the frame of the MRI, or around each point of a file of 3D "
+    "Slicer (.mrk.json, .fcsv): masks beside the labels, which stay as they are; --add lays them over. With a tissue "
+    "(tumour, oedema, necrosis, cyst, haematoma, cavity, enhancing) it is proposed as that, also where it looks like a "
+    "vessel, a ventricle or the other side; not where it has no border or looks as that tissue cannot. May be repeated.",
 )  # fmt: skip
 propose_option = click.option(
     "--propose",
@@ -42,8 +42,8 @@ def split_seeds(texts: Iterable[str]) -> list[tuple[tuple[float, ...], str | Non
         points = _points_of(place)
         require(
             bool(points) and ("=" not in text or bool(tissue.strip())),
-            f"--seed is {text!r}, expected R,A,S in mm, such as 31.5,-20,42, or a .mrk.json file of 3D Slicer, and "
-            "with a tissue 31.5,-20,42=oedema",
+            f"--seed is {text!r}, expected R,A,S in mm, such as 31.5,-20,42, or points of 3D Slicer (.mrk.json, "
+            ".fcsv), and with a tissue 31.5,-20,42=oedema",
         )
         if tissue:
             from SlicerUSSim.Logic.base.errors import about_file
@@ -57,9 +57,9 @@ def split_seeds(texts: Iterable[str]) -> list[tuple[tuple[float, ...], str | Non
 
 def _points_of(place: str) -> list[tuple[float, ...]]:
     """The point R,A,S, or those of a file; empty for another text."""
-    if place.lower().endswith(".json"):
-        from SlicerUSSim.Logic.mri.markups import markup_points
+    from SlicerUSSim.Logic.mri.markups import is_markup_name, markup_points  # imported here to keep --help fast
 
+    if is_markup_name(place):
         _, points = markup_points(place, ("Fiducial",), "a list of points")
         require(len(points) > 0, f"{place}: has no point that was placed, expected one in each lesion")
         return [tuple(map(float, point)) for point in points]

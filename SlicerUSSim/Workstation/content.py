@@ -13,6 +13,7 @@ from SlicerUSSim.Logic.base.files import read_json
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.imaging.preset import SECTIONS
 from SlicerUSSim.Logic.mri.ct_unit import looks_like_ct
+from SlicerUSSim.Logic.mri.markups import is_markup_name
 from SlicerUSSim.Logic.mri.recognition import is_head_sized, require_no_ultrasound, stripped_brain
 from SlicerUSSim.Logic.tissue.label_files import TABLE_SUFFIXES, names_of_file
 from SlicerUSSim.Logic.tissue.label_maps import as_whole
@@ -64,6 +65,8 @@ def content_of(path: Path) -> Content:
         return of_volume(path, Volume.read(path))
     if name.endswith(".json"):
         return _of_json(path)
+    if is_markup_name(path):
+        return Content(Kind.POINTS, "points of 3D Slicer")
     if name.endswith((".mrb", ".zip")):
         return Content(Kind.SCENE, "a scene of 3D Slicer or of this page")
     if name.endswith(".vtp"):

@@ -20,6 +20,7 @@ from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.imaging.preset import Preset
 from SlicerUSSim.Logic.mri.craniotomy import is_open, polygon_of_file
 from SlicerUSSim.Logic.mri.kept_mask import mask_beside
+from SlicerUSSim.Logic.mri.markups import is_markup_name
 from SlicerUSSim.Logic.mri.masks import with_label_names
 from SlicerUSSim.Logic.mri.samples import demo_mri
 from SlicerUSSim.Logic.mri.settings import SheetSettings
@@ -203,8 +204,8 @@ class Opener:
         return self._label_map(self._volume(path), path, ["inside"])
 
     def opening(self, path: str):
-        """A node with the opening of a file: a closed curve through the points of a .mrk.json, or a mask."""
-        if not _is_json(Path(path)):
+        """A node with the opening of a file: a closed curve through the points of a markup, or a mask."""
+        if not is_markup_name(path):
             return self._label_map(is_open(self._volume(path), path), path, ["opening"])
         return self._markups("vtkMRMLMarkupsClosedCurveNode", path, polygon_of_file(path))
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
 from scipy import ndimage
@@ -16,7 +15,7 @@ from scipy import ndimage
 from SlicerUSSim.Logic.base.errors import require
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.mri.distances import distance_to
-from SlicerUSSim.Logic.mri.markups import markup_points
+from SlicerUSSim.Logic.mri.markups import is_markup_name, markup_points
 from SlicerUSSim.Logic.mri.outside import OUTSIDE
 from SlicerUSSim.Logic.probe.arrays import Probe
 from SlicerUSSim.Logic.probe.placement import craniotomy_pose, sample
@@ -118,11 +117,11 @@ def polygon_opening(labels: Volume, names: Sequence[str], points_ras: np.ndarray
 
 
 def file_opening(labels: Volume, names: Sequence[str], path: str) -> np.ndarray:
-    """(k, j, i) bool of a file: a mask (not 0 is open), or a markup of 3D Slicer (.mrk.json), a polygon of its points.
+    """(k, j, i) bool of a file: a mask (not 0 is open), or points of 3D Slicer (.mrk.json, .fcsv), a polygon.
 
     Raises SimulationError for another file, and for a mask that is empty or lies elsewhere.
     """
-    if Path(path).suffix.lower() == ".json":
+    if is_markup_name(path):
         return polygon_opening(labels, names, polygon_of_file(path))
     return mask_opening(labels, Volume.read(path), path)
 
@@ -267,7 +266,7 @@ def _crossing_sides(outline: np.ndarray) -> tuple[int, int] | None:
 
 
 def polygon_of_file(path: str) -> np.ndarray:
-    """(points, 3) RAS mm of the markup in a .mrk.json file of 3D Slicer, whose points are a polygon.
+    """(points, 3) RAS mm of the points in a file of 3D Slicer (.mrk.json, .fcsv), which are a polygon.
 
     Raises SimulationError for another file, and for several markups, another kind, frame or unit.
     """
