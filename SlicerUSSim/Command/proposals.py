@@ -20,8 +20,9 @@ seed_option = click.option(
     "--seed", "seeds", multiple=True, metavar="R,A,S|FILE[=TISSUE]",
     help="Propose the lesion around a point, RAS mm in the frame of the MRI, or around each point of a file of 3D "
     "Slicer (.mrk.json, .fcsv): masks beside the labels, which stay as they are; --add lays them over. With a tissue "
-    "(tumour, oedema, necrosis, cyst, haematoma, cavity, enhancing) it is proposed as that, also where it looks like a "
-    "vessel, a ventricle or the other side; not where it has no border or looks as that tissue cannot. May be repeated.",
+    "(tumour, oedema, necrosis, cyst, haematoma, cavity, enhancing) it is proposed as that, also where it looks like "
+    "a vessel, a ventricle or the other side; not where it has no border or looks as that tissue cannot. May be "
+    "repeated.",
 )  # fmt: skip
 propose_option = click.option(
     "--propose",
