@@ -57,10 +57,7 @@ class Added:
         parts, count = ndimage.label(differs)  # type: ignore[misc]
         if not count:
             return None
-        largest = parts == np.bincount(parts.ravel())[1:].argmax() + 1
-        depth = np.asarray(ndimage.distance_transform_edt(np.pad(largest, 1)))
-        place = np.subtract(np.unravel_index(int(np.argmax(depth)), np.add(largest.shape, 2)), 1)
-        return self.labels.ijk_to_ras[:3] @ np.append(place[::-1], 1.0)
+        return innermost_ras(parts == np.bincount(parts.ravel())[1:].argmax() + 1, self.labels)
 
     def table(self, tissues: TissueTable) -> TissueTable:
         """The tissue table of the labels before, with the tissues of new labels from the presets."""
@@ -68,6 +65,16 @@ class Added:
         new = {label: name for label, name in enumerate(self.tissue_names, 1) if name and label not in tissues}
         table = {**tissues, **{label: mine.get(name) or tissue_named(name) for label, name in new.items()}}
         return tissues.with_labels(table)
+
+
+def innermost_ras(where: np.ndarray, grid: Volume) -> np.ndarray:
+    """(3,) RAS mm of the innermost voxel of a region (k, j, i) bool, not empty, on the grid of a volume."""
+    places = np.argwhere(where)
+    low, high = places.min(axis=0), places.max(axis=0) + 1
+    region = where[tuple(slice(start, stop) for start, stop in zip(low, high, strict=True))]
+    depth = np.asarray(ndimage.distance_transform_edt(np.pad(region, 1)))
+    place = np.unravel_index(int(np.argmax(depth)), depth.shape) + low - 1
+    return grid.ijk_to_ras[:3] @ np.append(place[::-1], 1.0)
 
 
 def tissue_to_add(name: str, tissue_names: Iterable[str] = ()) -> str:
