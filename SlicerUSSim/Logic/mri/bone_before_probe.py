@@ -20,7 +20,7 @@ CLOSED_DB = 30.0
 #: Where less than this part of the lines that reach the brain pass, a skull is closed
 _OPEN_SHARE = 0.1
 #: A face does not fit where bone is before, or so near behind, that much of it, mm
-_BEHIND_MM, _COVERED_MM = 10.0, 2.0
+_BEHIND_MM, _COVERED_MM = 10.0, 1.0
 #: Brain is looked for so far from a face, mm
 _BRAIN_MM = 60.0
 _STEP_MM = 0.5
