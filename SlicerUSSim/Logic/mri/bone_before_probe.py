@@ -44,7 +44,7 @@ COMMAND = Words(
     "--craniotomy auto, disc:MM or a file", "--pose auto is in it", "--probe transcranial with --pose temporal"
 )
 SCENE = Words(
-    "Open skull in Craniotomy", "it is where the probe is placed without a view",
+    "Open skull in Craniotomy", "the model of the removed piece shows where",
     "the probe transcranial, placed at the view temporal",
 )  # fmt: skip
 
