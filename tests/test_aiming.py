@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from SlicerUSSim.Logic import Volume
-from SlicerUSSim.Logic.mri.aiming import FARTHEST_DEG, opening_pose
+from SlicerUSSim.Logic.mri.aiming import FARTHEST_DEG, LESION_GROUPS, opening_pose
 from SlicerUSSim.Logic.mri.bone_before_probe import CLOSED_DB, COMMAND, SCENE, about_bone
 from SlicerUSSim.Logic.mri.craniotomy import default_pose, disc_opening, middle_of, opened, without_outside
+from SlicerUSSim.Logic.mri.pathology import LESIONS
 from SlicerUSSim.Logic.mri.views import view_pose
 from SlicerUSSim.Logic.probe import PROBES, ConvexProbe, LinearProbe, Probe
 from SlicerUSSim.Logic.probe.placement import pose_looking_at, turned
@@ -98,6 +99,10 @@ def test_specks_are_no_lesion_and_one_right_before_the_face_needs_no_turn(head):
     pose, line = opening_pose(labels, ILL, PROBES["phased"], middle)
     assert line == "the tumour lies in front of the face"
     np.testing.assert_allclose(pose[:3, 1], [0.0, 0.0, -1.0], atol=0.03)
+
+
+def test_all_tissues_that_are_lesions_alone_are_looked_at():
+    assert sorted(name for group in LESION_GROUPS for name in group) == sorted(set(LESIONS) - {"blood", "brats"})
 
 
 def test_the_target_of_a_caller_comes_before_lesions_of_the_labels(head):  # noqa: F811

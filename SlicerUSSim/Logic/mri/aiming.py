@@ -64,15 +64,17 @@ def _lesions(labels: Volume, names: Sequence[str]) -> list[tuple[np.ndarray, str
     for group in LESION_GROUPS:
         numbers = [number for number, name in enumerate(names, 1) if name in group]
         parts, _ = ndimage.label(np.isin(labels.array, numbers))  # type: ignore[misc]
-        sizes = np.bincount(parts.ravel())[1:]
-        wanted = [n for n in np.argsort(-sizes, kind="stable") + 1 if sizes[n - 1] * labels.voxel_ml >= _LEAST_ML]
-        if wanted:
-            return [(innermost_ras(parts == n, labels), _name_in(labels, names, parts == n)) for n in wanted]
+        sizes, boxes, found = np.bincount(parts.ravel())[1:], ndimage.find_objects(parts), []
+        for number in np.argsort(-sizes, kind="stable"):
+            if sizes[number] * labels.voxel_ml < _LEAST_ML:
+                break
+            box = boxes[number]
+            where = parts[box] == number + 1
+            tissue = names[int(np.bincount(labels.array[box][where]).argmax()) - 1]
+            found.append((innermost_ras(where, labels, [part.start for part in box]), tissue))
+        if found:
+            return found
     return []
-
-
-def _name_in(labels: Volume, names: Sequence[str], where: np.ndarray) -> str:
-    return names[int(np.bincount(labels.array[where]).argmax()) - 1]
 
 
 def _name_at(labels: Volume, names: Sequence[str], place: np.ndarray) -> str:

@@ -57,7 +57,9 @@ class Added:
         parts, count = ndimage.label(differs)  # type: ignore[misc]
         if not count:
             return None
-        return innermost_ras(parts == np.bincount(parts.ravel())[1:].argmax() + 1, self.labels)
+        largest = np.bincount(parts.ravel())[1:].argmax()
+        box = ndimage.find_objects(parts)[largest]
+        return innermost_ras(parts[box] == largest + 1, self.labels, [part.start for part in box])
 
     def table(self, tissues: TissueTable) -> TissueTable:
         """The tissue table of the labels before, with the tissues of new labels from the presets."""
@@ -67,13 +69,13 @@ class Added:
         return tissues.with_labels(table)
 
 
-def innermost_ras(where: np.ndarray, grid: Volume) -> np.ndarray:
-    """(3,) RAS mm of the innermost voxel of a region (k, j, i) bool, not empty, on the grid of a volume."""
-    places = np.argwhere(where)
-    low, high = places.min(axis=0), places.max(axis=0) + 1
-    region = where[tuple(slice(start, stop) for start, stop in zip(low, high, strict=True))]
-    depth = np.asarray(ndimage.distance_transform_edt(np.pad(region, 1)))
-    place = np.unravel_index(int(np.argmax(depth)), depth.shape) + low - 1
+def innermost_ras(where: np.ndarray, grid: Volume, first: Sequence[int] = (0, 0, 0)) -> np.ndarray:
+    """(3,) RAS mm of the innermost voxel of a region on the grid of a volume.
+
+    `where` (k, j, i) bool, not empty, is a part of the grid that begins at its voxel `first`.
+    """
+    depth = np.asarray(ndimage.distance_transform_edt(np.pad(where, 1)))
+    place = np.add(np.unravel_index(int(np.argmax(depth)), depth.shape), first) - 1
     return grid.ijk_to_ras[:3] @ np.append(place[::-1], 1.0)
 
 
