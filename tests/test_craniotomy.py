@@ -178,7 +178,26 @@ def test_the_probe_stands_on_the_brain_in_the_opening_of_a_file(head, tmp_path):
     _, told = image(tmp_path, "--pose", str(tmp_path / "pose.json"))
     assert "mm of bone lie behind the face of the probe, which stands in a closed skull" in told
     _, told = image(tmp_path, "--pose", str(tmp_path / "pose.json"), "--craniotomy", "disc:10")
-    assert "mm wide and does not fit through" in told
+    assert re.search(
+        r"the face of the probe is 12 mm wide and does not fit the opening, which leaves (9|10) mm of it free: expect",
+        told,
+    )
+    assert "the skull is closed" not in told  # it is behind the face
+
+
+def test_the_command_aims_at_a_tumour_in_the_opening_of_a_file_and_says_where_the_skull_is_closed(head, tmp_path):
+    place, names = (12.0, 0.0, 35.0), (*NAMES, "tumour")
+    inside = np.linalg.norm(places_of(head) - place, axis=-1) <= 7.0
+    labels = head.with_array(np.where(inside, len(names), head.array).astype(np.uint8))
+    write_label_files(tmp_path / "head.nii.gz", labels, TissueTable.brain().for_names(names))
+    hole = disc_opening(labels, names, TOP, 40.0).astype(np.uint8)
+    head.with_array(hole).write(tmp_path / "hole.nii.gz")
+    through, told = image(tmp_path, "--pose", "auto", "--craniotomy", str(tmp_path / "hole.nii.gz"))
+    assert re.search(r"^probe: aimed at the tumour, 2\d degrees off the surface's normal$", told, re.MULTILINE)
+    assert "the skull is closed" not in told and "does not fit" not in told and through.mean() > 10.0
+    black, told = image(tmp_path, "--pose", "auto")
+    assert told.count("the skull is closed in front of the probe") == 1 and "(--craniotomy auto, disc:MM or a " in told
+    assert black[black.shape[0] // 3 :].mean() < 3.0
 
 
 def image(tmp_path, *arguments) -> tuple[np.ndarray, str]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import re
 
 import numpy as np
 import pytest
@@ -22,6 +23,7 @@ from SlicerUSSim.Logic.mrml.own_labels import mark_as_made  # noqa: E402
 from SlicerUSSim.Logic.mrml.scene_record import put_nodes, record_scene  # noqa: E402
 from SlicerUSSim.Logic.probe.placement import pose_looking_at  # noqa: E402
 from SlicerUSSim.Widget.presenter import PanelPresenter  # noqa: E402
+from tests.test_aiming import with_ball  # noqa: E402
 from tests.test_craniotomy import NAMES, TOP, head  # noqa: E402, F401
 from tests.test_presenter import PlainView  # noqa: E402
 
@@ -32,7 +34,7 @@ TURN = np.array([[0.8, -0.6, 0.0, 12.0], [0.6, 0.8, 0.0, -7.0], [0.0, 0.0, 1.0, 
 class Bench:
     """The round head in a scene, with a probe on its vertex, under a transform that turns and moves both."""
 
-    def __init__(self, labels: Volume, kind: str = KINDS[0], to_world: np.ndarray = TURN) -> None:
+    def __init__(self, labels: Volume, kind: str = KINDS[0], to_world: np.ndarray = TURN, names=NAMES) -> None:
         self.scene = slicer.vtkMRMLScene()
         self.presenter = PanelPresenter(UltrasoundSceneLogic(self.scene), PlainView(), label_maps=kind == KINDS[0])
         self.logic, self.view = self.presenter.logic, self.presenter.view
@@ -47,7 +49,7 @@ class Bench:
             self.add("LinearTransform", "Probe"),
             to_world,
         )
-        write_labels(self.whole, labels, NAMES, grid)
+        write_labels(self.whole, labels, names, grid)
         mark_as_made(self.whole)
         self.logic.parameters.labels, self.logic.parameters.probe_transform = self.whole, self.probe
         self.move(TOP)
@@ -237,6 +239,52 @@ def test_gel_is_between_skin_and_probe_as_in_the_commands_unless_the_user_says_o
     assert bench.logic.settings(bench.labels).contact_gap_mm == 3.0
     brain = Bench(head.with_array(np.where(head.array == 2, 2, 0).astype(np.uint8)))
     assert brain.logic.settings(brain.whole).contact_gap_mm is None
+
+
+def test_place_aims_at_a_tumour_below_the_opening_and_the_notes_say_so(head):  # noqa: F811
+    place = np.array([10.0, 8.0, 35.0])
+    bench = Bench(with_ball(head, place, 7.0), names=(*NAMES, "tumour"))
+    bench.presenter.openCraniotomy()
+    assert "probe: " not in bench.presenter.notes()
+    for _ in range(2):
+        bench.presenter.placeProbe()
+        pose = np.linalg.inv(TURN) @ node_to_world(bench.probe)
+        assert np.hypot(*(np.linalg.inv(pose) @ [*place, 1.0])[[0, 2]]) < 1.5 and not bench.view.errors
+        said = [line for line in bench.presenter.notes().splitlines() if line.startswith("probe: ")]
+        assert len(said) == 1 and re.fullmatch(
+            r"probe: aimed at the tumour, 2\d degrees off the surface's normal", said[0]
+        )
+    bench.presenter.closeCraniotomy()
+    assert "probe: " not in bench.presenter.notes()
+    bench.presenter.placeProbe()
+    assert "probe: " not in bench.presenter.notes()  # on the skin, upright as before
+
+
+def test_the_notes_follow_the_probe_over_bone_and_openings(head):  # noqa: F811
+    closed, misfit = "the skull is closed in front of the probe", "does not fit the opening"
+    bench = Bench(head)
+    bench.presenter.placeProbe()
+    assert bench.presenter.notes().count(closed) == 1 and "Open skull in Craniotomy" in bench.presenter.notes()
+    bench.presenter.openCraniotomy()
+    bench.presenter.placeProbe()
+    assert closed not in bench.presenter.notes() and misfit not in bench.presenter.notes()
+    bench.logic.preset = bench.logic.preset.changed("probe", aperture_mm=40.0)
+    assert "is 40 mm wide and does not fit the opening" in bench.presenter.notes()
+    bench.logic.preset = bench.logic.preset.changed("probe", aperture_mm=12.0)
+    bench.presenter.setLive(True)
+    assert misfit not in bench.presenter.notes() and not bench.view.errors
+    refreshed = bench.view.refreshed
+    bench.move(pose_looking_at((78.5, 0.0, 0.0), (0.0, 0.0, 0.0), (0.0, 1.0, 0.0)))
+    bench.view.waiting.pop()()  # the image there
+    assert bench.view.refreshed == refreshed + 1  # so that the notes are shown anew
+    assert closed in bench.presenter.notes() and "the opening is elsewhere" in bench.presenter.notes()
+    bench.presenter.setLive(False)
+    assert bench.presenter.noteLines == tuple(
+        line for line in bench.presenter.notes().splitlines() if closed not in line
+    )
+    brain = Bench(head.with_array(np.where(head.array == 2, 2, 0).astype(np.uint8)))
+    brain.presenter.placeProbe()
+    assert closed not in brain.presenter.notes() and not brain.view.errors
 
 
 @pytest.mark.slow

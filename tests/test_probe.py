@@ -32,6 +32,15 @@ lines = st.integers(2, 300)
 each_preset = pytest.mark.parametrize("name", PROBES)
 
 
+@pytest.mark.parametrize(
+    "probe", [*PROBES.values(), LinearProbe(38, 40, trapezoid_deg=15.0), LinearProbe(38, 40, steering_deg=-20.0)]
+)
+def test_lines_leave_points_of_the_face(probe):
+    positions = probe.line_positions()
+    leave = probe.origins_mm() + probe.line_starts_mm(positions)[:, None] * probe.directions()
+    np.testing.assert_allclose(probe.face_points_mm(leave[:, 0]), leave, atol=1e-9)
+
+
 @given(st.floats(5, 120), st.floats(10, 120), st.floats(10, 200), lines)
 def test_convex_lines_leave_the_face_at_right_angles(radius, field, depth, count):
     probe = ConvexProbe(radius, field, depth, scan_lines=count)

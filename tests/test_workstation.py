@@ -831,11 +831,13 @@ def test_bad_anatomy_is_one_line_in_the_page_which_goes_on(browser, files, tmp_p
 
 @pytest.mark.slow
 def test_a_craniotomy_is_opened_and_closed_in_the_page(browser, tmp_path):
+    closed, misfit = "the skull is closed in front of the probe", "mm wide and does not fit the opening"
     round_head(tmp_path)
     with serving("--labels", str(tmp_path / "labels.nii.gz")) as address:
         page = opened(browser, address)
         settled(page)
         shut = np.asarray(Image.open(download(page, "png")), float)
+        assert shown(page, "notesLabel").count(closed) == 1 and "Open skull" in shown(page, "notesLabel")
         open_section(page, "Craniotomy")
         assert page.locator("#closeCraniotomyButton").is_disabled()
         pressed_until(page, "#openCraniotomyButton", lambda: "craniotomy: a disc of" in shown(page, "notesLabel"))
@@ -843,13 +845,45 @@ def test_a_craniotomy_is_opened_and_closed_in_the_page(browser, tmp_path):
         page.evaluate("window.trame.trigger('press', ['placeButton'])")  # on the brain, in the middle of the opening
         settled(page)
         assert not errors(page) and "craniotomy: a disc of" in shown(page, "notesLabel")
+        assert closed not in shown(page, "notesLabel") and misfit not in shown(page, "notesLabel")
+        assert "probe: " not in shown(page, "notesLabel")  # there is no lesion to aim at
         through = np.asarray(Image.open(download(page, "png")), float)
         assert through.mean() > shut.mean() + 5.0
         assert np.array_equal(run_again(script_of(page), tmp_path), through)
+        page.evaluate("window.trame.trigger('set', ['probePresetComboBox', 'abdominal'])")
+        eventually(page, lambda: f"the face of the probe is 69 {misfit}" in shown(page, "notesLabel"))
         pressed_until(page, "#closeCraniotomyButton", lambda: "craniotomy: " not in shown(page, "notesLabel"))
         settled(page)
         assert not errors(page) and "craniotomy: " not in shown(page, "notesLabel")
+        assert misfit not in shown(page, "notesLabel")
         assert page.locator("#closeCraniotomyButton").is_disabled()
+        page.close()
+
+
+@pytest.mark.slow
+def test_the_page_places_the_probe_in_the_opening_so_that_it_looks_at_the_tumour(browser, tmp_path):
+    labels, place = round_head(tmp_path), np.array([12.0, 0.0, 33.0])
+    k, j, i = np.indices(labels.array.shape)
+    centres = np.stack([i, j, k], axis=-1) * 3.0 - 84.0
+    labels.with_array(np.where(np.linalg.norm(centres - place, axis=-1) < 9.0, 4, labels.array).astype(np.uint8)).write(
+        tmp_path / "labels.nii.gz"
+    )
+    TissueTable.brain(("grey matter", "skull", "skin", "tumour")).write(tmp_path / "labels.json")
+    hole = labels.with_array(np.zeros_like(labels.array))
+    hole.array[36:, 21:36, 21:36] = 1
+    hole.write(tmp_path / "hole.nii.gz")
+    with serving("--labels", str(tmp_path / "labels.nii.gz"), "--craniotomy", str(tmp_path / "hole.nii.gz")) as address:
+        page = opened(browser, address)
+        settled(page)
+        assert not errors(page)
+        assert re.search(
+            r"^probe: aimed at the tumour, 2\d degrees off the surface's normal$",
+            shown(page, "notesLabel"),
+            re.MULTILINE,
+        )
+        assert "the skull is closed" not in shown(page, "notesLabel")
+        image = np.asarray(Image.open(download(page, "png")), float)
+        assert image[image.shape[0] // 3 :].mean() > 5.0  # the beam reaches the brain
         page.close()
 
 

@@ -84,7 +84,6 @@ class Craniotomy:
         from SlicerUSSim.Logic.mri.craniotomy import (
             disc_diameter_mm,
             disc_opening,
-            face_width_mm,
             file_opening,
             middle_of,
             opened,
@@ -97,9 +96,6 @@ class Craniotomy:
                 )
             diameter = self.diameter_mm or disc_diameter_mm(probe)
             opening, what = disc_opening(labels, names, probe_to_ras, diameter), f"a disc of {diameter:.0f} mm"
-            face = face_width_mm(probe)
-            if diameter < face:
-                what += f" (the face of the probe is {face:.0f} mm wide and does not fit through)"
         else:
             opening, what = file_opening(labels, names, self.source), self.source
         found, millilitres = opened(labels, names, opening)

@@ -245,6 +245,7 @@ def open_examination(patient: PatientOptions, pose: np.ndarray | str | None = No
         )
         tissues = changes.to_tissues(with_their_tissue(added.table(tissues), sheets.read))
         placed = _placed(patient, craniotomy, preset, added, labels, pose)
+        _say_bone(placed, added, tissues, preset, craniotomy)
         simulator = UltrasoundSimulator(placed.labels, tissues, placed.settings, patient.device, sheets=sheets.read)
         return Examination(simulator, preset.probe, preset.display, is_labels, placed.probe_to_ras)
     require(
@@ -276,6 +277,7 @@ def open_examination(patient: PatientOptions, pose: np.ndarray | str | None = No
     texture = texture_below(segmentation.texture(), volume, segmentation.labels, added.labels)
     tissues = changes.to_tissues(tissues)
     placed = _placed(patient, craniotomy, preset, added, segmentation.labels, pose)
+    _say_bone(placed, added, tissues, preset, craniotomy)
     simulator = UltrasoundSimulator(placed.labels, tissues, placed.settings, patient.device, texture, surfels)
     return Examination(simulator, preset.probe, preset.display, is_labels, placed.probe_to_ras)
 
@@ -294,6 +296,7 @@ def _placed(
     pose: np.ndarray | str | None,
 ) -> _Placed:  # fmt: skip
     """The probe at its pose on a patient; `before` are the labels without what --add laid over them."""
+    from SlicerUSSim.Logic.mri.aiming import opening_pose
     from SlicerUSSim.Logic.mri.craniotomy import default_pose, middle_of
     from SlicerUSSim.Logic.mri.views import opened_view_pose, view_pose
     from SlicerUSSim.Logic.tissue.brain_orders import BRAIN_TISSUES
@@ -308,9 +311,12 @@ def _placed(
         if pose == AUTO:
             if not set(names) & {*BRAIN_TISSUES, "brain"}:
                 note("--pose is auto, and no tissue of a brain is labelled: the probe stands on top of what is")
-            pose = default_pose(
-                labels, names, preset.probe, is_open=craniotomy.is_wanted, opening_ras=at, target_ras=target
-            )
+            if at is None:
+                pose = default_pose(labels, names, preset.probe, is_open=craniotomy.is_wanted, target_ras=target)
+            else:
+                pose, line = opening_pose(labels, names, preset.probe, at, target)
+                if line:
+                    note(f"probe: {line}")
         else:
             if at is None:
                 pose = view_pose(labels, names, pose, is_open=craniotomy.is_wanted)
@@ -323,6 +329,18 @@ def _placed(
         note(f"gel fills gaps of up to {GEL_MM:g} mm between skin and probe (--contact-gap)")
         settings = replace(settings, contact_gap_mm=GEL_MM)
     return _Placed(labels, pose, settings)
+
+
+def _say_bone(placed: _Placed, added: Added, tissues: TissueTable, preset: Preset, craniotomy: Craniotomy) -> None:
+    """Say that the skull before the probe is closed, or that its face does not fit the opening."""
+    from SlicerUSSim.Logic.mri.bone_before_probe import COMMAND, about_bone
+
+    if placed.probe_to_ras is not None:
+        for line in about_bone(
+            placed.labels, added.tissue_names, tissues.all_tissues(), preset.probe, placed.probe_to_ras,
+            is_open=craniotomy.is_wanted, words=COMMAND,
+        ):  # fmt: skip
+            note(line)
 
 
 def open_examination_at(patient: PatientOptions, pose: str) -> tuple[Examination, np.ndarray]:

@@ -45,8 +45,8 @@ from SlicerUSSim.Widget.sections import CUSTOM_PROBE, SHOWN_PROBES
 _CHECK = "Check: "
 #: Begin of the line about an opening
 _OPENED = "craniotomy: "
-#: Begin of the line about a standard view
-_VIEW = "view: "
+#: Begin of the line about where the probe was placed: at a standard view, or in an opening
+_VIEW, _PLACED = "view: ", "probe: "
 #: Begin of the lines about a proposal
 _PROPOSED = "proposal: "
 #: What is said of an image that does not follow the probe any more
@@ -122,6 +122,8 @@ class PanelPresenter:
         self._made_by: dict[str | None, SegmentationSettings] = {}
         self._custom_probe: Probe | None = None  # the last one that was none of PROBES
         self._last_image: float | None = None
+        #: The lines about bone before the probe that the notes had when they were shown last
+        self._bone_said: tuple[str, ...] = ()
         self._followed: tuple = ()  # the nodes of the live update
         #: Fits of simulated to real ultrasound
         self.fits = FitPresenter(self)
@@ -602,7 +604,7 @@ class PanelPresenter:
                     diameter_mm=parameters.panel.craniotomy_mm,
                 )  # fmt: skip
             parameters.labels = node
-            kept = [line for line in self._notes if not line.startswith(_OPENED)]
+            kept = [line for line in self._notes if not line.startswith((_OPENED, _PLACED))]
             self._notes, self._labels_said = [*kept, *self.logic.notes], node.GetID()
             self._notes += _checks(self.logic.warnings)
         self.view.refresh()
@@ -616,13 +618,14 @@ class PanelPresenter:
             require(closed is not chosen, f"{chosen.GetName()!r} has no opening, or the labels before it are gone")
             self.logic.hideOpening(chosen)
             parameters.labels = closed
-            self._notes = [line for line in self._notes if not line.startswith(_OPENED)]
+            self._notes = [line for line in self._notes if not line.startswith((_OPENED, _PLACED))]
             self._labels_said = closed.GetID()
         self.view.refresh()
 
     def notes(self) -> str:
         """What the last segmentation or addition did, and what a user should check, in lines."""
-        return "\n".join([*self._notes, *self._gel()])
+        self._bone_said = self._bone()
+        return "\n".join([*self._notes, *self._gel(), *self._bone_said])
 
     @property
     def noteLines(self) -> tuple[str, ...]:
@@ -641,6 +644,16 @@ class PanelPresenter:
         except SimulationError:  # an empty node, or unknown names: the error is shown by simulate()
             return []
         return [f"gel fills gaps of up to {GEL_MM:g} mm between skin and probe (Gel on the skin)"] if is_there else []
+
+    def _bone(self) -> tuple[str, ...]:
+        """Lines about bone before the probe where it is now."""
+        parameters = self.logic.parameters
+        if parameters.labels is None or parameters.probe_transform is None:
+            return ()
+        try:
+            return self.logic.aboutBone(parameters.labels, parameters.probe_transform)
+        except SimulationError:  # as in _gel, or a probe that scales: the error is shown by simulate()
+            return ()
 
     def forgetPatient(self) -> None:
         """Release what is kept in memory of the last patient, with notes and fit; nodes stay."""
@@ -661,17 +674,20 @@ class PanelPresenter:
         """Place the probe on the surface in the slice view, or at a craniotomy; create its transform if needed."""
         with self.shown():
             require(self.logic.parameters.labels is not None, "no label map chosen, expected one to put the probe on")
-            self._put_probe(self.view.sliceNode())
+            self._say_placed(_PLACED, self._put_probe(self.view.sliceNode()))
         self.view.refresh()
 
     def placeAtView(self) -> None:
         """Place the probe where the chosen standard view is seen from; create its transform if needed."""
         with self.shown():
             require(self.logic.parameters.labels is not None, "no label map chosen, expected one to put the probe on")
-            line = self._put_probe(view=self.logic.parameters.panel.view)
-            self._notes = [known for known in self._notes if not known.startswith(_VIEW)]
-            self._notes += [f"{_VIEW}{line}"] if line else []
+            self._say_placed(_VIEW, self._put_probe(view=self.logic.parameters.panel.view))
         self.view.refresh()
+
+    def _say_placed(self, what: str, line: str) -> None:
+        """Replace the line of the notes about where the probe was placed."""
+        self._notes = [known for known in self._notes if not known.startswith((_VIEW, _PLACED))]
+        self._notes += [f"{what}{line}"] if line else []
 
     def simulate(self) -> None:
         """Simulate one image, into the chosen volume or a new one."""
@@ -872,6 +888,9 @@ class PanelPresenter:
         else:
             self.view.showStatus("")
         self._last_image = now
+        before, self._bone_said = self._bone_said, self._bone()
+        if self._bone_said != before:  # the probe has moved over bone or an opening
+            self.view.refresh()
 
     def _stopped(self) -> None:
         taken = self.logic.taken

@@ -319,7 +319,7 @@ def _pose_sliders() -> None:
     v3.VBtn(
         "Place at craniotomy", size="small", classes="ma-1", id="place", click="trigger('press', ['placeButton'])",
         disabled=(f"{NAMES.panel.can}.placeButton === false",),
-        title="Coronal view through a parasagittal craniotomy",
+        title="Coronal view through a parasagittal craniotomy, or into the opening, aimed at a tumour below it",
     )  # fmt: skip
     v3.VBtn(
         "Align with normal", size="small", classes="ma-1", click="trigger('key', ['Home', false])", id="stand-upright"

@@ -164,20 +164,16 @@ def disc_diameter_mm(probe: Probe) -> float:
 
 
 def default_pose(
-    labels: Volume, names: Sequence[str], probe: Probe, *, is_open: bool = False,
-    opening_ras: np.ndarray | None = None, target_ras: np.ndarray | None = None,
-) -> np.ndarray:  # fmt: skip
+    labels: Volume, names: Sequence[str], probe: Probe, *, is_open: bool = False, target_ras: np.ndarray | None = None
+) -> np.ndarray:
     """(4, 4) probe_to_ras where a probe stands by default on labels 1, 2, ... called `names`.
 
     On a brain alone it is a view through a craniotomy (placement.craniotomy_pose), of `target_ras` if that is given; on
-    a whole head the same, upright on the skin. With `is_open` it is on the brain, at `opening_ras` (3,), the middle of
-    an opening, if that is given.
+    a whole head the same, upright on the skin. With `is_open` it is on the brain, where a disc is opened under it; in
+    an opening that is there it stands by aiming.opening_pose.
     """
     ground = without_outside(labels, names) if is_open else labels
     pose = craniotomy_pose(ground, probe, target_ras=target_ras)
-    if opening_ras is not None:
-        surface = PatientSurface(ground)
-        return surface.slid(pose, surface.nearest(opening_ras))
     if not is_open and "skin" in names:  # a face that is oblique to the skin would stand in the bone
         surface = PatientSurface(labels)
         return surface.slid(pose, surface.nearest(pose[:3, 3]))

@@ -57,10 +57,9 @@ class Added:
         parts, count = ndimage.label(differs)  # type: ignore[misc]
         if not count:
             return None
-        largest = parts == np.bincount(parts.ravel())[1:].argmax() + 1
-        depth = np.asarray(ndimage.distance_transform_edt(np.pad(largest, 1)))
-        place = np.subtract(np.unravel_index(int(np.argmax(depth)), np.add(largest.shape, 2)), 1)
-        return self.labels.ijk_to_ras[:3] @ np.append(place[::-1], 1.0)
+        largest = np.bincount(parts.ravel())[1:].argmax()
+        box = ndimage.find_objects(parts)[largest]
+        return innermost_ras(parts[box] == largest + 1, self.labels, [part.start for part in box])
 
     def table(self, tissues: TissueTable) -> TissueTable:
         """The tissue table of the labels before, with the tissues of new labels from the presets."""
@@ -68,6 +67,16 @@ class Added:
         new = {label: name for label, name in enumerate(self.tissue_names, 1) if name and label not in tissues}
         table = {**tissues, **{label: mine.get(name) or tissue_named(name) for label, name in new.items()}}
         return tissues.with_labels(table)
+
+
+def innermost_ras(where: np.ndarray, grid: Volume, first: Sequence[int] = (0, 0, 0)) -> np.ndarray:
+    """(3,) RAS mm of the innermost voxel of a region on the grid of a volume.
+
+    `where` (k, j, i) bool, not empty, is a part of the grid that begins at its voxel `first`.
+    """
+    depth = np.asarray(ndimage.distance_transform_edt(np.pad(where, 1)))
+    place = np.add(np.unravel_index(int(np.argmax(depth)), depth.shape), first) - 1
+    return grid.ijk_to_ras[:3] @ np.append(place[::-1], 1.0)
 
 
 def tissue_to_add(name: str, tissue_names: Iterable[str] = ()) -> str:

@@ -30,7 +30,9 @@ from SlicerUSSim.Logic.imaging.preset import Preset
 from SlicerUSSim.Logic.imaging.reuse import ReusedSimulator
 from SlicerUSSim.Logic.imaging.simulator import EmptyViewWarning, UltrasoundSimulator
 from SlicerUSSim.Logic.mri.addable import require_addable
-from SlicerUSSim.Logic.mri.craniotomy import default_pose, disc_diameter_mm, disc_opening, face_width_mm, opened
+from SlicerUSSim.Logic.mri.aiming import opening_pose
+from SlicerUSSim.Logic.mri.bone_before_probe import SCENE, about_bone
+from SlicerUSSim.Logic.mri.craniotomy import default_pose, disc_diameter_mm, disc_opening, opened
 from SlicerUSSim.Logic.mri.ct import CtSegmentation
 from SlicerUSSim.Logic.mri.modality import has_brain_mask, segment_image
 from SlicerUSSim.Logic.mri.pathology import Added, add_tissues, texture_below
@@ -475,9 +477,6 @@ class UltrasoundSceneLogic:
             diameter = disc_diameter_mm(probe) if diameter_mm is None else diameter_mm
             opening = self._work.do(lambda: disc_opening(placed, names, pose, diameter))
             what = f"a disc of {diameter:.0f} mm under the probe"
-            face = face_width_mm(probe)
-            if diameter < face:
-                what += f", through which its face of {face:.0f} mm does not fit"
         result, millilitres = self._work.do(lambda: opened(placed, names, opening))
         found = labels.with_array(result.array)
         texture = None
@@ -767,9 +766,10 @@ class UltrasoundSceneLogic:
 
         With a slice node the image is in that slice, with its depth towards the bottom of the view, aimed at
         `target_ras` (default: the middle of the view). Without one it is a coronal view through a parasagittal
-        craniotomy: on a brain, upright on the skin of a whole head, or on the brain in the middle of an opening.
+        craniotomy: on a brain, upright on the skin of a whole head, or on the brain in the middle of an opening, aimed
+        at a lesion below it (aiming.opening_pose).
         `view` is one of mri.views.VIEWS instead, as "temporal". With `will_open` it is on the brain of a closed head,
-        where openCraniotomy opens a disc under it. Returns a line about a view of labels with an opening, "" otherwise.
+        where openCraniotomy opens a disc under it. Returns a line about what was done in labels with an opening, or "".
         """
         require_node(probe_transform_node, "vtkMRMLLinearTransformNode", use="probe transform")
         patient = self._patient(labels_node)
@@ -780,15 +780,29 @@ class UltrasoundSceneLogic:
         elif view is not None:
             pose = view_pose(surface, patient.names, view)
         elif slice_node is None:
-            pose = default_pose(
-                surface, patient.names, self.preset.probe, is_open=will_open or is_opened(labels_node),
-                opening_ras=flap_centre(labels_node),
-            )  # fmt: skip
+            opening = flap_centre(labels_node)
+            probe, names = self.preset.probe, patient.names
+            if opening is None:
+                pose = default_pose(surface, names, probe, is_open=will_open or is_opened(labels_node))
+            else:
+                pose, line = opening_pose(surface, names, probe, opening)
         else:
             require_node(slice_node, "vtkMRMLSliceNode", use="slice view")
             pose = pose_in_slice(surface, matrix_array(slice_node.GetSliceToRAS()), target_ras)
         set_node_to_world(probe_transform_node, pose)
         return line
+
+    def aboutBone(self, labels_node, probe_transform_node) -> tuple[str, ...]:
+        """Lines about bone before the probe at its pose: a closed skull, or an opening that its face does not fit.
+
+        See bone_before_probe.about_bone.
+        """
+        patient = self._patient(labels_node)
+        tissues = _tissues_of(self.preset, patient.names, None).all_tissues()
+        pose = patient.pose(probe_pose(probe_transform_node))
+        return about_bone(
+            patient.labels, patient.names, tissues, self.preset.probe, pose, is_open=is_opened(labels_node), words=SCENE
+        )
 
     def showOutline(self, model_node, probe_transform_node) -> None:
         """The outline of the imaged field as a model under the probe's transform.

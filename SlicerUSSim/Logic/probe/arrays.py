@@ -180,6 +180,13 @@ class Probe(Beam):
         """Lateral size of the array: of a phased array its aperture, otherwise that between the outermost lines."""
         return max(float(np.ptp(self.origins_mm()[:, 0])), self.aperture_mm)
 
+    def face_points_mm(self, lateral_mm) -> np.ndarray:
+        """(..., 3) points of the face in the probe frame at these lateral places, in the middle of its height."""
+        x = np.asarray(lateral_mm, float)
+        radius = self.apex_radius_mm
+        y = 0.0 * x if self.has_flat_face else np.sqrt(np.maximum(radius**2 - x**2, 0.0)) - radius
+        return np.stack([x, y, 0.0 * x], axis=-1)
+
     def line_positions(self) -> np.ndarray:
         """(scan_lines,) position of every line: radians around the apex, or millimetres along a linear face."""
         return self.first_line + self.line_spacing * np.arange(self.scan_lines)

@@ -1,0 +1,135 @@
+"""Bone between a probe and the brain: a face that does not fit an opening, and a skull that is closed before it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from SlicerUSSim.Logic.base.volume import Volume
+from SlicerUSSim.Logic.mri.outside import OUTSIDE
+from SlicerUSSim.Logic.probe.arrays import Probe
+from SlicerUSSim.Logic.probe.placement import sample
+from SlicerUSSim.Logic.tissue.tissue import Tissue
+
+#: Tissues of the skull, which an opening removes
+SKULL = ("skull", "cancellous bone")
+#: Echoes from behind a skull that takes more from them, there and back, are lost in half of the usual dynamic range, dB
+CLOSED_DB = 30.0
+#: Where less than this part of the lines that reach the brain pass, a skull is closed
+_OPEN_SHARE = 0.1
+#: A face does not fit where bone is before, or so near behind, that much of it, mm
+_BEHIND_MM, _COVERED_MM = 10.0, 1.0
+#: Brain is looked for so far from a face, mm
+_BRAIN_MM = 60.0
+_STEP_MM = 0.5
+_LINES = 33
+_BONE, _BRAIN = 1, 2
+
+
+@dataclass(frozen=True)
+class Words:
+    """What to do about a closed skull, in the words of one door."""
+
+    #: To open it under the probe
+    to_open: str
+    #: To go to the opening that there is
+    to_go: str
+    #: To look through the bone
+    through: str
+
+
+COMMAND = Words(
+    "--craniotomy auto, disc:MM or a file", "--pose auto is in it", "--probe transcranial with --pose temporal"
+)
+SCENE = Words(
+    "Open skull in Craniotomy", "the model of the removed piece shows where",
+    "the probe transcranial, placed at the view temporal",
+)  # fmt: skip
+
+
+def about_bone(
+    labels: Volume, names: Sequence[str], tissues: Iterable[Tissue], probe: Probe, probe_to_ras: np.ndarray, *,
+    is_open: bool, words: Words,
+) -> tuple[str, ...]:  # fmt: skip
+    """Lines about a probe at a pose (4, 4) on labels 1, 2, ... called `names`: bone before it, or a face that does not
+    fit an opening. None where no skull is labelled, and of images that show the brain.
+
+    `tissues` are those of the names. `is_open` says that the labels have an opening.
+    """
+    if "skull" not in names:
+        return ()
+    found = _closed_mm_and_db(labels, names, tissues, probe, probe_to_ras)
+    if found is not None:
+        thick, loss = found
+        line = (
+            f"the skull is closed in front of the probe, and {thick:.0f} mm of bone take {loss:.0f} dB from the echoes "
+            "of the brain: "
+        )
+        if is_open:
+            return (f"{line}the opening is elsewhere ({words.to_go})",)
+        return (f"{line}choose a craniotomy ({words.to_open}); for an image through the temple, {words.through}",)
+    line = _misfit(labels, names, probe, probe_to_ras) if is_open else ""
+    return (line,) if line else ()
+
+
+def _closed_mm_and_db(
+    labels: Volume, names: Sequence[str], tissues: Iterable[Tissue], probe: Probe, pose: np.ndarray
+) -> tuple[float, float] | None:
+    """Medians of (bone in mm, its two-way attenuation in dB) over the lines to the brain; None if it is seen."""
+    positions = np.linspace(probe.first_line, -probe.first_line, _LINES)
+    origin, direction = probe.line_at(positions)
+    along = probe.line_starts_mm(positions)[:, None] + np.arange(0.0, probe.depth_mm, _STEP_MM)
+    seen = _labels_at(labels, pose, origin[:, None] + along[..., None] * direction[:, None])
+    kinds = _kinds(names)[seen]
+    reached = (kinds == _BRAIN).any(axis=1)
+    if not reached.any():
+        return None
+    before = _bone_before_brain(kinds)[reached]
+    known = {tissue.name: tissue.attenuation_db_cm_mhz for tissue in tissues}
+    per_mm = np.array([0.0, *(0.1 * known.get(name, 0.0) for name in names)]) * 2.0 * probe.frequency_mhz
+    loss = (before * per_mm[seen[reached]]).sum(axis=1) * _STEP_MM
+    if (loss < CLOSED_DB).mean() >= _OPEN_SHARE:
+        return None
+    return float(np.median(before.sum(axis=1)) * _STEP_MM), float(np.median(loss))
+
+
+def _misfit(labels: Volume, names: Sequence[str], probe: Probe, pose: np.ndarray) -> str:
+    """A line about a face, the middle of which is in an opening, that bone covers in part; "" for others."""
+    lines = []
+    count = 2 * int(np.ceil(probe.face_mm)) + 1
+    across = probe.face_points_mm(np.linspace(-0.5, 0.5, count) * probe.face_mm)
+    high = np.linspace(-0.5, 0.5, count)[:, None] * [0.0, 0.0, probe.elevation_aperture_mm]
+    for points, size, side in ((across, probe.face_mm, "wide"), (high, probe.elevation_aperture_mm, "thick")):
+        depth = np.arange(-_BEHIND_MM, _BRAIN_MM, _STEP_MM)
+        kinds = _kinds(names)[_labels_at(labels, pose, points[:, None] + depth[:, None] * [0.0, 1.0, 0.0])]
+        is_covered = _bone_before_brain(kinds).sum(axis=1) * _STEP_MM >= 1.0
+        middle = count // 2
+        if is_covered[middle] or not (kinds[middle] == _BRAIN).any():
+            return ""
+        covered = float(is_covered.mean() * size)
+        if covered >= _COVERED_MM:
+            lines.append((covered, size, side))
+    if not lines:
+        return ""
+    covered, size, side = max(lines)
+    return (
+        f"the face of the probe is {size:.0f} mm {side} and does not fit the opening, which leaves "
+        f"{size - covered:.0f} mm of it free: expect black sectors where it lies on bone or lifts off"
+    )
+
+
+def _kinds(names: Sequence[str]) -> np.ndarray:
+    """(labels,) _BONE, _BRAIN or 0 of labels 0, 1, 2, ..."""
+    return np.array([0, *(_BONE if name in SKULL else 0 if name in (*OUTSIDE, "") else _BRAIN for name in names)])
+
+
+def _bone_before_brain(kinds: np.ndarray) -> np.ndarray:
+    """(lines, places) bool: where lines meet bone before the brain, or anywhere if they do not reach it."""
+    return (kinds == _BONE) & (np.cumsum(kinds == _BRAIN, axis=1) == 0)
+
+
+def _labels_at(labels: Volume, pose: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Labels at (..., 3) points in the frame of a probe; 0 outside the volume."""
+    return sample(labels, points @ pose[:3, :3].T + pose[:3, 3], order=0)

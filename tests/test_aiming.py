@@ -1,0 +1,170 @@
+"""A probe in an opening: aimed at a lesion below it, and what its notes say about bone before it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from SlicerUSSim.Logic import Volume
+from SlicerUSSim.Logic.mri.aiming import FARTHEST_DEG, LESION_GROUPS, opening_pose
+from SlicerUSSim.Logic.mri.bone_before_probe import CLOSED_DB, COMMAND, SCENE, about_bone
+from SlicerUSSim.Logic.mri.craniotomy import default_pose, disc_opening, middle_of, opened, without_outside
+from SlicerUSSim.Logic.mri.pathology import LESIONS
+from SlicerUSSim.Logic.mri.views import view_pose
+from SlicerUSSim.Logic.probe import PROBES, ConvexProbe, LinearProbe, Probe
+from SlicerUSSim.Logic.probe.placement import pose_looking_at, turned
+from SlicerUSSim.Logic.tissue.presets import TISSUES
+from tests.test_craniotomy import NAMES, TOP, head, places_of  # noqa: F401
+
+ILL = (*NAMES, "tumour", "oedema")
+TUMOUR, OEDEMA = len(ILL) - 1, len(ILL)
+ON_SKIN = pose_looking_at((0.0, 0.0, 78.5), (0.0, 0.0, 0.0))
+
+
+def with_ball(labels: Volume, centre, radius_mm: float, label: int = TUMOUR) -> Volume:
+    """Labels with a ball in the brain."""
+    inside = (np.linalg.norm(places_of(labels) - centre, axis=-1) <= radius_mm) & (labels.array == 2)
+    return labels.with_array(np.where(inside, label, labels.array).astype(np.uint8))
+
+
+def with_disc(labels: Volume, diameter_mm: float) -> tuple[Volume, np.ndarray]:
+    """(labels with a disc opened at the vertex, the middle of what was removed)"""
+    found, _ = opened(labels, ILL, disc_opening(labels, ILL, TOP, diameter_mm))
+    return found, middle_of(labels, found)
+
+
+def off_axis_mm(pose: np.ndarray, place) -> float:
+    across, _, up = (np.linalg.inv(pose) @ [*place, 1.0])[:3]
+    return float(np.hypot(across, up))
+
+
+def notes_of(labels: Volume, probe: Probe, pose: np.ndarray, *, is_open: bool, names=ILL, words=SCENE):
+    return about_bone(labels, names, TISSUES.values(), probe, pose, is_open=is_open, words=words)
+
+
+def test_a_probe_in_an_opening_looks_at_the_tumour_below_it(head):  # noqa: F811
+    place = np.array([10.0, 8.0, 35.0])
+    labels, middle = with_disc(with_ball(head, place, 7.0), 40.0)
+    pose, line = opening_pose(labels, ILL, PROBES["phased"], middle)
+    assert off_axis_mm(pose, place) < 1.5
+    upright, nothing = opening_pose(with_disc(head, 40.0)[0], NAMES, PROBES["phased"], middle)
+    assert nothing == "" and off_axis_mm(upright, place) > 10.0
+    np.testing.assert_allclose(upright[:3, 1], [0.0, 0.0, -1.0], atol=0.03)  # without a lesion along the normal
+    angle = np.rad2deg(np.arccos(pose[:3, 1] @ upright[:3, 1]))
+    assert line == f"aimed at the tumour, {angle:.0f} degrees off the surface's normal" and 20.0 < angle < 30.0
+
+
+@pytest.mark.parametrize("probe", ["linear", "convex"])
+def test_the_edge_of_a_turned_face_lies_on_the_surface(head, probe):  # noqa: F811
+    """A flat face of 38 mm that is turned by 25 degrees about its middle would be 5 mm in the brain with one edge."""
+    probe = PROBES[probe]
+    labels, middle = with_disc(with_ball(head, [14.0, 0.0, 35.0], 7.0), 60.0)
+    pose, _ = opening_pose(labels, ILL, probe, middle)
+    across = np.linspace(-0.5, 0.5, 31) * probe.face_mm
+    radius = np.linalg.norm(probe.face_points_mm(across) @ pose[:3, :3].T + pose[:3, 3], axis=1)
+    assert 57.0 < radius.min() < 61.5  # the brain's is 60
+    assert off_axis_mm(pose, [14.0, 0.0, 35.0]) < 1.5
+
+
+def test_a_lesion_too_far_aside_leaves_the_probe_along_the_normal_and_is_said(head):  # noqa: F811
+    labels, middle = with_disc(with_ball(head, [45.0, 0.0, 15.0], 7.0), 40.0)
+    pose, line = opening_pose(labels, ILL, PROBES["phased"], middle)
+    np.testing.assert_allclose(pose[:3, 1], [0.0, 0.0, -1.0], atol=0.03)
+    assert line == (
+        "not aimed at the tumour, which is 45 degrees off the surface's normal at the opening, "
+        f"more than {FARTHEST_DEG:.0f}"
+    )
+
+
+def test_of_several_lesions_the_largest_in_reach_is_looked_at_and_oedema_only_without_a_tumour(head):  # noqa: F811
+    far, large, small = [-50.0, 0.0, 0.0], [10.0, 0.0, 30.0], [-10.0, 0.0, 40.0]
+    labels = head
+    for centre, radius in ((far, 9.0), (large, 7.0), (small, 4.0)):
+        labels = with_ball(labels, centre, radius)
+    labels, middle = with_disc(with_ball(labels, [0.0, 15.0, 20.0], 12.0, OEDEMA), 40.0)
+    pose, _ = opening_pose(labels, ILL, PROBES["phased"], middle)
+    assert off_axis_mm(pose, large) < 1.5
+    swollen, middle = with_disc(with_ball(head, [0.0, 15.0, 20.0], 12.0, OEDEMA), 40.0)
+    pose, line = opening_pose(swollen, ILL, PROBES["phased"], middle)
+    assert off_axis_mm(pose, [0.0, 15.0, 20.0]) < 1.5 and "aimed at the oedema, " in line
+
+
+def test_specks_are_no_lesion_and_one_right_before_the_face_needs_no_turn(head):  # noqa: F811
+    labels, middle = with_disc(with_ball(head, [10.5, 0.0, 34.5], 2.0), 40.0)
+    assert 0 < (labels.array == TUMOUR).sum() * labels.voxel_ml < 0.05
+    assert opening_pose(labels, ILL, PROBES["phased"], middle)[1] == ""
+    labels, middle = with_disc(with_ball(head, [4.5, 0.0, 56.0], 3.0), 40.0)
+    pose, line = opening_pose(labels, ILL, PROBES["phased"], middle)
+    assert line == "the tumour lies in front of the face"
+    np.testing.assert_allclose(pose[:3, 1], [0.0, 0.0, -1.0], atol=0.03)
+
+
+def test_all_tissues_that_are_lesions_alone_are_looked_at():
+    assert sorted(name for group in LESION_GROUPS for name in group) == sorted(set(LESIONS) - {"blood", "brats"})
+
+
+def test_the_target_of_a_caller_comes_before_lesions_of_the_labels(head):  # noqa: F811
+    labels, middle = with_disc(with_ball(with_ball(head, [12.0, 0.0, 30.0], 7.0), [-8.0, 0.0, 30.0], 5.0, OEDEMA), 40.0)
+    pose, line = opening_pose(labels, ILL, PROBES["phased"], middle, np.array([-8.0, 0.0, 30.0]))
+    assert off_axis_mm(pose, [-8.0, 0.0, 30.0]) < 1e-6 and "aimed at the oedema, " in line
+
+
+# ---- bone before the probe ------------------------------------------------------------------------------------------
+
+
+def test_a_face_that_does_not_fit_an_opening_is_said_with_both_sizes(head):  # noqa: F811
+    wide = ConvexProbe(radius_mm=60.0, field_of_view_deg=60.0, depth_mm=120.0, frequency_mhz=3.5)
+    labels, middle = with_disc(head, 30.0)
+    for pose in (ON_SKIN, opening_pose(labels, ILL, wide, middle)[0]):  # over the opening, and on the brain in it
+        (line,) = notes_of(labels, wide, pose, is_open=True)
+        assert line.startswith("the face of the probe is 60 mm wide and does not fit the opening, which leaves ")
+        assert float(line.split("leaves ")[1].split(" mm")[0]) == pytest.approx(30.0, abs=3.0)
+        assert line.endswith("mm of it free: expect black sectors where it lies on bone or lifts off")
+        assert notes_of(labels, PROBES["phased"], pose, is_open=True) == ()
+    narrow, _ = with_disc(head, 10.0)
+    thick = replace(PROBES["phased"], aperture_mm=8.0, elevation_aperture_mm=20.0)
+    assert "is 20 mm thick and does not fit the opening" in notes_of(narrow, thick, ON_SKIN, is_open=True)[0]
+
+
+@pytest.mark.parametrize("name", ["phased", "linear", "convex"])
+def test_a_face_fits_the_opening_that_was_made_for_it_also_when_it_is_aimed(head, name):  # noqa: F811
+    probe = PROBES[name]
+    whole = with_ball(head, [14.0, 0.0, 35.0], 7.0)
+    labels, _ = opened(whole, ILL, disc_opening(whole, ILL, TOP, max(probe.face_mm, probe.elevation_aperture_mm) + 10))
+    pose, line = opening_pose(labels, ILL, probe, middle_of(whole, labels))
+    assert line.startswith("aimed at the tumour") and notes_of(labels, probe, pose, is_open=True) == ()
+
+
+def test_a_closed_skull_before_the_brain_is_said_where_its_bone_leaves_no_signal(head):  # noqa: F811
+    probe = PROBES["phased"]
+    pose = default_pose(head, NAMES, probe)
+    (line,) = notes_of(head, probe, pose, is_open=False, names=NAMES)
+    assert line.startswith("the skull is closed in front of the probe, and 7 mm of bone take ")  # 6 mm obliquely
+    assert float(line.split("take ")[1].split(" dB")[0]) > CLOSED_DB
+    assert "choose a craniotomy (Open skull in Craniotomy)" in line
+    (line,) = notes_of(head, probe, pose, is_open=False, names=NAMES, words=COMMAND)
+    assert "choose a craniotomy (--craniotomy auto, disc:MM or a file)" in line
+    labels, _ = with_disc(head, 30.0)
+    assert notes_of(labels, probe, ON_SKIN, is_open=True) == ()
+    elsewhere = pose_looking_at((78.5, 0.0, 0.0), (0.0, 0.0, 0.0), (0.0, 1.0, 0.0))
+    (line,) = notes_of(labels, probe, elsewhere, is_open=True)
+    assert "the skull is closed in front of the probe" in line and "the opening is elsewhere (" in line
+
+
+def test_a_skull_is_not_said_to_be_closed_where_the_brain_is_seen(head):  # noqa: F811
+    pose = view_pose(head, NAMES, "temporal")
+    assert notes_of(head, PROBES["transcranial"], pose, is_open=False) == ()  # 2 MHz pass
+    assert notes_of(head, PROBES["phased"], pose, is_open=False)  # 5 MHz do not: the image is black
+    brain = without_outside(head, NAMES)
+    assert notes_of(brain, PROBES["phased"], default_pose(brain, NAMES, PROBES["phased"]), is_open=False) == ()
+    away = turned(ON_SKIN, rock_deg=180.0)
+    assert notes_of(head, PROBES["phased"], away, is_open=False) == ()
+    labels, _ = with_disc(head, 10.0)  # of a wide face: the lines of a quarter of it see the brain
+    assert not any("closed" in line for line in notes_of(labels, LinearProbe(38, 60), ON_SKIN, is_open=True))
+
+
+def test_labels_without_a_skull_have_no_notes_about_it(head):  # noqa: F811
+    names = ["muscle" if name == "grey matter" else "bone" if name == "skull" else name for name in NAMES]
+    assert notes_of(head, PROBES["phased"], ON_SKIN, is_open=False, names=names) == ()
