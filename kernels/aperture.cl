@@ -112,7 +112,7 @@ __kernel void fans(__constant const Acquisition *acquisition, __global const ush
   const float length = acquisition->fan_step;
 
   float covered = 0.0f;           // the largest part of a cell that was bone
-  int label = 0, was_strong = 0;  // of the last soft tissue; whether there was strong tissue behind it
+  int label = 0, was_strong = 0;  // of the last soft tissue, first the coupling medium; whether strong tissue is behind
   int leaving = 0;                // whether it was in this cell or the last ones
   float4 soft = acoustics[0];
   float impedance = 0.0f;
@@ -151,7 +151,8 @@ __kernel void fans(__constant const Acquisition *acquisition, __global const ush
         const int corner = (f.x > 0.5f) + (f.y > 0.5f ? nx : 0) + (f.z > 0.5f ? nxy : 0);
         const int nearest = (is_mixed && !all_soft ? cell[corner] : first) & LABEL_MASK;
         const float4 found = acoustics[nearest];
-        const int goes_on = all_soft || depth + n == 1 || is_soft(soft.z, soft.w, found.z, found.w);
+        const int begins = depth + n == 1 && !is_covered(soft.z, found.z);
+        const int goes_on = all_soft || begins || is_soft(soft.z, soft.w, found.z, found.w);
         if (goes_on) {
           soft = found;
           label = nearest;
@@ -560,23 +561,27 @@ typedef struct {
 
 inline Means means_over(__constant const Acquisition *acquisition, const Lines *lines, float path) {
   const float pitch = acquisition->fan_pitch;
-  float all = 0.0f, first = 0.0f, second = 0.0f, delays = 0.0f, moments = 0.0f, losses = 0.0f;
+  float all = 0.0f, first = 0.0f, second = 0.0f, delays = 0.0f, moments = 0.0f, arriving = 0.0f, losses = 0.0f;
   float row_lift[ROWS];
   for (int row = 0; row < ROWS; row++) {
     float row_power = 0.0f;
     row_lift[row] = 0.0f;
     for (int i = 0; i < lines->count; i++) {
-      const float passed = lines->passed[row][i] * lines->kept[row][i], x = lines->x[i];
-      const float delay = lines->delay[row][i];
+      const float kept = lines->kept[row][i], passed = lines->passed[row][i], x = lines->x[i];
+      const float delay = lines->delay[row][i], seen = passed * kept;
       // A little is left of what tissue stops, so that there is always a mean.
-      const float power = ROW_WEIGHT(row) * (lines->weight[i] * (passed * passed + LEFT_FOR_MEANS) + 1e-6f);
+      const float power = ROW_WEIGHT(row) * (lines->weight[i] * (seen * seen + LEFT_FOR_MEANS) + 1e-6f);
+      // Of what lossy tissue takes, such as marrow, nothing arrives: its tens of nepers are not the mean of what does.
+      const float arrives =
+          ROW_WEIGHT(row) * kept * kept * (lines->weight[i] * (passed * passed + LEFT_FOR_MEANS) + 1e-6f);
       row_power += power;
       row_lift[row] += power * lines->lift[row][i];
       delays += power * delay;
       first += power * x;
       second += power * x * x;
       moments += power * x * delay;
-      losses += power * lines->loss[row][i];
+      arriving += arrives;
+      losses += arrives * lines->loss[row][i];
     }
     all += row_power;
     row_lift[row] /= row_power;
@@ -584,7 +589,7 @@ inline Means means_over(__constant const Acquisition *acquisition, const Lines *
   Means means;
   means.x = first / all;
   means.delay = delays / all;
-  means.loss = losses / all;
+  means.loss = losses / fmax(arriving, 1e-6f);
   const float spread = second / all - means.x * means.x, common = moments / all - means.x * means.delay;
   means.slope = clamp(common / (spread + 0.02f * pitch * pitch), -STEEPEST, STEEPEST);
   means.rise = clamp(row_lift[2] - row_lift[0], -STEEPEST * path, STEEPEST * path);

@@ -432,7 +432,21 @@ __kernel void trace(__constant const Acquisition *acquisition, __global const us
       course.step = affine_vector(acquisition->ras_to_voxel, ray.direction);
       course.aside = affine_vector(acquisition->ras_to_voxel, ray.elevational) * quantile;
       course.path = ray.path;
-      if (ray.label < 0) ray.label = label_at(voxels, groups, acquisition, course_at(acquisition, &course, 0.0f));
+      if (ray.label < 0) {
+        ray.label = label_at(voxels, groups, acquisition, course_at(acquisition, &course, 0.0f));
+        const Tissue coupling = tissues[0], covering = tissues[ray.label];
+        if (ray.piece >= 0 && is_covered(beam_speed(coupling.speed_of_sound_m_s, decay_in(acquisition, coupling)),
+                                         beam_speed(covering.speed_of_sound_m_s, decay_in(acquisition, covering)))) {
+          // The face stands in bone: beside the ray through it goes what other parts of the aperture see.
+          if (!is_dark(acquisition, my_shades, ray.piece)) {
+            Ray under = ray;
+            under.front = 0;
+            under.strong = UNDER;
+            stack[waiting++] = under;
+          }
+          ray.piece = -1;
+        }
+      }
       Tissue here = tissues[ray.label], behind = here;
       const int is_under = ray.strong == UNDER;
       const Tissue front = tissues[ray.strong == NOT_STRONG ? ray.label : ray.front];

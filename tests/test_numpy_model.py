@@ -177,6 +177,25 @@ def test_numpy_follows_beams_past_lossy_tissue(kind, attenuations):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("kind", ["linear", "convex"])
+def test_numpy_follows_beams_from_a_face_that_stands_in_bone(kind):
+    """Its edges in marrow and bone: lines go through them, and what the rest of the aperture sees beside them."""
+
+    def label(x, y, z):
+        bone = (np.abs(x - 1.0) > 6) & (y < 3)
+        return np.where(bone, np.where(y < -1, 2, 3), 1)
+
+    marrow = replace(BRAIN, name="marrow", attenuation_db_cm_mhz=20.0)
+    tissues = TissueTable({0: BRAIN, 1: BRAIN, 2: marrow, 3: STONE})
+    simulator = UltrasoundSimulator(block(label, half_mm=(22, 34, 12)), tissues)
+    pose, display = rigid(np.eye(3), [1.0, -4.0, 0.5]), DisplaySettings(image_size=(240, 200))
+    image = simulator.simulate(PROBES[kind], pose, display).image
+    difference = np.abs(image.astype(int) - NumpyModel(simulator).simulate(PROBES[kind], pose, display))
+    assert image.max() > 100
+    assert (difference <= 1).mean() > 0.97
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "settings",
     [

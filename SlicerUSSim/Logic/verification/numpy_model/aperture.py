@@ -47,6 +47,12 @@ def bends(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     return np.abs(speeds[0] - speeds[1]) > f32(0.5 * _STRAIGHT_SPEED) * (speeds[0] + speeds[1])
 
 
+def are_covering(seen: np.ndarray) -> np.ndarray:
+    """(labels,) whether records of as_beams_see cover a face: strong tissue, as if behind a film of label 0."""
+    lossy = (seen["speed_of_sound_m_s"] < 0) & (seen["speed_of_sound_m_s"][0] > 0)
+    return lossy | bends(seen[:1], seen)
+
+
 @dataclass
 class Axis:
     """The axis of a line: where it leaves the face, its direction, across it (2,), and its place along the face."""
@@ -148,7 +154,8 @@ class Screens:
         sums = np.maximum(impedance[:, None] + impedance, 1e-9)  # labels without a tissue have none
         reflected = ((impedance[:, None] - impedance) / sums) ** 2
         self.border = -np.log(np.maximum(1.0 - reflected, 1e-6))
-        self.current = np.full(count, -1)  # the last soft tissue
+        self.covered_by = are_covering(seen)
+        self.current = np.full(count, -1)  # the last soft tissue; -1 at the face
         self.last = np.zeros(count, int)  # the tissue of the last step, and whether it was strong
         self.was_strong = np.zeros(count, bool)
         self.leaving = np.zeros(count, bool)  # whether strong tissue was in this cell or the last ones
@@ -163,7 +170,9 @@ class Screens:
         one_label, nearest = self.labels.one_label[here], self.labels.label[here].astype(int)
         mixed = np.flatnonzero(~one_label)
         nearest[mixed] = self.labels.label[here[mixed] + (f[mixed] > f32(0.5)) @ self.labels.steps]
-        soft = (self.current < 0) | self.soft[self.current, nearest]
+        begins = (self.current < 0) & ~self.covered_by[nearest]
+        self.current = np.maximum(self.current, 0)  # the coupling medium
+        soft = begins | self.soft[self.current, nearest]
         self.current = np.where(soft, nearest, self.current)
         bent = self.bent[self.current, nearest]
         rate = self.rates[:, self.current]
@@ -305,13 +314,14 @@ class Screens:
         """Means by power of the points' positions and of the extra path; its slope; elevational deflection; nepers."""
         x, open_, delay, loss, kept, passed, lift = self._lines(sums, axis, path)
         power = _WEIGHTS[:, None] * (open_ * ((kept * passed) ** 2 + 0.01) + 1e-6)
+        arrives = _WEIGHTS[:, None] * kept**2 * (open_ * (passed**2 + 0.01) + 1e-6)
         share = power / power.sum()
         mean_x, mean_delay = (share * x).sum(), (share * delay).sum()
         spread, common = (share * x**2).sum() - mean_x**2, (share * x * delay).sum() - mean_x * mean_delay
         slope = np.clip(common / (spread + 0.02 * self.fields["fan_pitch"] ** 2), -0.1, 0.1)
         row_lift = (power * lift).sum(axis=1) / power.sum(axis=1)
         rise = np.clip(row_lift[2] - row_lift[0], -0.1 * path, 0.1 * path)
-        return mean_x, mean_delay, slope, rise, (share * loss).sum()
+        return mean_x, mean_delay, slope, rise, (arrives * loss).sum() / max(arrives.sum(), 1e-6)
 
     def _lines(self, sums: np.ndarray, axis: Axis, depth: float) -> tuple[np.ndarray, ...]:
         """Lateral positions and weights (points,) of the lines to a depth of an axis; (rows, points) sums along them.

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from SlicerUSSim.Logic.opencl.layout import HIT, SEGMENT
-from SlicerUSSim.Logic.verification.numpy_model.aperture import Lit, as_beams_see, bends, is_soft
+from SlicerUSSim.Logic.verification.numpy_model.aperture import Lit, are_covering, as_beams_see, bends, is_soft
 from SlicerUSSim.Logic.verification.numpy_model.beam import Beam
 from SlicerUSSim.Logic.verification.numpy_model.elementary import (
     LN10_OVER_20,
@@ -119,7 +119,7 @@ class Tracer:
         self._segments, self._segment_lines, self._hits, self._hit_lines = [], [], [], []
         self._segment_pieces, self._hit_pieces, self._corrections = [], [], []
         self._root = self._roots(roots, quantiles)
-        rays = self._begin(self._start_pieces(self._root, self._root.piece))
+        rays = self._uncovered(self._begin(self._start_pieces(self._root, self._root.piece)))
         while len(rays):
             rays = self._advance(rays)
         self._correct()
@@ -181,6 +181,14 @@ class Tracer:
         common, weight = np.maximum(f32(1) - n * np.abs(ratio), f32(0)), np.exp(-decay * n * n)
         terms = common * np.where(weight < 1e-3, f32(0), weight) * np.cos(f32(2 * np.pi) * n * turns)
         return np.maximum(f32(1) + f32(2) * terms.sum(axis=0), _LEAST_GATHERED)
+
+    def _uncovered(self, rays: Rays) -> Rays:
+        """Rays that start in bone by themselves, and beside them what other parts of the aperture see."""
+        covered = (rays.piece >= 0) & are_covering(self.seen)[rays.label]
+        below = rays.of(covered & ~self._are_dark(rays))
+        below.strong[:] = _UNDER  # of label 0
+        rays.piece = np.where(covered, -1, rays.piece)
+        return Rays.joined([self._begin(rays), self._begin(below)])
 
     def _start_pieces(self, rays: Rays, number: np.ndarray) -> Rays:
         """The rays at the start of the pieces `number` of their lines; behind the last one they go straight on."""
