@@ -18,7 +18,8 @@
 // depth before and this one; those that soft tissue has taken from what arrives, on the mean; and the distance from
 // that end in mm, NO_END if there is none, negative in strong tissue. spreads float2 [screen line][depth]: width of the
 // beam and a factor of its echoes, both re an undisturbed one; beams float4 [traced line][1 + depth] as screens,
-// followed by float4 [traced line][1 + depth] as shades.
+// followed by float4 [traced line][1 + depth] as shades, but that the last is 1, -1 where the beam is in strong tissue,
+// and -2 where that does not end between this depth and the one before.
 
 #include "common.clh"
 
@@ -332,7 +333,7 @@ inline float depth_outside(__constant const Acquisition *acquisition, __global c
   const Beside beside = rays_beside(acquisition, axis, path);
   // Lines are interpolated between rays, and labels found at the middle of a step: they seem to enter strong tissue up
   // to four steps before the axis does.
-  const int own = clamp(beside.depth, 2, acquisition->fan_depths - 6);
+  int own = clamp(beside.depth, 2, acquisition->fan_depths - 6);
   const float own_share = share_strong(acquisition, sums, &beside, own);
   float in_front = 0.0f, beyond = own_share, most = own_share;
   int ends = 0;  // the last step in strong tissue, from this one on
@@ -346,9 +347,15 @@ inline float depth_outside(__constant const Acquisition *acquisition, __global c
   // Not in it, nor before it: beside it, or behind it
   if (most <= 0.5f || (own_share <= 0.5f && beyond <= 2.0f * in_front)) return path;
   if (ends > 0) return fmax(path, path_behind(acquisition, ends));
-  int last = own;
-  while (last > 4 && share_strong(acquisition, sums, &beside, last) > 0.0f) last--;
-  return fmin(fmax(last - 3.0f, 1.0f) * acquisition->fan_step, path);
+  float share = own_share;
+  for (int last = own; last > 4 && share > 0.0f; last--) {
+    const float before = share_strong(acquisition, sums, &beside, last - 1);
+    // It has come out of other strong tissue, which lies in front of this one.
+    if (share <= 0.5f && before > share) return fmin(last * acquisition->fan_step, path);
+    share = before;
+    own = last - 1;
+  }
+  return fmin(fmax(own - 3.0f, 1.0f) * acquisition->fan_step, path);
 }
 
 // The path on the axis behind the last step between `start` and `end` in which strong tissue ends; 0 if there is none.
@@ -731,10 +738,12 @@ inline float mean_lit(__constant const Acquisition *acquisition, __global const 
   const int nodes = acquisition->screen_depths;
   const Between middle = between_lines(acquisition, place);
   __global const float *left = shades + 4 * (middle.left * nodes + node), *right = left + 4 * nodes;
-  // Between a line that is in strong tissue and one that is not, a ray which has left it is as the latter.
-  const int one_is_inside = (left[3] < 0.0f) != (right[3] < 0.0f);
-  const float own = blend(exp_fast(-left[kind]), exp_fast(-right[kind]),
-                          one_is_inside ? (left[3] < 0.0f ? 1.0f : 0.0f) : middle.part);
+  // Between a line that is in strong tissue and one that is not, a ray which has left it is as the latter; between two
+  // that are, as the darker one: the other may not have come out since the face.
+  const int left_inside = left[3] < 0.0f, right_inside = right[3] < 0.0f;
+  const float on_left = exp_fast(-left[kind]), on_right = exp_fast(-right[kind]);
+  const float part = left_inside != right_inside ? (left_inside ? 1.0f : 0.0f) : middle.part;
+  const float own = left_inside && right_inside ? fmin(on_left, on_right) : blend(on_left, on_right, part);
   float sum = 0.6666667f * own;
   for (int side = -1; side <= 1; side += 2) {
     const Between at = between_lines(acquisition, place + side * 1.7320508f * sigma);
@@ -802,6 +811,9 @@ __kernel void beams(__constant const Acquisition *acquisition, __global const fl
     beam.x += mean.x - own.x;
     own.xy = mean;
   }
+  // Of interest to rays that are not where both lines are: whether these are in strong tissue, of which no end is near
+  const int is_inside = left_shade.w < 0.0f && right_shade.w < 0.0f;
+  own.w = !is_inside ? 1.0f : left_shade.w == -NO_END && right_shade.w == -NO_END ? -2.0f : -1.0f;
   vstore4(own, to, shade);
   const float4 per_strip = (right - left) * per_line;  // from line to line
   const float tilt = beam.z / path;

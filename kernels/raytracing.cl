@@ -302,7 +302,8 @@ inline void start_piece(__constant const Acquisition *acquisition, __global cons
   ray->piece = number < acquisition->screen_depths ? number : -1;
   ray->piece_has = count;
   ray->from = ray->given_from = number * acquisition->screen_step;
-  if (ray->strong == NOT_STRONG) ray->shade = shades[4 * number];
+  if (ray->strong == NOT_STRONG && (shades[4 * number + 3] >= 0.0f || ray->shade < shades[4 * number]))
+    ray->shade = shades[4 * number];
   ray->given = 0.0f;
   ray->decay_before = 1e9f;  // what it starts in lies in front of nothing
   const float4 here = vload4(number, beams);
@@ -359,6 +360,25 @@ inline int is_dark(__constant const Acquisition *acquisition, __global const flo
   for (int n = piece + 1; n <= acquisition->screen_depths; n++)
     if (shades[4 * n] < DARKEST) return 0;
   return 1;
+}
+
+// The nepers that strong tissue has taken from a ray and not from its beam at the end of the piece: what the beam has
+// there, where it is in such tissue, is what it had in front of that. So of a ray in strong tissue, and of a darker one
+// that is beside it or has left it already.
+inline float taken_from_ray(__global const float *shades, const Ray *ray) {
+  const float lacks = ray->shade - shades[4 * ray->piece + 4];
+  if (ray->strong != NOT_STRONG) return lacks;
+  return shades[4 * ray->piece + 7] < 0.0f ? fmax(lacks, 0.0f) : 0.0f;
+}
+
+// The nepers that strong tissue takes right behind where a ray leaves it in this piece. Where the beam does not leave
+// it before the end, those behind that.
+inline float shade_behind(__constant const Acquisition *acquisition, __global const float *shades, int piece) {
+  float shade = shades[4 * piece + 5];
+  if (shades[4 * piece + 7] > -1.5f) return shade;
+  for (int n = piece + 2; n <= acquisition->screen_depths; n++)
+    if (shades[4 * n + 3] > 0.0f) return fmax(shade, shades[4 * n]);
+  return shade;
 }
 
 // Length over which a ray at `path` is corrected. Strong tissue may end a little beyond its piece.
@@ -514,8 +534,7 @@ __kernel void trace(__constant const Acquisition *acquisition, __global const us
         if (ray.piece >= 0)
           by = correction(acquisition, my_beams, my_shades, start, &ray, ray.path + until,
                           ray.depth + until * depth_per_mm, ray.log_attenuation - spent, ray.soft, depth_per_mm,
-                          own_decay,
-                          ray.excess + (ray.strong != NOT_STRONG ? ray.shade - my_shades[4 * ray.piece + 4] : 0.0f));
+                          own_decay, ray.excess + taken_from_ray(my_shades, &ray));
         if (ray.piece >= 0 && on_axis) correct_segments(my_segments + ray.piece_has, written, by, ray.from);
         if (ray.piece >= 0 && !on_axis) correct_hits(my_hits + ray.piece_has, written, by, ray.from);
         if (!piece_ends && !goes_dark) {
@@ -701,7 +720,7 @@ __kernel void trace(__constant const Acquisition *acquisition, __global const us
         if (count > room) break;
         if (!is_strong && ray.strong != NOT_STRONG) {
           // What this and other strong tissue has taken from the beam is in the level of its aperture.
-          const float shade = my_shades[4 * ray.piece + 5];
+          const float shade = shade_behind(acquisition, my_shades, ray.piece);
           ray.log_attenuation += ray.excess - (shade - ray.shade);
           // Of the pulse, the frequency falls by attenuation. Behind opaque tissue it is what has come past that.
           ray.loss -= ray.excess - clamp(shade - ray.shade, fmin(ray.excess, 0.0f), clamp(ray.excess, 0.0f, MOST_LOSS));

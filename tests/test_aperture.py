@@ -704,3 +704,19 @@ def test_a_face_whose_edges_stand_in_bone_brightens_nothing(name):
         rows = slice(int(deep / frame.sample_interval_mm), int((deep + 5.0) / frame.sample_interval_mm))
         mean = 10.0 * np.log10(power[:, rows].mean(axis=1) + 1e-20)
         assert mean.max() < mean[free - 5 : free + 6].max() + 10.0, (name, deep)  # not a number, linear
+
+
+@pytest.mark.parametrize("slope", [2.0, 3.0, 5.0])
+def test_what_leaves_bone_before_its_neighbours_is_as_dark_as_they_are(slope):
+    """A saturated patch behind an inner face that beams leave at a small angle: there they had what they had before."""
+    labels = block(
+        lambda x, y, z: np.where((y > -18) & (y < -13 + slope * np.abs(x + 0.3)), 1, 2), half_mm=(45, 60, 10)
+    )
+    bone, soft = (TissueTable.brain((name,))[1] for name in ("skull", "white matter"))
+    fluid = TissueTable.brain()[0]
+    found = UltrasoundSimulator(labels, TissueTable({0: fluid, 1: bone, 2: soft}), SimulationSettings(max_ray_depth=0))
+    for name in ("phased", "convex", "linear"):
+        segments = found.trace(STANDARD_PROBES[name], FACE).segments
+        behind = (segments["label"] == 2) & (segments["start"][:, 1] > -13)
+        level = 20.0 * np.log10(np.maximum(segments["attenuation"] * segments["weight"], 1e-30))[behind]
+        assert len(level) > 3 and level.max() < -45.0, name  # 5 mm of bone take 39 dB, and its faces; it was -17

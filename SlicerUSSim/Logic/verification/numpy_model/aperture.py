@@ -261,6 +261,8 @@ class Screens:
             if share[own] > 0.5 >= share[ends + 1]:
                 return max(path, (ends + 1.5) * step)
         while own > 4 and share[own] > 0.0:
+            if share[own] <= 0.5 and share[own - 1] > share[own]:  # other strong tissue, in front of this one
+                return min(own * step, path)
             own -= 1
         return min(max(own - 3.0, 1.0) * step, path)
 
@@ -397,7 +399,7 @@ class Lit:
         inside = [each[..., 7] < 0.0 for each in (left, right)]
         between = np.where(inside[0] ^ inside[1], inside[0], between)
         lit = [np.exp(-each[..., kind]) for each in (left, right)]
-        own = lit[0] + between * (lit[1] - lit[0])
+        own = np.where(inside[0] & inside[1], np.minimum(*lit), lit[0] + between * (lit[1] - lit[0]))
         total = _WEIGHTS[1] * own
         for row, weight in zip(_ROWS[::2] * np.sqrt(2.0), _WEIGHTS[::2], strict=True):
             left, right, between = self._between(place + row * sigma, depth)

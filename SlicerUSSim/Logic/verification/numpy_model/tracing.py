@@ -35,6 +35,7 @@ _MOST_GATHERED, _LEAST_GATHERED = 64, f32(0.4)  # lines with scatterers in commo
 _MOST_BEFORE_STRONG = f32(0.35)  # nepers by which a piece of a beam in front of bone may differ from its ray
 _MOST_LOSS = 1.0  # nepers by which strong tissue may change the frequency of what has passed it
 _LEAST_GIVEN = f32(0.2)  # nepers lost to a layer which are given back behind it, not along the whole piece
+_NO_END = f32(1e3)  # mm: no strong tissue ends in front, as in aperture.Screens
 _NO_DECAY = f32(1e9)  # in front of a piece: what it starts in lies in front of nothing
 
 
@@ -170,6 +171,8 @@ class Tracer:
         shades = self._lit.shades(place, np.maximum(number - 1, 0), apart)
         beam[:, 0] += shades[:, 0] - beam[:, 4]
         beam[:, 4:6] = shades
+        inside, endless = (left[:, 7] < 0) & (right[:, 7] < 0), (left[:, 7] == -_NO_END) & (right[:, 7] == -_NO_END)
+        beam[:, 7] = np.where(~inside, 1, np.where(endless, -2, -1))
         beam[:, 0] += f32(0.5) * log(self._gathered_power(path, apart, f32(1) + per_strip[:, 2] / apart, turns))
         return np.where(number[:, None] == 0, f32(0), beam)
 
@@ -206,7 +209,8 @@ class Tracer:
         )
         rays.piece[at] = np.where(number < depths, number, -1)
         rays.since_path[at], rays.course[at] = path, 0
-        rays.shade[at] = np.where(rays.strong[at] == _NOT_STRONG, beam[:, 4], rays.shade[at])
+        follows = (rays.strong[at] == _NOT_STRONG) & ((beam[:, 7] >= 0) | (rays.shade[at] < beam[:, 4]))
+        rays.shade[at] = np.where(follows, beam[:, 4], rays.shade[at])
         rays.given[at], rays.given_from[at], rays.decay_before[at] = 0, path, _NO_DECAY
         has_next = number < depths
         at, root, beam = at[has_next], root.of(has_next), beam[has_next]
@@ -265,6 +269,21 @@ class Tracer:
     def _next_shade(self, rays: Rays, kind: int = 4) -> np.ndarray:
         """Nepers lost to strong tissue at the ends of pieces, or (kind 5) behind its last end in them."""
         return np.where(rays.piece >= 0, self._beams_at(rays.line, np.maximum(rays.piece + 1, 0))[:, kind], f32(0))
+
+    def _taken_from_rays(self, rays: Rays) -> np.ndarray:
+        """Nepers that strong tissue has taken from rays and not from their beams at the ends of pieces."""
+        lacks = rays.shade - self._next_shade(rays)
+        held = (rays.strong == _NOT_STRONG) & (self._next_shade(rays, 7) < 0) & (lacks > 0)
+        return np.where((rays.strong != _NOT_STRONG) | held, lacks, f32(0))
+
+    def _shade_behind(self, rays: Rays) -> np.ndarray:
+        """Nepers lost to strong tissue behind it, in these pieces, or where beams leave it in a later one."""
+        shade, found = self._next_shade(rays, 5), self._next_shade(rays, 7) > f32(-1.5)
+        for number in range(2, self.screens.shape[1] + 1):
+            beam = self._beams_at(rays.line, np.minimum(rays.piece + number, self.screens.shape[1]))
+            leaves = ~found & (rays.piece >= 0) & (rays.piece + number <= self.screens.shape[1]) & (beam[:, 7] > 0)
+            shade, found = np.where(leaves, np.maximum(shade, beam[:, 4]), shade), found | leaves
+        return shade
 
     def _are_dark(self, rays: Rays) -> np.ndarray:
         """Whether strong tissue leaves nothing of beams from their piece on."""
@@ -410,7 +429,7 @@ class Tracer:
         lost = (self.decay[self._front(rays)] - rays.decay_before) * (until - rays.since)
         self._give_back(rays, np.ones(len(rays), bool), lost, rays.path + rays.since)
         rays.excess, rays.taken = self._excess(rays, until), self._taken(rays, until)
-        more = rays.excess + np.where(rays.strong != _NOT_STRONG, rays.shade - self._next_shade(rays), f32(0))
+        more = rays.excess + self._taken_from_rays(rays)
         by = self._correction(rays, path, depth, rays.log_attenuation - rays.spent, rays.depth_per_mm, more)
         self._keep_correction(rays, by)
         deeper, louder, less = self._corrections_at(rays, path, by)
@@ -502,7 +521,7 @@ class Tracer:
         lost = (self.decay[rays.label] - self.decay[other]) * (border - rays.since)
         self._give_back(rays, ~strong_border, lost, path)
         rays.excess, rays.taken = self._excess(rays, border), self._taken(rays, border)
-        leaves, next_shade, end_shade = ~keep, self._next_shade(rays), self._next_shade(rays, 5)
+        leaves, next_shade, end_shade = ~keep, self._next_shade(rays), self._shade_behind(rays)
         behind_rate = acquisition["reference_speed_m_s"] / tissues["speed_of_sound_m_s"][other]
         rate = np.where(bent | under | leaves, rays.depth_per_mm, behind_rate)
         more = rays.excess + np.where(leaves, f32(0), rays.shade - next_shade)
