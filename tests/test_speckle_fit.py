@@ -78,6 +78,7 @@ def test_smoothing_and_texture_are_found_by_the_costs_of_texture(tracked):
     assert np.isnan(width_misfit(unknown, real))
 
 
+@pytest.mark.slow
 def test_fit_with_speckle_beats_the_fit_without(tracked):
     """Even tissues get the texture of their presets; the paper's cost is not worse for it."""
     settings = {"free": ["gain_db", "dynamic_range_db"], "display": PLAIN, "max_evaluations": 80, "restarts": 0}
