@@ -200,6 +200,25 @@ def test_the_command_aims_at_a_tumour_in_the_opening_of_a_file_and_says_where_th
     assert black[black.shape[0] // 3 :].mean() < 3.0
 
 
+def test_commands_say_that_no_part_of_the_face_touches_the_patient(head, tmp_path):
+    """The image was black, without a word."""
+    write_label_files(tmp_path / "head.nii.gz", head, TissueTable.brain().for_names(NAMES))
+    off, on = tmp_path / "off.json", tmp_path / "on.json"
+    for path, height in ((off, 88.0), (on, 78.5)):
+        path.write_text(json.dumps(pose_looking_at((0.0, 0.0, height), (0.0, 0.0, 0.0)).tolist()))
+    nothing = "0% of the probe's face touches the patient (gel fills gaps of up to 3 mm): the image is black"
+    black, told = image(tmp_path, "--pose", str(off), "--contact-gap", "3")
+    assert told.count(nothing) == 1 and black[black.shape[0] // 3 :].mean() < 3.0
+    for arguments in (("--pose", str(on), "--contact-gap", "3"), ("--pose", str(off), "--contact-gap", "none")):
+        assert "face touches" not in image(tmp_path, *arguments)[1]
+    done = CliRunner().invoke(
+        main,
+        ["volume", str(tmp_path / "head.nii.gz"), "--pose", str(on), "--contact-gap", "3", "--slide", "300",
+         "--frames", "3", "--spacing", "4", "-o", str(tmp_path / "v.nrrd")],
+    )  # fmt: skip
+    assert done.exit_code == 0 and done.stderr.count("in 2 of 3 images 0% of the probe's face touches") == 1
+
+
 def image(tmp_path, *arguments) -> tuple[np.ndarray, str]:
     picture = str(tmp_path / "a.png")
     done = CliRunner().invoke(main, ["simulate", str(tmp_path / "head.nii.gz"), *arguments, "-o", picture])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -258,6 +259,21 @@ def test_place_aims_at_a_tumour_below_the_opening_and_the_notes_say_so(head):  #
     assert "probe: " not in bench.presenter.notes()
     bench.presenter.placeProbe()
     assert "probe: " not in bench.presenter.notes()  # on the skin, upright as before
+
+
+def test_the_notes_say_that_no_part_of_the_face_touches_the_patient(head):  # noqa: F811
+    nothing = "0% of the probe's face touches the patient (gel fills gaps of up to 3 mm): the image is black"
+    bench = Bench(head)
+    bench.presenter.placeProbe()
+    assert "face touches" not in bench.presenter.notes()
+    bench.presenter.setLive(True)
+    refreshed = bench.view.refreshed
+    bench.move(pose_looking_at((0.0, 0.0, 88.0), (0.0, 0.0, 0.0)))
+    bench.view.waiting.pop()()
+    assert bench.view.refreshed == refreshed + 1 and bench.presenter.notes().count(nothing) == 1
+    bench.presenter.setLive(False)
+    bench.logic.parameters.panel = replace(bench.logic.parameters.panel, gel=False)  # it lies in the coupling medium
+    assert "face touches" not in bench.presenter.notes() and not bench.view.errors
 
 
 def test_the_notes_follow_the_probe_over_bone_and_openings(head):  # noqa: F811

@@ -343,6 +343,15 @@ def _say_bone(placed: _Placed, added: Added, tissues: TissueTable, preset: Prese
             note(line)
 
 
+def say_contact(examination: Examination, probe: Probe, poses: Sequence[np.ndarray]) -> None:
+    """Say that a probe's face does not touch the patient at poses (4, 4), or with little of it."""
+    from SlicerUSSim.Logic.imaging.contact import about_contact
+
+    simulator = examination.simulator
+    for line in about_contact(simulator.medium.labels, probe, poses, simulator.settings.contact_gap_mm):
+        note(line)
+
+
 def open_examination_at(patient: PatientOptions, pose: str) -> tuple[Examination, np.ndarray]:
     """(Examination, (4, 4) probe_to_ras) of a command's options.
 

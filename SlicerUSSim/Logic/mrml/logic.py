@@ -23,6 +23,7 @@ from SlicerUSSim.Logic.fitting.held_out import predict
 from SlicerUSSim.Logic.fitting.search import Progress
 from SlicerUSSim.Logic.fitting.settings import FitSettings
 from SlicerUSSim.Logic.fitting.tracked_fit import Fit, fit
+from SlicerUSSim.Logic.imaging.contact import about_contact
 from SlicerUSSim.Logic.imaging.found_sheets import with_their_tissue
 from SlicerUSSim.Logic.imaging.frame import Frame
 from SlicerUSSim.Logic.imaging.noise import seed_of_pose
@@ -803,6 +804,15 @@ class UltrasoundSceneLogic:
         return about_bone(
             patient.labels, patient.names, tissues, self.preset.probe, pose, is_open=is_opened(labels_node), words=SCENE
         )
+
+    def aboutContact(self, labels_node, probe_transform_node) -> tuple[str, ...]:
+        """Lines about a probe whose face does not touch the patient at its pose, or with little of it.
+
+        See contact.about_contact.
+        """
+        patient, gap_mm = self._patient(labels_node), self.settings(labels_node).contact_gap_mm
+        pose = patient.pose(probe_pose(probe_transform_node))
+        return about_contact(patient.labels, self.preset.probe, [pose], gap_mm)
 
     def showOutline(self, model_node, probe_transform_node) -> None:
         """The outline of the imaged field as a model under the probe's transform.
