@@ -91,6 +91,15 @@ def test_demo_writes_everything_it_promises(head, tmp_path):
     assert abs((np.linalg.inv(pose) @ [*centre_ras, 1])[2]) < 1e-3
 
 
+def test_a_pose_that_is_neither_a_file_nor_a_view_names_all_that_there_is(head):
+    done = CliRunner().invoke(main, ["simulate", str(head), "--pose", "tempral", "-o", "a.png"])
+    assert done.exit_code == 2 and len(done.stderr.splitlines()) == 1
+    assert "--pose is 'tempral' (no such file), expected a file with the pose (.json, .txt, .tfm, .h5), auto, or" in (
+        done.stderr
+    )
+    assert done.stderr.endswith("temporal, temporal-left, fontanelle, fontanelle-sagittal\n")
+
+
 @pytest.mark.parametrize("command", [pytest.param("demo", marks=pytest.mark.slow), "simulate"])
 def test_a_probe_that_places_itself_looks_at_what_was_added(command, head, tmp_path):
     """On the other side of the brain than the usual view, 20 mm behind it: it was not in the image."""
@@ -228,7 +237,7 @@ def bad_inputs(folder):
         (["segment", mri, "-o", folder / "l.nii.gz", "--classes", 9], "classes is 9"),
         (["segment", mri, "-o", folder / "l.nii.gz", "--map", "24=csf"], "--map is for a label map"),
         (["segment", mri, "-o", folder / "l.nii.gz", "--mask", folder / "nine.nrrd"], "same grid"),
-        (["simulate", mri, "--pose", folder / "none.txt", "-o", out], "none.txt: no such file"),
+        (["simulate", mri, "--pose", folder / "none.txt", "-o", out], "none.txt' (no such file)"),
         (["simulate", mri, "--pose", folder / "three.txt", "-o", out], "9 numbers"),
         (["simulate", mri, "--pose", folder / "scaled.txt", "-o", out], "last row"),
         (["simulate", mri, "--pose", folder / "singular.txt", "-o", out], "last row"),

@@ -81,7 +81,7 @@ def test_a_face_off_the_patient_is_said_with_the_share_that_touches():
     deep = slab(from_mm=-17.0)  # 3 mm below the face
     (line,) = about_contact(deep, LINEAR, [AT_TOP], 2.0)
     assert line == (
-        "0% of the probe's face touches the patient (gel fills gaps of up to 2 mm): the image is black; move the probe "
+        "0% of the probe's face touches the patient (contact gap: 2 mm): the image is black; move the probe "
         "onto the patient"
     )
     assert about_contact(deep, LINEAR, [AT_TOP], 3.5) == () and about_contact(deep, LINEAR, [AT_TOP], None) == ()

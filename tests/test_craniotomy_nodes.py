@@ -171,7 +171,7 @@ def test_what_cannot_be_opened_changes_nothing(head):  # noqa: F811
     assert [node.GetName() for node in nodes_of_class(bench.scene, "vtkMRMLVolumeNode")] == names
     brain = Bench(head.with_array(np.where(head.array == 2, 2, 0).astype(np.uint8)))
     brain.presenter.openCraniotomy()
-    assert "the craniotomy removes nothing, expected skin, scalp" in brain.view.errors[-1]
+    assert "as those of a brain without its skull: there is nothing to open" in brain.view.errors[-1]
     mine = bench.add("LabelMapVolume", "mine")
     write_labels(mine, head, NAMES, bench.whole)
     with pytest.raises(SimulationError, match="was not made by this module, or edited since, and is not replaced"):
@@ -262,7 +262,7 @@ def test_place_aims_at_a_tumour_below_the_opening_and_the_notes_say_so(head):  #
 
 
 def test_the_notes_say_that_no_part_of_the_face_touches_the_patient(head):  # noqa: F811
-    nothing = "0% of the probe's face touches the patient (gel fills gaps of up to 3 mm): the image is black"
+    nothing = "0% of the probe's face touches the patient (contact gap: 3 mm): the image is black"
     bench = Bench(head)
     bench.presenter.placeProbe()
     assert "face touches" not in bench.presenter.notes()

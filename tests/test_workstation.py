@@ -1287,7 +1287,12 @@ def test_a_server_on_loopback_refuses_pages_of_other_sites(url):
         (["{head}", "--contrast", "flair", "--sheets", "auto"], "sheets are not found in contrast 'flair'"),
         (["{head}", "--sheets", "{head}"], "head.nii.gz: expected a .vtp that `ussim segment --sheets` has written"),
         (["{head}", "--no-sheet", "falx"], "--no-sheet leaves out some of --sheets; give --sheets, too"),
-        (["{head}", "--craniotomy", "disc:30"], "--craniotomy is disc:30, and only a brain is labelled, expected"),
+        (["{head}", "--craniotomy", "disc:30"], "--craniotomy is disc:30, and the image shows a brain without"),
+        (
+            ["--craniotomy", "auto"],
+            "--craniotomy is auto, and the demo is a brain without its skull, which has nothing",
+        ),
+        (["{head}", "--ct", "--craniotomy", "auto"], "which opens a head that was found in an MRI, and this is a CT"),
         (["{head}", "--outside", "--craniotomy", "disc:3"], "--craniotomy is 'disc:3', expected disc: and a diameter"),
         (["{head}", "--outside", "--craniotomy", "{head}"], "head.nii.gz: has "),
     ],

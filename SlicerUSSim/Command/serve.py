@@ -160,10 +160,18 @@ def serve(
     require(organs is None or contrast == CT, "--organs is for a CT, expected --ct too")
     drawn = DrawnSheets.of(sheets, no_sheets, is_labels=labels is not None, contrast=contrast)
     opening = Craniotomy.of(craniotomy)
-    require(
-        not opening.is_wanted or labels is not None or outside,
-        f"--craniotomy is {craniotomy}, and only a brain is labelled, expected --outside too",
-    )
+    if opening.is_wanted and labels is None:
+        require(
+            scene is None and also_open is None,
+            f"--craniotomy is {craniotomy}, which opens the skull in the MRI of a head, and the file is none",
+        )
+        is_given = mri is not None and not outside
+        head = (
+            read_mri(mri, mask=mask, skull_strip=skull_strip, contrast=contrast, is_served=True) if is_given else None
+        )
+        opening.require_head(
+            head, outside=outside, contrast=contrast, skull_strip=skull_strip, has_mask=mask is not None
+        )  # fmt: skip
     if opening.is_file:
         _require_opening(opening.source)
     if contrast == CT and others:

@@ -56,7 +56,7 @@ def about_contact(labels: Volume, probe: Probe, poses: Sequence[np.ndarray], gap
     shares = [touching_share(labels, probe, pose, gap_mm) for pose in poses]
     little = [share for share in shares if 0.0 < share < _LEAST_SHARE]
     count, off = len(shares), len(shares) - np.count_nonzero(shares)
-    touches = f"of the probe's face touches the patient (gel fills gaps of up to {gap_mm:g} mm)"
+    touches = f"of the probe's face touches the patient (contact gap: {gap_mm:g} mm)"
     lines = []
     if off:
         which = "0%" if count == 1 else f"in {off} of {count} images 0%"

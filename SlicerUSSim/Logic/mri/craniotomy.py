@@ -186,11 +186,17 @@ def opened(labels: Volume, names: Sequence[str], opening: np.ndarray) -> tuple[V
     Raises SimulationError if nothing outside the brain lies in the opening, and for labels without a brain.
     """
     require_brain(names)
-    removed = opening & _is_any(labels, names, REMOVED)
+    around = _is_any(labels, names, REMOVED)
+    require(
+        bool(around.any()),
+        f"the labels have nothing of {', '.join(REMOVED)}, as those of a brain without its skull: there is nothing to "
+        "open; leave the craniotomy out, or label the whole head (--outside)",
+    )
+    removed = opening & around
     require(
         bool(removed.any()),
-        f"the craniotomy removes nothing, expected {', '.join(REMOVED)} in it; it is off the head or in the brain, the "
-        "image cuts the head there, or only a brain is labelled (--outside labels the rest)",
+        f"the craniotomy removes nothing, expected {', '.join(REMOVED)} in it; it is off the head or in the brain, or "
+        "the image cuts the head there",
     )
     millilitres = float(removed.sum() * labels.voxel_ml)
     require(

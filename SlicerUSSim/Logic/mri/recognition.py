@@ -237,6 +237,18 @@ def stripped_brain(mri: Volume) -> np.ndarray | None:
     return None if found is None else found[0]
 
 
+def is_stripped(mri: Volume) -> bool:
+    """Whether an image shows a skull-stripped brain, also one that is refused for how it lies."""
+    try:
+        check_finite(mri)
+    except SimulationError:
+        return False
+    try:
+        return stripped_brain(mri) is not None
+    except SimulationError:  # it has the size and the shape of one
+        return True
+
+
 def _stripped_brain(mri: Volume) -> tuple[np.ndarray, CoarseImage] | None:
     """(stripped_brain, its intensities above the least one and 0 around it)."""
     values = mri.array
