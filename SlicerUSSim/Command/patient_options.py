@@ -270,7 +270,7 @@ def open_examination(patient: PatientOptions, pose: np.ndarray | str | None = No
     tissues = with_their_tissue(tissues, surfels, known)
     texture = texture_below(segmentation.texture(), volume, segmentation.labels, added.labels)
     tissues = changes.to_tissues(tissues)
-    placed = _placed(patient, craniotomy, preset, added, segmentation.labels, pose)
+    placed = _placed(patient, craniotomy, preset, added, labels, pose)
     _say_bone(placed, added, tissues, preset, craniotomy)
     simulator = UltrasoundSimulator(placed.labels, tissues, placed.settings, patient.device, texture, surfels)
     return Examination(simulator, preset.probe, preset.display, is_labels, placed.probe_to_ras)
