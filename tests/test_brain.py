@@ -880,6 +880,9 @@ def test_false_voxels_away_from_the_brain_and_labels_in_a_mask_are_said(head):
     labels = brain * np.where(np.arange(brain.shape[2]) < 40, 1, 2)
     (line,) = given_brain(mri.with_array(labels.astype(np.uint8)), mri).warnings
     assert "the mask holds 2 values (1, 2), expected one; the brain is taken where it is not 0" in line
+    named = Volume(labels.astype(np.uint8), mri.ijk_to_ras, label_names={1: "Left", 2: "Skull"})
+    (line,) = given_brain(named, mri).warnings
+    assert line.startswith("the mask holds the segments 1 'Left', 2 'Skull', expected a file with one; ")
 
 
 @needs_nilearn

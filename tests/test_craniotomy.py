@@ -7,10 +7,13 @@ import re
 
 import numpy as np
 import pytest
+import SimpleITK as sitk
 from click.testing import CliRunner
 from PIL import Image
 
 from SlicerUSSim.Command.cli import main
+from SlicerUSSim.Command.proposals import split_seeds
+from SlicerUSSim.Command.serve import _require_opening
 from SlicerUSSim.Logic import SimulationError, Volume
 from SlicerUSSim.Logic.mri.craniotomy import (
     disc_opening,
@@ -267,6 +270,34 @@ def refused_craniotomy(path, *arguments) -> str:
     )
     assert done.exit_code == 2, done.output
     return done.stderr
+
+
+def test_a_file_with_two_segments_is_no_opening_and_both_are_named(head, tmp_path):
+    """It was "has 3 different values"."""
+    sides = (head.array == 3) * np.where(np.arange(head.array.shape[2]) < 56, 1, 2)
+    stored = head.with_array(sides.astype(np.uint8)).to_sitk()
+    for number, name in enumerate(("Flap", "Burr hole")):
+        for key, value in (("Name", name), ("LabelValue", number + 1), ("Layer", 0), ("ID", f"Segment_{number + 1}")):
+            stored.SetMetaData(f"Segment{number}_{key}", str(value))
+    sitk.WriteImage(stored, path := str(tmp_path / "two.seg.nrrd"))
+    for checked in (lambda: file_opening(head, NAMES, path), lambda: _require_opening(path)):
+        with pytest.raises(SimulationError, match=r"two\.seg\.nrrd: holds the segments 1 'Flap', 2 'Burr hole'"):
+            checked()
+    with pytest.raises(SimulationError, match="a segment of 3D Slicer, is not grown but laid over the labels"):
+        split_seeds([path])
+
+
+def test_the_page_takes_the_list_of_points_of_an_older_slicer_as_an_opening(tmp_path):
+    """It was read as an image."""
+    corners = ("-20,-20", "20,-20", "20,20", "-20,20")
+    rows = [f"n{n},{corner},78,0,0,0,1,1,1,0,F,," for n, corner in enumerate(corners)]
+    head_lines = [
+        "# Markups fiducial file version = 4.11",
+        "# CoordinateSystem = RAS",
+        "# columns = id,x,y,z,ow,ox,oy,oz",
+    ]
+    (tmp_path / "hole.fcsv").write_text("\n".join([*head_lines, *rows]) + "\n")
+    _require_opening(str(tmp_path / "hole.fcsv"))
 
 
 def image(tmp_path, *arguments) -> tuple[np.ndarray, str]:

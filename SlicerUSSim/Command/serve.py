@@ -165,10 +165,9 @@ def serve(
             scene is None and also_open is None,
             f"--craniotomy is {craniotomy}, which opens the skull in the MRI of a head, and the file is none",
         )
-        is_given = mri is not None and not outside
-        head = (
-            read_mri(mri, mask=mask, skull_strip=skull_strip, contrast=contrast, is_served=True) if is_given else None
-        )
+        head = None
+        if mri is not None and not outside:
+            head = read_mri(mri, mask=mask, skull_strip=skull_strip, contrast=contrast, is_served=True)
         opening.require_head(
             head, outside=outside, contrast=contrast, skull_strip=skull_strip, has_mask=mask is not None
         )  # fmt: skip
@@ -265,13 +264,14 @@ def _opened_first(path: str, options: list[str]) -> tuple[tuple[SceneRecord, str
 
 def _require_opening(path: str) -> None:
     """Raise SimulationError for a file of --craniotomy that is neither a mask nor a polygon."""
-    from SlicerUSSim.Logic.base.volume import Volume
     from SlicerUSSim.Logic.mri.craniotomy import is_open, polygon_of_file
+    from SlicerUSSim.Logic.mri.markups import is_markup_name
+    from SlicerUSSim.Logic.mri.masks import read_mask
 
-    if Path(path).suffix.lower() == ".json":
+    if is_markup_name(path):
         polygon_of_file(path)
     else:
-        is_open(Volume.read(path), path)
+        is_open(read_mask(path), path)
 
 
 def _require_workstation() -> None:

@@ -16,6 +16,7 @@ from SlicerUSSim.Logic.base.errors import require
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.mri.distances import distance_to
 from SlicerUSSim.Logic.mri.markups import is_markup_name, markup_points
+from SlicerUSSim.Logic.mri.masks import read_mask, several_segments
 from SlicerUSSim.Logic.mri.outside import OUTSIDE
 from SlicerUSSim.Logic.probe.arrays import Probe
 from SlicerUSSim.Logic.probe.placement import craniotomy_pose, sample
@@ -123,7 +124,7 @@ def file_opening(labels: Volume, names: Sequence[str], path: str) -> np.ndarray:
     """
     if is_markup_name(path):
         return polygon_opening(labels, names, polygon_of_file(path))
-    return mask_opening(labels, Volume.read(path), path)
+    return mask_opening(labels, read_mask(path), path)
 
 
 def mask_opening(labels: Volume, mask: Volume, name: str) -> np.ndarray:
@@ -143,6 +144,11 @@ def is_open(mask: Volume, name: str) -> Volume:
 
     Raises SimulationError for what is no mask.
     """
+    segments = several_segments(mask)
+    require(
+        not segments,
+        f"{name}: holds the segments {segments}, expected a file with one segment, the opening: export that one alone",
+    )
     values = np.unique(mask.array[np.isfinite(mask.array)])
     is_soft = bool(values.size) and float(values[0]) >= 0.0 and float(values[-1]) <= 1.0
     require(
