@@ -806,6 +806,23 @@ def test_the_workstation_begins_with_the_opening_of_its_option(browser, tmp_path
         page.close()
 
 
+@pytest.mark.slow
+def test_the_workstation_opens_over_the_lesion_that_is_added_as_the_command_does(browser, tmp_path):
+    labels, place = round_head(tmp_path), np.array([35.0, -20.0, 25.0])
+    at = np.stack(np.meshgrid(*[np.arange(57) * 3.0 - 84.0] * 3, indexing="ij"), axis=-1)[..., ::-1]
+    ball = np.linalg.norm(at - place, axis=-1) < 8.0
+    labels.with_array(ball.astype(np.uint8)).write(lesion := tmp_path / "lesion.nii.gz")
+    with serving(
+        "--labels", str(tmp_path / "labels.nii.gz"), "--add", f"tumour={lesion}", "--craniotomy", "auto"
+    ) as address:  # fmt: skip
+        page = opened(browser, address)
+        settled(page)
+        pose = np.array(page.evaluate("window.ussim.image.pose")).reshape(4, 4)
+        page.close()
+    off = (np.linalg.inv(pose) @ [*place, 1.0])[[0, 2]]
+    assert np.hypot(*off) < 3.0, pose
+
+
 @pytest.mark.parametrize("what", ["a craniotomy off the head", "an MRI called CT"])
 @pytest.mark.slow
 def test_bad_anatomy_is_one_line_in_the_page_which_goes_on(browser, files, tmp_path, what):
