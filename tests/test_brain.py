@@ -466,6 +466,53 @@ def test_a_ct_head_whose_air_is_0_is_told_from_an_mri_by_its_brain_without_contr
         recognition._head(ct, CoarseImage.of(ct), found.alignment)
 
 
+@needs_nilearn
+@pytest.mark.slow
+def test_a_ct_that_was_cut_to_a_window_is_refused_where_its_brain_is_dark_and_said_where_it_is_not(head, found):
+    """A brain was looked for in it, for two minutes."""
+    mri, inside = head
+    rng = np.random.default_rng(0)
+    skull = ndimage.binary_dilation(inside, iterations=5) & ~inside
+    for level, is_refused in ((30.0, True), (600.0, False)):
+        array = np.where(
+            inside, level * (1.0 + 0.002 * mri.array), np.where(skull, 3000.0, np.where(mri.array > 30, level, 0.0))
+        )
+        ct = mri.with_array(np.clip(array + rng.normal(0, 6, array.shape), 0, None).astype(np.float32))
+        if is_refused:
+            with pytest.raises(SimulationError, match=r"as dark as the air around it, as in a CT that .* with --ct"):
+                recognition._head(ct, CoarseImage.of(ct), found.alignment)
+        else:
+            (line,) = recognition._head(ct, CoarseImage.of(ct), found.alignment).warnings
+            assert line.startswith("what lies around the brain is brighter than the brain, as the bone of a CT is")
+    assert recognition._head(mri, CoarseImage.of(mri), found.alignment).warnings == ()
+
+
+def test_vessels_of_a_ct_are_not_called_a_head_of_another_voxel_size():
+    """Whatever its voxel size, an image of scattered vessels is no head: "too little for a head; correct it"."""
+    axis = np.arange(-80.0, 80.0, 2.0)
+    z, y, x = np.meshgrid(axis, axis, axis, indexing="ij")
+    tubes = sum((np.hypot(a - p, b - q) < 6.0) for a, b in ((x, y), (y, z), (x, z)) for p, q in ((0, 0), (0, 40)))
+    vessels = np.where(tubes > 0, 300.0, 0.0) * np.random.default_rng(0).uniform(0.5, 1.0, x.shape)
+    matrix = np.diag([2.0, 2.0, 2.0, 1.0])
+    matrix[:3, 3] = axis[0]
+    with pytest.raises(
+        SimulationError, match=r"ml of bright tissue that is scattered over .* with --ct \(contrast ct\)"
+    ):
+        find_brain(Volume(vessels.astype(np.float32), matrix))
+
+
+def test_a_ct_whose_air_was_set_to_0_is_not_asked_for_a_dark_background():
+    axis = np.arange(-100.0, 100.0, 3.0)
+    z, y, x = np.meshgrid(axis, axis, axis, indexing="ij")
+    r = np.sqrt(x**2 + (0.8 * y) ** 2 + z**2)
+    array = np.select([r < 62, r < 70, r < 72, r < 78], [35.0, 1100.0, -600.0, -100.0], 0.0)
+    noisy = array + np.where(r < 78, np.random.default_rng(0).normal(0, 8, r.shape), 0.0)
+    with pytest.raises(
+        SimulationError, match=r"values from -\d+, as the fat and air of a CT .* with --ct \(contrast ct\)"
+    ):
+        find_brain(Volume(noisy.astype(np.float32), np.diag([3.0, 3.0, 3.0, 1.0])))
+
+
 # ---- extraction ------------------------------------------------------------------------------------------------------
 
 
@@ -880,6 +927,9 @@ def test_false_voxels_away_from_the_brain_and_labels_in_a_mask_are_said(head):
     labels = brain * np.where(np.arange(brain.shape[2]) < 40, 1, 2)
     (line,) = given_brain(mri.with_array(labels.astype(np.uint8)), mri).warnings
     assert "the mask holds 2 values (1, 2), expected one; the brain is taken where it is not 0" in line
+    named = Volume(labels.astype(np.uint8), mri.ijk_to_ras, label_names={1: "Left", 2: "Skull"})
+    (line,) = given_brain(named, mri).warnings
+    assert line.startswith("the mask holds the segments 1 'Left', 2 'Skull', expected a file with one; ")
 
 
 @needs_nilearn

@@ -91,6 +91,41 @@ def test_demo_writes_everything_it_promises(head, tmp_path):
     assert abs((np.linalg.inv(pose) @ [*centre_ras, 1])[2]) < 1e-3
 
 
+def test_what_sheets_lay_over_the_labels_is_not_what_add_did(head, tmp_path, monkeypatch):
+    """--pose auto is aimed at what --add laid, and was aimed at a structure of --sheets auto."""
+    from SlicerUSSim.Command import patient_options, sheets
+
+    def found(self, path, mri, segmentation, contrast):
+        array = segmentation.labels.array.copy()
+        array[30:40, 30:40, 20:30] = len(segmentation.tissue_names) + 1
+        return sheets._Drawn(
+            None, segmentation.labels.with_array(array), (*segmentation.tissue_names, "choroid plexus")
+        )
+
+    placed, poses = patient_options._placed, []
+
+    def recorded(*given):
+        poses.append(placed(*given).probe_to_ras)
+        return placed(*given)
+
+    monkeypatch.setattr(patient_options, "_placed", recorded)
+    for is_drawn in (False, True):
+        if is_drawn:
+            monkeypatch.setattr(sheets.DrawnSheets, "found", found)
+        result = ussim("simulate", head, "--pose", "auto", "-o", tmp_path / "a.png")
+        assert result.exit_code == 0, result.output
+    np.testing.assert_allclose(poses[1], poses[0], atol=1e-6)
+
+
+def test_a_pose_that_is_neither_a_file_nor_a_view_names_all_that_there_is(head):
+    done = CliRunner().invoke(main, ["simulate", str(head), "--pose", "tempral", "-o", "a.png"])
+    assert done.exit_code == 2 and len(done.stderr.splitlines()) == 1
+    assert "--pose is 'tempral' (no such file), expected a file with the pose (.json, .txt, .tfm, .h5), auto, or" in (
+        done.stderr
+    )
+    assert done.stderr.endswith("temporal, temporal-left, fontanelle, fontanelle-sagittal\n")
+
+
 @pytest.mark.parametrize("command", [pytest.param("demo", marks=pytest.mark.slow), "simulate"])
 def test_a_probe_that_places_itself_looks_at_what_was_added(command, head, tmp_path):
     """On the other side of the brain than the usual view, 20 mm behind it: it was not in the image."""
@@ -228,7 +263,7 @@ def bad_inputs(folder):
         (["segment", mri, "-o", folder / "l.nii.gz", "--classes", 9], "classes is 9"),
         (["segment", mri, "-o", folder / "l.nii.gz", "--map", "24=csf"], "--map is for a label map"),
         (["segment", mri, "-o", folder / "l.nii.gz", "--mask", folder / "nine.nrrd"], "same grid"),
-        (["simulate", mri, "--pose", folder / "none.txt", "-o", out], "none.txt: no such file"),
+        (["simulate", mri, "--pose", folder / "none.txt", "-o", out], "none.txt' (no such file)"),
         (["simulate", mri, "--pose", folder / "three.txt", "-o", out], "9 numbers"),
         (["simulate", mri, "--pose", folder / "scaled.txt", "-o", out], "last row"),
         (["simulate", mri, "--pose", folder / "singular.txt", "-o", out], "last row"),

@@ -14,7 +14,7 @@ from SlicerUSSim.Logic import (
     TissueTable,
     UltrasoundSimulator,
 )
-from SlicerUSSim.Logic.imaging.contact import line_contact
+from SlicerUSSim.Logic.imaging.contact import about_contact, line_contact, touching_share
 from SlicerUSSim.Logic.verification.numpy_model import NumpyModel
 from tests.conftest import FLUID, SPECKLE, block, rigid
 
@@ -74,6 +74,46 @@ def test_a_curved_face_touches_a_plane_as_far_as_the_gel_reaches():
     # R (1 - cos a) / cos a = gap
     assert np.rad2deg(touching.max()) == pytest.approx(np.rad2deg(np.arccos(40.0 / 42.0)), abs=2.0)
     assert np.rad2deg(-touching.min()) == pytest.approx(np.rad2deg(touching.max()), abs=0.6)
+
+
+def test_a_face_off_the_patient_is_said_with_the_share_that_touches():
+    """The image was black, without a word."""
+    deep = slab(from_mm=-17.0)  # 3 mm below the face
+    (line,) = about_contact(deep, LINEAR, [AT_TOP], 2.0)
+    assert line == (
+        "0% of the probe's face touches the patient (contact gap: 2 mm): the image is black; move the probe "
+        "onto the patient"
+    )
+    assert about_contact(deep, LINEAR, [AT_TOP], 3.5) == () and about_contact(deep, LINEAR, [AT_TOP], None) == ()
+    assert about_contact(slab(until_mm=0.25), PHASED, [AT_TOP], 2.0) == ()  # half of it
+    corner = slab(until_mm=-4.0)  # a quarter
+    assert touching_share(corner, PHASED, AT_TOP, 2.0) == pytest.approx(0.25, abs=0.03)
+    (line,) = about_contact(corner, PHASED, [AT_TOP], 2.0)
+    assert line.startswith("only 2") and "% of the probe's face touches" in line and "the image is black" not in line
+    speck = slab(until_mm=-7.25)
+    assert 0.0 < touching_share(speck, PHASED, AT_TOP, 2.0) < 0.05
+    assert not about_contact(speck, PHASED, [AT_TOP], 2.0)[0].startswith(("0%", "only 0%"))
+
+
+@pytest.mark.parametrize("probe", [LINEAR, PHASED, CONVEX], ids=lambda probe: probe.kind)
+@pytest.mark.parametrize("off_mm", [0.0, 90.0])
+def test_no_share_of_a_face_touches_where_all_lines_are_dark(probe, off_mm):
+    pose = AT_TOP @ rigid(np.eye(3), [off_mm, 0.0, 0.0])
+    dark = not line_contact(slab(-25.0), probe, pose, 2.0).any()
+    assert (
+        dark
+        == (touching_share(slab(-25.0), probe, pose, 2.0) == 0.0)
+        == any("the image is black" in line for line in about_contact(slab(-25.0), probe, [pose], 2.0))
+    )
+    assert dark or off_mm == 0.0
+
+
+def test_images_of_a_sweep_without_contact_are_counted():
+    lifted, corner = (AT_TOP @ rigid(np.eye(3), at) for at in ([0.0, -10.0, 0.0], [75.0, 0.0, 0.0]))
+    assert about_contact(slab(), LINEAR, [AT_TOP, AT_TOP], 2.0) == ()
+    black, partly = about_contact(slab(), LINEAR, [AT_TOP, lifted, corner, lifted], 2.0)
+    assert black.startswith("in 2 of 4 images 0% of the probe's face touches the patient (")
+    assert "): they are black" in black and partly.startswith("in 1 of 4 images only ") and "% or less of" in partly
 
 
 def test_lines_without_contact_are_dark_and_the_others_as_before():

@@ -7,13 +7,24 @@ import re
 
 import numpy as np
 import pytest
+import SimpleITK as sitk
 from click.testing import CliRunner
 from PIL import Image
 
 from SlicerUSSim.Command.cli import main
+from SlicerUSSim.Command.proposals import split_seeds
+from SlicerUSSim.Command.serve import _require_opening
 from SlicerUSSim.Logic import SimulationError, Volume
-from SlicerUSSim.Logic.mri.craniotomy import disc_opening, file_opening, mask_opening, opened, polygon_opening
+from SlicerUSSim.Logic.mri.craniotomy import (
+    disc_opening,
+    file_opening,
+    mask_opening,
+    opened,
+    polygon_opening,
+    without_outside,
+)
 from SlicerUSSim.Logic.mri.outside import OUTSIDE
+from SlicerUSSim.Logic.mri.samples import head_mri
 from SlicerUSSim.Logic.mri.views import view_pose
 from SlicerUSSim.Logic.probe.placement import pose_looking_at
 from SlicerUSSim.Logic.tissue.own_files import write_label_files
@@ -89,6 +100,8 @@ def test_what_is_no_craniotomy_is_refused(head, tmp_path):
     with pytest.raises(SimulationError, match="there is no brain under the craniotomy"):
         disc_opening(head, NAMES, away, 30.0)
     with pytest.raises(SimulationError, match="removes nothing, expected skin, scalp, skull, cancellous bone in it"):
+        opened(head, NAMES, head.array == 2)
+    with pytest.raises(SimulationError, match="have nothing of skin, scalp, skull, cancellous bone"):
         opened(head, ("csf", "grey matter", "a", "b", "c", "d"), disc_opening(head, NAMES, TOP, 30.0))
     with pytest.raises(SimulationError, match="lie on a line"):
         polygon_opening(head, NAMES, np.array([[0.0, 0, 80], [1, 0, 80], [2, 0, 80]]))
@@ -198,6 +211,93 @@ def test_the_command_aims_at_a_tumour_in_the_opening_of_a_file_and_says_where_th
     black, told = image(tmp_path, "--pose", "auto")
     assert told.count("the skull is closed in front of the probe") == 1 and "(--craniotomy auto, disc:MM or a " in told
     assert black[black.shape[0] // 3 :].mean() < 3.0
+
+
+def test_commands_say_that_no_part_of_the_face_touches_the_patient(head, tmp_path):
+    """The image was black, without a word."""
+    write_label_files(tmp_path / "head.nii.gz", head, TissueTable.brain().for_names(NAMES))
+    off, on = tmp_path / "off.json", tmp_path / "on.json"
+    for path, height in ((off, 88.0), (on, 78.5)):
+        path.write_text(json.dumps(pose_looking_at((0.0, 0.0, height), (0.0, 0.0, 0.0)).tolist()))
+    nothing = "0% of the probe's face touches the patient (contact gap: 3 mm): the image is black"
+    black, told = image(tmp_path, "--pose", str(off), "--contact-gap", "3")
+    assert told.count(nothing) == 1 and black[black.shape[0] // 3 :].mean() < 3.0
+    for arguments in (("--pose", str(on), "--contact-gap", "3"), ("--pose", str(off), "--contact-gap", "none")):
+        assert "face touches" not in image(tmp_path, *arguments)[1]
+    done = CliRunner().invoke(
+        main,
+        ["volume", str(tmp_path / "head.nii.gz"), "--pose", str(on), "--contact-gap", "3", "--slide", "300",
+         "--frames", "3", "--spacing", "4", "-o", str(tmp_path / "v.nrrd")],
+    )  # fmt: skip
+    assert done.exit_code == 0 and done.stderr.count("in 2 of 3 images 0% of the probe's face touches") == 1
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ((), "and the image shows a brain without its skull, which has nothing to open; leave --craniotomy out"),
+        (("--contrast", "t2"), "a brain without its skull, which has nothing to open; leave --craniotomy out"),
+        (("--outside",), "image is a brain without its head (skull-stripped), and what is outside the brain"),
+    ],
+)
+def test_a_brain_without_its_skull_has_nothing_to_open(arguments, message, tmp_path):
+    """It was to be given --outside, which is refused for it."""
+    head_mri(spacing_mm=4.0).write(tmp_path / "brain.nii.gz")
+    told = refused_craniotomy(tmp_path / "brain.nii.gz", *arguments)
+    assert message in told and ("expected --outside" not in told)
+
+
+def test_a_head_is_to_be_labelled_whole_where_that_is_possible(head, tmp_path):
+    noise = np.random.default_rng(3).normal(1.0, 0.05, head.array.shape)
+    levels = np.array([5.0, 0.0, 100.0, 150.0, 120.0, 10.0, 90.0])
+    head.with_array((levels[head.array] * noise).astype(np.float32)).write(tmp_path / "head.nii.gz")
+    assert "--craniotomy is disc:30, and only a brain is labelled, expected --outside too" in refused_craniotomy(
+        tmp_path / "head.nii.gz"
+    )
+    told = refused_craniotomy(tmp_path / "head.nii.gz", "--contrast", "t2")  # --outside is refused for it
+    assert "expected --outside" not in told and "of contrast t1 or t1gd, and this is t2" in told
+
+
+def test_labels_of_a_brain_alone_have_nothing_to_open(head):
+    brain = without_outside(head, NAMES)
+    with pytest.raises(SimulationError, match="as those of a brain without its skull: there is nothing to open"):
+        opened(brain, NAMES, disc_opening(brain, NAMES, TOP, 30.0))
+
+
+def refused_craniotomy(path, *arguments) -> str:
+    done = CliRunner().invoke(
+        main, ["simulate", str(path), "--pose", "auto", "--craniotomy", "disc:30", *arguments, "-o", "a.png"]
+    )
+    assert done.exit_code == 2, done.output
+    return done.stderr
+
+
+def test_a_file_with_two_segments_is_no_opening_and_both_are_named(head, tmp_path):
+    """It was "has 3 different values"."""
+    sides = (head.array == 3) * np.where(np.arange(head.array.shape[2]) < 56, 1, 2)
+    stored = head.with_array(sides.astype(np.uint8)).to_sitk()
+    for number, name in enumerate(("Flap", "Burr hole")):
+        for key, value in (("Name", name), ("LabelValue", number + 1), ("Layer", 0), ("ID", f"Segment_{number + 1}")):
+            stored.SetMetaData(f"Segment{number}_{key}", str(value))
+    sitk.WriteImage(stored, path := str(tmp_path / "two.seg.nrrd"))
+    for checked in (lambda: file_opening(head, NAMES, path), lambda: _require_opening(path)):
+        with pytest.raises(SimulationError, match=r"two\.seg\.nrrd: holds the segments 1 'Flap', 2 'Burr hole'"):
+            checked()
+    with pytest.raises(SimulationError, match="a segment of 3D Slicer, is not grown but laid over the labels"):
+        split_seeds([path])
+
+
+def test_the_page_takes_the_list_of_points_of_an_older_slicer_as_an_opening(tmp_path):
+    """It was read as an image."""
+    corners = ("-20,-20", "20,-20", "20,20", "-20,20")
+    rows = [f"n{n},{corner},78,0,0,0,1,1,1,0,F,," for n, corner in enumerate(corners)]
+    head_lines = [
+        "# Markups fiducial file version = 4.11",
+        "# CoordinateSystem = RAS",
+        "# columns = id,x,y,z,ow,ox,oy,oz",
+    ]
+    (tmp_path / "hole.fcsv").write_text("\n".join([*head_lines, *rows]) + "\n")
+    _require_opening(str(tmp_path / "hole.fcsv"))
 
 
 def image(tmp_path, *arguments) -> tuple[np.ndarray, str]:

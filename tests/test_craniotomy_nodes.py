@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -15,8 +16,10 @@ from vtkmodules.vtkCommonCore import vtkPoints  # noqa: E402
 from SlicerUSSim.Logic import SimulationError, Volume  # noqa: E402
 from SlicerUSSim.Logic.base.reading import read_values, write_values  # noqa: E402
 from SlicerUSSim.Logic.base.vtk_data import vtk_matrix  # noqa: E402
-from SlicerUSSim.Logic.mri.craniotomy import disc_opening, opened  # noqa: E402
+from SlicerUSSim.Logic.mri.craniotomy import default_pose, disc_opening, opened  # noqa: E402
+from SlicerUSSim.Logic.mri.pathology import add_tissues  # noqa: E402
 from SlicerUSSim.Logic.mrml.label_nodes import read_labels, write_labels  # noqa: E402
+from SlicerUSSim.Logic.mrml.lesion_nodes import add_lesion  # noqa: E402
 from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic  # noqa: E402
 from SlicerUSSim.Logic.mrml.nodes import node_to_world, nodes_of_class, set_node_to_world, write_volume  # noqa: E402
 from SlicerUSSim.Logic.mrml.own_labels import mark_as_made  # noqa: E402
@@ -170,7 +173,7 @@ def test_what_cannot_be_opened_changes_nothing(head):  # noqa: F811
     assert [node.GetName() for node in nodes_of_class(bench.scene, "vtkMRMLVolumeNode")] == names
     brain = Bench(head.with_array(np.where(head.array == 2, 2, 0).astype(np.uint8)))
     brain.presenter.openCraniotomy()
-    assert "the craniotomy removes nothing, expected skin, scalp" in brain.view.errors[-1]
+    assert "as those of a brain without its skull: there is nothing to open" in brain.view.errors[-1]
     mine = bench.add("LabelMapVolume", "mine")
     write_labels(mine, head, NAMES, bench.whole)
     with pytest.raises(SimulationError, match="was not made by this module, or edited since, and is not replaced"):
@@ -258,6 +261,42 @@ def test_place_aims_at_a_tumour_below_the_opening_and_the_notes_say_so(head):  #
     assert "probe: " not in bench.presenter.notes()
     bench.presenter.placeProbe()
     assert "probe: " not in bench.presenter.notes()  # on the skin, upright as before
+
+
+@pytest.mark.parametrize("to_world", [np.eye(4), TURN], ids=["plain", "turned"])
+def test_a_disc_opens_over_the_lesion_that_was_laid_over_the_labels_as_in_commands(head, to_world):  # noqa: F811
+    """At the start of the page with --add and --craniotomy auto it was where a craniotomy is by default."""
+    place = np.array([38.0, -20.0, 20.0])
+    bench = Bench(head, to_world=to_world)
+    mask = with_ball(head, place, 8.0, 9)
+    mask = mask.with_array((mask.array == 9).astype(np.uint8))
+    lesions = bench.add("Segmentation", "lesions")
+    lesions.SetAndObserveTransformNodeID(bench.whole.GetTransformNodeID())
+    add_lesion(lesions, mask, "tumour", "tumour")
+    bench.logic.addTissues(bench.whole, lesions)
+    bench.logic.placeProbe(bench.whole, bench.probe, will_open=True)
+    pose = np.linalg.inv(to_world) @ node_to_world(bench.probe)
+    assert np.hypot(*(np.linalg.inv(pose) @ [*place, 1.0])[[0, 2]]) < 2.5
+    if to_world is not TURN:  # a coronal view is one of the world
+        added = add_tissues(head, NAMES, [("tumour", mask, "a")], has_brain_mask=False)
+        probe, target = bench.logic.preset.probe, added.centre_ras(head)
+        same = default_pose(added.labels, added.tissue_names, probe, is_open=True, target_ras=target)
+        np.testing.assert_allclose(pose, same, atol=1e-3)
+
+
+def test_the_notes_say_that_no_part_of_the_face_touches_the_patient(head):  # noqa: F811
+    nothing = "0% of the probe's face touches the patient (contact gap: 3 mm): the image is black"
+    bench = Bench(head)
+    bench.presenter.placeProbe()
+    assert "face touches" not in bench.presenter.notes()
+    bench.presenter.setLive(True)
+    refreshed = bench.view.refreshed
+    bench.move(pose_looking_at((0.0, 0.0, 88.0), (0.0, 0.0, 0.0)))
+    bench.view.waiting.pop()()
+    assert bench.view.refreshed == refreshed + 1 and bench.presenter.notes().count(nothing) == 1
+    bench.presenter.setLive(False)
+    bench.logic.parameters.panel = replace(bench.logic.parameters.panel, gel=False)  # it lies in the coupling medium
+    assert "face touches" not in bench.presenter.notes() and not bench.view.errors
 
 
 def test_the_notes_follow_the_probe_over_bone_and_openings(head):  # noqa: F811

@@ -806,6 +806,23 @@ def test_the_workstation_begins_with_the_opening_of_its_option(browser, tmp_path
         page.close()
 
 
+@pytest.mark.slow
+def test_the_workstation_opens_over_the_lesion_that_is_added_as_the_command_does(browser, tmp_path):
+    labels, place = round_head(tmp_path), np.array([35.0, -20.0, 25.0])
+    at = np.stack(np.meshgrid(*[np.arange(57) * 3.0 - 84.0] * 3, indexing="ij"), axis=-1)[..., ::-1]
+    ball = np.linalg.norm(at - place, axis=-1) < 8.0
+    labels.with_array(ball.astype(np.uint8)).write(lesion := tmp_path / "lesion.nii.gz")
+    with serving(
+        "--labels", str(tmp_path / "labels.nii.gz"), "--add", f"tumour={lesion}", "--craniotomy", "auto"
+    ) as address:  # fmt: skip
+        page = opened(browser, address)
+        settled(page)
+        pose = np.array(page.evaluate("window.ussim.image.pose")).reshape(4, 4)
+        page.close()
+    off = (np.linalg.inv(pose) @ [*place, 1.0])[[0, 2]]
+    assert np.hypot(*off) < 3.0, pose
+
+
 @pytest.mark.parametrize("what", ["a craniotomy off the head", "an MRI called CT"])
 @pytest.mark.slow
 def test_bad_anatomy_is_one_line_in_the_page_which_goes_on(browser, files, tmp_path, what):
@@ -1287,7 +1304,12 @@ def test_a_server_on_loopback_refuses_pages_of_other_sites(url):
         (["{head}", "--contrast", "flair", "--sheets", "auto"], "sheets are not found in contrast 'flair'"),
         (["{head}", "--sheets", "{head}"], "head.nii.gz: expected a .vtp that `ussim segment --sheets` has written"),
         (["{head}", "--no-sheet", "falx"], "--no-sheet leaves out some of --sheets; give --sheets, too"),
-        (["{head}", "--craniotomy", "disc:30"], "--craniotomy is disc:30, and only a brain is labelled, expected"),
+        (["{head}", "--craniotomy", "disc:30"], "--craniotomy is disc:30, and the image shows a brain without"),
+        (
+            ["--craniotomy", "auto"],
+            "--craniotomy is auto, and the demo is a brain without its skull, which has nothing",
+        ),
+        (["{head}", "--ct", "--craniotomy", "auto"], "which opens a head that was found in an MRI, and this is a CT"),
         (["{head}", "--outside", "--craniotomy", "disc:3"], "--craniotomy is 'disc:3', expected disc: and a diameter"),
         (["{head}", "--outside", "--craniotomy", "{head}"], "head.nii.gz: has "),
     ],

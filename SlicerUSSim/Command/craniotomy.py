@@ -11,7 +11,7 @@ import click
 
 from SlicerUSSim.Command.progress import note
 from SlicerUSSim.Logic.base.errors import SimulationError, require
-from SlicerUSSim.Logic.mri.settings import GEL_MM as GEL_MM
+from SlicerUSSim.Logic.mri.settings import CT, GEL_MM as GEL_MM
 
 if TYPE_CHECKING:
     import numpy as np
@@ -73,6 +73,39 @@ class Craniotomy:
     def needs_pose(self) -> bool:
         """Whether the opening lies under the probe."""
         return self.source in (AUTO, DISC)
+
+    def require_head(
+        self, mri: Volume | None, *, outside: bool, contrast: str, skull_strip: str, has_mask: bool
+    ) -> None:  # fmt: skip
+        """Raise SimulationError for an opening in a segmentation without skin and skull, as --outside finds them.
+
+        Says what is missing: --outside, or a head. `mri` is None for the demo brain.
+        """
+        if not self.is_wanted:
+            return
+        require(
+            contrast != CT,
+            f"--craniotomy is {self.text}, which opens a head that was found in an MRI, and this is a CT (--ct)",
+        )
+        if outside:
+            return
+        from SlicerUSSim.Logic.mri.outside import require_findable
+        from SlicerUSSim.Logic.mri.recognition import is_stripped
+
+        given = f"--craniotomy is {self.text}"
+        nothing = "a brain without its skull, which has nothing to open; leave --craniotomy out"
+        require(mri is not None, f"{given}, and the demo is {nothing}")
+        require(mri is None or not is_stripped(mri), f"{given}, and the image shows {nothing}")
+        try:
+            require_findable(contrast, skull_strip, has_mask)
+        except SimulationError as error:
+            raise SimulationError(f"{given}, and only a brain is labelled: {error}") from None
+        raise SimulationError(f"{given}, and only a brain is labelled, expected --outside too")
+
+    @property
+    def text(self) -> str:
+        """As it was given: "disc:30"."""
+        return self.source if self.diameter_mm is None else f"{self.source}{self.diameter_mm:g}"
 
     def on(self, labels: Volume, names: Sequence[str], probe: Probe, probe_to_ras: np.ndarray | None) -> Volume:
         """Labels 1, 2, ... called `names` with the opening; says what was removed. The pose is needed for a disc alone.

@@ -58,8 +58,8 @@ def demo(
 ) -> None:  # fmt: skip
     """Segment a brain MRI, simulate a view through a craniotomy, and write figures."""
     from SlicerUSSim.Command.whole_line import run_whole_line
-    from SlicerUSSim.Logic.base.volume import Volume
     from SlicerUSSim.Logic.mri.kept_mask import mask_beside
+    from SlicerUSSim.Logic.mri.masks import read_mask
     from SlicerUSSim.Logic.mri.samples import demo_mri
     from SlicerUSSim.Logic.probe.arrays import PROBES
 
@@ -70,7 +70,7 @@ def demo(
     )  # fmt: skip
     note(f"MRI: {source}, {volume.size_text} voxels")
     brain = {
-        "contrast": contrast, "skull_strip": skull_strip, "mask": Volume.read(mask) if mask else None,
+        "contrast": contrast, "skull_strip": skull_strip, "mask": read_mask(mask) if mask else None,
         "others": read_also(also, mri), "keep_mask_at": mask_beside(mri) if mri else None,
     }  # fmt: skip
     with Steps(5) as step:

@@ -90,8 +90,8 @@ def segmented_file(
     Raises SimulationError before the segmentation for `additions` that could not be added after it.
     """
     from SlicerUSSim.Logic.base.errors import about_file
-    from SlicerUSSim.Logic.base.volume import Volume
     from SlicerUSSim.Logic.mri.kept_mask import mask_beside
+    from SlicerUSSim.Logic.mri.masks import read_mask
     from SlicerUSSim.Logic.mri.modality import has_brain_mask, segment_image
     from SlicerUSSim.Logic.mri.segmentation import Segmentation
 
@@ -101,7 +101,7 @@ def segmented_file(
     require_no_map(path, maps, organs)
     require(organs is None or not is_of_brain, f"--organs is for a CT, expected --ct; {path} is read as an MRI")
     others = read_also(also, path)
-    brain = Volume.read(mask) if mask else None
+    brain = read_mask(mask) if mask else None
     if additions is not None:
         additions.require_addable(mri, brain, settings["skull_strip"] if is_of_brain else "none")
     found = None if organs is None else _read_organs(organs, maps)

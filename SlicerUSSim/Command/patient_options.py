@@ -222,12 +222,10 @@ def open_examination(patient: PatientOptions, pose: np.ndarray | str | None = No
         )
     if not is_labels:
         require_no_map(patient.mri_or_labels, patient.maps, patient.organs)
+        kind = {name: patient.segmentation[name] for name in ("outside", "contrast", "skull_strip")}
+        craniotomy.require_head(volume, **kind, has_mask=patient.mask is not None)
     if is_labels:
         require_no_mri_options(patient.mri_or_labels, "leave it out, or use --mri if it is one")
-    require(
-        not (is_ct and craniotomy.is_wanted),
-        f"--craniotomy is {patient.craniotomy}, which opens a head that was found in an MRI, and this is a CT (--ct)",
-    )
     split_also(patient.also)
     if patient.segmentation["outside"] and not is_ct:
         require_findable(
@@ -248,10 +246,6 @@ def open_examination(patient: PatientOptions, pose: np.ndarray | str | None = No
         _say_bone(placed, added, tissues, preset, craniotomy)
         simulator = UltrasoundSimulator(placed.labels, tissues, placed.settings, patient.device, sheets=sheets.read)
         return Examination(simulator, preset.probe, preset.display, is_labels, placed.probe_to_ras)
-    require(
-        not craniotomy.is_wanted or patient.segmentation["outside"],
-        f"--craniotomy is {patient.craniotomy}, and only a brain is labelled, expected --outside too",
-    )
     log.info("tissues: %s", patient.tissues or ("the preset's" if patient.preset else "presets of the brain"))
     tissues = preset.tissues if table is None else table
     additions = Additions.read(patient.additions, (tissue.name for tissue in tissues.all_tissues()))
@@ -276,7 +270,7 @@ def open_examination(patient: PatientOptions, pose: np.ndarray | str | None = No
     tissues = with_their_tissue(tissues, surfels, known)
     texture = texture_below(segmentation.texture(), volume, segmentation.labels, added.labels)
     tissues = changes.to_tissues(tissues)
-    placed = _placed(patient, craniotomy, preset, added, segmentation.labels, pose)
+    placed = _placed(patient, craniotomy, preset, added, labels, pose)
     _say_bone(placed, added, tissues, preset, craniotomy)
     simulator = UltrasoundSimulator(placed.labels, tissues, placed.settings, patient.device, texture, surfels)
     return Examination(simulator, preset.probe, preset.display, is_labels, placed.probe_to_ras)
@@ -343,6 +337,15 @@ def _say_bone(placed: _Placed, added: Added, tissues: TissueTable, preset: Prese
             note(line)
 
 
+def say_contact(examination: Examination, probe: Probe, poses: Sequence[np.ndarray]) -> None:
+    """Say that a probe's face does not touch the patient at poses (4, 4), or with little of it."""
+    from SlicerUSSim.Logic.imaging.contact import about_contact
+
+    simulator = examination.simulator
+    for line in about_contact(simulator.medium.labels, probe, poses, simulator.settings.contact_gap_mm):
+        note(line)
+
+
 def open_examination_at(patient: PatientOptions, pose: str) -> tuple[Examination, np.ndarray]:
     """(Examination, (4, 4) probe_to_ras) of a command's options.
 
@@ -354,6 +357,11 @@ def open_examination_at(patient: PatientOptions, pose: str) -> tuple[Examination
     require(
         not is_chosen or patient.segmentation["contrast"] != CT,
         f"--pose is {pose}, which is on a head, and the image is a CT (--ct), expected a file with the pose",
+    )
+    require(
+        is_chosen or Path(pose).exists(),
+        f"--pose is {pose!r} (no such file), expected a file with the pose (.json, .txt, .tfm, .h5), {AUTO}, "
+        f"or a view: {', '.join(STANDARD_VIEWS)}",
     )
     examination = open_examination(patient, pose if is_chosen else read_pose(pose))
     return examination, required(examination.probe_to_ras, "the examination has no pose")

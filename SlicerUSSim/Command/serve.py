@@ -160,10 +160,17 @@ def serve(
     require(organs is None or contrast == CT, "--organs is for a CT, expected --ct too")
     drawn = DrawnSheets.of(sheets, no_sheets, is_labels=labels is not None, contrast=contrast)
     opening = Craniotomy.of(craniotomy)
-    require(
-        not opening.is_wanted or labels is not None or outside,
-        f"--craniotomy is {craniotomy}, and only a brain is labelled, expected --outside too",
-    )
+    if opening.is_wanted and labels is None:
+        require(
+            scene is None and also_open is None,
+            f"--craniotomy is {craniotomy}, which opens the skull in the MRI of a head, and the file is none",
+        )
+        head = None
+        if mri is not None and not outside:
+            head = read_mri(mri, mask=mask, skull_strip=skull_strip, contrast=contrast, is_served=True)
+        opening.require_head(
+            head, outside=outside, contrast=contrast, skull_strip=skull_strip, has_mask=mask is not None
+        )  # fmt: skip
     if opening.is_file:
         _require_opening(opening.source)
     if contrast == CT and others:
@@ -257,13 +264,14 @@ def _opened_first(path: str, options: list[str]) -> tuple[tuple[SceneRecord, str
 
 def _require_opening(path: str) -> None:
     """Raise SimulationError for a file of --craniotomy that is neither a mask nor a polygon."""
-    from SlicerUSSim.Logic.base.volume import Volume
     from SlicerUSSim.Logic.mri.craniotomy import is_open, polygon_of_file
+    from SlicerUSSim.Logic.mri.markups import is_markup_name
+    from SlicerUSSim.Logic.mri.masks import read_mask
 
-    if Path(path).suffix.lower() == ".json":
+    if is_markup_name(path):
         polygon_of_file(path)
     else:
-        is_open(Volume.read(path), path)
+        is_open(read_mask(path), path)
 
 
 def _require_workstation() -> None:

@@ -7,7 +7,7 @@ from pathlib import Path
 import click
 
 from SlicerUSSim.Command.options import check_output, gathered
-from SlicerUSSim.Command.patient_options import PatientOptions, open_examination_at, pose_option
+from SlicerUSSim.Command.patient_options import PatientOptions, open_examination_at, pose_option, say_contact
 from SlicerUSSim.Command.progress import note
 from SlicerUSSim.Logic.mri.settings import CT
 
@@ -25,6 +25,7 @@ def simulate(patient: PatientOptions, pose: str, out: Path) -> None:
 
     check_output(out, png=True)
     examination, probe_to_ras = open_examination_at(patient, pose)
+    say_contact(examination, examination.probe, [probe_to_ras])
     frame = examination.simulator.simulate(examination.probe, probe_to_ras, examination.display)
     if out.suffix.lower() == ".png":
         write_png(out, frame.image)

@@ -7,7 +7,7 @@ from pathlib import Path
 import click
 
 from SlicerUSSim.Command.options import check_output, gathered
-from SlicerUSSim.Command.patient_options import PatientOptions, open_examination_at, pose_option
+from SlicerUSSim.Command.patient_options import PatientOptions, open_examination_at, pose_option, say_contact
 from SlicerUSSim.Command.progress import Share, note
 from SlicerUSSim.Logic.base.errors import SimulationError
 
@@ -43,9 +43,11 @@ def volume(
         raise SimulationError("expected exactly one of --tilt DEGREES and --slide MILLIMETRES")
     grid = Volume.read(like) if like else None
     examination, middle = open_examination_at(patient, pose)
+    poses = sweep(middle, extent, frames)
+    say_contact(examination, examination.probe, poses)
     with Share("sweep") as progress:
         result = examination.simulator.volume(
-            examination.probe, sweep(middle, extent, frames), examination.display, spacing_mm=spacing, like=grid,
+            examination.probe, poses, examination.display, spacing_mm=spacing, like=grid,
             progress=lambda done: progress(done / frames),
         )  # fmt: skip
     write_own_volume(out, result)

@@ -123,7 +123,7 @@ class PanelPresenter:
         self._custom_probe: Probe | None = None  # the last one that was none of PROBES
         self._last_image: float | None = None
         #: The lines about bone before the probe that the notes had when they were shown last
-        self._bone_said: tuple[str, ...] = ()
+        self._probe_said: tuple[str, ...] = ()
         self._followed: tuple = ()  # the nodes of the live update
         #: Fits of simulated to real ultrasound
         self.fits = FitPresenter(self)
@@ -624,8 +624,8 @@ class PanelPresenter:
 
     def notes(self) -> str:
         """What the last segmentation or addition did, and what a user should check, in lines."""
-        self._bone_said = self._bone()
-        return "\n".join([*self._notes, *self._gel(), *self._bone_said])
+        self._probe_said = self._about_probe()
+        return "\n".join([*self._notes, *self._gel(), *self._probe_said])
 
     @property
     def noteLines(self) -> tuple[str, ...]:
@@ -645,13 +645,14 @@ class PanelPresenter:
             return []
         return [f"gel fills gaps of up to {GEL_MM:g} mm between skin and probe (Gel on the skin)"] if is_there else []
 
-    def _bone(self) -> tuple[str, ...]:
-        """Lines about bone before the probe where it is now."""
+    def _about_probe(self) -> tuple[str, ...]:
+        """Lines about the probe where it is now: its contact with the patient, and bone before it."""
         parameters = self.logic.parameters
-        if parameters.labels is None or parameters.probe_transform is None:
+        labels, probe = parameters.labels, parameters.probe_transform
+        if labels is None or probe is None:
             return ()
         try:
-            return self.logic.aboutBone(parameters.labels, parameters.probe_transform)
+            return (*self.logic.aboutContact(labels, probe), *self.logic.aboutBone(labels, probe))
         except SimulationError:  # as in _gel, or a probe that scales: the error is shown by simulate()
             return ()
 
@@ -888,8 +889,8 @@ class PanelPresenter:
         else:
             self.view.showStatus("")
         self._last_image = now
-        before, self._bone_said = self._bone_said, self._bone()
-        if self._bone_said != before:  # the probe has moved over bone or an opening
+        before, self._probe_said = self._probe_said, self._about_probe()
+        if self._probe_said != before:  # the probe has moved over bone or an opening, or off the patient
             self.view.refresh()
 
     def _stopped(self) -> None:

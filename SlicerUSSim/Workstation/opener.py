@@ -206,7 +206,7 @@ class Opener:
     def opening(self, path: str):
         """A node with the opening of a file: a closed curve through the points of a markup, or a mask."""
         if not is_markup_name(path):
-            return self._label_map(is_open(self._volume(path), path), path, ["opening"])
+            return self._label_map(is_open(self._mask(path), path), path, ["opening"])
         return self._markups("vtkMRMLMarkupsClosedCurveNode", path, polygon_of_file(path))
 
     def points(self, path: str, points: np.ndarray):

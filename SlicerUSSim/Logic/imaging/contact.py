@@ -7,6 +7,8 @@ sent, and c of what is received.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from SlicerUSSim.Logic.base.volume import Volume
@@ -15,6 +17,8 @@ from SlicerUSSim.Logic.probe.placement import sample
 
 #: Places along the face per aperture, and across it; steps through the gap in voxels
 _ALONG, _ACROSS, _STEP = 25, 5, 0.5
+#: A user is told of a face less of which than this share touches the patient; of a curved one on a head half does
+_LEAST_SHARE = 1.0 / 3.0
 
 
 def line_contact(labels: Volume, probe: Probe, probe_to_ras: np.ndarray, gap_mm: float) -> np.ndarray:
@@ -27,17 +31,54 @@ def line_contact(labels: Volume, probe: Probe, probe_to_ras: np.ndarray, gap_mm:
     gap_mm : the widest gap that gel fills; 0 or more.
     """
     middles, half = _line_middles(probe), 0.5 * probe.aperture_mm
+    edges, touching = _touching(labels, probe, probe_to_ras, gap_mm)
+    # The mean over an aperture is the difference of two sums along the face.
+    sums = np.append(0.0, np.cumsum(touching * np.diff(edges)))
+    share = (np.interp(middles + half, edges, sums) - np.interp(middles - half, edges, sums)) / (2.0 * half)
+    return (share.clip(0.0, 1.0) ** 2).astype(np.float32)
+
+
+def touching_share(labels: Volume, probe: Probe, probe_to_ras: np.ndarray, gap_mm: float) -> float:
+    """Share of the face, over all of its apertures, that touches the patient, 0 to 1; at 0 no line has an echo.
+
+    The parameters are those of line_contact.
+    """
+    return float(_touching(labels, probe, probe_to_ras, gap_mm)[1].mean())
+
+
+def about_contact(labels: Volume, probe: Probe, poses: Sequence[np.ndarray], gap_mm: float | None) -> tuple[str, ...]:
+    """Lines about a face that does not touch the patient, or with little of it, at one pose (4, 4) or more.
+
+    None without a gap (None), as the patient then lies in the coupling medium. The others are as in line_contact.
+    """
+    if gap_mm is None:
+        return ()
+    shares = [touching_share(labels, probe, pose, gap_mm) for pose in poses]
+    little = [share for share in shares if 0.0 < share < _LEAST_SHARE]
+    count, off = len(shares), len(shares) - np.count_nonzero(shares)
+    touches = f"of the probe's face touches the patient (contact gap: {gap_mm:g} mm)"
+    lines = []
+    if off:
+        which = "0%" if count == 1 else f"in {off} of {count} images 0%"
+        black = "the image is black" if count == 1 else "they are black"
+        lines.append(f"{which} {touches}: {black}; move the probe onto the patient")
+    if little:
+        which = "only" if count == 1 else f"in {len(little)} of {count} images only"
+        percent = f"{max(max(little), 0.01):.0%}{'' if count == 1 else ' or less'}"
+        lines.append(f"{which} {percent} {touches}: expect a dark image, or black sectors where it lifts off")
+    return tuple(lines)
+
+
+def _touching(labels: Volume, probe: Probe, probe_to_ras: np.ndarray, gap_mm: float) -> tuple[np.ndarray, np.ndarray]:
+    """((n + 1,) edges of n parts along the face in mm, (n,) share of each that touches the patient)."""
+    middles, half = _line_middles(probe), 0.5 * probe.aperture_mm
     count = int(np.ceil(_ALONG * (np.ptp(middles) + 2.0 * half) / (2.0 * half)))
     edges = np.linspace(middles.min() - half, middles.max() + half, count + 1)
     points, outward = _on_face(probe, 0.5 * (edges[1:] + edges[:-1]))
     steps = int(np.ceil(gap_mm / (_STEP * float(labels.spacing_mm.min())))) + 1
     away = np.linspace(0.0, gap_mm, steps)[:, None, None, None]
     ras = (points + away * outward) @ probe_to_ras[:3, :3].T + probe_to_ras[:3, 3]
-    touching = (sample(labels, ras, order=0) > 0).any(axis=0).mean(axis=1)
-    # The mean over an aperture is the difference of two sums along the face.
-    sums = np.append(0.0, np.cumsum(touching * np.diff(edges)))
-    share = (np.interp(middles + half, edges, sums) - np.interp(middles - half, edges, sums)) / (2.0 * half)
-    return (share.clip(0.0, 1.0) ** 2).astype(np.float32)
+    return edges, (sample(labels, ras, order=0) > 0).any(axis=0).mean(axis=1)
 
 
 def _line_middles(probe: Probe) -> np.ndarray:

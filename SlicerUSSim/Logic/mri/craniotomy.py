@@ -16,6 +16,7 @@ from SlicerUSSim.Logic.base.errors import require
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.mri.distances import distance_to
 from SlicerUSSim.Logic.mri.markups import is_markup_name, markup_points
+from SlicerUSSim.Logic.mri.masks import read_mask, several_segments
 from SlicerUSSim.Logic.mri.outside import OUTSIDE
 from SlicerUSSim.Logic.probe.arrays import Probe
 from SlicerUSSim.Logic.probe.placement import craniotomy_pose, sample
@@ -123,7 +124,7 @@ def file_opening(labels: Volume, names: Sequence[str], path: str) -> np.ndarray:
     """
     if is_markup_name(path):
         return polygon_opening(labels, names, polygon_of_file(path))
-    return mask_opening(labels, Volume.read(path), path)
+    return mask_opening(labels, read_mask(path), path)
 
 
 def mask_opening(labels: Volume, mask: Volume, name: str) -> np.ndarray:
@@ -143,6 +144,11 @@ def is_open(mask: Volume, name: str) -> Volume:
 
     Raises SimulationError for what is no mask.
     """
+    segments = several_segments(mask)
+    require(
+        not segments,
+        f"{name}: holds the segments {segments}, expected a file with one segment, the opening: export that one alone",
+    )
     values = np.unique(mask.array[np.isfinite(mask.array)])
     is_soft = bool(values.size) and float(values[0]) >= 0.0 and float(values[-1]) <= 1.0
     require(
@@ -186,11 +192,17 @@ def opened(labels: Volume, names: Sequence[str], opening: np.ndarray) -> tuple[V
     Raises SimulationError if nothing outside the brain lies in the opening, and for labels without a brain.
     """
     require_brain(names)
-    removed = opening & _is_any(labels, names, REMOVED)
+    around = _is_any(labels, names, REMOVED)
+    require(
+        bool(around.any()),
+        f"the labels have nothing of {', '.join(REMOVED)}, as those of a brain without its skull: there is nothing to "
+        "open; leave the craniotomy out, or label the whole head (--outside)",
+    )
+    removed = opening & around
     require(
         bool(removed.any()),
-        f"the craniotomy removes nothing, expected {', '.join(REMOVED)} in it; it is off the head or in the brain, the "
-        "image cuts the head there, or only a brain is labelled (--outside labels the rest)",
+        f"the craniotomy removes nothing, expected {', '.join(REMOVED)} in it; it is off the head or in the brain, or "
+        "the image cuts the head there",
     )
     millilitres = float(removed.sum() * labels.voxel_ml)
     require(

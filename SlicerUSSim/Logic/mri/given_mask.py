@@ -11,6 +11,7 @@ from scipy import ndimage
 from SlicerUSSim.Logic.base.errors import require, require_kind
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.mri.mask_check import MaskDoubts, border_doubts
+from SlicerUSSim.Logic.mri.masks import several_segments
 from SlicerUSSim.Logic.mri.plausibility import is_whole_brain
 from SlicerUSSim.Logic.mri.recognition import POSSIBLE_ML, USUAL_ML
 
@@ -143,6 +144,12 @@ def label_doubts(mask: Volume) -> tuple[str, ...]:
     values = np.unique(mask.array[mask.array > 0])
     if len(values) < 2 or _is_probability(mask.array):
         return ()
+    segments = several_segments(mask)
+    if segments:
+        return (
+            f"the mask holds the segments {segments}, expected a file with one; the brain is taken where any of them "
+            "is: if some are not brain, export the brain alone",
+        )
     listed = ", ".join(f"{value:g}" for value in values[:_LISTED]) + (", ..." if len(values) > _LISTED else "")
     return (
         f"the mask holds {len(values)} values ({listed}), expected one; the brain is taken where it is not 0: if some "

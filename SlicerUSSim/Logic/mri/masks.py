@@ -108,10 +108,20 @@ def read_masks(volume: Volume, tissue: str, source: str, advice: Advice = COMMAN
     warnings = ()
     if len(labels) > 1:
         warnings = (
-            f"{source} holds the labels {_called(labels, names)}; all of them are added as {tissue}"
+            f"{source} holds the labels {called(labels, names)}; all of them are added as {tissue}"
             f"{_alternative(labels, names, advice.several_tissues)}",
         )
     return _masks(volume, {tissue: whole != 0}, source, warnings)
+
+
+def several_segments(volume: Volume) -> str:
+    """The labels that a mask holds with their names, if there are several and they have names; otherwise ""."""
+    labels = np.unique(volume.array[np.isfinite(volume.array)])
+    labels = labels[labels != 0]
+    if not 1 < len(labels) <= _MOST_LABELS or (labels % 1 != 0).any():
+        return ""
+    names = {int(label): volume.label_names[int(label)] for label in labels if int(label) in volume.label_names}
+    return called(labels.astype(int), names) if names else ""
 
 
 def _alternative(labels: np.ndarray, names: Mapping[int, str], several: str) -> str:
@@ -144,7 +154,7 @@ def _by_name(labelled: Volume, labels: np.ndarray, names: Mapping[int, str], sou
             tissue = None
         require(
             tissue is not None,
-            f"{source}: holds the labels {_called(labels, names)}, and {name or f'label {label}'!r} is called like no "
+            f"{source}: holds the labels {called(labels, names)}, and {name or f'label {label}'!r} is called like no "
             "tissue; rename it (tumour, oedema, necrosis, enhancing, cyst, cavity), or add every label from a file of "
             "its own with its tissue",
         )
@@ -186,8 +196,8 @@ def _whole_numbers(array: np.ndarray) -> np.ndarray | None:
     return None if float(np.abs(array).max()) > 2**31 else whole_numbers(array)
 
 
-def _called(labels: np.ndarray, names: Mapping[int, str]) -> str:
-    """1 'Edema', 2 'Necrosis'"""
+def called(labels: np.ndarray, names: Mapping[int, str]) -> str:
+    """Labels with their names, as far as they have one: "1 'Edema', 2 'Necrosis'"."""
     if not names:
         return _listed(labels)
     return ", ".join(f"{label} {names[label]!r}" if label in names else str(label) for label in labels.tolist())

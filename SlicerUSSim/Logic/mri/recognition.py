@@ -58,6 +58,16 @@ _SYMMETRIC = (
 )
 #: Share of the voxels at the edges of an image from which their most frequent value is its border
 _LEAST_BORDER = 0.5
+#: Least median of the brain of a head, from air (0) to the brightest tissue (1): MRIs that were tried had 0.38 to 0.86,
+#: CTs that were cut to their bone at most 0.03
+_LEAST_BRAIN = 0.08
+#: So far around the brain is bone, mm; what is there is brighter than the brain by this factor in this share of it in
+#: CTs: 0.83 to 0.99 in their windows; in MRIs 0.00 to 0.05, and 0.47 with the CSF of a T2
+_BONE_MM, _BRIGHT_BONE, _SHARE_OF_BONE = (4.0, 7.0), 1.4, 0.75
+#: Share of the box around it that is filled by what is bright: heads and brains have 0.44 to 0.81, vessels 0.06
+_SCATTERED = 0.15
+#: Numbers from which on down there is no MRI's tissue
+_BELOW_MRI = -200.0
 #: Volume of what may be a head
 _LEAST_HEAD_ML, _MOST_HEAD_ML = 900.0, 9000.0
 #: What one hemisphere may have: its extents in ascending order, and its volume
@@ -221,6 +231,11 @@ def _require_dark_border(mri: Volume) -> None:
         return
     low, bright = np.percentile(within, (1.0, 99.0))
     require(
+        low > _BELOW_MRI,
+        f"image has values from {low:.0f}, as the fat and air of a CT have, and a border of {around:g}, expected an "
+        "MRI; segment a CT in Hounsfield units, with its air, with --ct (contrast ct)",
+    )
+    require(
         around <= low + 0.25 * (threshold_otsu(within[:: max(1, within.size // 500_000)]) - low),
         f"image has a border of one value ({around:g}) that is as bright as tissue (the rest has {low:g} to "
         f"{bright:g}), expected a dark background; crop it, or set it to {low:g}",
@@ -235,6 +250,18 @@ def stripped_brain(mri: Volume) -> np.ndarray | None:
     """
     found = _stripped_brain(mri)
     return None if found is None else found[0]
+
+
+def is_stripped(mri: Volume) -> bool:
+    """Whether an image shows a skull-stripped brain, also one that is refused for how it lies."""
+    try:
+        check_finite(mri)
+    except SimulationError:
+        return False
+    try:
+        return stripped_brain(mri) is not None
+    except SimulationError:  # it has the size and the shape of one
+        return True
 
 
 def _stripped_brain(mri: Volume) -> tuple[np.ndarray, CoarseImage] | None:
@@ -319,6 +346,13 @@ def _check_size(image: CoarseImage, mri: Volume) -> None:
     size = " x ".join(f"{mm + image.spacing_mm:.0f}" for mm in extent)
     is_half = all(low <= mm <= high for mm, (low, high) in zip(np.sort(extent), _HALF_A_BRAIN_MM, strict=True))
     is_half &= _HALF_A_BRAIN_ML[0] <= millilitres <= _HALF_A_BRAIN_ML[1]
+    share = float(inside.sum() / np.prod(extent / image.spacing_mm + 1.0))
+    require(
+        millilitres >= _LEAST_HEAD_ML or share >= _SCATTERED,
+        f"image shows {millilitres:.0f} ml of bright tissue that is scattered over {size} mm ({share:.0%} of it), as "
+        "vessels of an angiogram or bone of a CT that was cut to a window, and no head; use an MRI of the head, or "
+        "segment a CT, uncut and in Hounsfield units, with --ct (contrast ct)",
+    )
     known = "a whole brain: it may be half a brain" if is_half else "a head"
     require(
         millilitres >= _LEAST_HEAD_ML and extent.max() >= 110.0,
@@ -351,6 +385,11 @@ def _head(mri: Volume, image: CoarseImage, alignment: Alignment) -> Shown:
     )
     low, middle, high = np.percentile(np.pad(image.array, pad)[distance < -8.0], (5, 50, 95))
     require(
+        middle >= _LEAST_BRAIN,
+        "the brain in this head is as dark as the air around it, as in a CT that was cut to bone, expected an MRI; "
+        "segment a CT, uncut and in Hounsfield units, with --ct (contrast ct); for an MRI give a brain mask (--mask)",
+    )
+    require(
         high - low >= _LEAST_CONTRAST * middle,
         f"the tissues of the brain in this head differ by {(high - low) / max(middle, 1e-9):.0%}, as in CT, expected "
         f"{_LEAST_CONTRAST:.0%} or more of an MRI; use an MRI, or segment a CT with --ct (contrast ct)",
@@ -358,6 +397,13 @@ def _head(mri: Volume, image: CoarseImage, alignment: Alignment) -> Shown:
     warnings = ()
     if shown < _USUAL_SHOWN:
         warnings = (f"the image shows only {shown:.0%} of the brain; its {missing} is cut off",)
+    bone = (distance > _BONE_MM[0]) & (distance < _BONE_MM[1])
+    beside = image.array[bone[pad:-pad, pad:-pad, pad:-pad]]
+    if beside.size and float((beside > _BRIGHT_BONE * middle).mean()) > _SHARE_OF_BONE:
+        warnings += (
+            "what lies around the brain is brighter than the brain, as the bone of a CT is: if this is one, segment "
+            "it, uncut and in Hounsfield units, with --ct (contrast ct)",
+        )
     # In a head, scalp and muscle lie around the brain. The foreground of a stripped brain ends with it.
     around = (distance > 8.0) & (distance < 24.0)
     bright = float((np.pad(image.array, pad)[around] > 0.25 * np.median(np.pad(image.array, pad)[brain])).mean())

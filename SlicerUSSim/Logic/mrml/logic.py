@@ -23,6 +23,7 @@ from SlicerUSSim.Logic.fitting.held_out import predict
 from SlicerUSSim.Logic.fitting.search import Progress
 from SlicerUSSim.Logic.fitting.settings import FitSettings
 from SlicerUSSim.Logic.fitting.tracked_fit import Fit, fit
+from SlicerUSSim.Logic.imaging.contact import about_contact
 from SlicerUSSim.Logic.imaging.found_sheets import with_their_tissue
 from SlicerUSSim.Logic.imaging.frame import Frame
 from SlicerUSSim.Logic.imaging.noise import seed_of_pose
@@ -175,6 +176,8 @@ class UltrasoundSceneLogic:
         self._segmented: _Segmented | None = None
         #: Version of the labels over which lesions were laid last, and what was told about each of them
         self._laid: tuple[Hashable, _Told] = (None, {})
+        # (labels_version, (3,) mm in their frame) of the largest lesion that was laid over labels
+        self._lesion_place: tuple[Hashable, np.ndarray | None] = (None, None)
         #: Lesions proposed from the MRI that was segmented last
         self.proposals = LesionProposals(scene, lambda work: self._work.do(work))
         #: What the last segment() or addTissues() did, and what a user should check, one line each
@@ -329,6 +332,7 @@ class UltrasoundSceneLogic:
         require_node(labels_node, *LABEL_CLASSES, use="output of Segment")
         self._write_tissues(labels_node, added, mri_node, shares)
         self._laid = labels_version(labels_node), told
+        self._lesion_place = labels_version(labels_node), added.centre_ras(labels)
         if isinstance(result, Segmentation):  # lesions are proposed on MRIs only
             self.proposals.segmented(mri_node, result)
         self._segmented = _Segmented(
@@ -414,6 +418,7 @@ class UltrasoundSceneLogic:
             texture = self._work.do(lambda: texture_below(known, mri, whole, added.labels))
         self._write_tissues(output, added, labels_node, texture)
         self._laid = labels_version(output), told
+        self._lesion_place = labels_version(output), added.centre_ras(labels)
         if texture is not None and was is not None:
             self._segmented = _Segmented(
                 labels_version(output), added.labels, added.tissue_names, texture, was.mri, was.is_of_brain
@@ -638,7 +643,7 @@ class UltrasoundSceneLogic:
         self._simulators.forget()
         self._patients = PatientReader()
         self._segmented = self._sheets = self._texture = self._taken = None
-        self._laid, self._in_sequence = (None, {}), ("", None)
+        self._laid, self._lesion_place, self._in_sequence = (None, {}), (None, None), ("", None)
         self.proposals = LesionProposals(self.scene, lambda work: self._work.do(work))
         self.notes = self.warnings = ()
 
@@ -769,7 +774,8 @@ class UltrasoundSceneLogic:
         craniotomy: on a brain, upright on the skin of a whole head, or on the brain in the middle of an opening, aimed
         at a lesion below it (aiming.opening_pose).
         `view` is one of mri.views.VIEWS instead, as "temporal". With `will_open` it is on the brain of a closed head,
-        where openCraniotomy opens a disc under it. Returns a line about what was done in labels with an opening, or "".
+        where openCraniotomy opens a disc under it: over the lesion that was laid over the labels, if there is one.
+        Returns a line about what was done in labels with an opening, or "".
         """
         require_node(probe_transform_node, "vtkMRMLLinearTransformNode", use="probe transform")
         patient = self._patient(labels_node)
@@ -783,7 +789,10 @@ class UltrasoundSceneLogic:
             opening = flap_centre(labels_node)
             probe, names = self.preset.probe, patient.names
             if opening is None:
-                pose = default_pose(surface, names, probe, is_open=will_open or is_opened(labels_node))
+                pose = default_pose(
+                    surface, names, probe, is_open=will_open or is_opened(labels_node),
+                    target_ras=self._laid_lesion(labels_node) if will_open else None,
+                )  # fmt: skip
             else:
                 pose, line = opening_pose(surface, names, probe, opening)
         else:
@@ -791,6 +800,14 @@ class UltrasoundSceneLogic:
             pose = pose_in_slice(surface, matrix_array(slice_node.GetSliceToRAS()), target_ras)
         set_node_to_world(probe_transform_node, pose)
         return line
+
+    def _laid_lesion(self, labels_node) -> np.ndarray | None:
+        """(3,) RAS mm of the largest lesion that was laid over these labels at last, as of --add; or None."""
+        version, place = self._lesion_place
+        if place is None or version != labels_version(labels_node):
+            return None
+        world_to_labels, scaling = pose_in_labels(labels_node, np.eye(4))
+        return (np.linalg.inv(world_to_labels) @ scaling @ [*place, 1.0])[:3]
 
     def aboutBone(self, labels_node, probe_transform_node) -> tuple[str, ...]:
         """Lines about bone before the probe at its pose: a closed skull, or an opening that its face does not fit.
@@ -803,6 +820,15 @@ class UltrasoundSceneLogic:
         return about_bone(
             patient.labels, patient.names, tissues, self.preset.probe, pose, is_open=is_opened(labels_node), words=SCENE
         )
+
+    def aboutContact(self, labels_node, probe_transform_node) -> tuple[str, ...]:
+        """Lines about a probe whose face does not touch the patient at its pose, or with little of it.
+
+        See contact.about_contact.
+        """
+        patient, gap_mm = self._patient(labels_node), self.settings(labels_node).contact_gap_mm
+        pose = patient.pose(probe_pose(probe_transform_node))
+        return about_contact(patient.labels, self.preset.probe, [pose], gap_mm)
 
     def showOutline(self, model_node, probe_transform_node) -> None:
         """The outline of the imaged field as a model under the probe's transform.
