@@ -25,7 +25,7 @@ from SlicerUSSim.Logic.mri.sheets.falx import falx
 from SlicerUSSim.Logic.mri.sheets.head import Head
 from SlicerUSSim.Logic.mri.sheets.heights import settled
 from SlicerUSSim.Logic.mri.sheets.kept import key_of, read_kept_sheets
-from SlicerUSSim.Logic.mri.sheets.polydata import read_surfels, require_own_surface, write_surfels
+from SlicerUSSim.Logic.mri.sheets.polydata import as_polydata, read_surfels, require_own_surface, write_surfels
 from SlicerUSSim.Logic.mri.sheets.regions import tentorium_height
 from SlicerUSSim.Logic.mri.sheets.ridges import ridges
 from SlicerUSSim.Logic.mri.sheets.sulcal import sulci
@@ -551,6 +551,38 @@ def test_sheets_that_do_not_fit_on_the_disk_leave_those_before(name, tmp_path):
     assert done.returncode == 0 and size > 2000
     assert done.stdout.count("cannot be written (not all of it is in the file; is the disk full?)") == 3, done.stdout
     assert done.stderr == "" and [file.name for file in tmp_path.iterdir()] == [name]
+
+
+def test_a_file_whose_points_were_moved_is_refused(tmp_path):
+    """Its arrays stayed, and sheets were drawn where they were before."""
+    from vtkmodules.vtkCommonTransforms import vtkTransform
+    from vtkmodules.vtkFiltersGeneral import vtkTransformPolyDataFilter
+    from vtkmodules.vtkIOXML import vtkXMLPolyDataWriter
+
+    surfels = some_surfels()
+
+    def written(name: str, scale=(1.0, 1.0, 1.0), shift=(0.0, 0.0, 0.0), space: str = "RAS") -> Path:
+        transform, moved, writer = vtkTransform(), vtkTransformPolyDataFilter(), vtkXMLPolyDataWriter()
+        transform.Translate(*shift)
+        transform.Scale(*scale)
+        moved.SetTransform(transform)
+        moved.SetInputData(as_polydata(surfels))
+        moved.Update()
+        data = moved.GetOutput()
+        data.GetFieldData().GetAbstractArray("SPACE").SetValue(0, space)
+        writer.SetInputData(data)
+        writer.SetFileName(str(tmp_path / name))
+        writer.Write()
+        return tmp_path / name
+
+    for scale, shift in (((1, 1, 1), (0, 0, 1.0)), ((-1, -1, 1), (0, 0, 0)), ((-1, 1, 1), (0, 0, 0))):
+        path = written("moved.vtp", scale, shift)
+        with pytest.raises(SimulationError, match=r"moved\.vtp: its points differ by up to .* mm .* find the sheets"):
+            read_surfels(path)
+    with pytest.raises(SimulationError, match="its points differ"):
+        read_surfels(written("place.vtp", space="LPS"))
+    same = read_surfels(written("slicer.vtp", (-1, -1, 1), space="LPS"))  # as Slicer writes a model
+    np.testing.assert_array_equal(same.place, surfels.place)
 
 
 def test_an_incomplete_file_of_sheets_is_one_line(tmp_path, capfd):

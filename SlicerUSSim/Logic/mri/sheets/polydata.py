@@ -21,6 +21,8 @@ if TYPE_CHECKING:
 _SUFFIXES = (".vtp", ".ply")
 #: Array of a .vtp and comment of a .ply with a hash of the surface, by which a file that nobody edited is known
 _MARK = "ussim_mark"
+#: By so much the middle of a square may differ from its surfel's place, for what other programs round, mm
+_MOVED_MM = 0.05
 #: Colours of the kinds, 0 to 255
 COLOURS = ((255, 140, 26), (0, 229, 255), (77, 107, 255), (57, 230, 57))
 
@@ -178,7 +180,7 @@ def read_surfels(path: str | os.PathLike) -> Surfels:
 def surfels_of(data: vtkPolyData, source: str) -> Surfels:
     """The surfels of a surface by as_polydata, as its arrays have them, called `source` in errors.
 
-    Raises SimulationError for another surface.
+    Raises SimulationError for another surface, and for one whose points were moved: the arrays stay where they were.
     """
     from vtkmodules.util.numpy_support import vtk_to_numpy
 
@@ -191,4 +193,30 @@ def surfels_of(data: vtkPolyData, source: str) -> Surfels:
         )
         kind = np.uint8 if entry.name == "kind" else np.float32
         arrays.append(np.array(vtk_to_numpy(array), kind))
-    return Surfels(*arrays)
+    surfels = Surfels(*arrays)
+    _require_unmoved(data, surfels, source)
+    return surfels
+
+
+def _require_unmoved(data: vtkPolyData, surfels: Surfels, source: str) -> None:
+    """Raise SimulationError unless the squares are around the places of the surfels."""
+    from vtkmodules.util.numpy_support import vtk_to_numpy
+    from vtkmodules.vtkFiltersCore import vtkCellCenters
+
+    if not len(surfels):
+        return
+    centres = vtkCellCenters()
+    centres.SetInputData(data)
+    centres.Update()
+    points = centres.GetOutput().GetPoints()
+    found = np.zeros((0, 3)) if points is None else vtk_to_numpy(points.GetData())
+    space = data.GetFieldData().GetAbstractArray("SPACE")
+    if space is not None and space.GetValue(0) == "LPS":  # as Slicer writes a model; the arrays stay in RAS
+        found = found * (-1.0, -1.0, 1.0)
+    apart_mm = np.linalg.norm(found - surfels.place, axis=1).max() if len(found) == len(surfels) else np.inf
+    how = f"by up to {apart_mm:.3g} mm" if np.isfinite(apart_mm) else "in number"
+    require(
+        apart_mm <= _MOVED_MM,
+        f"{source}: its points differ {how} from its array 'place': it was transformed or cut in another program, "
+        "which leaves places and normals as they were; find the sheets anew in the MRI that they belong to",
+    )
