@@ -162,7 +162,7 @@ def _mark_of(data: vtkPolyData) -> str:
 
 @in_child  # VTK ends the process for some damaged files
 def read_surfels(path: str | os.PathLike) -> Surfels:
-    """The surfels of a .vtp by write_surfels. Raises SimulationError for a file that is none."""
+    """The surfels of a .vtp by write_surfels, where its squares are. Raises SimulationError for a file that is none."""
     from vtkmodules.vtkIOXML import vtkXMLPolyDataReader
 
     require(Path(path).is_file(), f"{path}: no such file")
@@ -174,13 +174,13 @@ def read_surfels(path: str | os.PathLike) -> Surfels:
         file.SetFileName(str(path))
         file.Update()
         require(file.GetErrorCode() == 0, f"{path}: is damaged; copy or write it again")
-        return surfels_of(file.GetOutput(), str(path))
+        return placed_surfels(file.GetOutput(), str(path))
 
 
 def surfels_of(data: vtkPolyData, source: str) -> Surfels:
     """The surfels of a surface by as_polydata, as its arrays have them, called `source` in errors.
 
-    Raises SimulationError for another surface, and for one whose points were moved: the arrays stay where they were.
+    Raises SimulationError for another surface.
     """
     from vtkmodules.util.numpy_support import vtk_to_numpy
 
@@ -193,30 +193,51 @@ def surfels_of(data: vtkPolyData, source: str) -> Surfels:
         )
         kind = np.uint8 if entry.name == "kind" else np.float32
         arrays.append(np.array(vtk_to_numpy(array), kind))
-    surfels = Surfels(*arrays)
-    _require_unmoved(data, surfels, source)
-    return surfels
+    return Surfels(*arrays)
 
 
-def _require_unmoved(data: vtkPolyData, surfels: Surfels, source: str) -> None:
-    """Raise SimulationError unless the squares are around the places of the surfels."""
+def placed_surfels(data: vtkPolyData, source: str) -> Surfels:
+    """The surfels of a surface by as_polydata in RAS, where its squares are: another program may have moved them.
+
+    Raises SimulationError as surfels_of does, and for squares that were moved and cut.
+    """
+    surfels, to_ras = surfels_of(data, source), np.eye(4)
+    space = data.GetFieldData().GetAbstractArray("SPACE")
+    if space is not None and space.GetValue(0) == "LPS":  # as Slicer writes a model; its arrays stay as they were
+        to_ras = np.diag([-1.0, -1.0, 1.0, 1.0])
+    by_squares = surfels_of_squares(data, surfels, to_ras, source)
+    same = len(by_squares) == len(surfels) and np.allclose(by_squares.place, surfels.place, rtol=0.0, atol=_MOVED_MM)
+    return surfels if same else by_squares
+
+
+def surfels_of_squares(data: vtkPolyData, surfels: Surfels, matrix: np.ndarray, source: str) -> Surfels:
+    """Surfels with the places, normals and areas of their squares after a (4, 4) linear transform.
+
+    What is in a sheet grows by its volume, and the thickness with it. Squares of no area are left out.
+    Raises SimulationError for cells that are no squares.
+    """
     from vtkmodules.util.numpy_support import vtk_to_numpy
-    from vtkmodules.vtkFiltersCore import vtkCellCenters
 
     if not len(surfels):
-        return
-    centres = vtkCellCenters()
-    centres.SetInputData(data)
-    centres.Update()
-    points = centres.GetOutput().GetPoints()
-    found = np.zeros((0, 3)) if points is None else vtk_to_numpy(points.GetData())
-    space = data.GetFieldData().GetAbstractArray("SPACE")
-    if space is not None and space.GetValue(0) == "LPS":  # as Slicer writes a model; the arrays stay in RAS
-        found = found * (-1.0, -1.0, 1.0)
-    apart_mm = np.linalg.norm(found - surfels.place, axis=1).max() if len(found) == len(surfels) else np.inf
-    how = f"by up to {apart_mm:.3g} mm" if np.isfinite(apart_mm) else "in number"
+        return surfels
+    squares = np.asarray(vtk_to_numpy(data.GetPolys().GetConnectivityArray()), np.int64)
+    count = data.GetNumberOfPoints()
     require(
-        apart_mm <= _MOVED_MM,
-        f"{source}: its points differ {how} from its array 'place': it was transformed or cut in another program, "
-        "which leaves places and normals as they were; find the sheets anew in the MRI that they belong to",
+        len(squares) == 4 * len(surfels) and squares.min() >= 0 and squares.max() < count,
+        f"{source} has cells that are no squares, expected a model of `ussim segment --sheets`",
     )
+    corners = (
+        vtk_to_numpy(data.GetPoints().GetData())[squares].reshape(-1, 4, 3).astype(float) @ matrix[:3, :3].T
+        + matrix[:3, 3]
+    )
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 3] - corners[:, 0])
+    area = np.linalg.norm(normal, axis=1)
+    volume = abs(float(np.linalg.det(matrix[:3, :3])))
+    is_whole = (area > 1e-9) & (surfels.area > 1e-9)
+    thickness = surfels.thickness[is_whole] * volume * surfels.area[is_whole] / area[is_whole]
+    chosen = surfels.chosen(is_whole)
+    return Surfels(
+        corners[is_whole].mean(axis=1).astype(np.float32),
+        (normal[is_whole] / area[is_whole, None]).astype(np.float32),
+        thickness.astype(np.float32), chosen.confidence, area[is_whole].astype(np.float32), chosen.kind,
+    )  # fmt: skip
