@@ -25,7 +25,7 @@ from SlicerUSSim.Logic.mri.sheets.falx import falx
 from SlicerUSSim.Logic.mri.sheets.head import Head
 from SlicerUSSim.Logic.mri.sheets.heights import settled
 from SlicerUSSim.Logic.mri.sheets.kept import key_of, read_kept_sheets
-from SlicerUSSim.Logic.mri.sheets.polydata import read_surfels, require_own_surface, write_surfels
+from SlicerUSSim.Logic.mri.sheets.polydata import as_polydata, read_surfels, require_own_surface, write_surfels
 from SlicerUSSim.Logic.mri.sheets.regions import tentorium_height
 from SlicerUSSim.Logic.mri.sheets.ridges import ridges
 from SlicerUSSim.Logic.mri.sheets.sulcal import sulci
@@ -551,6 +551,38 @@ def test_sheets_that_do_not_fit_on_the_disk_leave_those_before(name, tmp_path):
     assert done.returncode == 0 and size > 2000
     assert done.stdout.count("cannot be written (not all of it is in the file; is the disk full?)") == 3, done.stdout
     assert done.stderr == "" and [file.name for file in tmp_path.iterdir()] == [name]
+
+
+def test_sheets_of_a_file_that_was_transformed_are_where_its_points_are(tmp_path):
+    """Other programs leave the arrays as they were, and sheets were drawn where they had been before."""
+    from vtkmodules.vtkCommonTransforms import vtkTransform
+    from vtkmodules.vtkFiltersGeneral import vtkTransformPolyDataFilter
+    from vtkmodules.vtkIOXML import vtkXMLPolyDataWriter
+
+    surfels = some_surfels()
+
+    def written(name: str, scale=(1.0, 1.0, 1.0), shift=(0.0, 0.0, 0.0), space: str = "RAS") -> Path:
+        transform, moved, writer = vtkTransform(), vtkTransformPolyDataFilter(), vtkXMLPolyDataWriter()
+        transform.Translate(*shift)
+        transform.Scale(*scale)
+        moved.SetTransform(transform)
+        moved.SetInputData(as_polydata(surfels))
+        moved.Update()
+        data = moved.GetOutput()
+        data.GetFieldData().GetAbstractArray("SPACE").SetValue(0, space)
+        writer.SetInputData(data)
+        writer.SetFileName(str(tmp_path / name))
+        writer.Write()
+        return tmp_path / name
+
+    for scale, shift in (((1, 1, 1), (0, 0, 1.0)), ((-1, -1, 1), (0, 0, 0)), ((-1, 1, 1), (0, 0, 0))):
+        found = read_surfels(written("moved.vtp", scale, shift))
+        np.testing.assert_allclose(found.place, surfels.place * np.array(scale) + shift, atol=1e-4)
+        along = np.abs((found.normal * (surfels.normal * np.array(scale))).sum(axis=1))
+        np.testing.assert_allclose(along, 1.0, atol=1e-4)
+        np.testing.assert_allclose(found.thickness, surfels.thickness, rtol=1e-3)
+    same = read_surfels(written("slicer.vtp", (-1, -1, 1), space="LPS"))  # as Slicer writes a model
+    np.testing.assert_array_equal(same.place, surfels.place)
 
 
 def test_an_incomplete_file_of_sheets_is_one_line(tmp_path, capfd):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -23,7 +25,7 @@ from SlicerUSSim.Logic.base.neighbourhood import largest_around
 from SlicerUSSim.Logic.mri import head_mri
 from SlicerUSSim.Logic.mri.ct_unit import looks_like_ct
 from SlicerUSSim.Logic.probe.placement import pose_looking_at
-from SlicerUSSim.Logic.tissue import LabelMapping, read_label_map
+from SlicerUSSim.Logic.tissue import LabelledTissues, LabelMapping, read_label_map
 from SlicerUSSim.Logic.verification.ct_phantoms import BY_NUMBER, NAMES, CtPhantom, lower_chest, lumbar_spine
 
 
@@ -154,14 +156,54 @@ def test_organs_take_the_place_of_muscle_and_blood_but_not_of_fat_and_bone(chest
 def test_organs_on_another_grid_are_resampled_and_those_of_another_place_refused(chest):
     organs = read_label_map(chest.organs, mapping=LabelMapping.of(["totalsegmentator"]))
     half = Volume(organs.labels.array[::2, ::2, ::2], chest.ct.ijk_to_ras @ np.diag([2.0, 2.0, 2.0, 1.0]))
-    from dataclasses import replace
-
     found = segment_ct(chest.ct, organs=replace(organs, labels=half))
     assert (of(found, "liver") & (chest.truth.array == NAMES.index("liver") + 1)).sum() > 0.9 * of(found, "liver").sum()
     away = half.ijk_to_ras.copy()
     away[0, 3] += 1000.0
     with pytest.raises(SimulationError, match="does not meet the CT"):
         segment_ct(chest.ct, organs=replace(organs, labels=Volume(half.array, away)))
+
+
+def moved(organs: LabelledTissues, *, factors=(1.0, 1.0, 1.0), shift_mm=(0.0, 0.0, 0.0)) -> LabelledTissues:
+    matrix = np.diag([*factors, 1.0])
+    matrix[:3, 3] = shift_mm
+    return replace(organs, labels=Volume(organs.labels.array, matrix @ organs.labels.ijk_to_ras))
+
+
+def test_organs_of_another_patient_or_place_are_refused_by_the_numbers_of_the_ct():
+    """Their outlines became tissue: a liver of 66 +- 71 HU in a lumbar spine."""
+    chest, spine = lower_chest((2.0, 2.0, 2.0)), lumbar_spine((2.0, 2.0, 2.0))
+    in_chest, in_spine = (
+        read_label_map(phantom.organs, mapping=LabelMapping.of("totalsegmentator")) for phantom in (chest, spine)
+    )
+    for ct, organs, message in (
+        (
+            spine.ct,
+            in_chest,
+            r"organs: liver: \d\d% of it is free of bone in the CT, .* 97% or more; expected a label map",
+        ),
+        (chest.ct, in_spine, r"organs: bone: 0% of its surface is beside bone in the CT, expected 70% or more; give"),
+        (chest.ct, moved(in_chest, factors=(-1.0, 1.0, 1.0)), r"organs: kidney: 4\d% of it is soft tissue in the CT"),
+        (chest.ct, moved(in_chest, shift_mm=(60.0, 0.0, 0.0)), r"organs: kidney: \d+% of it is soft tissue"),
+        (chest.ct, moved(in_chest, shift_mm=(0.0, 0.0, -60.0)), r"organs: lung: \d+% of it is gas or lung in the CT"),
+        (spine.ct, moved(in_spine, shift_mm=(0.0, 30.0, 0.0)), r"organs: bone: \d\d% of its surface is beside bone"),
+    ):
+        with pytest.raises(SimulationError, match=message):
+            segment_ct(ct, organs=organs)
+    doubtful = segment_ct(chest.ct, organs=moved(in_chest, shift_mm=(0.0, 30.0, 0.0)))
+    assert any("organs: liver: 7" in line and "is the label map of this CT" in line for line in doubtful.warnings)
+    assert not any("of this CT" in line for line in segment_ct(chest.ct, organs=in_chest).warnings)
+
+
+def test_bones_whose_marrow_is_as_soft_as_muscle_are_those_of_the_ct():
+    spine = lumbar_spine((1.0, 1.0, 2.5))
+    marrow = spine.truth.array == NAMES.index("cancellous bone") + 1
+    ct = spine.ct.with_array(np.where(marrow, spine.ct.array - 150, spine.ct.array).astype(np.int16))
+    organs = read_label_map(spine.organs, mapping=LabelMapping.of("totalsegmentator"))
+    assert not any("of this CT" in line for line in segment_ct(ct, organs=organs).warnings)
+    # Voxels of 4 mm show too little cortex to tell
+    coarse = lumbar_spine((4.0, 4.0, 4.0))
+    segment_ct(coarse.ct, organs=read_label_map(coarse.organs, mapping=LabelMapping.of("totalsegmentator")))
 
 
 # ---- units and bad input ---------------------------------------------------------------------------------------------

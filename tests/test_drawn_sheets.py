@@ -176,6 +176,68 @@ def test_sheets_of_another_patient_are_refused():
         UltrasoundSimulator(labels, tissues, sheets=walls(1000.0))
 
 
+def folded(seed: int, half_mm: float = 34.0):
+    """(labels of sulci every 13 mm or so in white matter, which wind, with a tissue beyond; their surfels)."""
+    random = np.random.default_rng(seed)
+    middles = np.cumsum(random.uniform(9.0, 17.0, 12)) - 75.0
+    phase = random.uniform(0.0, 6.3, 2)
+
+    def wound(y, z):
+        return 3.0 * np.sin(y / 9.0 + phase[0]) + 3.0 * np.sin(z / 8.0 + phase[1])
+
+    def label(x, y, z):
+        across = np.abs((x - wound(y, z))[..., None] - middles).min(axis=-1)
+        return np.where(across < 0.7, 1, np.where(across < 3.5, 2, 3))
+
+    labels = block(label, half_mm=(half_mm,) * 3)
+    step = np.arange(-half_mm + 6.0, half_mm - 6.0, 0.9)
+    y, z = (grid.ravel() for grid in np.meshgrid(step, step))
+    place = np.concatenate([np.stack([middle + wound(y, z), y, z], axis=1) for middle in middles])
+    y, z = np.tile(y, len(middles)), np.tile(z, len(middles))
+    slopes = [3.0 / size * np.cos(at / size + p) for at, size, p in ((y, 9.0, phase[0]), (z, 8.0, phase[1]))]
+    normal = np.stack([np.ones_like(y), -slopes[0], -slopes[1]], axis=1)
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    inside = np.abs(place[:, 0]) < half_mm - 6.0
+    return labels, Surfels.of("sulcus", place[inside], normal[inside], 0.8, 1.0, 0.81)
+
+
+def moved(sheets: Surfels, matrix: np.ndarray, shift_mm=(0.0, 0.0, 0.0)) -> Surfels:
+    place, normal = sheets.place @ matrix.T + np.array(shift_mm), sheets.normal @ matrix.T
+    return replace(sheets, place=place.astype(np.float32), normal=normal.astype(np.float32))
+
+
+def test_sheets_whose_sulci_are_others_are_refused():
+    """Of another patient, mirrored or shifted ones, walls of ventricles lie on fluid often enough to pass."""
+    tissues = TissueTable.brain(["csf", "grey matter", "white matter"])
+    (labels, own), (_, others) = folded(1), folded(2)
+    UltrasoundSimulator(labels, tissues, sheets=own)
+    turn = sulci.Rotation.from_euler("xyz", (15.0, 25.0, 10.0), degrees=True).as_matrix()
+    for wrong in (
+        others, moved(own, np.diag([-1.0, 1.0, 1.0])), moved(own, np.eye(3), (6.5, 0.0, 0.0)), moved(own, turn),
+        Surfels.joined([others, plane("ependyma", np.eye(4))]),
+    ):  # fmt: skip
+        with pytest.raises(SimulationError, match=r"the sheets' sulci do not lie in those of the labels: .* expected"):
+            UltrasoundSimulator(labels, tissues, sheets=wrong)
+    # Turned together, also on coarse slices, the labels are theirs.
+    matrix = np.eye(4)
+    matrix[:3, :3] = turn
+    UltrasoundSimulator(Volume(labels.array, matrix @ labels.ijk_to_ras), tissues, sheets=moved(own, turn))
+    coarse = labels.ijk_to_ras @ np.diag([1.0, 1.0, 5.0, 1.0])
+    UltrasoundSimulator(Volume(labels.array[::5], coarse), tissues, sheets=own)
+
+
+def test_a_lesion_over_the_walls_of_ventricles_leaves_them_this_patients():
+    """A large tumour in the labels hid the fluid beside the walls, and the patient's own sheets were refused."""
+    labels = block(lambda x, y, z: 1 + (x * x + y * y + z * z < 100.0), half_mm=(30, 30, 30))
+    array = labels.array.copy()
+    array[:, :, : 5 + array.shape[2] // 2] = 3
+    normal = np.random.default_rng(1).normal(size=(3000, 3)).astype(np.float32)
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    own = Surfels.of("ependyma", 10.0 * normal, normal, 0.4, 1.0, 1.0)
+    tissues = TissueTable.brain(["white matter", "csf", "tumour"])
+    UltrasoundSimulator(labels.with_array(array), tissues, sheets=own)
+
+
 def test_a_wall_is_drawn_once():
     phantom, tissues = grey(layers=[sulci._GREY, sulci._CSF])
     wall = plane("ependyma", phantom.probe_to_ras, 15.0)

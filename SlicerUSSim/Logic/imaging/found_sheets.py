@@ -14,16 +14,24 @@ from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.mri.sheets.surfels import KINDS, Surfels
 from SlicerUSSim.Logic.mri.sheets.voxels import on_voxels
 from SlicerUSSim.Logic.opencl.layout import CONSTANTS
-from SlicerUSSim.Logic.tissue.sheet_looks import SheetLook, with_dura
+from SlicerUSSim.Logic.tissue.sheet_looks import SheetLook, looks_of, with_dura
 from SlicerUSSim.Logic.tissue.table import TissueTable
 
 #: Fluid around a sheet, along its normal, is a gap as narrow as a sheet up to here on either side; from here on it is
 #: a cistern, whose walls are two lines. A sheet of labels may lie this far beside a sheet that was found.
 _WIDE_MM, _STEP_MM, _BESIDE_MM = 2.0, 0.5, 1.0
+_GREY, _WHITE = "grey matter", "white matter"
 #: Least distance from a sheet within which nothing else draws a line, mm
 _OWN_MM = 1.0
+#: A sulcus has fluid and grey matter in it, within the first distance along its normal, and white matter beside it,
+#: between the others, mm. From there to here it is 0.8 to 1.1 steps of fluid, grey and white matter for sheets of six
+#: MRIs on their own labels (0.4 to 0.9 on slices and voxels of 5 mm, 0.7 on those of another MRI of the same patient),
+#: -0.03 to 0.03 for those of others, 0.04 to 0.13 for mirrored ones, and 0.01 to 0.23 for those shifted by 4 mm.
+_IN_SULCUS_MM, _BESIDE_SULCUS_MM, _LEAST_CHANGE = 0.5, (4.0, 5.0), 0.3
+#: So many pieces of sulci tell; of fewer, the walls of ventricles do
+_LEAST_SULCI = 2000
 #: Sheets are another patient's if fewer of so many walls of ventricles lie within this of fluid beside tissue, mm or a
-#: voxel. Of four heads 0.67 to 0.90 of their own walls do and 0.03 to 0.25 of the others'.
+#: voxel: 0.66 to 0.92 of their own walls do, 0.01 to 0.62 of the others', and 0.37 to 0.77 of mirrored ones.
 _LEAST_WALLS, _LEAST_ON_WALLS, _NEAR_MM = 200, 0.45, 1.5
 #: Or if fewer of those in the volume are beside labelled tissue, or none is within this of the volume, mm
 _LEAST_LABELLED, _FAR_MM = 0.4, 100.0
@@ -50,7 +58,7 @@ class FoundSheets:
 
 
 def found_sheets(
-    surfels: Surfels, padded: np.ndarray, grid: Volume, fluids: tuple[int, ...], looks: dict[str, SheetLook]
+    surfels: Surfels, padded: np.ndarray, grid: Volume, fluids: tuple[int, ...], tissues: TissueTable
 ) -> FoundSheets:
     """Lay sheets over a label map.
 
@@ -59,12 +67,12 @@ def found_sheets(
     surfels : in RAS mm.
     padded : (k, j, i) uint8 labels with a margin of one voxel around `grid`.
     fluids : labels of which gaps consist, without the coupling medium.
-    looks : by kind.
+    tissues : of the labels, with a membrane.
 
     Raises SimulationError for sheets that are not of this patient.
     """
-    grid = _with_margin(grid)
-    _require_of_patient(surfels, padded, grid, fluids)
+    grid, looks = _with_margin(grid), looks_of(tissues)
+    _require_of_patient(surfels, padded, grid, fluids, tissues)
     extent = _fluid_beside(surfels, padded, grid, fluids)
     is_gap = np.isin(surfels.kind, [KINDS.index(kind) for kind in ("sulcus", "falx", "tentorium")])
     is_wide = is_gap & (extent >= _WIDE_MM - 1e-6).any(axis=1)
@@ -89,7 +97,9 @@ def with_their_tissue(tissues: TissueTable, sheets: Surfels | None, known: Tissu
     return tissues if sheets is None else with_dura(tissues, sheets.kinds(), known)
 
 
-def _require_of_patient(surfels: Surfels, padded: np.ndarray, grid: Volume, fluids: tuple[int, ...]) -> None:
+def _require_of_patient(
+    surfels: Surfels, padded: np.ndarray, grid: Volume, fluids: tuple[int, ...], tissues: TissueTable
+) -> None:
     """Raise SimulationError for sheets that do not fit these labels: they would be drawn as this patient's anatomy."""
     if not len(surfels):
         return
@@ -102,22 +112,64 @@ def _require_of_patient(surfels: Surfels, padded: np.ndarray, grid: Volume, flui
 
     inside = surfels.chosen(away_mm == 0.0)
     near = max(_NEAR_MM, float(grid.spacing_mm.max()))
-    is_fluid, is_tissue, is_labelled = np.zeros((3, len(inside)), bool)
+    fluid, tissue, labelled, brain = np.zeros((4, len(inside)), bool)
+    of_brain = [label for label, tissue in tissues.items() if label and tissue.name in (_GREY, _WHITE)]
     for step in np.arange(-near, near + 1e-6, _STEP_MM):
         label = padded.ravel()[_index(grid, inside.place + step * inside.normal, padded.shape)]
-        outside = np.isin(label, (0, *fluids))
-        is_fluid |= outside
-        is_tissue |= ~outside
-        is_labelled |= label != 0
-    share = is_labelled.mean() if len(inside) else 1.0
+        is_outside = np.isin(label, (0, *fluids))
+        fluid |= is_outside
+        tissue |= ~is_outside
+        labelled |= label != 0
+        brain |= np.isin(label, (*of_brain, *fluids))
+    share = labelled.mean() if len(inside) else 1.0
     require(share >= _LEAST_LABELLED, f"only {share:.0%} of the sheets are beside labelled tissue, {expected}")
-    walls = is_labelled & (inside.kind == KINDS.index("ependyma"))
+
+    # Sulci tell more than walls, which lesions may hide, and which are alike on both sides.
+    change, count = _change_beside_sulci(inside, padded, grid, fluids, tissues)
+    if count >= _LEAST_SULCI:
+        require(
+            change >= _LEAST_CHANGE,
+            "the sheets' sulci do not lie in those of the labels: from them to white matter beside, it is "
+            f"{change:.2f} steps of fluid, grey and white matter on average, {_LEAST_CHANGE:g} or more where they do; "
+            f"{expected}",
+        )
+        return
+    walls = labelled & (inside.kind == KINDS.index("ependyma"))
+    walls &= brain | (not of_brain)  # the others are in a lesion
     if np.count_nonzero(walls) >= _LEAST_WALLS and np.isin(padded, fluids).any():
-        share = (is_fluid & is_tissue)[walls].mean()
+        share = (fluid & tissue)[walls].mean()
         require(
             share >= _LEAST_ON_WALLS,
             f"only {share:.0%} of the sheets' walls of ventricles lie where fluid of the labels ends, {expected}",
         )
+
+
+def _change_beside_sulci(
+    surfels: Surfels, padded: np.ndarray, grid: Volume, fluids: tuple[int, ...], tissues: TissueTable
+) -> tuple[float, int]:
+    """(Steps from fluid over grey to white matter, from sulci to what is beside them; number of pieces they are of).
+
+    Pieces beside other labels, as of a lesion or the skull, are left out.
+    """
+    steps = np.full(256, -1, np.int8)
+    for label, tissue in tissues.items():
+        if label:
+            steps[label] = 0 if label in fluids else {_GREY: 1, _WHITE: 2}.get(tissue.name, -1)
+    if not np.isin(padded, np.flatnonzero(steps == 2)).any():
+        return 0.0, 0
+    sulci = surfels.of_kind("sulcus")
+    first, last = _BESIDE_SULCUS_MM
+    outwards = np.arange(first, last + 1e-6, _STEP_MM)
+    means, of_brain = [], np.ones(len(sulci), bool)
+    for places in ([-_IN_SULCUS_MM, 0.0, _IN_SULCUS_MM], [*-outwards, *outwards]):
+        total = np.zeros(len(sulci))
+        for place in places:
+            found = steps[padded.ravel()[_index(grid, sulci.place + place * sulci.normal, padded.shape)]]
+            of_brain &= found >= 0
+            total += found
+        means.append(total / len(places))
+    count = int(np.count_nonzero(of_brain))
+    return float((means[1] - means[0])[of_brain].mean()) if count else 0.0, count
 
 
 def _with_margin(grid: Volume) -> Volume:

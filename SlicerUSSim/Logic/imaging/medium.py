@@ -196,7 +196,7 @@ class Medium:
         if self.sheets is None or membrane is None or membrane.thickness_mm == 0:
             return padded
         fluids = tuple(label for label in _fluid_labels(tissues, membrane) if label)
-        found = found_sheets(self.sheets, padded, self.labels, fluids, looks_of(tissues))
+        found = found_sheets(self.sheets, padded, self.labels, fluids, tissues)
         if not len(found.voxels):
             _log.debug("no sheet that was found lies in the volume")
             return padded

@@ -13,7 +13,7 @@ from SlicerUSSim.Logic.base.errors import SimulationError, require, require_betw
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.mri.ct_body import cells, find_body, pooled
 from SlicerUSSim.Logic.mri.ct_classes import BLOOD, NAMES, SKIN_MM, classified, sharpened
-from SlicerUSSim.Logic.mri.ct_organs import Organs, laid_over
+from SlicerUSSim.Logic.mri.ct_organs import Organs, laid_over, require_of_ct
 from SlicerUSSim.Logic.mri.ct_shares import border_shares
 from SlicerUSSim.Logic.mri.ct_unit import hounsfield_offset
 from SlicerUSSim.Logic.mri.filtering import estimate_noise, guided_filter
@@ -109,7 +109,7 @@ def segment_ct(
     progress : called with the completed fraction, 0 to 1; it may raise errors.Cancelled.
 
     Raises SimulationError for an image that is constant or not finite, a label map, an MRI, numbers in another unit,
-    and an image without a patient.
+    an image without a patient, and organs that do not lie in what they are made of.
 
     >>> from SlicerUSSim.Logic import segment_ct
     >>> from SlicerUSSim.Logic.verification.ct_phantoms import lumbar_spine
@@ -151,7 +151,9 @@ def segment_ct(
     report(0.85)
     names = NAMES
     if organs is not None:
-        classes, names, lines = laid_over(Organs.on(organs, ct), classes, hu, names)
+        on_ct = Organs.on(organs, ct)
+        warnings += require_of_ct(on_ct, classes, ct.voxel_ml)
+        classes, names, lines = laid_over(on_ct, classes, hu, names)
         notes += lines
         timed("organs")
     warnings += _doubts(classes, ct, noise, organs is not None)

@@ -7,10 +7,8 @@ from dataclasses import fields
 from typing import Any
 
 import numpy as np
-from vtkmodules.util.numpy_support import vtk_to_numpy
 
-from SlicerUSSim.Logic.base.errors import require
-from SlicerUSSim.Logic.mri.sheets.polydata import as_polydata, surfels_of
+from SlicerUSSim.Logic.mri.sheets.polydata import as_polydata, surfels_of, surfels_of_squares
 from SlicerUSSim.Logic.mri.sheets.surfels import KINDS, Surfels
 from SlicerUSSim.Logic.mrml.nodes import display_of, named, node_to_world, require_node
 from SlicerUSSim.Logic.mrml.own_results import SHEETS, mark_as_result
@@ -55,23 +53,7 @@ def read_sheets(model_node, world_to_labels: np.ndarray, kinds: Iterable[str]) -
     if data is None or data.GetNumberOfCells() == 0:
         return Surfels.joined([])
     surfels = surfels_of(data, f"sheets {named(model_node)}")
-    points, squares = data.GetPoints().GetData(), data.GetPolys().GetConnectivityArray()
-    corners = vtk_to_numpy(points)[np.asarray(vtk_to_numpy(squares), np.int64)]
-    require(
-        len(corners) == 4 * len(surfels),
-        f"sheets {named(model_node)} has cells that are no squares, expected a model of `ussim segment --sheets`",
+    placed = surfels_of_squares(
+        data, surfels, world_to_labels @ node_to_world(model_node), f"sheets {named(model_node)}"
     )
-    moved = world_to_labels @ node_to_world(model_node)
-    corners = corners.reshape(-1, 4, 3).astype(float) @ moved[:3, :3].T + moved[:3, 3]
-    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 3] - corners[:, 0])
-    area = np.linalg.norm(normal, axis=1)
-    volume = abs(float(np.linalg.det(moved[:3, :3])))  # of a unit cube; what is in a sheet grows by it
-    is_whole = (area > 1e-9) & (surfels.area > 1e-9)
-    thickness = surfels.thickness[is_whole] * volume * surfels.area[is_whole] / area[is_whole]
-    chosen = surfels.chosen(is_whole)
-    placed = Surfels(
-        corners[is_whole].mean(axis=1).astype(np.float32),
-        (normal[is_whole] / area[is_whole, None]).astype(np.float32),
-        thickness.astype(np.float32), chosen.confidence, area[is_whole].astype(np.float32), chosen.kind,
-    )  # fmt: skip
     return placed.of_kind(*(kind for kind in KINDS if kind in set(kinds)))

@@ -42,7 +42,7 @@ from SlicerUSSim.Logic.mri.modality import has_brain_mask, segment_image
 from SlicerUSSim.Logic.mri.pathology import add_tissues
 from SlicerUSSim.Logic.mri.segmentation import Segmentation
 from SlicerUSSim.Logic.mri.settings import SegmentationSettings
-from SlicerUSSim.Logic.mri.sheets.polydata import surfels_of
+from SlicerUSSim.Logic.mri.sheets.polydata import placed_surfels
 from SlicerUSSim.Logic.mri.sheets.surfels import KINDS, Surfels
 from SlicerUSSim.Logic.probe.arrays import Probe
 from SlicerUSSim.Logic.probe.image_grid import ImageGrid
@@ -484,7 +484,7 @@ class UltrasoundSimulationFilter(_ImageFilter):
             return None
         key = (self._sheets_data, self._sheets_data.GetMTime(), self._sheet_kinds)
         if self._sheets is None or self._sheets[0] != key:
-            self._sheets = key, surfels_of(self._sheets_data, "sheets").of_kind(*self._sheet_kinds)
+            self._sheets = key, placed_surfels(self._sheets_data, "sheets").of_kind(*self._sheet_kinds)
         return self._sheets[1]
 
     def _pose(self) -> np.ndarray:

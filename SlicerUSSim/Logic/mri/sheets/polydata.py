@@ -21,6 +21,8 @@ if TYPE_CHECKING:
 _SUFFIXES = (".vtp", ".ply")
 #: Array of a .vtp and comment of a .ply with a hash of the surface, by which a file that nobody edited is known
 _MARK = "ussim_mark"
+#: By so much the middle of a square may differ from its surfel's place, for what other programs round, mm
+_MOVED_MM = 0.05
 #: Colours of the kinds, 0 to 255
 COLOURS = ((255, 140, 26), (0, 229, 255), (77, 107, 255), (57, 230, 57))
 
@@ -160,7 +162,7 @@ def _mark_of(data: vtkPolyData) -> str:
 
 @in_child  # VTK ends the process for some damaged files
 def read_surfels(path: str | os.PathLike) -> Surfels:
-    """The surfels of a .vtp by write_surfels. Raises SimulationError for a file that is none."""
+    """The surfels of a .vtp by write_surfels, where its squares are. Raises SimulationError for a file that is none."""
     from vtkmodules.vtkIOXML import vtkXMLPolyDataReader
 
     require(Path(path).is_file(), f"{path}: no such file")
@@ -172,7 +174,7 @@ def read_surfels(path: str | os.PathLike) -> Surfels:
         file.SetFileName(str(path))
         file.Update()
         require(file.GetErrorCode() == 0, f"{path}: is damaged; copy or write it again")
-        return surfels_of(file.GetOutput(), str(path))
+        return placed_surfels(file.GetOutput(), str(path))
 
 
 def surfels_of(data: vtkPolyData, source: str) -> Surfels:
@@ -192,3 +194,50 @@ def surfels_of(data: vtkPolyData, source: str) -> Surfels:
         kind = np.uint8 if entry.name == "kind" else np.float32
         arrays.append(np.array(vtk_to_numpy(array), kind))
     return Surfels(*arrays)
+
+
+def placed_surfels(data: vtkPolyData, source: str) -> Surfels:
+    """The surfels of a surface by as_polydata in RAS, where its squares are: another program may have moved them.
+
+    Raises SimulationError as surfels_of does, and for squares that were moved and cut.
+    """
+    surfels, to_ras = surfels_of(data, source), np.eye(4)
+    space = data.GetFieldData().GetAbstractArray("SPACE")
+    if space is not None and space.GetValue(0) == "LPS":  # as Slicer writes a model; its arrays stay as they were
+        to_ras = np.diag([-1.0, -1.0, 1.0, 1.0])
+    by_squares = surfels_of_squares(data, surfels, to_ras, source)
+    same = len(by_squares) == len(surfels) and np.allclose(by_squares.place, surfels.place, rtol=0.0, atol=_MOVED_MM)
+    return surfels if same else by_squares
+
+
+def surfels_of_squares(data: vtkPolyData, surfels: Surfels, matrix: np.ndarray, source: str) -> Surfels:
+    """Surfels with the places, normals and areas of their squares after a (4, 4) linear transform.
+
+    What is in a sheet grows by its volume, and the thickness with it. Squares of no area are left out.
+    Raises SimulationError for cells that are no squares.
+    """
+    from vtkmodules.util.numpy_support import vtk_to_numpy
+
+    if not len(surfels):
+        return surfels
+    squares = np.asarray(vtk_to_numpy(data.GetPolys().GetConnectivityArray()), np.int64)
+    count = data.GetNumberOfPoints()
+    require(
+        len(squares) == 4 * len(surfels) and squares.min() >= 0 and squares.max() < count,
+        f"{source} has cells that are no squares, expected a model of `ussim segment --sheets`",
+    )
+    corners = (
+        vtk_to_numpy(data.GetPoints().GetData())[squares].reshape(-1, 4, 3).astype(float) @ matrix[:3, :3].T
+        + matrix[:3, 3]
+    )
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 3] - corners[:, 0])
+    area = np.linalg.norm(normal, axis=1)
+    volume = abs(float(np.linalg.det(matrix[:3, :3])))
+    is_whole = (area > 1e-9) & (surfels.area > 1e-9)
+    thickness = surfels.thickness[is_whole] * volume * surfels.area[is_whole] / area[is_whole]
+    chosen = surfels.chosen(is_whole)
+    return Surfels(
+        corners[is_whole].mean(axis=1).astype(np.float32),
+        (normal[is_whole] / area[is_whole, None]).astype(np.float32),
+        thickness.astype(np.float32), chosen.confidence, area[is_whole].astype(np.float32), chosen.kind,
+    )  # fmt: skip

@@ -14,7 +14,6 @@ from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.imaging.found_sheets import found_sheets
 from SlicerUSSim.Logic.mri.sheets.surfels import Surfels
 from SlicerUSSim.Logic.opencl.layout import HIT
-from SlicerUSSim.Logic.tissue.sheet_looks import looks_of
 from SlicerUSSim.Logic.tissue.table import TissueTable
 from SlicerUSSim.Logic.verification.numpy_model.beam import Beam
 from SlicerUSSim.Logic.verification.numpy_model.elementary import f32
@@ -47,7 +46,7 @@ class DrawnPlanes:
         if sheets is None or not len(sheets) or membrane is None or membrane.thickness_mm == 0:
             return None
         fluids = tuple(label for label, tissue in tissues.items() if label and tissue.name in membrane.fluids)
-        found = found_sheets(sheets, padded, grid, fluids, looks_of(tissues))
+        found = found_sheets(sheets, padded, grid, fluids, tissues)
         if not len(found.voxels):
             return None
         plane, look = found.words.T.astype(np.int64)
