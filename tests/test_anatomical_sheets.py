@@ -14,7 +14,7 @@ import pytest
 from scipy import ndimage
 from scipy.spatial import KDTree
 
-from SlicerUSSim.Logic import Segmentation, SimulationError, Volume, segment_mri
+from SlicerUSSim.Logic import Segmentation, SimulationError, TissueTable, UltrasoundSimulator, Volume, segment_mri
 from SlicerUSSim.Logic.base.errors import Cancelled
 from SlicerUSSim.Logic.mri import demo_mri, head_mri
 from SlicerUSSim.Logic.mri.atlas import mni152
@@ -518,6 +518,17 @@ def test_sheets_of_colin27_are_where_its_image_and_aal_show_them():
         normal = tentorium.normal[nearest] * np.sign(tentorium.normal[nearest][:, 2:])
         side = ((places - tentorium.place[nearest]) * normal).sum(axis=1)
         assert (sign * side[away < 8] > 0).mean() > 0.85
+    # They are his, also on slices of 5 mm, and mirrored or 6 mm aside they are not.
+    tissues = TissueTable.brain(found.tissue_names)
+    slices = Volume(found.labels.array[::5], found.labels.ijk_to_ras @ np.diag([1.0, 1.0, 5.0, 1.0]))
+    for labels in (found.labels, slices):
+        UltrasoundSimulator(labels, tissues, sheets=sheets.surfels)
+    sign = np.array([-1.0, 1.0, 1.0], np.float32)
+    mirrored = replace(sheets.surfels, place=sheets.surfels.place * sign, normal=sheets.surfels.normal * sign)
+    aside = replace(sheets.surfels, place=sheets.surfels.place + np.array([0.0, 0.0, 6.0], np.float32))
+    for wrong in (mirrored, aside):
+        with pytest.raises(SimulationError, match="the sheets' sulci do not lie in those of the labels"):
+            UltrasoundSimulator(found.labels, tissues, sheets=wrong)
 
 
 _FULL = """

@@ -180,7 +180,7 @@ def test_organs_of_another_patient_or_place_are_refused_by_the_numbers_of_the_ct
         (
             spine.ct,
             in_chest,
-            r"organs: liver: \d\d% of it is free of bone in the CT, .* 97% or more; expected a label map",
+            r"organs: liver: \d\d% of it is free of bone in the CT, expected 97% or more; give",
         ),
         (chest.ct, in_spine, r"organs: bone: 0% of its surface is beside bone in the CT, expected 70% or more; give"),
         (chest.ct, moved(in_chest, factors=(-1.0, 1.0, 1.0)), r"organs: kidney: 4\d% of it is soft tissue in the CT"),
@@ -191,10 +191,11 @@ def test_organs_of_another_patient_or_place_are_refused_by_the_numbers_of_the_ct
         with pytest.raises(SimulationError, match=message):
             segment_ct(ct, organs=organs)
     doubtful = segment_ct(chest.ct, organs=moved(in_chest, shift_mm=(0.0, 30.0, 0.0)))
-    assert any("organs: liver: 7" in line and "is the label map of this CT" in line for line in doubtful.warnings)
+    assert any("organs: liver: 8" in line and "is the label map of this CT" in line for line in doubtful.warnings)
     assert not any("of this CT" in line for line in segment_ct(chest.ct, organs=in_chest).warnings)
 
 
+@pytest.mark.slow
 def test_bones_whose_marrow_is_as_soft_as_muscle_are_those_of_the_ct():
     spine = lumbar_spine((1.0, 1.0, 2.5))
     marrow = spine.truth.array == NAMES.index("cancellous bone") + 1
@@ -204,6 +205,41 @@ def test_bones_whose_marrow_is_as_soft_as_muscle_are_those_of_the_ct():
     # Voxels of 4 mm show too little cortex to tell
     coarse = lumbar_spine((4.0, 4.0, 4.0))
     segment_ct(coarse.ct, organs=read_label_map(coarse.organs, mapping=LabelMapping.of("totalsegmentator")))
+
+
+def test_a_few_organs_are_read_by_totalsegmentators_numbers_and_checked_by_those_of_the_ct():
+    """The phantom's own 2, 5 and 14 were refused, with the advice to take them for FreeSurfer's."""
+    chest, spine = lower_chest((2.0, 2.0, 2.0)), lumbar_spine((2.0, 2.0, 2.0))
+    organs = read_label_map(chest.organs, of_ct=True)
+    found = segment_ct(chest.ct, organs=organs)
+    (line,) = (line for line in found.warnings if "taken for" in line)
+    assert "TotalSegmentator CT (2 kidney right, 5 liver, 14 lung lower lobe right); check" in line
+    assert {"liver", "kidney"} <= set(found.tissue_names) and "white matter" not in found.tissue_names
+    with pytest.raises(SimulationError, match=r"organs: liver: .* whose numbers are what they are taken for"):
+        segment_ct(spine.ct, organs=organs)
+
+    def renumbered(**labels: int) -> Volume:
+        numbers = np.zeros(200, np.int16)
+        for name, label in labels.items():
+            numbers[{"kidney": 2, "liver": 5, "lung": 14}[name]] = label
+        return chest.organs.with_array(numbers[chest.organs.array])
+
+    # 10 is a part of the lung in version 2, and the pancreas in version 1; 13 of the lung in version 1 and 2
+    two = read_label_map(renumbered(kidney=2, liver=5, lung=10), of_ct=True)
+    assert len(two.others) == 1
+    found = segment_ct(chest.ct, organs=two)
+    assert any("taken for the numbers of TotalSegmentator CT (2 kidney" in line for line in found.warnings)
+    two = read_label_map(renumbered(kidney=2, liver=10, lung=16), of_ct=True)  # pancreas and lung of version 1
+    found = segment_ct(chest.ct, organs=two)
+    assert any("taken for the numbers of TotalSegmentator CT, version 1 (" in line for line in found.warnings)
+    # Numbers that nothing of the CT can tell are not guessed, and brains' are none of a CT
+    for labels in ({"kidney": 2, "liver": 5}, {"lung": 14}, {"kidney": 1, "liver": 2, "lung": 3}):
+        with pytest.raises(SimulationError, match=r"may be those of TotalSegmentator CT .* --map totalseg") as error:
+            read_label_map(renumbered(**labels), of_ct=True)
+        assert "FreeSurfer" not in str(error.value)
+    with pytest.raises(SimulationError, match="no program's numbers are recognised") as error:
+        read_label_map(renumbered(kidney=150, liver=151, lung=152), of_ct=True)
+    assert "FreeSurfer" not in str(error.value)
 
 
 # ---- units and bad input ---------------------------------------------------------------------------------------------

@@ -15,7 +15,7 @@ from SlicerUSSim.Logic.imaging.noise import seed_of_pose  # noqa: E402
 from SlicerUSSim.Logic.mri.settings import SheetSettings  # noqa: E402
 from SlicerUSSim.Logic.mri.sheets import KINDS, Surfels, find_sheets  # noqa: E402
 from SlicerUSSim.Logic.mri.sheets.finding import ALL_KINDS  # noqa: E402
-from SlicerUSSim.Logic.mrml.label_nodes import write_labels  # noqa: E402
+from SlicerUSSim.Logic.mrml.label_nodes import read_labels, write_labels  # noqa: E402
 from SlicerUSSim.Logic.mrml.nodes import node_to_world, write_volume  # noqa: E402
 from SlicerUSSim.Logic.mrml.sheet_nodes import read_sheets, sheets_version, write_sheets  # noqa: E402
 from SlicerUSSim.Logic.tissue.presets import TISSUES  # noqa: E402
@@ -210,6 +210,17 @@ def test_organs_of_a_ct_are_laid_over_its_tissues_wherever_their_node_lies(kind)
     assert len(presenter.view.errors) == 1 and "organs: liver" in presenter.notes()
     laid = bench.voxels("liver", parameters.labels)
     assert 0.6 * liver.array.sum() < laid <= liver.array.sum()
+
+
+def test_organs_without_names_are_read_by_totalsegmentators_numbers_whatever_tissues_there_are():
+    """After Segment of a CT, they were taken for the tissues that it had found: a kidney for fat."""
+    bench, phantom = Scene(), coarse_chest()
+    organs = bench.add("LabelMapVolume", "organs")
+    write_volume(organs, phantom.organs)
+    for tissues in (bench.logic.preset.tissues, TissueTable.named(("skin", "fat", "muscle", "blood", "bone"))):
+        found = read_labels(organs, tissues, of_ct=True)
+        assert found.names == ("kidney", "liver", "lung")
+        assert "taken for the numbers of TotalSegmentator CT (2 kidney right" in found.taken_for
 
 
 # ---- lesions that are proposed ---------------------------------------------------------------------------------------

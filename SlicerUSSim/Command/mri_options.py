@@ -128,8 +128,9 @@ def _read_organs(path: str, maps: Iterable[str]) -> LabelledTissues:
     from SlicerUSSim.Logic.tissue.table import TissueTable
 
     table = TissueTable({})
-    found = read_label_file(Path(path), Volume.read(path), LabelMapping.of(maps, table), default=table)
-    note(f"{path}: {found.message}")
+    found = read_label_file(Path(path), Volume.read(path), LabelMapping.of(maps, table), default=table, of_ct=True)
+    if not found.others:
+        note(f"{path}: {found.message}")
     for warning in found.warnings:
         if "--map 0=" in warning:  # between organs the CT says what is there
             continue

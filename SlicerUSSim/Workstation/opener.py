@@ -35,7 +35,7 @@ from SlicerUSSim.Logic.mrml.scene_record import SceneRecord, SequenceRecord
 from SlicerUSSim.Logic.mrml.sequence_nodes import add_sequence
 from SlicerUSSim.Logic.mrml.taken_image import PATIENT, patient_of
 from SlicerUSSim.Logic.probe.arrays import Probe
-from SlicerUSSim.Logic.tissue.label_advice import PAGE
+from SlicerUSSim.Logic.tissue.label_advice import ORGANS_PAGE, PAGE
 from SlicerUSSim.Logic.tissue.label_mapping import LabelMapping
 from SlicerUSSim.Logic.tissue.label_maps import LabelledTissues, as_whole
 from SlicerUSSim.Logic.tissue.label_sources import read_label_file, table_beside
@@ -189,7 +189,10 @@ class Opener:
         """(label map node with the organs of a CT, what was recognised) of a file."""
         volume, table = self._volume(path), TissueTable({})
         mapping = LabelMapping.of(maps, table)
-        found = self._tasks.doAside(lambda: read_label_file(Path(path), volume, mapping, default=table, advice=PAGE))
+        found = self._tasks.doAside(
+            lambda: read_label_file(Path(path), volume, mapping, default=table, of_ct=True, advice=ORGANS_PAGE)
+        )
+        require(not found.others, found.ambiguity)  # a node has one name for each label
         return self._label_map(found.labels, path, found.names), replace(found, message=self.as_known(found.message))
 
     def second_mri(self, path: str):

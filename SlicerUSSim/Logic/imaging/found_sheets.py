@@ -25,8 +25,8 @@ _GREY, _WHITE = "grey matter", "white matter"
 _OWN_MM = 1.0
 #: A sulcus has fluid and grey matter in it, within the first distance along its normal, and white matter beside it,
 #: between the others, mm. From there to here it is 0.8 to 1.1 steps of fluid, grey and white matter for sheets of six
-#: MRIs on their own labels (0.4 to 0.9 on slices and voxels of 5 mm, 0.7 on those of another MRI of the same patient),
-#: -0.03 to 0.03 for those of others, 0.04 to 0.13 for mirrored ones, and 0.01 to 0.23 for those shifted by 4 mm.
+#: MRIs on their own labels (0.37 to 0.9 on slices and voxels of 5 mm, 0.7 on those of another MRI of the same patient),
+#: -0.03 to 0.03 for those of others, 0.04 to 0.15 for mirrored ones, and 0.01 to 0.23 for those shifted by 4 mm.
 _IN_SULCUS_MM, _BESIDE_SULCUS_MM, _LEAST_CHANGE = 0.5, (4.0, 5.0), 0.3
 #: So many pieces of sulci tell; of fewer, the walls of ventricles do
 _LEAST_SULCI = 2000

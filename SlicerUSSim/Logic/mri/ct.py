@@ -13,7 +13,7 @@ from SlicerUSSim.Logic.base.errors import SimulationError, require, require_betw
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.mri.ct_body import cells, find_body, pooled
 from SlicerUSSim.Logic.mri.ct_classes import BLOOD, NAMES, SKIN_MM, classified, sharpened
-from SlicerUSSim.Logic.mri.ct_organs import Organs, laid_over, require_of_ct
+from SlicerUSSim.Logic.mri.ct_organs import laid_over, organs_of_ct
 from SlicerUSSim.Logic.mri.ct_shares import border_shares
 from SlicerUSSim.Logic.mri.ct_unit import hounsfield_offset
 from SlicerUSSim.Logic.mri.filtering import estimate_noise, guided_filter
@@ -151,8 +151,8 @@ def segment_ct(
     report(0.85)
     names = NAMES
     if organs is not None:
-        on_ct = Organs.on(organs, ct)
-        warnings += require_of_ct(on_ct, classes, ct.voxel_ml)
+        on_ct, lines = organs_of_ct(organs, classes, ct)
+        warnings += lines
         classes, names, lines = laid_over(on_ct, classes, hu, names)
         notes += lines
         timed("organs")

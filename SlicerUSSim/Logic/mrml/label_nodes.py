@@ -131,13 +131,13 @@ def labels_version(labels_node) -> Hashable:
     )
 
 
-def read_labels(labels_node, tissues: TissueTable) -> LabelledTissues:
+def read_labels(labels_node, tissues: TissueTable, *, of_ct: bool = False) -> LabelledTissues:
     """The content of a label map or segmentation, with one label for every tissue of its names.
 
     The names are those of segments, or of a label map's colours. They are looked up in `tissues`, then in the presets.
     A label whose colour has no tissue's name, or only the name in Slicer's default table, is the tissue with that
     label in `tissues`; if these are the brain's, or do not have it, the numbers of other programs are recognised
-    (label_maps.read_label_map).
+    (label_maps.read_label_map). With `of_ct` it has organs of a CT, whose numbers are not those of `tissues`.
     Raises SimulationError for a node without voxels or segments, for unknown names, which it lists, and for a mask or
     lesion without a patient.
     """
@@ -148,11 +148,12 @@ def read_labels(labels_node, tissues: TissueTable) -> LabelledTissues:
     else:
         volume = read_volume(labels_node, "label map")
         names = _colour_names(labels_node, volume)
-        if tuple(tissues.names()) != _OF_EVERY_BRAIN:  # somebody chose which tissue has which number
+        if not of_ct and tuple(tissues.names()) != _OF_EVERY_BRAIN:  # somebody chose which tissue has which number
             by_number = tissues
     found = read_label_map(
-        volume, names, source=named(labels_node), tissues=tissues, by_number=by_number, renumber=True, advice=SCENE
-    )
+        volume, names, source=named(labels_node), tissues=tissues, by_number=by_number, renumber=True, of_ct=of_ct,
+        advice=SCENE,
+    )  # fmt: skip
     _log.info("%s: %s", named(labels_node), found.message)
     for warning in found.warnings:
         _log.warning("%s", warning)

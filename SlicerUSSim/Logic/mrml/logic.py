@@ -1031,9 +1031,13 @@ class UltrasoundSceneLogic:
             f"{named(organs_node)} has organs of a CT, and the contrast is {contrast}; choose ct, or no organs",
         )
         require_node(organs_node, *LABEL_CLASSES, use="organs")
-        found = read_labels(organs_node, self.preset.tissues)
         to_mri = np.linalg.inv(node_to_world(mri_node)) @ node_to_world(organs_node)
-        return replace(found, labels=Volume(found.labels.array, to_mri @ found.labels.ijk_to_ras))
+
+        def in_frame_of_mri(found: LabelledTissues) -> LabelledTissues:
+            labels = Volume(found.labels.array, to_mri @ found.labels.ijk_to_ras)
+            return replace(found, labels=labels, others=tuple(map(in_frame_of_mri, found.others)))
+
+        return in_frame_of_mri(read_labels(organs_node, self.preset.tissues, of_ct=True))
 
     def _sheets_of(self, labels_node) -> Surfels | None:
         """The chosen sheets of the kinds that are ticked, in the frame of the simulator's labels; None without any."""

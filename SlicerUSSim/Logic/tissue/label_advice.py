@@ -98,6 +98,8 @@ PAGE = replace(
     one_tissue="{tissue!r}",
     several_tissues=repr(PAGE_SEVERAL),
 )
+#: The same for organs of a CT
+ORGANS_PAGE = replace(PAGE, ambiguous="start ussim serve CT --ct --organs FILE with --map {key}")
 #: 3D Slicer
 SCENE = Advice(
     unknown="rename to one of",

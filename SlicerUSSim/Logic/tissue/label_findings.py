@@ -19,7 +19,7 @@ from SlicerUSSim.Logic.tissue.label_advice import Advice
 from SlicerUSSim.Logic.tissue.label_mapping import LabelMapping
 from SlicerUSSim.Logic.tissue.names import nearest_tissue, same_name, tissue_named
 from SlicerUSSim.Logic.tissue.presets import TISSUES
-from SlicerUSSim.Logic.tissue.schemes import Scheme, schemes
+from SlicerUSSim.Logic.tissue.schemes import Scheme, schemes, schemes_of_ct
 from SlicerUSSim.Logic.tissue.table import TissueTable
 from SlicerUSSim.Logic.tissue.tissue import Tissue
 
@@ -63,6 +63,8 @@ class Findings:
     mapping: LabelMapping
     tissues: TissueTable
     advice: Advice
+    #: Whether it is of organs of a CT
+    of_ct: bool = False
 
     @property
     def is_mapped(self) -> bool:
@@ -136,7 +138,8 @@ class Findings:
 
     def _if_of_a_program(self, labels: list[int]) -> str:
         """Which programs have all these numbers, though they are too few to be recognised, and how to say so."""
-        programs = [scheme for scheme in schemes().values() if scheme.order and set(labels) <= set(scheme.names)]
+        known = schemes_of_ct() if self.of_ct else schemes().values()
+        programs = [scheme for scheme in known if scheme.order and set(labels) <= set(scheme.names)]
         if not programs or len(labels) > _TOO_FEW:
             return ""
         first = programs[0]

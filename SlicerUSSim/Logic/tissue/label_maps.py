@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from SlicerUSSim.Logic.base.errors import SimulationError, require, require_kind
+from SlicerUSSim.Logic.base.errors import SimulationError, either, require, require_kind
 from SlicerUSSim.Logic.base.label_numbers import whole_numbers
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.tissue.body_orientation import has_exchanged_sides, places_of, wrong_body
@@ -21,7 +21,7 @@ from SlicerUSSim.Logic.tissue.label_findings import UNNAMED, Findings, listed
 from SlicerUSSim.Logic.tissue.label_mapping import LabelMapping
 from SlicerUSSim.Logic.tissue.names import nearest_tissue, plain_name, tissue_named
 from SlicerUSSim.Logic.tissue.presets import TISSUES
-from SlicerUSSim.Logic.tissue.schemes import Scheme, recognised, scheme_with_names, schemes, title_of
+from SlicerUSSim.Logic.tissue.schemes import Scheme, recognised, recognised_in_ct, scheme_with_names, schemes, title_of
 from SlicerUSSim.Logic.tissue.table import MAX_LABEL, TissueTable
 from SlicerUSSim.Logic.tissue.tissue import Tissue
 from SlicerUSSim.Logic.tissue.upright import wrong_way_up
@@ -31,6 +31,8 @@ _log = logging.getLogger(__name__)
 LARGEST_LABEL = 99_999
 #: Smallest distance of a label from a whole number that is said
 _WORTH_ROUNDING = 0.01
+#: Fewer labels are not taken for a program's organs; and tissues that the numbers of a CT can tell from most others
+_FEWEST_ORGANS, _TELLING = 2, ("lung", "bone")
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,6 +51,12 @@ class LabelledTissues:
     warnings: tuple[str, ...] = ()
     #: Whether the labels are as they were, with a tissue table that was made for them
     has_own_table: bool = False
+    #: By which numbers organs of a CT were read, if too few are known by their places; segment_ct checks it
+    taken_for: str = ""
+    #: The same numbers as other programs' organs, of which the CT's numbers have to tell the right ones, and how a user
+    #: says which they are
+    others: tuple[LabelledTissues, ...] = ()
+    ambiguity: str = ""
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -66,6 +74,7 @@ def read_label_map(
     tissues: TissueTable | None = None,
     by_number: TissueTable | None = None,
     renumber: bool = False,
+    of_ct: bool = False,
     advice: Advice = COMMAND,
 ) -> LabelledTissues:
     """The tissues of a label map: by the user's mapping, by names, by a table, or by the numbers of a known program.
@@ -80,6 +89,8 @@ def read_label_map(
     by_number : a table made for this label map; used for labels without a name. If it has every label, and there are
         no names, labels are not renumbered.
     renumber : renumber them also then, from 1.
+    of_ct : it has organs of a CT: programs for brains are not thought of, and a few numbers of TotalSegmentator are
+        taken for its organs, with alternatives, since segment_ct checks them by the numbers of the CT.
     advice : remedies in messages.
 
     Raises SimulationError for numbers that are no labels, labels without a tissue, which it lists, numbers that fit
@@ -98,7 +109,7 @@ def read_label_map(
     require_kind("label map", volume, Volume, "Volume.read reads a file")
     reading = _Reading(
         as_whole(volume, source), names or {}, mapping or LabelMapping(), source,
-        tissues or by_number or TissueTable.brain(), by_number, advice,
+        tissues or by_number or TissueTable.brain(), by_number, advice, of_ct,
     )  # fmt: skip
     found = (None if renumber else reading.unchanged()) or reading.by_tissue()
     off = 0.0 if np.issubdtype(volume.array.dtype, np.integer) else _largest_fraction(volume.array)
@@ -136,8 +147,9 @@ class _Reading:
 
     def __init__(
         self, volume: Volume, names: Mapping[int, str], mapping: LabelMapping, source: str, tissues: TissueTable,
-        by_number: TissueTable | None, advice: Advice,
+        by_number: TissueTable | None, advice: Advice, of_ct: bool,
     ) -> None:  # fmt: skip
+        self._of_ct = of_ct
         self._volume, self._mapping, self._source, self._advice = volume, mapping, source, advice
         self._tissues, self._by_number = tissues, by_number
         self._counts = np.bincount(volume.array.ravel())
@@ -160,12 +172,19 @@ class _Reading:
     def by_tissue(self) -> LabelledTissues:
         """Labels renumbered from 1, one for each tissue, in the order of their first labels."""
         self._require_background()
-        scheme = self._scheme()
+        if self._of_ct:
+            organs = self._organs()
+            if organs is not None:
+                return organs
+        return self._by_scheme(self._scheme())
+
+    def _by_scheme(self, scheme: Scheme | None) -> LabelledTissues:
+        """By the numbers of a program, for labels that have no name."""
         names = {label: self._names.get(label, scheme.names.get(label) if scheme else None) for label in self._present}
         found = {label: self._tissue(label, name) for label, name in names.items()}
         findings = Findings(
             self._source, self._volume, self._counts, names, found,
-            scheme or scheme_with_names(self._names), self._mapping, self._tissues, self._advice,
+            scheme or scheme_with_names(self._names), self._mapping, self._tissues, self._advice, self._of_ct,
         )  # fmt: skip
         findings.require_patient()
         findings.require_known()
@@ -228,15 +247,53 @@ class _Reading:
 
     # ---- what it is --------------------------------------------------------------------------------------------
 
+    def _without_meaning(self) -> tuple[list[int], Volume]:
+        """(labels that neither a name nor the user says anything about, the label map without those left out)"""
+        unknown = [label for label in self._present if self._tissue(label, self._names.get(label)) is None]
+        left_out = [label for label, name in self._mapping.by_label.items() if name == "coupling"]
+        kept = self._volume.with_array(np.where(np.isin(self._volume.array, left_out), 0, self._volume.array))
+        return unknown, kept
+
+    def _organs(self) -> LabelledTissues | None:
+        """Organs of a CT by their numbers alone; None if the user or names say what they are, or nothing is known."""
+        unknown, kept = self._without_meaning()
+        if self._mapping.scheme or not unknown or (self._names and len(unknown) < len(self._present)):
+            return None
+        found, is_sure = recognised_in_ct(kept, unknown)
+        readings: dict[tuple[str | None, ...], Scheme] = {}
+        for scheme in found:
+            tissues = (self._named(scheme.names[label]) if label in scheme.names else None for label in unknown)
+            readings.setdefault(tuple(None if tissue is None else tissue.name for tissue in tissues), scheme)
+        if not readings:
+            return None
+        titles = either([self._with_names(scheme, unknown) for scheme in readings.values()])
+        first = next(iter(readings.values()))
+        remedy = self._advice.ambiguous.format(key=first.key)
+        ambiguity = f"{self._source}: labels {listed(unknown)} may be those of {titles}; {remedy}"
+        tells = any(tissue in _TELLING for tissues in readings for tissue in tissues)
+        if not is_sure and (len(unknown) < _FEWEST_ORGANS or not tells):
+            otherwise = self._advice.unknown.format(label=unknown[0])
+            raise SimulationError(f"{ambiguity}; or {otherwise}: {', '.join(TISSUES)}")
+        result = []
+        for scheme in readings.values():
+            of_scheme = self._by_scheme(scheme)
+            if not is_sure or len(readings) > 1:
+                line = f"{self._source}: taken for the numbers of {self._with_names(scheme, unknown)}; check them"
+                of_scheme = replace(of_scheme, taken_for=line)
+            result.append(of_scheme)
+        return replace(result[0], others=tuple(result[1:]), ambiguity=ambiguity if len(result) > 1 else "")
+
+    def _with_names(self, scheme: Scheme, labels: list[int]) -> str:
+        called = listed([f"{label} {plain_name(scheme.names.get(label, 'unknown'))}" for label in labels], 6)
+        return f"{scheme.title} ({called})"
+
     def _scheme(self) -> Scheme | None:
         """The numbering scheme, if some labels have neither a name nor a tissue of the user's."""
         if self._mapping.scheme:
             return schemes()[self._mapping.scheme]
-        unknown = [label for label in self._present if self._tissue(label, self._names.get(label)) is None]
-        if not unknown or (self._names and len(unknown) < len(self._present)):
+        unknown, kept = self._without_meaning()
+        if not unknown or self._of_ct or (self._names and len(unknown) < len(self._present)):
             return None
-        left_out = [label for label, name in self._mapping.by_label.items() if name == "coupling"]
-        kept = self._volume.with_array(np.where(np.isin(self._volume.array, left_out), 0, self._volume.array))
         recognition = recognised(kept, unknown)
         if recognition.candidates:
             titles = " and ".join(scheme.title for scheme in recognition.candidates)

@@ -85,6 +85,7 @@ def read_label_file(
     table: TissueTable | None = None,
     preset: TissueTable | None = None,
     default: TissueTable | None = None,
+    of_ct: bool = False,
     advice: Advice = COMMAND,
 ) -> LabelledTissues:
     """The tissues of a label map that was read from a file.
@@ -97,6 +98,7 @@ def read_label_file(
     table : given for this label map (--tissues).
     preset : of a preset that the user gave; then the table beside the file is not used.
     default : tissues by their names, and the membrane, if neither of them is given.
+    of_ct : as of read_label_map.
 
     Raises SimulationError as read_label_map does.
     """
@@ -120,8 +122,9 @@ def read_label_file(
     elif own is None and not names and preset is not None and all(label in preset for label in present if label):
         by_number = preset
     found = read_label_map(
-        volume, names, mapping, source=str(path), tissues=own or preset or default, by_number=by_number, advice=advice
-    )
+        volume, names, mapping, source=str(path), tissues=own or preset or default, by_number=by_number, of_ct=of_ct,
+        advice=advice,
+    )  # fmt: skip
     return replace(found, message=f"{found.message}, named in {where}") if names else found
 
 

@@ -45,6 +45,10 @@ _LARGEST_BRAIN_ML = 3000.0
 _SHALLOW = 0.7
 
 
+#: Schemes of organs in a CT
+_OF_CT = ("totalsegmentator", "totalsegmentator-v1")
+
+
 @dataclass(frozen=True)
 class Scheme:
     """The numbering of one program."""
@@ -146,6 +150,29 @@ def recognised(labels: Volume, values: list[int]) -> Recognition:
     if len({tuple(scheme.names.get(value) for value in values) for scheme in best}) > 1:
         return Recognition(None, tuple(best))
     return Recognition(best[0])
+
+
+def schemes_of_ct() -> list[Scheme]:
+    """Those that number organs of a CT; brains' are none."""
+    return [schemes()[key] for key in _OF_CT]
+
+
+def recognised_in_ct(labels: Volume, values: list[int]) -> tuple[tuple[Scheme, ...], bool]:
+    """(schemes of organs that a label map with these labels may have, whether the places of organs leave no doubt).
+
+    Parameters
+    ----------
+    labels : (k, j, i) whole numbers.
+    """
+    centres, fits = label_centres(labels), []
+    for scheme in schemes_of_ct():
+        holds, _, count = _agreement(scheme.order, centres)
+        if np.mean([value in scheme.names for value in values]) >= _KNOWN and holds >= _AGREEING * count:
+            fits.append((holds, count, scheme))
+    sure = [fit for fit in fits if fit[1] >= _FEWEST]
+    most = max((holds for holds, _, _ in sure), default=0)
+    best = tuple(scheme for holds, _, scheme in sure if holds == most)
+    return (best, True) if best else (tuple(scheme for _, _, scheme in fits), False)
 
 
 def _freesurfer(
