@@ -23,7 +23,7 @@ _OPEN_SHARE = 0.1
 _BEHIND_MM, _COVERED_MM = 10.0, 1.0
 #: Brain is looked for so far from a face, mm
 _BRAIN_MM = 60.0
-_STEP_MM = 0.5
+_STEP_MM, _COVER_STEP_MM = 0.5, 1.0
 _LINES = 33
 _BONE, _BRAIN = 1, 2
 
@@ -97,18 +97,15 @@ def _closed_mm_and_db(
 
 def _misfit(labels: Volume, names: Sequence[str], probe: Probe, pose: np.ndarray) -> str:
     """A line about a face, the middle of which is in an opening, that bone covers in part; "" for others."""
+    is_covered, sees_brain = _under(labels, names, pose, np.zeros((1, 3)))
+    if is_covered[0] or not sees_brain[0]:  # most poses: looked up before the other places, since live images wait
+        return ""
     lines = []
     count = 2 * int(np.ceil(probe.face_mm)) + 1
     across = probe.face_points_mm(np.linspace(-0.5, 0.5, count) * probe.face_mm)
     high = np.linspace(-0.5, 0.5, count)[:, None] * [0.0, 0.0, probe.elevation_aperture_mm]
     for points, size, side in ((across, probe.face_mm, "wide"), (high, probe.elevation_aperture_mm, "thick")):
-        depth = np.arange(-_BEHIND_MM, _BRAIN_MM, _STEP_MM)
-        kinds = _kinds(names)[_labels_at(labels, pose, points[:, None] + depth[:, None] * [0.0, 1.0, 0.0])]
-        is_covered = _bone_before_brain(kinds).sum(axis=1) * _STEP_MM >= 1.0
-        middle = count // 2
-        if is_covered[middle] or not (kinds[middle] == _BRAIN).any():
-            return ""
-        covered = float(is_covered.mean() * size)
+        covered = float(_under(labels, names, pose, points)[0].mean() * size)
         if covered >= _COVERED_MM:
             lines.append((covered, size, side))
     if not lines:
@@ -118,6 +115,14 @@ def _misfit(labels: Volume, names: Sequence[str], probe: Probe, pose: np.ndarray
         f"the face of the probe is {size:.0f} mm {side} and does not fit the opening, which leaves "
         f"{size - covered:.0f} mm of it free: expect black sectors where it lies on bone or lifts off"
     )
+
+
+def _under(labels: Volume, names: Sequence[str], pose: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(bone covers it, there is brain below), each (n,) bool, of (n, 3) places of a face."""
+    depth = np.arange(-_BEHIND_MM, _BRAIN_MM, _COVER_STEP_MM)
+    kinds = _kinds(names)[_labels_at(labels, pose, points[:, None] + depth[:, None] * [0.0, 1.0, 0.0])]
+    is_covered = _bone_before_brain(kinds).sum(axis=1) * _COVER_STEP_MM >= _COVERED_MM
+    return is_covered, (kinds == _BRAIN).any(axis=1)
 
 
 def _kinds(names: Sequence[str]) -> np.ndarray:
