@@ -103,6 +103,21 @@ def test_optimize_writes_result_report_preset_and_state(folder):
         (folder / name).write_text(own)
 
 
+@pytest.mark.parametrize(
+    "command",
+    [("optimize", "--evaluations", 1, "--restarts", 0, "-o", "o.json"), ("sweep", "-o", "o.igs.mha")],
+    ids=lambda command: command[0],
+)
+def test_a_probe_off_the_patient_is_said_before_its_black_images_are_compared(command, folder, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    write_json(tmp_path / "off.json", rigid_from([300.0, 0.0, 0.0, 0.0, 0.0, 0.0]).tolist())
+    done = ussim(
+        *command, folder / "labels.nii.gz", "--sequence", folder / "tracked.igs.mha", "--probe", folder / "probe.json",
+        "--contact-gap", 3, "--to-mri", tmp_path / "off.json",
+    )  # fmt: skip
+    assert "in 3 of 3 images 0% of the probe's face touches the patient (contact gap: 3 mm)" in done.stderr
+
+
 @pytest.mark.parametrize("name", ["o.igs.mha", "o.nrrd"])
 def test_sweep_replaces_only_what_it_wrote(name, folder, tmp_path):
     out, field = tmp_path / name, tmp_path / "field.png"

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import click
 
 from SlicerUSSim.Command.options import declared
-from SlicerUSSim.Command.patient_options import Examination, PatientOptions, open_examination
+from SlicerUSSim.Command.patient_options import Examination, PatientOptions, open_examination, say_contact
 from SlicerUSSim.Command.progress import note
 from SlicerUSSim.Logic.base.errors import SimulationError
 
@@ -133,6 +133,7 @@ def open_tracked(
         images, others = images.split(beside)
     if recording.field:
         draw_field(recording.field, sequence.images[images.numbers[0]], images.field)
+    say_contact(examination, images.probe, images.poses if others is None else [*images.poses, *others.poses])
     return TrackedExamination(examination, sequence, images, others, to_ras)
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import click
 
 from SlicerUSSim.Command.options import check_outputs, gathered
-from SlicerUSSim.Command.patient_options import PatientOptions, say_contact
+from SlicerUSSim.Command.patient_options import PatientOptions
 from SlicerUSSim.Command.progress import Share, note
 from SlicerUSSim.Command.sequence_options import SequenceOptions, open_tracked
 
@@ -31,7 +31,6 @@ def sweep(patient: PatientOptions, recording: SequenceOptions, out: Path) -> Non
     tracked = open_tracked(patient, recording)
     simulator, display = tracked.examination.simulator, tracked.examination.display
     real = tracked.images
-    say_contact(tracked.examination, real.probe, real.poses)
     rows, columns = real.field.mask.shape
     simulated = np.zeros((len(real.poses), rows, columns), np.uint8)
     with Share("sweep") as progress:
