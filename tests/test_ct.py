@@ -346,6 +346,19 @@ def test_the_command_segments_a_ct_with_organs(tmp_path, chest, capsys):
     assert table.membrane is not None and "coupling" not in table.membrane.fluids
 
 
+@pytest.mark.parametrize(("name", "organ"), [("kidney_left", "kidney"), ("mask", "liver")])
+def test_a_mask_of_one_organ_is_not_a_lesion(chest, tmp_path, capsys, name, organ):
+    """TotalSegmentator writes a file for each; the advice was to add it to an MRI."""
+    chest.ct.write(tmp_path / "ct.nii.gz")
+    Volume((chest.organs.array == 5).astype(np.uint8), chest.organs.ijk_to_ras).write(tmp_path / f"{name}.nii.gz")
+    files = [str(tmp_path / "ct.nii.gz"), "--ct", "--organs", str(tmp_path / f"{name}.nii.gz")]
+    with pytest.raises(SystemExit) as ended:
+        cli(["segment", *files, "-o", str(tmp_path / "labels.nii.gz")])
+    told = capsys.readouterr().err
+    assert ended.value.code == 2 and ": a binary mask (" in told
+    assert told.rstrip().endswith(f"say which organ it is with --map 1={organ}")
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [

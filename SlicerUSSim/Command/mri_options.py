@@ -123,12 +123,15 @@ def _read_organs(path: str, maps: Iterable[str]) -> LabelledTissues:
     import logging
 
     from SlicerUSSim.Logic.base.volume import Volume
+    from SlicerUSSim.Logic.tissue.label_advice import ORGANS_COMMAND
     from SlicerUSSim.Logic.tissue.label_mapping import LabelMapping
     from SlicerUSSim.Logic.tissue.label_sources import read_label_file
     from SlicerUSSim.Logic.tissue.table import TissueTable
 
     table = TissueTable({})
-    found = read_label_file(Path(path), Volume.read(path), LabelMapping.of(maps, table), default=table, of_ct=True)
+    found = read_label_file(
+        Path(path), Volume.read(path), LabelMapping.of(maps, table), default=table, of_ct=True, advice=ORGANS_COMMAND
+    )
     if not found.others:
         note(f"{path}: {found.message}")
     for warning in found.warnings:

@@ -28,6 +28,8 @@ class Advice:
         "if it is the mask of a brain, give it with that brain's MRI as --mask {source}; or simulate it alone with "
         "{maps} (ussim simulate)"
     )
+    #: A tissue that a mask may be of whose name tells none
+    mask_tissue: str = "tumour"
     #: About numbers that several programs use; {key} is one of them
     ambiguous: str = "say which with --map {key}"
     #: About numbers whose tissues are likely, but not certain; {maps} are options
@@ -98,8 +100,15 @@ PAGE = replace(
     one_tissue="{tissue!r}",
     several_tissues=repr(PAGE_SEVERAL),
 )
-#: The same for organs of a CT
-ORGANS_PAGE = replace(PAGE, ambiguous="start ussim serve CT --ct --organs FILE with --map {key}")
+_SAY_ORGAN = "say which organ it is with {maps}"
+#: Organs of a CT: a mask of one of them is not a lesion
+ORGANS_COMMAND = replace(COMMAND, lesion=_SAY_ORGAN, brain_mask=_SAY_ORGAN, mask_tissue="liver")
+_OPEN_ORGAN = "open it together with a .json file that says which organ it is, such as {maps}"
+#: The same on the page
+ORGANS_PAGE = replace(
+    PAGE, lesion=_OPEN_ORGAN, brain_mask=_OPEN_ORGAN, mask_tissue="liver",
+    ambiguous="start ussim serve CT --ct --organs FILE with --map {key}",
+)  # fmt: skip
 #: 3D Slicer
 SCENE = Advice(
     unknown="rename to one of",

@@ -100,7 +100,7 @@ class Findings:
             what = f"a lesion ({', '.join(names)}; {size})"
         else:
             return
-        of_file = _tissue_of_file(self.source) or "tumour"
+        of_file = _tissue_of_file(self.source) or self.advice.mask_tissue
         pairs = zip(self.names, known, strict=True)
         maps = self.advice.maps(f"{label}={tissue or of_file}" for label, tissue in pairs)
         is_brats = self.scheme is not None and self.scheme.is_lesion
@@ -270,4 +270,4 @@ def _tissue_of_file(source: str) -> str | None:
     try:
         return tissue_named(name).name
     except SimulationError:
-        return None
+        return nearest_tissue(name)

@@ -259,6 +259,8 @@ class _Reading:
         unknown, kept = self._without_meaning()
         if self._mapping.scheme or not unknown or (self._names and len(unknown) < len(self._present)):
             return None
+        if unknown == [1]:  # no number, but the mask of any organ: the spleen's is one of many that are 1
+            return None
         found, is_sure = recognised_in_ct(kept, unknown)
         readings: dict[tuple[str | None, ...], Scheme] = {}
         for scheme in found:
