@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from SlicerUSSim.Logic import Volume
-from SlicerUSSim.Logic.mri.aiming import FARTHEST_DEG, LESION_GROUPS, opening_pose
+from SlicerUSSim.Logic.mri.aiming import FARTHEST_DEG, opening_pose
 from SlicerUSSim.Logic.mri.bone_before_probe import CLOSED_DB, COMMAND, SCENE, about_bone
 from SlicerUSSim.Logic.mri.craniotomy import default_pose, disc_opening, middle_of, opened, without_outside
-from SlicerUSSim.Logic.mri.pathology import LESIONS
+from SlicerUSSim.Logic.mri.pathology import LESION_GROUPS, LESIONS, add_tissues
 from SlicerUSSim.Logic.mri.views import view_pose
 from SlicerUSSim.Logic.probe import PROBES, ConvexProbe, LinearProbe, Probe
 from SlicerUSSim.Logic.probe.placement import pose_looking_at, turned
@@ -54,6 +54,20 @@ def test_a_probe_in_an_opening_looks_at_the_tumour_below_it(head):  # noqa: F811
     np.testing.assert_allclose(upright[:3, 1], [0.0, 0.0, -1.0], atol=0.03)  # without a lesion along the normal
     angle = np.rad2deg(np.arccos(pose[:3, 1] @ upright[:3, 1]))
     assert line == f"aimed at the tumour, {angle:.0f} degrees off the surface's normal" and 20.0 < angle < 30.0
+
+
+@pytest.mark.parametrize("order", [("tumour", "oedema"), ("oedema", "tumour")])
+def test_of_what_was_laid_over_a_tumour_comes_before_its_larger_oedema(head, order):  # noqa: F811
+    """The probe was aimed at the oedema, which surrounds the tumour on one side, or at nothing, as it was too far."""
+    place = {"tumour": np.array([10.0, 8.0, 35.0]), "oedema": np.array([-14.0, 0.0, 20.0])}
+    masks = {
+        name: head.with_array((np.linalg.norm(places_of(head) - place[name], axis=-1) <= radius).astype(np.uint8))
+        for name, radius in (("tumour", 6.0), ("oedema", 14.0))
+    }
+    added = add_tissues(head, NAMES, [(name, masks[name], name) for name in order], has_brain_mask=False)
+    np.testing.assert_allclose(added.centre_ras(head), place["tumour"], atol=3.0)
+    alone = add_tissues(head, NAMES, [("oedema", masks["oedema"], "oedema")], has_brain_mask=False)
+    np.testing.assert_allclose(alone.centre_ras(head), place["oedema"], atol=3.0)
 
 
 @pytest.mark.parametrize("probe", ["linear", "convex"])

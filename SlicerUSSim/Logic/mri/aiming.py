@@ -9,13 +9,11 @@ from scipy import ndimage
 
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.mri.craniotomy import face_width_mm, without_outside
-from SlicerUSSim.Logic.mri.pathology import innermost_ras
+from SlicerUSSim.Logic.mri.pathology import LESION_GROUPS, innermost_ras
 from SlicerUSSim.Logic.probe.arrays import Probe
 from SlicerUSSim.Logic.probe.placement import aimed_at, craniotomy_pose, sample
 from SlicerUSSim.Logic.probe.surface import PatientSurface
 
-#: Tissues of lesions; of those that are there, the probe looks at the first of these groups
-LESION_GROUPS = (("tumour", "enhancing", "necrosis", "cyst", "haematoma"), ("cavity",), ("oedema",))
 #: A probe is turned so far from the surface's normal at most, degrees: farther, most of its face would be off the brain
 FARTHEST_DEG = 35.0
 #: Smaller regions are specks of a segmentation, ml

@@ -27,6 +27,8 @@ _log = logging.getLogger(__name__)
 
 #: Tissues that are usually added, for choices; "brats" is a map of several.
 LESIONS = ("tumour", "oedema", "necrosis", "cyst", "haematoma", "cavity", "enhancing", "blood", "brats")
+#: Of the lesions that are there, a probe looks at those of the first of these groups
+LESION_GROUPS = (("tumour", "enhancing", "necrosis", "cyst", "haematoma"), ("cavity",), ("oedema",))
 #: A mask of more than this share of the patient is not a lesion.
 LARGEST_SHARE = 0.6
 #: A mask without a voxel in the patient may lie this far from it: a meningioma that brain extraction has cut off.
@@ -52,8 +54,17 @@ class Added:
     warnings: tuple[str, ...] = ()
 
     def centre_ras(self, before: Volume) -> np.ndarray | None:
-        """(3,) RAS mm of the innermost voxel of the largest region that differs from `before`; None without any."""
+        """(3,) RAS mm of the innermost voxel of the largest region that differs from `before`; None without any.
+
+        Of lesions among what differs only those of the first group of LESION_GROUPS: a tumour before its oedema.
+        """
         differs = self.labels.array != before.array
+        for group in LESION_GROUPS:
+            numbers = [number for number, name in enumerate(self.tissue_names, 1) if name in group]
+            lesion = differs & np.isin(self.labels.array, numbers)
+            if lesion.any():
+                differs = lesion
+                break
         parts, count = ndimage.label(differs)  # type: ignore[misc]
         if not count:
             return None
