@@ -105,7 +105,7 @@ def test_what_is_no_craniotomy_is_refused(head, tmp_path):
         opened(head, ("csf", "grey matter", "a", "b", "c", "d"), disc_opening(head, NAMES, TOP, 30.0))
     with pytest.raises(SimulationError, match="lie on a line"):
         polygon_opening(head, NAMES, np.array([[0.0, 0, 80], [1, 0, 80], [2, 0, 80]]))
-    with pytest.raises(SimulationError, match="has 2 points, expected three or more"):
+    with pytest.raises(SimulationError, match="of the polygon is 2, expected three or more"):
         polygon_opening(head, NAMES, np.array([[0.0, 0, 80], [1, 0, 80]]))
     (tmp_path / "a.json").write_text("{}")
     with pytest.raises(SimulationError, match=r"a\.json: has no points, expected a markup"):

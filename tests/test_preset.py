@@ -46,6 +46,13 @@ def test_a_preset_may_carry_a_pose_and_one_without_is_as_before(tmp_path):
         Preset.from_dict({"probe_to_ras": pose.tolist()})  # which would reset probe and tissues
 
 
+def test_the_result_of_a_fit_is_no_preset_and_the_first_unknown_key_is_named():
+    with pytest.raises(SimulationError, match="result of a fit, expected a preset, as ussim optimize --save-preset"):
+        Preset.from_dict({"at_bounds": [], "parameters": [], "cost_before": 0.9, "cost_after": 0.4, "display": {}})
+    with pytest.raises(SimulationError, match="has 'b', expected probe, display"):
+        Preset.from_dict({"display": {}, "b": 1, "a": 2, "c": 3})
+
+
 def test_changing_the_kind_of_probe_keeps_what_both_have():
     preset = Preset().changed("probe", depth_mm=70.0, frequency_mhz=4.0, focus_mm=30.0)
     convex = preset.changed("probe", kind="convex").probe

@@ -94,8 +94,12 @@ class Preset:
         """
         known = ("probe", *SECTIONS, "tissues", "membrane", _POSE)
         require(isinstance(values, dict), f"{source}: is {kind_of(values)}, expected an object")
-        for name in values.keys() - {MARK}:
-            require(name in known, f"{source}: has {short(name)}, expected {', '.join(known)}")
+        require(
+            not {"cost_after", "parameters"} <= values.keys(),
+            f"{source}: is the result of a fit, expected a preset, as ussim optimize --save-preset writes it",
+        )
+        for name in values:
+            require(name in (*known, MARK), f"{source}: has {short(name)}, expected {', '.join(known)}")
         sections: dict[str, Any] = {}
         if "probe" in values:
             sections["probe"] = probe_from_dict(values["probe"], f"{source}: probe")

@@ -81,7 +81,7 @@ def polygon_opening(labels: Volume, names: Sequence[str], points_ras: np.ndarray
     """
     from skimage.measure import points_in_poly
 
-    require(len(points_ras) >= 3, f"the polygon has {len(points_ras)} points, expected three or more")
+    require(len(points_ras) >= 3, f"the number of points of the polygon is {len(points_ras)}, expected three or more")
     middle = points_ras.mean(axis=0)
     _, sizes, axes = np.linalg.svd(points_ras - middle)
     require(sizes[1] > 1e-3 * sizes[0], "the points of the polygon lie on a line, expected an area")
