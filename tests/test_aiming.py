@@ -56,6 +56,19 @@ def test_a_probe_in_an_opening_looks_at_the_tumour_below_it(head):  # noqa: F811
     assert line == f"aimed at the tumour, {angle:.0f} degrees off the surface's normal" and 20.0 < angle < 30.0
 
 
+def test_veins_are_no_lesion(head):  # noqa: F811
+    """With contrast agent a class of the T1 is what enhances, and a probe was aimed at the sinus as "the enhancing"."""
+    vein, tumour, names = np.array([10.0, 8.0, 35.0]), np.array([-12.0, 0.0, 30.0]), (*ILL, "enhancing")
+    labels, middle = with_disc(with_ball(head, vein, 7.0, len(names)), 40.0)
+    pose, line = opening_pose(labels, names, PROBES["phased"], middle)
+    assert line == "" and off_axis_mm(pose, vein) > 10.0
+    ring = with_ball(with_ball(head, tumour, 7.0, len(names)), vein, 9.0, len(names))
+    inside = np.linalg.norm(places_of(head) - tumour, axis=-1) <= 5.0
+    labels, middle = with_disc(ring.with_array(np.where(inside, TUMOUR, ring.array).astype(np.uint8)), 40.0)
+    pose, line = opening_pose(labels, names, PROBES["phased"], middle)
+    assert line.startswith("aimed at the ") and off_axis_mm(pose, tumour) < 2.5  # with its rim, and not the larger vein
+
+
 @pytest.mark.parametrize("order", [("tumour", "oedema"), ("oedema", "tumour")])
 def test_of_what_was_laid_over_a_tumour_comes_before_its_larger_oedema(head, order):  # noqa: F811
     """The probe was aimed at the oedema, which surrounds the tumour on one side, or at nothing, as it was too far."""

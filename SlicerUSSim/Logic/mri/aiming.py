@@ -9,7 +9,7 @@ from scipy import ndimage
 
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.mri.craniotomy import face_width_mm, without_outside
-from SlicerUSSim.Logic.mri.pathology import LESION_GROUPS, innermost_ras
+from SlicerUSSim.Logic.mri.pathology import ENHANCING, LESION_GROUPS, innermost_ras
 from SlicerUSSim.Logic.probe.arrays import Probe
 from SlicerUSSim.Logic.probe.placement import aimed_at, craniotomy_pose, sample
 from SlicerUSSim.Logic.probe.surface import PatientSurface
@@ -62,6 +62,8 @@ def _lesions(labels: Volume, names: Sequence[str]) -> list[tuple[np.ndarray, str
     for group in LESION_GROUPS:
         numbers = [number for number, name in enumerate(names, 1) if name in group]
         parts, _ = ndimage.label(np.isin(labels.array, numbers))  # type: ignore[misc]
+        if ENHANCING in group:
+            parts = _without_veins(parts, labels, names)
         sizes, boxes, found = np.bincount(parts.ravel())[1:], ndimage.find_objects(parts), []
         for number in np.argsort(-sizes, kind="stable"):
             if sizes[number] * labels.voxel_ml < _LEAST_ML:
@@ -73,6 +75,14 @@ def _lesions(labels: Volume, names: Sequence[str]) -> list[tuple[np.ndarray, str
         if found:
             return found
     return []
+
+
+def _without_veins(parts: np.ndarray, labels: Volume, names: Sequence[str]) -> np.ndarray:
+    """The numbered parts, 0 where all of one is what enhances: veins and choroid plexus."""
+    others = (labels.array != names.index(ENHANCING) + 1) if ENHANCING in names else np.ones(parts.shape, bool)
+    kept = np.zeros(parts.max() + 1, bool)
+    kept[np.unique(parts[others])] = True
+    return np.where(kept[parts], parts, 0)
 
 
 def _name_at(labels: Volume, names: Sequence[str], place: np.ndarray) -> str:

@@ -27,8 +27,10 @@ _log = logging.getLogger(__name__)
 
 #: Tissues that are usually added, for choices; "brats" is a map of several.
 LESIONS = ("tumour", "oedema", "necrosis", "cyst", "haematoma", "cavity", "enhancing", "blood", "brats")
-#: Of the lesions that are there, a probe looks at those of the first of these groups
+#: Of the lesions that are there, a probe looks at those of the first of these groups. What enhances belongs to the first
+#: beside others of it; alone it is veins, a class of a T1 with contrast agent
 LESION_GROUPS = (("tumour", "enhancing", "necrosis", "cyst", "haematoma"), ("cavity",), ("oedema",))
+ENHANCING = "enhancing"
 #: A mask of more than this share of the patient is not a lesion.
 LARGEST_SHARE = 0.6
 #: A mask without a voxel in the patient may lie this far from it: a meningioma that brain extraction has cut off.

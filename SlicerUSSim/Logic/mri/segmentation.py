@@ -20,7 +20,7 @@ from SlicerUSSim.Logic.mri.lesions.evidence import Evidence
 from SlicerUSSim.Logic.mri.neighbours import less_sure, smoothed_posteriors
 from SlicerUSSim.Logic.mri.not_a_head import if_probabilities
 from SlicerUSSim.Logic.mri.nuclei import with_nuclei
-from SlicerUSSim.Logic.mri.outside import find_outside, require_findable
+from SlicerUSSim.Logic.mri.outside import find_outside, require_findable, watery
 from SlicerUSSim.Logic.mri.plausibility import brighter_than_tissue, require_contrast
 from SlicerUSSim.Logic.mri.recognition import check_intensities, require_no_hounsfield
 from SlicerUSSim.Logic.mri.segmentation_steps import (
@@ -317,7 +317,9 @@ def segment_mri(
         _log.info("thin sulci: %d voxels become leptomeninges", int(middles.sum()))
     whole, brain_labels = mri.with_array(part.whole(labels)), len(tissue_names)
     if outside:
-        around = find_outside(images[0], foreground)
+        t2 = images[contrasts.index("t2")].array if "t2" in contrasts else None
+        fluid = None if t2 is None else watery(t2, names, whole.array)
+        around = find_outside(images[0], foreground, fluid)
         whole, tissue_names = around.over(whole, tissue_names)
         notes.append(around.text(mri.voxel_ml))
         warnings += around.warnings
