@@ -27,8 +27,8 @@ _log = logging.getLogger(__name__)
 
 #: Tissues that are usually added, for choices; "brats" is a map of several.
 LESIONS = ("tumour", "oedema", "necrosis", "cyst", "haematoma", "cavity", "enhancing", "blood", "brats")
-#: Of the lesions that are there, a probe looks at those of the first of these groups. What enhances belongs to the first
-#: beside others of it; alone it is veins, a class of a T1 with contrast agent
+#: Of the lesions that are there, a probe looks at those of the first of these groups. What enhances belongs to the
+#: first beside others of it; alone it is veins, a class of a T1 with contrast agent
 LESION_GROUPS = (("tumour", "enhancing", "necrosis", "cyst", "haematoma"), ("cavity",), ("oedema",))
 ENHANCING = "enhancing"
 #: A mask of more than this share of the patient is not a lesion.
