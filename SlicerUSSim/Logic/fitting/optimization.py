@@ -28,7 +28,7 @@ from SlicerUSSim.Logic.fitting.identifiability import (
     quantities_of,
 )
 from SlicerUSSim.Logic.fitting.image_similarity import Similarity, SimilaritySettings
-from SlicerUSSim.Logic.fitting.parameters import Bounds, FreeParameters
+from SlicerUSSim.Logic.fitting.parameters import ECHOGENICITY, Bounds, FreeParameters
 from SlicerUSSim.Logic.fitting.search import (
     GLOBAL_ALGORITHM,
     LOCAL_ALGORITHM,
@@ -48,8 +48,10 @@ from SlicerUSSim.Logic.tissue.table import TissueTable
 
 _log = logging.getLogger(__name__)
 
-#: Stages of the search; they are followed by "redraw n", "restart n" and "draw".
+#: Stages of the search; they are followed by "redraw n", "restart n", AGAIN and "draw".
 STAGES = ("global", "local", "polish")
+#: A search from the best restart, where that fits better
+AGAIN = "again"
 #: Fractions of the evaluations for the first two; the rest is for the search after the anchor has changed.
 _SHARES = (0.6, 0.25)
 #: The largest number of evaluations of a restart, as a fraction of the fit's. Most need half of it or less.
@@ -58,6 +60,8 @@ _RESTART_SHARE = 0.4
 _RESTART_SPREAD = 0.15
 #: Costs that differ by less than this fraction are considered equal, even if other speckle changes them by less.
 _LEAST_TOLERANCE = 0.01
+#: Evaluations for the level of a tissue alone, and their steps, in parts of its bounds (2 of 24 dB)
+_FOR_A_LEVEL, _LEVEL_STEP = 4, 1.0 / 12.0
 #: Number of sampled solutions with equal variance of the scatterers, expected to fit equally well.
 _DRAWS = 12
 
@@ -240,6 +244,7 @@ def optimize_appearance(
     cost = AppearanceCost(model, parameters, references, masks, tissues, display, settings)
     problem = _problem(cost, references, masks, settings, algorithms, seed)
     limit = max_evaluations + restarts * (int(_RESTART_SHARE * max_evaluations) + 1) + _DRAWS
+    limit += int(_SHARES[1] * max_evaluations) if restarts else 0
 
     def describe(units: np.ndarray) -> dict[str, float]:
         return dict(zip(parameters.names, parameters.values(units).tolist(), strict=True))
@@ -256,12 +261,14 @@ def optimize_appearance(
     before = cost.of_each(tissues, display)
     try:
         best = _searched(search, cost, start, algorithms, max_evaluations)
+        again = _restarted(
+            cost, search, simulator, best, restarts, int(_RESTART_SHARE * max_evaluations), algorithms[1]
+        )
+        best, stage = _better(search, cost, algorithms[1], best, again, int(_SHARES[1] * max_evaluations))
         fitted_tissues, fitted_display = parameters.apply(best, tissues, display)
         model.anchor(fitted_tissues)
         after = cost.of_each(fitted_tissues, fitted_display)
-        identifiability = _identifiability(
-            cost, search, simulator, best, restarts, int(_RESTART_SHARE * max_evaluations), algorithms[1]
-        )
+        identifiability = _identifiability(cost, search, best, search.best_cost(stage), again)
     finally:
         state = {"problem": problem, "history": search.state()}
         if checkpoint is not None:
@@ -295,7 +302,34 @@ def _searched(
     best = _descended(search, cost, local_name, STAGES[1], best, int(_SHARES[1] * evaluations))
     # With the anchor here, the model is exact again.
     cost.model.anchor(cost.parameters.apply(best, cost.tissues, cost.display)[0])
-    return _descended(search, cost, local_name, STAGES[2], best, evaluations - len(search.history))
+    levels = [place for place, free in enumerate(cost.parameters) if free.attribute == ECHOGENICITY.name]
+    rest = evaluations - len(search.history)
+    kept = min(_FOR_A_LEVEL * len(levels), rest // 2) if len(cost.parameters) > 1 else 0
+    best = _descended(search, cost, local_name, STAGES[2], best, rest - kept)
+    return _levels_alone(search, STAGES[2], best, levels, evaluations - len(search.history) if kept else 0)
+
+
+def _levels_alone(search: Search, stage: str, best: np.ndarray, places: Sequence[int], budget: int) -> np.ndarray:
+    """The best positions when each of these is moved alone, in turn, from those of a search.
+
+    What images show little of, such as a falx, changes the cost less than a search of all parameters tells from the
+    curvature of the others, and stays where that has carried it: often so dark that nothing is seen of it.
+    """
+    end, cost = len(search.history) + budget, search.best_cost(stage)
+    best = np.array(search.best(stage).units)
+    for place in places:
+        start = best[place]
+        for step in (_LEVEL_STEP, -_LEVEL_STEP):
+            while len(search.history) < end and 0.0 < best[place] + step < 1.0:
+                units = best.copy()
+                units[place] += step
+                found = search.evaluate(stage, units)
+                if found >= cost:
+                    break
+                best, cost = units, found
+            if best[place] != start:
+                break
+    return best
 
 
 def _descended(
@@ -330,7 +364,17 @@ def _descended_again(
     return best
 
 
-def _identifiability(
+@dataclass(frozen=True)
+class _Again:
+    """Searches with other scatterers from starting points around the best fit."""
+
+    #: Of the best fit, with its own scatterers and each of the others
+    costs_of_best: list[float]
+    #: (positions, cost above that of the best fit with the same scatterers)
+    found: list[tuple[np.ndarray, float]]
+
+
+def _restarted(
     cost: AppearanceCost,
     search: Search,
     simulator: UltrasoundSimulator,
@@ -338,12 +382,11 @@ def _identifiability(
     restarts: int,
     budget: int,
     algorithm: str,
-) -> Identifiability:
-    """Equally good fits: searches with other scatterers from starting points around the best, and evaluations."""
+) -> _Again:
+    """Searches with other scatterers, from starting points around the best."""
     parameters = cost.parameters
     random = np.random.default_rng(search.seed)
     best_cost = search.best_cost(STAGES[2])
-    met = [entry for entry in search.history if entry.stage in STAGES[1:]]
     settings = simulator.settings
     costs_of_best, found = [best_cost], []
     axes = cost.axes(best) if restarts else None
@@ -359,20 +402,47 @@ def _identifiability(
             found.append((units, search.best_cost(stage) - costs_of_best[-1]))
     finally:
         simulator.settings = settings
+    return _Again(costs_of_best, found)
+
+
+def _better(
+    search: Search, cost: AppearanceCost, algorithm: str, best: np.ndarray, again: _Again, budget: int
+) -> tuple[np.ndarray, str]:
+    """(the best positions, the stage they are of): those of a search from the best restart, if it fits better.
+
+    The cost has several minima, and a restart that is better with its scatterers is in another one than the fit.
+    """
+    units, excess = min(again.found, key=lambda found: found[1], default=(best, 0.0))
+    if excess >= 0.0:
+        return best, STAGES[2]
+    cost.model.anchor(cost.parameters.apply(units, cost.tissues, cost.display)[0])
+    found = _descended(search, cost, algorithm, AGAIN, units, budget)
+    is_better = search.best_cost(AGAIN) < search.best_cost(STAGES[2])
+    return (found, AGAIN) if is_better else (best, STAGES[2])
+
+
+def _identifiability(
+    cost: AppearanceCost, search: Search, best: np.ndarray, best_cost: float, again: _Again
+) -> Identifiability:
+    """Equally good fits: restarts, evaluations of the searches, and draws of equal variance."""
+    parameters = cost.parameters
+    random = np.random.default_rng(search.seed)
+    met = [entry for entry in search.history if entry.stage in (*STAGES[1:], AGAIN)]
     # The change of the cost between realisations of the speckle: a smaller difference of two fits is not significant.
-    tolerance = max(float(np.std(costs_of_best)), _LEAST_TOLERANCE * best_cost)
-    cost.model.anchor(parameters.apply(best, cost.tissues, cost.display)[0])
+    tolerance = max(float(np.std(again.costs_of_best)), _LEAST_TOLERANCE * best_cost)
     for units in equal_variance_draws(parameters, best, cost.tissues, cost.display, random, _DRAWS):
         search.evaluate("draw", units)
     met += [entry for entry in search.history if entry.stage == "draw"]
     as_good = [entry.units for entry in met if entry.cost <= best_cost + tolerance]
-    again = [units for units, excess in found if excess <= tolerance]
+    # A restart is judged against the fit that it began around, which may no longer be the best one
+    gained = again.costs_of_best[0] - best_cost
+    good_again = [units for units, excess in again.found if excess + gained <= tolerance]
 
     def state_of(units: Units) -> State:
         return parameters.apply(np.asarray(units), cost.tissues, cost.display)
 
     quantities = quantities_of(parameters, cost.model.probe.received_mhz, cost.tissues)
-    return Identifiability.of(quantities, state_of, best, as_good, again, restarts, tolerance)
+    return Identifiability.of(quantities, state_of, best, as_good, good_again, len(again.found), tolerance)
 
 
 def _with_source(tissues: TissueTable, parameters: FreeParameters) -> TissueTable:

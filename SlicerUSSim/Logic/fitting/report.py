@@ -15,7 +15,7 @@ import numpy as np
 from SlicerUSSim.Logic.base.files import written_whole
 from SlicerUSSim.Logic.base.own_outputs import marked_html
 from SlicerUSSim.Logic.fitting.identifiability import Spread
-from SlicerUSSim.Logic.fitting.optimization import STAGES, AppearanceResult
+from SlicerUSSim.Logic.fitting.optimization import AGAIN, STAGES, AppearanceResult
 from SlicerUSSim.Logic.fitting.parameters import Parameter
 from SlicerUSSim.Logic.fitting.prediction import Prediction
 from SlicerUSSim.Logic.fitting.texture_costs import TextureReference
@@ -211,7 +211,7 @@ def _curve(result: AppearanceResult) -> str:
 
     figure = Figure(figsize=(9.5, 3.2), facecolor=_PAPER, dpi=110, layout="constrained")
     axis = _dark(figure.add_subplot())
-    main = [entry for entry in result.history if entry.stage in STAGES]
+    main = [entry for entry in result.history if entry.stage in (*STAGES, AGAIN)]
     costs = np.array([entry.cost for entry in main])
     axis.plot(costs, ".", color=_BEFORE, markersize=3, label="evaluation")
     axis.plot(np.minimum.accumulate(costs), color=_AFTER, label="best so far")
