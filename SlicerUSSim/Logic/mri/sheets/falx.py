@@ -40,7 +40,7 @@ def falx(head: Head, use_intensity: bool = True) -> Surfels:
         return head.at(flat, array).reshape(points.shape[:3])
 
     distance = sampled(_distance_to_thick_white(head))
-    inside = sampled((head.depth > -1.0).astype(np.float32)) > 0.5
+    inside = _between_banks(sampled((head.depth > -1.0).astype(np.float32)) > 0.5)
     evidence = sampled(_evidence(head)) if use_intensity else np.zeros_like(distance)
     relief = np.minimum(distance, _FARTHEST_MM) + _EVIDENCE_MM * np.where(distance > 0.5, evidence, 0.0)
     height, _ = settled(relief, x, inside, _WINDOWS_MM, _SMOOTHINGS_MM)
@@ -62,6 +62,13 @@ def falx(head: Head, use_intensity: bool = True) -> Surfels:
     seen = np.clip(on_sheet(evidence), 0.0, 1.0)
     confidence = np.clip(above / _EDGE_MM, 0.3, 1.0) * (_SURE + (1.0 - _SURE) * seen)
     return Surfels.of("falx", place[kept], normal[kept], _THICKNESS_MM, confidence[kept], area[kept])
+
+
+def _between_banks(inside: np.ndarray) -> np.ndarray:
+    """(..., offsets) bool: inside, or between two places that are, along the last axis."""
+    before = np.logical_or.accumulate(inside, axis=-1)
+    after = np.logical_or.accumulate(inside[..., ::-1], axis=-1)[..., ::-1]
+    return before & after
 
 
 def _distance_to_thick_white(head: Head) -> np.ndarray:
