@@ -1,4 +1,7 @@
-"""The falx cerebri: a height field over the midsagittal plane, above the template's free edge."""
+"""The falx cerebri: a height field over the midsagittal plane, above the template's free edge.
+
+It ends at the line between the rims of the hemispheres, and with contrast agent goes on into the sinus that is seen.
+"""
 
 from __future__ import annotations
 
@@ -52,7 +55,7 @@ def falx(head: Head, use_intensity: bool = True) -> Surfels:
 
     distance = sampled(_distance_to_thick_white(head))
     between = _between_rims(head, y, z)
-    beyond = np.asarray(ndimage.distance_transform_edt(~between, _STEP_MM)) if not between.all() else 0.0 * distance
+    beyond = np.asarray(ndimage.distance_transform_edt(~between, _STEP_MM))
     evidence = _sampled_evidence(head, sampled, beyond) if use_intensity else np.zeros_like(distance)
     relief = np.minimum(distance, _FARTHEST_MM) + _EVIDENCE_MM * np.where(distance > 0.5, evidence, 0.0)
     # Beyond the rims the relief is flat, and counts as such: were it left out, the middle of what is left beside a rim
@@ -72,8 +75,9 @@ def falx(head: Head, use_intensity: bool = True) -> Surfels:
     kept = (wide | (above > _EDGE_MM)) & (above > 0.0) & (on_sheet(between) > 0.5)
     if use_intensity and head.is_enhanced:
         bright = (on_sheet(evidence) > _ENHANCED) & (above > _EDGE_MM)
-        kept = np.asarray(ndimage.binary_propagation(kept, mask=kept | bright))
-        kept = np.asarray(ndimage.binary_fill_holes(kept)) & (above > 0.0)  # between the brain and the sinus
+        kept = np.asarray(ndimage.binary_propagation(kept, mask=kept | bright), bool)
+        # It is whole between the brain and the sinus.
+        kept |= np.asarray(ndimage.binary_fill_holes(kept), bool) & (above > _EDGE_MM)
     kept = largest_component(np.asarray(ndimage.binary_opening(kept, np.ones((3, 3)))))
     place = head.from_atlas(np.stack([height, *np.broadcast_arrays(y[None], z[:, None])], axis=-1).reshape(-1, 3))
     place = place.reshape(*height.shape, 3)
@@ -86,13 +90,6 @@ def falx(head: Head, use_intensity: bool = True) -> Surfels:
     by_place = _UNSEEN + (_SURE - _UNSEEN) * support + (1.0 - _SURE) * seen * support
     confidence = np.clip(above / _EDGE_MM, 0.3, 1.0) * by_place
     return Surfels.of("falx", place[kept], normal[kept], _THICKNESS_MM, confidence[kept], area[kept])
-
-
-def _between_banks(inside: np.ndarray) -> np.ndarray:
-    """(..., offsets) bool: inside, or between two places that are, along the last axis."""
-    before = np.logical_or.accumulate(inside, axis=-1)
-    after = np.logical_or.accumulate(inside[..., ::-1], axis=-1)[..., ::-1]
-    return before & after
 
 
 def _between_rims(head: Head, y: np.ndarray, z: np.ndarray) -> np.ndarray:
