@@ -110,14 +110,34 @@ def t2_confirms(head: Head, sulci: Surfels, t2: Volume) -> None:
     )
 
 
-def falx_shown(head: Head) -> np.ndarray:
+def falx_shown(head: Head, least_depth_mm: float = 1.0) -> np.ndarray:
     """(n, 3) RAS mm of the enhancing falx: bright ridges that stand upright above the free edge, near the midline."""
     x, _, _ = head.in_atlas
-    where = (np.abs(x) < 12) & (head.depth > 1) & (head.smoothed(0.5) > head.white + 2 * head.noise)
+    where = (np.abs(x) < 12) & (head.depth > least_depth_mm) & (head.smoothed(0.5) > head.white + 2 * head.noise)
     found = large_parts(ridges(head.image.array, head.spacing, where, 0.8, 5.0), where.shape, 30.0)
     points, normal = atlas_places(head, found)
     edge = np.interp(-points[:, 1], [-y for y, _ in FREE_EDGE], [float(z) for _, z in FREE_EDGE])
     return head.from_atlas(points[(np.abs(normal[:, 0]) > 0.85) & (points[:, 2] > edge + 1)])
+
+
+def falx_by_height(label: str, head: Head, surfels: Surfels) -> None:
+    """How many surfels are more than 2 mm off the enhancing falx, up to the sinus, by how far they are below the top.
+
+    Of those more than 40 mm above the atlas's origin with an enhancing place within 1.5 mm in y and z.
+    """
+    places, shown = head.to_atlas(surfels.place), head.to_atlas(falx_shown(head, -12.0))
+    column = np.rint(places[:, 1]).astype(int)
+    top = {y: places[np.abs(column - y) <= 1, 2].max() for y in np.unique(column)}
+    below = np.array([top[y] for y in column]) - places[:, 2]
+    near = KDTree(shown[:, 1:]).query_ball_point(places[:, 1:], 1.5)
+    off = np.array([abs(x - np.median(shown[n, 0])) if n else np.nan for x, n in zip(places[:, 0], near, strict=True)])
+    lines = []
+    for low, high in ((-1, 3), (3, 6), (6, 10), (10, 100)):
+        band = (below >= low) & (below < high) & (places[:, 2] > 40)
+        some = off[band & np.isfinite(off)]
+        sure = surfels.confidence[band].mean()
+        lines.append(f"{(some > 2).mean():.1%} of {len(some)} (confidence {sure:.2f}) from {max(low, 0)} mm")
+    print(f"falx {label}, more than 2 mm off by mm below its top: {', '.join(lines)}")
 
 
 def tentorium_shown(head: Head) -> np.ndarray:
@@ -166,6 +186,8 @@ def dura(head: Head, surfels: Surfels) -> None:
         "3 mm aside": moved(here, here.place + 3 * here.normal),
     }  # fmt: skip
     sheet_errors("falx", head, falx_shown(head), controls)
+    for label in ("with contrast", "without using it"):
+        falx_by_height(label, head, controls[label])
     here = surfels.of_kind("tentorium")
     flat = head.to_atlas(here.place)
     flat[:, 2] = tentorium_height(flat[:, 0], flat[:, 1])

@@ -364,6 +364,50 @@ def test_a_falx_that_enhances_as_white_matter_does_is_no_white_matter(use_intens
     assert np.percentile(np.abs(away), 90) < 1.0
 
 
+def wide_vertex(is_enhanced: bool) -> tuple[Head, np.ndarray]:
+    """(head whose hemispheres part towards the vertex, one more than the other, (y,) x of its falx from y = -60).
+
+    The brain mask dips into the wide fluid between them, 12 mm below the sinus.
+    """
+    x, y, z = np.mgrid[-40:41, -60:41, 0:97].astype(float).transpose(0, 3, 2, 1)
+    csf, grey, white = 20.0, 100.0, 140.0
+    at = 1.0 + 0.7 * np.sin(y / 15.0)
+    opening = np.maximum(z - 58.0, 0.0) ** 2
+    bank = np.where(x < 0, -x - 3.0 - opening / 50.0, x - 3.0 - opening / 25.0)  # mm into the hemisphere
+    bank = np.minimum(bank, np.where(x < 0, 79.0, 76.0) - z)
+    image = np.select([bank > 3.0, bank > 0.0], [white, grey], csf)
+    image[(z < 42.0) & (np.abs(x) < 10.0)] = white  # below the free edge
+    in_falx = (np.abs(x - at) < np.maximum(1.2, z - 79.0)) & (z >= 42.0)
+    image[in_falx] = white + 80.0 if is_enhanced else 0.5 * (csf + grey)
+    image[z > 84.0] = 0.0  # bone
+    image = ndimage.gaussian_filter(image, 0.7) + np.random.default_rng(1).normal(0.0, 4.0, image.shape)
+    in_brain = (bank > 0.0) | ((z < 64.0) & (np.abs(x) < 6.0))
+    matrix = np.eye(4)
+    matrix[:3, 3] = -40.0, -60.0, 0.0
+    fit = AtlasFit(np.eye(4), 1.0, None)  # type: ignore[arg-type]
+    head = Head(Volume(image.astype(np.float32), matrix), in_brain, csf, grey, white, 4.0, is_enhanced, fit)
+    return head, at[0, :, 0]
+
+
+@pytest.mark.parametrize("is_enhanced", [True, False])
+def test_a_falx_in_wide_fluid_at_the_vertex_stays_off_the_gyri(is_enhanced):
+    """Only the bank of the higher gyrus counted up there, and the falx climbed over it."""
+    head, at = wide_vertex(is_enhanced)
+    found = falx(head)
+    _, y, z = found.place.T
+    away = np.abs(found.place[:, 0] - at[np.rint(y + 60.0).astype(int)])
+    inner, upper = (z > 48) & (z < 60) & (np.abs(y + 10) < 40), (z > 66) & (np.abs(y + 10) < 40)
+    assert inner.sum() > 500
+    assert upper.sum() > 500
+    assert z.max() > (82.0 if is_enhanced else 74.0)  # the sinus; the lower of the rims
+    assert np.percentile(away[upper], 95) < (0.8 if is_enhanced else 2.0)
+    top = upper & (z > 72)
+    if is_enhanced:
+        assert found.confidence[top].min() > 0.7
+    else:  # drawn on from below
+        assert np.median(found.confidence[top]) < 0.6 < found.confidence[inner].min()
+
+
 @pytest.mark.slow
 def test_what_cannot_be_found_is_said_before_the_search():
     mri = head_mri(spacing_mm=3.0)

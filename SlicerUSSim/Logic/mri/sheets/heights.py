@@ -30,23 +30,41 @@ def settled(
     smoothings : standard deviations in rows and columns by which the heights of each step are smoothed; places where
         the relief stands out count more.
     """
-    height, step = np.zeros(relief.shape[:2], np.float32), float(offsets[1] - offsets[0])
+    height = np.zeros(relief.shape[:2], np.float32)
     sure = np.zeros_like(height)
     for window, smoothing in zip(windows_mm, smoothings, strict=True):
-        # The windows' ends lie between steps: on a plateau of the relief, whole steps would pull to one side
-        share = np.clip((window - np.abs(offsets - height[..., None])) / step + 0.5, 0.0, 1.0)
-        near = usable & (share > 0.0)
-        top = np.where(near, relief, -np.inf).max(axis=2, keepdims=True)
-        weight = np.where(near, share * np.exp((relief - np.where(np.isfinite(top), top, 0.0)) / softness), 0.0)
-        total = np.maximum(weight.sum(axis=2), 1e-9)
-        middle = (weight * offsets).sum(axis=2) / total
-        spread = np.sqrt((weight * (offsets - middle[..., None]) ** 2).sum(axis=2) / total)
-        # Of a uniform relief the spread is that of the window.
-        sure = np.where(near.any(axis=2), np.clip(1.0 - spread / (window / np.sqrt(3.0)), 0.02, 1.0), 0.0)
+        middle, sure = centred(relief, offsets, usable, height, window, softness)
         amount = ndimage.gaussian_filter(sure, smoothing, mode="nearest")
         smooth = ndimage.gaussian_filter(sure * middle, smoothing, mode="nearest") / np.maximum(amount, 1e-9)
         height = np.where(amount > 1e-6, smooth, height).astype(np.float32)
-    return height, sure.astype(np.float32)
+    return height, sure
+
+
+def centred(
+    relief: np.ndarray,
+    offsets: np.ndarray,
+    usable: np.ndarray,
+    height: np.ndarray,
+    window_mm: float,
+    softness: float = _SOFTNESS,
+) -> tuple[np.ndarray, np.ndarray]:
+    """((rows, columns) middle in mm of the ridge of a relief within a window around heights, confidence from 0 to 1).
+
+    The confidence tells how narrow the ridge is for the window; of a uniform relief it is 0.02, so that its middle,
+    the height before, hardly counts. Arrays are as in `settled`.
+    """
+    step = float(offsets[1] - offsets[0])
+    # The windows' ends lie between steps: on a plateau of the relief, whole steps would pull to one side
+    share = np.clip((window_mm - np.abs(offsets - height[..., None])) / step + 0.5, 0.0, 1.0)
+    near = usable & (share > 0.0)
+    top = np.where(near, relief, -np.inf).max(axis=2, keepdims=True)
+    weight = np.where(near, share * np.exp((relief - np.where(np.isfinite(top), top, 0.0)) / softness), 0.0)
+    total = np.maximum(weight.sum(axis=2), 1e-9)
+    middle = (weight * offsets).sum(axis=2) / total
+    spread = np.sqrt((weight * (offsets - middle[..., None]) ** 2).sum(axis=2) / total)
+    # Of a uniform relief the spread is that of the window.
+    sure = np.where(near.any(axis=2), np.clip(1.0 - spread / (window_mm / np.sqrt(3.0)), 0.02, 1.0), 0.0)
+    return middle, sure.astype(np.float32)
 
 
 def patches(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

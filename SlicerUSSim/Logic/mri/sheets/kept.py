@@ -21,7 +21,7 @@ from SlicerUSSim.Logic.mri.sheets.surfels import Surfels
 
 _log = logging.getLogger(__name__)
 #: Raised where other sheets are found from the same image
-_RECIPE = 2
+_RECIPE = 3
 
 
 def sheets_beside(mri_path: str | Path) -> Path:
