@@ -157,6 +157,10 @@ class AppearanceCost:
         tissues, display = self.parameters.apply(units, self.tissues, self.display)
         return mean_cost(self.of_each(tissues, display))
 
+    def anchor(self, units: np.ndarray) -> None:
+        """Recompute what the model approximates, so that it is exact here."""
+        self.model.anchor(self.parameters.apply(units, self.tissues, self.display)[0])
+
     def axes(self, units: np.ndarray) -> np.ndarray:
         """(parameters, parameters) axes of a local search from a position (sensitivity.py)."""
 
@@ -264,11 +268,11 @@ def optimize_appearance(
         again = _restarted(
             cost, search, simulator, best, restarts, int(_RESTART_SHARE * max_evaluations), algorithms[1]
         )
-        best, stage = _better(search, cost, algorithms[1], best, again, int(_SHARES[1] * max_evaluations))
+        best, best_cost = _better(search, cost, algorithms[1], best, again, int(_SHARES[1] * max_evaluations))
         fitted_tissues, fitted_display = parameters.apply(best, tissues, display)
         model.anchor(fitted_tissues)
         after = cost.of_each(fitted_tissues, fitted_display)
-        identifiability = _identifiability(cost, search, best, search.best_cost(stage), again)
+        identifiability = _identifiability(cost, search, best, best_cost, again)
     finally:
         state = {"problem": problem, "history": search.state()}
         if checkpoint is not None:
@@ -301,7 +305,7 @@ def _searched(
         best = search.minimise(global_name, STAGES[0], best, int(_SHARES[0] * evaluations))
     best = _descended(search, cost, local_name, STAGES[1], best, int(_SHARES[1] * evaluations))
     # With the anchor here, the model is exact again.
-    cost.model.anchor(cost.parameters.apply(best, cost.tissues, cost.display)[0])
+    cost.anchor(best)
     levels = [place for place, free in enumerate(cost.parameters) if free.attribute == ECHOGENICITY.name]
     rest = evaluations - len(search.history)
     kept = min(_FOR_A_LEVEL * len(levels), rest // 2) if len(cost.parameters) > 1 else 0
@@ -384,7 +388,6 @@ def _restarted(
     algorithm: str,
 ) -> _Again:
     """Searches with other scatterers, from starting points around the best."""
-    parameters = cost.parameters
     random = np.random.default_rng(search.seed)
     best_cost = search.best_cost(STAGES[2])
     settings = simulator.settings
@@ -393,7 +396,7 @@ def _restarted(
     try:
         for number in range(1, restarts + 1):
             simulator.settings = replace(settings, seed=(settings.seed + 7919 * number) % 2**32)
-            cost.model.anchor(parameters.apply(best, cost.tissues, cost.display)[0])
+            cost.anchor(best)
             stage = f"restart {number}"
             start = np.clip(best + random.normal(0.0, _RESTART_SPREAD, len(best)), 0.0, 1.0)
             costs_of_best.append(search.evaluate(f"redraw {number}", best))
@@ -407,18 +410,22 @@ def _restarted(
 
 def _better(
     search: Search, cost: AppearanceCost, algorithm: str, best: np.ndarray, again: _Again, budget: int
-) -> tuple[np.ndarray, str]:
-    """(the best positions, the stage they are of): those of a search from the best restart, if it fits better.
+) -> tuple[np.ndarray, float]:
+    """(the best positions, their cost): those of a search from the best restart, if it fits better.
 
     The cost has several minima, and a restart that is better with its scatterers is in another one than the fit.
     """
+    best_cost = search.best_cost(STAGES[2])
     units, excess = min(again.found, key=lambda found: found[1], default=(best, 0.0))
     if excess >= 0.0:
-        return best, STAGES[2]
-    cost.model.anchor(cost.parameters.apply(units, cost.tissues, cost.display)[0])
+        return best, best_cost
+    cost.anchor(units)
     found = _descended(search, cost, algorithm, AGAIN, units, budget)
-    is_better = search.best_cost(AGAIN) < search.best_cost(STAGES[2])
-    return (found, AGAIN) if is_better else (best, STAGES[2])
+    exact = []
+    for place in (best, found):  # far from an anchor, a cost is not exact
+        cost.anchor(place)
+        exact.append(cost(place))
+    return (found, exact[1]) if exact[1] < exact[0] else (best, best_cost)
 
 
 def _identifiability(
