@@ -65,7 +65,7 @@ class LesionProposals:
         """As grow, from the last control point of a markups node that is placed."""
         require_node(points_node, "vtkMRMLMarkupsFiducialNode", use="point in the lesion")
         placed = control_points(points_node)
-        require(len(placed) > 0, f"{named(points_node)} has no point, expected one in the lesion")
+        require(len(placed) > 0, f"{named(points_node)} has no point, expected one in the lesion; click it in a slice")
         return self.grow(mri_node, placed[-1].tolist(), tissue)
 
     def propose(self, mri_node):
