@@ -141,15 +141,20 @@ def test_equally_good_is_what_another_draw_of_the_speckle_could_make_of_the_best
     def of(stage):
         return [entry for entry in result.history if entry.stage == stage]
 
-    best = min(entry.cost for entry in of("polish"))
+    first = min(of("polish"), key=lambda entry: entry.cost)
+    fitted = result.parameters.units(result.tissues, result.display)
+    went_on = not np.allclose(fitted, first.units, atol=1e-6)  # from a restart, to a better fit
+    best = result.cost_after if went_on else first.cost
     redrawn = [of(f"redraw {n}")[0].cost for n in (1, 2)]
-    tolerance = max(np.std([best, *redrawn]), 0.01 * best)
-    assert found.cost_tolerance == pytest.approx(tolerance) and tolerance < 0.1 * best
-    entries = [entry for stage in ("local", "polish", "draw") for entry in of(stage)]
+    tolerance = max(np.std([first.cost, *redrawn]), 0.01 * best)
+    assert found.cost_tolerance == pytest.approx(tolerance, rel=1e-3) and tolerance < 0.1 * best
+    tolerance = found.cost_tolerance
+    entries = [entry for stage in ("local", "polish", AGAIN, "draw") for entry in of(stage)]
     as_good = [entry for entry in entries if entry.cost <= best + tolerance]
     assert 0 < len(as_good) < len(entries)
     again = [min(of(f"restart {n}"), key=lambda entry: entry.cost) for n in (1, 2)]
-    again = [entry for entry, cost in zip(again, redrawn, strict=True) if entry.cost - cost <= tolerance]
+    gained = first.cost - best
+    again = [entry for entry, cost in zip(again, redrawn, strict=True) if entry.cost - cost + gained <= tolerance]
     assert found.restarts_as_good == len(again) and found.solutions == len(as_good) + len(again)
     values = np.array([result.parameters.values(np.array(entry.units)) for entry in [*as_good, *again]])
     for parameter, column in zip(result.parameters, values.T, strict=True):
