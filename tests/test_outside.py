@@ -95,6 +95,7 @@ def test_a_head_that_the_image_cuts_is_said_to_be():
     assert find_outside(Volume(mri.array[5:].copy(), mri.ijk_to_ras), brain[5:]).warnings == ()  # the neck
 
 
+@pytest.mark.slow
 def test_wide_csf_around_a_shrunken_brain_is_bone_in_a_t1_and_csf_with_a_t2():
     """Of a patient's skull 73 of 609 ml were CSF that a T2 beside the T1 showed: 16 mm of bone in front of a probe."""
     mri, _, radius = round_head()
