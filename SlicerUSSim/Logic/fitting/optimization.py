@@ -309,18 +309,18 @@ def _searched(
     levels = [place for place, free in enumerate(cost.parameters) if free.attribute == ECHOGENICITY.name]
     rest = evaluations - len(search.history)
     kept = min(_FOR_A_LEVEL * len(levels), rest // 2) if len(cost.parameters) > 1 else 0
-    best = _descended(search, cost, local_name, STAGES[2], best, rest - kept)
-    return _levels_alone(search, STAGES[2], best, levels, evaluations - len(search.history) if kept else 0)
+    _descended(search, cost, local_name, STAGES[2], best, rest - kept)
+    return _levels_alone(search, STAGES[2], levels, evaluations - len(search.history) if kept else 0)
 
 
-def _levels_alone(search: Search, stage: str, best: np.ndarray, places: Sequence[int], budget: int) -> np.ndarray:
-    """The best positions when each of these is moved alone, in turn, from those of a search.
+def _levels_alone(search: Search, stage: str, places: Sequence[int], budget: int) -> np.ndarray:
+    """The best positions when each of these is moved alone, in turn, from the best of a stage.
 
     What images show little of, such as a falx, changes the cost less than a search of all parameters tells from the
     curvature of the others, and stays where that has carried it: often so dark that nothing is seen of it.
     """
-    end, cost = len(search.history) + budget, search.best_cost(stage)
-    best = np.array(search.best(stage).units)
+    end, first = len(search.history) + budget, search.best(stage)
+    best, cost = np.array(first.units), first.cost
     for place in places:
         start = best[place]
         for step in (_LEVEL_STEP, -_LEVEL_STEP):

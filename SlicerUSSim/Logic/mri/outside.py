@@ -134,7 +134,7 @@ def find_outside(mri: Volume, brain: np.ndarray, fluid: np.ndarray | None = None
     margin = [slice(max(box.start - 2, 0), box.stop + 2) for box in ndimage.find_objects(head.astype(np.uint8))[0]]
     box = tuple(margin)
     image, head, brain, mm = image[box], head[box], brain[box], mri.spacing_mm
-    inner = _within(_closed(brain, _SULCUS_MM, mm), _DURA_MM, mm)
+    inner = _with_dura(brain, mm)
     from_brain = distance_to(inner, mm)
     beside = image[head & (from_brain > _BESIDE_MM[0]) & (from_brain < _BESIDE_MM[1])]
     require(
@@ -143,16 +143,20 @@ def find_outside(mri: Volume, brain: np.ndarray, fluid: np.ndarray | None = None
     )
     dark = _DARK * _otsu(beside)
     below_skin = _depth(head, mm)
-    is_dark = head & (image < dark) & ~inner
-    may_be = (below_skin > _SKIN_MM) & (from_brain < _LARGEST_SKULL_MM)
-    thickness = thickness_of_skull(image, inner, below_skin, dark, mm, mri.ijk_to_ras)
+
+    def skull_over(inner: np.ndarray, from_brain: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Where it may be, and how thick it is."""
+        may_be = (below_skin > _SKIN_MM) & (from_brain < _LARGEST_SKULL_MM)
+        return may_be, thickness_of_skull(image, inner, below_skin, dark, mm, mri.ijk_to_ras)
+
+    may_be, thickness = skull_over(inner, from_brain)
     around = None
     if fluid is not None:
         around = _beside(inner, fluid[box] & (image < _FLUID * dark) & may_be & ~np.isnan(thickness), mm) & ~brain
-        inner = _within(_closed(brain | around, _SULCUS_MM, mm), _DURA_MM, mm)
-        from_brain, is_dark = distance_to(inner, mm), is_dark & ~inner
-        may_be = (below_skin > _SKIN_MM) & (from_brain < _LARGEST_SKULL_MM)
-        thickness = thickness_of_skull(image, inner, below_skin, dark, mm, mri.ijk_to_ras)
+        inner = _with_dura(brain | around, mm)
+        from_brain = distance_to(inner, mm)
+        may_be, thickness = skull_over(inner, from_brain)
+    is_dark = head & (image < dark) & ~inner
     vault = may_be & (from_brain <= thickness)
     base = may_be & np.isnan(thickness) & (is_dark | inner)
     thick = _opened(is_dark & may_be, _CAVITY_MM, mm)  # also where it is thicker than usual
@@ -174,6 +178,11 @@ def find_outside(mri: Volume, brain: np.ndarray, fluid: np.ndarray | None = None
         found = np.zeros(mri.array.shape, bool)
         found[box] = around & head
     return Outside(whole, float(dark), _cut(whole, mri), found)
+
+
+def _with_dura(brain: np.ndarray, mm: np.ndarray) -> np.ndarray:
+    """(k, j, i) bool: the brain with its sulci, the dura and what is between."""
+    return _within(_closed(brain, _SULCUS_MM, mm), _DURA_MM, mm)
 
 
 def _beside(inner: np.ndarray, fluid: np.ndarray, mm: np.ndarray) -> np.ndarray:
