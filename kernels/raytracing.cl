@@ -209,19 +209,41 @@ inline float decay_in(__constant const Acquisition *acquisition, Tissue tissue) 
   return tissue.attenuation_db_cm_mhz * acquisition->frequency_mhz * 0.2f * LN10_OVER_20;
 }
 
+// The sides of a border between two tissues.
+inline Sides sides_of(__constant const Acquisition *acquisition, __constant const Tissue *tissues, Tissue here,
+                      Tissue behind) {
+  const float speed = beam_speed(here.speed_of_sound_m_s, decay_in(acquisition, here));
+  const float speed_behind = beam_speed(behind.speed_of_sound_m_s, decay_in(acquisition, behind));
+  Sides sides;
+  sides.before = here.group, sides.behind = behind.group;
+  sides.all_before = 1ul << here.group, sides.all_behind = 1ul << behind.group;
+  sides.is_strong = !is_soft(speed, here.impedance_mrayl, speed_behind, behind.impedance_mrayl);
+  for (int group = 0; sides.is_strong && group < MAX_TISSUES; group++) {
+    const int label = tissues[group].label_of_group;
+    if (label < 0) break;
+    const Tissue third = tissues[label];
+    const float speed_of_third = beam_speed(third.speed_of_sound_m_s, decay_in(acquisition, third));
+    const ulong bit = 1ul << group;
+    if (is_soft(speed, here.impedance_mrayl, speed_of_third, third.impedance_mrayl))
+      sides.all_before |= bit;
+    else if (is_soft(speed_behind, behind.impedance_mrayl, speed_of_third, third.impedance_mrayl))
+      sides.all_behind |= bit;
+  }
+  return sides;
+}
+
 // The tube (tube_after) behind a mirror of curvature k at angle of incidence i in the plane of the offset: a ray beside
 // this one meets a normal turned by k / cos i per mm of offset, and is itself turned by twice that angle.
 inline float4 tube_reflected(__global const uchar *groups, __global const ushort *smooth,
                              __constant const Acquisition *acquisition, float4 tube, Ray ray, float3 point,
-                             float3 normal, int before, int behind) {
+                             float3 normal, Sides sides) {
   for (int axis = 0; axis < 2; axis++) {
     const float3 offset = axis == 0 ? ray.lateral : ray.elevational;
     // Projected along the ray onto the surface, which lengthens the offset by 1 / cos i.
     const float3 along = offset - dot3(normal, offset) / fmin(dot3(normal, ray.direction), -0.2f) * ray.direction;
     const float longer = fmax(length3(along), 1e-3f);
     // Concave mirrors focus. With curvatures from voxels this would cause random bright spots, so they count as flat.
-    const float curvature =
-        convex_curvature(groups, smooth, acquisition, point, normal, along / longer, before, behind);
+    const float curvature = convex_curvature(groups, smooth, acquisition, point, normal, along / longer, sides);
     const float growth = 2.0f * curvature * longer;
     if (axis == 0)
       tube.y += growth * tube.x;
@@ -564,9 +586,9 @@ __kernel void trace(__constant const Acquisition *acquisition, __global const us
       }
 
       float overshoot, curvature;
-      const float3 normal =
-          interface_normal(groups, smooth, acquisition, course_at(acquisition, &course, border), here.group,
-                           behind.group, ray.direction, course.step, &overshoot, &curvature);
+      const Sides sides = sides_of(acquisition, tissues, here, behind);
+      const float3 normal = interface_normal(groups, smooth, acquisition, course_at(acquisition, &course, border),
+                                             sides, ray.direction, course.step, &overshoot, &curvature);
       // Not back beyond the last border; but beyond the start of a piece, where there is none.
       const int is_continued = ray.piece > 0 && since == 0.0f;
       overshoot = fmin(overshoot, border - since + (is_continued ? acquisition->voxel_mm : 0.0f));
@@ -678,8 +700,7 @@ __kernel void trace(__constant const Acquisition *acquisition, __global const us
           child.elevational = mirror(ray.elevational, normal);
           child.axis = hit_point - mirror(aside, normal);
           if (acquisition->reflection_spreading)
-            child.tube =
-                tube_reflected(groups, smooth, acquisition, tube, ray, hit_point, normal, here.group, behind.group);
+            child.tube = tube_reflected(groups, smooth, acquisition, tube, ray, hit_point, normal, sides);
           child.path = path;
           child.depth = corrected_depth;
           child.log_attenuation = corrected_log;

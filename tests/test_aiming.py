@@ -181,7 +181,7 @@ def test_a_closed_skull_before_the_brain_is_said_where_its_bone_leaves_no_signal
 
 
 def test_a_skull_is_not_said_to_be_closed_where_the_brain_is_seen(head):  # noqa: F811
-    pose = view_pose(head, NAMES, "temporal")
+    pose, _ = view_pose(head, NAMES, "temporal")
     assert notes_of(head, PROBES["transcranial"], pose, is_open=False) == ()  # 2 MHz pass
     assert notes_of(head, PROBES["phased"], pose, is_open=False)  # 5 MHz do not: the image is black
     brain = without_outside(head, NAMES)

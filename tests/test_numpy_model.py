@@ -42,6 +42,7 @@ from SlicerUSSim.Logic.verification.numpy_model.acquisition import (
     stratum_centres,
 )
 from tests.conftest import block, rigid
+from tests.test_raytracing import RIB_TISSUES, rib
 
 FLUID = Tissue("fluid", 1520, 1.52, 0.0, 0.0, 0.0, 0.0)
 BRAIN = Tissue("brain", 1546, 1.60, 0.5, 0.3, 0.0, 0.15)
@@ -193,6 +194,17 @@ def test_numpy_follows_beams_from_a_face_that_stands_in_bone(kind):
     difference = np.abs(image.astype(int) - NumpyModel(simulator).simulate(PROBES[kind], pose, display))
     assert image.max() > 100
     assert (difference <= 1).mean() > 0.97
+
+
+@pytest.mark.slow
+def test_numpy_spreads_what_a_rib_reflects_where_fat_meets_muscle():
+    simulator = UltrasoundSimulator(rib(), TissueTable(dict(enumerate([RIB_TISSUES[0], *RIB_TISSUES]))))
+    pose, display = rigid(np.eye(3), [1.0, -20.0, 0.5]), DisplaySettings(image_size=(240, 200))
+    image = simulator.simulate(PROBES["linear"], pose, display).image
+    expected = NumpyModel(simulator).simulate(PROBES["linear"], pose, display)
+    assert (np.abs(image.astype(int) - expected) <= 1).mean() > 0.97
+    shadow = np.s_[140:]  # where what the rib reflects is drawn
+    assert image[shadow].max() > 30 and (np.abs(image.astype(int) - expected)[shadow] <= 1).mean() > 0.97
 
 
 @pytest.mark.slow

@@ -61,6 +61,44 @@ def test_a_flat_mirror_is_flat_near_its_edge(seed, spacing_mm, thick_mm):
     assert level.min() > -3.5 and np.sqrt((level**2).mean()) < 0.8
 
 
+#: Fat, muscle, the shell of a rib and its marrow
+RIB_TISSUES = (
+    Tissue("fat", 1450.0, 1.38, 0.5), Tissue("muscle", 1580.0, 1.68, 0.6), Tissue("bone", 3500.0, 7.0, 8.0),
+    Tissue("marrow", 1900.0, 2.5, 9.0),
+)  # fmt: skip
+
+
+def rib(spacing_mm: float = 1.0, radius_mm: float = 8.0):
+    """A round rib along z, of a shell around marrow, in fat which meets muscle at its flanks."""
+
+    def label(x, y, z):
+        away = np.hypot(x, y)
+        return np.where(away < radius_mm, np.where(away < radius_mm - 2.0, 4, 3), 1 + (y > -0.6 * radius_mm))
+
+    return block(label, (26, 26, 14), spacing_mm)
+
+
+@pytest.mark.parametrize("spacing_mm", [0.5, 1.0])
+def test_a_mirror_is_curved_also_where_the_tissue_before_it_changes(spacing_mm):
+    """What the flank of a rib reflects where fat meets muscle was spread by nothing, a bright streak below the pleura.
+
+    Rays beside each other at a distance d meet normals turned by d / (r cos i), and part by twice that angle.
+    """
+    radius_mm = 8.0
+    sim = simulator(rib(spacing_mm, radius_mm), *RIB_TISSUES, coupling=RIB_TISSUES[0], interfaces=False)
+    mirrored = sim.trace(LinearProbe(20, 40, scan_lines=161), rigid(np.eye(3), [0.0, -20.0, 0.0])).segments
+    first = np.hypot(mirrored["start"][:, 0], mirrored["start"][:, 1]) < radius_mm + 1.0
+    outside = np.isin(mirrored["label"], (0, 1, 2)) & (mirrored["tube"][:, 0] == 1.0)
+    mirrored = mirrored[(mirrored["reflections"] == 1) & first & outside]
+    height = mirrored["start"][:, 1] / radius_mm
+    flank = mirrored[(height > -0.75) & (height < -0.45)]  # where they meet, and 3 voxels beside it
+    assert len(flank) > 8
+    cosine = -flank["start"][:, 1] / np.hypot(flank["start"][:, 0], flank["start"][:, 1])
+    growth = flank["tube"][:, 1] * radius_mm * cosine / 2.0
+    assert (growth > 0.3).mean() > 0.9 and 0.6 < np.median(growth) < 1.5
+    assert np.median(flank["tube"][:, 3]) < 0.02  # along the rib it is straight
+
+
 def test_a_gap_of_a_few_voxels_keeps_its_width():
     """Smoothing across a gap must not displace its sides."""
     for voxels in (3, 5, 7, 9):

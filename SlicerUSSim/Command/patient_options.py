@@ -313,10 +313,11 @@ def _placed(
                     note(f"probe: {line}")
         else:
             if at is None:
-                pose = view_pose(labels, names, pose, is_open=craniotomy.is_wanted)
+                pose, line = view_pose(labels, names, pose, is_open=craniotomy.is_wanted)
             else:
                 pose, line = opened_view_pose(labels, names, pose)
-                note(line)
+            if line:
+                note(f"probe: {line}")
     if at is None:
         labels = craniotomy.on(labels, names, preset.probe, pose)
     if "skin" in names and not craniotomy.is_wanted and not patient.gives_contact:

@@ -102,13 +102,20 @@ def find_proposals(segmentation: Segmentation, seeds: Iterable[str], propose: bo
             proposals.append(grow_lesion(segmentation, point, tissue))
         except SimulationError as error:
             refused.append(str(error))
-    require(not refused, "; ".join(refused))
+    require(not refused, _with_how("; ".join(refused)))
     if propose:
         found = propose_lesions(segmentation)
         proposals += [new for new in found if not any(new.is_mostly_in(old) for old in proposals)]
         if not found:
             note("no lesion proposed: nothing compact in this brain looks unlike the other hemisphere")
     return proposals
+
+
+def _with_how(line: str) -> str:
+    """A line about a seed; with how the command is told what a lesion is, where the line asks for it."""
+    from SlicerUSSim.Logic.mri.lesions.seeded import SAY_WHAT
+
+    return line + (" (as --seed R,A,S=TISSUE)" if SAY_WHAT in line else "")
 
 
 def write_proposals(proposals: Iterable[Proposal], labels_path: Path) -> None:
@@ -122,7 +129,7 @@ def write_proposals(proposals: Iterable[Proposal], labels_path: Path) -> None:
     for number, proposal in enumerate(proposals, 1):
         note(proposal.message)
         for line in proposal.warnings:
-            note(f"  {line}")
+            note(f"  {_with_how(line)}")
         files = proposal.write(labels_path, number)
         written |= set(files.values())
         additions = " ".join(f"--add {tissue}={path}" for tissue, path in files.items())

@@ -39,7 +39,7 @@ _FARTHEST_SIGMAS = 2.2  # limit of the stored distance
 # Smoothed indicators need two bytes per voxel and group. Limits of groups and of all values; at least two groups.
 _MOST_SMOOTHED_GROUPS = 6
 _SMOOTHED_VOXELS = 100_000_000
-_TISSUE_ATTRIBUTES = tuple(name for name in TISSUE.names or () if name not in ("group", "is_fluid"))
+_TISSUE_ATTRIBUTES = tuple(name for name in TISSUE.names or () if name not in ("group", "label_of_group", "is_fluid"))
 #: Attenuation (dB/(cm MHz)) from which tissues may be LOSSY_PER_MM at some frequency and have borders by that alone
 _LOSSY = 2.0
 _PAD = 1  # one voxel of coupling medium around the volume, for clamped look-ups outside
@@ -175,6 +175,7 @@ class Medium:
         """layout.TISSUE per label. Acoustic groups are numbered by decreasing frequency; the first ones have a smoothed
         indicator."""
         rows = np.zeros(CONSTANTS["MAX_TISSUES"], TISSUE)
+        rows["label_of_group"] = -1
         members = {int(label): tissues[label] for label in self.present} | dict(tissues)
         if tissues.membrane is not None:
             members[CONSTANTS["MEMBRANE_LABEL"]] = tissues.membrane.tissue
@@ -183,7 +184,8 @@ class Medium:
             acoustics = (tissue.speed_of_sound_m_s, tissue.impedance_mrayl, tissue.attenuation_db_cm_mhz > _LOSSY)
             for name in _TISSUE_ATTRIBUTES:
                 rows[label][name] = getattr(tissue, name)
-            rows[label]["group"] = groups.setdefault(acoustics, len(groups))
+            group = rows[label]["group"] = groups.setdefault(acoustics, len(groups))
+            rows[group]["label_of_group"] = label
         if tissues.membrane is not None:
             rows["is_fluid"][list(_fluid_labels(tissues, tissues.membrane))] = 1
         return rows

@@ -1,4 +1,4 @@
-"""Standard views of a head: where a probe stands, and what its image is oriented by."""
+"""Standard views of a head: where a probe stands, and what its image is oriented by, along the head's own axes."""
 
 from __future__ import annotations
 
@@ -10,13 +10,14 @@ import numpy as np
 from SlicerUSSim.Logic.base.errors import require
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.mri.craniotomy import require_brain, without_outside
+from SlicerUSSim.Logic.mri.head_axes import head_axes
 from SlicerUSSim.Logic.probe.placement import pose_looking_at, sample
 from SlicerUSSim.Logic.probe.surface import PatientSurface
 
 
 @dataclass(frozen=True)
 class View:
-    """A place on the head and an orientation, both in RAS."""
+    """A place on the head and an orientation: to the head's right, front and top."""
 
     #: What it shows
     tip: str
@@ -55,22 +56,25 @@ def opened_view_pose(labels: Volume, names: Sequence[str], view: str) -> tuple[n
 
     It stands on the brain if the opening is where the view is seen from, and on the skin of the closed skull otherwise.
     """
-    pose = view_pose(labels, names, view, is_open=True)
+    pose, line = view_pose(labels, names, view, is_open=True)
     behind = pose[:3, 3] - np.arange(1.0, _BEHIND_MM)[:, None] * pose[:3, 1]
     bones = [number for number, name in enumerate(names, 1) if name in ("skull", "bone")]
     if int(np.isin(sample(labels, behind, order=0), bones).sum()) < _CLOSED_MM:
-        return pose, f"the view {view} is seen through the opening"
-    return view_pose(labels, names, view), (
+        return pose, _joined(line, f"the view {view} is seen through the opening")
+    pose, line = view_pose(labels, names, view)
+    return pose, _joined(
+        line,
         f"the opening is not where the view {view} is seen from: the probe stands on the skin over the closed skull; "
-        "without a view it stands in the opening"
+        "without a view it stands in the opening",
     )
 
 
-def view_pose(labels: Volume, names: Sequence[str], view: str, *, is_open: bool = False) -> np.ndarray:
-    """(4, 4) probe_to_ras of one of VIEWS on labels 1, 2, ... called `names`, with the axis square to the surface.
+def view_pose(labels: Volume, names: Sequence[str], view: str, *, is_open: bool = False) -> tuple[np.ndarray, str]:
+    """((4, 4) probe_to_ras of one of VIEWS on labels 1, 2, ... called `names`, a line about the head's axes or "").
 
-    It stands on the skin if that is labelled, unless skin and skull are to be opened (`is_open`), and on the brain
-    otherwise. Raises SimulationError for an unknown view, and for labels without a brain.
+    The probe's axis is square to the surface; left, front and top are the head's own (head_axes). It stands on the skin
+    if that is labelled, unless skin and skull are to be opened (`is_open`), and on the brain otherwise. Raises
+    SimulationError for an unknown view, and for labels without a brain.
     """
     require(view in VIEWS, f"view is {view!r}, expected one of {', '.join(VIEWS)}")
     require_brain(names)
@@ -81,8 +85,14 @@ def view_pose(labels: Volume, names: Sequence[str], view: str, *, is_open: bool 
     centre = (labels.ijk_to_ras @ [*middle[::-1], 1.0])[:3]
     surface = PatientSurface(brain if is_open else labels)
     chosen = VIEWS[view]
-    outward = np.asarray(chosen.outward) / np.linalg.norm(chosen.outward)
+    axes, line = head_axes(brain, names)
+    outward = axes @ chosen.outward / np.linalg.norm(chosen.outward)
     far = centre + 1000.0 * outward
     found = surface.hit(far, centre)
     face = surface.nearest(far) if found is None else found
-    return pose_looking_at(face, face - surface.normal(face), chosen.lateral)
+    return pose_looking_at(face, face - surface.normal(face), axes @ chosen.lateral), line
+
+
+def _joined(*lines: str) -> str:
+    """The lines that are not empty, as one."""
+    return "; ".join(line for line in lines if line)

@@ -775,7 +775,7 @@ class UltrasoundSceneLogic:
         at a lesion below it (aiming.opening_pose).
         `view` is one of mri.views.VIEWS instead, as "temporal". With `will_open` it is on the brain of a closed head,
         where openCraniotomy opens a disc under it: over the lesion that was laid over the labels, if there is one.
-        Returns a line about what was done in labels with an opening, or "".
+        Returns a line about what was done in labels with an opening, or about how the head lies for a view, or "".
         """
         require_node(probe_transform_node, "vtkMRMLLinearTransformNode", use="probe transform")
         patient = self._patient(labels_node)
@@ -784,7 +784,7 @@ class UltrasoundSceneLogic:
         if view is not None and is_opened(labels_node):
             pose, line = opened_view_pose(surface, patient.names, view)
         elif view is not None:
-            pose = view_pose(surface, patient.names, view)
+            pose, line = view_pose(surface, patient.names, view)
         elif slice_node is None:
             opening = flap_centre(labels_node)
             probe, names = self.preset.probe, patient.names

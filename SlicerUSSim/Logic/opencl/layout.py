@@ -173,6 +173,7 @@ TISSUE = np.dtype(
         ("specks_per_mm3", _FLOAT),
         ("speck_db", _FLOAT),
         ("group", _INT),  # tissues of one speed and impedance: no interface between them
+        ("label_of_group", _INT),  # one that is in the acoustic group of this row's number; -1: no such group
         ("is_fluid", _INT),  # of the membrane's fluids
     ]
 )

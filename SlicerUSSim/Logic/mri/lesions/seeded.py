@@ -54,10 +54,12 @@ _BESIDE_MM = 2.0
 _OEDEMA_MM = 4.0
 
 
-_FLUID_NAMES = "R,A,S=cyst, =cavity or =necrosis"
+#: In every message whose remedy is `tissue`
+SAY_WHAT = "say what it is"
+_FLUID_NAMES = f"{SAY_WHAT}: a cyst, a cavity or a necrosis"
 _WATERY_MEANS = (
-    "what holds more water than white matter may be tumour or oedema: look, and say which (R,A,S=oedema); contrast "
-    "agent would tell more"
+    f"what holds more water than white matter may be tumour or oedema: look, and {SAY_WHAT}; contrast agent would tell "
+    "more"
 )
 
 
@@ -164,12 +166,15 @@ def _contradiction(evidence: Evidence, grown: Grown, named: str) -> str:
     """The rest of the sentence "the seed is in ..."."""
     look, size = grown.look.name, millilitres(grown.region.volume_ml(evidence.spacing_mm))
     if look == "enhancing":
-        return f"what enhances ({size}), and {named} does not: expected a point in the {named}, or R,A,S=tumour"
+        return f"what enhances ({size}), and {named} does not: expected a point in the {named}, or {SAY_WHAT}: a tumour"
     if look == _FLUID:
         return f"fluid ({size}), and {named} is none: expected a point in the {named}, or {_FLUID_NAMES}"
     if evidence.channel("t1gd") is None:
-        return f"an MRI without contrast agent, in which nothing is enhancing: it is {look} ({size}), as R,A,S=tumour"
-    return f"what does not enhance, but is {look} ({size}), as R,A,S=tumour or =oedema may be"
+        return (
+            f"an MRI without contrast agent, in which nothing is enhancing: it is {look} ({size}); {SAY_WHAT}, such as "
+            "tumour"
+        )
+    return f"what does not enhance, but is {look} ({size}); {SAY_WHAT}, such as tumour or oedema"
 
 
 def _core_of(evidence: Evidence, grown: Grown, index: np.ndarray) -> Grown | None:
@@ -391,20 +396,19 @@ def _what_is_at(segmentation: Segmentation, index: np.ndarray, doubts: list[str]
     evidence = segmentation.evidence
     window, ball = around(evidence, index)
     if float(evidence.fluid[window][ball].mean()) >= 0.5:
-        remedy = f"for a fluid lesion say what it is: {_FLUID_NAMES}"
-        return f"fluid that looks like CSF, expected a point in a lesion; {remedy}"
+        return f"fluid that looks like CSF, expected a point in a lesion; for a fluid lesion {_FLUID_NAMES}"
     nearest = tuple(int(n) for n in np.rint(index).astype(int) + evidence.start)
     label = int(segmentation.labels.array[nearest])
     name = segmentation.tissue_names[label - 1] if label else "the background"
     if doubts and name == "enhancing":
         return f"what enhances {doubts[0]}, expected a point in a lesion"
     why = f" ({doubts[-1]})" if doubts else ""
-    remedy = "; if it is a lesion all the same, say what it is, as R,A,S=tumour"
+    remedy = f"; if it is a lesion all the same, {SAY_WHAT}, such as tumour"
     if named is not None:
-        remedy = f"; what looks like its surroundings has no border: draw a mask, and give it with --add {named}=MASK"
+        remedy = f"; what looks like its surroundings has no border: draw a mask, and add it as {named}"
     if evidence.had_field and evidence.atlas is None:
         remedy += (
             "; without an atlas a large lesion can be taken for a bias field, which was removed: try without bias "
-            "correction (--no-bias-correction)"
+            "correction"
         )
     return f"{name} that looks healthy{why}, expected a point in a lesion{remedy}"

@@ -77,18 +77,23 @@ class Labels:
             labels[several] = self.label[chosen]
         return labels
 
-    def borders(self, voxel, before, behind) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """(towards (n, 3), overshoot (n,), curvature (n,)) of the border between groups near (n, 3) voxel positions."""
-        halved = f32(0.5) * voxel - f32(0.25)
-        found = self.widest.border(halved, before, behind)
+    def borders(self, voxel, before, behind, soft) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """(towards (n, 3), overshoot (n,), curvature (n,)) of the border between groups near (n, 3) voxel positions.
+
+        `soft` (groups, groups) tells which groups have soft borders.
+        """
+        halved, numbers = f32(0.5) * voxel - f32(0.25), np.arange(len(soft))
+        is_third = (numbers != before[:, None]) & (numbers != behind[:, None])
+        alike = ~soft[before, behind][:, None] & (soft[before] | soft[behind]) & is_third
+        found = self.widest.border(halved, before, behind, alike=alike)
         flat = found.confidence.copy()
         self.flat.beside_edges(halved, found, before, behind)
         edge = found.edge.copy()
         less = np.flatnonzero(found.confidence < 1)
         widest, places, sides = found.at(less), voxel[less], (before[less], behind[less])
-        near = self.wide.border(places, *sides)
+        near = self.wide.border(places, *sides, alike=alike[less])
         some = np.flatnonzero(near.confidence < 1)
-        fine = self._fine(places[some], before[less][some], behind[less][some])
+        fine = self._fine(places[some], before[less][some], behind[less][some], soft)
         wider = near.at(some)
         agrees = f32(1) - ramp(0.4, 0.55, np.abs(wider.overshoot - fine.overshoot))
         agrees *= ramp(0.9877, 0.9945, dot(wider.towards, fine.towards))
@@ -122,8 +127,15 @@ class Labels:
         self.flat.straighten(voxel, found, before, behind)
         return found.towards, found.overshoot, found.curvature
 
-    def _fine(self, voxel, before, behind) -> Borders:
-        """From the labels within 3.5 voxels, smoothed here."""
+    def _fine(self, voxel, before, behind, soft) -> Borders:
+        """From the labels within 3.5 voxels, smoothed here.
+
+        At a strong border, groups that have a soft border with one of the two belong to its side.
+        """
+        rows, numbers = np.arange(len(voxel)), np.arange(len(soft))
+        is_strong = ~soft[before, behind][:, None]
+        first = (numbers == before[:, None]) | is_strong & soft[before]
+        side = f32(first) - f32((numbers == behind[:, None]) | is_strong & soft[behind] & ~first)
         top = self.dims - 1
         inside = np.clip(voxel, f32(0), f32(top))
         low = np.maximum(np.ceil(inside - _FINE_REACH).astype(np.int64), 0)
@@ -141,7 +153,7 @@ class Labels:
                 # Outside the window the weight is 0.
                 row = np.minimum((low + [0, j, k]) @ self.steps, len(self.groups) - 8)
                 group = self.groups[row[:, None] + np.arange(8)]
-                sign = f32(group == before[:, None]) - f32(group == behind[:, None])
+                sign = side[rows[:, None], group]
                 factors = (yz, yz * y, yz * z, yz * (y * y + z * z))
                 for moment, factor in zip(moments, factors, strict=False):
                     moment += factor * sign

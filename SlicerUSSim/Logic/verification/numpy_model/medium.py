@@ -167,6 +167,7 @@ def _tissue_rows(tissues: TissueTable, present: list[int]) -> np.ndarray:
         members[CONSTANTS["MEMBRANE_LABEL"]] = tissues.membrane.tissue
         fluids = tissues.membrane.fluids
     rows = np.zeros(CONSTANTS["MAX_TISSUES"], TISSUE)
+    rows["label_of_group"] = -1
     known: list[tuple[float, float, bool]] = []
     for label, tissue in members.items():
         acoustics = tissue.speed_of_sound_m_s, tissue.impedance_mrayl, tissue.attenuation_db_cm_mhz > _LOSSY
@@ -178,6 +179,7 @@ def _tissue_rows(tissues: TissueTable, present: list[int]) -> np.ndarray:
                 row[parameter.name] = getattr(tissue, parameter.name)
         share = special.ndtr(-tissue.mu1)
         row["scatterer_share"], row["group"] = share, known.index(acoustics)
+        rows[known.index(acoustics)]["label_of_group"] = label
         row["scatterer_variance"] = share * (1.0 - share) * tissue.mu0**2 + share * tissue.sigma0**2
         row["is_fluid"] = label in tissues and tissue.name in fluids
     return rows

@@ -13,6 +13,7 @@ from SlicerUSSim.Logic.verification.numpy_model.elementary import dot, exp, f32,
 OF_BOTH, _OF_BEFORE, _OF_BEHIND = (1.0, 1.0, 0.0), (2.0, 0.0, -65535.0), (0.0, 2.0, 65535.0)
 TWO_GROUPS, _MOSTLY_TWO = 0.9999, 0.97  # sums of both indicators
 _FARTHEST_DIFFERENCE = 0.75  # of D from 0
+_FEW_ALIKE = 0.01  # share of others on the same side that bends no normals
 # Nodes (i, j, k) of the stencil of D: a cell, and those beside it along each axis
 _NODES = np.array(
     [
@@ -120,8 +121,11 @@ class SmoothGrid:
         self.steps = np.array([1, self.dims[0], self.dims[0] * self.dims[1]])
         self.smooth = smooth.reshape(self.groups, -1)
 
-    def border(self, voxel, before, behind, farthest: float | None = None) -> Borders:
-        """Borders near (n, 3) positions; confidence 0: they do not determine it."""
+    def border(self, voxel, before, behind, farthest: float | None = None, alike: np.ndarray | None = None) -> Borders:
+        """Borders near (n, 3) positions; confidence 0: they do not determine it.
+
+        `alike` (n, groups) are third groups on the same side of a strong border as one of the two.
+        """
         found = Borders.none(len(voxel))
         if self.dims.min() < 4:
             return found
@@ -132,6 +136,12 @@ class SmoothGrid:
         found.put(known, of_both)
         third = both < f32(TWO_GROUPS)
         known, both = known[third], both[third]
+        if alike is not None:
+            mixed = self._share(voxel[known], alike[known]) > f32(_FEW_ALIKE)
+            some = known[mixed]
+            found.confidence[some] = found.sigma[some] = found.bent[some] = 0
+            found.share[some] = np.nan
+            known, both = known[~mixed], both[~mixed]
         front, _ = self._border(voxel[known], before[known], behind[known], _OF_BEFORE, limit)
         back, _ = self._border(voxel[known], before[known], behind[known], _OF_BEHIND, limit)
         of_before, of_behind = front.steepness[:, None] * front.towards, back.steepness[:, None] * back.towards
@@ -147,6 +157,12 @@ class SmoothGrid:
         found.put(known[better], layer.at(better))
         found.sigma[known], found.share[known], found.bent[known] = 0, np.nan, 0
         return found
+
+    def _share(self, voxel, groups: np.ndarray) -> np.ndarray:
+        """(n,) share of some groups (n, groups) at the voxels nearest to positions."""
+        at = np.clip((voxel + f32(0.5)).astype(np.int64), 0, self.dims - 1) @ self.steps
+        shares = [np.where(groups[:, n], self.smooth[n, at].astype(np.float32), f32(0)) for n in range(self.groups)]
+        return np.sum(shares, axis=0, dtype=np.float32) / f32(65535)
 
     def border_of(self, voxel, group) -> Borders:
         """Borders of one group, for each of (n, 3) positions, against all others."""

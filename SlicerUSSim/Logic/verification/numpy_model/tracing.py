@@ -113,6 +113,9 @@ class Tracer:
         self.voxel_mm = acquisition["voxel_mm"]
         self._lit = Lit(acquisition, screens)
         self.seen = as_beams_see(tissues, acquisition)
+        of_group = tissues["label_of_group"]
+        self.soft = is_soft(self.seen[of_group][:, None], self.seen[of_group][None])
+        self.soft &= (of_group >= 0) & (of_group >= 0)[:, None]
         self.decay = tissues["attenuation_db_cm_mhz"] * acquisition["frequency_mhz"] * f32(0.2) * LN10_OVER_20
 
     def run(self, roots: np.ndarray, quantiles: np.ndarray):
@@ -657,7 +660,7 @@ class Tracer:
 
     def _normals(self, rays: Rays, border, before, behind) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """(unit normals in RAS against the rays, lengths that the rays are beyond the border, curvatures in 1/mm)."""
-        towards, overshoot, curvature = self.labels.borders(self._place(rays, border), before, behind)
+        towards, overshoot, curvature = self.labels.borders(self._place(rays, border), before, behind, self.soft)
         across = -dot(rays.step, towards)
         with np.errstate(divide="ignore", invalid="ignore"):
             overshoot = np.where(across * self.voxel_mm > f32(0.2), overshoot / across, f32(0))
@@ -676,7 +679,7 @@ class Tracer:
             curvature = np.full(len(point), np.inf, np.float32)
             for reach in f32([-_CURVATURE_REACH, _CURVATURE_REACH]) * self.voxel_mm:
                 place = affine_point(self.to_voxel, point + reach * tangent)
-                turned = border_normals(self.to_voxel, self.labels.borders(place, before, behind)[0])
+                turned = border_normals(self.to_voxel, self.labels.borders(place, before, behind, self.soft)[0])
                 curvature = np.minimum(curvature, dot(turned - normal, tangent) / reach)
             curvature = np.maximum(curvature, f32(0)) * ramp(0.004, 0.008, curvature * self.voxel_mm)
             tube[:, width + 1] += f32(2) * curvature * longer * tube[:, width]

@@ -1,0 +1,54 @@
+"""Standard views follow the head, however it lies in its image."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from SlicerUSSim.Logic import Volume
+from SlicerUSSim.Logic.mri.head_axes import head_axes
+from SlicerUSSim.Logic.mri.views import view_pose
+
+NAMES = ("csf", "grey matter", "white matter")
+
+
+@pytest.fixture(scope="module")
+def brain(mni):
+    """Labels of MNI152, every second voxel."""
+    t1, grey, white = (volume.array[::2, ::2, ::2] for volume in mni)
+    labels = np.where(t1 > 0, 1 + np.argmax([255 - grey - white.astype(int), grey, white], axis=0), 0)
+    return Volume(labels.astype(np.uint8), mni[0].ijk_to_ras @ np.diag([2.0, 2.0, 2.0, 1.0]))
+
+
+def lying(brain: Volume, turn: Rotation) -> Volume:
+    """The same head, turned about the origin of MNI152 and moved, which its header tells truly."""
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = turn.as_matrix(), [12.0, -30.0, 45.0]
+    return Volume(brain.array, matrix @ brain.ijk_to_ras)
+
+
+@pytest.mark.parametrize("turn", [(25.0, 0.0, 0.0), (-18.0, 7.0, 12.0)], ids=["nodding", "three axes"])
+def test_views_of_a_turned_head_are_those_of_the_upright_one_turned(brain, turn):
+    """A probe at the temple of a head that nods by 25 degrees missed the midline: it followed the scanner's axes."""
+    rotation = Rotation.from_euler("xyz", turn, degrees=True)
+    turned = lying(brain, rotation)
+    upright, line = head_axes(brain, NAMES)
+    assert line == "" and Rotation.from_matrix(upright).magnitude() < np.radians(2.0)
+    axes, line = head_axes(turned, NAMES)
+    assert Rotation.from_matrix(axes @ rotation.as_matrix().T).magnitude() < np.radians(2.0)
+    assert "the head lies turned by 2" in line
+    for view in ("temporal", "fontanelle"):
+        (before, _), (after, told) = (view_pose(labels, NAMES, view) for labels in (brain, turned))
+        expected = rotation.as_matrix() @ before[:3, :3]
+        assert told == line
+        assert Rotation.from_matrix(after[:3, :3] @ expected.T).magnitude() < np.radians(12.0)  # normals of a surface
+
+
+def test_where_the_atlas_does_not_lead_a_view_follows_the_image_and_says_so(brain):
+    half = brain.array.copy()
+    half[:, :, : half.shape[2] // 2] = 0
+    half[:, : half.shape[1] // 2] = 0
+    axes, line = head_axes(brain.with_array(half), NAMES)
+    assert np.array_equal(axes, np.eye(3)) and line.startswith("the view follows the image's axes, since ")
+    assert view_pose(brain.with_array(half), NAMES, "temporal")[1] == line
