@@ -124,7 +124,7 @@ class SmoothGrid:
     def border(self, voxel, before, behind, farthest: float | None = None, alike: np.ndarray | None = None) -> Borders:
         """Borders near (n, 3) positions; confidence 0: they do not determine it.
 
-        `alike` (n, groups) are third groups on the same side of a strong border as one of the two.
+        `alike` (n, groups) are third groups that may be on the same side of a strong border as one of the two.
         """
         found = Borders.none(len(voxel))
         if self.dims.min() < 4:
@@ -136,23 +136,21 @@ class SmoothGrid:
         found.put(known, of_both)
         third = both < f32(TWO_GROUPS)
         known, both = known[third], both[third]
-        if alike is not None:
-            mixed = self._share(voxel[known], alike[known]) > f32(_FEW_ALIKE)
-            some = known[mixed]
-            found.confidence[some] = found.sigma[some] = found.bent[some] = 0
-            found.share[some] = np.nan
-            known, both = known[~mixed], both[~mixed]
         front, _ = self._border(voxel[known], before[known], behind[known], _OF_BEFORE, limit)
         back, _ = self._border(voxel[known], before[known], behind[known], _OF_BEHIND, limit)
         of_before, of_behind = front.steepness[:, None] * front.towards, back.steepness[:, None] * back.towards
         gradient, normal = f32(0.5) * (of_before - of_behind), of_before + of_behind
         along = dot(gradient, normal) / np.maximum(length(normal), f32(1e-9))
         steep = np.maximum(length(gradient), f32(1e-9))
+        agree = dot(front.towards, back.towards)
         layer = back
         is_front = np.flatnonzero(along > 0)
         layer.put(is_front, front.at(is_front))
         layer.confidence *= ramp(0.4, 0.8, np.sqrt(self.variance) * steep / (f32(1) - both))
         layer.confidence *= ramp(0.9, 0.97, np.abs(along) / steep)
+        if alike is not None:
+            beside = self._share(voxel[known], alike[known]) > f32(_FEW_ALIKE)
+            layer.confidence *= np.where(beside, ramp(0.98, 0.998, agree), f32(1))
         better = layer.confidence >= found.confidence[known]
         found.put(known[better], layer.at(better))
         found.sigma[known], found.share[known], found.bent[known] = 0, np.nan, 0
