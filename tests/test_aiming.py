@@ -44,6 +44,7 @@ def notes_of(labels: Volume, probe: Probe, pose: np.ndarray, *, is_open: bool, n
     return about_bone(labels, names, TISSUES.values(), probe, pose, is_open=is_open, words=words)
 
 
+@pytest.mark.slow
 def test_a_probe_in_an_opening_looks_at_the_tumour_below_it(head):  # noqa: F811
     place = np.array([10.0, 8.0, 35.0])
     labels, middle = with_disc(with_ball(head, place, 7.0), 40.0)
@@ -56,6 +57,7 @@ def test_a_probe_in_an_opening_looks_at_the_tumour_below_it(head):  # noqa: F811
     assert line == f"aimed at the tumour, {angle:.0f} degrees off the surface's normal" and 20.0 < angle < 30.0
 
 
+@pytest.mark.slow
 def test_veins_are_no_lesion(head):  # noqa: F811
     """With contrast agent a class of the T1 is what enhances, and a probe was aimed at the sinus as "the enhancing"."""
     vein, tumour, names = np.array([10.0, 8.0, 35.0]), np.array([-12.0, 0.0, 30.0]), (*ILL, "enhancing")
@@ -105,6 +107,7 @@ def test_a_lesion_too_far_aside_leaves_the_probe_along_the_normal_and_is_said(he
     )
 
 
+@pytest.mark.slow
 def test_of_several_lesions_the_largest_in_reach_is_looked_at_and_oedema_only_without_a_tumour(head):  # noqa: F811
     far, large, small = [-50.0, 0.0, 0.0], [10.0, 0.0, 30.0], [-10.0, 0.0, 40.0]
     labels = head
@@ -118,6 +121,7 @@ def test_of_several_lesions_the_largest_in_reach_is_looked_at_and_oedema_only_wi
     assert off_axis_mm(pose, [0.0, 15.0, 20.0]) < 1.5 and "aimed at the oedema, " in line
 
 
+@pytest.mark.slow
 def test_specks_are_no_lesion_and_one_right_before_the_face_needs_no_turn(head):  # noqa: F811
     labels, middle = with_disc(with_ball(head, [10.5, 0.0, 34.5], 2.0), 40.0)
     assert 0 < (labels.array == TUMOUR).sum() * labels.voxel_ml < 0.05
@@ -180,6 +184,7 @@ def test_a_closed_skull_before_the_brain_is_said_where_its_bone_leaves_no_signal
     assert "the skull is closed in front of the probe" in line and "the opening is elsewhere (" in line
 
 
+@pytest.mark.slow
 def test_a_skull_is_not_said_to_be_closed_where_the_brain_is_seen(head):  # noqa: F811
     pose, _ = view_pose(head, NAMES, "temporal")
     assert notes_of(head, PROBES["transcranial"], pose, is_open=False) == ()  # 2 MHz pass

@@ -207,6 +207,7 @@ def test_a_file_shows_squares_of_the_surfels_area_where_slicer_expects_them(tmp_
     assert mass.GetSurfaceArea() == pytest.approx(surfels.area.sum(), rel=1e-4)
 
 
+@pytest.mark.slow
 def test_files_that_are_no_sheets_are_named(tmp_path):
     with pytest.raises(SimulationError, match=r"\.vtp or \.ply"):
         write_surfels(tmp_path / "sheets.stl", some_surfels())
@@ -339,6 +340,7 @@ def test_a_grid_too_coarse_for_the_reach_and_no_surfels():
 # ---- whole heads ----------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("use_intensity", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_a_falx_that_enhances_as_white_matter_does_is_no_white_matter(use_intensity):
     """Between hemispheres 10 mm apart, off the middle between them. Of a real one, a third of the places were taken for
@@ -500,6 +502,7 @@ def test_a_search_can_be_cancelled():
         find_sheets(mri, found, contrast="t1", progress=stop)
 
 
+@pytest.mark.slow
 def test_vessels_and_plexus_are_not_invented_without_contrast_agent():
     mri, found = template_head()
     sheets = find_sheets(mri, found, contrast="t1", kinds=("vessels", "choroid plexus"))
@@ -594,6 +597,7 @@ for size in (0, 700, 2000):
 """
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="no limit of the size of files")
 @pytest.mark.parametrize("name", ["sheets.vtp", "sheets.ply"])
 def test_sheets_that_do_not_fit_on_the_disk_leave_those_before(name, tmp_path):
@@ -608,6 +612,7 @@ def test_sheets_that_do_not_fit_on_the_disk_leave_those_before(name, tmp_path):
     assert done.stderr == "" and [file.name for file in tmp_path.iterdir()] == [name]
 
 
+@pytest.mark.slow
 def test_sheets_of_a_file_that_was_transformed_are_where_its_points_are(tmp_path):
     """Other programs leave the arrays as they were, and sheets were drawn where they had been before."""
     from vtkmodules.vtkCommonTransforms import vtkTransform

@@ -71,6 +71,7 @@ def test_a_homogeneous_medium_changes_depth_and_attenuation_alone(kind):
         np.testing.assert_allclose(path["direction"], path["direction"][:1].repeat(len(path), 0), atol=2e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", PROBES)
 @pytest.mark.parametrize("speeds", [(1500.0, 1560.0), (1580.0, 1510.0)])
 def test_a_soft_wedge_shifts_wires_as_snell_says(kind, speeds):
@@ -533,6 +534,7 @@ def test_axes_that_come_together_and_apart_create_no_power():
     assert change.mean() == pytest.approx(expected.mean(), abs=0.25)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("cycles", [0.25, 0.5])
 def test_a_phase_step_across_the_aperture_widens_speckle(cycles):
     """Tissue before half of the aperture delays its wave: by half a cycle the beam is 1.7 times as wide."""

@@ -156,6 +156,7 @@ def phantom(shape):
     return Volume(array.astype(np.float32), grid.ijk_to_ras)
 
 
+@pytest.mark.slow
 @needs_nilearn
 @pytest.mark.parametrize("shape", [pytest.param("box", marks=pytest.mark.slow), "sphere"])
 def test_a_phantom_is_refused_as_one(shape):
@@ -188,6 +189,7 @@ def test_a_phantom_as_large_as_a_brain_on_a_background_of_0_is_refused_as_one():
         find_brain(empty.with_array(array.astype(np.float32)))
 
 
+@pytest.mark.slow
 @needs_nilearn
 def test_a_phantom_of_noisy_shells_as_large_as_a_brain_on_a_background_of_0_is_said():
     empty, radius = ellipsoid((62, 84, 60), spacing=2.0)
@@ -326,6 +328,7 @@ def test_an_image_resampled_along_other_axes_is_no_fan(head):
     assert not is_ultrasound(Volume(turned, np.eye(4)))
 
 
+@pytest.mark.slow
 @needs_nilearn
 def test_a_limb_is_refused_as_going_through_the_image():
     _, j, i = np.indices((50, 54, 54)) * 3.0
@@ -1045,6 +1048,7 @@ def test_more_than_any_brain_given_as_the_brain_is_refused():
         given_brain(mri.with_array(outside), mri)
 
 
+@pytest.mark.slow
 @needs_nilearn
 def test_a_program_that_is_not_installed_is_said_before_the_image_is_looked_at(head, monkeypatch):
     monkeypatch.setattr(extractors, "has_deepbet", lambda: False)

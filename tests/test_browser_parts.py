@@ -575,6 +575,7 @@ def test_the_script_of_an_mri_has_its_mask_and_options_and_the_texture_if_it_is_
         compile(text, "script", "exec")
 
 
+@pytest.mark.slow
 def test_the_script_of_labels_with_lesions_of_a_page_simulates_the_same_image_beside_their_file(head, tmp_path):
     """Of a mask that a page has sent, only the name is known."""
     labels, mask = tmp_path / "labels.nii.gz", "it's a cyst.nii.gz"
@@ -714,6 +715,7 @@ def _opener() -> Opener:
     return Opener(scene, UltrasoundSceneLogic(scene), AtOnce(), Files())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("table", ["t2", "names", "mapping"])
 def test_a_label_map_is_opened_with_the_table_of_its_labels_whatever_that_is_called(head, tmp_path, table):
     """Of ussim segment, of another program, or as --map takes it; the label map alone is refused with this remedy."""
@@ -907,6 +909,7 @@ def test_the_field_as_triangles_has_its_area_and_the_image_lies_on_it(probe):
 # ---- views -----------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_frozen_image_stays_where_it_was_taken_in_3d_and_in_the_slices():
     """It was draped over the anatomy at the probe's new place."""
     from trame.app import get_server

@@ -52,6 +52,7 @@ def test_help_names_the_commands():
         assert command in result.output
 
 
+@pytest.mark.slow
 def test_demo_writes_everything_it_promises(head, tmp_path):
     pytest.importorskip("matplotlib", reason="pictures need matplotlib: pip install '.[demo]'")
     out = tmp_path / "out"
@@ -397,6 +398,7 @@ def test_options_for_an_mri_are_refused_with_labels(command, given, named, label
     assert f"{labels}: is a label map, and " in result.stderr and "use --mri if it is one" in result.stderr
 
 
+@pytest.mark.slow
 def test_errors_about_another_mri_name_its_file_alone(head, labels, tmp_path):
     constant = tmp_path / "constant.nii.gz"
     mri = Volume.read(head)
@@ -616,6 +618,7 @@ def test_the_demo_refuses_a_label_map_as_segment_does(labels, tmp_path):
     assert not (tmp_path / "demo").exists()
 
 
+@pytest.mark.slow
 def test_the_demo_leaves_nothing_behind_of_an_image_that_it_refuses(tmp_path):
     pytest.importorskip("matplotlib", reason="pictures need matplotlib: pip install '.[demo]'")
     noise = tmp_path / "noise.nrrd"

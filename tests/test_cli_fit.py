@@ -56,6 +56,7 @@ def optimize(folder, *options):
     )  # fmt: skip
 
 
+@pytest.mark.slow
 def test_optimize_writes_result_report_preset_and_state(folder):
     pytest.importorskip("matplotlib", reason="reports need matplotlib: pip install '.[demo]'")
     done = optimize(

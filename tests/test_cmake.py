@@ -102,6 +102,7 @@ def test_every_installed_resource_bears_the_modules_name(installed):
     assert mine and all("USSim" in Path(path).parts or Path(path).stem == "USSim" for path in mine)
 
 
+@pytest.mark.slow
 @needs_cmake
 def test_a_new_file_is_built_without_a_list_to_add_it_to(tmp_path):
     source = tmp_path / "source"

@@ -51,6 +51,7 @@ def slope(points) -> np.ndarray:
     return 120 + 1.1 * points[..., 0] - 0.7 * points[..., 1] + 0.5 * points[..., 2]
 
 
+@pytest.mark.slow
 @settings(max_examples=8)
 @given(
     angles=st.tuples(*[st.floats(-180, 180)] * 3),

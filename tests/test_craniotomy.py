@@ -176,6 +176,7 @@ def test_an_open_curve_is_closed_and_that_is_said(head, tmp_path, caplog):
     np.testing.assert_array_equal(*found)
 
 
+@pytest.mark.slow
 def test_the_probe_stands_on_the_brain_in_the_opening_of_a_file(head, tmp_path):
     """It stood under closed bone, and showed the brain all the same."""
     write_label_files(tmp_path / "head.nii.gz", head, TissueTable.brain().for_names(NAMES))
@@ -198,6 +199,7 @@ def test_the_probe_stands_on_the_brain_in_the_opening_of_a_file(head, tmp_path):
     assert "the skull is closed" not in told  # it is behind the face
 
 
+@pytest.mark.slow
 def test_the_command_aims_at_a_tumour_in_the_opening_of_a_file_and_says_where_the_skull_is_closed(head, tmp_path):
     place, names = (12.0, 0.0, 35.0), (*NAMES, "tumour")
     inside = np.linalg.norm(places_of(head) - place, axis=-1) <= 7.0
@@ -213,6 +215,7 @@ def test_the_command_aims_at_a_tumour_in_the_opening_of_a_file_and_says_where_th
     assert black[black.shape[0] // 3 :].mean() < 3.0
 
 
+@pytest.mark.slow
 def test_commands_say_that_no_part_of_the_face_touches_the_patient(head, tmp_path):
     """The image was black, without a word."""
     write_label_files(tmp_path / "head.nii.gz", head, TissueTable.brain().for_names(NAMES))

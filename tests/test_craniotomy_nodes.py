@@ -244,6 +244,7 @@ def test_gel_is_between_skin_and_probe_as_in_the_commands_unless_the_user_says_o
     assert brain.logic.settings(brain.whole).contact_gap_mm is None
 
 
+@pytest.mark.slow
 def test_place_aims_at_a_tumour_below_the_opening_and_the_notes_say_so(head):  # noqa: F811
     place = np.array([10.0, 8.0, 35.0])
     bench = Bench(with_ball(head, place, 7.0), names=(*NAMES, "tumour"))
@@ -299,6 +300,7 @@ def test_the_notes_say_that_no_part_of_the_face_touches_the_patient(head):  # no
     assert "face touches" not in bench.presenter.notes() and not bench.view.errors
 
 
+@pytest.mark.slow
 def test_the_notes_follow_the_probe_over_bone_and_openings(head):  # noqa: F811
     closed, misfit = "the skull is closed in front of the probe", "does not fit the opening"
     bench = Bench(head)

@@ -170,6 +170,7 @@ def moved(organs: LabelledTissues, *, factors=(1.0, 1.0, 1.0), shift_mm=(0.0, 0.
     return replace(organs, labels=Volume(organs.labels.array, matrix @ organs.labels.ijk_to_ras))
 
 
+@pytest.mark.slow
 def test_organs_of_another_patient_or_place_are_refused_by_the_numbers_of_the_ct():
     """Their outlines became tissue: a liver of 66 +- 71 HU in a lumbar spine."""
     chest, spine = lower_chest((2.0, 2.0, 2.0)), lumbar_spine((2.0, 2.0, 2.0))
@@ -207,6 +208,7 @@ def test_bones_whose_marrow_is_as_soft_as_muscle_are_those_of_the_ct():
     segment_ct(coarse.ct, organs=read_label_map(coarse.organs, mapping=LabelMapping.of("totalsegmentator")))
 
 
+@pytest.mark.slow
 def test_a_few_organs_are_read_by_totalsegmentators_numbers_and_checked_by_those_of_the_ct():
     """The phantom's own 2, 5 and 14 were refused, with the advice to take them for FreeSurfer's."""
     chest, spine = lower_chest((2.0, 2.0, 2.0)), lumbar_spine((2.0, 2.0, 2.0))
@@ -295,6 +297,7 @@ def test_a_label_map_called_ct_is_refused(chest):
         segment_ct("ct.nii.gz")  # type: ignore[arg-type]
 
 
+@pytest.mark.slow
 def test_a_ct_called_mri_is_refused_with_the_option(spine):
     with pytest.raises(SimulationError, match="segment a CT with --ct"):
         segment_mri(spine.ct)
@@ -399,6 +402,7 @@ def levels_db(phantom_found, probe, face, target, lateral) -> tuple[np.ndarray, 
     return 20.0 * np.log10(np.maximum(frame.envelope, 1e-9)), frame.sample_interval_mm
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("frequency_mhz", "attenuation"),
     [
@@ -468,6 +472,7 @@ def test_what_a_ct_has_not_is_said(tmp_path, spine, capsys, options, message):
     assert message in capsys.readouterr().err.replace("\n", " ")
 
 
+@pytest.mark.slow
 def test_a_view_of_a_label_map_without_a_brain_is_said(tmp_path, spine, spine_found, capsys):
     spine_found.labels.write(tmp_path / "labels.nii.gz")
     TissueTable.named(spine_found.tissue_names).write(tmp_path / "labels.json")

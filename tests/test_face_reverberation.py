@@ -54,6 +54,7 @@ def test_without_a_face_and_where_nothing_comes_back_to_it_there_is_no_image():
     assert peak(plate(12.0), probe, 2.0 * DEPTH_MM)[1] < level - 60.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["linear", pytest.param("convex", marks=pytest.mark.slow)])
 def test_the_numpy_model_has_the_same_image(name):
     simulator = plate(3.0)

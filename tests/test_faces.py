@@ -137,6 +137,7 @@ def test_an_unknown_name_is_an_error_that_names_package_and_name(package):
         exec(f"from {package} import {name}")
 
 
+@pytest.mark.slow
 def test_a_type_checker_knows_what_the_package_exports(tmp_path):
     if importlib.util.find_spec("pyright") is None:
         pytest.skip("needs pyright: pip install '.[test]'")
@@ -159,6 +160,7 @@ def test_a_type_checker_knows_what_the_package_exports(tmp_path):
     assert [text.split(" is ")[-1] for text in revealed[1:]] == ['"float"', '"float"']
 
 
+@pytest.mark.slow
 def test_faces_work_in_a_build_without_source_files(tmp_path):
     """Slicer can be packaged with compiled files alone."""
     copy = tmp_path / "SlicerUSSim" / "Logic"

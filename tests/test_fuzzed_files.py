@@ -205,6 +205,7 @@ def is_read_or_refused(path: Path, read: Callable[[Path], object]) -> None:
         assert np.isfinite(found).all()
 
 
+@pytest.mark.slow
 def test_every_format_is_read_before_it_is_damaged(tmp_path):
     for number, file in enumerate(FORMATS.values()):
         path = tmp_path / str(number) / file.name
@@ -213,6 +214,7 @@ def test_every_format_is_read_before_it_is_damaged(tmp_path):
         assert file.read(file.of(path)) is not None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name", [pytest.param(name, marks=[pytest.mark.slow] * (name in ("IM", "dcm", "dcms"))) for name in FORMATS]
 )

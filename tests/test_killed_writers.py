@@ -109,6 +109,7 @@ print("steps", steps)
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("how", ["kill", *(pytest.param(how, marks=pytest.mark.slow) for how in ("fail", "EIO"))])
 @pytest.mark.parametrize(
     "name",

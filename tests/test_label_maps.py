@@ -721,6 +721,7 @@ def test_a_probability_map_without_the_others_is_refused(tmp_path):
     )
 
 
+@pytest.mark.slow
 def test_an_mri_scaled_to_one_is_an_mri(mni):
     from SlicerUSSim.Logic.tissue.label_sources import is_label_file
 
@@ -817,6 +818,7 @@ def test_an_mri_enlarged_by_nearest_neighbours_is_an_mri(mni):
     ).looks_like_labels()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mm", [3, 5, 8])
 @pytest.mark.parametrize("regions", [0, 150])
 def test_a_parcellation_is_no_mri_in_coarse_voxels(mm, regions, mni):
@@ -859,6 +861,7 @@ def test_labels_out_of_range_are_refused_as_labels(change, mni, tmp_path):
     assert not (tmp_path / "o.nii.gz").exists()
 
 
+@pytest.mark.slow
 def test_an_mri_with_negative_numbers_is_an_mri(mni):
     t1 = mni[0]
     for shift in (1, 40, 120, 400):
@@ -892,6 +895,7 @@ def test_a_label_map_that_was_smoothed_is_called_so(change, tmp_path):
     assert "as a label map that was" in message and "resampled with interpolation" in message, message
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sigma", [0.0, 0.7, 2.0])
 @pytest.mark.parametrize("levels", [None, 255])
 def test_a_smoothed_mri_or_tissue_map_is_no_smoothed_label_map(sigma, levels, mni):

@@ -422,6 +422,7 @@ def test_a_modulated_map_is_refused_as_one_and_not_with_the_contrast_that_it_res
             assert f"{name}: a modulated tissue map ({name[:-6]}, volumes" in message and "c1, c2, c3 of SPM" in message
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("cut_at", [100, *(pytest.param(n, marks=pytest.mark.slow) for n in (97, 80))])
 def test_an_mri_up_to_3_is_no_partial_volume_map(cut_at, mni, tmp_path):
     t1 = mni[0].array.astype(np.float32)
@@ -431,6 +432,7 @@ def test_an_mri_up_to_3_is_no_partial_volume_map(cut_at, mni, tmp_path):
     assert not is_label_file(tmp_path / "mwp1T1.nii", mni[0])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("cut_at", [*(pytest.param(n, marks=pytest.mark.slow) for n in (100, 97, 80)), 60])
 def test_an_mri_up_to_100_or_255_is_no_probability_map_whatever_it_is_called(cut_at, mni, tmp_path):
     t1 = mni[0].array.astype(float)

@@ -98,6 +98,7 @@ def core(proposal: Proposal) -> np.ndarray:
     return np.isin(proposal.labels.array, [n for n, name in enumerate(proposal.tissues, 1) if name != "oedema"])
 
 
+@pytest.mark.slow
 @needs_atlas
 @pytest.mark.parametrize("kind", [pytest.param("ring", marks=pytest.mark.slow), "low"])
 def test_one_seed_grows_the_lesion_and_not_what_is_outside(kind):
@@ -158,6 +159,7 @@ def test_a_seed_in_no_lesion_says_what_is_there(seed, words):
     assert "\n" not in str(error.value)
 
 
+@pytest.mark.slow
 @needs_atlas
 def test_a_tissue_that_the_user_names_is_taken_at_his_word():
     segmentation, _ = brain("healthy")
@@ -317,6 +319,7 @@ def test_a_list_of_points_that_is_none_is_refused(text, message, tmp_path):
 # ---- scene -----------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @needs_atlas
 def test_a_point_in_a_scene_makes_a_proposal_that_is_applied_when_confirmed():
     slicer = pytest.importorskip("slicer", reason="MRML nodes come with slicer-core: pip install '.[slicer]'")

@@ -100,6 +100,7 @@ def test_a_build_is_logged_with_its_options_and_the_next_use_as_known(log):
     assert messages(log)[-1] == f"bmode.cl ({device.lanes}): built before in this process"
 
 
+@pytest.mark.slow
 def test_segmentation_says_what_it_found_and_how_long_it_took(log):
     segment_mri(head_mri(3.0), thin_sulci=True)
     found = "\n".join(messages(log, logging.INFO))
@@ -309,6 +310,7 @@ def test_files_that_were_asked_for_leave_stdout_empty(files, tmp_path):
         assert result.stdout == "" and result.stderr.startswith("wrote "), arguments[0]
 
 
+@pytest.mark.slow
 def test_segment_prints_its_tissues_alone(files, tmp_path):
     result = ussim("segment", files / "head.nii.gz", "-o", tmp_path / "labels.nii.gz", "-vv")
     lines = [line.split() for line in result.stdout.splitlines()]
@@ -343,6 +345,7 @@ def test_demo_prints_the_path_of_its_figure(files, tmp_path):
     assert "device: " in result.stderr
 
 
+@pytest.mark.slow
 def test_validate_prints_its_numbers_and_not_where_they_are(tmp_path):
     pytest.importorskip("matplotlib", reason="pictures need matplotlib: pip install '.[demo]'")
     from SlicerUSSim.Logic.verification.validation import all_checks

@@ -72,6 +72,7 @@ def scene(membrane: bool = True):
     return block(label, half_mm=(22, 34, 12)), TissueTable(tissues, membrane=skin)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", [pytest.param(k, marks=[pytest.mark.slow] * (k != "linear")) for k in PROBES])
 @pytest.mark.parametrize(
     "turn",

@@ -404,6 +404,7 @@ def test_a_replay_ends_where_the_runs_part():
     assert other.evaluate("polish", np.array([0.1])) == 0.1  # another stage
 
 
+@pytest.mark.slow
 def test_progress_tells_the_best_and_ends_at_one(twin):
     told = []
     result = optimise(twin, ["display"], max_evaluations=60, restarts=1, progress=told.append)
@@ -607,12 +608,14 @@ def _fit_of_a_thin_sheet(evaluations: int, restarts: int, seed: int = 0):
     return found, changes
 
 
+@pytest.mark.slow
 def test_the_level_of_no_tissue_alone_is_left_where_a_search_of_all_has_carried_it():
     """A falx ended 5 dB too dark, and was not to be seen, though a brighter one cost less."""
     _, changes = _fit_of_a_thin_sheet(150, 0)
     assert len(changes) == 4 and min(changes.values()) > -5e-4, changes
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("evaluations", "seed"), [(60, 0), (90, 2)])
 def test_a_restart_that_fits_better_is_gone_on_from_and_no_other(evaluations, seed):
     once, again = (_fit_of_a_thin_sheet(evaluations, restarts, seed)[0] for restarts in (0, 2))

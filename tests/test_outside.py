@@ -50,6 +50,7 @@ def round_head(
     return Volume(found[0], matrix), *found[1:]
 
 
+@pytest.mark.slow
 def test_layers_of_a_round_head_are_found_where_they_are():
     mri, brain, radius = round_head()
     found = find_outside(mri, brain)

@@ -527,6 +527,7 @@ def test_segment_writes_added_tissues_and_says_what_it_added(files, tmp_path):
     assert again.exit_code == 0 and "tumour" not in TissueTable.read(tmp_path / "labels.json").names()
 
 
+@pytest.mark.slow
 def test_every_command_that_simulates_takes_additions_for_an_mri_and_for_labels(files, tmp_path):
     labels = tmp_path / "l.nii.gz"
     assert ussim("segment", files / "head.nii.gz", "-o", labels).exit_code == 0

@@ -59,6 +59,7 @@ def test_band_and_aperture_follow_from_the_widths_and_frequency_does_not():
     assert nothing.of(GIVEN) == GIVEN and json.dumps(nothing.to_dict(), allow_nan=False)
 
 
+@pytest.mark.slow
 def test_a_probe_whose_speckle_is_too_fine_gets_the_true_one_back():
     tracked = recorded()
     made = UltrasoundSimulator(LABELS, EVEN, SimulationSettings(seed=2, ring_down=False))

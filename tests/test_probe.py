@@ -211,6 +211,7 @@ def test_a_matrix_array_is_focused_elevationally_as_laterally_at_every_depth():
         assert sigma[0] == pytest.approx(sigma[1], rel=0.01)
 
 
+@pytest.mark.slow
 def test_a_matrix_array_gives_a_volume_of_a_sphere():
     """A black ball of 20 mm, 60 mm deep, seen by a tilt sweep: it is where it was put, and about as large each way."""
     ball = block(lambda x, y, z: np.where(x**2 + y**2 + z**2 < 100.0, 2, 1), half_mm=(40, 40, 40))

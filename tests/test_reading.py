@@ -103,6 +103,7 @@ def sent():
     assert not path.exists()
 
 
+@pytest.mark.slow
 def test_a_file_is_read_here_unless_it_is_not_trusted(file, sent, monkeypatch):
     assert process_of(file) == os.getpid()
     assert process_of(sent) not in (os.getpid(), process_of(sent))

@@ -295,6 +295,7 @@ def test_command_says_numbers_with_controls(twin, tmp_path):
     assert (tmp_path / "realism.png").stat().st_size > 10_000
 
 
+@pytest.mark.slow
 @needs_shared
 def test_costs_of_a_real_sweep_are_those_found_by_trial():
     """The table of the recipe: neighbours .247 .052 .20, another anatomy .450 .094 .20, blurred .279 .295 1.80.

@@ -292,6 +292,7 @@ def test_a_probe_placed_in_any_slice_lies_in_it_and_looks_down_it(view, along, a
 # ---- segmentation ----------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["LabelMapVolume", "Segmentation"])
 def test_segment_names_and_colours_tissues_where_the_mri_is(kind):
     scene = slicer.vtkMRMLScene()
@@ -1032,6 +1033,7 @@ def test_an_image_says_whose_it_is_and_how_and_when_it_was_taken(bench):
     assert about_image(bench.labels) == {}
 
 
+@pytest.mark.slow
 def test_segment_names_the_patient_after_the_mri():
     bench = Bench()
     mri = volume_node(bench.scene, head_mri(4.0), "head of somebody")

@@ -111,6 +111,7 @@ def test_a_tracked_sequence_is_fitted_where_its_transforms_say(scene, found):
     assert found.appearance.cost_after < found.appearance.cost_before
 
 
+@pytest.mark.slow
 def test_images_that_a_sequence_node_takes_for_one_keep_their_own_transforms(brain, scene, found):
     own = Scene(brain, step_s=3e-4)
     poses = own.optimize(max_evaluations=1).tracked.poses
@@ -134,6 +135,7 @@ def test_images_that_are_not_fitted_are_predicted(scene):
         scene.optimize(scene.volume("none"), validate=[1])
 
 
+@pytest.mark.slow
 def test_cost_is_plotted_in_the_scene(scene, found):
     (chart,) = nodes_of_class(scene.scene, "vtkMRMLPlotChartNode")
     assert chart.GetNumberOfPlotSeriesNodes() == 2
@@ -146,6 +148,7 @@ def test_cost_is_plotted_in_the_scene(scene, found):
     assert vtk_to_numpy(table.GetColumnByName("cost")).min() == pytest.approx(best.min())
 
 
+@pytest.mark.slow
 def test_a_fit_changes_the_preset_only_when_applied_and_can_be_reverted(brain):
     own = Scene(brain)
     before = own.logic.preset
@@ -161,6 +164,7 @@ def test_a_fit_changes_the_preset_only_when_applied_and_can_be_reverted(brain):
     assert own.logic.preset == before
 
 
+@pytest.mark.slow
 def test_values_that_were_set_after_apply_stay_when_it_is_taken_back(brain):
     """Revert dropped a tissue's value that was typed in the meantime."""
     own = Scene(brain)
@@ -213,6 +217,7 @@ def test_images_to_compare_lie_where_the_real_one_does(scene, found):
         scene.logic.showFit(found, scene.labels, nodes, 7)
 
 
+@pytest.mark.slow
 def test_moved_patient_and_tracking_together_change_nothing(brain, found):
     moved = np.array([[0, -1, 0, 10], [1, 0, 0, -20], [0, 0, 1, 30], [0, 0, 0, 1.0]])
     own = Scene(brain)
@@ -251,6 +256,7 @@ def test_a_3d_volume_is_cut_where_the_probe_is(scene):
     assert np.allclose(found.tracked.poses[0], scene.twin.poses[1], atol=1e-6)
 
 
+@pytest.mark.slow
 def test_geometry_can_be_estimated(scene):
     scene_preset = scene.logic.preset
     try:
@@ -302,6 +308,7 @@ def test_a_registration_of_labels_that_were_moved_is_written_for_where_they_are(
     assert np.allclose(node_to_world(node) @ to_world @ point, to_world @ correction @ point, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_cancelling_leaves_the_scene_as_it_was(brain):
     own = Scene(brain)
     before = own.logic.preset

@@ -105,6 +105,7 @@ def in_new_scene(record: SceneRecord) -> UltrasoundSceneLogic:
     return logic
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["LabelMapVolume", "Segmentation"])
 def test_a_scene_has_the_same_image_after_it_was_kept_as_values(kind):
     """With the shares of tissues in voxels, lesions, transforms, probe, display and tissues."""

@@ -115,6 +115,7 @@ def test_segment_finds_sheets_and_images_show_them_as_those_of_the_command():
     assert parameters.sheets is None and "of an earlier Segment, are not shown any more" in presenter.notes()
 
 
+@pytest.mark.slow
 def test_the_tissue_of_the_falx_that_is_drawn_is_in_the_panel_and_changes_images():
     bench, presenter = bench_with_probe()
     presenter.segment()
@@ -212,6 +213,7 @@ def test_organs_of_a_ct_are_laid_over_its_tissues_wherever_their_node_lies(kind)
     assert 0.6 * liver.array.sum() < laid <= liver.array.sum()
 
 
+@pytest.mark.slow
 def test_organs_without_names_are_read_by_totalsegmentators_numbers_whatever_tissues_there_are():
     """After Segment of a CT, they were taken for the tissues that it had found: a kidney for fat."""
     bench, phantom = Scene(), coarse_chest()

@@ -85,6 +85,7 @@ def test_mni_with_five_percent_noise_is_better_than_with_free_variances(mni, tru
     assert not result.warnings
 
 
+@pytest.mark.slow
 @given(st.floats(0.05, 0.3), st.floats(0.3, 0.5), st.floats(2, 8), st.integers(0, 2**16))
 @settings(max_examples=8)
 def test_the_likelihood_never_falls_and_a_known_mixture_is_recovered(csf, white, noise, seed):
@@ -205,6 +206,7 @@ def test_noise_is_estimated_beside_edges(sigma):
     assert estimate_noise(noisy.astype(np.float32), np.ones(image.shape, bool)) == pytest.approx(sigma, rel=0.35)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "contrast, order",
     [
@@ -221,6 +223,7 @@ def test_classes_are_named_by_contrast(contrast, order):
     assert (np.diff(result.means) > 0).all()
 
 
+@pytest.mark.slow
 def test_the_table_has_a_line_per_label_whose_shares_and_millilitres_add_up():
     result = segment_mri(head_mri(2.0), thin_sulci=True)
     rows = [line.split() for line in result.table().splitlines()[1:]]
@@ -242,6 +245,7 @@ def test_the_table_has_means_and_deviations_in_every_unit(unit):
         assert numbers == pytest.approx([mean, deviation], rel=0.006, abs=0.006 * unit)
 
 
+@pytest.mark.slow
 def test_the_table_leaves_out_tissues_that_were_covered_wholly():
     """A tissue under a lesion was a row of 0.0 ml."""
     result = segment_mri(head_mri(4.0))
@@ -349,6 +353,7 @@ def textured(seed: int) -> Volume:
     return Volume((smooth / smooth.std()).astype(np.float32), np.diag([2.0, 2.0, 2.0, 1.0]))
 
 
+@pytest.mark.slow
 def test_the_parts_of_one_brain_lie_in_the_same_places_in_any_contrast_and_those_of_two_do_not():
     first, other = textured(0), textured(1)
     inside = np.zeros(first.array.shape, bool)
@@ -449,6 +454,7 @@ def test_thick_slices_of_a_turned_head_are_registered(mni, axis):
     assert np.corrcoef(moved.array[inside], t1.array[inside])[0, 1] < -0.75
 
 
+@pytest.mark.slow
 def test_a_second_volume_without_data_in_part_of_the_brain_is_said(mni):
     t1 = mni[0]
     inside = t1.array > 20
@@ -486,6 +492,7 @@ def test_a_fifth_of_the_field_of_one_persons_phantom_is_left_at_most(seed):
     assert left.std() < 0.19 * true.std()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("part", "bias", "least"),
     [

@@ -192,6 +192,7 @@ def test_frames_go_to_vtk_with_their_place_in_the_patient(solid):
     np.testing.assert_allclose(corner, (pose @ frame.image_to_probe @ [columns - 1, rows - 1, 0, 1])[:3], atol=1e-4)
 
 
+@pytest.mark.slow
 @given(
     st.lists(st.floats(-180, 180), min_size=3, max_size=3),
     st.lists(st.floats(-25, 25), min_size=3, max_size=3),

@@ -123,6 +123,7 @@ def stale_wheel(wheel, tmp_path) -> Path:
     return site
 
 
+@pytest.mark.slow
 @needs_slicer
 def test_from_the_sources():
     folder = ROOT / "SlicerUSSim"

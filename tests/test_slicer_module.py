@@ -500,6 +500,7 @@ def test_a_new_display_parameter_is_in_the_panel_by_its_declaration_alone(module
 # ---- working with it -------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_the_first_image_takes_a_volume_and_two_clicks(session):
     session.parameters.mri = None
     assert not session.ui.segmentButton.isEnabled() and not session.ui.liveCheckBox.isEnabled()
@@ -518,6 +519,7 @@ def test_the_first_image_takes_a_volume_and_two_clicks(session):
     assert session.parameters.probe_transform.GetDisplayNode().GetEditorVisibility()
 
 
+@pytest.mark.slow
 def test_the_image_follows_the_probe_and_the_controls_from_the_event_loop(session):
     session.segmented()
     session.ui.liveCheckBox.setChecked(True)
@@ -957,6 +959,7 @@ def test_a_preset_beyond_the_sliders_is_shown_as_it_is(session, tmp_path):
     assert session.ui.depthSlider.property("value") == 350.0 and not session.app.errors
 
 
+@pytest.mark.slow
 def test_a_probe_that_looks_away_is_told_beside_the_tick_box(session):
     session.segmented()
     session.ui.placeButton.click()
@@ -1071,6 +1074,7 @@ def test_on_windows_without_a_device_intels_runtime_is_offered(bare_slicer, simu
     assert not app.questions
 
 
+@pytest.mark.slow
 def test_a_scene_loaded_while_the_panel_is_open_is_shown(session, tmp_path):
     session.segmented()
     session.ui.placeButton.click()
@@ -1101,6 +1105,7 @@ def offered(selector) -> list[str]:
     return [selector.itemText(n) for n in range(selector.count())]
 
 
+@pytest.mark.slow
 def test_selectors_offer_only_what_fits(session):
     session.segmented()
     session.ui.simulateButton.click()
@@ -1130,6 +1135,7 @@ def test_selectors_offer_only_what_fits(session):
     assert offered(ui.probeTransformSelector) == ["None", "Probe"]
 
 
+@pytest.mark.slow
 def test_deleting_the_output_while_live_ends_live_and_takes_no_other_volume(session):
     """Slicer's selector goes on to the next node: live images were then written into the FLAIR of the patient."""
     session.segmented()

@@ -114,6 +114,7 @@ def test_a_scatterer_is_in_the_same_place_seen_from_the_front_and_from_the_side(
     assert abs((found_sample + int(19.6 / dz)) * dz - 20.0) < 0.25
 
 
+@pytest.mark.slow
 def test_a_pulse_loses_less_than_its_centre_frequency():
     """(A sf)^2 / 2 nepers, for a Gaussian band: 1.6 dB after 25 dB, and its mean frequency falls by 0.65 MHz."""
     lossy = replace(SPECKLE, attenuation_db_cm_mhz=1.0)
@@ -144,6 +145,7 @@ def test_speckle_near_the_point_where_all_lines_of_a_phased_array_begin_has_its_
         assert level_db(near) == pytest.approx(10 * np.log10(SPECKLE.scatterer_variance), abs=1.2), depth
 
 
+@pytest.mark.slow
 def test_the_prediction_for_few_scatterers_is_that_of_sums_of_phasors():
     """30 000 sums over a lattice of two sites per cubic millimetre, of which one in four has a scatterer."""
     rng = np.random.default_rng(5)
@@ -162,6 +164,7 @@ def test_the_prediction_for_few_scatterers_is_that_of_sums_of_phasors():
     assert envelope_snr(1e5, 1e7, [tuple(sigmas)]) == pytest.approx(1.913, abs=2e-3)
 
 
+@pytest.mark.slow
 def test_rare_scatterers_of_a_15_mhz_array_are_sparse_as_predicted():
     """They were said to be developed speckle up to mu1 = 3.5; there are two in the smallest resolution cell."""
     tissue, probe = replace(SPECKLE, mu1=3.0), PROBES["linear_15"]

@@ -59,6 +59,7 @@ def simulator(tissues=TISSUES) -> UltrasoundSimulator:
     return UltrasoundSimulator(LABELS, tissues, SimulationSettings(seed=2, ring_down=False))
 
 
+@pytest.mark.slow
 def test_smoothing_and_texture_are_found_by_the_costs_of_texture(tracked):
     shown, has_map = with_estimated_map(PLAIN, tracked[1])
     assert has_map and shown.map_dark == pytest.approx(0.75, abs=0.25)
@@ -98,6 +99,7 @@ def test_fit_with_speckle_beats_the_fit_without(tracked):
     assert written["speckle"]["grey_map_found"] is True
 
 
+@pytest.mark.slow
 def test_the_speckle_of_one_image_is_fitted_and_that_is_said(tracked, caplog):
     fit(
         simulator(), tracked[1].only([1]), speckle=True, free=["gain_db"], display=PLAIN, max_evaluations=10, restarts=0

@@ -271,6 +271,7 @@ def test_the_benchmark_uses_an_added_stage(added, monkeypatch):
     assert row["best_ms"] > 0 and row["floor_ms"] > 0 and row["operations"] > 0
 
 
+@pytest.mark.slow
 def test_numpy_uses_an_added_stage(added):
     found = make()
     model = NumpyModel(found)

@@ -269,6 +269,7 @@ def test_textures_that_do_not_fit_are_refused():
         SimulationSettings(mri_modulation_db=9)
 
 
+@pytest.mark.slow
 def test_the_commands_take_the_settings_from_an_mri_and_refuse_them_for_labels(tmp_path):
     from PIL import Image
 

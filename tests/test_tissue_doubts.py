@@ -50,6 +50,7 @@ def test_a_t1_in_which_nothing_enhances_is_said_not_to_be_after_contrast_agent()
     assert any("choose t1 instead" in line for line in told)
 
 
+@pytest.mark.slow
 def test_a_healthy_t1_is_not_taken_for_one_with_contrast_agent():
     case = phantom(brain(), "t1", noise=0.07)
     assert not segment_mri(case.mri, contrast="t1", mask=case.mask).warnings
@@ -62,6 +63,7 @@ def test_bright_pieces_smaller_than_2_ml_are_no_contrast_agent():
     assert "2.0 ml" in brighter_than_tissue(image, inside, 80.0, 100.0, voxel_ml=0.002, contrast="t1")[0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("shown", "said"), [("t2", "t1"), ("t1", "t2"), ("t1", "flair"), ("t2", "flair")])
 def test_a_contrast_in_another_order_is_refused_and_the_right_one_is_named(shown, said):
     case = phantom(brain(), shown)
@@ -69,6 +71,7 @@ def test_a_contrast_in_another_order_is_refused_and_the_right_one_is_named(shown
         segment_mri(case.mri, contrast=said, mask=case.mask)
 
 
+@pytest.mark.slow
 def test_cortex_does_not_become_csf_where_the_mask_leaves_only_the_ventricles():
     whole = brain()
     deep = cast(np.ndarray, ndimage.distance_transform_edt(whole.mask)) * 2.0 > 24.0

@@ -89,6 +89,7 @@ def test_mean_power_is_kept(changes):
     assert 10 * np.log10(np.mean(ratios)) == pytest.approx(0.0, abs=max(0.1, 2.5 * error))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "values",
     [

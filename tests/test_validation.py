@@ -21,12 +21,13 @@ from SlicerUSSim.Logic.verification.phantoms import Echo
 from SlicerUSSim.Logic.verification.validation import ORIENTATIONS, PROBES, Outcome, Row, all_checks, run, validate
 
 #: Checks that take longer than some seconds
-_LONG = ("beams behind cysts", "beams in folds", "beams in heads", "beams past strong tissue", "compounding",
-         "curved mirrors", "cyst contrast", "flanks and lines", "flat layers", "frequency downshift", "oblique walls",
-         "planes along diagonals", "planes in small maps", "planes with edges", "rough planes", "rough sheets",
+_LONG = ("beams behind cysts", "beams in folds", "beams in heads", "beams past strong tissue", "compounded angles",
+         "compounding", "curved mirrors", "cyst contrast", "flanks and lines", "flat layers", "frequency downshift",
+         "harmonic", "oblique walls", "planes along diagonals", "planes in small maps", "planes with edges",
+         "range distortion", "rayleigh", "refraction", "reverberation", "rough planes", "rough sheets",
          "slice thickness", "small curved walls", "sparse speckle", "speckle correlation", "speckle everywhere",
-         "thickness of sheets", "thin sulci", "uneven tissue", "walls and lines",
-         "walls near ends")  # fmt: skip
+         "speckle statistics", "steered lines", "thickness of sheets", "thin sulci", "turned planes", "uneven tissue",
+         "walls and lines", "walls near ends", "wires and cysts")  # fmt: skip
 #: Those of them that the tests have aligned and oblique alone, and `ussim validate` diagonal, too: of speckle and beams
 #: in tissue whose steps of voxels echo nothing, of sheets re smooth ones in the same voxels, and of planes and walls
 #: that the check itself turns in their voxels
@@ -112,6 +113,7 @@ def test_an_echo_that_was_not_there_is_farther_from_its_limit_than_any_other(kin
 # ---- wrong physics is noticed ---------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("check", "wrong"),
     [
@@ -180,6 +182,7 @@ def test_the_command_exits_with_zero_when_all_is_well_and_two_for_a_wrong_name(t
     assert result.exit_code == 2 and "check is 'gravity', expected part of" in result.stderr
 
 
+@pytest.mark.slow
 def test_the_command_replaces_only_its_own_reports(tmp_path):
     def run_it(*only):
         return CliRunner().invoke(main, ["validate", "--out", str(tmp_path), *(f"--only={text}" for text in only)])

@@ -384,6 +384,7 @@ def test_segmentation_has_the_declared_defaults_and_refuses_when_it_updates():
     assert not errors and segmentation.GetErrorMessage() == ""
 
 
+@pytest.mark.slow
 def test_segmentation_takes_a_mask_and_can_be_stopped():
     mri = head_mri(3.0)
     mask = mri.with_array((np.indices(mri.array.shape)[2] < mri.array.shape[2] // 2).astype(np.uint8))
@@ -559,6 +560,7 @@ def test_labels_without_names_and_table_are_recognised_or_refused_and_not_taken_
     assert known.GetFrame() is not None
 
 
+@pytest.mark.slow
 def test_masks_in_place_of_the_mri_or_of_a_lesion_are_told_by_the_filters_methods():
     """Errors gave options of the command, which the filter lacks: is it the mask of the brain (--mask)?"""
     from tests.test_label_maps import tumour

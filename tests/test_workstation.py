@@ -639,6 +639,7 @@ def test_freezing_stops_the_images_and_live_goes_on(page):
 # ---- real images -----------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_sequence_plays_beside_the_simulation_and_the_cost_follows(page):
     click(page, "#compare-beside")
     settled(page)

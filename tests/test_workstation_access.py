@@ -74,6 +74,7 @@ def server(files):
     assert "Traceback" not in log and "Error" not in log, log
 
 
+@pytest.mark.slow
 def test_on_loopback_too_the_token_is_asked(server):
     """Other users of the computer can connect to it."""
     assert len(server.token) >= 32
@@ -88,6 +89,7 @@ def test_on_loopback_too_the_token_is_asked(server):
     assert " 403 " in refused and "&lt;script&gt;" in refused and "<script>" not in refused
 
 
+@pytest.mark.slow
 def test_requests_that_no_browser_sends_leave_no_traceback(server):
     host, token = f"127.0.0.1:{server.port}", server.token
     socket_of = f"GET /ws?token={token} HTTP/1.1\nHost: {host}\n"
@@ -130,6 +132,7 @@ def test_with_a_certificate_page_and_images_come_over_tls(browser, files, certif
         server.end()
 
 
+@pytest.mark.slow
 @needs_openssl
 def test_what_is_no_certificate_is_said_in_one_line(files, certificate, tmp_path):
     labels = files / "labels.nii.gz"

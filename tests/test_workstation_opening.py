@@ -329,6 +329,7 @@ def test_files_are_dropped_anywhere_on_the_page(page, files, dicom):
     assert not errors(page)
 
 
+@pytest.mark.slow
 def test_a_series_with_a_missing_slice_is_said_and_changes_nothing(page, dicom):
     before = state(page, NAMES.title), shown(page, "labelsSelector")
     paths = sorted((dicom / "IMAGES" / "A").iterdir())

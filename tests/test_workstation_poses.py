@@ -61,6 +61,7 @@ def typed(page, field: str, text: str) -> None:
     settled(page)
 
 
+@pytest.mark.slow
 def test_a_pose_is_typed_as_position_and_angles_or_as_a_matrix(page):
     shown = [float(number) for number in page.locator("#pose-numbers").input_value().split()]
     np.testing.assert_allclose(pose_of_angles(shown[:3], shown[3:]), where(page), atol=1e-2)
@@ -78,6 +79,7 @@ def test_a_pose_is_typed_as_position_and_angles_or_as_a_matrix(page):
     assert not errors(page)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("field", "text", "words"),
     [
@@ -93,6 +95,7 @@ def test_what_is_no_pose_is_said_and_moves_nothing(page, field, text, words):
     np.testing.assert_array_equal(where(page), before)
 
 
+@pytest.mark.slow
 def test_keys_typed_in_the_fields_do_not_move_the_probe(page):
     before = where(page)
     page.locator("#pose-matrix").focus()
@@ -103,6 +106,7 @@ def test_keys_typed_in_the_fields_do_not_move_the_probe(page):
     settled(page)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "suffix", [*POSE_SUFFIXES[:2], *(pytest.param(suffix, marks=pytest.mark.slow) for suffix in POSE_SUFFIXES[2:])]
 )
@@ -125,6 +129,7 @@ def test_a_pose_is_saved_and_opened_again(page, suffix, tmp_path):
     assert not errors(page)
 
 
+@pytest.mark.slow
 def test_a_file_that_is_no_pose_is_said_by_its_own_name(page, tmp_path):
     (tmp_path / "no.tfm").write_text("nothing")
     page.set_input_files("#open-pose", tmp_path / "no.tfm")
@@ -132,6 +137,7 @@ def test_a_file_that_is_no_pose_is_said_by_its_own_name(page, tmp_path):
     assert errors(page)[0].startswith("no.tfm: ") and "/tmp" not in errors(page)[0]
 
 
+@pytest.mark.slow
 def test_a_preset_carries_the_pose_if_it_is_wanted(page, tmp_path):
     open_section(page, "Output")
     with page.expect_download() as waiting:

@@ -130,6 +130,7 @@ def test_ultrasound_without_a_calibration_asks_for_it_and_is_compared_with_it(pa
     assert 0 < cost(page) < 0.5 and not errors(page)
 
 
+@pytest.mark.slow
 def test_values_are_typed_and_wrong_ones_are_said_and_change_nothing(page, recording):
     for typed, words in (
         ("1 0 0", "Calibration has 3 numbers, expected 16 numbers, the 4x4 matrix by rows"),

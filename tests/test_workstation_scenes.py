@@ -252,6 +252,7 @@ def test_nothing_of_a_patient_stays_on_the_next_one(page, files, tmp_path):
     settled(page)
 
 
+@pytest.mark.slow
 def test_a_scene_comes_from_a_child_process_as_plain_values(module_scene):
     path, _, pose = module_scene
     record = read_scene(path)
@@ -312,6 +313,7 @@ def test_a_bundle_with_files_outside_or_headers_of_others_is_refused(module_scen
         read_scene(tmp_path / "empty.mrb")
 
 
+@pytest.mark.slow
 def test_a_scene_that_cannot_be_read_changes_nothing_on_the_page(page, module_scene, tmp_path):
     settled(page)  # the page draws its first images for a while
     before, title = pixels(page), state(page, NAMES.title)
@@ -384,6 +386,7 @@ def test_the_workstation_starts_with_what_the_page_opens(browser, files, tmp_pat
         page.close()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("options", "message"),
     [

@@ -358,6 +358,7 @@ def test_a_new_server_with_another_token_is_said_and_not_trusted(server, browser
     page.close()
 
 
+@pytest.mark.slow
 def test_without_autosave_nothing_is_on_the_disk(server, browser, files, tmp_path):
     own = server("--labels", str(files / "labels.nii.gz"), "--no-autosave")
     page = opened(browser, own.url)

@@ -123,6 +123,7 @@ def test_an_image_comes_with_patient_time_pose_and_ruler(head_page):
     assert kept["images"][-2]["probe_to_ras"] != last["probe_to_ras"] and kept["images"][-2]["time"] < last["time"]
 
 
+@pytest.mark.slow
 def test_ruler_and_image_change_together(page):
     page.evaluate(
         """() => { window.drawnWith = []; const draw = CanvasRenderingContext2D.prototype.drawImage;
@@ -184,6 +185,7 @@ def output_of_scene(bundle: Path, folder: Path):
     return node, node_to_world(node) @ ijk_to_ras(node)
 
 
+@pytest.mark.slow
 def test_a_live_image_is_saved_where_it_was_taken_and_follows_the_probe_after_that(page, tmp_path):
     shutil.copy(download(page, "nrrd"), tmp_path / "live.nrrd")
     _, in_scene = output_of_scene(download(page, "mrb"), tmp_path)
@@ -193,6 +195,7 @@ def test_a_live_image_is_saved_where_it_was_taken_and_follows_the_probe_after_th
     assert page.locator("#frozen").is_hidden()
 
 
+@pytest.mark.slow
 def test_while_a_fit_runs_the_image_is_marked_frozen(head_page):
     page = head_page
     fit(page, 100_000)
@@ -203,6 +206,7 @@ def test_while_a_fit_runs_the_image_is_marked_frozen(head_page):
     settled(page)
 
 
+@pytest.mark.slow
 def test_the_cost_is_blank_where_the_probe_sees_nothing(head_page):
     """A black image had a lower cost than a real one."""
     page = head_page
@@ -218,6 +222,7 @@ def test_the_cost_is_blank_where_the_probe_sees_nothing(head_page):
     assert 0 < cost(page) < 1
 
 
+@pytest.mark.slow
 def test_a_new_patient_clears_image_ruler_and_cost_at_once_and_the_probe_is_placed_anew(head_page, files, tmp_path):
     page = head_page
     for _ in range(6):

@@ -44,6 +44,7 @@ from tests.test_workstation import (
 )
 
 
+@pytest.mark.slow
 def test_what_does_not_hear_of_its_cancellation_is_abandoned_within_a_second():
     async def scenario():
         goes_on, happened, renewed = threading.Event(), [], []
@@ -89,6 +90,7 @@ def test_what_does_not_hear_of_its_cancellation_is_abandoned_within_a_second():
     assert happened == ["an image", "cancelled"] and renewed == [1] and is_blocked and 0.0 < waited < 1.0
 
 
+@pytest.mark.slow
 def test_images_do_not_wait_for_what_needs_no_device():
     async def scenario():
         goes_on, done = threading.Event(), []
@@ -106,6 +108,7 @@ def test_images_do_not_wait_for_what_needs_no_device():
     assert run_in_loop(scenario) == (["an image"], ["an image", "a surface"])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("end", [signal.SIGTERM, pytest.param(signal.SIGINT, marks=pytest.mark.slow)])
 def test_the_server_ends_within_two_seconds_whatever_it_computes(tmp_path, end):
     """It took 110 s while it extracted a brain."""
@@ -166,6 +169,7 @@ _run(
 """
 
 
+@pytest.mark.slow
 def test_the_server_ends_without_a_word_while_a_library_calls_back():
     """ "FATAL: exception not rethrown", or an abort."""
     ended = subprocess.run(
@@ -304,6 +308,7 @@ def test_a_surface_of_a_patient_who_was_closed_meanwhile_is_not_shown(page, larg
     assert state(page, NAMES.pose) is None and page.evaluate("window.ussim.image") is None
 
 
+@pytest.mark.slow
 def test_exports_are_for_whom_has_the_token(page, browser, url):
     other = browser.new_context()
     address = f"{url.split('?')[0]}exported?kind="
