@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy import ndimage
 from scipy.spatial.transform import Rotation
 
 from SlicerUSSim.Logic import Volume
@@ -52,3 +53,23 @@ def test_where_the_atlas_does_not_lead_a_view_follows_the_image_and_says_so(brai
     axes, line = head_axes(brain.with_array(half), NAMES)
     assert np.array_equal(axes, np.eye(3)) and line.startswith("the view follows the image's axes, since ")
     assert view_pose(brain.with_array(half), NAMES, "temporal")[1] == line
+
+
+def test_a_temporal_view_looks_for_the_window_where_bone_is_thin(brain):
+    away = ndimage.distance_transform_edt(brain.array == 0, brain.spacing_mm[::-1])
+    labels = np.where(away < 14.0, 5, 0)
+    labels[away < 10.0] = 4
+    labels[brain.array > 0] = brain.array[brain.array > 0]
+    names = (*NAMES, "skull", "scalp")
+    pose, line = view_pose(Volume(labels.astype(np.uint8), brain.ijk_to_ras), names, "temporal")
+    assert line == ""  # as thick everywhere
+    k, j, i = np.indices(labels.shape)
+    places = np.stack([i, j, k, np.ones_like(i)], axis=-1) @ brain.ijk_to_ras.T
+    window = pose[:3, 3] + [0.0, 12.0, 0.0]  # in front of the middle of the temple
+    is_thin = np.hypot(places[..., 1] - window[1], places[..., 2] - window[2]) < 8.0
+    labels[is_thin & (away > 3.0) & (labels == 4)] = 5
+    moved, line = view_pose(Volume(labels.astype(np.uint8), brain.ijk_to_ras), names, "temporal")
+    assert np.linalg.norm(moved[:3, 3] - pose[:3, 3]) > 4.0 and np.linalg.norm(moved[1:3, 3] - window[1:]) < 8.0
+    assert line.startswith("placed where bone is ") and " from the middle of the temple, where it is 1" in line
+    on_brain, line = view_pose(Volume(labels.astype(np.uint8), brain.ijk_to_ras), names, "temporal", is_open=True)
+    assert line == "" and np.linalg.norm(on_brain[1:3, 3] - pose[1:3, 3]) < 6.0  # an opening needs no window

@@ -25,17 +25,24 @@ class View:
     outward: tuple[float, float, float]
     #: To the right of the image
     lateral: tuple[float, float, float]
+    #: Up to so far from there the probe looks for the thinnest bone, mm
+    window_mm: float = 0.0
 
+
+#: A temporal window is found by moving the probe: about so far, in such steps, mm
+_WINDOW_MM, _STEP_MM = 15.0, 5.0
+#: Millimetres of bone that are worth moving for
+_WORTH_MM = 1
 
 #: Views by name, with the conventions of transcranial and neonatal ultrasound: the front is on the left of the image;
 #: coronal images are seen from the front, with the patient's right on their left
 VIEWS = {
     "temporal": View(
         "axial, through the right temporal bone: midline, ventricles, the other hemisphere; 2 MHz",
-        (1.0, 0.1, 0.1), (0.0, -1.0, 0.0),
+        (1.0, 0.1, 0.1), (0.0, -1.0, 0.0), _WINDOW_MM,
     ),
     "temporal-left": View(
-        "the same through the left temporal bone", (-1.0, 0.1, 0.1), (0.0, -1.0, 0.0)
+        "the same through the left temporal bone", (-1.0, 0.1, 0.1), (0.0, -1.0, 0.0), _WINDOW_MM
     ),
     "fontanelle": View(
         "coronal, through the anterior fontanelle: ventricles, corpus callosum; 6 to 8 MHz in newborns",
@@ -49,6 +56,8 @@ VIEWS = {
 
 #: Bone is looked for so far behind a face in an opening, and so much of it is a closed skull, mm
 _BEHIND_MM, _CLOSED_MM = 40.0, 2
+#: Depths at which bone is looked for below a place on the skin
+_DEEP_MM = np.arange(0.5, 40.0)
 
 
 def opened_view_pose(labels: Volume, names: Sequence[str], view: str) -> tuple[np.ndarray, str]:
@@ -58,8 +67,7 @@ def opened_view_pose(labels: Volume, names: Sequence[str], view: str) -> tuple[n
     """
     pose, line = view_pose(labels, names, view, is_open=True)
     behind = pose[:3, 3] - np.arange(1.0, _BEHIND_MM)[:, None] * pose[:3, 1]
-    bones = [number for number, name in enumerate(names, 1) if name in ("skull", "bone")]
-    if int(np.isin(sample(labels, behind, order=0), bones).sum()) < _CLOSED_MM:
+    if int(np.isin(sample(labels, behind, order=0), _numbers(names, "skull", "bone")).sum()) < _CLOSED_MM:
         return pose, _joined(line, f"the view {view} is seen through the opening")
     pose, line = view_pose(labels, names, view)
     return pose, _joined(
@@ -86,11 +94,57 @@ def view_pose(labels: Volume, names: Sequence[str], view: str, *, is_open: bool 
     surface = PatientSurface(brain if is_open else labels)
     chosen = VIEWS[view]
     axes, line = head_axes(brain, names)
-    outward = axes @ chosen.outward / np.linalg.norm(chosen.outward)
+    outward = _unit(axes @ chosen.outward)
+    face = _face(surface, centre, outward)
+    if chosen.window_mm and not is_open:
+        face, told = _at_window(surface, labels, names, face, axes, centre, chosen)
+        line = _joined(line, told)
+    return pose_looking_at(face, face - surface.normal(face), axes @ chosen.lateral), line
+
+
+def _face(surface: PatientSurface, centre: np.ndarray, outward: np.ndarray) -> np.ndarray:
+    """(3,) RAS mm of the surface outwards of the brain's middle."""
     far = centre + 1000.0 * outward
     found = surface.hit(far, centre)
-    face = surface.nearest(far) if found is None else found
-    return pose_looking_at(face, face - surface.normal(face), axes @ chosen.lateral), line
+    return surface.nearest(far) if found is None else found
+
+
+def _at_window(
+    surface: PatientSurface, labels: Volume, names: Sequence[str], face: np.ndarray, axes: np.ndarray,
+    centre: np.ndarray, view: View,
+) -> tuple[np.ndarray, str]:  # fmt: skip
+    """((3,) place near a face with the thinnest bone below it, and a line if it is another place)."""
+    bones = _numbers(names, "skull", "bone", "cancellous bone")
+
+    def thickness(place: np.ndarray) -> int:
+        return int(np.isin(sample(labels, place - _DEEP_MM[:, None] * surface.normal(place), order=0), bones).sum())
+
+    usual = thickness(face)
+    steps = np.arange(-view.window_mm, view.window_mm + 0.5, _STEP_MM)
+    best, thinnest = face, usual
+    # The nearest ones first, so that it moves no farther than it has to
+    for front, up in sorted(((a, b) for a in steps for b in steps), key=lambda step: np.hypot(*step)):
+        if 0.0 < np.hypot(front, up) <= view.window_mm:
+            place = _face(surface, centre, _unit(face + axes @ (0.0, front, up) - centre))
+            here = thickness(place)
+            if 0 < here <= thinnest - _WORTH_MM:
+                best, thinnest = place, here
+    if thinnest == usual:
+        return face, ""
+    moved = float(np.linalg.norm(best - face))
+    return (
+        best,
+        f"placed where bone is {thinnest} mm thick, {moved:.0f} mm from the middle of the temple, where it is {usual}",
+    )
+
+
+def _unit(vector: np.ndarray) -> np.ndarray:
+    return vector / np.linalg.norm(vector)
+
+
+def _numbers(names: Sequence[str], *wanted: str) -> list[int]:
+    """The labels of some names."""
+    return [number for number, name in enumerate(names, 1) if name in wanted]
 
 
 def _joined(*lines: str) -> str:
