@@ -32,7 +32,7 @@ class View:
 #: A temporal window is found by moving the probe: about so far, in such steps, mm
 _WINDOW_MM, _STEP_MM = 15.0, 5.0
 #: Millimetres of bone that are worth moving for
-_WORTH_MM = 1
+_WORTH_MM = 2
 
 #: Views by name, with the conventions of transcranial and neonatal ultrasound: the front is on the left of the image;
 #: coronal images are seen from the front, with the patient's right on their left
@@ -127,7 +127,7 @@ def _at_window(
         if 0.0 < np.hypot(front, up) <= view.window_mm:
             place = _face(surface, centre, _unit(face + axes @ (0.0, front, up) - centre))
             here = thickness(place)
-            if 0 < here <= thinnest - _WORTH_MM:
+            if 0 < here < thinnest and here <= usual - _WORTH_MM:
                 best, thinnest = place, here
     if thinnest == usual:
         return face, ""
