@@ -36,6 +36,7 @@ from SlicerUSSim.Logic.probe.beam import FWHM_PER_SIGMA
 from SlicerUSSim.Logic.probe.image_grid import ImageGrid
 from SlicerUSSim.Logic.tissue.tissue import Tissue
 from SlicerUSSim.Logic.verification.twins import make_twin
+from tests.conftest import few_slow_others_long
 from tests.remembered import segment_once
 
 SMALL = PhasedProbe(70.0, 50.0, scan_lines=80)
@@ -70,6 +71,7 @@ def result(twin):
 # ---- what it finds ---------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_images_become_alike(twin, result):
     assert result.cost_after < 0.75 * result.cost_before
     with twin.simulator.with_tissues(result.tissues):
@@ -80,6 +82,7 @@ def test_images_become_alike(twin, result):
         assert before.total > 0.0
 
 
+@pytest.mark.slow
 def test_costs_are_those_of_whole_simulations(twin, result):
     from SlicerUSSim.Logic import similarity
 
@@ -97,6 +100,7 @@ def test_costs_are_those_of_whole_simulations(twin, result):
         assert cost == pytest.approx(np.mean(costs), abs=2e-3)
 
 
+@pytest.mark.slow
 def test_net_fall_with_depth_and_relative_echogenicity_are_recovered(twin, result):
     found, true = white(result.tissues), white(twin.true_tissues)
     fall = found.attenuation_db_cm_mhz - result.display.tgc_db_cm_mhz
@@ -110,6 +114,7 @@ def test_net_fall_with_depth_and_relative_echogenicity_are_recovered(twin, resul
     assert spread.is_determined is False or abs(truth - spread.value) < 3.0
 
 
+@pytest.mark.slow
 def test_it_says_what_cannot_be_known(result):
     found = result.identifiability
     assert not found["white matter.mu1"].is_determined  # only Var shows
@@ -122,8 +127,7 @@ def test_it_says_what_cannot_be_known(result):
     assert json.loads(json.dumps(result.to_dict()))["identifiability"]["cost_tolerance"] > 0
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", few_slow_others_long(3, 1))
 def test_restarts_reach_the_fit_and_its_interval_holds_the_truth(brain, seed):
     """Along the parameters restarts stopped in the valley of TGC and attenuation: 8 of 25 reached the fit's cost."""
     twin = make_twin(*brain, seed, probe=SMALL)
@@ -134,6 +138,7 @@ def test_restarts_reach_the_fit_and_its_interval_holds_the_truth(brain, seed):
     assert fall.is_determined and fall.low - 0.1 <= 2 * SMALL.frequency_mhz * true <= fall.high + 0.1
 
 
+@pytest.mark.slow
 def test_equally_good_is_what_another_draw_of_the_speckle_could_make_of_the_best(result):
     """The tolerance, how many solutions lie within it, and that no other widens a spread."""
     found = result.identifiability
@@ -162,6 +167,7 @@ def test_equally_good_is_what_another_draw_of_the_speckle_could_make_of_the_best
         assert (spread.low, spread.high) == pytest.approx((column.min(), column.max())), parameter.name
 
 
+@pytest.mark.slow
 def test_every_restart_has_other_scatterers(result):
     """The best fit, evaluated before each restart with that restart's seed, has another cost each time."""
     last = [entry for entry in result.history if entry.stage == "polish"]
@@ -246,11 +252,13 @@ def test_the_last_search_sees_what_whole_simulations_show(twin):
     assert last.cost == pytest.approx(whole, abs=1e-5)
 
 
+@pytest.mark.slow
 def test_sources_say_what_was_fitted(result):
     sources = white(result.tissues).sources
     assert sources["mu0"] == "fitted to tracked ultrasound" and "Szabo" in sources["speed_of_sound_m_s"]
 
 
+@pytest.mark.slow
 def test_simulator_is_left_as_it_was(twin, result):
     assert white(twin.simulator.medium.tissues).mu0 == 0.33
     assert twin.simulator.settings.seed == twin.seed
@@ -541,8 +549,7 @@ def real_brain(mni):
 PATIENTS = PhasedProbe(75.0, 60.0, scan_lines=128)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("seed", range(14))
+@pytest.mark.parametrize("seed", few_slow_others_long(14, 2))
 def test_fourteen_patients_with_a_known_display(real_brain, seed):
     twin = make_twin(*real_brain, seed, probe=PATIENTS, display_is_known=True)
     result = optimise(twin, ["white matter"], max_evaluations=150)
@@ -561,8 +568,7 @@ def net_fall(tissue: Tissue, display: DisplaySettings) -> float:
     return (loss_db - gained_db) / path - display.tgc_db_cm_mhz
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("seed", range(14))
+@pytest.mark.parametrize("seed", few_slow_others_long(14, 2))
 def test_fourteen_patients_with_everything_free(real_brain, seed):
     twin = make_twin(*real_brain, seed, probe=PATIENTS)
     result = optimise(twin, ["display", "white matter"], max_evaluations=600)  # the default number

@@ -46,7 +46,7 @@ def moved_away(twin, shift, turn) -> tuple[np.ndarray, np.ndarray, list[np.ndarr
     return offset, middle, [np.linalg.inv(offset) @ pose for pose in twin.poses]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_an_offset_of_four_millimetres_and_degrees_is_found_back(twin):
     offset, middle, poses = moved_away(twin, (2.4, -2.0, 2.5), (2.0, 2.8, -2.0))
     with twin.simulator.with_tissues(twin.true_tissues):
