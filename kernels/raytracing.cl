@@ -223,11 +223,10 @@ inline Sides sides_of(__constant const Acquisition *acquisition, __constant cons
     if (label < 0) break;
     const Tissue third = tissues[label];
     const float speed_of_third = beam_speed(third.speed_of_sound_m_s, decay_in(acquisition, third));
-    const ulong bit = 1ul << group;
-    if (is_soft(speed, here.impedance_mrayl, speed_of_third, third.impedance_mrayl))
-      sides.all_before |= bit;
-    else if (is_soft(speed_behind, behind.impedance_mrayl, speed_of_third, third.impedance_mrayl))
-      sides.all_behind |= bit;
+    const int with_here = is_soft(speed, here.impedance_mrayl, speed_of_third, third.impedance_mrayl);
+    const int with_behind = is_soft(speed_behind, behind.impedance_mrayl, speed_of_third, third.impedance_mrayl);
+    if (with_here && !with_behind) sides.all_before |= 1ul << group;
+    if (with_behind && !with_here) sides.all_behind |= 1ul << group;
   }
   return sides;
 }

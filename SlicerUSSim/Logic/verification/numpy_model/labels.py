@@ -84,7 +84,7 @@ class Labels:
         """
         halved, numbers = f32(0.5) * voxel - f32(0.25), np.arange(len(soft))
         is_third = (numbers != before[:, None]) & (numbers != behind[:, None])
-        alike = ~soft[before, behind][:, None] & (soft[before] | soft[behind]) & is_third
+        alike = ~soft[before, behind][:, None] & (soft[before] ^ soft[behind]) & is_third
         found = self.widest.border(halved, before, behind, alike=alike)
         flat = found.confidence.copy()
         self.flat.beside_edges(halved, found, before, behind)
@@ -130,12 +130,12 @@ class Labels:
     def _fine(self, voxel, before, behind, soft) -> Borders:
         """From the labels within 3.5 voxels, smoothed here.
 
-        At a strong border, groups that have a soft border with one of the two belong to its side.
+        At a strong border, groups that have a soft border with one of the two alone belong to its side.
         """
         rows, numbers = np.arange(len(voxel)), np.arange(len(soft))
         is_strong = ~soft[before, behind][:, None]
-        first = (numbers == before[:, None]) | is_strong & soft[before]
-        side = f32(first) - f32((numbers == behind[:, None]) | is_strong & soft[behind] & ~first)
+        first = (numbers == before[:, None]) | is_strong & soft[before] & ~soft[behind]
+        side = f32(first) - f32((numbers == behind[:, None]) | is_strong & soft[behind] & ~soft[before])
         top = self.dims - 1
         inside = np.clip(voxel, f32(0), f32(top))
         low = np.maximum(np.ceil(inside - _FINE_REACH).astype(np.int64), 0)
