@@ -261,6 +261,19 @@ def test_a_narrow_gap_is_closed_and_a_wide_one_stays():
             assert (found.labels == csf).sum() < 0.2 * (phantom.labels.array == csf).sum()
 
 
+def test_a_falx_does_not_hang_in_the_saline_of_an_opening():
+    """It goes on above the hull of the brain, into the sinus, which is not there without the head."""
+    labels = block(lambda x, y, z: (y > 0.0) & (np.abs(x) > 0.6), half_mm=(20, 20, 20))  # a fissure below coupling
+    y, z = (grid.ravel() for grid in np.meshgrid(np.arange(-12.0, 12.0, 0.8), np.arange(-12.0, 12.0, 0.8)))
+    place = np.stack([np.zeros_like(y), y, z], axis=1)
+    falx = Surfels.of("falx", place, np.broadcast_to([1.0, 0.0, 0.0], place.shape), 0.6, 1.0, 0.64)
+    tissues = TissueTable({0: TISSUES["coupling"], 1: TISSUES["grey matter"]}, TissueTable.brain().membrane)
+    found = UltrasoundSimulator(labels, tissues, sheets=falx).medium.found
+    voxels = np.stack(np.unravel_index(found.voxels, found.labels.shape), axis=1)
+    at = voxels[:, 1] - 1 - 20.0  # y, mm
+    assert at.max() > 10.0 and at.min() > -2.5
+
+
 def test_changed_tissues_keep_the_sheets():
     phantom, tissues = grey()
     louder = tissues.with_membrane(replace(sulci._MEMBRANE, thickness_mm=0.8))

@@ -20,6 +20,8 @@ from SlicerUSSim.Logic.tissue.table import TissueTable
 #: Fluid around a sheet, along its normal, is a gap as narrow as a sheet up to here on either side; from here on it is
 #: a cistern, whose walls are two lines. A sheet of labels may lie this far beside a sheet that was found.
 _WIDE_MM, _STEP_MM, _BESIDE_MM = 2.0, 0.5, 1.0
+#: Dura in the coupling medium has tissue on both sides within this, or hangs in it
+_BETWEEN_MM = 8.0
 _GREY, _WHITE = "grey matter", "white matter"
 #: Least distance from a sheet within which nothing else draws a line, mm
 _OWN_MM = 1.0
@@ -73,6 +75,7 @@ def found_sheets(
     """
     grid, looks = _with_margin(grid), looks_of(tissues)
     _require_of_patient(surfels, padded, grid, fluids, tissues)
+    surfels = surfels.chosen(~_hangs(surfels, padded, grid))
     extent = _fluid_beside(surfels, padded, grid, fluids)
     is_gap = np.isin(surfels.kind, [KINDS.index(kind) for kind in ("sulcus", "falx", "tentorium")])
     is_wide = is_gap & (extent >= _WIDE_MM - 1e-6).any(axis=1)
@@ -90,6 +93,24 @@ def found_sheets(
     words, half = _words(planes.kind[entry], distance, normal, thickness, confidence, grid, looks)
     words[:, 0] |= tissue_beside(labels, voxels, fluids).astype(np.uint32) << np.uint32(26)
     return FoundSheets(labels, voxels, words, np.abs(distance) <= half + half_diagonal, closed)
+
+
+def _hangs(surfels: Surfels, padded: np.ndarray, grid: Volume) -> np.ndarray:
+    """(n,) bool: falx and tentorium in the coupling medium, without tissue on both sides.
+
+    Above the hull of a brain without its head, or in the saline of an opening, what holds the dura is not there.
+    """
+    labels = padded.ravel()
+    found = np.isin(surfels.kind, [KINDS.index("falx"), KINDS.index("tentorium")])
+    found &= labels[_index(grid, surfels.place, padded.shape)] == 0
+    some = np.flatnonzero(found)
+    has_tissue = np.zeros((2, len(some)), bool)
+    for side, sign in enumerate((-1.0, 1.0)):
+        for step in np.arange(1.0, _BETWEEN_MM + 0.5):
+            place = surfels.place[some] + sign * step * surfels.normal[some]
+            has_tissue[side] |= labels[_index(grid, place, padded.shape)] != 0
+    found[some] = ~has_tissue.all(axis=0)
+    return found
 
 
 def with_their_tissue(tissues: TissueTable, sheets: Surfels | None, known: TissueTable | None = None) -> TissueTable:
