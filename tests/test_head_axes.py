@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from SlicerUSSim.Logic import Volume
 from SlicerUSSim.Logic.mri.head_axes import head_axes
-from SlicerUSSim.Logic.mri.views import view_pose
+from SlicerUSSim.Logic.mri.views import VIEWS, view_pose
 
 NAMES = ("csf", "grey matter", "white matter")
 
@@ -34,6 +34,8 @@ def lying(brain: Volume, turn: Rotation) -> Volume:
     [
         pytest.param((25.0, 0.0, 0.0), id="nodding"),
         pytest.param((-18.0, 7.0, 12.0), id="three axes", marks=pytest.mark.slow),
+        pytest.param((0.0, 90.0, 0.0), id="on its side", marks=pytest.mark.slow),
+        pytest.param((40.0, 30.0, 155.0), id="anyhow", marks=pytest.mark.slow),
     ],
 )
 def test_views_of_a_turned_head_are_those_of_the_upright_one_turned(brain, turn):
@@ -44,12 +46,14 @@ def test_views_of_a_turned_head_are_those_of_the_upright_one_turned(brain, turn)
     assert line == "" and Rotation.from_matrix(upright).magnitude() < np.radians(2.0)
     axes, line = head_axes(turned, NAMES)
     assert Rotation.from_matrix(axes @ rotation.as_matrix().T).magnitude() < np.radians(2.0)
-    assert "the head lies turned by 2" in line
-    for view in ("temporal", "fontanelle"):
+    assert f"the head lies turned by {np.degrees(rotation.magnitude()):.0f}"[:-1] in line
+    for view in ("temporal", "fontanelle-sagittal"):
         (before, _), (after, told) = (view_pose(labels, NAMES, view) for labels in (brain, turned))
         expected = rotation.as_matrix() @ before[:3, :3]
         assert told == line
         assert Rotation.from_matrix(after[:3, :3] @ expected.T).magnitude() < np.radians(12.0)  # normals of a surface
+        across = np.cross(VIEWS[view].lateral, VIEWS[view].outward)
+        assert abs(after[:3, 2] @ axes @ across) / np.linalg.norm(across) > np.cos(np.radians(1.0))  # in its plane
 
 
 def test_where_the_atlas_does_not_lead_a_view_follows_the_image_and_says_so(brain):

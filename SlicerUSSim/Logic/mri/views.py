@@ -49,13 +49,16 @@ VIEWS = {
         (0.0, 0.35, 1.0), (-1.0, 0.0, 0.0),
     ),
     "fontanelle-sagittal": View(
-        "sagittal, through the anterior fontanelle: corpus callosum, cerebellum", (0.0, 0.35, 1.0), (0.0, -1.0, 0.0)
+        "sagittal, through the anterior fontanelle: corpus callosum, in newborns the cerebellum",
+        (0.0, 0.35, 1.0), (0.0, -1.0, 0.0),
     ),
 }  # fmt: skip
 
 
 #: Bone is looked for so far behind a face in an opening, and so much of it is a closed skull, mm
 _BEHIND_MM, _CLOSED_MM = 40.0, 2
+#: Cosine of the angle between a surface's normal and the plane of a view, within which the probe stands in that plane
+_FLAT_COS = 0.87
 #: Depths at which bone is looked for below a place on the skin
 _DEEP_MM = np.arange(0.5, 40.0)
 
@@ -99,7 +102,17 @@ def view_pose(labels: Volume, names: Sequence[str], view: str, *, is_open: bool 
     if chosen.window_mm and not is_open:
         face, told = _at_window(surface, labels, names, face, axes, centre, chosen)
         line = _joined(line, told)
-    return pose_looking_at(face, face - surface.normal(face), axes @ chosen.lateral), line
+    return pose_looking_at(face, face + _inwards(surface.normal(face), axes, chosen), axes @ chosen.lateral), line
+
+
+def _inwards(normal: np.ndarray, axes: np.ndarray, view: View) -> np.ndarray:
+    """(3,) unit vector into the head: square to the surface as seen in the view's plane, which stays in the head's.
+
+    Gyri tilted it out of that plane. Where the surface is more oblique to the plane than 30 degrees the face lies flat.
+    """
+    across = _unit(np.cross(axes @ view.lateral, axes @ view.outward))
+    within = normal - (normal @ across) * across
+    return -_unit(within) if np.linalg.norm(within) > _FLAT_COS else -normal
 
 
 def _face(surface: PatientSurface, centre: np.ndarray, outward: np.ndarray) -> np.ndarray:

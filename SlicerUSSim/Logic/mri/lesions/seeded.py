@@ -105,7 +105,7 @@ def grow_lesion(segmentation: Segmentation, seed_ras_mm: Sequence[float], tissue
     for grown in _regions_at(evidence, index, named):
         why = why_no_lesion(evidence, grown.look, grown.region, grown.window)
         if named is not None and _contradicts(grown, named):
-            contradiction = contradiction or _contradiction(evidence, grown, named)
+            contradiction = contradiction or _contradiction(evidence, grown, named, why)
             if named in FLUIDS and why is None:
                 break
         elif why is None or (named in FLUIDS and grown.look.name in (_FLUID, _CORE)):
@@ -162,9 +162,11 @@ def _contradicts(grown: Grown, named: str) -> bool:
     return named == "enhancing"
 
 
-def _contradiction(evidence: Evidence, grown: Grown, named: str) -> str:
-    """The rest of the sentence "the seed is in ..."."""
+def _contradiction(evidence: Evidence, grown: Grown, named: str, doubt: str | None) -> str:
+    """The rest of the sentence "the seed is in ..."; `doubt` is why the region is no lesion, if it is none."""
     look, size = grown.look.name, millilitres(grown.region.volume_ml(evidence.spacing_mm))
+    if look == "enhancing" and doubt is not None:
+        return f"what enhances {doubt}, and {named} does not: expected a point in the {named}"
     if look == "enhancing":
         return f"what enhances ({size}), and {named} does not: expected a point in the {named}, or {SAY_WHAT}: a tumour"
     if look == _FLUID:
