@@ -135,8 +135,9 @@ def falx_by_height(label: str, head: Head, surfels: Surfels) -> None:
     for low, high in ((-1, 3), (3, 6), (6, 10), (10, 100)):
         band = (below >= low) & (below < high) & (places[:, 2] > 40)
         some = off[band & np.isfinite(off)]
-        sure = surfels.confidence[band].mean()
-        lines.append(f"{(some > 2).mean():.1%} of {len(some)} (confidence {sure:.2f}) from {max(low, 0)} mm")
+        if len(some):
+            sure = surfels.confidence[band].mean()
+            lines.append(f"{(some > 2).mean():.1%} of {len(some)} (confidence {sure:.2f}) from {max(low, 0)} mm")
     print(f"falx {label}, more than 2 mm off by mm below its top: {', '.join(lines)}")
 
 
