@@ -11,6 +11,7 @@ from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.mri.atlas import Atlas, mni152
 from SlicerUSSim.Logic.mri.atlas_registration import AtlasFit, register_atlas
 from SlicerUSSim.Logic.mri.plausibility import is_whole_brain
+from SlicerUSSim.Logic.probe.placement import sample
 
 #: Brightness in a T1, by which the atlas is registered to labels; what is not named here is as grey matter
 _BRIGHTNESS = {"csf": 0.2, "ventricle": 0.2, "resection cavity": 0.2, "white matter": 1.0, "corpus callosum": 1.0}
@@ -53,10 +54,8 @@ def head_axes(brain: Volume, names: Sequence[str]) -> tuple[np.ndarray, str]:
     if degrees < _TOLD_DEG:
         return axes, ""
     top = ", ".join(f"{letter} {value:.2f}" for letter, value in zip(_AXES, axes[:, 2], strict=True))
-    return (
-        axes,
-        f"the head lies turned by {degrees:.0f} degrees in its image (its top is at {top}): the view follows it",
-    )
+    told = f"the head lies turned by {degrees:.0f} degrees in its image (its top is at {top}): the view follows it"
+    return axes, told
 
 
 def _found(image: Volume, inside: np.ndarray, atlas: Atlas) -> tuple[AtlasFit, float]:
@@ -67,11 +66,7 @@ def _found(image: Volume, inside: np.ndarray, atlas: Atlas) -> tuple[AtlasFit, f
     points = places[:, ::-1] @ image.ijk_to_ras[:3, :3].T + image.ijk_to_ras[:3, 3]
 
     def correlation(patient_to_atlas: np.ndarray) -> float:
-        matrix = atlas.t1.ras_to_ijk @ patient_to_atlas
-        at = np.rint(points @ matrix[:3, :3].T + matrix[:3, 3]).astype(int)[:, ::-1]
-        is_in = ((at >= 0) & (at < atlas.t1.array.shape)).all(axis=1)
-        there = np.zeros(len(at))
-        there[is_in] = atlas.t1.array[tuple(at[is_in].T)]
+        there = sample(atlas.t1, points @ patient_to_atlas[:3, :3].T + patient_to_atlas[:3, 3], order=0)
         return float(np.corrcoef(values, there)[0, 1]) if there.std() > 0.0 else 0.0
 
     upright = register_atlas(image, inside, atlas)
