@@ -245,6 +245,27 @@ def test_a_part_of_a_body_that_two_tasks_number_alike_is_called_so():
     assert read_label_map(made(lungs), lungs).message.startswith("TotalSegmentator MR: 10 labels to ")
 
 
+def test_tissues_of_a_head_without_their_names_are_not_taken_for_organs(tmp_path):
+    """Nine shells as `ussim segment --outside` numbers them, without their .json, were read as organs of an abdomen."""
+    grid = np.stack(np.meshgrid(*[np.arange(64.0)] * 3, indexing="ij"))
+    shells = np.zeros((64, 64, 64), np.uint8)
+    # A little to the sides, as chance has it: all pairs of organs with these numbers lie as they should.
+    sides = {1: -1, 5: 1, 6: -1, 4: 1, 3: -1, 2: 1, 9: -1, 8: 1, 7: 0}
+    for number, radius in ((6, 29.0), (5, 27.0), (8, 25.0), (7, 23.0), (9, 21.0), (1, 18.0), (4, 15.0), (2, 12.0)):
+        middle = np.array([31.5, 31.5, 31.5 + sides[number]])[:, None, None, None]
+        shells[((grid - middle) ** 2).sum(axis=0) < radius**2] = number
+    shells[((grid - np.array([31.5, 31.5, 30.5])[:, None, None, None]) ** 2).sum(axis=0) < 64.0] = 3
+    head_of_nine = Volume(shells, np.diag([3.0, 3.0, 3.0, 1.0]))
+    path = tmp_path / "head.nii.gz"
+    head_of_nine.write(path)
+    refusal = refused("simulate", path, "--pose", "auto", "-o", tmp_path / "x.png")
+    assert "no program's numbers are recognised" in refusal and "if ussim segment wrote them, put the .json" in refusal
+    assert "TotalSegmentator" not in refusal and "--map 1=0" not in refusal
+    assert not (tmp_path / "x.png").exists()
+    with pytest.raises(SimulationError, match="no program's numbers"):
+        read_label_map(head_of_nine, of_ct=True)
+
+
 def test_two_tissues_for_one_label_are_refused(tmp_path):
     for texts in (["24=csf", "24=tumour"], ["Left-Lesion=csf", "left lesion=tumour"], ["24=csf", "{json}"]):
         (tmp_path / "map.json").write_text('{"24": "tumour"}')

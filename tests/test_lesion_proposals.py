@@ -173,7 +173,7 @@ def test_a_tissue_that_the_user_names_is_taken_at_his_word():
 def test_proposals_are_files_of_their_own_that_are_not_replaced_once_edited(tmp_path, capsys):
     segmentation, true = brain("low")
     labels = tmp_path / "labels.nii.gz"
-    proposals = find_proposals(segmentation, ["28,-22,28"], False)
+    proposals, _ = find_proposals(segmentation, ["28,-22,28"], False)
     assert not list(tmp_path.iterdir())
     write_proposals(proposals, labels)
     mask = tmp_path / "labels_proposed_tumour.nii.gz"
@@ -233,7 +233,7 @@ def test_only_lesions_are_grown(name):
 
 @needs_atlas
 @pytest.mark.slow
-def test_a_refused_seed_writes_nothing_and_earlier_proposals_are_told(tmp_path):
+def test_a_refused_seed_costs_neither_the_labels_nor_the_other_seeds_and_earlier_proposals_are_told(tmp_path):
     maps = tissue_maps("mni152")
     assert maps is not None
     image = phantom(with_low_grade_tumour(maps, CENTRE, 14.0).coarser(2), "flair", noise=0.03, bias=0.0)
@@ -245,12 +245,13 @@ def test_a_refused_seed_writes_nothing_and_earlier_proposals_are_told(tmp_path):
         command = ["segment", mri, "--contrast", "flair", "--mask", mask, "-o", labels, *options]
         return CliRunner().invoke(main, [str(part) for part in command])
 
-    result = segment("--seed", "28,-22,28", "--seed", "-12,-20,8")
-    assert result.exit_code == 2 and "looks healthy" in result.stderr, result.output
-    assert {file.name for file in tmp_path.iterdir()} == {"mri.nii.gz", "mask.nii.gz"}
-    assert segment("--seed", "28,-22,28").exit_code == 0
     proposal = tmp_path / "labels_proposed_tumour.nii.gz"
-    assert proposal.exists()
+    result = segment("--seed", "-12,-20,8", "--seed", "28,-22,28")
+    assert result.exit_code == 2 and "looks healthy" in result.stderr, result.output
+    assert result.stderr.splitlines()[-1].endswith(f"{labels} is written, with all that was not refused")
+    assert labels.exists() and proposal.exists()
+    alone = proposal.read_bytes()
+    assert segment("--seed", "28,-22,28").exit_code == 0 and proposal.read_bytes() == alone
     result = segment("--seed", "28,-22,28=oedema")
     assert result.exit_code == 0 and f"{proposal} of an earlier run stays" in result.stderr
     result = segment()

@@ -88,10 +88,10 @@ def require_seeds(seeds: Iterable[str], mri: Volume, labels_path: Path) -> None:
     require_own_proposals(labels_path)
 
 
-def find_proposals(segmentation: Segmentation, seeds: Iterable[str], propose: bool) -> list[Proposal]:
-    """The lesions around seeds, and with `propose` those that are found without one; writes nothing.
+def find_proposals(segmentation: Segmentation, seeds: Iterable[str], propose: bool) -> tuple[list[Proposal], list[str]]:
+    """(the lesions around seeds, and with `propose` those that are found without one; a line for each refused seed).
 
-    Raises SimulationError for seeds in what is no lesion, with each of them.
+    Writes nothing. A refused seed is in what is no lesion.
     """
     from SlicerUSSim.Logic.mri.lesions.detection import propose_lesions
     from SlicerUSSim.Logic.mri.lesions.seeded import grow_lesion
@@ -101,14 +101,19 @@ def find_proposals(segmentation: Segmentation, seeds: Iterable[str], propose: bo
         try:
             proposals.append(grow_lesion(segmentation, point, tissue))
         except SimulationError as error:
-            refused.append(str(error))
-    require(not refused, _with_how("; ".join(refused)))
+            refused.append(_with_how(str(error)))
     if propose:
         found = propose_lesions(segmentation)
         proposals += [new for new in found if not any(new.is_mostly_in(old) for old in proposals)]
         if not found:
             note("no lesion proposed: nothing compact in this brain looks unlike the other hemisphere")
-    return proposals
+    return proposals, refused
+
+
+def require_none_refused(refused: Iterable[str], labels_path: Path) -> None:
+    """Raise SimulationError with the lines of refused seeds, when labels and the other lesions are written."""
+    lines = "; ".join(refused)
+    require(not lines, f"{lines}; {labels_path} is written, with all that was not refused")
 
 
 def _with_how(line: str) -> str:

@@ -16,6 +16,7 @@ from SlicerUSSim.Command.progress import note
 from SlicerUSSim.Command.proposals import (
     find_proposals,
     propose_option,
+    require_none_refused,
     require_seeds,
     seed_option,
     split_seeds,
@@ -92,8 +93,7 @@ def segment(
         tell_all=True,
     )
     seconds = perf_counter() - start
-    # Before anything is written, since a seed may be refused
-    proposals = find_proposals(result, seeds, propose) if isinstance(result, Segmentation) else []
+    proposals, refused = find_proposals(result, seeds, propose) if isinstance(result, Segmentation) else ([], [])
     labels, names = result.labels, result.tissue_names
     if sheets is not None and isinstance(result, Segmentation):
         labels, names = write_sheets(sheets, mri, volume, result, settings.contrast, sheet_kinds)
@@ -102,6 +102,7 @@ def segment(
     click.echo(replace(result, labels=added.labels, tissue_names=added.tissue_names).table())
     note(f"segmented in {seconds:.1f} s; wrote {out} and {beside}")
     write_proposals(proposals, out)
+    require_none_refused(refused, out)  # at last: a wrong seed does not cost a segmentation
 
 
 def _require_no_kept_mask(out: Path, mri: str) -> None:

@@ -34,6 +34,8 @@ class Advice:
     ambiguous: str = "say which with --map {key}"
     #: About numbers whose tissues are likely, but not certain; {maps} are options
     likely: str = "if that is right, say so with {maps}"
+    #: About numbers as of `ussim segment` without the tissues that are written beside them; "" if there is nothing to say
+    own: str = "if ussim segment wrote them, put the .json file that it wrote beside them there; otherwise "
     #: About voxels without a label between organs
     between: str = "--map 0=fat gives it a tissue"
     #: A mask that is added as {tissue}, and one of several tissues
@@ -78,6 +80,7 @@ SERVE_COMMAND = replace(
 PAGE = replace(
     COMMAND,
     leave_out="",
+    own="",
     unknown=(
         "open it together with a table of its names (.txt, .ctbl), the tissue table of ussim segment (.json), or a "
         '.json file with {{"{label}": "TISSUE"}} (0 removes a label), one of'
@@ -113,6 +116,7 @@ ORGANS_PAGE = replace(
 SCENE = Advice(
     unknown="rename to one of",
     leave_out="",
+    own="",
     background="set it to 0, or give the label map colours with the name of its tissue",
     lesion="add it to a segmentation as a segment",
     brain_mask="if it is the mask of a brain, choose it as the brain mask of that brain's MRI",

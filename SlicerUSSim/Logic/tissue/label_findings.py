@@ -24,6 +24,8 @@ from SlicerUSSim.Logic.tissue.table import TissueTable
 from SlicerUSSim.Logic.tissue.tissue import Tissue
 
 _LONGEST_LIST = 12
+#: As many tissues as `ussim segment` writes at most, with all that --outside, --sheets and --add give
+_MOST_OF_OURS = 20
 #: So few labels are not recognised by their places.
 _TOO_FEW = 3
 #: More unknown labels may be the intensities of an image
@@ -120,12 +122,13 @@ class Findings:
             return
         remedy = self.advice.unknown.format(label=unknown[0])
         nothing = "no program's numbers are recognised, and " if len(unknown) == len(self.names) else ""
-        if len(unknown) > 1 and self.advice.leave_out and not self._are_interpolated:
+        if len(unknown) > 1 and not nothing and self.advice.leave_out and not self._are_interpolated:
             maps = self.advice.maps(f"{n}=0" for n in unknown[:_LONGEST_LIST])
             maps += " ..." * (len(unknown) > _LONGEST_LIST)
             remedy = f"{self.advice.leave_out.format(maps=maps)}; or {remedy}"
         if nothing:
-            remedy = f"{self._if_of_a_program(unknown)}{remedy}"
+            is_ours = sorted(self.names) == list(range(1, len(self.names) + 1)) and len(self.names) <= _MOST_OF_OURS
+            remedy = f"{self._if_of_a_program(unknown)}{self.advice.own if is_ours else ''}{remedy}"
         if self._are_interpolated:
             remedy = f"{_INTERPOLATED}; or {remedy}"
         elif nothing and len(unknown) > MOST_LABELS:

@@ -2,7 +2,9 @@
 
 Numbers alone are often not enough: 2, 3 and 4 are white matter, cortex and ventricle for FreeSurfer, kidneys and gall
 bladder for TotalSegmentator. What the numbers stand for has its place in the body, however: the left hemisphere is left
-of the right one, a vertebra is above the next lower one. A scheme is therefore accepted only if the positions agree.
+of the right one, a vertebra is above the next lower one. A scheme is therefore accepted only if the positions agree,
+and one of organs only if the labels do not lie around each other, as skin, skull and brain do: their centres are close
+together, and any order of them is chance.
 """
 
 from __future__ import annotations
@@ -18,7 +20,7 @@ from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.tissue import freesurfer, totalsegmentator
 from SlicerUSSim.Logic.tissue.brain_orders import BRAIN_TISSUES, BrainLabels
 from SlicerUSSim.Logic.tissue.names import same_name
-from SlicerUSSim.Logic.tissue.thinning import label_centres, thinning
+from SlicerUSSim.Logic.tissue.thinning import label_centres, lie_apart, thinning
 
 #: At least this share of the positions of structures has to agree with a scheme, and this number of them.
 _AGREEING, _FEWEST = 0.85, 3
@@ -138,7 +140,7 @@ def recognised(labels: Volume, values: list[int]) -> Recognition:
             elif count > 1 and min(known, usual) == 1:
                 doubt = "structures of the left do not lie to the left of those of the right: check the orientation in "
                 possible = Recognition(None, possible=scheme, doubt=f"{doubt}its header")
-        elif known >= _KNOWN and count >= _FEWEST and holds >= _AGREEING * count:
+        elif known >= _KNOWN and count >= _FEWEST and holds >= _AGREEING * count and lie_apart(labels):
             fits.append((holds, scheme))
     if not fits:
         brain = _of_brain(labels, values)
@@ -165,6 +167,8 @@ def recognised_in_ct(labels: Volume, values: list[int]) -> tuple[tuple[Scheme, .
     labels : (k, j, i) whole numbers.
     """
     centres, fits = label_centres(labels), []
+    if len(centres) >= _FEWEST and not lie_apart(labels):
+        return (), False
     for scheme in schemes_of_ct():
         holds, _, count = _agreement(scheme.order, centres)
         if np.mean([value in scheme.names for value in values]) >= _KNOWN and holds >= _AGREEING * count:

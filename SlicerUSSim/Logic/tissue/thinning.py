@@ -1,6 +1,8 @@
-"""Where labels are: how much of a large label map is looked at, and their centres."""
+"""Where labels are: how much of a large label map is looked at, their centres, and whether they lie apart."""
 
 from __future__ import annotations
+
+from itertools import combinations
 
 import numpy as np
 
@@ -8,6 +10,8 @@ from SlicerUSSim.Logic.base.volume import Volume
 
 #: Voxels from which on places of structures are known well enough
 _VOXELS = 2_000_000
+#: 0.12 and 0.24 in the tissues of a brain and of a head, 2.8 and more in an atlas of regions
+_APART = 0.6
 
 
 def thinning(labels: np.ndarray) -> int:
@@ -15,12 +19,34 @@ def thinning(labels: np.ndarray) -> int:
     return max(1, int(np.ceil((labels.size / _VOXELS) ** (1 / 3))))
 
 
-def label_centres(labels: Volume) -> dict[int, np.ndarray]:
-    """{label: its centre in RAS mm} of all labels but 0."""
+def label_places(labels: Volume) -> dict[int, tuple[np.ndarray, np.ndarray]]:
+    """{label: (its centre, its standard deviation along R, A and S), in mm} of all labels but 0."""
     step = thinning(labels.array)
     array = labels.array[::step, ::step, ::step]
     where = np.nonzero(array)
     values, inverse, counts = np.unique(array[where], return_inverse=True, return_counts=True)
-    ijk = np.stack([np.bincount(inverse, axis) * step / counts for axis in where[::-1]], axis=1)
+    ijk = np.stack(where[::-1], axis=1) * float(step)
     ras = ijk @ labels.ijk_to_ras[:3, :3].T + labels.ijk_to_ras[:3, 3]
-    return dict(zip(map(int, values), ras, strict=True))
+    centres = np.stack([np.bincount(inverse, axis) / counts for axis in ras.T], axis=1)
+    squares = np.stack([np.bincount(inverse, axis) / counts for axis in ((ras - centres[inverse]) ** 2).T], axis=1)
+    places = zip(centres, np.sqrt(squares), strict=True)
+    return dict(zip(map(int, values), places, strict=True))
+
+
+def label_centres(labels: Volume) -> dict[int, np.ndarray]:
+    """{label: its centre in RAS mm} of all labels but 0."""
+    return {label: centre for label, (centre, _) in label_places(labels).items()}
+
+
+def lie_apart(labels: Volume) -> bool:
+    """Whether most labels lie beside each other, as organs do, and not around each other, as the tissues of a head do.
+
+    Two lie beside each other if their centres are further apart along R, A or S than a part of what their voxels
+    deviate from these.
+    """
+    places = list(label_places(labels).values())
+    distances = [
+        np.max(np.abs(one - other) / np.maximum(spread + other_spread, 1e-9))
+        for (one, spread), (other, other_spread) in combinations(places, 2)
+    ]
+    return not distances or float(np.median(distances)) >= _APART
