@@ -95,6 +95,17 @@ def test_a_face_off_the_patient_is_said_with_the_share_that_touches():
     assert not about_contact(speck, PHASED, [AT_TOP], 2.0)[0].startswith(("0%", "only 0%"))
 
 
+def test_a_face_far_from_a_patient_in_the_coupling_medium_is_said():
+    """A probe 45 mm off an opened head gave the image of a water bath, without a word."""
+    near, far = slab(from_mm=5.0), slab(from_mm=15.0)  # 25 and 35 mm below the face
+    assert about_contact(near, LINEAR, [AT_TOP], None) == ()
+    (line,) = about_contact(far, LINEAR, [AT_TOP], None)
+    assert line.startswith("the probe's face is more than 30 mm from the patient, across the coupling medium")
+    aside = AT_TOP @ rigid(np.eye(3), [500.0, 0.0, 0.0])
+    (line,) = about_contact(near, LINEAR, [AT_TOP, aside, AT_TOP], None)
+    assert line.startswith("in 1 of 3 images the probe's face is more than 30 mm")
+
+
 @pytest.mark.parametrize("probe", [LINEAR, PHASED, CONVEX], ids=lambda probe: probe.kind)
 @pytest.mark.parametrize("off_mm", [0.0, 90.0])
 def test_no_share_of_a_face_touches_where_all_lines_are_dark(probe, off_mm):

@@ -320,6 +320,7 @@ def test_options_of_the_command(tmp_path):
     for given, without, message in (
         ("none", ("falx",), "give --sheets, too"), ("auto", ("dura",), "--no-sheet is 'dura'"),
         ("auto", (), "a label map has no sheets"), ("nowhere.vtp", (), "no such file"),
+        ("all", (), "expected a .vtp file, auto or none"),
     ):  # fmt: skip
         with pytest.raises(SimulationError, match=message):
             DrawnSheets.of(given, without, is_labels=True, contrast="t1")

@@ -65,6 +65,9 @@ class DrawnSheets:
             require(kind in ALL_KINDS, f"--no-sheet is {kind!r}, expected one of: {', '.join(ALL_KINDS)}")
         kinds = tuple(kind for kind in ALL_KINDS if kind not in without)
         if source != AUTO:
+            require(
+                Path(source).is_file(), f"--sheets is {source!r} (no such file), expected a .vtp file, {AUTO} or {NONE}"
+            )
             return cls(source, kinds, read_surfels(source).of_kind(*(set(KINDS) & set(kinds))))
         require(not is_labels, "--sheets is auto, and a label map has no sheets, expected a .vtp or an MRI")
         require_findable(kinds, contrast)

@@ -19,6 +19,8 @@ from SlicerUSSim.Logic.probe.placement import sample
 _ALONG, _ACROSS, _STEP = 25, 5, 0.5
 #: A user is told of a face less of which than this share touches the patient; of a curved one on a head half does
 _LEAST_SHARE = 1.0 / 3.0
+#: Without a gap, the same of a face that is further from the patient than a bath or a cavity needs
+_BATH_MM = 30.0
 
 
 def line_contact(labels: Volume, probe: Probe, probe_to_ras: np.ndarray, gap_mm: float) -> np.ndarray:
@@ -49,10 +51,15 @@ def touching_share(labels: Volume, probe: Probe, probe_to_ras: np.ndarray, gap_m
 def about_contact(labels: Volume, probe: Probe, poses: Sequence[np.ndarray], gap_mm: float | None) -> tuple[str, ...]:
     """Lines about a face that does not touch the patient, or with little of it, at one pose (4, 4) or more.
 
-    None without a gap (None), as the patient then lies in the coupling medium. The others are as in line_contact.
+    Without a gap (None) the patient lies in the coupling medium, and only a face that is far from it is told of. The
+    others are as in line_contact.
     """
     if gap_mm is None:
-        return ()
+        steps = (0.1 * _BATH_MM, _BATH_MM)  # most faces are near, which takes a tenth of the time to see
+        far = sum(not any(touching_share(labels, probe, pose, mm) > 0.0 for mm in steps) for pose in poses)
+        which = "the probe's face is" if len(poses) == 1 else f"in {far} of {len(poses)} images the probe's face is"
+        line = f"{which} more than {_BATH_MM:g} mm from the patient, across the coupling medium, as in a water bath"
+        return (f"{line}; if it should touch, move it onto the patient",) if far else ()
     shares = [touching_share(labels, probe, pose, gap_mm) for pose in poses]
     little = [share for share in shares if 0.0 < share < _LEAST_SHARE]
     count, off = len(shares), len(shares) - np.count_nonzero(shares)

@@ -34,7 +34,7 @@ class Advice:
     ambiguous: str = "say which with --map {key}"
     #: About numbers whose tissues are likely, but not certain; {maps} are options
     likely: str = "if that is right, say so with {maps}"
-    #: About numbers as of `ussim segment` without the tissues that are written beside them; "" if there is nothing to say
+    #: About numbers as of `ussim segment` without the tissues that it writes beside them; may be empty
     own: str = "if ussim segment wrote them, put the .json file that it wrote beside them there; otherwise "
     #: About voxels without a label between organs
     between: str = "--map 0=fat gives it a tissue"
