@@ -68,8 +68,8 @@ def timed(name: str, mri: Volume, found: Segmentation, contrast: str, **options)
 def coverage(name: str, head: Head, sheets: Surfels) -> None:
     """Visible sulcal CSF: more fluid than grey matter, deeper than 2 mm, not in or near ventricles and hindbrain.
 
-    And what of it is in sulci: a ball of 4 mm does not fit into its fluid, as it does into that of cisterns. Half of what
-    is in a wider space is further than 1 mm from any sheet in its middle.
+    And what of it is in sulci: a ball of 4 mm does not fit into its fluid, as it does into that of cisterns, of which
+    half is further than 1 mm from any sheet in its middle.
     """
     away = distance_to(ventricles(head), head.image.spacing_mm) >= 3.0
     fluid = head.brain & (head.fluid(head.image.array) > 0.5) & (head.depth > 2.0) & ~hindbrain(head) & away
