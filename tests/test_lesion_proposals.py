@@ -8,6 +8,7 @@ from functools import cache
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from scipy import ndimage
 
 from SlicerUSSim.Command.cli import main
 from SlicerUSSim.Command.proposals import find_proposals, split_seeds, write_proposals
@@ -129,6 +130,25 @@ def test_a_point_beside_what_is_proposed_is_said():
         is_said.add(any("mm beside what is proposed" in line for line in found.warnings))
         assert any("mm beside what is proposed" in line for line in found.warnings) == (apart >= 2.0)
     assert is_said == {False, True}
+
+
+@needs_atlas
+@pytest.mark.slow
+def test_a_point_in_a_ventricle_beside_what_enhances_is_refused_and_one_within_its_rim_is_not():
+    """A seed in a cistern gave the veins beside it as a tumour, since a point may be 5 mm beside what enhances."""
+    maps = tissue_maps("mni152")
+    assert maps is not None
+    centre = (18.0, 8.0, 18.0)  # beside the frontal horn
+    maps = with_ring_tumour(maps, centre, 9.0).coarser(2)
+    image = phantom(maps, "t1gd", noise=0.03, bias=0.0)
+    segmentation = segment_mri(image.mri, contrast="t1gd", mask=image.mask)
+    assert "necrosis" in grow_lesion(segmentation, centre).tissues
+    apart = np.asarray(ndimage.distance_transform_edt(maps.shares[3] + maps.shares[4] < 0.5, sampling=2.0))
+    fluid = np.where((apart > 2.5) & (apart < 5.0), ndimage.uniform_filter(maps.shares[0], 3), 0.0)
+    beside = np.unravel_index(np.argmax(fluid), fluid.shape)[::-1] @ maps.ijk_to_ras[:3, :3].T + maps.ijk_to_ras[:3, 3]
+    assert fluid.max() > 0.8
+    with pytest.raises(SimulationError, match="fluid that looks like CSF"):
+        grow_lesion(segmentation, beside)
 
 
 @needs_atlas

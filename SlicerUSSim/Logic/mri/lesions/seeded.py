@@ -104,6 +104,7 @@ def grow_lesion(segmentation: Segmentation, seed_ras_mm: Sequence[float], tissue
     contradiction, doubtful = None, None
     for grown in _regions_at(evidence, index, named):
         why = why_no_lesion(evidence, grown.look, grown.region, grown.window)
+        why = why or _why_not_meant(evidence, grown, index)
         if named is not None and _contradicts(grown, named):
             contradiction = contradiction or _contradiction(evidence, grown, named, why)
             if named in FLUIDS and why is None:
@@ -134,6 +135,22 @@ def _regions_at(evidence: Evidence, index: np.ndarray, named: str | None) -> Ite
                 break
             core = _core_of(evidence, grown, index) if named in FLUIDS and look is enhancing else None
             yield core or grown
+
+
+def _why_not_meant(evidence: Evidence, grown: Grown, index: np.ndarray) -> str | None:
+    """Words for why what enhances beside a point (k, j, i in the box) in fluid is not meant by it; None if it may be.
+
+    Fluid within a rim is: veins that cross a cistern do not enclose the point.
+    """
+    nearest = np.rint(index).astype(int)
+    if grown.look.name != "enhancing" or not evidence.fluid[tuple(nearest)]:
+        return None
+    point = nearest - [part.start for part in grown.window]
+    iterations = max(round(_RIM_MM / float(evidence.spacing_mm.max())), 1)
+    padded = np.pad(grown.region.inside, iterations)
+    closed = np.asarray(ndimage.binary_closing(padded, iterations=iterations))
+    enclosed = np.asarray(ndimage.binary_fill_holes(closed))
+    return None if enclosed[tuple(point + iterations)] else "beside the point, which is in fluid"
 
 
 def lesion_tissue(name: str) -> str:
