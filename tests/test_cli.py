@@ -124,7 +124,7 @@ def test_a_pose_that_is_neither_a_file_nor_a_view_names_all_that_there_is(head):
     assert "--pose is 'tempral' (no such file), expected a file with the pose (.json, .txt, .tfm, .h5), auto, or" in (
         done.stderr
     )
-    assert done.stderr.endswith("temporal, temporal-left, fontanelle, fontanelle-sagittal\n")
+    assert done.stderr.endswith("temporal, temporal-left, fontanelle, fontanelle-sagittal (temporal: from the right)\n")
 
 
 @pytest.mark.parametrize("command", [pytest.param("demo", marks=pytest.mark.slow), "simulate"])
