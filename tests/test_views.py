@@ -25,7 +25,7 @@ def test_the_command_knows_the_views():
 @pytest.mark.parametrize("name", VIEWS)
 @pytest.mark.parametrize("is_open, radius", [(False, 78.0), (True, 60.0)])
 def test_a_view_is_square_to_the_skin_or_the_brain(head, name, is_open, radius):  # noqa: F811
-    pose = view_pose(head, NAMES, name, is_open=is_open)
+    pose, _ = view_pose(head, NAMES, name, is_open=is_open)
     place, axis = pose[:3, 3], pose[:3, 1]
     assert np.linalg.norm(place) == pytest.approx(radius, abs=2.0)
     np.testing.assert_allclose(axis, -place / np.linalg.norm(place), atol=0.05)
@@ -35,7 +35,7 @@ def test_a_view_is_square_to_the_skin_or_the_brain(head, name, is_open, radius):
 
 @pytest.mark.slow
 def test_left_and_right_front_and_back_are_where_they_are_in_such_images(head):  # noqa: F811
-    right, left, coronal, sagittal = (view_pose(head, NAMES, name) for name in VIEWS)
+    right, left, coronal, sagittal = (view_pose(head, NAMES, name)[0] for name in VIEWS)
     assert right[0, 3] > 70 and left[0, 3] < -70  # RAS: the right is positive
     assert right[1, 0] < -0.9 and left[1, 0] < -0.9 and sagittal[1, 0] < -0.9  # the front on the left of the image
     assert coronal[0, 0] < -0.9  # seen from the front: the patient's right on the left of the image
@@ -70,7 +70,9 @@ def test_the_command_stands_where_a_view_is_seen_from(head, tmp_path):  # noqa: 
 def test_with_an_opening_of_a_file_a_view_is_in_it_or_said_to_be_elsewhere(head, tmp_path, name):  # noqa: F811
     path, mask, out = tmp_path / "head.nii.gz", tmp_path / "mask.nii.gz", tmp_path / "out.png"
     write_label_files(path, head, TissueTable.brain().for_names(NAMES))
-    head.with_array(disc_opening(head, NAMES, view_pose(head, NAMES, "fontanelle"), 40.0).astype(np.uint8)).write(mask)
+    head.with_array(disc_opening(head, NAMES, view_pose(head, NAMES, "fontanelle")[0], 40.0).astype(np.uint8)).write(
+        mask
+    )
     done = CliRunner().invoke(
         main, ["simulate", str(path), "--pose", name, "--craniotomy", str(mask), "-o", str(out)]
     )  # fmt: skip
