@@ -54,11 +54,12 @@ map_option = click.option(
 #: A pose that is chosen; and those of mri.views.VIEWS
 AUTO = "auto"
 STANDARD_VIEWS = ("temporal", "temporal-left", "fontanelle", "fontanelle-sagittal")
+_VIEWS = f"{', '.join(STANDARD_VIEWS)} (temporal: from the right)"
 pose_option = click.option(
     "--pose", required=True,
     help='File with probe_to_ras (4 x 4 in JSON, 16 numbers in text, or a Slicer transform), "auto": a coronal '
     "view through a craniotomy, of what --add laid over the labels if there is something, or a standard view: "
-    f"{', '.join(STANDARD_VIEWS)} (temporal: from the right).",
+    f"{_VIEWS}.",
 )  # fmt: skip
 
 
@@ -362,7 +363,7 @@ def open_examination_at(patient: PatientOptions, pose: str) -> tuple[Examination
     require(
         is_chosen or Path(pose).exists(),
         f"--pose is {pose!r} (no such file), expected a file with the pose (.json, .txt, .tfm, .h5), {AUTO}, "
-        f"or a view: {', '.join(STANDARD_VIEWS)} (temporal: from the right)",
+        f"or a view: {_VIEWS}",
     )
     examination = open_examination(patient, pose if is_chosen else read_pose(pose))
     return examination, required(examination.probe_to_ras, "the examination has no pose")

@@ -20,7 +20,7 @@ from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.tissue import freesurfer, totalsegmentator
 from SlicerUSSim.Logic.tissue.brain_orders import BRAIN_TISSUES, BrainLabels
 from SlicerUSSim.Logic.tissue.names import same_name
-from SlicerUSSim.Logic.tissue.thinning import label_centres, lie_apart, thinning
+from SlicerUSSim.Logic.tissue.thinning import centres_of, label_places, lie_apart, thinning
 
 #: At least this share of the positions of structures has to agree with a scheme, and this number of them.
 _AGREEING, _FEWEST = 0.85, 3
@@ -120,7 +120,8 @@ def recognised(labels: Volume, values: list[int]) -> Recognition:
     ----------
     labels : (k, j, i) whole numbers.
     """
-    centres = label_centres(labels)
+    places = label_places(labels)
+    centres = centres_of(places)
     possible = None
     may_be_freesurfers = False
     fits: list[tuple[int, Scheme]] = []
@@ -140,7 +141,7 @@ def recognised(labels: Volume, values: list[int]) -> Recognition:
             elif count > 1 and min(known, usual) == 1:
                 doubt = "structures of the left do not lie to the left of those of the right: check the orientation in "
                 possible = Recognition(None, possible=scheme, doubt=f"{doubt}its header")
-        elif known >= _KNOWN and count >= _FEWEST and holds >= _AGREEING * count and lie_apart(labels):
+        elif known >= _KNOWN and count >= _FEWEST and holds >= _AGREEING * count and lie_apart(places):
             fits.append((holds, scheme))
     if not fits:
         brain = _of_brain(labels, values)
@@ -166,8 +167,9 @@ def recognised_in_ct(labels: Volume, values: list[int]) -> tuple[tuple[Scheme, .
     ----------
     labels : (k, j, i) whole numbers.
     """
-    centres, fits = label_centres(labels), []
-    if len(centres) >= _FEWEST and not lie_apart(labels):
+    places, fits = label_places(labels), []
+    centres = centres_of(places)
+    if len(places) >= _FEWEST and not lie_apart(places):
         return (), False
     for scheme in schemes_of_ct():
         holds, _, count = _agreement(scheme.order, centres)

@@ -13,13 +13,16 @@ _VOXELS = 2_000_000
 #: 0.12 and 0.24 in the tissues of a brain and of a head, 2.8 and more in an atlas of regions
 _APART = 0.6
 
+#: {label: (its centre, its standard deviation along R, A and S), in mm}
+Places = dict[int, tuple[np.ndarray, np.ndarray]]
+
 
 def thinning(labels: np.ndarray) -> int:
     """Every so-manieth voxel along each axis of (k, j, i) labels tells where structures are."""
     return max(1, int(np.ceil((labels.size / _VOXELS) ** (1 / 3))))
 
 
-def label_places(labels: Volume) -> dict[int, tuple[np.ndarray, np.ndarray]]:
+def label_places(labels: Volume) -> Places:
     """{label: (its centre, its standard deviation along R, A and S), in mm} of all labels but 0."""
     step = thinning(labels.array)
     array = labels.array[::step, ::step, ::step]
@@ -35,18 +38,22 @@ def label_places(labels: Volume) -> dict[int, tuple[np.ndarray, np.ndarray]]:
 
 def label_centres(labels: Volume) -> dict[int, np.ndarray]:
     """{label: its centre in RAS mm} of all labels but 0."""
-    return {label: centre for label, (centre, _) in label_places(labels).items()}
+    return centres_of(label_places(labels))
 
 
-def lie_apart(labels: Volume) -> bool:
+def centres_of(places: Places) -> dict[int, np.ndarray]:
+    """The centres alone."""
+    return {label: centre for label, (centre, _) in places.items()}
+
+
+def lie_apart(places: Places) -> bool:
     """Whether most labels lie beside each other, as organs do, and not around each other, as the tissues of a head do.
 
     Two lie beside each other if their centres are further apart along R, A or S than a part of what their voxels
     deviate from these.
     """
-    places = list(label_places(labels).values())
     distances = [
         np.max(np.abs(one - other) / np.maximum(spread + other_spread, 1e-9))
-        for (one, spread), (other, other_spread) in combinations(places, 2)
+        for (one, spread), (other, other_spread) in combinations(places.values(), 2)
     ]
     return not distances or float(np.median(distances)) >= _APART
