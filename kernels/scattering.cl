@@ -344,8 +344,35 @@ inline floatn unevenness(uint seed, const floatn *words, int has_specks, floatn 
 }
 #endif
 
-// Three passes over a batch, each without unpredictable branches: vectors of all cells; labels of the scatterers that
-// contribute; their echoes, one after the other.
+// Where scatterers are re a piece, for LANES of them at places u, v, w from the segment's start.
+typedef struct {
+  floatn t, right, depth;  // part of the piece, of the strip's width, displayed depth
+  floatn aside2;           // squared distance from the axis in elevation
+#ifdef LOBES
+  floatn along, away;
+#endif
+} Beside;
+
+inline Beside beside_piece(const Piece *piece, floatn pu, floatn pv, floatn pw, intn *counts) {
+  const floatn along = dot_lanes(pu, pv, pw, piece->direction);
+  const floatn aside_l = dot_lanes(pu, pv, pw, piece->lateral);
+  const floatn aside_e = dot_lanes(pu, pv, pw, piece->elevational);
+  Beside at;
+  at.t = (along - piece->low) * piece->span;
+  at.right = fma(aside_l, line_lanes(at.t, piece->line0, piece->line1), (floatn)(piece->edge));
+  at.aside2 = aside_e * aside_e;
+  const floatn range = fma(aside_l, aside_l * piece->bend, along);
+  at.depth = line_lanes(range, piece->depth0, piece->slope);
+  *counts = (at.right >= 0.0f) & (at.right < 1.0f) & (along >= piece->from_mm) & (along < piece->to_mm);
+#ifdef LOBES
+  at.along = along;
+  at.away = fabs(aside_e);
+#endif
+  return at;
+}
+
+// Four passes over a batch, each without unpredictable branches: where all cells' scatterers are, and which contribute,
+// often a quarter of them; vectors of these; their labels; their echoes, one after the other.
 inline void scatter_batch(__constant const Acquisition *acquisition, __global const ushort *voxels,
                           __global const uint *planes, __global const uint *texture, __global const float *sites,
                           const Piece *piece, const int *cell_u, const uint *row_key, const float *row_v,
@@ -355,27 +382,16 @@ inline void scatter_batch(__constant const Acquisition *acquisition, __global co
   const float cutoff2 = 0.5f * LOG2_E * acquisition->beam_cutoff * acquisition->beam_cutoff;
 #endif
   const float inverse_sample = 1.0f / acquisition->sample_mm;
-  const int nx = acquisition->dims[0], ny = acquisition->dims[1];
-  const float3 voxel_top = (float3)(nx - 1.001f, ny - 1.001f, acquisition->dims[2] - 1.001f);
   const int u = piece->u, v = piece->v, w = piece->w;
   const uint step_u = axis_step(u);
-  const float3 d = piece->direction, l = piece->lateral, e = piece->elevational;
 
-  float part_[BATCH], right_[BATCH], re_[BATCH], im_[BATCH], fx_[BATCH], fy_[BATCH], fz_[BATCH];
-  int bin_[BATCH], voxel_[BATCH];
-  uint random_[BATCH];
-#ifdef LOBES
-  float away_[BATCH], path_[BATCH];
-#endif
-#ifdef UNEVEN
-  float place_[3 * BATCH], uneven_[BATCH + LANES];
-#endif
+  float u_[BATCH], v_[BATCH], w_[BATCH];
+  uint key_[BATCH];
   ushort chosen[BATCH + 1];
   int n = 0;
   for (int begin = 0; begin < count; begin += LANES) {
     const intn cells = LOAD_LANES(cell_u + begin);
     const uintn key = hash_mixn((LOAD_LANES(row_key + begin) + TO_UINTN(cells) * step_u) ^ acquisition->seed);
-    const uintn random = hash_mixn(key + 0x3C6EF372u);  // 16 bits for its existence, one for its sign, 15 for its label
     // (The seed is not added to the index: seeds would then give the same scatterers, shifted by cells.)
     // Jitter is defined by lattice axis: u, v, w use the bits of the axis they represent.
     const uintn bits_u = (key >> (10 * u)) & 0x3ffu, bits_v = (key >> (10 * v)) & 0x3ffu,
@@ -383,52 +399,70 @@ inline void scatter_batch(__constant const Acquisition *acquisition, __global co
     const floatn pu = fma(TO_FLOATN(bits_u), (floatn)(grain), fma(TO_FLOATN(cells), (floatn)(cell), (floatn)(first_u)));
     const floatn pv = fma(TO_FLOATN(bits_v), (floatn)(grain), LOAD_LANES(row_v + begin));
     const floatn pw = fma(TO_FLOATN(bits_w), (floatn)(grain), LOAD_LANES(row_w + begin));
-#ifdef UNEVEN
-    STORE_LANES(pu + piece->start_u, place_ + u * BATCH + begin);
-    STORE_LANES(pv + piece->start_v, place_ + v * BATCH + begin);
-    STORE_LANES(pw + piece->start_w, place_ + w * BATCH + begin);
-#endif
-    const floatn along = dot_lanes(pu, pv, pw, d);
-    const floatn aside_l = dot_lanes(pu, pv, pw, l);
-    const floatn aside_e = dot_lanes(pu, pv, pw, e);
-    const floatn t = (along - piece->low) * piece->span;
-    const floatn right = fma(aside_l, line_lanes(t, piece->line0, piece->line1), (floatn)(piece->edge));
+    intn counts;
+    const Beside at = beside_piece(piece, pu, pv, pw, &counts);
 #ifdef LOBES
-    const floatn r2 = 0.0f, curved = 0.0f;  // lobes have random phases
-    const intn near = fabs(aside_e) <= piece->reach;
-    STORE_LANES(fabs(aside_e), away_ + begin);
-    STORE_LANES(piece->path0 + (along - piece->low), path_ + begin);
+    const intn near = at.away <= piece->reach;
 #else
-    const floatn aside2 = aside_e * aside_e;
-    const floatn r2 = aside2 * line_lanes(t, piece->narrow0, piece->narrow1);
-    const floatn curved = aside2 * line_lanes(t, piece->curved0, piece->curved1);
-    const intn near = r2 <= cutoff2;
+    const intn near = at.aside2 * line_lanes(at.t, piece->narrow0, piece->narrow1) <= cutoff2;
 #endif
-    const floatn range = fma(aside_l, aside_l * piece->bend, along);
-    const floatn depth = line_lanes(range, piece->depth0, piece->slope);
-    const floatn place = depth * inverse_sample;
-    const floatn bin = floor(place);
-    const intn bins = TO_INTN(bin) - piece->first;
-    const intn counts = (right >= 0.0f) & (right < 1.0f) & near & (bins >= -1) & (bins < CHUNK) &
-                        (along >= piece->from_mm) & (along < piece->to_mm) & (LANE_INDEX < count - begin);
-    SPREAD(int, counts_, counts);
+    const intn bins = TO_INTN(floor(at.depth * inverse_sample)) - piece->first;
+    SPREAD(int, counts_, counts & near & (bins >= -1) & (bins < CHUNK) & (LANE_INDEX < count - begin));
     for (int j = 0; j < LANES; j++) {
       chosen[n] = begin + j;
       n += counts_[j] & 1;
     }
+    STORE_LANES(pu, u_ + begin);
+    STORE_LANES(pv, v_ + begin);
+    STORE_LANES(pw, w_ + begin);
+    STORE_LANES(key, key_ + begin);
+  }
+  // Side by side, in place
+  for (int i = 0; i < n; i++) {
+    const int j = chosen[i];
+    u_[i] = u_[j];
+    v_[i] = v_[j];
+    w_[i] = w_[j];
+    key_[i] = key_[j];
+  }
+
+  const int nx = acquisition->dims[0], ny = acquisition->dims[1];
+  const float3 voxel_top = (float3)(nx - 1.001f, ny - 1.001f, acquisition->dims[2] - 1.001f);
+  float part_[BATCH], right_[BATCH], re_[BATCH], im_[BATCH], fx_[BATCH], fy_[BATCH], fz_[BATCH];
+  int bin_[BATCH], voxel_[BATCH];
+  uint random_[BATCH];
+#ifdef LOBES
+  float away_[BATCH], path_[BATCH];
+#endif
+  for (int begin = 0; begin < n; begin += LANES) {
+    const floatn pu = LOAD_LANES(u_ + begin), pv = LOAD_LANES(v_ + begin), pw = LOAD_LANES(w_ + begin);
+    // 16 bits for its existence, one for its sign, 15 for its label
+    const uintn random = hash_mixn(LOAD_LANES(key_ + begin) + 0x3C6EF372u);
+    intn counts;
+    const Beside beside = beside_piece(piece, pu, pv, pw, &counts);
+#ifdef LOBES
+    const floatn r2 = 0.0f, curved = 0.0f;  // lobes have random phases
+    STORE_LANES(beside.away, away_ + begin);
+    STORE_LANES(piece->path0 + (beside.along - piece->low), path_ + begin);
+#else
+    const floatn r2 = beside.aside2 * line_lanes(beside.t, piece->narrow0, piece->narrow1);
+    const floatn curved = beside.aside2 * line_lanes(beside.t, piece->curved0, piece->curved1);
+#endif
+    const floatn place = beside.depth * inverse_sample;
+    const floatn bin = floor(place);
     const floatn amplitude =
-        exp2_fast(clamp(line_lanes(t, piece->gain0, piece->gain1) - r2, (floatn)(-100.0f), (floatn)(100.0f)));
+        exp2_fast(clamp(line_lanes(beside.t, piece->gain0, piece->gain1) - r2, (floatn)(-100.0f), (floatn)(100.0f)));
     const floatn echo = amplitude * (1.0f - TO_FLOATN((random >> 14) & 2u));
     floatn cosine, sine;
-    turn(fma(depth, (floatn)(acquisition->cycles_per_mm), curved), &cosine, &sine);
+    turn(fma(beside.depth, (floatn)(acquisition->cycles_per_mm), curved), &cosine, &sine);
     const float3 at = piece->at_start, ri = piece->row_i, rj = piece->row_j, rk = piece->row_k;
     const floatn vx = clamp(at.x + dot_lanes(pu, pv, pw, ri), (floatn)(0.0f), (floatn)(voxel_top.x));
     const floatn vy = clamp(at.y + dot_lanes(pu, pv, pw, rj), (floatn)(0.0f), (floatn)(voxel_top.y));
     const floatn vz = clamp(at.z + dot_lanes(pu, pv, pw, rk), (floatn)(0.0f), (floatn)(voxel_top.z));
     const intn ix = TO_INTN(vx), iy = TO_INTN(vy), iz = TO_INTN(vz);
-    STORE_LANES(bins, bin_ + begin);
+    STORE_LANES(TO_INTN(bin) - piece->first, bin_ + begin);
     STORE_LANES(place - bin, part_ + begin);
-    STORE_LANES(right, right_ + begin);
+    STORE_LANES(beside.right, right_ + begin);
     STORE_LANES(echo * cosine, re_ + begin);
     STORE_LANES(echo * -sine, im_ + begin);
     STORE_LANES(random, random_ + begin);
@@ -442,7 +476,7 @@ inline void scatter_batch(__constant const Acquisition *acquisition, __global co
   ushort mixed[BATCH + 1];
   int several = 0;
   for (int i = 0; i < n; i++) {
-    const int word = voxels[voxel_[chosen[i]]];
+    const int word = voxels[voxel_[i]];
     label_[i] = word & LABEL_MASK;
     mixed[several] = i;
 #ifdef TEXTURE
@@ -452,26 +486,22 @@ inline void scatter_batch(__constant const Acquisition *acquisition, __global co
 #endif
   }
   for (int k = 0; k < several; k++) {
-    const int i = mixed[k], j = chosen[i], here = voxel_[j];
+    const int i = mixed[k], here = voxel_[i];
     float gain = 1.0f;
     label_[i] =
         drawn_label(acquisition, voxels + here, planes + (acquisition->sheet_label < 0 ? 0 : PLANE_WORDS * here),
-                    texture + here, piece, (float3)(fx_[j], fy_[j], fz_[j]), random_[j], &gain);
+                    texture + here, piece, (float3)(fx_[i], fy_[i], fz_[i]), random_[i], &gain);
 #ifdef TEXTURE
-    re_[j] *= gain;
-    im_[j] *= gain;
+    re_[i] *= gain;
+    im_[i] *= gain;
 #endif
   }
 
 #ifdef UNEVEN
+  float uneven_[BATCH + LANES];
   for (int i = 0; i < n; i += LANES) {
-    float places[3][LANES];
     int several_tissues = 0;
-    for (int lane = 0; lane < LANES; lane++) {
-      const int at = min(i + lane, n - 1);
-      several_tissues |= label_[at] ^ label_[i];
-      for (int axis = 0; axis < 3; axis++) places[axis][lane] = place_[axis * BATCH + chosen[at]];
-    }
+    for (int lane = 0; lane < LANES; lane++) several_tissues |= label_[min(i + lane, n - 1)] ^ label_[i];
     __global const float *uneven = sites + 3 * MAX_TISSUES, *here = uneven + UNEVEN_WORDS * TISSUE_OF(label_[i]);
     floatn words[6];
     int has_specks = here[3] > 0.0f;
@@ -489,25 +519,28 @@ inline void scatter_batch(__constant const Acquisition *acquisition, __global co
     } else {
       for (int word = 0; word < 6; word++) words[word] = here[word];
     }
-    STORE_LANES(unevenness(acquisition->seed, words, has_specks, LOAD_LANES(places[0]), LOAD_LANES(places[1]),
-                           LOAD_LANES(places[2])),
-                uneven_ + i);
+    const floatn along_u = LOAD_LANES(u_ + i) + piece->start_u, along_v = LOAD_LANES(v_ + i) + piece->start_v,
+                 along_w = LOAD_LANES(w_ + i) + piece->start_w;
+    const floatn x = u == 0 ? along_u : v == 0 ? along_v : along_w;  // along the axes of the patient
+    const floatn y = u == 1 ? along_u : v == 1 ? along_v : along_w;
+    const floatn z = u == 2 ? along_u : v == 2 ? along_v : along_w;
+    STORE_LANES(unevenness(acquisition->seed, words, has_specks, x, y, z), uneven_ + i);
   }
 #endif
 
   for (int i = 0; i < n; i++) {
-    const int j = chosen[i], label = TISSUE_OF(label_[i]);
+    const int label = TISSUE_OF(label_[i]);
     const float2 site = vload2(label, sites);
-    float strength = (random_[j] >> 16) + 0.5f < site.x ? site.y : 0.0f;
+    float strength = (random_[i] >> 16) + 0.5f < site.x ? site.y : 0.0f;
 #ifdef LOBES
     if (strength == 0.0f) continue;
-    strength *= lobe_at(acquisition, piece->lobes, path_[j], away_[j]);
+    strength *= lobe_at(acquisition, piece->lobes, path_[i], away_[i]);
 #endif
     if (IS_ON_MEMBRANE(label_[i])) {
-      const int here = voxel_[j];
+      const int here = voxel_[i];
       strength *=
           gain_on_membrane(acquisition, voxels + here, planes + (acquisition->sheet_label < 0 ? 0 : PLANE_WORDS * here),
-                           piece, (float3)(fx_[j], fy_[j], fz_[j]));
+                           piece, (float3)(fx_[i], fy_[i], fz_[i]));
     }
 #ifdef UNEVEN
     strength *= uneven_[i];
@@ -517,7 +550,7 @@ inline void scatter_batch(__constant const Acquisition *acquisition, __global co
     part = part_of[label];
     if (part < 0) continue;
 #endif
-    add_echo(sum, part, bin_[j], part_[j], right_[j], strength, re_[j], im_[j]);
+    add_echo(sum, part, bin_[i], part_[i], right_[i], strength, re_[i], im_[i]);
   }
 }
 

@@ -22,7 +22,7 @@ from SlicerUSSim.Logic.opencl.device import Device, kernel_folder
 from SlicerUSSim.Logic.opencl.devices import DeviceInfo, choose_device, faster_hint
 from SlicerUSSim.Logic.opencl.layout import shared_source
 from SlicerUSSim.Logic.opencl.limits import lack_of_programs_disk
-from SlicerUSSim.Logic.opencl.pocl import name_unknown_processor, remove_damaged_kernels, require_linker
+from SlicerUSSim.Logic.opencl.pocl import name_processor, remove_damaged_kernels, require_linker
 from SlicerUSSim.Logic.opencl.runtimes import pocl_of_pip, register_pip_runtimes
 from SlicerUSSim.Logic.probe import pose_looking_at
 from tests.conftest import SPECKLE, block, rigid, simulator
@@ -281,8 +281,10 @@ _AVX512 = {
     [
         ("generic", _AVX512, "skylake-avx512"),  # Zen 5
         ("znver3", _AVX512, "skylake-avx512"),  # Zen 4: vectors of 16 floats ended the process
-        ("znver3", _AVX512 - {"avx512f"}, None),  # Zen 3
-        ("icelake-server", _AVX512, None),
+        ("znver2", _AVX512 - {"avx512f"}, "haswell"),  # Zen 2: no built-in function was inlined
+        ("rocketlake", _AVX512, "skylake-avx512"),  # Sapphire Rapids, in the same way
+        ("skylake-avx512", _AVX512, None),
+        ("bdver2", {"avx", "f16c", "fma4"}, None),  # with a library of its own
         ("generic", {"avx", "f16c"}, "ivybridge"),
         ("generic", set(), None),
     ],
@@ -294,11 +296,18 @@ def test_pocl_builds_for_a_processor_with_the_vectors_of_its_kernel_library(monk
     ctypes.memmove(name, called.encode() + b"\0", len(called) + 1)
     structure = (ctypes.c_uint64 * 512)(3, 0, name)  # a device's structure, with a pointer to its processor's name
     handle = SimpleNamespace(
-        version=f"OpenCL 3.0 PoCL HSTR: pthread-x86_64-{called}", int_ptr=ctypes.addressof(structure)
-    )
+        version=f"OpenCL 3.0 PoCL HSTR: pthread-x86_64-{called}", int_ptr=ctypes.addressof(structure),
+        driver_version="3.0-rc2",
+    )  # fmt: skip
     monkeypatch.setattr("SlicerUSSim.Logic.opencl.pocl._processor_flags", lambda: flags)
-    assert name_unknown_processor(handle) == named
+    assert name_processor(handle) == named
     assert ctypes.string_at(name).decode() == (named or called)
+
+
+def test_other_versions_of_pocl_keep_a_name_that_they_know(monkeypatch):
+    monkeypatch.setattr("SlicerUSSim.Logic.opencl.pocl._processor_flags", lambda: _AVX512)
+    version = "OpenCL 3.0 PoCL HSTR: pthread-x86_64-rocketlake"
+    assert name_processor(SimpleNamespace(version=version, int_ptr=0, driver_version="6.0")) is None
 
 
 def test_threads_share_a_simulator_and_a_device():

@@ -54,7 +54,7 @@ class Device:
             from SlicerUSSim.Logic.opencl.pocl import (
                 cache_folder,
                 keep_signals,
-                name_unknown_processor,
+                name_processor,
                 remove_damaged_kernels,
                 require_linker,
             )
@@ -65,7 +65,7 @@ class Device:
                     f"OpenCL device {info} cannot be opened: {full}; free some of it, or set XDG_CACHE_HOME"
                 )
             require_linker(info.handle.platform.version)
-            name_unknown_processor(info.handle)
+            name_processor(info.handle)
             remove_damaged_kernels()
         try:
             self.context = cl.Context([info.handle])

@@ -1,11 +1,14 @@
 """Workarounds for PoCL 3.0: a processor name that its compiler supports, signals, checks for a linker and of its cache.
 
-LLVM 14 calls a processor it does not know "generic" (AMD Zen 5, for instance). PoCL passes that name to clang, which
-rejects it: "unknown target CPU 'generic'" (pocl/pocl issue 1049, open since 2022). Zen 4 it takes for Zen 3, which has
-no AVX-512, while PoCL selects its AVX-512 kernel library by the processor's flags: vectors of 16 floats then end the
-process while they are compiled. PoCL 3.0 has no setting for the name, but stores it as a C string that is read at every
-build. This module replaces the string by the name of a processor that LLVM 14 supports and whose instructions this
-processor has.
+PoCL builds kernels for the processor that LLVM 14 takes this one for, and links a library of built-in functions, which
+it selects by the processor's flags and which was built for an older processor. Three things go wrong. LLVM calls a
+processor it does not know "generic" (AMD Zen 5, for instance), which clang rejects: "unknown target CPU 'generic'"
+(pocl/pocl issue 1049, open since 2022). Zen 4 it takes for Zen 3, which has no AVX-512: vectors of 16 floats then end
+the process while they are compiled. And LLVM inlines a function only into one of a processor with all its
+instructions, even those that it does not use: on Sapphire Rapids, taken for Rocket Lake, which lacks CLWB, and on Zen 1
+and 2, which lack INVPCID, every fma, floor and vload of a kernel is a call, and an image takes half again as long. PoCL
+3.0 has no setting for the name, but stores it as a C string that is read at every build. This module replaces the
+string by the name of the processor that the library was built for.
 """
 
 from __future__ import annotations
@@ -37,37 +40,43 @@ _KNOWN_PROCESSORS = (
 _UNKNOWN = "generic"
 # Names that LLVM 14 also gives to later processors, which have AVX-512
 _WITHOUT_AVX512 = ("znver1", "znver2", "znver3")
+# Bulldozer and its successors, for which PoCL has a library of their own
+_OWN_LIBRARY = "fma4"
 _DEVICE_STRUCT_BYTES = 4096
 _NOTHING = "__kernel void nothing() {}"
-_NOT_NAMED = "PoCL's compiler calls this processor %s, and that cannot be changed: %s; kernels may not build"
+_NOT_NAMED = "PoCL's compiler calls this processor %s, and that cannot be changed: %s; kernels may %s"
 
 
-def name_unknown_processor(handle) -> str | None:
-    """Give PoCL a processor name that its compiler accepts. Returns the name, or None if nothing was changed.
+def name_processor(handle) -> str | None:
+    """Give PoCL the processor name of its kernel library. Returns the name, or None if nothing was changed.
 
-    `handle` is the pyopencl Device. Nothing is written unless a pointer to exactly the string that is its name now, in
-    a heap block large enough for the new name, is found in the device's own structure.
+    Of other versions than 3.0 only one that its compiler rejects, or that ends the process, is changed. `handle` is the
+    pyopencl Device. Nothing is written unless a pointer to exactly the string that is its name now, in a heap block
+    large enough for the new name, is found in the device's own structure.
     """
     flags = _processor_flags()
     called = handle.version.rsplit("-", 1)[-1]
-    if called != _UNKNOWN and not (called in _WITHOUT_AVX512 and "avx512f" in flags):
+    fails = called == _UNKNOWN or (called in _WITHOUT_AVX512 and "avx512f" in flags)
+    if not fails and re.match(r"3\.0\b", handle.driver_version) is None:
         return None
     name = next((name for name, needed in _KNOWN_PROCESSORS if needed <= flags), None)
-    if name is None:
+    if name is None and called == _UNKNOWN:
         _log.warning("PoCL's compiler does not know this processor, and no older one is like it: kernels may not build")
+    if name in (None, called) or (_OWN_LIBRARY in flags and not fails):
         return None
+    level, otherwise = (logging.WARNING, "not build") if fails else (logging.INFO, "be slow")
     try:
         # Reading a wrong pointer through /proc/self/mem is an error; dereferencing it would end the process.
         memory = os.open("/proc/self/mem", os.O_RDONLY)
     except OSError as error:
-        _log.warning(_NOT_NAMED, called, f"its memory cannot be read ({error.strerror})")
+        _log.log(level, _NOT_NAMED, called, f"its memory cannot be read ({error.strerror})", otherwise)
         return None
     try:
         address = _find_string(memory, handle.int_ptr, called.encode() + b"\0")
     finally:
         os.close(memory)
     if address is None or _usable_bytes(address) <= len(name):
-        _log.warning(_NOT_NAMED, called, "the name is not where PoCL 3.0 has it")
+        _log.log(level, _NOT_NAMED, called, "the name is not where PoCL 3.0 has it", otherwise)
         return None
     ctypes.memmove(address, name.encode() + b"\0", len(name) + 1)
     _log.info("PoCL's compiler calls this processor %s; kernels are built for %s", called, name)
