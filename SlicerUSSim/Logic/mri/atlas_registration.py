@@ -147,7 +147,8 @@ def _registered(
     affine.SetMatrix(linear.ravel().tolist())
     affine.SetTranslation((linear @ centres[0] + shift - centres[0]).tolist())
     found = _optimised(fixed, moving, affine, 50, (2, 1))[1]
-    warped = sitk.GetArrayViewFromImage(sitk.Resample(moving_mask, fixed_mask, found)) > 0.5
+    # An array of its own: a view of an image that nothing else holds is of memory that is used again
+    warped = sitk.GetArrayFromImage(sitk.Resample(moving_mask, fixed_mask, found)) > 0.5
     mask = sitk.GetArrayViewFromImage(fixed_mask) > 0.5
     report(1.0)
     return _ras_matrix(found), 2.0 * float((warped & mask).sum()) / float(warped.sum() + mask.sum())
@@ -206,6 +207,7 @@ def _method(moving: sitk.Image) -> sitk.ImageRegistrationMethod:
     method = sitk.ImageRegistrationMethod()
     method.SetMetricAsMattesMutualInformation(32)
     method.SetInterpolator(sitk.sitkLinear)
+    method.SetNumberOfWorkUnits(1)  # ITK adds up what several find in the order in which they end
     return method
 
 

@@ -23,6 +23,10 @@ _ONE_NUMBER = 0.2
 #: from -1000 it may be
 _MAYBE_AIR_HU, _PEAK_HU, _NEAR_PEAK_HU = (-1300.0, -500.0), 30.0, 120.0
 _LEAST_OF_PEAK, _LEAST_OF_IMAGE, _MOST_OFF_HU = 0.85, 0.05, 50.0
+#: Fat and soft tissue, of which a body has most; which of two offsets the numbers have is where more of it lies in these
+_FAT_HU, _SOFT_HU = (-130.0, -70.0), (0.0, 90.0)
+#: One number below this is padding, outside the round field of view, if nothing else is
+_PADDING_HU = -1100.0
 #: Bone begins here; an image whose largest number is below it and is had by so many voxels was cut to a window
 _BONE_HU, _MOST_AT_TOP = 700.0, 50
 #: Between fat and water
@@ -45,11 +49,12 @@ def hounsfield_offset(ct: Volume) -> tuple[float, str | None, str | None]:
 
 def _offset_of(values: np.ndarray) -> tuple[float, str | None, str | None]:
     """hounsfield_offset, of a sample of the numbers."""
+    values = _without_padding(values)
     low, high = float(values.min()), float(values.max())
     level = _air_level(values)
     if level is not None:
-        require(
-            abs(level + 1000.0) <= _MOST_OFF_HU,
+        require(  # what is alike in all lungs may be as narrow a peak as air
+            abs(level + 1000.0) <= _MOST_OFF_HU or _share_of_tissue(values) >= _share_of_tissue(values - level - 1000.0),
             f"air is at {level:.0f}, expected -1000: the values are {level + 1000.0:+.0f} from Hounsfield units; "
             "subtract that, or apply the intercept of the CT's header",
         )
@@ -103,6 +108,20 @@ def _air_level(values: np.ndarray) -> float | None:
     peak, near = (int(np.sum(np.abs(dark - level) < width)) for width in (_PEAK_HU, _NEAR_PEAK_HU))
     is_narrow = peak >= _LEAST_OF_PEAK * near and peak >= _LEAST_OF_IMAGE * values.size
     return float(np.median(dark[np.abs(dark - level) < _PEAK_HU])) if is_narrow else None
+
+
+def _without_padding(values: np.ndarray) -> np.ndarray:
+    """The values within the field of view: a scanner writes one number far below air around it, as -2000 or -3024."""
+    below = values[values < _PADDING_HU]
+    is_padded = below.size and below.size < values.size and below.min() == below.max()
+    return values[values >= _PADDING_HU] if is_padded else values
+
+
+def _share_of_tissue(values: np.ndarray) -> float:
+    """Share of what is neither air nor lung that has the numbers of fat or soft tissue."""
+    inside = values[values > _NOT_LUNG_HU]
+    within = sum(np.count_nonzero((inside > low) & (inside < high)) for low, high in (_FAT_HU, _SOFT_HU))
+    return within / max(inside.size, 1)
 
 
 def _mode(values: np.ndarray, low: float, high: float) -> float:

@@ -190,6 +190,7 @@ def _at_atlas(image, path: Path):
     registration.SetInterpolator(sitk.sitkLinear)
     registration.SetOptimizerAsRegularStepGradientDescent(2.0, 1e-2, 200, 0.9, 1e-6)
     registration.SetOptimizerScalesFromPhysicalShift()
+    registration.SetNumberOfWorkUnits(1)  # the same result every time, see atlas_registration.py
     try:
         found = sitk.CenteredTransformInitializer(
             *small, sitk.AffineTransform(3), sitk.CenteredTransformInitializerFilter.MOMENTS
