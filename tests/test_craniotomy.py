@@ -105,6 +105,9 @@ def test_what_is_no_craniotomy_is_refused(head, tmp_path):
         opened(head, ("csf", "grey matter", "a", "b", "c", "d"), disc_opening(head, NAMES, TOP, 30.0))
     with pytest.raises(SimulationError, match="lie on a line"):
         polygon_opening(head, NAMES, np.array([[0.0, 0, 80], [1, 0, 80], [2, 0, 80]]))
+    inside = np.array([[-5.0, -5, 10], [5, -5, 10], [5, 5, 10], [-5, 5, 10]])
+    with pytest.raises(SimulationError, match=r"mm behind the polygon, .* draw it on the scalp, around the opening"):
+        polygon_opening(head, NAMES, inside)
     with pytest.raises(SimulationError, match="of the polygon is 2, expected three or more"):
         polygon_opening(head, NAMES, np.array([[0.0, 0, 80], [1, 0, 80]]))
     (tmp_path / "a.json").write_text("{}")

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy import ndimage
 
 from SlicerUSSim.Command.cli import main as cli
 from SlicerUSSim.Logic import (
@@ -23,7 +24,7 @@ from SlicerUSSim.Logic.base.errors import Cancelled
 from SlicerUSSim.Logic.base.files import write_json
 from SlicerUSSim.Logic.base.neighbourhood import largest_around
 from SlicerUSSim.Logic.mri import head_mri
-from SlicerUSSim.Logic.mri.ct_unit import looks_like_ct
+from SlicerUSSim.Logic.mri.ct_unit import hounsfield_offset, looks_like_ct
 from SlicerUSSim.Logic.probe.placement import pose_looking_at
 from SlicerUSSim.Logic.tissue import LabelledTissues, LabelMapping, read_label_map
 from SlicerUSSim.Logic.verification.ct_phantoms import BY_NUMBER, NAMES, CtPhantom, lower_chest, lumbar_spine
@@ -272,6 +273,31 @@ def test_an_offset_is_removed_and_said(spine, spine_found, offset):
 def test_what_is_no_ct_is_refused_with_what_it_is(spine, change, message):
     with pytest.raises(SimulationError, match=message):
         segment_ct(spine.ct.with_array(change(spine.ct.array.astype(np.float32))))
+
+
+def test_lungs_without_air_around_the_body_are_no_air(chest):
+    """Where they were even, +151 was to be subtracted from true Hounsfield units."""
+    smooth = ndimage.gaussian_filter(chest.ct.array.astype(np.float32), 1.5)
+    within = smooth[:, 30:90, 30:137]
+    offset, line, doubt = hounsfield_offset(Volume(within, chest.ct.ijk_to_ras))
+    assert (offset, line) == (0.0, None) and doubt is not None and "no air is in the image" in doubt
+    with pytest.raises(SimulationError, match=r"air is at -\d+, expected -1000: the values are \+\d+ from"):
+        hounsfield_offset(chest.ct.with_array(chest.ct.array.astype(np.float32) + 151.0))
+
+
+@pytest.mark.parametrize("padding", [-2000.0, -3024.0])
+def test_padding_around_a_round_field_of_view_is_no_unit(chest, chest_found, padding):
+    j, i = np.indices(chest.ct.array.shape[1:])
+    middle = 0.5 * (np.array(chest.ct.array.shape[1:]) - 1)
+    outside = np.hypot(j - middle[0], i - middle[1]) > 0.45 * chest.ct.array.shape[1]
+    cut = chest.ct.with_array(np.where(outside, padding, chest.ct.array).astype(np.float32))
+    assert hounsfield_offset(cut)[0] == 0.0
+    found = segment_ct(cut)
+    ours, whole = (np.array(["", *one.tissue_names])[one.labels.array] for one in (found, chest_found))
+    same = ours == whole
+    inner = ndimage.binary_erosion(~outside, iterations=8)
+    assert same[:, inner].mean() > 0.995
+    assert not found.labels.array[:, outside].any() and f"of the image is {padding:g}, outside" in found.notes[0]
 
 
 def test_soft_tissue_where_there_is_none_is_said(spine):

@@ -218,12 +218,27 @@ def test_sheets_whose_sulci_are_others_are_refused():
     ):  # fmt: skip
         with pytest.raises(SimulationError, match=r"the sheets' sulci do not lie in those of the labels: .* expected"):
             UltrasoundSimulator(labels, tissues, sheets=wrong)
+    # Also of kinds that are drawn without the sulci
+    falx = Surfels.joined([moved(own, np.eye(3), (6.5, 0.0, 0.0)), plane("falx", np.eye(4))]).of_kind("falx")
+    with pytest.raises(SimulationError, match="the sheets' sulci do not lie in those of the labels"):
+        UltrasoundSimulator(labels, tissues, sheets=falx)
     # Turned together, also on coarse slices, the labels are theirs.
     matrix = np.eye(4)
     matrix[:3, :3] = turn
     UltrasoundSimulator(Volume(labels.array, matrix @ labels.ijk_to_ras), tissues, sheets=moved(own, turn))
     coarse = labels.ijk_to_ras @ np.diag([1.0, 1.0, 5.0, 1.0])
     UltrasoundSimulator(Volume(labels.array[::5], coarse), tissues, sheets=own)
+
+
+def test_a_falx_alone_in_white_matter_is_refused():
+    labels = block(lambda x, y, z: np.where(np.abs(x) < 1.0, 1, 2), half_mm=(30, 30, 30))
+    tissues = TissueTable.brain(["csf", "white matter"])
+    y, z = (grid.ravel() for grid in np.meshgrid(np.arange(-20.0, 20.0), np.arange(-20.0, 20.0)))
+    place = np.stack([np.zeros_like(y), y, z], axis=1)
+    own = Surfels.of("falx", place, np.tile([1.0, 0.0, 0.0], (len(y), 1)), 1.0, 1.0, 1.0)
+    UltrasoundSimulator(labels, tissues, sheets=own)
+    with pytest.raises(SimulationError, match="100% of the sheets' falx lie in white matter, expected those that were"):
+        UltrasoundSimulator(labels, tissues, sheets=moved(own, np.eye(3), (8.0, 0.0, 0.0)))
 
 
 def test_a_lesion_over_the_walls_of_ventricles_leaves_them_this_patients():
@@ -301,6 +316,7 @@ def test_options_of_the_command(tmp_path):
     for name, more in {
         "none": [], "file": ["--sheets", tmp_path / "s.vtp"],
         "off": ["--sheets", tmp_path / "s.vtp", "--no-sheet", "sulcus"],
+        "structure": ["--sheets", tmp_path / "s.vtp", "--no-sheet", "vessels"],
     }.items():  # fmt: skip
         out = tmp_path / f"{name}.png"
         arguments = [
@@ -316,7 +332,8 @@ def test_options_of_the_command(tmp_path):
         result = CliRunner().invoke(main, list(map(str, arguments)))
         assert result.exit_code == 0, result.output
         images[name] = out.read_bytes()
-    assert images["none"] == images["off"] != images["file"]
+        assert ("--no-sheet vessels leaves nothing out: it is no sheet of" in result.stderr) == (name == "structure")
+    assert images["none"] == images["off"] != images["file"] == images["structure"]
     for given, without, message in (
         ("none", ("falx",), "give --sheets, too"), ("auto", ("dura",), "--no-sheet is 'dura'"),
         ("auto", (), "a label map has no sheets"), ("nowhere.vtp", (), "no such file"),

@@ -50,7 +50,8 @@ def test_views_of_a_turned_head_are_those_of_the_upright_one_turned(brain, turn)
     for view in ("temporal", "fontanelle-sagittal"):
         (before, _), (after, told) = (view_pose(labels, NAMES, view) for labels in (brain, turned))
         expected = rotation.as_matrix() @ before[:3, :3]
-        assert told == line
+        bare = "no skull is labelled: the probe stands on the brain, and the image has no bone"
+        assert told == ("; ".join([line, bare]) if view == "temporal" else line)
         assert Rotation.from_matrix(after[:3, :3] @ expected.T).magnitude() < np.radians(12.0)  # normals of a surface
         across = np.cross(VIEWS[view].lateral, VIEWS[view].outward)
         assert abs(after[:3, 2] @ axes @ across) / np.linalg.norm(across) > np.cos(np.radians(1.0))  # in its plane
@@ -62,7 +63,7 @@ def test_where_the_atlas_does_not_lead_a_view_follows_the_image_and_says_so(brai
     half[:, : half.shape[1] // 2] = 0
     axes, line = head_axes(brain.with_array(half), NAMES)
     assert np.array_equal(axes, np.eye(3)) and line.startswith("the view follows the image's axes, since ")
-    assert view_pose(brain.with_array(half), NAMES, "temporal")[1] == line
+    assert view_pose(brain.with_array(half), NAMES, "fontanelle")[1] == line
 
 
 @pytest.mark.slow

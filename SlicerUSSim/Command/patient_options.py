@@ -361,7 +361,7 @@ def open_examination_at(patient: PatientOptions, pose: str) -> tuple[Examination
         f"--pose is {pose}, which is on a head, and the image is a CT (--ct), expected a file with the pose",
     )
     require(
-        is_chosen or Path(pose).exists(),
+        is_chosen or (pose != "" and Path(pose).exists()),
         f"--pose is {pose!r} (no such file), expected a file with the pose (.json, .txt, .tfm, .h5), {AUTO}, "
         f"or a view: {_VIEWS}",
     )

@@ -68,18 +68,25 @@ class DrawnSheets:
             require(
                 Path(source).is_file(), f"--sheets is {source!r} (no such file), expected a .vtp file, {AUTO} or {NONE}"
             )
-            return cls(source, kinds, read_surfels(source).of_kind(*(set(KINDS) & set(kinds))))
+            for kind in set(without) - set(KINDS):
+                note(
+                    f"--no-sheet {kind} leaves nothing out: it is no sheet of {source} but a label, where there is one"
+                )
+            whole = read_surfels(source)
+            if kinds and len(whole) and "sulcus" not in whole.kinds():
+                note(f"{source} has no sulci, by which sheets of another patient are known: look whether they fit")
+            return cls(source, kinds, whole.of_kind(*(set(KINDS) & set(kinds))))
         require(not is_labels, "--sheets is auto, and a label map has no sheets, expected a .vtp or an MRI")
         require_findable(kinds, contrast)
         return cls(source, kinds)
 
     def found(self, mri_path: str, mri: Volume, segmentation: Segmentation, contrast: str) -> _Drawn:
         """The sheets of an MRI, and its labels with the structures on top. Looked for once: everything is kept."""
-        if self.source != AUTO:
+        if self.source != AUTO or not self.kinds:
             return _Drawn(self.read, segmentation.labels, segmentation.tissue_names)
         from SlicerUSSim.Logic.base.errors import about_file
         from SlicerUSSim.Logic.mri.pathology import add_tissues
-        from SlicerUSSim.Logic.mri.sheets.finding import STRUCTURES, find_sheets
+        from SlicerUSSim.Logic.mri.sheets.finding import ALL_KINDS, STRUCTURES, find_sheets
         from SlicerUSSim.Logic.mri.sheets.kept import sheets_beside
         from SlicerUSSim.Logic.mri.sheets.surfels import KINDS
 
@@ -87,8 +94,10 @@ class DrawnSheets:
             sheets = find_sheets(
                 mri, segmentation, contrast=contrast, keep_at=sheets_beside(mri_path), progress=progress
             )
+        without = tuple(f"{kind}:" for kind in ALL_KINDS if kind not in self.kinds)
         for line in sheets.notes:
-            note(line)
+            if not line.startswith(without):
+                note(line)
         labels, names = segmentation.labels, segmentation.tissue_names
         masks = [mask for mask in sheets.masks() if mask[2] in set(STRUCTURES) & set(self.kinds)]
         if masks:

@@ -53,7 +53,7 @@ STAGES = ("global", "local", "polish")
 #: A search from the best restart, where that fits better
 AGAIN = "again"
 #: Fractions of the evaluations for the first two; the rest is for the search after the anchor has changed.
-_SHARES = (0.6, 0.25)
+_SHARES = (0.4, 0.3)
 #: The largest number of evaluations of a restart, as a fraction of the fit's. Most need half of it or less.
 _RESTART_SHARE = 0.4
 #: Standard deviation of the starting points of restarts around the best, with bounds scaled to 0 and 1.

@@ -104,7 +104,9 @@ def polygon_opening(labels: Volume, names: Sequence[str], points_ras: np.ndarray
         )
     inside = points_in_poly(places[..., [0, 2]].reshape(-1, 2), outline).reshape(labels.array.shape)
     radius = 0.5 * float(np.ptp(outline, axis=0).max())
-    deepest = _deepest(labels, names, inside, places[..., 1], radius)
+    deepest = _deepest(
+        labels, names, inside, places[..., 1], radius, above="polygon", move="draw it on the scalp, around the opening"
+    )
     filled = labels.array > 0
     patient = places[filled & ~np.asarray(ndimage.binary_erosion(filled), bool)]  # the nearest place is on the surface
     drawn = (points_ras - middle) @ pose[:3, :3]
@@ -239,21 +241,27 @@ def _in_probe(labels: Volume, probe_to_ras: np.ndarray) -> np.ndarray:
     return np.stack([i, j, k], axis=-1) @ matrix[:3, :3].T + matrix[:3, 3]
 
 
-def _deepest(labels: Volume, names: Sequence[str], within: np.ndarray, depth: np.ndarray, radius_mm: float) -> float:
-    """Depth in mm to which an opening reaches: that of the uppermost brain in it, and as far as the brain is curved."""
+def _deepest(
+    labels: Volume, names: Sequence[str], within: np.ndarray, depth: np.ndarray, radius_mm: float, *,
+    above: str = "probe", move: str = "move or turn the probe",
+) -> float:  # fmt: skip
+    """Depth in mm to which an opening reaches: that of the uppermost brain in it, and as far as the brain is curved.
+
+    Depths count from what is `above` it; `move` is what to do if it is in a wrong place, in errors.
+    """
     brain = within & (without_outside(labels, names).array > 0)
-    require(bool(brain.any()), "there is no brain under the craniotomy, expected one; move it or the probe")
+    require(bool(brain.any()), f"there is no brain under the craniotomy, expected one; {move}")
     begins = float(depth[brain].min())
     low, high = _BRAIN_MM
     require(
         begins <= high,
         f"there is no brain under the craniotomy within {high:g} mm (it begins {begins:.0f} mm below), expected one; "
-        "move it or the probe",
+        f"{move}",
     )
     require(
         begins >= low,
-        f"the brain under the craniotomy begins {-begins:.0f} mm behind the probe, which is in the head or looks out "
-        "of it, expected one before it; move or turn the probe",
+        f"the brain under the craniotomy begins {-begins:.0f} mm behind the {above}, which is in the head or looks out "
+        f"of it, expected one before it; {move}",
     )
     return begins + _BELOW * radius_mm
 

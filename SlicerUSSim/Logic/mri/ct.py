@@ -11,11 +11,11 @@ from scipy import ndimage
 
 from SlicerUSSim.Logic.base.errors import SimulationError, require, require_between, require_kind
 from SlicerUSSim.Logic.base.volume import Volume
-from SlicerUSSim.Logic.mri.ct_body import cells, find_body, pooled
+from SlicerUSSim.Logic.mri.ct_body import axis_of_slices, cells, extend_into, find_body, pooled
 from SlicerUSSim.Logic.mri.ct_classes import BLOOD, NAMES, SKIN_MM, classified, sharpened
 from SlicerUSSim.Logic.mri.ct_organs import laid_over, organs_of_ct
 from SlicerUSSim.Logic.mri.ct_shares import border_shares
-from SlicerUSSim.Logic.mri.ct_unit import hounsfield_offset
+from SlicerUSSim.Logic.mri.ct_unit import hounsfield_offset, padding_of
 from SlicerUSSim.Logic.mri.filtering import estimate_noise, guided_filter
 from SlicerUSSim.Logic.mri.recognition import check_finite
 from SlicerUSSim.Logic.mri.segmentation_steps import StepTimes
@@ -134,6 +134,9 @@ def segment_ct(
     hu = np.empty(ct.array.shape, np.int16)
     for part in _slabs(ct.array.shape):
         np.rint(np.clip(ct.array[part] - np.float32(offset), LOWEST_HU, HIGHEST_HU), out=hu[part], casting="unsafe")
+    padding = _padding(ct, notes)
+    if padding is not None:
+        extend_into(hu, padding, axis_of_slices(ct))
     noise = _noise_of(hu)
     if filter_radius:
         epsilon = (_EPSILON_PER_NOISE * noise) ** 2 if filter_epsilon is None else filter_epsilon
@@ -143,10 +146,12 @@ def segment_ct(
     sharp = sharpened(hu, left)
     timed("borders")
     report(0.6)
-    body = _body(sharp, ct, mask, notes)
+    body = _body(sharp, ct, mask, padding, notes)
     timed("body")
     report(0.7)
     classes = classified(sharp, hu, left, body, ct, skin_mm)
+    if padding is not None:
+        classes[padding] = 0
     timed("classes")
     report(0.85)
     names = NAMES
@@ -210,7 +215,21 @@ def _filtered(
     return result
 
 
-def _body(sharp: np.ndarray, ct: Volume, mask: Volume | None, notes: list[str]) -> np.ndarray:
+def _padding(ct: Volume, notes: list[str]) -> np.ndarray | None:
+    """(k, j, i) bool, what lies outside of a round field of view; None where the whole image is in it."""
+    number = padding_of(ct)
+    if number is None:
+        return None
+    found = np.asarray(ct.array == number)
+    notes.append(
+        f"{found.mean():.0%} of the image is {number:g}, outside of the scanner's field of view, and is not labelled"
+    )
+    return found
+
+
+def _body(
+    sharp: np.ndarray, ct: Volume, mask: Volume | None, padding: np.ndarray | None, notes: list[str]
+) -> np.ndarray:
     if mask is not None:
         require(
             mask.array.shape == ct.array.shape and np.allclose(mask.ijk_to_ras, ct.ijk_to_ras, atol=1e-2),
@@ -229,7 +248,8 @@ def _body(sharp: np.ndarray, ct: Volume, mask: Volume | None, notes: list[str]) 
             "has 10 ml; give the patient's mask (--mask), or check the voxel size",
         )
         raise AssertionError
-    text = f"patient: {inside.sum() * ct.voxel_ml / 1000.0:.3g} litres"
+    seen = np.count_nonzero(inside if padding is None else inside & ~padding)
+    text = f"patient: {seen * ct.voxel_ml / 1000.0:.3g} litres"
     notes.append(text + (f" in {parts} parts" if parts > 1 else "") + "; couch and clothes are left out")
     return inside
 

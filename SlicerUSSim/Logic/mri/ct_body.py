@@ -71,7 +71,7 @@ def find_body(hu: np.ndarray, ct: Volume) -> tuple[np.ndarray | None, int]:
     kept = np.flatnonzero(volumes >= _LEAST_PART * volumes.max()) + 1
     body = np.isin(parts, kept)
     around = cast(np.ndarray, ndimage.binary_dilation(body, _BALL))
-    filled = _filled(body, coarse, _axis_of_slices(ct))
+    filled = _filled(body, coarse, axis_of_slices(ct))
     deep = _eroded(filled, 1)  # cells at the outside are judged voxel by voxel
     inside = spread(around | filled, size, hu.shape) & (hu > _TISSUE_HU)
     inside |= spread(deep, size, hu.shape)
@@ -137,9 +137,23 @@ def _mean_of_cells(hu: np.ndarray, size: tuple[int, int, int]) -> np.ndarray:
     return (sums / counts).astype(np.float32)
 
 
-def _axis_of_slices(ct: Volume) -> int:
+def axis_of_slices(ct: Volume) -> int:
     """The axis (of k, j, i) nearest to that from the feet to the head: across it the body is one closed outline."""
     return 2 - int(np.abs(ct.ijk_to_ras[2, :3] / ct.spacing_mm).argmax())
+
+
+def extend_into(hu: np.ndarray, padding: np.ndarray, axis: int) -> None:
+    """Fill what lies outside of a round field of view (k, j, i) in every slice with the nearest number in it.
+
+    So what the field cuts is no surface, as at the sides of an image; lung that it cut was air around the patient.
+    """
+    last, nearest = np.zeros(0, bool), ()
+    for values, outside in zip(np.moveaxis(hu, axis, 0), np.moveaxis(padding, axis, 0), strict=True):
+        if outside.any() and not outside.all():
+            if not np.array_equal(outside, last):
+                indices = ndimage.distance_transform_edt(outside, return_distances=False, return_indices=True)
+                nearest, last = tuple(cast(np.ndarray, indices)[:, outside]), outside
+            values[outside] = values[nearest]
 
 
 def _filled(body: np.ndarray, coarse: np.ndarray, axis: int) -> np.ndarray:

@@ -23,7 +23,7 @@ _ONE_NUMBER = 0.2
 #: from -1000 it may be
 _MAYBE_AIR_HU, _PEAK_HU, _NEAR_PEAK_HU = (-1300.0, -500.0), 30.0, 120.0
 _LEAST_OF_PEAK, _LEAST_OF_IMAGE, _MOST_OFF_HU = 0.85, 0.05, 50.0
-#: Fat and soft tissue, of which a body has most; which of two offsets the numbers have is where more of it lies in these
+#: Fat and soft tissue, of which a body has most: numbers have the offset with which more of them lie in these
 _FAT_HU, _SOFT_HU = (-130.0, -70.0), (0.0, 90.0)
 #: One number below this is padding, outside the round field of view, if nothing else is
 _PADDING_HU = -1100.0
@@ -54,7 +54,8 @@ def _offset_of(values: np.ndarray) -> tuple[float, str | None, str | None]:
     level = _air_level(values)
     if level is not None:
         require(  # what is alike in all lungs may be as narrow a peak as air
-            abs(level + 1000.0) <= _MOST_OFF_HU or _share_of_tissue(values) >= _share_of_tissue(values - level - 1000.0),
+            abs(level + 1000.0) <= _MOST_OFF_HU
+            or _share_of_tissue(values) >= _share_of_tissue(values - level - 1000.0),
             f"air is at {level:.0f}, expected -1000: the values are {level + 1000.0:+.0f} from Hounsfield units; "
             "subtract that, or apply the intercept of the CT's header",
         )
@@ -110,8 +111,14 @@ def _air_level(values: np.ndarray) -> float | None:
     return float(np.median(dark[np.abs(dark - level) < _PEAK_HU])) if is_narrow else None
 
 
+def padding_of(ct: Volume) -> float | None:
+    """The number far below air that a scanner writes around a round field of view, as -2000 or -3024; or None."""
+    lowest = float(ct.array.min())
+    return lowest if lowest < _PADDING_HU and _without_padding(_sample(ct.array)).min() >= _PADDING_HU else None
+
+
 def _without_padding(values: np.ndarray) -> np.ndarray:
-    """The values within the field of view: a scanner writes one number far below air around it, as -2000 or -3024."""
+    """The values within the field of view."""
     below = values[values < _PADDING_HU]
     is_padded = below.size and below.size < values.size and below.min() == below.max()
     return values[values >= _PADDING_HU] if is_padded else values

@@ -308,7 +308,7 @@ def segment_mri(
     tissue_names = names
     thickest_mm = float(mri.spacing_mm.max())
     if thin_sulci and thickest_mm > _THICK_SLICE_MM:
-        notes.append(f"thin sulci are not looked for: voxels of {thickest_mm:.3g} mm are thicker than they are")
+        notes.append(f"thin sulci get no label of their own: voxels of {thickest_mm:.3g} mm are thicker than they are")
     elif thin_sulci:
         middles = narrow_sulci(labels, found, filtered[0][0], filtered[0][1])
         labels[middles] = len(names) + 1

@@ -99,7 +99,9 @@ def view_pose(labels: Volume, names: Sequence[str], view: str, *, is_open: bool 
     axes, line = head_axes(brain, names)
     outward = _unit(axes @ chosen.outward)
     face = _face(surface, centre, outward)
-    if chosen.window_mm and not is_open:
+    if chosen.window_mm and not _numbers(names, "skull", "bone"):
+        line = _joined(line, "no skull is labelled: the probe stands on the brain, and the image has no bone")
+    elif chosen.window_mm and not is_open:
         face, told = _at_window(surface, labels, names, face, axes, centre, chosen)
         line = _joined(line, told)
     return pose_looking_at(face, face + _inwards(surface.normal(face), axes, chosen), axes @ chosen.lateral), line

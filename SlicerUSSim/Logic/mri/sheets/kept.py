@@ -60,7 +60,7 @@ def keep_sheets(path: Path, key: str, kinds: tuple[str, ...], surfels: Surfels, 
     A file that was not written by this function is never replaced.
     """
     if path.exists() and not _is_ours(path):
-        return f"{path} was not written by ussim and stays as it is; the sheets are not kept"
+        return f"{path} was not written by ussim or is damaged, and stays as it is; without it the sheets would be kept"
     arrays = _hash_of(surfels, structures)
     head = json.dumps({"key": key, "kinds": kinds, "version": __version__, "arrays": arrays})
     try:
