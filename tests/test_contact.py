@@ -156,3 +156,13 @@ def test_the_model_in_numpy_has_the_same_dark_lines(harmonic):
     apart = np.abs(image.astype(int) - twin)  # at the edge it looks up the labels at more places
     assert np.mean(apart > 4) < 0.003 and np.mean(apart > 1) < 0.04 and image.std() > 10.0
     assert image[20:, 52:].mean() < 0.2 * image[20:, :12].mean()
+
+
+def test_a_face_deep_in_the_patient_is_said():
+    """A pose 78 mm deep in a brain gave an image without a word."""
+    labels = block(lambda x, y, z: np.ones_like(x, np.uint8), (40, 100, 20), 1.0)  # half sizes
+    deep, shallow = (rigid(np.eye(3), [0, -100 + mm, 0]) for mm in (40, 25))
+    (line,) = about_contact(labels, LINEAR, [deep], None)
+    assert line.startswith("the probe's face lies inside the patient, with more than 30 mm of tissue straight behind")
+    assert about_contact(labels, LINEAR, [deep, shallow], 2.0)[0].startswith("in 1 of 2 images the probe's face lies")
+    assert about_contact(labels, LINEAR, [shallow], None) == ()

@@ -19,7 +19,8 @@ from SlicerUSSim.Logic.probe.placement import sample
 _ALONG, _ACROSS, _STEP = 25, 5, 0.5
 #: A user is told of a face less of which than this share touches the patient; of a curved one on a head half does
 _LEAST_SHARE = 1.0 / 3.0
-#: Without a gap, the same of a face that is further from the patient than a bath or a cavity needs
+#: Without a gap, the same of a face that is further from the patient than a bath or a cavity needs; and of one with so
+#: much of the patient behind it
 _BATH_MM = 30.0
 
 
@@ -49,11 +50,25 @@ def touching_share(labels: Volume, probe: Probe, probe_to_ras: np.ndarray, gap_m
 
 
 def about_contact(labels: Volume, probe: Probe, poses: Sequence[np.ndarray], gap_mm: float | None) -> tuple[str, ...]:
-    """Lines about a face that does not touch the patient, or with little of it, at one pose (4, 4) or more.
+    """Lines about a face that does not touch the patient, with little of it, or in him, at one pose (4, 4) or more.
 
     Without a gap (None) the patient lies in the coupling medium, and only a face that is far from it is told of. The
     others are as in line_contact.
     """
+    buried = sum(_is_buried(labels, pose) for pose in poses)
+    which = "the probe's face lies" if len(poses) == 1 else f"in {buried} of {len(poses)} images the probe's face lies"
+    line = f"{which} inside the patient, with more than {_BATH_MM:g} mm of tissue straight behind it; if it should not"
+    inside = (f"{line}, move it to the surface",) if buried else ()
+    return inside + _about_gap(labels, probe, poses, gap_mm)
+
+
+def _is_buried(labels: Volume, pose: np.ndarray) -> bool:
+    behind = pose[:3, 3] - np.arange(0.0, _BATH_MM + 1.0)[:, None] * pose[:3, 1]
+    return bool((sample(labels, behind, order=0) > 0).all())
+
+
+def _about_gap(labels: Volume, probe: Probe, poses: Sequence[np.ndarray], gap_mm: float | None) -> tuple[str, ...]:
+    """Those of about_contact about what lies between face and patient."""
     if gap_mm is None:
         steps = (0.1 * _BATH_MM, _BATH_MM)  # most faces are near, which takes a tenth of the time to see
         far = sum(not any(touching_share(labels, probe, pose, mm) > 0.0 for mm in steps) for pose in poses)
