@@ -17,6 +17,8 @@ from SlicerUSSim.Logic.tissue.tissue import Tissue
 SKULL = ("skull", "cancellous bone")
 #: Echoes from behind a skull that takes more from them, there and back, are lost in half of the usual dynamic range, dB
 CLOSED_DB = 30.0
+#: And they are dark where it takes this from half of the lines (a temple 17 dB at 2 MHz)
+_DARK_DB = 22.0
 #: Where less than this part of the lines that reach the brain pass, a skull is closed
 _OPEN_SHARE = 0.1
 #: A face does not fit where bone is before, or so near behind, that much of it, mm
@@ -60,13 +62,15 @@ def about_bone(
     """
     if "skull" not in names:
         return ()
-    found = _closed_mm_and_db(labels, names, tissues, probe, probe_to_ras)
-    if found is not None:
-        thick, loss = found
+    found = _bone_mm_and_db(labels, names, tissues, probe, probe_to_ras)
+    if found is not None and (found[2] or not is_open):
+        thick, loss, is_closed = found
         line = (
             f"the skull is closed in front of the probe, and {thick:.0f} mm of bone take {loss:.0f} dB from the echoes "
             "of the brain: "
         )
+        if not is_closed:
+            return (f"{line}expect a dark image; a craniotomy ({words.to_open}) lets them through",)
         if is_open:
             return (f"{line}the opening is elsewhere ({words.to_go})",)
         return (f"{line}choose a craniotomy ({words.to_open}); for an image through the temple, {words.through}",)
@@ -74,10 +78,11 @@ def about_bone(
     return (line,) if line else ()
 
 
-def _closed_mm_and_db(
+def _bone_mm_and_db(
     labels: Volume, names: Sequence[str], tissues: Iterable[Tissue], probe: Probe, pose: np.ndarray
-) -> tuple[float, float] | None:
-    """Medians of (bone in mm, its two-way attenuation in dB) over the lines to the brain; None if it is seen."""
+) -> tuple[float, float, bool] | None:
+    """(Medians of bone in mm and of its two-way attenuation in dB over the lines to the brain, whether hardly any line
+    passes); None where the brain is seen well."""
     positions = np.linspace(probe.first_line, -probe.first_line, _LINES)
     origin, direction = probe.line_at(positions)
     along = probe.line_starts_mm(positions)[:, None] + np.arange(0.0, probe.depth_mm, _STEP_MM)
@@ -90,9 +95,10 @@ def _closed_mm_and_db(
     known = {tissue.name: tissue.attenuation_db_cm_mhz for tissue in tissues}
     per_mm = np.array([0.0, *(0.1 * known.get(name, 0.0) for name in names)]) * 2.0 * probe.frequency_mhz
     loss = (before * per_mm[seen[reached]]).sum(axis=1) * _STEP_MM
-    if (loss < CLOSED_DB).mean() >= _OPEN_SHARE:
+    is_closed = bool((loss < CLOSED_DB).mean() < _OPEN_SHARE)
+    if not is_closed and np.median(loss) < _DARK_DB:
         return None
-    return float(np.median(before.sum(axis=1)) * _STEP_MM), float(np.median(loss))
+    return float(np.median(before.sum(axis=1)) * _STEP_MM), float(np.median(loss)), is_closed
 
 
 def _misfit(labels: Volume, names: Sequence[str], probe: Probe, pose: np.ndarray) -> str:
