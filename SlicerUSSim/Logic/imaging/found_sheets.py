@@ -35,9 +35,6 @@ _LEAST_SULCI = 2000
 #: Sheets are another patient's if fewer of so many walls of ventricles lie within this of fluid beside tissue, mm or a
 #: voxel: 0.66 to 0.92 of their own walls do, 0.01 to 0.62 of the others', and 0.37 to 0.77 of mirrored ones.
 _LEAST_WALLS, _LEAST_ON_WALLS, _NEAR_MM = 200, 0.45, 1.5
-#: Or, without sulci, if more of so many pieces of falx lie in white matter: up to 0.14 of those of three patients do,
-#: where dura that enhances counts as such, and 0.42 of one that was shifted by 14 mm
-_LEAST_FALX, _MOST_IN_WHITE = 500, 0.3
 #: Or if fewer of those in the volume are beside labelled tissue, or none is within this of the volume, mm
 _LEAST_LABELLED, _FAR_MM = 0.4, 100.0
 
@@ -158,11 +155,6 @@ def _require_of_patient(
             f"{expected}",
         )
         return
-    falx = inside.of_kind("falx")
-    if len(falx) >= _LEAST_FALX:
-        white = [label for label, tissue in tissues.items() if label and tissue.name == _WHITE]
-        share = np.isin(padded.ravel()[_index(grid, falx.place, padded.shape)], white).mean()
-        require(share <= _MOST_IN_WHITE, f"{share:.0%} of the sheets' falx lie in white matter, {expected}")
     walls = labelled & (inside.kind == KINDS.index("ependyma"))
     walls &= brain | (not of_brain)  # the others are in a lesion
     if np.count_nonzero(walls) >= _LEAST_WALLS and np.isin(padded, fluids).any():
