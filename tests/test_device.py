@@ -289,7 +289,7 @@ _AVX512 = {
         ("generic", set(), None),
     ],
 )
-def test_pocl_builds_for_a_processor_with_the_vectors_of_its_kernel_library(monkeypatch, called, flags, named):
+def test_pocl_builds_for_a_processor_with_the_vectors_of_its_kernel_library(monkeypatch, caplog, called, flags, named):
     libc = ctypes.CDLL(None)
     libc.malloc.restype = ctypes.c_void_p
     name = libc.malloc(ctypes.c_size_t(24))
@@ -301,6 +301,9 @@ def test_pocl_builds_for_a_processor_with_the_vectors_of_its_kernel_library(monk
     )  # fmt: skip
     monkeypatch.setattr("SlicerUSSim.Logic.opencl.pocl._processor_flags", lambda: flags)
     assert name_processor(handle) == named
+    if named:  # opened again
+        caplog.clear()
+        assert name_processor(handle) is None and not caplog.records
     assert ctypes.string_at(name).decode() == (named or called)
 
 

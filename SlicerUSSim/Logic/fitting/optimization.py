@@ -230,7 +230,7 @@ def optimize_appearance(
     >>> probe = LinearProbe(width_mm=20, depth_mm=30, scan_lines=64)
     >>> pose = pose_looking_at(face_ras=(20, 20, 39), target_ras=(20, 20, 0))
     >>> reference = simulator.simulate(probe, pose, DisplaySettings(gain_db=6.0)).image
-    >>> found = optimize_appearance(simulator, probe, [pose], [reference], free=["gain_db"], max_evaluations=30)
+    >>> found = optimize_appearance(simulator, probe, [pose], [reference], free=["gain_db"], max_evaluations=50)
     >>> round(found.display.gain_db, 2)
     6.0
     >>> found.cost_after < found.cost_before
