@@ -45,7 +45,7 @@ def refused(*arguments: object) -> str:
 
 @needs_atlas
 @pytest.mark.slow
-def test_the_command_refuses_seeds_outside_the_brain_and_in_csf_and_writes_nothing(tmp_path):
+def test_the_command_refuses_seeds_outside_the_brain_and_in_csf_and_writes_the_labels_alone(tmp_path):
     maps = tissue_maps("mni152")
     assert maps is not None
     image = phantom(maps.coarser(2), "t1", noise=0.03, bias=0.0)
@@ -56,7 +56,8 @@ def test_the_command_refuses_seeds_outside_the_brain_and_in_csf_and_writes_nothi
         "-o", tmp_path / "labels.nii.gz",
     )  # fmt: skip
     assert "mm outside the brain" in line and "fluid that looks like CSF" in line
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["mask.nii.gz", "t1.nii.gz"]
+    written = sorted(path.name for path in tmp_path.iterdir())
+    assert written == ["labels.json", "labels.nii.gz", "mask.nii.gz", "t1.nii.gz"]
 
 
 # ---- craniotomies ----------------------------------------------------------------------------------------------------
