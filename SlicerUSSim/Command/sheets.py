@@ -68,7 +68,7 @@ class DrawnSheets:
             require(
                 Path(source).is_file(), f"--sheets is {source!r} (no such file), expected a .vtp file, {AUTO} or {NONE}"
             )
-            for kind in set(without) - set(KINDS):
+            for kind in dict.fromkeys(kind for kind in without if kind not in KINDS):
                 note(
                     f"--no-sheet {kind} leaves nothing out: it is no sheet of {source} but a label, where there is one"
                 )
