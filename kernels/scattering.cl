@@ -348,12 +348,13 @@ inline floatn unevenness(uint seed, const floatn *words, int has_specks, floatn 
 typedef struct {
   floatn t, right, depth;  // part of the piece, of the strip's width, displayed depth
   floatn aside2;           // squared distance from the axis in elevation
+  intn counts;             // whether it belongs to this piece and strip
 #ifdef LOBES
   floatn along, away;
 #endif
 } Beside;
 
-inline Beside beside_piece(const Piece *piece, floatn pu, floatn pv, floatn pw, intn *counts) {
+inline Beside beside_piece(const Piece *piece, floatn pu, floatn pv, floatn pw) {
   const floatn along = dot_lanes(pu, pv, pw, piece->direction);
   const floatn aside_l = dot_lanes(pu, pv, pw, piece->lateral);
   const floatn aside_e = dot_lanes(pu, pv, pw, piece->elevational);
@@ -363,7 +364,7 @@ inline Beside beside_piece(const Piece *piece, floatn pu, floatn pv, floatn pw, 
   at.aside2 = aside_e * aside_e;
   const floatn range = fma(aside_l, aside_l * piece->bend, along);
   at.depth = line_lanes(range, piece->depth0, piece->slope);
-  *counts = (at.right >= 0.0f) & (at.right < 1.0f) & (along >= piece->from_mm) & (along < piece->to_mm);
+  at.counts = (at.right >= 0.0f) & (at.right < 1.0f) & (along >= piece->from_mm) & (along < piece->to_mm);
 #ifdef LOBES
   at.along = along;
   at.away = fabs(aside_e);
@@ -399,15 +400,14 @@ inline void scatter_batch(__constant const Acquisition *acquisition, __global co
     const floatn pu = fma(TO_FLOATN(bits_u), (floatn)(grain), fma(TO_FLOATN(cells), (floatn)(cell), (floatn)(first_u)));
     const floatn pv = fma(TO_FLOATN(bits_v), (floatn)(grain), LOAD_LANES(row_v + begin));
     const floatn pw = fma(TO_FLOATN(bits_w), (floatn)(grain), LOAD_LANES(row_w + begin));
-    intn counts;
-    const Beside at = beside_piece(piece, pu, pv, pw, &counts);
+    const Beside at = beside_piece(piece, pu, pv, pw);
 #ifdef LOBES
     const intn near = at.away <= piece->reach;
 #else
     const intn near = at.aside2 * line_lanes(at.t, piece->narrow0, piece->narrow1) <= cutoff2;
 #endif
     const intn bins = TO_INTN(floor(at.depth * inverse_sample)) - piece->first;
-    SPREAD(int, counts_, counts & near & (bins >= -1) & (bins < CHUNK) & (LANE_INDEX < count - begin));
+    SPREAD(int, counts_, at.counts & near & (bins >= -1) & (bins < CHUNK) & (LANE_INDEX < count - begin));
     for (int j = 0; j < LANES; j++) {
       chosen[n] = begin + j;
       n += counts_[j] & 1;
@@ -438,8 +438,7 @@ inline void scatter_batch(__constant const Acquisition *acquisition, __global co
     const floatn pu = LOAD_LANES(u_ + begin), pv = LOAD_LANES(v_ + begin), pw = LOAD_LANES(w_ + begin);
     // 16 bits for its existence, one for its sign, 15 for its label
     const uintn random = hash_mixn(LOAD_LANES(key_ + begin) + 0x3C6EF372u);
-    intn counts;
-    const Beside beside = beside_piece(piece, pu, pv, pw, &counts);
+    const Beside beside = beside_piece(piece, pu, pv, pw);
 #ifdef LOBES
     const floatn r2 = 0.0f, curved = 0.0f;  // lobes have random phases
     STORE_LANES(beside.away, away_ + begin);

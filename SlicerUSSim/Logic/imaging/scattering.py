@@ -72,8 +72,9 @@ class Scatterers(Stage):
         end = [] if part_of is None else [part_of]
         variant = (["TEXTURE"] if frame.medium.has_texture else []) + (["VARIED"] if part_of is not None else [])
         variant += ["FOUND"] if frame.medium.found is not None else []
-        variant += ["UNEVEN"] if is_uneven(tissues) else []
-        uneven, none_dark = unevenness_table(tissues).ravel(), np.zeros(CONSTANTS["MAX_TISSUES"], np.float32)
+        table = unevenness_table(tissues)
+        variant += ["UNEVEN"] if is_uneven(table) else []
+        uneven, none_dark = table.ravel(), np.zeros(CONSTANTS["MAX_TISSUES"], np.float32)
         self.device.write(
             self._sites[0], np.concatenate([lattice_sites(tissues, frame.acquisition).ravel(), none_dark, uneven])
         )
@@ -85,13 +86,13 @@ class Scatterers(Stage):
             record, lobes = elevational_lobe_record(frame.acquisition), lobes_of(frame.probe)
             self.device.write(self._lobes, record)
             chunk, together = _LOBE_CHUNKS * self.device.chunk, lines_together(record, frame.probe)
-            table = self._tables.get(frame.probe, np.append(lobes.elevational, lobes.reach_mm))
+            patterns = self._tables.get(frame.probe, np.append(lobes.elevational, lobes.reach_mm))
             dark = frame.medium.quieter(DARK).astype(np.float32)
             sites = np.concatenate([lattice_sites(tissues, record).ravel(), dark, uneven])
             self.device.write(self._sites[1], sites)
             self._enqueue(
                 frame, lines, self._lobes, self._sites[1], [*variant, "LOBES", f"CHUNK={chunk}"],
-                (-(-samples // chunk), -(-traced // together)), [*end, table, np.int32(together)],
+                (-(-samples // chunk), -(-traced // together)), [*end, patterns, np.int32(together)],
             )  # fmt: skip
 
     def _enqueue(

@@ -51,6 +51,7 @@ _FAR_MM = 1e6
 _MANY_CELLS, _MOST_CELLS, _CELLS_PER_S = 1.5e8, 1e10, 3e7
 #: How far behind the face bone is looked for, and how much of it says that the face is in a closed skull, mm
 _BEHIND_MM, _BONE_BEHIND_MM = 40.0, 2
+_DEFAULT_DISPLAY = DisplaySettings()
 _log = logging.getLogger(__name__)
 
 StageKind = TypeVar("StageKind", bound=Stage)
@@ -129,6 +130,8 @@ class UltrasoundSimulator:
         self.display_stages = [stage(self.device) for stage in stages.DISPLAY_STAGES]
         self.tracer = self.stage(RayTracer)
         self._acquisition_buffer = self.device.empty(ACQUISITION.itemsize)
+        # The last probe and settings that were found fast enough
+        self._fast_for: tuple | None = None
         # The record of the last frame, and its inputs but for the pose
         self._record: np.ndarray | None = None
         self._record_made_for: tuple | None = None
@@ -380,7 +383,7 @@ class UltrasoundSimulator:
         buffer: Buffer | None = None,
     ) -> DeviceFrame:
         """The inputs of the stages of one frame; its record is written to `buffer`, by default a new one."""
-        display = DisplaySettings() if display is None else display
+        display = _DEFAULT_DISPLAY if display is None else display
         require(isinstance(display, DisplaySettings), f"display is {display!r:.80}, expected DisplaySettings")
         gap_mm = self.settings.contact_gap_mm
         frame = DeviceFrame(
@@ -493,13 +496,15 @@ class UltrasoundSimulator:
 
         Raises SimulationError, before anything is computed, if it would take minutes.
         """
-        if not self.settings.scattering:
+        asked_for = probe, self.settings
+        if not self.settings.scattering or self._fast_for == asked_for:
             return
         lateral, guard = _traced_lines_for(probe, self.settings)
         traced = (probe.scan_lines - 1) * lateral + 1 + 2 * guard
         chunk_mm = CONSTANTS["BLOCK"] * self._sample_mm(probe)
         cells = cells_in_view(self.settings, probe, traced, lateral, chunk_mm)
         if cells <= _MANY_CELLS:
+            self._fast_for = asked_for
             return
         density = self.settings.scatterers_per_mm3
         automatic = sites_per_mm3(replace(self.settings, scatterers_per_mm3=None), probe)

@@ -48,9 +48,9 @@ def unevenness_table(tissues: np.ndarray) -> np.ndarray:
     return table.astype(np.float32)
 
 
-def is_uneven(tissues: np.ndarray) -> bool:
-    """Whether some of these layout.TISSUE vary."""
-    return bool((unevenness_table(tissues)[:, [0, 3]] > 0.0).any())
+def is_uneven(table: np.ndarray) -> bool:
+    """Whether some tissue of an unevenness_table varies."""
+    return bool((table[:, [0, 3]] > 0.0).any())
 
 
 @cache
