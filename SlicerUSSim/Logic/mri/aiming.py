@@ -13,6 +13,7 @@ from SlicerUSSim.Logic.mri.pathology import ENHANCING, LESION_GROUPS, innermost_
 from SlicerUSSim.Logic.probe.arrays import Probe
 from SlicerUSSim.Logic.probe.placement import aimed_at, craniotomy_pose, sample
 from SlicerUSSim.Logic.probe.surface import PatientSurface
+from SlicerUSSim.Logic.tissue.names import labels_of
 
 #: A probe is turned so far from the surface's normal at most, degrees: farther, most of its face would be off the brain
 FARTHEST_DEG = 35.0
@@ -60,8 +61,7 @@ def opening_pose(
 def _lesions(labels: Volume, names: Sequence[str]) -> list[tuple[np.ndarray, str]]:
     """((3,) RAS mm of the innermost voxel, most frequent tissue) of the lesions in labels, the largest first."""
     for group in LESION_GROUPS:
-        numbers = [number for number, name in enumerate(names, 1) if name in group]
-        parts, _ = ndimage.label(np.isin(labels.array, numbers))  # type: ignore[misc]
+        parts, _ = ndimage.label(np.isin(labels.array, labels_of(names, group)))  # type: ignore[misc]
         if ENHANCING in group:
             parts = _without_veins(parts, labels, names)
         sizes, boxes, found = np.bincount(parts.ravel())[1:], ndimage.find_objects(parts), []

@@ -21,6 +21,7 @@ from SlicerUSSim.Logic.mri.outside import OUTSIDE
 from SlicerUSSim.Logic.probe.arrays import Probe
 from SlicerUSSim.Logic.probe.placement import craniotomy_pose, sample
 from SlicerUSSim.Logic.probe.surface import PatientSurface
+from SlicerUSSim.Logic.tissue.names import labels_of
 
 _log = logging.getLogger(__name__)
 
@@ -231,7 +232,7 @@ def middle_of(before: Volume, after: Volume) -> np.ndarray:
 
 
 def _is_any(labels: Volume, names: Sequence[str], which: Sequence[str]) -> np.ndarray:
-    return np.isin(labels.array, [number for number, name in enumerate(names, 1) if name in which])
+    return np.isin(labels.array, labels_of(names, which))
 
 
 def _in_probe(labels: Volume, probe_to_ras: np.ndarray) -> np.ndarray:

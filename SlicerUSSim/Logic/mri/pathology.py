@@ -18,7 +18,7 @@ from SlicerUSSim.Logic.base.errors import SimulationError, either, require
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.mri.masks import Masks, read_masks, resampled
 from SlicerUSSim.Logic.tissue.label_advice import COMMAND, Advice
-from SlicerUSSim.Logic.tissue.names import same_name, similar_tissues, tissue_named
+from SlicerUSSim.Logic.tissue.names import labels_of, same_name, similar_tissues, tissue_named
 from SlicerUSSim.Logic.tissue.presets import TISSUES
 from SlicerUSSim.Logic.tissue.table import MAX_LABEL, TissueTable
 from SlicerUSSim.Logic.tissue.texture import Texture, tissue_deviation
@@ -62,8 +62,7 @@ class Added:
         """
         differs = self.labels.array != before.array
         for group in LESION_GROUPS:
-            numbers = [number for number, name in enumerate(self.tissue_names, 1) if name in group]
-            lesion = differs & np.isin(self.labels.array, numbers)
+            lesion = differs & np.isin(self.labels.array, labels_of(self.tissue_names, group))
             if lesion.any():
                 differs = lesion
                 break

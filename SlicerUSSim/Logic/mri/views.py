@@ -13,6 +13,7 @@ from SlicerUSSim.Logic.mri.craniotomy import require_brain, without_outside
 from SlicerUSSim.Logic.mri.head_axes import head_axes
 from SlicerUSSim.Logic.probe.placement import pose_looking_at, sample
 from SlicerUSSim.Logic.probe.surface import PatientSurface
+from SlicerUSSim.Logic.tissue.names import labels_of
 
 
 @dataclass(frozen=True)
@@ -70,7 +71,7 @@ def opened_view_pose(labels: Volume, names: Sequence[str], view: str) -> tuple[n
     """
     pose, line = view_pose(labels, names, view, is_open=True)
     behind = pose[:3, 3] - np.arange(1.0, _BEHIND_MM)[:, None] * pose[:3, 1]
-    if int(np.isin(sample(labels, behind, order=0), _numbers(names, "skull", "bone")).sum()) < _CLOSED_MM:
+    if int(np.isin(sample(labels, behind, order=0), labels_of(names, ("skull", "bone"))).sum()) < _CLOSED_MM:
         return pose, _joined(line, f"the view {view} is seen through the opening")
     pose, line = view_pose(labels, names, view)
     return pose, _joined(
@@ -99,7 +100,7 @@ def view_pose(labels: Volume, names: Sequence[str], view: str, *, is_open: bool 
     axes, line = head_axes(brain, names)
     outward = _unit(axes @ chosen.outward)
     face = _face(surface, centre, outward)
-    if chosen.window_mm and not _numbers(names, "skull", "bone"):
+    if chosen.window_mm and not labels_of(names, ("skull", "bone")):
         line = _joined(line, "no skull is labelled: the probe stands on the brain, and the image has no bone")
     elif chosen.window_mm and not is_open:
         face, told = _at_window(surface, labels, names, face, axes, centre, chosen)
@@ -129,7 +130,7 @@ def _at_window(
     centre: np.ndarray, view: View,
 ) -> tuple[np.ndarray, str]:  # fmt: skip
     """((3,) place near a face with the thinnest bone below it, and a line if it is another place)."""
-    bones = _numbers(names, "skull", "bone", "cancellous bone")
+    bones = labels_of(names, ("skull", "bone", "cancellous bone"))
 
     def thickness(place: np.ndarray) -> int:
         return int(np.isin(sample(labels, place - _DEEP_MM[:, None] * surface.normal(place), order=0), bones).sum())
@@ -155,11 +156,6 @@ def _at_window(
 
 def _unit(vector: np.ndarray) -> np.ndarray:
     return vector / np.linalg.norm(vector)
-
-
-def _numbers(names: Sequence[str], *wanted: str) -> list[int]:
-    """The labels of some names."""
-    return [number for number, name in enumerate(names, 1) if name in wanted]
 
 
 def _joined(*lines: str) -> str:

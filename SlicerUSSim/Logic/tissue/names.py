@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from difflib import get_close_matches
 from functools import cache
 
@@ -91,6 +91,11 @@ def plain_name(name: str) -> str:
 def same_name(a: str, b: str) -> bool:
     """Whether two names differ only in case, hyphens and underscores."""
     return plain_name(a) == plain_name(b)
+
+
+def labels_of(names: Iterable[str], wanted: Collection[str]) -> list[int]:
+    """The labels, counted from 1, that have one of the names."""
+    return [label for label, name in enumerate(names, 1) if name in wanted]
 
 
 def tissue_named(name: str) -> Tissue:

@@ -11,6 +11,7 @@ from scipy import ndimage
 
 from SlicerUSSim.Logic.base.own_outputs import require_own, write_own_volume
 from SlicerUSSim.Logic.base.volume import Volume
+from SlicerUSSim.Logic.tissue.names import labels_of
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,7 +35,7 @@ class Proposal:
 
     def volume_ml(self, *tissues: str) -> float:
         """Of these parts, by default of all."""
-        numbers = [n for n, tissue in enumerate(self.tissues, 1) if not tissues or tissue in tissues]
+        numbers = labels_of(self.tissues, tissues or self.tissues)
         return float(np.isin(self.labels.array, numbers).sum() * self.labels.voxel_ml)
 
     def is_mostly_in(self, other: Proposal) -> bool:

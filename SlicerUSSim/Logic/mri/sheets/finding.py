@@ -26,6 +26,7 @@ from SlicerUSSim.Logic.mri.sheets.sulcal import sulci
 from SlicerUSSim.Logic.mri.sheets.surfels import KINDS, Surfels
 from SlicerUSSim.Logic.mri.sheets.tentorium import tentorium
 from SlicerUSSim.Logic.mri.sheets.vessels import choroid_plexus, vessels
+from SlicerUSSim.Logic.tissue.names import labels_of
 
 _log = logging.getLogger(__name__)
 
@@ -106,7 +107,7 @@ def find_sheets(
     kept = read_kept_sheets(keep_at, key, wanted) if keep_at is not None else None
     if kept is not None:
         surfels, array, place = kept
-        array = np.where(np.isin(array, [n for n, name in enumerate(STRUCTURES, 1) if name in wanted]), array, 0)
+        array = np.where(np.isin(array, labels_of(STRUCTURES, wanted)), array, 0)
         structures = Volume(array.astype(np.uint8), mri.ijk_to_ras, label_names=dict(enumerate(STRUCTURES, 1)))
         surfels, first = surfels.of_kind(*(set(KINDS) & set(wanted))), f"the sheets are those kept in {place}"
     else:
