@@ -750,10 +750,13 @@ __kernel void scatter(__constant const Acquisition *acquisition, __global const 
       float band_low, band_high;
       const float frequency_low = band_after(acquisition, loss_low, &band_low);
       const float frequency_high = band_after(acquisition, loss_high, &band_high);
-      const float2 sigma_low = sigma_at(acquisition, path_low, 1.0f / frequency_low);
-      const float2 sigma_high = sigma_at(acquisition, path_high, 1.0f / frequency_high);
       const float apart_low = line_distance(acquisition, path_low + line_begins);
       const float apart_high = line_distance(acquisition, path_high + line_begins);
+      // beam.cl knows the displayed depth alone, which differs from the path where sound is slower or faster.
+      const float shown_low = fmax(piece.depth0 + piece.slope * low, line_begins);
+      const float shown_high = fmax(piece.depth0 + piece.slope * high, line_begins);
+      const float wide_low = lateral_sigma_at(acquisition, shown_low - line_begins, 1.0f / frequency_low);
+      const float wide_high = lateral_sigma_at(acquisition, shown_high - line_begins, 1.0f / frequency_high);
       piece.low = low;
       piece.span = 1.0f / fmax(high - low, 1e-6f);
       piece.bend = acquisition->linear ? 0.0f : 0.5f / fmax(to_apex + low, 1.0f);
@@ -768,25 +771,31 @@ __kernel void scatter(__constant const Acquisition *acquisition, __global const 
       const float radius_e = piece.reach =
           fmax(reach_of_lobes(acquisition, lobes, path_low), reach_of_lobes(acquisition, lobes, path_high));
 #else
-      const float tall_low = sigma_low.y, tall_high = sigma_high.y;
-      const float radius_e = acquisition->beam_cutoff * fmax(sigma_low.y, sigma_high.y);
-      piece.narrow0 = 0.5f * LOG2_E / (sigma_low.y * sigma_low.y);
-      piece.narrow1 = 0.5f * LOG2_E / (sigma_high.y * sigma_high.y) - piece.narrow0;
-      piece.curved0 = elevational_cycles(acquisition, path_low, frequency_low, sigma_low.y);
-      piece.curved1 = elevational_cycles(acquisition, path_high, frequency_high, sigma_high.y) - piece.curved0;
+      const float tall_low = elevation_sigma_at(acquisition, path_low, 1.0f / frequency_low);
+      const float tall_high = elevation_sigma_at(acquisition, path_high, 1.0f / frequency_high);
+      const float radius_e = acquisition->beam_cutoff * fmax(tall_low, tall_high);
+      piece.narrow0 = 0.5f * LOG2_E / (tall_low * tall_low);
+      piece.narrow1 = 0.5f * LOG2_E / (tall_high * tall_high) - piece.narrow0;
+      piece.curved0 = elevational_cycles(acquisition, path_low, frequency_low, tall_low);
+      piece.curved1 = elevational_cycles(acquisition, path_high, frequency_high, tall_high) - piece.curved0;
 #endif
       // Unit energy of the point spread function for all widths: sqrt(1 / (sigma_l sigma_e)) times the scale. The
-      // weights of beam.cl have unit sum, that is apart / (sqrt(2 pi) sigma_l) at the peak.
+      // weights of beam.cl have unit sum, that is apart / (sqrt(2 pi) sigma_l) at the peak, so that a strip of width
+      // `apart` has the power apart / sigma_l of both at the displayed depth. A pulse covers 1 / slope of its length.
       const float gain = log2_scalar(segment->weight * segment->attenuation * acquisition->speckle_scale * 2.50662827f);
       const float decay = LOG2_E * segment->decay_per_mm;
       // Behind a curved mirror the same power is spread over a wider tube.
       const float4 tube_low = tube_after(vload4(0, segment->tube), low);
       const float4 tube_high = tube_after(vload4(0, segment->tube), high);
-      piece.gain0 = gain + LOG2_E * band_low - decay * low +
-                    0.5f * log2_scalar(sigma_low.x / (tall_low * tube_low.x * tube_low.z)) - log2_scalar(apart_low);
+      piece.gain0 =
+          gain + LOG2_E * band_low - decay * low +
+          0.5f * log2_scalar(piece.slope * wide_low /
+                             (tall_low * tube_low.x * tube_low.z * apart_low * line_distance(acquisition, shown_low)));
       piece.gain1 = gain + LOG2_E * band_high - decay * high +
-                    0.5f * log2_scalar(sigma_high.x / (tall_high * tube_high.x * tube_high.z)) -
-                    log2_scalar(apart_high) - piece.gain0;
+                    0.5f * log2_scalar(piece.slope * wide_high /
+                                       (tall_high * tube_high.x * tube_high.z * apart_high *
+                                        line_distance(acquisition, shown_high))) -
+                    piece.gain0;
 
       // Off the axis of a curved array the same range is reached slightly earlier.
       const float lines_aside = max(line - left_line, left_line + lines - 1 - line) + 0.5f;

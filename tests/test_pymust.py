@@ -8,10 +8,10 @@ user; here its channels are beamformed by its own delay-and-sum matrix. Differen
   than the echo of a point is wide. Our beam has a phase that does the same (docs/physics.md#wavefront-curvature).
 - The mean frequency of its echoes is 4.76 MHz for 5 MHz and 60 %, and its elements' directivity tapers the aperture.
   Its compounded beams are 4 to 7 % wider than two sinc functions, and speckle correlates over a length 12 % longer.
-- Its beams have side lobes (sinc), ours none; the main lobes' widths are compared.
+- Its beams are sinc functions, ours Gaussian with side lobes as clutter beside; the main lobes' widths are compared.
 - It attenuates each frequency by itself, so that the pulse's centre frequency sinks with depth and it loses less than
-  2 alpha f0 z: by 0.2 dB for the attenuation tested here, by 1.6 dB for 0.5 dB/(cm MHz) at 50 mm. This simulator has no
-  downshift (docs/physics.md#8-not-modelled).
+  2 alpha f0 z: by 0.2 dB for the attenuation tested here, by 1.6 dB for 0.5 dB/(cm MHz) at 50 mm. So does ours
+  (docs/physics.md#frequency-that-falls-with-depth).
 - Its level falls with distance by diffraction, which this simulator takes for compensated; so what attenuation alone
   does to the level is compared.
 - Elevation: PyMUST 0.1.9 with `height` and `focus` gives a beam half as wide as the diffraction integral of that

@@ -48,8 +48,9 @@ class Beam(Declared):
         "focus, as a scanner's gain makes it",
     )  # fmt: skip
     band_mhz: tuple[float, float] | None = parameter(
-        None, "Band", "Lowest and highest frequency that the array transmits and receives, -6 dB; the second harmonic "
-        "of the pulse must lie within; none: any", unit="MHz", bounds=(0.1, 100),
+        None, "Band", "Lowest and highest frequency that the array receives, -6 dB; the second harmonic of the pulse "
+        "must lie within; none: any", unit="MHz", bounds=(0.1, 100),
+        note="Without harmonic, frequency_mhz is not held to it: a preset can be tried at any frequency",
     )  # fmt: skip
     fractional_bandwidth: float = parameter(
         0.5, "Bandwidth", "-6 dB bandwidth of the two-way pulse, as a fraction of the frequency", bounds=(0.05, 1.5)

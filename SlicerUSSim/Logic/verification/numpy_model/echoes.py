@@ -113,16 +113,18 @@ def _add_piece(acquisition, labels, tissues, segment, first, low, high, belongs,
     path = segment["path_mm"] + np.array([low, high])
     loss = segment["loss"] + segment["loss_per_mm"] * np.array([low, high])
     frequency, begins = beam.frequency_after(loss), beam.traced_start(np.asarray(strips.line))
-    lateral, elevation, apart = (
-        beam.lateral_sigma(path, frequency), beam.elevation_sigma(path, frequency), beam.line_distance(path + begins)
-    )  # fmt: skip
+    elevation, apart = beam.elevation_sigma(path, frequency), beam.line_distance(path + begins)
+    # The image is as wide as the beam at the displayed depth.
+    shown = np.maximum(segment["depth_mm"] + segment["depth_per_mm"] * np.array([low, high]), begins)
+    across = beam.lateral_sigma(shown - begins, frequency) / beam.line_distance(shown)
     narrow = f32(0.5) * LOG2_E / (elevation * elevation)
     curved = beam.elevational_cycles(path, frequency)
     along_tube = [segment["tube"][w] + segment["tube"][w + 1] * np.array([low, high]) for w in (0, 2)]
     strength = np.log2(segment["weight"] * segment["attenuation"] * acquisition["speckle_scale"] * f32(2.50662827))
     gain = strength - LOG2_E * segment["decay_per_mm"] * np.array([low, high]) + LOG2_E * beam.gain_of_band(loss)
     tall = elevation if strips.table is None else f32(1.0 / np.sqrt(np.pi))
-    gain = gain + f32(0.5) * np.log2(lateral / (tall * along_tube[0] * along_tube[1])) - np.log2(apart)
+    spread = tall * along_tube[0] * along_tube[1] * apart
+    gain = gain + f32(0.5) * np.log2(segment["depth_per_mm"] * across / spread)
 
     # Lattice axes in the kernel's order, for the same rounding of sums.
     u = int(np.abs(segment["elevational"]).argmax())

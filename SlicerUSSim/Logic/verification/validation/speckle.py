@@ -285,8 +285,12 @@ def uneven(rotation: np.ndarray, device) -> Outcome:
     return Outcome(tuple(rows))
 
 
+#: Of lung, fat, skin and skull, m/s
+SPEEDS = (950.0, 1430.0, 1624.0, 2800.0)
+
+
 def echogenicity(rotation: np.ndarray, device) -> Outcome:
-    """Var = p (1 - p) mu0^2 + p sigma0^2 alone sets the level."""
+    """Var = p (1 - p) mu0^2 + p sigma0^2 alone sets the level, whatever the speed of sound and the array."""
     rows = []
     for name, changes in {
         "mu0 0.33, sigma0 0.15, mu1 0": {},
@@ -299,6 +303,16 @@ def echogenicity(rotation: np.ndarray, device) -> Outcome:
         frames = [s.simulate(PROBES["linear"], phantom.probe_to_ras) for s in simulators]
         level = level_db(np.stack([f.iq[:, 64:-64] for f in frames]))
         rows.append(Row(name, "dB", 10 * np.log10(tissue.scatterer_variance), level, 0.5))
+    for speed in SPEEDS:
+        tissue = replace(SPECKLE, speed_of_sound_m_s=speed)
+        phantom, simulators = _simulators(rotation, device, tissue)
+        for name in ("linear", "phased"):
+            probe = PROBES[name]
+            frames = [s.simulate(probe, phantom.probe_to_ras) for s in simulators]
+            for part in (0.25, 0.75):
+                _, level = _window_statistics(frames, part * probe.depth_mm, 0.2 * probe.depth_mm)
+                what = f"{speed:.0f} m/s, {name}, at {part * probe.depth_mm:.0f} mm"
+                rows.append(Row(what, "dB", 10 * np.log10(tissue.scatterer_variance), level, 0.3))
     return Outcome(tuple(rows))
 
 
