@@ -101,7 +101,7 @@ def optimize(
             prediction = predict(
                 found, simulator, tracked.others, free=names, display=tracked.examination.display,
                 speckle=settings.speckle, neighbours=near[0], fitted_neighbours=near[1],
-                max_evaluations=settings.evaluations, progress=curve,
+                max_evaluations=settings.evaluations, restarts=settings.restarts, progress=curve,
             )  # fmt: skip
             found = replace(found, prediction=prediction)
     write_own_json(out, found.to_dict())

@@ -38,6 +38,7 @@ def predict(
     neighbours: Sequence[Sequence[np.ndarray]] | None = None,
     fitted_neighbours: Sequence[Sequence[np.ndarray]] | None = None,
     max_evaluations: int = FitSettings.evaluations,
+    restarts: int = FitSettings.restarts,
     settings: SimilaritySettings | None = None,
     progress: Callable[[Progress], None] | None = None,
 ) -> Prediction:
@@ -48,7 +49,8 @@ def predict(
     found, simulator : a fit, and the simulator that it was made with.
     others : other images of the same recording, at the poses as tracked; a registration moves them as well, and a
         deformation of the tissues is theirs too.
-    free, display, speckle, max_evaluations : as they were for the fit; the uniform tissue is fitted with the same.
+    free, display, speckle, max_evaluations, restarts : as they were for the fit; the uniform tissue is fitted with the
+        same, since a cost has several minima.
     neighbours, fitted_neighbours : per image of `others`, and of the fitted ones, real images near it
         (realism.neighbours_of); without them there is no floor.
 
@@ -73,7 +75,7 @@ def predict(
     plain = replace(simulator.settings, partial_volume=False, mri_modulation_db=0.0)
     uniform = UltrasoundSimulator(labels, tissues, plain, simulator.device)
     control = fit_images(
-        uniform, found.tracked, free=_free_of_one(free), display=display, speckle=speckle, restarts=0,
+        uniform, found.tracked, free=_free_of_one(free), display=display, speckle=speckle, restarts=restarts,
         max_evaluations=max_evaluations, settings=settings, progress=progress,
     )  # fmt: skip
     shown = control.appearance

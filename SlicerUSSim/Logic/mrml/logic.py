@@ -911,7 +911,7 @@ class UltrasoundSceneLogic:
                 return found
             prediction = predict(
                 found, simulator, others, free=free, display=preset.display, speckle=speckle, fitted_neighbours=near[0],
-                neighbours=near[1], max_evaluations=max_evaluations, progress=report,
+                neighbours=near[1], max_evaluations=max_evaluations, restarts=restarts, progress=report,
             )  # fmt: skip
             return replace(found, prediction=prediction)
 
