@@ -72,7 +72,7 @@ def optimize(
     from SlicerUSSim.Logic.imaging.figures import require_matplotlib
     from SlicerUSSim.Logic.imaging.preset import Preset
 
-    places = [place for place in (out, report, save_preset, save_transform, state) if place]
+    places = [place for place in (out, report, save_preset, save_transform, state, recording.field) if place]
     check_outputs(out, report, save_preset, save_transform, recording.field)
     check_places(state)  # which is read before it is written
     for place in places:
