@@ -74,7 +74,7 @@ def predict(
     uniform = UltrasoundSimulator(labels, tissues, plain, simulator.device)
     control = fit_images(
         uniform, found.tracked, free=_free_of_one(free), display=display, speckle=speckle, restarts=0,
-        max_evaluations=max_evaluations, settings=settings, progress=progress,
+        max_evaluations=max_evaluations, settings=settings, progress=Progress.named("uniform tissue", progress),
     )  # fmt: skip
     shown = control.appearance
     images = {

@@ -115,7 +115,7 @@ def fit_speckle(
     references = [TextureReference(image, spacing, tracked.mask) for image in tracked.images]
     with simulator.with_tissues(tissues):
         model = AppearanceModel(simulator, tracked.probe, tracked.poses, {}, tracked.grid)
-    done, total = 0, sum(_EVALUATIONS) + by_width * _WIDTH_EVALUATIONS
+    done, total = 0, sum(_EVALUATIONS[: len(factors)]) + by_width * _WIDTH_EVALUATIONS
 
     def images_of(table: TissueTable, shown: DisplaySettings) -> list[np.ndarray]:
         return [model.image(n, table, shown) for n in range(len(references))]
@@ -194,20 +194,24 @@ def _widths(tracked: TrackedImages, images: Sequence[np.ndarray]) -> list[Speckl
 
 
 def with_point_spread(
-    simulator: UltrasoundSimulator, tracked: TrackedImages, first: SpeckleFit, display: DisplaySettings
+    simulator: UltrasoundSimulator,
+    tracked: TrackedImages,
+    first: SpeckleFit,
+    display: DisplaySettings,
+    progress: Callable[[float], None] | None = None,
 ) -> tuple[SpeckleFit, TrackedImages]:
     """The fit of the speckle, and the images with the probe that has it.
 
     The point spread function by the width of the real speckle is a start only: another fit begins with it, at the
     texture of `first` and with `display`'s levels, and is taken if T1 + T2 / 2 is lower and T2, the number of grains,
-    not higher.
+    not higher. `progress` gets the part done.
     """
     spread = point_spread(_widths(tracked, tracked.images), tracked.probe)
     other = replace(tracked, probe=spread.of(tracked.probe))
     if other.probe == tracked.probe:
         return replace(first, spread=spread), tracked
     try:
-        found = fit_speckle(simulator, other, first.tissues, display, factors=(1.0,), by_width=False)
+        found = fit_speckle(simulator, other, first.tissues, display, progress, factors=(1.0,), by_width=False)
     except SimulationError as error:  # with that probe an image would take minutes, or is dark
         _log.info("the point spread function by the width of the speckle cannot be tried: %s", error)
         return replace(first, spread=spread), tracked
