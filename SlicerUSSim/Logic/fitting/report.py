@@ -187,6 +187,8 @@ def _spread_cells(spread: Spread) -> str:
     answer = {True: '<td class="yes">yes</td>', False: '<td class="no">no</td>', None: "<td>?</td>"}[
         spread.is_determined
     ]
+    if not spread.is_fitted:
+        answer = '<td class="dim">not fitted</td>'
     return f"<td>{spread.low:.3f} to {spread.high:.3f}</td><td>{restarts}</td>{answer}"
 
 
@@ -202,7 +204,8 @@ def _in_words(result: AppearanceResult) -> str:
         )
     return text + (
         "mu0, sigma0 and mu1 determine the variance of developed speckle (Var), Var and gain the level, attenuation "
-        "and TGC the net attenuation: such a combination can be determined although its parts are not."
+        "and TGC the net attenuation: such a combination can be determined although its parts are not. Not fitted "
+        "is the net attenuation of a tissue whose attenuation was not free: it changes with TGC alone."
     )
 
 
