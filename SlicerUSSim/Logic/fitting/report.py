@@ -178,10 +178,10 @@ def _realism(realism: Realism, prediction: Prediction | None, reference: str) ->
     return f"""<h2>How much the images are like {of} ones</h2>
 <p class="dim">The numbers of <code>ussim realism</code>, of the fitted images ({_listed(realism)}). Simulated are those
 after the fit. Beside them are controls. {of.capitalize()} neighbours, the images before and after in the recording, are
-the floor that nothing needs to go below. Uniform tissue is the tissue that fills most, without anatomy, at the
-gain that gives it the {of} images' mean grey level; with the {of} level, the same speckle on their own local mean. {of.capitalize()}, blurred
-(by 2 pixels) is what a cost that sees speckle must refuse. The sum is the paper's cost + T1 + T2 / 2; T1 is the size of
-grains, T2 their number.</p>
+the floor that nothing needs to go below. Uniform tissue is the tissue that fills most instead of all, at the gain that
+gives it the {of} images' mean grey level; with the {of} level, the same speckle on their own local mean.
+{of.capitalize()}, blurred (by 2 pixels) is what a cost that sees speckle must refuse. The sum is the paper's cost + T1
++ T2 / 2; T1 is the size of grains, T2 their number.</p>
 {_tables(realism, reference)}
 {folded}"""
 
