@@ -173,12 +173,13 @@ def test_what_the_fit_of_the_speckle_found_is_said():
 
 def test_steps_of_a_fit_say_their_names():
     told: list[Progress] = []
-    named, shares = (of("levels for the speckle", told.append) for of in (Progress.named, Progress.shares))
+    named = Progress.named("levels for the speckle", told.append)
+    shares = Progress.shares("smoothing and texture", told.append)
     assert named is not None and shares is not None
     named(Progress("global", 3, 10, 0.5, 0.4, {}))
     shares(0.25)
     assert [step.in_words() for step in told] == [
-        "levels for the speckle, global: cost 0.4000", "levels for the speckle"
+        "levels for the speckle, global: cost 0.4000", "smoothing and texture"
     ]  # fmt: skip
     assert [step.share for step in told] == [0.3, 0.25]
     assert Progress.named("no one listens", None) is Progress.shares("no one listens", None) is None

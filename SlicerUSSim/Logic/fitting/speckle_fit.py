@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import optimize
 
-from SlicerUSSim.Logic.base.errors import SimulationError
+from SlicerUSSim.Logic.base.errors import Cancelled, SimulationError
 from SlicerUSSim.Logic.base.settings import DisplaySettings
 from SlicerUSSim.Logic.fitting.appearance import AppearanceModel
 from SlicerUSSim.Logic.fitting.parameters import DISPLAY_BOUNDS
@@ -235,6 +235,8 @@ def with_point_spread(
         return replace(first, spread=spread), tracked
     try:
         found = fit_speckle(simulator, other, first.tissues, display, progress, factors=(1.0,), by_width=False)
+    except Cancelled:
+        raise
     except SimulationError as error:  # with that probe an image would take minutes, or is dark
         _log.info("the point spread function by the width of the speckle cannot be tried: %s", error)
         return replace(first, spread=spread), tracked
