@@ -73,6 +73,7 @@ def test_a_probe_whose_speckle_is_too_fine_gets_the_true_one_back():
     assert found.after.total < first.after.total and found.after.extrema <= first.after.extrema
 
 
+@pytest.mark.slow
 def test_the_trial_can_be_cancelled():
     """A probe that cannot be tried is no error, and its errors are of the same kind."""
     made = UltrasoundSimulator(LABELS, EVEN, SimulationSettings(seed=2, ring_down=False))
