@@ -19,7 +19,7 @@ from SlicerUSSim.Logic.fitting.identifiability import Spread
 from SlicerUSSim.Logic.fitting.optimization import AGAIN, STAGES, AppearanceResult
 from SlicerUSSim.Logic.fitting.parameters import Parameter
 from SlicerUSSim.Logic.fitting.prediction import FITTED, Prediction
-from SlicerUSSim.Logic.fitting.realism import Realism
+from SlicerUSSim.Logic.fitting.realism import NEIGHBOURS, Realism
 from SlicerUSSim.Logic.fitting.speckle_fit import SpeckleFit
 from SlicerUSSim.Logic.fitting.texture_costs import TextureReference
 from SlicerUSSim.Logic.imaging.figures import require_matplotlib
@@ -76,7 +76,7 @@ def write_report(
         "count": str(len(images)),
         "evaluations": str(result.evaluations),
         "seconds": f"{result.seconds:.1f}",
-        "prediction": "" if prediction is None else _predicted(prediction),
+        "prediction": "" if prediction is None else _predicted(prediction, reference),
         "images": "\n".join(
             _trio(number, real, old, new, *misfits)
             for number, real, old, new, *misfits in zip(
@@ -150,21 +150,24 @@ def _trio(
 </figure>"""
 
 
-def _predicted(prediction: Prediction) -> str:
+def _predicted(prediction: Prediction, reference: str) -> str:
     """A table of the costs on fitted and predicted images, and what it says."""
     listed = [", ".join(map(str, numbers)) for numbers in (prediction.fitted_numbers, prediction.numbers)]
     heads = [
         "images", f"fitted ({listed[0]}): cost", "with texture", f"predicted ({listed[1]}): cost", "with texture"
     ]  # fmt: skip
     rows = [
-        [source, *("–" if np.isnan(value) else f"{value:.3f}" for value in values)]
+        [
+            f"{reference} neighbours" if source == NEIGHBOURS else source,
+            *("–" if np.isnan(value) else f"{value:.3f}" for value in values),
+        ]
         for source, *values in prediction.rows()
     ]
     return f"""<h2>Images that were not fitted</h2>
 {_table(heads, rows)}
 <p class="dim">The predicted images cost {prediction.of_uniform:.2f} of what one uniform tissue without anatomy, fitted
-in the same way, costs there; real neighbours are the images before and after in the recording. With texture: + T1 +
-T2 / 2.</p>"""
+in the same way, costs there; {html.escape(reference)} neighbours are the images before and after in the recording. With
+texture: + T1 + T2 / 2.</p>"""
 
 
 def _realism(realism: Realism, prediction: Prediction | None, reference: str) -> str:
