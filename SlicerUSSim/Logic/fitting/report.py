@@ -177,6 +177,7 @@ def _realism(realism: Realism, prediction: Prediction | None, reference: str) ->
     folded = ""
     if others is not None:
         folded = f"""<details><summary>The same of the images that were not fitted ({_listed(others)})</summary>
+<p class="dim">Uniform tissue, fitted, has display and tissue fitted to the same images as the simulated ones.</p>
 {_tables(others, reference)}</details>"""
     return f"""<h2>How much the images are like {of} ones</h2>
 <p class="dim">The numbers of <code>ussim realism</code>, of the fitted images ({_listed(realism)}). Simulated are those
