@@ -206,3 +206,13 @@ def test_the_net_fall_follows_every_tissue_that_is_looked_at_where_tgc_is_free()
     parameters = FreeParameters.of(["white matter.mu0", "tgc_db_cm_mhz"], TISSUES_OF_BRAIN, DISPLAY)
     names = [q.name for q in quantities_of(parameters, 5.0, TISSUES_OF_BRAIN)]
     assert [name for name in names if "net attenuation" in name] == ["net attenuation in white matter"]
+
+
+def test_what_was_not_free_of_a_tissue_is_not_said_to_be_determined():
+    """Net attenuation changes with TGC alone where the tissue's attenuation is as given."""
+    for free, is_fitted in (("white matter.mu0", False), ("white matter.attenuation_db_cm_mhz", True)):
+        found, _ = spreads_of([], [{}], free=(free, "tgc_db_cm_mhz"))
+        spread = found["net attenuation in white matter"]
+        assert spread.is_fitted is is_fitted and spread.is_determined is (True if is_fitted else None)
+        (row,) = [row for row in found.to_dict()["spreads"] if row["name"] == spread.name]
+        assert (row["is_fitted"], row["is_determined"]) == (is_fitted, spread.is_determined)

@@ -254,7 +254,7 @@ def test_realism_of_the_images_themselves_is_perfect_and_controls_are_not(twin):
         assert found.mean(control)["paper"] > 0.05
     assert found.mean(BLURRED)["t2"] > 2 * found.mean(NEIGHBOURS)["t2"]
     real, uniform = (np.mean([i[tracked.mask].mean() for i in found.images[name]]) for name in (REAL, UNIFORM))
-    assert uniform == pytest.approx(real, abs=1.0)  # at its best gain
+    assert uniform == pytest.approx(real, abs=1.0)  # at the gain for it
     assert found.mean(LEVELLED)["paper"] < found.mean(UNIFORM)["paper"]
     for levelled, real in zip(found.images[LEVELLED], found.images[REAL], strict=True):
         inside = ndimage.binary_erosion(tracked.mask, iterations=40)

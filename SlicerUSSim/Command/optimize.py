@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -10,7 +11,7 @@ import click
 
 from SlicerUSSim.Command.options import check_outputs, check_places, gathered
 from SlicerUSSim.Command.patient_options import PatientOptions
-from SlicerUSSim.Command.progress import Curve, note
+from SlicerUSSim.Command.progress import Curve, Steps, note
 from SlicerUSSim.Command.sequence_options import SequenceOptions, TrackedExamination, open_tracked
 from SlicerUSSim.Logic.base.errors import SimulationError, require
 from SlicerUSSim.Logic.base.version import __version__
@@ -38,7 +39,11 @@ _STATE_BYTES = 2**30
     "and tissues).",
 )
 @gathered(settings=FitSettings)
-@click.option("--report", type=click.Path(path_type=Path), help="Self-contained HTML report: .html")
+@click.option(
+    "--report",
+    type=click.Path(path_type=Path),
+    help="Self-contained HTML report, with the numbers of ussim realism, which the result has then as well: .html",
+)
 @click.option("--save-preset", type=click.Path(path_type=Path), help="Preset with the fitted values: .json")
 @click.option(
     "--state",
@@ -72,7 +77,7 @@ def optimize(
     from SlicerUSSim.Logic.imaging.figures import require_matplotlib
     from SlicerUSSim.Logic.imaging.preset import Preset
 
-    places = [place for place in (out, report, save_preset, save_transform, state) if place]
+    places = [place for place in (out, report, save_preset, save_transform, state, recording.field) if place]
     check_outputs(out, report, save_preset, save_transform, recording.field)
     check_places(state)  # which is read before it is written
     for place in places:
@@ -113,6 +118,8 @@ def optimize(
         to_mri = found.registration.correction @ tracked.reference_to_ras
         write_own_json(save_transform, {"probe_to_ras": to_mri.tolist()})
     if report:
+        found = _measured(found, tracked)
+        write_own_json(out, found.to_dict())  # again: measuring takes long enough to be interrupted
         _write_report(report, found, tracked, patient, recording)
     _tell(found)
     note("wrote " + ", ".join(map(str, places)))
@@ -132,6 +139,24 @@ def _free_parameter(text: str) -> tuple[str, tuple[float, float] | None]:
     return name.strip(), (low, high)
 
 
+def _measured(found: Fit, tracked: TrackedExamination) -> Fit:
+    """The fit with the numbers of `ussim realism`; without them, which is said, where they cannot be measured."""
+    from SlicerUSSim.Logic.fitting.fit_realism import measure_fit
+    from SlicerUSSim.Logic.fitting.realism import neighbours_of
+
+    near = [None if of is None else neighbours_of(tracked.sequence, of) for of in (tracked.images, tracked.others)]
+    with Steps(1) as step:
+        step("numbers of realism for the report")
+        try:
+            return measure_fit(
+                found, tracked.examination.simulator, neighbours=near[0], others=tracked.others,
+                others_neighbours=near[1],
+            )  # fmt: skip
+        except SimulationError as error:  # as of labels of which nothing scatters
+            logging.getLogger(__name__).warning("the report has no numbers of realism: %s", error)
+            return found
+
+
 def _write_report(
     path: Path, found: Fit, tracked: TrackedExamination, patient: PatientOptions, recording: SequenceOptions
 ) -> None:
@@ -147,7 +172,8 @@ def _write_report(
     write_report(
         path, found.appearance, found.tracked, found.before, found.after, found.simulator or simulator,
         subtitle=f"{Path(recording.sequence).name} on {Path(patient.source).name}", provenance=provenance,
-        prediction=found.prediction, reference="twin" if tracked.sequence.is_simulated else "real",
+        prediction=found.prediction, realism=found.realism, speckle=found.speckle,
+        reference="twin" if tracked.sequence.is_simulated else "real",
     )  # fmt: skip
 
 

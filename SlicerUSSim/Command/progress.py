@@ -103,5 +103,5 @@ class Curve(_Bar):
         super().__init__(100, name)
 
     def __call__(self, progress: Progress) -> None:
-        self._show(f"{progress.stage}: cost {progress.best_cost:.4f}")
+        self._show(progress.in_words())
         self._reach(progress.share)

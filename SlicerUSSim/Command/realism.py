@@ -26,8 +26,9 @@ _MOST_IMAGES = 6
 def realism(patient: PatientOptions, recording: SequenceOptions, out: Path | None, picture: Path | None) -> None:
     """Measure how much simulated images are like tracked real ones: costs, speckle, grey levels, sheets.
 
-    Beside them are controls: real neighbours of the images, one uniform tissue at the best gain, and the real images
-    blurred by 2 pixels. See docs/realism.md.
+    Beside them are controls: real neighbours of the images, one uniform tissue at the gain that gives it the real
+    images' mean grey level, its speckle on their local mean, and the real images blurred by 2 pixels. See
+    docs/realism.md.
     """
     from SlicerUSSim.Logic.base.own_outputs import write_own_json
     from SlicerUSSim.Logic.fitting.realism import draw_sources, measure_realism, neighbours_of
@@ -45,8 +46,9 @@ def realism(patient: PatientOptions, recording: SequenceOptions, out: Path | Non
     if picture:
         draw_sources(picture, found)
     _tell(found)
-    if out or picture:
-        note("wrote " + ", ".join(str(place) for place in (out, picture) if place))
+    written = [place for place in (out, picture, recording.field) if place]
+    if written:
+        note("wrote " + ", ".join(map(str, written)))
 
 
 def _tell(found: Realism) -> None:

@@ -40,4 +40,5 @@ def sweep(patient: PatientOptions, recording: SequenceOptions, out: Path) -> Non
             progress((place + 1) / len(real.poses))
     sequence = tracked.sequence.with_images(real.numbers, simulated)
     replace(sequence, fields={**sequence.fields, MADE_BY: mark_of(simulated)}).write(out)
-    note(f"wrote {out} ({len(simulated)} images of {columns}x{rows})")
+    figure = f", {recording.field}" if recording.field else ""
+    note(f"wrote {out} ({len(simulated)} images of {columns}x{rows}){figure}")

@@ -129,7 +129,7 @@ class FitPresenter:
             panel.view.showChart(plot.chart)
 
             def report(step: Progress) -> None:
-                panel.view.showStatus(f"{step.stage}: cost {step.best_cost:.4f}")
+                panel.view.showStatus(step.in_words())
                 progress(step.share)
 
             labels, settings = parameters.labels, parameters.fit

@@ -9,6 +9,7 @@ from SlicerUSSim.Logic.base.lazy import lazy_exports
 
 if TYPE_CHECKING:
     from .appearance import AppearanceModel as AppearanceModel
+    from .fit_realism import measure_fit as measure_fit
     from .held_out import predict as predict
     from .image_similarity import (
         Similarity as Similarity,

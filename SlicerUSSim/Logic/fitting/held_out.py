@@ -67,16 +67,14 @@ def predict(
             others.numbers[0],
         )
     given, simulator = simulator, found.simulator or simulator
-    if found.registration is not None:
-        others = replace(others, poses=[found.registration.correction @ pose for pose in others.poses])
-    others = replace(others, probe=found.tracked.probe)  # whose point spread function a fit may have changed
+    others = as_fitted(found, others)
     result = found.appearance
     labels, tissues = uniform_tissues(given)
     plain = replace(simulator.settings, partial_volume=False, mri_modulation_db=0.0)
     uniform = UltrasoundSimulator(labels, tissues, plain, simulator.device)
     control = fit_images(
         uniform, found.tracked, free=_free_of_one(free), display=display, speckle=speckle, restarts=restarts,
-        max_evaluations=max_evaluations, settings=settings, progress=progress,
+        max_evaluations=max_evaluations, settings=settings, progress=Progress.named("uniform tissue", progress),
     )  # fmt: skip
     shown = control.appearance
     images = {
@@ -99,6 +97,13 @@ def predict(
         costs(images, others, neighbours),
         images,
     )
+
+
+def as_fitted(found: Fit, others: TrackedImages) -> TrackedImages:
+    """Other images of the recording at the poses where a fit has them, with its probe."""
+    if found.registration is not None:
+        others = replace(others, poses=[found.registration.correction @ pose for pose in others.poses])
+    return replace(others, probe=found.tracked.probe)  # whose point spread function a fit may have changed
 
 
 def _costs_against(tracked: TrackedImages, settings: SimilaritySettings) -> Callable[[np.ndarray, int], Cost]:

@@ -32,6 +32,8 @@ class Quantity:
     #: It counts as determined if the values spread by at most twice this
     tolerance: float
     of: Callable[[TissueTable, DisplaySettings], float]
+    #: False: what it is of the tissue was not free, only what that is combined with
+    is_fitted: bool = True
 
 
 @dataclass(frozen=True)
@@ -51,10 +53,17 @@ class Spread:
     tolerance: float
     #: Whether a search from another starting point reached the same cost; otherwise agreement has no meaning
     was_tested: bool
+    #: Whether what it is of the tissue was free; otherwise it is as good as the tissue table
+    is_fitted: bool = True
 
     @property
     def is_determined(self) -> bool | None:
-        """Whether the equally good solutions agree within the tolerance; None if there is no other solution."""
+        """Whether the equally good solutions agree within the tolerance; None if that cannot be said.
+
+        It cannot without another solution, nor of what was not fitted.
+        """
+        if not self.is_fitted:
+            return None
         if self.high - self.low > 2.0 * self.tolerance:
             return False
         return True if self.was_tested else None
@@ -103,6 +112,7 @@ class Identifiability:
                     float(restarted.std(ddof=1)) if has_restarts else float("nan"),
                     quantity.tolerance,
                     has_restarts,
+                    quantity.is_fitted,
                 )
             )
         return cls(tuple(spreads), len(met) + len(found), len(found), restarts, cost_tolerance)
@@ -164,11 +174,14 @@ def quantities_of(parameters: FreeParameters, frequency_mhz: float, tissues: Tis
     brightened = [name for name, names in varied.items() if names & SCATTERING]
     display = {p.attribute for p in parameters if p.tissue is None}
     dampened = [name for name, names in varied.items() if "attenuation_db_cm_mhz" in names]
+    own = set(dampened)
     if "tgc_db_cm_mhz" in display:
         dampened += [name for name in _scattering(tissues) if name not in dampened and name in varied]
     for name in dampened:
         quantities.append(
-            Quantity(f"net attenuation in {name}", "dB/cm", 0.2 * frequency_mhz, _fall(name, frequency_mhz))
+            Quantity(
+                f"net attenuation in {name}", "dB/cm", 0.2 * frequency_mhz, _fall(name, frequency_mhz), name in own
+            )
         )
     for name in brightened:
         quantities.append(Quantity(f"Var of {name}", "dB", 1.5, _echogenicity(name)))

@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from SlicerUSSim.Logic.fitting.speckle_width import SpeckleWidth
+from SlicerUSSim.Logic.fitting.texture_costs import TextureMisfit
 from SlicerUSSim.Logic.probe.arrays import Probe
 
 #: Frequency x fractional bandwidth x sigma of the amplitude, MHz mm
@@ -32,6 +33,9 @@ class PointSpread:
     aperture_mm_mhz: float
     #: Whether a fit took it; None: not tried
     is_taken: bool | None = None
+    #: T1 and T2 with it, and without; None: not tried
+    with_it: TextureMisfit | None = None
+    without: TextureMisfit | None = None
 
     def of(self, probe: Probe) -> Probe:
         """The probe with this point spread function at its own frequency, which is not known from the images."""
@@ -46,12 +50,17 @@ class PointSpread:
         """Plain values for JSON; what could not be measured is None."""
         values = {"band_mhz": self.band_mhz, "aperture_mm_mhz": self.aperture_mm_mhz}
         plain = {name: value if np.isfinite(value) else None for name, value in values.items()}
-        return {**plain, "is_taken": self.is_taken, "frequency_mhz": None}
+        tried = {
+            name: {key: value if np.isfinite(value) else None for key, value in vars(misfit).items()}
+            for name, misfit in (("with_it", self.with_it), ("without", self.without))
+            if misfit is not None
+        }
+        return {**plain, "is_taken": self.is_taken, **tried, "frequency_mhz": None}
 
     def in_words(self) -> str:
         """One line, with what cannot be known."""
         taken = {
-            None: "",
+            None: "; not tried",
             True: "; taken, with as many grains",
             False: "; not taken: its grains are no more like the real ones",
         }[self.is_taken]

@@ -15,7 +15,7 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 from scipy import ndimage
@@ -51,6 +51,9 @@ from SlicerUSSim.Logic.probe.placement import slice_under_probe
 from SlicerUSSim.Logic.tissue.table import TissueTable
 from SlicerUSSim.Logic.tracked.images import TrackedImages
 from SlicerUSSim.Logic.tracked.sequence import TrackedSequence
+
+#: Title, heads, and rows with one text per head
+Table: TypeAlias = tuple[str, list[str], list[list[str]]]
 
 #: Names of the sources that are always there
 REAL, NEIGHBOURS, BLURRED, UNIFORM = "real", "real neighbours", "real, blurred", "uniform tissue"
@@ -149,25 +152,30 @@ class Realism:
             }
         )
 
-    def tables(self) -> list[tuple[str, list[str], list[list[str]]]]:
-        """(title, heads, rows) of texts, for reports and terminals."""
+    def tables(self, reference: str = REAL) -> list[Table]:
+        """(title, heads, rows) of texts, for reports and terminals; `reference` is what the real images are called."""
         real = self.looks[REAL]
+
+        def shown(name: str) -> str:
+            return name.replace(REAL, reference) if name in _CONTROLS else name
+
         costs = [
-            [name, *(_text(self.mean(name)[key], 3) for key in ("paper", "t1", "t2", "sum"))] for name in self.costs
+            [shown(name), *(_text(self.mean(name)[key], 3) for key in ("paper", "t1", "t2", "sum"))]
+            for name in self.costs
         ]
-        tables = [("Costs against the real images", ["images", "paper's", "T1", "T2", "sum"], costs)]
+        tables = [(f"Costs against the {reference} images", ["images", "paper's", "T1", "T2", "sum"], costs)]
         depths = [f"{width.depth_mm:.0f} mm" for width in real.widths]
         widths = [
-            [name, *(f"{_text(w.half_height_mm[0])} / {_text(w.half_height_mm[1])}" for w in looks.widths)]
+            [shown(name), *(f"{_text(w.half_height_mm[0])} / {_text(w.half_height_mm[1])}" for w in looks.widths)]
             for name, looks in self.looks.items()
         ]
         tables.append(("Width of the speckle at half height, axial / lateral, mm", ["depth", *depths], widths))
-        maxima = [[name, *(_text(m, 0) for m in looks.maxima_per_cm2)] for name, looks in self.looks.items()]
+        maxima = [[shown(name), *(_text(m, 0) for m in looks.maxima_per_cm2)] for name, looks in self.looks.items()]
         tables.append(("Local maxima per cm²", ["depth", *depths], maxima))
         for tissue in real.tissues:
             rows = [
                 [
-                    name, _text(grey.mean, 0), _text(grey.deviation, 1), f"{grey.skewness:+.2f}",
+                    shown(name), _text(grey.mean, 0), _text(grey.deviation, 1), f"{grey.skewness:+.2f}",
                     f"{grey.percentile_1:+.0f}", f"{grey.percentile_99:+.0f}", _text(grey.maxima_per_cm2, 0),
                     _text(histogram_misfit(grey, real.tissues[tissue])),
                 ]
@@ -179,18 +187,18 @@ class Realism:
         half = 0.5 * (real.depth_mm[1] - real.depth_mm[0]) if len(real.depth_mm) > 1 else 0.0
         greys = (15, 30, 45, 60, 80, 100, 160, 200)
         maps = [
-            [name, *(_text(looks.grey_map.at(grey)) for grey in greys)]
+            [shown(name), *(_text(looks.grey_map.at(grey)) for grey in greys)]
             for name, looks in self.looks.items()
             if looks.grey_map is not None
         ]
         tables.append(("Slope of the grey map relative to that at 130", ["grey level", *map(str, greys)], maps))
         level_heads = ["depth, mm", *(f"{d - half:.0f}-{d + half:.0f}" for d in real.depth_mm)]
-        level = [[name, *(_text(g, 0) for g in looks.level)] for name, looks in self.looks.items()]
+        level = [[shown(name), *(_text(g, 0) for g in looks.level)] for name, looks in self.looks.items()]
         tables.append(("Mean grey level", level_heads, level))
         for tissue in real.lines:
             rows = [
                 [
-                    name, f"{line.angle_deg[0]}-{line.angle_deg[1]}°", str(line.points), _text(line.contrast, 0),
+                    shown(name), f"{line.angle_deg[0]}-{line.angle_deg[1]}°", str(line.points), _text(line.contrast, 0),
                     _text(line.chance, 0), _text(line.width_mm),
                 ]
                 for name, looks in self.looks.items()

@@ -6,6 +6,7 @@ import base64
 import html
 import io
 import os
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from string import Template
 from tempfile import TemporaryDirectory
@@ -17,7 +18,9 @@ from SlicerUSSim.Logic.base.own_outputs import marked_html
 from SlicerUSSim.Logic.fitting.identifiability import Spread
 from SlicerUSSim.Logic.fitting.optimization import AGAIN, STAGES, AppearanceResult
 from SlicerUSSim.Logic.fitting.parameters import Parameter
-from SlicerUSSim.Logic.fitting.prediction import Prediction
+from SlicerUSSim.Logic.fitting.prediction import FITTED, Prediction
+from SlicerUSSim.Logic.fitting.realism import NEIGHBOURS, Realism
+from SlicerUSSim.Logic.fitting.speckle_fit import SpeckleFit
 from SlicerUSSim.Logic.fitting.texture_costs import TextureReference
 from SlicerUSSim.Logic.imaging.figures import require_matplotlib
 from SlicerUSSim.Logic.imaging.simulator import UltrasoundSimulator
@@ -46,12 +49,15 @@ def write_report(
     provenance: str = "",
     prediction: Prediction | None = None,
     reference: str = "real",
+    realism: Realism | None = None,
+    speckle: SpeckleFit | None = None,
 ) -> None:
     """Write the report; on failure an existing file is kept.
 
     `before` and `after` are the simulated images (rows, columns) for those of `tracked`; `prediction` adds the costs of
     other images with their controls, and the simulated ones. `reference` is what the images of `tracked` are called:
-    those of a twin are not real.
+    those of a twin are not real. `realism` adds the tables of `ussim realism` with their controls, of the fitted images
+    and, where the prediction has them, of the others; `speckle` adds what the fit of the speckle found.
     Raises SimulationError without matplotlib and if the file cannot be written.
     """
     require_matplotlib()
@@ -70,7 +76,7 @@ def write_report(
         "count": str(len(images)),
         "evaluations": str(result.evaluations),
         "seconds": f"{result.seconds:.1f}",
-        "prediction": "" if prediction is None else _predicted(prediction),
+        "prediction": "" if prediction is None else _predicted(prediction, reference),
         "images": "\n".join(
             _trio(number, real, old, new, *misfits)
             for number, real, old, new, *misfits in zip(
@@ -86,6 +92,8 @@ def write_report(
         ).replace(_REFERENCE, html.escape(reference)),
         "reference": html.escape(reference),
         "histograms": _histograms(tracked, before, after, simulator, reference),
+        "realism": "" if realism is None else _realism(realism, prediction, reference),
+        "speckle": "" if speckle is None else _speckle(speckle),
         "curve": _curve(result),
         "parameters": "\n".join(_parameter_row(result, parameter) for parameter in result.parameters),
         "combinations": "\n".join(
@@ -142,22 +150,74 @@ def _trio(
 </figure>"""
 
 
-def _predicted(prediction: Prediction) -> str:
+def _predicted(prediction: Prediction, reference: str) -> str:
     """A table of the costs on fitted and predicted images, and what it says."""
     listed = [", ".join(map(str, numbers)) for numbers in (prediction.fitted_numbers, prediction.numbers)]
-    rows = "\n".join(
-        f"<tr><td>{source}</td>"
-        + "".join("<td>–</td>" if np.isnan(v) else f"<td>{v:.3f}</td>" for v in values)
-        + "</tr>"
+    heads = [
+        "images", f"fitted ({listed[0]}): cost", "with texture", f"predicted ({listed[1]}): cost", "with texture"
+    ]  # fmt: skip
+    rows = [
+        [
+            f"{reference} neighbours" if source == NEIGHBOURS else source,
+            *("–" if np.isnan(value) else f"{value:.3f}" for value in values),
+        ]
         for source, *values in prediction.rows()
-    )
+    ]
     return f"""<h2>Images that were not fitted</h2>
-<table><tr><th>images</th><th>fitted ({listed[0]}): cost</th><th>with texture</th>
-<th>predicted ({listed[1]}): cost</th><th>with texture</th></tr>
-{rows}</table>
+{_table(heads, rows)}
 <p class="dim">The predicted images cost {prediction.of_uniform:.2f} of what one uniform tissue without anatomy, fitted
-in the same way, costs there; real neighbours are the images before and after in the recording. With texture: + T1 +
-T2 / 2.</p>"""
+in the same way, costs there; {html.escape(reference)} neighbours are the images before and after in the recording. With
+texture: + T1 + T2 / 2.</p>"""
+
+
+def _realism(realism: Realism, prediction: Prediction | None, reference: str) -> str:
+    """The tables of the fitted images and, folded away, of the predicted ones."""
+    of = html.escape(reference)
+    others = None if prediction is None else prediction.realism
+    folded = ""
+    if others is not None:
+        folded = f"""<details><summary>The same of the images that were not fitted ({_listed(others)})</summary>
+<p class="dim">Uniform tissue, fitted, has display and tissue fitted to the same images as the simulated ones.</p>
+{_tables(others, reference)}</details>"""
+    return f"""<h2>How much the images are like {of} ones</h2>
+<p class="dim">The numbers of <code>ussim realism</code>, of the fitted images ({_listed(realism)}). Simulated are those
+after the fit. Beside them are controls. {of.capitalize()} neighbours, the images before and after in the recording, are
+the floor that nothing needs to go below. Uniform tissue is the tissue that fills most instead of all, at the gain that
+gives it the {of} images' mean grey level; with the {of} level, the same speckle on their own local mean.
+{of.capitalize()}, blurred (by 2 pixels) is what a cost that sees speckle must refuse. The sum is the paper's cost + T1
++ T2 / 2; T1 is the size of grains, T2 their number.</p>
+{_tables(realism, reference)}
+{folded}"""
+
+
+def _listed(realism: Realism) -> str:
+    return ", ".join(map(str, realism.numbers))
+
+
+def _tables(realism: Realism, reference: str) -> str:
+    return "\n".join(
+        f"<h3>{html.escape(title)}</h3>\n{_table(heads, rows)}" for title, heads, rows in realism.tables(reference)
+    )
+
+
+def _speckle(speckle: SpeckleFit) -> str:
+    """What the fit of the speckle found, step by step."""
+    return f"""<h2>Fit of the speckle</h2>
+<p class="dim">The grey map is that of the images alone. Smoothing and texture are found by T1 + T2 / 2, and smoothing
+once more with the width of the speckle. The point spread function by that width is a start only: it is taken if T1 + T2
+/ 2 is lower and T2 not higher. The fit by the paper's cost began with what is below.</p>
+{_table(["step", "found"], speckle.rows(), "words")}"""
+
+
+def _table(heads: Sequence[str], rows: Iterable[Sequence[str]], kind: str = "") -> str:
+    """A table of texts; the rows of the simulated images stand out."""
+
+    def row(cells: Sequence[str], tag: str = "td") -> str:
+        shown = ' class="own"' if cells[0] == FITTED else ""
+        return f"<tr{shown}>" + "".join(f"<{tag}>{html.escape(cell)}</{tag}>" for cell in cells) + "</tr>"
+
+    body = "\n".join(row(cells) for cells in rows)
+    return f'<table class="{kind}">{row(heads, "th")}\n{body}</table>'
 
 
 def _explained(parameter: Parameter) -> str:
@@ -187,6 +247,8 @@ def _spread_cells(spread: Spread) -> str:
     answer = {True: '<td class="yes">yes</td>', False: '<td class="no">no</td>', None: "<td>?</td>"}[
         spread.is_determined
     ]
+    if not spread.is_fitted:
+        answer = '<td class="dim">not fitted</td>'
     return f"<td>{spread.low:.3f} to {spread.high:.3f}</td><td>{restarts}</td>{answer}"
 
 
@@ -202,7 +264,8 @@ def _in_words(result: AppearanceResult) -> str:
         )
     return text + (
         "mu0, sigma0 and mu1 determine the variance of developed speckle (Var), Var and gain the level, attenuation "
-        "and TGC the net attenuation: such a combination can be determined although its parts are not."
+        "and TGC the net attenuation: such a combination can be determined although its parts are not. Not fitted "
+        "is the net attenuation of a tissue whose attenuation was not free: it changes with TGC alone."
     )
 
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import weakref
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from math import isnan, nan
 
 import numpy as np
 
@@ -38,6 +39,7 @@ class Progress:
     evaluations: int
     #: Largest number of evaluations
     limit: int
+    #: NaN in a step that has another cost than the fit
     cost: float
     best_cost: float
     #: {parameter name: value} of the best so far
@@ -47,6 +49,26 @@ class Progress:
     def share(self) -> float:
         """Fraction done, 0 to 1."""
         return min(self.evaluations / self.limit, 1.0)
+
+    def in_words(self) -> str:
+        """The stage and the best cost so far."""
+        return self.stage if isnan(self.best_cost) else f"{self.stage}: cost {self.best_cost:.4f}"
+
+    @staticmethod
+    def shares(name: str, progress: Callable[[Progress], None] | None) -> Callable[[float], None] | None:
+        """A function of the fraction done, 0 to 1, for a step of this name that says no cost."""
+        if progress is None:
+            return None
+        told = progress
+        return lambda share: told(Progress(name, round(100 * share), 100, nan, nan, {}))
+
+    @staticmethod
+    def named(name: str, progress: Callable[[Progress], None] | None) -> Callable[[Progress], None] | None:
+        """A progress function for a step of this name, which is said before its stages."""
+        if progress is None:
+            return None
+        told = progress
+        return lambda step: told(replace(step, stage=f"{name}, {step.stage}"))
 
 
 class Search:

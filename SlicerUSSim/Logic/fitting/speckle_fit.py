@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import optimize
 
-from SlicerUSSim.Logic.base.errors import SimulationError
+from SlicerUSSim.Logic.base.errors import Cancelled, SimulationError
 from SlicerUSSim.Logic.base.settings import DisplaySettings
 from SlicerUSSim.Logic.fitting.appearance import AppearanceModel
 from SlicerUSSim.Logic.fitting.parameters import DISPLAY_BOUNDS
@@ -73,6 +73,29 @@ class SpeckleFit:
             "point_spread": None if self.spread is None else self.spread.to_dict(),
         }  # fmt: skip
 
+    def rows(self) -> list[tuple[str, str]]:
+        """(what, what was found of it) of texts, in the order of the steps, for reports."""
+        shown, spread = self.display, self.spread
+        slopes = (
+            f"slope {shown.map_black:.2f} at black, {shown.map_dark:.2f} at a quarter of white, {shown.map_white:.2f} "
+            "at white, relative to that at half of it"
+        )
+        rows = [
+            ("grey map, from the images alone", slopes if self.has_map else "as given: they have too few grey levels"),
+            ("T1 and T2 before", _in_words(self.before)),
+            (
+                "smoothing of the envelope",
+                f"{shown.smoothing_axial_mm:.3f} mm axially, {shown.smoothing_lateral_deg:.2f}° laterally",
+            ),
+            ("texture of the tissues", f"x {self.texture_factor:g}"),
+            ("T1 and T2 with these", _in_words(self.after)),
+        ]
+        if spread is not None:
+            rows.append(("point spread function", spread.in_words()))
+            if spread.with_it is not None and spread.without is not None:
+                rows.append(("T1 and T2 with it; without", f"{_in_words(spread.with_it)}; {_in_words(spread.without)}"))
+        return rows
+
 
 def with_estimated_map(display: DisplaySettings, tracked: TrackedImages) -> tuple[DisplaySettings, bool]:
     """The display with the grey map of the real images, and whether they have enough grey levels for one."""
@@ -115,7 +138,7 @@ def fit_speckle(
     references = [TextureReference(image, spacing, tracked.mask) for image in tracked.images]
     with simulator.with_tissues(tissues):
         model = AppearanceModel(simulator, tracked.probe, tracked.poses, {}, tracked.grid)
-    done, total = 0, sum(_EVALUATIONS) + by_width * _WIDTH_EVALUATIONS
+    done, total = 0, sum(_EVALUATIONS[: len(factors)]) + by_width * _WIDTH_EVALUATIONS
 
     def images_of(table: TissueTable, shown: DisplaySettings) -> list[np.ndarray]:
         return [model.image(n, table, shown) for n in range(len(references))]
@@ -194,25 +217,31 @@ def _widths(tracked: TrackedImages, images: Sequence[np.ndarray]) -> list[Speckl
 
 
 def with_point_spread(
-    simulator: UltrasoundSimulator, tracked: TrackedImages, first: SpeckleFit, display: DisplaySettings
+    simulator: UltrasoundSimulator,
+    tracked: TrackedImages,
+    first: SpeckleFit,
+    display: DisplaySettings,
+    progress: Callable[[float], None] | None = None,
 ) -> tuple[SpeckleFit, TrackedImages]:
     """The fit of the speckle, and the images with the probe that has it.
 
     The point spread function by the width of the real speckle is a start only: another fit begins with it, at the
     texture of `first` and with `display`'s levels, and is taken if T1 + T2 / 2 is lower and T2, the number of grains,
-    not higher.
+    not higher. `progress` gets the part done.
     """
     spread = point_spread(_widths(tracked, tracked.images), tracked.probe)
     other = replace(tracked, probe=spread.of(tracked.probe))
     if other.probe == tracked.probe:
         return replace(first, spread=spread), tracked
     try:
-        found = fit_speckle(simulator, other, first.tissues, display, factors=(1.0,), by_width=False)
+        found = fit_speckle(simulator, other, first.tissues, display, progress, factors=(1.0,), by_width=False)
+    except Cancelled:
+        raise
     except SimulationError as error:  # with that probe an image would take minutes, or is dark
         _log.info("the point spread function by the width of the speckle cannot be tried: %s", error)
         return replace(first, spread=spread), tracked
     is_better = found.after.total < first.after.total and found.after.extrema <= first.after.extrema
-    spread = replace(spread, is_taken=is_better)
+    spread = replace(spread, is_taken=is_better, with_it=found.after, without=first.after)
     _log.info(
         "%s: T1 %.3f, T2 %.2f with it, %.3f and %.2f without", spread.in_words(), found.after.autocorrelation,
         found.after.extrema, first.after.autocorrelation, first.after.extrema,
@@ -220,6 +249,10 @@ def with_point_spread(
     if not is_better:
         return replace(first, spread=spread), tracked
     return replace(found, texture_factor=first.texture_factor, before=first.before, spread=spread), other
+
+
+def _in_words(misfit: TextureMisfit) -> str:
+    return f"{misfit.autocorrelation:.3f} and {misfit.extrema:.2f}, T1 + T2 / 2 = {misfit.total:.3f}"
 
 
 def _smoothing(display: DisplaySettings) -> np.ndarray:

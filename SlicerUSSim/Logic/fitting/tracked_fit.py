@@ -33,6 +33,7 @@ from SlicerUSSim.Logic.tracked.images import TrackedImages
 
 if TYPE_CHECKING:
     from SlicerUSSim.Logic.fitting.prediction import Prediction
+    from SlicerUSSim.Logic.fitting.realism import Realism
 
 _log = logging.getLogger(__name__)
 
@@ -65,6 +66,8 @@ class Fit:
     simulator: UltrasoundSimulator | None = field(default=None, repr=False)
     #: None unless other images were predicted (prediction.py)
     prediction: Prediction | None = None
+    #: None unless it was measured (fit_realism.py)
+    realism: Realism | None = None
 
     def to_dict(self) -> dict:
         """Plain values for JSON."""
@@ -77,9 +80,11 @@ class Fit:
             for before, after in zip(self.texture_before, self.texture_after, strict=True)
         ]
         prediction = {} if self.prediction is None else {"prediction": self.prediction.to_dict()}
+        realism = {} if self.realism is None else {"realism": self.realism.to_dict()}
         numbers = self.tracked.numbers
         return {
-            **self.appearance.to_dict(), **found, **speckle, "texture": texture, "numbers": numbers, **prediction
+            **self.appearance.to_dict(), **found, **speckle, "texture": texture, "numbers": numbers, **prediction,
+            **realism,
         }  # fmt: skip
 
 
@@ -124,24 +129,26 @@ def fit(
         # Of the patient and the probe as they are by then
         return optimize_appearance(
             patient, tracked.probe, poses, references=tracked.images, free=free, grid=tracked.grid, masks=masks,
-            seed=seed, settings=settings, progress=progress, **options,
+            seed=seed, settings=settings, **options,
         )  # fmt: skip
 
     registration = None
     if register:
         step_from = partial(
             register_poses, simulator, tracked.probe, references=tracked.images, grid=tracked.grid, masks=masks,
-            settings=settings, progress=progress,
+            settings=settings, progress=Progress.named("registration", progress),
         )  # fmt: skip
         short = partial(
-            appearance_at, display=display, restarts=0, max_evaluations=max(int(_FIRST_SHARE * max_evaluations), 1)
-        )
+            appearance_at, display=display, restarts=0, max_evaluations=max(int(_FIRST_SHARE * max_evaluations), 1),
+            progress=Progress.named("for the registration", progress),
+        )  # fmt: skip
         tracked, registration = _registered(simulator, tracked, short, step_from)
     deformation = None
     if deform:
         first = appearance_at(
-            tracked.poses, display=display, restarts=0, max_evaluations=max(int(_FIRST_SHARE * max_evaluations), 1)
-        )
+            tracked.poses, display=display, restarts=0, max_evaluations=max(int(_FIRST_SHARE * max_evaluations), 1),
+            progress=Progress.named("for the deformation", progress),
+        )  # fmt: skip
         with simulator.with_tissues(first.tissues):
             deformation, patient = find_deformation(
                 simulator, tracked, first.display, settings=settings, progress=progress
@@ -156,7 +163,7 @@ def fit(
     with patient.with_tissues(begun if found is None else _at_the_levels_of_tissues(found.tissues, begun)):
         appearance = appearance_at(
             tracked.poses, display=start, restarts=restarts, max_evaluations=max_evaluations, resume=resume,
-            checkpoint=checkpoint,
+            checkpoint=checkpoint, progress=progress,
         )  # fmt: skip
     before = simulated(simulator, given, begun, display)
     after = simulated(patient, tracked, appearance.tissues, appearance.display)
@@ -188,10 +195,13 @@ def _speckle_of(
         first = optimize_appearance(
             simulator, tracked.probe, tracked.poses, references=tracked.images, free=free, display=shown,
             grid=tracked.grid, masks=[tracked.mask] * len(tracked.images), seed=seed, settings=settings,
-            restarts=0, max_evaluations=max(int(_FIRST_SHARE * max_evaluations), 1), progress=progress,
+            restarts=0, max_evaluations=max(int(_FIRST_SHARE * max_evaluations), 1),
+            progress=Progress.named("levels for the speckle", progress),
         )  # fmt: skip
-    found = replace(fit_speckle(simulator, tracked, first.tissues, first.display), has_map=has_map)
-    return with_point_spread(simulator, tracked, found, first.display)
+    shares = Progress.shares("smoothing and texture of the speckle", progress)
+    found = replace(fit_speckle(simulator, tracked, first.tissues, first.display, shares), has_map=has_map)
+    shares = Progress.shares("point spread function of the speckle", progress)
+    return with_point_spread(simulator, tracked, found, first.display, shares)
 
 
 def _at_the_levels_of(found: DisplaySettings, given: DisplaySettings) -> DisplaySettings:

@@ -185,8 +185,8 @@ class CostPlot:
 
     def add(self, progress: Progress) -> None:
         """Add an evaluation; the views are updated a few times a second."""
-        if self.table.GetScene() is None:
-            return  # the user closed the scene
+        if self.table.GetScene() is None or not isfinite(progress.cost):
+            return  # the user closed the scene, or it is a step with another cost
         for column, value in zip(self._columns, (progress.evaluations, progress.cost, progress.best_cost), strict=True):
             column.InsertNextValue(value)
         if perf_counter() - self._drawn > _PLOT_EVERY:
