@@ -186,6 +186,7 @@ def optimize_appearance(
     *,
     free: Iterable[str] | Mapping[str, Bounds | None],
     display: DisplaySettings | None = None,
+    begin: tuple[TissueTable, DisplaySettings] | None = None,
     grid: ImageGrid | None = None,
     masks: Sequence[np.ndarray] | None = None,
     max_evaluations: int = FitSettings.evaluations,
@@ -205,7 +206,8 @@ def optimize_appearance(
     probe, poses : the probe of the references, and the (4, 4) probe_to_ras of each.
     references : (rows, columns) uint8 images.
     free : names of free parameters, or names with (low, high); see parameters.py.
-    display : starting values of the search.
+    display : the values before the fit, and of what is not free.
+    begin : tissues and display at whose free parameters the search begins instead, as an earlier fit has left them.
     grid : the pixels of the references in the probe frame (default: those of simulated images).
     masks : (rows, columns) bool each, the imaged field of a reference; only pixels inside both fields count.
     max_evaluations : largest number of evaluations of the cost of all images, without restarts.
@@ -246,7 +248,8 @@ def optimize_appearance(
     poses, references = list(poses), [np.asarray(reference) for reference in references]
     model = AppearanceModel(simulator, probe, poses, parameters.varied(), grid)
     cost = AppearanceCost(model, parameters, references, masks, tissues, display, settings)
-    problem = _problem(cost, references, masks, settings, algorithms, seed)
+    start = parameters.units(*(begin or (tissues, display)))
+    problem = _problem(cost, references, masks, settings, algorithms, seed, None if begin is None else start)
     limit = max_evaluations + restarts * (int(_RESTART_SHARE * max_evaluations) + 1) + _DRAWS
     limit += int(_SHARES[1] * max_evaluations) if restarts else 0
 
@@ -261,9 +264,10 @@ def optimize_appearance(
         _log.info("%d evaluations of an earlier run are reused", len(history))
     search = Search(cost, describe, limit, seed, progress, history)
 
-    start = parameters.units(tissues, display)
     before = cost.of_each(tissues, display)
     try:
+        if begin is not None:
+            cost.anchor(start)
         best = _searched(search, cost, start, algorithms, max_evaluations)
         again = _restarted(
             cost, search, simulator, best, restarts, int(_RESTART_SHARE * max_evaluations), algorithms[1]
@@ -470,6 +474,7 @@ def _problem(
     settings: SimilaritySettings,
     algorithms: tuple[str | None, str],
     seed: int,
+    begin: np.ndarray | None,
 ) -> dict[str, str]:
     """{name: fingerprint} of all inputs that determine the positions and costs of evaluations.
 
@@ -494,5 +499,5 @@ def _problem(
         "algorithms": algorithms,
         "seed": seed,
         "version": __version__,
-    }
+    } | ({} if begin is None else {"where the search begins": begin})
     return {name: fingerprint(part) for name, part in parts.items()}

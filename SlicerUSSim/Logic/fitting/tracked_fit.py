@@ -110,7 +110,7 @@ def fit(
     Registration requires similar images and the fit requires poses. Short fits and registrations therefore alternate,
     followed by the complete fit at the resulting poses. With `deform`, a short fit and a smooth deformation of the
     tissues follow (deformation.py), and all else is of the deformed patient. With `speckle`, a short fit with the real
-    images' grey map is followed by fit_speckle, and the complete fit begins there. Of the free parameters, "tissues"
+    images' grey map is followed by fit_speckle, and the complete fit begins where both have ended. Of the free parameters, "tissues"
     means those that the images can show (seen.py). `resume` and `checkpoint` are those of the complete fit.
     Raises SimulationError as those do.
     """
@@ -156,14 +156,14 @@ def fit(
         if patient is not simulator:
             patient.set_tissues(simulator.medium.tissues)
     begun = simulator.medium.tissues
-    start, found = display, None
+    start, begin, found = display, None, None
     if speckle:
         found, tracked = _speckle_of(patient, tracked, display, free, seed, settings, max_evaluations, progress)
-        start = _at_the_levels_of(found.display, display)
+        start, begin = _at_the_levels_of(found.display, display), (found.tissues, found.display)
     with patient.with_tissues(begun if found is None else _at_the_levels_of_tissues(found.tissues, begun)):
         appearance = appearance_at(
-            tracked.poses, display=start, restarts=restarts, max_evaluations=max_evaluations, resume=resume,
-            checkpoint=checkpoint, progress=progress,
+            tracked.poses, display=start, begin=begin, restarts=restarts, max_evaluations=max_evaluations,
+            resume=resume, checkpoint=checkpoint, progress=progress,
         )  # fmt: skip
     before = simulated(simulator, given, begun, display)
     after = simulated(patient, tracked, appearance.tissues, appearance.display)
@@ -205,7 +205,7 @@ def _speckle_of(
 
 
 def _at_the_levels_of(found: DisplaySettings, given: DisplaySettings) -> DisplaySettings:
-    """What was found of the speckle, with the rest as given: the complete fit begins at the user's values."""
+    """What was found of the speckle, with the rest as given: the user's values are those before the fit."""
     names = ("smoothing_axial_mm", "smoothing_lateral_deg", "grey_map", "map_black", "map_dark", "map_white")
     return replace(given, **{name: getattr(found, name) for name in names})
 
