@@ -9,6 +9,7 @@ import pytest
 from click.testing import CliRunner
 from scipy import ndimage
 from scipy.spatial.transform import Rotation
+from skimage.morphology import local_maxima
 
 from SlicerUSSim.Command.cli import main
 from SlicerUSSim.Logic import (
@@ -29,6 +30,7 @@ from SlicerUSSim.Logic.fitting.grey_statistics import grey_of_tissues, level_by_
 from SlicerUSSim.Logic.fitting.realism import BLURRED, LEVELLED, NEIGHBOURS, REAL, UNIFORM, blurred
 from SlicerUSSim.Logic.fitting.sheet_contrast import line_contrast, sheet_points, surfel_points, wall_points
 from SlicerUSSim.Logic.fitting.speckle_width import log_speckle_correlation
+from SlicerUSSim.Logic.fitting.texture_costs import local_extrema
 from SlicerUSSim.Logic.mri.samples import head_mri
 from SlicerUSSim.Logic.mri.sheets import Surfels
 from SlicerUSSim.Logic.probe import ImageGrid
@@ -79,6 +81,17 @@ def test_texture_cost_ignores_dark_patches_and_what_is_outside():
     dark = (image // 16).astype(np.uint8)
     nothing = texture_misfit(dark, dark, SPACING)
     assert np.isnan(nothing.autocorrelation) and np.isnan(nothing.extrema)
+
+
+def test_pixels_of_one_level_side_by_side_are_one_maximum():
+    """As codecs and saturation leave them: every one of them was counted."""
+    coarse = np.kron(np.random.default_rng(0).integers(1, 7, (30, 40)) * 40, np.ones((4, 4))).astype(np.uint8)
+    smooth = ndimage.gaussian_filter(coarse.astype(np.float32), 0.5)
+    for found, image in zip(local_extrema(coarse), (smooth, -smooth), strict=True):
+        _, expected = ndimage.label(local_maxima(image, connectivity=2), np.ones((3, 3)))
+        assert np.count_nonzero(found) == expected
+        assert local_maxima(image, connectivity=2)[found].all()
+    assert [np.count_nonzero(found) for found in local_extrema(np.full((50, 50), 200, np.uint8))] == [1, 1]
 
 
 def test_texture_reference_refuses_other_shapes_and_types():

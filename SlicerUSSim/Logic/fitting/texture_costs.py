@@ -134,14 +134,29 @@ def texture_misfit(
 def local_extrema(image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Two (rows, columns) bool: where an image has a maximum, or a minimum, among its eight neighbours.
 
-    After a Gaussian of half a pixel, and only where that is not black.
+    After a Gaussian of half a pixel, and only where that is not black. Of pixels of one level side by side, as codecs
+    and saturation leave them, the first one stands for all, if all beside them are darker (brighter).
     """
     smooth = ndimage.gaussian_filter(image.astype(np.float32), _EXTREMA_SIGMA)
     counted = smooth > _EXTREMA_LEVEL
-    return (
-        (smooth == ndimage.maximum_filter(smooth, 3)) & counted,
-        (smooth == ndimage.minimum_filter(smooth, 3)) & counted,
-    )
+    return _maxima(smooth, counted), _maxima(-smooth, counted)
+
+
+def _maxima(image: np.ndarray, counted: np.ndarray) -> np.ndarray:
+    """(rows, columns) bool: one pixel of each maximum among those that are counted."""
+    highest = ndimage.maximum_filter(image, 3)
+    found = (image == highest) & counted
+    # Two of one level beside each other, seldom
+    if not any((found & np.roll(found, step, (0, 1))).any() for step in ((0, 1), (1, 0), (1, 1), (1, -1))):
+        return found
+    regions, _ = ndimage.label(found, np.ones((3, 3)))  # type: ignore[misc]
+    # Beside pixels of the same level that have a brighter neighbour, a region is no maximum.
+    goes_on = found & (ndimage.maximum_filter(np.where(found, -np.inf, image), 3) == highest)
+    places = np.flatnonzero(found)
+    numbers, first = np.unique(regions.flat[places], return_index=True)
+    chosen = np.zeros(image.size, bool)
+    chosen[places[first[~np.isin(numbers, regions[goes_on])]]] = True
+    return chosen.reshape(image.shape)
 
 
 def _patches(inside: np.ndarray, size_mm: float, spacing_mm: tuple[float, float]) -> Iterator[tuple[slice, slice]]:

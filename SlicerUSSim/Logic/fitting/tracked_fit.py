@@ -110,8 +110,9 @@ def fit(
     Registration requires similar images and the fit requires poses. Short fits and registrations therefore alternate,
     followed by the complete fit at the resulting poses. With `deform`, a short fit and a smooth deformation of the
     tissues follow (deformation.py), and all else is of the deformed patient. With `speckle`, a short fit with the real
-    images' grey map is followed by fit_speckle, and the complete fit begins where both have ended. Of the free parameters, "tissues"
-    means those that the images can show (seen.py). `resume` and `checkpoint` are those of the complete fit.
+    images' grey map is followed by fit_speckle, and the complete fit begins where both have ended. Of the free
+    parameters, "tissues" means those that the images can show (seen.py). `resume` and `checkpoint` are those of the
+    complete fit.
     Raises SimulationError as those do.
     """
     display = display or DisplaySettings()
