@@ -39,6 +39,8 @@ _log = logging.getLogger(__name__)
 
 #: Fraction of the evaluations for a fit before registration.
 _FIRST_SHARE = 0.4
+#: Evaluations of a fit whose short one is good enough for a deformation to follow
+_LEAST_FOR_DEFORMATION = 300
 #: Successive registrations: bounds (mm and degrees) and evaluations. A fit at wrong poses is biased, and so is the
 #: registration after it; later ones start closer.
 _ROUNDS = ((8.0, 500), (4.0, 300), (2.0, 250))
@@ -145,6 +147,11 @@ def fit(
         )  # fmt: skip
         tracked, registration = _registered(simulator, tracked, short, step_from)
     deformation = None
+    if deform and max_evaluations < _LEAST_FOR_DEFORMATION:
+        _log.warning(
+            "the deformation is looked for after a short fit, of %d evaluations in all, expected at least %d: where levels "
+            "do not fit yet, it stands for them", max_evaluations, _LEAST_FOR_DEFORMATION,
+        )  # fmt: skip
     if deform:
         first = appearance_at(
             tracked.poses, display=display, restarts=0, max_evaluations=max(int(_FIRST_SHARE * max_evaluations), 1),
