@@ -107,13 +107,14 @@ def test_a_displaced_ball_is_found_again_and_a_true_one_is_left_alone():
 
 
 @pytest.mark.slow
-def test_a_fit_deforms_before_it_fits_and_says_so():
+def test_a_fit_deforms_before_it_fits_and_says_so(caplog):
     tracked, made = tracked_on(labels(4.0)), simulator(labels(), 2)
     free = ["gain_db"]
     plain = fit(made, tracked, free=free, display=replace(PLAIN, gain_db=0.0), max_evaluations=60, restarts=0)
     found = fit(
         made, tracked, free=free, display=replace(PLAIN, gain_db=0.0), max_evaluations=60, restarts=0, deform=True
     )
+    assert "short fit, of 60 evaluations in all, expected at least 300" in caplog.text
     assert found.deformation is not None and found.simulator is not None
     assert plain.deformation is None and plain.simulator is None
     assert found.appearance.cost_after < plain.appearance.cost_after - 0.01

@@ -149,8 +149,8 @@ def fit(
     deformation = None
     if deform and max_evaluations < _LEAST_FOR_DEFORMATION:
         _log.warning(
-            "the deformation is looked for after a short fit, of %d evaluations in all, expected at least %d: where levels "
-            "do not fit yet, it stands for them", max_evaluations, _LEAST_FOR_DEFORMATION,
+            "the deformation is looked for after a short fit, of %d evaluations in all, expected at least %d: where "
+            "levels do not fit yet, it stands for them", max_evaluations, _LEAST_FOR_DEFORMATION,
         )  # fmt: skip
     if deform:
         first = appearance_at(
