@@ -457,17 +457,17 @@ PROBES: dict[str, Probe] = {
     "abdominal": ConvexProbe(
         radius_mm=60.0, field_of_view_deg=70.0, depth_mm=160.0, frequency_mhz=3.5, aperture_mm=20.0,
         band_mhz=(2.6, 4.4),
-        elevation_aperture_mm=12.0,
+        elevation_aperture_mm=12.0, ring_down_mm=3.0,
     ),
     "cardiac": PhasedProbe(  # 64 elements of 0.3 mm
         field_of_view_deg=90.0, depth_mm=160.0, frequency_mhz=2.7, fractional_bandwidth=0.74,
         band_mhz=(1.7, 3.7), aperture_mm=19.2,
-        elevation_aperture_mm=14.0, elevation_focus_mm=60.0,
+        elevation_aperture_mm=14.0, elevation_focus_mm=60.0, ring_down_mm=3.0,
     ),
     "transcranial": PhasedProbe(  # for the temporal bone
         field_of_view_deg=90.0, depth_mm=140.0, frequency_mhz=2.0, fractional_bandwidth=0.6,
         band_mhz=(1.4, 2.6), aperture_mm=19.2, receive_f_number=1.5, focus_mm=70.0,
-        elevation_aperture_mm=14.0, elevation_focus_mm=70.0,
+        elevation_aperture_mm=14.0, elevation_focus_mm=70.0, ring_down_mm=3.0,
     ),
     "neonatal": ConvexProbe(  # for the anterior fontanelle
         radius_mm=11.0, field_of_view_deg=110.0, depth_mm=80.0, frequency_mhz=7.5, fractional_bandwidth=0.6,
@@ -492,6 +492,6 @@ PROBES: dict[str, Probe] = {
     "matrix": PhasedProbe(  # 3000 elements half a wavelength apart; its elevational focus is electronic
         field_of_view_deg=90.0, depth_mm=140.0, frequency_mhz=3.0, fractional_bandwidth=0.8,
         band_mhz=(1.8, 4.2), aperture_mm=14.0,
-        elevation_aperture_mm=14.0,
+        elevation_aperture_mm=14.0, ring_down_mm=3.0,
     ),
 }  # fmt: skip
