@@ -98,7 +98,8 @@ class TrackedImages:
         spacing = _pixel_spacing(matrices[0], path)
         if field is None:
             field = _located_field(sequence, images, spacing, probe, beam)
-        seen = visible_part(_as_uint8(spread_images(sequence.images)), field.mask, sequence.coloured)
+        every = _as_uint8(spread_images(sequence.images))
+        seen = visible_part(every, field.mask, sequence.coloured, is_recorded=sequence.is_recorded)
         require(bool(seen.any()), "nothing of the probe's field is seen in the images")
         for number, image in zip(kept, images, strict=True):
             low, high = int(image[seen].min()), int(image[seen].max())

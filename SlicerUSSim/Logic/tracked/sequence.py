@@ -34,6 +34,8 @@ SEQUENCE_SUFFIXES = (".igs.mha", ".seq.mha", ".mha", ".mhd", ".seq.nrrd", ".nrrd
 _FRAME_FIELD = re.compile(r"Seq_Frame(\d+)_(.+)")
 #: Field of sequences whose images are simulated
 SIMULATED = "SlicerUSSimSimulated"
+#: Field of sequences whose images are slices of a 3D ultrasound volume
+_CUT = "SlicerUSSimCutFromVolume"
 _ORIENTATION, _TYPE = "UltrasoundImageOrientation", "UltrasoundImageType"
 _OK = "OK"
 #: Fields of ITK and NRRD files that do not belong to a sequence.
@@ -104,6 +106,11 @@ class TrackedSequence:
     def is_simulated(self) -> bool:
         """Whether its images say that this package simulated them, as a twin's and those of `ussim sweep` do."""
         return SIMULATED in self.fields or MADE_BY in self.fields
+
+    @property
+    def is_recorded(self) -> bool:
+        """Whether a scanner may have drawn over its images: neither simulated nor slices of a volume."""
+        return not self.is_simulated and _CUT not in self.fields
 
     # ---- poses -------------------------------------------------------------------------------------------------
 
@@ -281,7 +288,7 @@ class TrackedSequence:
         images = [np.where(inside, slice_under_probe(volume, grid, pose), 0) for pose in poses]
         array = np.clip(np.stack(images), 0, 255).round().astype(np.uint8)
         transforms = tuple({"ImageToProbe": grid.image_to_probe, "ProbeToReference": pose} for pose in poses)
-        return cls(array, transforms, np.arange(len(poses), dtype=float))
+        return cls(array, transforms, np.arange(len(poses), dtype=float), fields={_CUT: "True"})
 
 
 def is_tracked_sequence(path: str | os.PathLike) -> bool:
