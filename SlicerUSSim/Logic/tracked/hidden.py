@@ -51,6 +51,8 @@ _MOST_IMAGES = 200
 #: Of the field at 255 grey levels, from which images are said to be saturated
 _SATURATED = 0.02
 _WHITE = 255
+#: Of the pixels at the border of images that are white in all of them: more is a background that should be black
+_INVERTED = 0.5
 
 
 def spread_images(images: np.ndarray) -> np.ndarray:
@@ -100,6 +102,21 @@ def visible_part(
         _say(drawn, seen, "are the same in all images, as text, rulers, logos and boxes are")
         seen = seen & ~drawn
     return seen
+
+
+def look_inverted(images: np.ndarray) -> bool:
+    """Whether the border of (n, rows, columns) uint8 images is white rather than black, as after 255 - image; said."""
+    darkest = spread_images(images).min(axis=0)
+    border = np.concatenate([darkest[[0, -1]].ravel(), darkest[:, [0, -1]].ravel()])
+    share = float((border >= _WHITE - _DARK).mean())
+    if share <= _INVERTED:
+        return False
+    _log.warning(
+        "the images look inverted: %.0f %% of their border is white, expected black around the probe's field, and what "
+        "echoes more to be brighter",
+        100 * share,
+    )
+    return True
 
 
 def _say(hidden: np.ndarray, of: np.ndarray, what: str) -> None:
