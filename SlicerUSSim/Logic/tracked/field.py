@@ -183,7 +183,7 @@ def draw_field(path: str | os.PathLike, image: np.ndarray, field: ImagedField) -
 
 
 def bright_region(images: np.ndarray) -> np.ndarray:
-    """(rows, columns) bool: the largest connected region that is bright in any image, without holes and thin attachments.
+    """(rows, columns) bool: the largest connected region bright in any image, without holes and thin attachments.
 
     Raises SimulationError for black images.
     """

@@ -12,6 +12,8 @@ from collections.abc import Sequence
 import numpy as np
 from scipy import ndimage
 
+from SlicerUSSim.Logic.base.errors import require
+
 _log = logging.getLogger(__name__)
 
 #: Largest grey level of black, as codecs leave it
@@ -46,6 +48,8 @@ _MOST_DRAWN = 0.15
 _AROUND = 2
 #: Smooth edges of what is drawn: least grey level above the surroundings, and largest part of their change
 _SMOOTH, _EDGE_SHARE = 15, 0.6
+#: Of what is bright in the field: colours in more are no Doppler box
+_MOST_COLOURED = 0.5
 #: Most images that are looked at
 _MOST_IMAGES = 200
 #: Of the field at 255 grey levels, from which images are said to be saturated
@@ -74,11 +78,18 @@ def visible_part(
     coloured : (rows, columns) bool, pixels that have a colour in any image, such as Doppler's.
     is_recorded : whether a scanner may have drawn over the images; not so for simulated ones.
 
-    What is left out is logged as a warning.
+    What is left out is logged as a warning. Raises SimulationError if most of what is bright has colours.
     """
     images = spread_images(images)
     seen: np.ndarray = field & ~_cut_off(images.max(axis=0), field)
     if coloured is not None and (coloured & seen).any():
+        bright = seen & (images.max(axis=0) > _DRAWN)
+        share = float((coloured & bright).sum() / max(bright.sum(), 1))
+        require(
+            share <= _MOST_COLOURED,
+            f"{share:.0%} of what is bright in the probe's field has colours, and not those of one colour map "
+            "from black on, expected grey levels, with colours in a Doppler box at most",
+        )
         hidden = np.asarray(ndimage.binary_dilation(coloured, iterations=_AROUND), bool) & seen
         _say(hidden, seen, "have colours, as of Doppler or markers")
         seen &= ~hidden

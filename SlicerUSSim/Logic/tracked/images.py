@@ -20,6 +20,8 @@ _log = logging.getLogger(__name__)
 
 #: Largest cosine between the axes of an image that still counts as perpendicular.
 _SKEW = 1e-3
+#: Of the field: an image that is brighter than black, as codecs leave it, in less of it cannot be compared
+_LEAST_SHOWN, _BLACK = 0.02, 4
 #: Least area of a given probe's field by that of what images show, which may have other bright areas beside it, and
 #: largest area by that of an image, which may be cropped
 _LEAST_AREA, _MOST_AREA = 1 / 3, 4.0
@@ -72,8 +74,9 @@ class TrackedImages:
             scanner draws over it is looked for again.
 
         Raises SimulationError for images that do not exist or were not tracked, a skewed calibration, a field that
-        cannot be estimated or whose size is not that of what images show, and images that are entirely black or of one grey level. A calibration that mirrors,
-        saturated or inverted images, and what a file cuts off or a scanner draws over the field (hidden.py) are warned of.
+        cannot be estimated or whose size is not that of what images show, colours in most of it, and images that are
+        black or of one grey level (nearly everywhere). A calibration that mirrors, saturated, inverted or tinted
+        images, and what a file cuts off or a scanner draws over the field (hidden.py) are warned of.
         """
         require(
             sequence.image_type == "BRIGHTNESS",
@@ -112,6 +115,12 @@ class TrackedImages:
             low, high = int(image[seen].min()), int(image[seen].max())
             require(
                 low < high, f"image {number} has the grey level {low} in all of the probe's field, expected a patient"
+            )
+            shown = float((image[seen] > _BLACK).sum() / field.mask.sum())
+            require(
+                shown >= _LEAST_SHOWN,
+                f"image {number} shows something in {shown:.1%} of the probe's field only, where nothing hides it, "
+                f"expected at least {_LEAST_SHOWN:.0%}",
             )
         field = replace(field, mask=seen)
         to_ras = np.eye(4) if reference_to_ras is None else check_rigid("reference_to_ras", reference_to_ras)
