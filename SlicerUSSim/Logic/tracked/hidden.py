@@ -40,6 +40,8 @@ _ALWAYS_BRIGHT = 100
 _WIDE, _STEP = 27, 3
 #: A mark of fewer pixels counts if as many are alike: anywhere in many images, in few within one row or column
 _WHOLE_MARK, _ALIKE, _MANY_IMAGES = 4, 4, 10
+#: How many times as many as by chance are clearly more
+_CLEARLY = 6.0
 #: Edges of a field that are found in images may lie outside what is bright, pixels
 _RIM = 6
 #: Of the field: more that stays the same is a recording of one place, and not drawn
@@ -235,8 +237,11 @@ def _marks(core: np.ndarray, images: int) -> np.ndarray:
         counts[small] = True
     elif len(small) >= _ALIKE:
         centres = np.array(ndimage.center_of_mass(core, labels, small))
-        for places in centres.T:
-            counts[small] |= (np.abs(places[:, None] - places) <= 1.0).sum(axis=1) >= _ALIKE
+        for places, extent in zip(centres.T, core.shape, strict=True):
+            # In few images single pixels are alike by chance, and as many lie in any row as in others
+            by_chance = 3.0 * len(small) / extent
+            aligned = (np.abs(places[:, None] - places) <= 1.0).sum(axis=1)
+            counts[small] |= aligned >= _ALIKE + _CLEARLY * by_chance
     return counts[labels]
 
 

@@ -49,9 +49,9 @@ _COLOURED = 24
 _BRIGHT, _TINTED = 40, 4
 #: Of what is bright: more with a colour at its level is a colour map, whose curve holds for at least as many
 _MOST_COLOURED, _ON_CURVE = 0.5, 0.8
-#: Least part of all pixels at a grey level that counts in a colour map, and largest step of a colour from such a level
-#: to the next
-_COMMON, _JUMP = 1e-4, 48
+#: Least part of all pixels at a grey level that counts in a colour map; largest step of a colour from such a level to
+#: the next, and how much more per level: red makes a third of a grey level
+_COMMON, _JUMP, _SLOPE = 1e-4, 48, 3
 _OPPOSITE = {"M": "U", "U": "M", "F": "N", "N": "F"}
 
 
@@ -490,7 +490,7 @@ def _as_images(array: np.ndarray, components: int, source: str) -> _Pixels:
         array = (colours @ np.array([0.299, 0.587, 0.114])).round().astype(array.dtype)  # ITU-R BT.601
         is_coloured = _are_coloured(colours, array, source)
         if is_coloured.any():
-            coloured = is_coloured.reshape(-1, *is_coloured.shape[-2:]).any(axis=0)
+            coloured = np.asarray(is_coloured.reshape(-1, *is_coloured.shape[-2:]).any(axis=0), bool)
     if array.ndim == 4:
         require(array.shape[1] == 1, f"{source}: has volumes of {array.shape[1]} slices, expected images")
         array = array[:, 0]
@@ -538,7 +538,9 @@ def _colour_maps(colours: np.ndarray, grey: np.ndarray) -> Iterable[np.ndarray]:
         counts = np.bincount(levels + colours[..., channel].ravel(), minlength=256 * 256).reshape(256, 256)
         curve[:, channel] = (2 * counts.cumsum(axis=1) >= number[:, None]).argmax(axis=1)
     common = np.flatnonzero(number >= _COMMON * number.sum())
-    if len(common) and curve[common[0]].max() <= _COLOURED and np.abs(np.diff(curve[common], axis=0)).max() <= _JUMP:
+    if not len(common) or curve[common[0]].max() > _COLOURED:
+        return
+    if (np.abs(np.diff(curve[common], axis=0)).max(axis=1) <= _JUMP + _SLOPE * np.diff(common)).all():
         yield curve
 
 
