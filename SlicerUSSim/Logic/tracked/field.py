@@ -169,6 +169,7 @@ def draw_field(path: str | os.PathLike, image: np.ndarray, field: ImagedField) -
 
     shown = np.repeat(np.asarray(image, np.uint8)[..., None], 3, axis=2)
     hidden = ImagedField.of(field.probe, field.image_to_probe, field.mask.shape).mask & ~field.mask
+    shown[hidden, :2] //= 2
     shown[hidden, 2] = np.maximum(shown[hidden, 2], 110)  # blue: in the field, but cut off or drawn over
     picture = Image.fromarray(shown)
     draw = ImageDraw.Draw(picture)
