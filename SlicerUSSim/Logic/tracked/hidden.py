@@ -40,6 +40,9 @@ _ALWAYS_BRIGHT = 100
 _WIDE, _STEP = 27, 3
 #: A mark of fewer pixels counts if as many are alike: anywhere in many images, in few within one row or column
 _WHOLE_MARK, _ALIKE, _MANY_IMAGES = 4, 4, 10
+#: Near a mark what stands out as sharply, and changes by less than this part of what its surroundings do, is one too;
+#: half the gap between letters, pixels
+_ALIKE_SHARE, _GAP = 0.25, 3
 #: How many times as many as by chance are clearly more
 _CLEARLY = 6.0
 #: Edges of a field that are found in images may lie outside what is bright, pixels
@@ -106,6 +109,7 @@ def visible_part(
         )
     if not is_recorded:
         return seen
+    images = _different(images, seen)
     untold = _why_untold(images, seen)
     if untold:
         _log.warning("text, rulers and other marks in the images could not be looked for: %s", untold)
@@ -169,10 +173,16 @@ def _cut_off(brightest: np.ndarray, field: np.ndarray) -> np.ndarray:
     return hidden
 
 
+def _different(images: np.ndarray, field: np.ndarray) -> np.ndarray:
+    """Those of the images that are not the same as one before them, as of a frozen scanner."""
+    first = {image[field].tobytes(): number for number, image in reversed(list(enumerate(images)))}
+    return images[sorted(first.values())]
+
+
 def _why_untold(images: np.ndarray, field: np.ndarray) -> str:
     """Why what is drawn cannot be told from the patient in these images; empty if it can."""
     if len(images) < _LEAST_IMAGES:
-        return f"{len(images)} image{'s' * (len(images) > 1)}, expected at least {_LEAST_IMAGES} of a moving probe"
+        return f"{len(images)} different image{'s' * (len(images) > 1)}, expected at least {_LEAST_IMAGES}"
     low, high = images.min(axis=0)[field].astype(int), images.max(axis=0)[field].astype(int)
     shows = high > _ALWAYS_DARK
     change = float(np.median((high - low)[shows])) if shows.any() else 0.0
@@ -205,11 +215,16 @@ def _drawn_over(images: np.ndarray, field: np.ndarray, below: int) -> np.ndarray
     is_changing = changes >= _CHANGING
     most = np.where(is_changing & (around < _ALWAYS_BRIGHT), np.maximum(_SAME_SHARE * changes, _SAME), _SAME)
     told = inside & (is_changing | (brightest <= _ALWAYS_DARK)) & (high < below)
-    core = told & (low >= _DRAWN) & (low - around >= _DRAWN) & (change <= most)
-    core &= beside - ndimage.minimum_filter(beside, 3) >= _SHARP
-    drawn = _marks(core, len(images))
+    stands_out = told & (low >= _DRAWN) & (low - around >= _DRAWN)
+    stands_out &= beside - ndimage.minimum_filter(beside, 3) >= _SHARP
+    drawn = _marks(stands_out & (change <= most), len(images))
     if not drawn.any():
         return drawn
+    # Codecs change some letters of a line more than others
+    share = _ALIKE_SHARE if len(images) >= _MANY_IMAGES else _SAME_SHARE
+    alike = drawn | (stands_out & (change <= np.where(around < _ALWAYS_BRIGHT, share * changes, _SAME)))
+    line, _ = _components(np.asarray(ndimage.binary_dilation(alike, iterations=_GAP), bool))
+    drawn = alike & np.isin(line, line[drawn])
     # The inside of a logo is drawn as its edge is, and of letters their smooth edges and the gaps between strokes
     same = field & (change <= _SAME) & (low >= _DRAWN) & (high < below)
     drawn = np.asarray(ndimage.binary_propagation(drawn, structure=np.ones((3, 3)), mask=drawn | same), bool)
