@@ -66,6 +66,7 @@ def refused(path: Path, words: str, read=Volume.read) -> None:
         (b"-1 0 0 0 -1 0 0 0 1", b"-1 0 0 0 -1 0 0 nan 1", "TransformMatrix is"),
         (b"DimSize = 4 5 6", b"DimSize = 4 5 4294967296", "has 4x5x4294967296 voxels, expected at most"),
         (b"DimSize = 4 5 6", b"DimSize = 4 5 600000", "which its"),
+        (b"DimSize = 4 5 6", b"DimSize = 4 5 12", "enough for 6 of 12 slices"),  # the rest was what the memory held
         (b"DimSize = 4 5 6", b"DimSize = 4 5", "DimSize is '4 5', expected 3 numbers above 0"),
         (b"ElementSpacing = 1 1 2", b"ElementSpacing = 1 1 \xff", "is not text"),
         (b"ElementDataFile", b"ElementDataPile", "its header"),

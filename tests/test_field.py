@@ -7,7 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from hypothesis import assume, given, strategies as st
-from PIL import Image
+from PIL import Image, ImageDraw
+from scipy import ndimage
 
 from SlicerUSSim.Logic import ConvexProbe, LinearProbe, PhasedProbe, SimulationError, TrackedSequence
 from SlicerUSSim.Logic.probe.image_grid import ImageGrid
@@ -306,25 +307,203 @@ def test_text_and_boxes_in_the_field_are_left_out_and_said(caplog):
     assert found.field.mask[middle[0] + 60, middle[1]]  # inside the box the patient is seen
 
 
-def test_colours_are_left_out_and_said(tmp_path, caplog):
+def letters(shape: tuple[int, int], row: int, column: int, height: int) -> np.ndarray:
+    """(rows, columns) float, the part of each pixel that strokes of eight letters cover: their edges are smooth."""
+    fine = 8
+    drawing = Image.new("L", (shape[1] * fine, shape[0] * fine))
+    pen = ImageDraw.Draw(drawing)
+    a, e = [(0, 1), (0.4, 0), (0.8, 1)], [(0.7, 0), (0, 0), (0, 0.5), (0.6, 0.5), (0, 0.5), (0, 1), (0.7, 1)]
+    for place in range(8):
+        points = [
+            ((column + (x + place) * height) * fine + 3, (row + y * height) * fine + 3) for x, y in (a, e)[place % 2]
+        ]
+        pen.line(points, fill=255, width=round(0.12 * height * fine))
+    return np.asarray(drawing, float).reshape(shape[0], fine, shape[1], fine).mean(axis=(1, 3)) / 255
+
+
+def drawn_over(sequence: TrackedSequence, part: np.ndarray, level: int = 240) -> TrackedSequence:
+    """The images under a drawing that covers a part (rows, columns) of each pixel."""
+    images = (sequence.images * (1 - part) + level * part).round().astype(np.uint8)
+    return sequence.with_images(range(len(sequence)), images)
+
+
+def speckled(probe, count: int = 12) -> TrackedSequence:
+    """A recording whose speckle has grains, and whose images have much in common, as those of a slow sweep."""
+    sequence = recording(probe, count + 2)
+    noise = ndimage.gaussian_filter(np.random.default_rng(5).normal(size=sequence.images.shape), (1, 1.2, 2))[1:-1]
+    levels = np.clip(60 + 45 * noise / noise.std(), 0, 255)
+    inside = sequence.images.max(axis=0) > 0
+    return sequence.with_images(range(count), np.where(inside, levels, 0).astype(np.uint8))
+
+
+@pytest.mark.parametrize("height", [10, 14, 20])
+@pytest.mark.parametrize("count", [4, 12])
+def test_letters_with_smooth_edges_are_left_out(height, count, caplog):
+    """Of text 10 pixels high nothing was left out, of 14 pixels half."""
+    sequence = speckled(CONVEX, count)
+    rows, columns = sequence.images.shape[1:]
+    part = letters((rows, columns), rows // 2, columns // 2 - 4 * height, height)
+    found = TrackedImages.of(drawn_over(sequence, part), probe=CONVEX)
+    assert "are the same in all images, as text, rulers, logos and boxes are" in caplog.text
+    whole = ImagedField.of(CONVEX, found.field.image_to_probe, (rows, columns)).mask
+    hidden = whole & ~found.field.mask
+    assert (hidden & (part > 0.1)).sum() > 0.95 * (part > 0.1).sum()
+    assert (hidden & ~ndimage.binary_dilation(part > 0, iterations=8)).sum() < 10
+
+
+@pytest.mark.parametrize("step", [(20, 0), (5, 0), (3, 4)], ids=["ticks", "dots", "oblique dots"])
+def test_ticks_and_dots_are_left_out(step, caplog):
+    sequence = speckled(CONVEX)
+    part = np.zeros(sequence.images.shape[1:])
+    for number in range(10):
+        row, column = 150 + number * step[0], part.shape[1] // 2 + number * step[1]
+        part[row, column : column + (3 if step[0] == 20 else 1)] = 1
+    found = TrackedImages.of(drawn_over(sequence, part), probe=CONVEX)
+    assert "are the same in all images" in caplog.text
+    assert not found.field.mask[part > 0].any()
+
+
+def test_a_patient_who_does_not_change_is_not_drawn(caplog):
+    """Smooth bright lines that stay the same, as of a bone, and what is bright at the face, as in a real sweep."""
+    sequence = speckled(CONVEX)
+    rows, columns = np.indices(sequence.images.shape[1:])
+    to_probe = sequence.transforms[0]["ImageToProbe"]
+    x, y = to_probe[0, 0] * columns + to_probe[0, 3], to_probe[1, 1] * rows + to_probe[1, 3]
+    depth_mm = np.hypot(x, y + CONVEX.radius_mm) - CONVEX.radius_mm
+    still = np.maximum(
+        200 * np.exp(-0.5 * ((rows - 200) / 3) ** 2), 150 * np.exp(-0.5 * (depth_mm / (3 * to_probe[1, 1])) ** 2)
+    )
+    images = np.where(sequence.images.max(axis=0) > 0, np.maximum(sequence.images, still), 0)
+    found = TrackedImages.of(sequence.with_images(range(len(images)), images.astype(np.uint8)), probe=CONVEX)
+    whole = ImagedField.of(CONVEX, found.field.image_to_probe, images.shape[1:]).mask
+    np.testing.assert_array_equal(found.field.mask, whole)
+    assert "same in all images" not in caplog.text and "could not be looked for" not in caplog.text
+
+
+def test_images_that_cannot_tell_what_is_drawn_are_said(caplog):
+    few = speckled(CONVEX, 3)
+    TrackedImages.of(few, probe=CONVEX)
+    assert "marks in the images could not be looked for: 3 different images, expected at least 4" in caplog.text
+    caplog.clear()
+    TrackedImages.of(few.with_images([0] * 6, few.images[[0] * 6]), probe=CONVEX)
+    assert "could not be looked for: 1 different image, expected at least 4" in caplog.text
+    caplog.clear()
+    still = few.images[[0] * 6] + np.arange(6, dtype=np.uint8)[:, None, None] * (few.images[0] > 0)
+    TrackedImages.of(few.with_images([0] * 6, still.astype(np.uint8)), probe=CONVEX)
+    assert "changes by at most 5 grey levels from image to image, expected 20 or more" in caplog.text
+    caplog.clear()
+    TrackedImages.of(replace(few, fields={"SlicerUSSimSimulated": "twin 1"}), probe=CONVEX)
+    assert "could not be looked for" not in caplog.text
+
+
+def test_the_dark_tip_of_a_sector_is_no_cut(caplog):
+    """One image of a real sweep ended "4 before the left end of the probe's field", where it was dark."""
+    sequence = recording(CONVEX, 1)
+    images = sequence.images.copy()
+    columns = np.arange(images.shape[2])
+    images[0][np.random.default_rng(1).random(images.shape[1:]) > (columns - 4) / 25] = 0
+    TrackedImages.of(sequence.with_images([0], images), probe=CONVEX)
+    assert "the images end at" not in caplog.text
+
+
+def test_pixels_of_another_size_are_named():
+    sequence = recording(CONVEX)
+    large = sequence.transforms[0]["ImageToProbe"] @ np.diag([10.0, 10.0, 1.0, 1.0])
+    scaled = sequence.with_transforms({"ImageToProbe": large})
+    with pytest.raises(SimulationError, match=r"check the size of a pixel in ImageToReference or the calibration"):
+        TrackedImages.of(scaled, probe=CONVEX)
+    with pytest.raises(
+        SimulationError, match=r"radius_mm is 400.* pixels are 1.67 x 1.67 mm large, check the calibration"
+    ):
+        TrackedImages.of(scaled)
+
+
+def test_inverted_images_are_said(caplog):
+    sequence = recording(CONVEX)
+    shown = np.pad(sequence.images, ((0, 0), (4, 4), (4, 4)))
+    TrackedImages.of(sequence.with_images(range(6), 255 - shown), probe=CONVEX)
+    assert "the images look inverted: 100 % of their border is white, expected black" in caplog.text
+    caplog.clear()
+    TrackedImages.of(sequence.with_images(range(6), shown), probe=CONVEX)
+    assert "inverted" not in caplog.text
+
+
+def test_an_image_that_shows_nearly_nothing_is_refused():
+    sequence = recording(CONVEX)
+    images = sequence.images.copy()
+    images[1] = 0
+    images[1, 200, 150:180] = 90
+    with pytest.raises(SimulationError, match=r"image 1 shows something in 0.0% of the probe's field only"):
+        TrackedImages.of(sequence.with_images(range(6), images), probe=CONVEX)
+
+
+def in_colours(path, sequence: TrackedSequence, colours: np.ndarray) -> TrackedSequence:
+    """The sequence with (n, rows, columns, 3) colours, as read from a file."""
     import SimpleITK as sitk
 
+    sequence.write(path)
+    grey = sitk.ReadImage(str(path))
+    colour = sitk.GetImageFromArray(colours, isVector=True)
+    for key in grey.GetMetaDataKeys():
+        colour.SetMetaData(key, grey.GetMetaData(key))
+    sitk.WriteImage(colour, str(path))
+    return TrackedSequence.read(path)
+
+
+@pytest.mark.parametrize(
+    "tint",
+    [
+        np.outer(np.arange(256), [1, 0.85, 0.6]),
+        np.outer(np.arange(256), [1, 0.97, 0.85]),
+        np.clip(np.arange(256)[:, None] * 3 - np.array([0, 255, 510]), 0, 255),
+    ],
+    ids=["sepia", "slight", "hot iron"],
+)
+def test_tinted_images_are_grey_levels_and_that_is_said(tint, tmp_path, caplog):
+    """Sepia was Doppler's: what was left of the field was black, and fitted."""
+    sequence = recording(CONVEX)
+    read = in_colours(tmp_path / "tinted.mha", sequence, tint.astype(np.uint8)[sequence.images])
+    assert "the images are tinted: 100 % of what is bright has the colours of one colour map" in caplog.text
+    levels = tint.astype(np.uint8)[sequence.images] @ [0.299, 0.587, 0.114]
+    assert np.abs(read.images - levels).max() <= 0.5 + 1e-9
+    found = TrackedImages.of(read, probe=CONVEX)
+    assert "have colours" not in caplog.text
+    assert found.field.mask.sum() == ImagedField.of(CONVEX, found.field.image_to_probe, levels.shape[1:]).mask.sum()
+
+
+def test_doppler_in_tinted_images_is_left_out(tmp_path, caplog):
+    sequence = recording(CONVEX)
+    colours = (sequence.images[..., None] * np.array([1, 0.85, 0.6])).astype(np.uint8)
+    box = (slice(180, 240), slice(150, 220))
+    colours[(slice(None), *box, 0)] = 250
+    found = TrackedImages.of(in_colours(tmp_path / "tinted.mha", sequence, colours), probe=CONVEX)
+    assert "the images are tinted" in caplog.text and "have colours, as of Doppler or markers" in caplog.text
+    assert found.field.mask[box].mean() < 0.05
+    clean = ImagedField.of(CONVEX, found.field.image_to_probe, colours.shape[1:3]).mask
+    assert not (clean & ~found.field.mask)[:170].any()
+
+
+def test_colours_that_are_no_colour_map_are_refused_where_most_is_coloured(tmp_path):
+    sequence = recording(CONVEX)
+    level = sequence.images.astype(float)
+    rainbow = np.stack([level, 255 - np.abs(2 * level - 255), 255 - level], axis=-1) * (level > 0)[..., None]
+    read = in_colours(tmp_path / "rainbow.mha", sequence, rainbow.astype(np.uint8))
+    with pytest.raises(SimulationError, match=r"% of what is bright .* has colours, .* expected grey levels"):
+        TrackedImages.of(read, probe=CONVEX)
+
+
+def test_colours_are_left_out_and_said(tmp_path, caplog):
     sequence = recording(CONVEX, 2)
-    sequence.write(tmp_path / "grey.mha")
-    grey = sitk.ReadImage(str(tmp_path / "grey.mha"))
-    array = np.repeat(sitk.GetArrayFromImage(grey)[..., None], 3, axis=-1)
+    array = np.repeat(sequence.images[..., None], 3, axis=-1)
     middle = np.array(array.shape[1:3]) // 2
     flow = (slice(middle[0], middle[0] + 20), slice(middle[1], middle[1] + 30))
     array[(1, *flow)] = 200, 30, 10
-    colour = sitk.GetImageFromArray(array, isVector=True)
-    for key in grey.GetMetaDataKeys():
-        colour.SetMetaData(key, grey.GetMetaData(key))
-    sitk.WriteImage(colour, str(tmp_path / "colour.mha"))
-    read = TrackedSequence.read(tmp_path / "colour.mha")
+    read = in_colours(tmp_path / "colour.mha", sequence, array)
     assert read.coloured is not None and read.coloured.sum() == 600
     found = TrackedImages.of(read, probe=CONVEX)
     assert "have colours, as of Doppler or markers: left out" in caplog.text
     assert not found.field.mask[flow].any()
+    sequence.write(tmp_path / "grey.mha")
     assert TrackedSequence.read(tmp_path / "grey.mha").coloured is None
 
 

@@ -308,6 +308,14 @@ def test_command_says_numbers_with_controls(twin, tmp_path):
     assert (tmp_path / "realism.png").stat().st_size > 10_000
 
 
+def test_an_image_without_a_bright_patch_is_dark():
+    """Its T1 is no number, and a fit says so."""
+    image = speckle((0.3, 0.8))
+    assert not TextureReference(image, SPACING).is_dark
+    assert TextureReference(image // 30, SPACING).is_dark
+    assert np.isnan(TextureReference(image // 30, SPACING).misfit(image).autocorrelation)
+
+
 @pytest.mark.slow
 @needs_shared
 def test_costs_of_a_real_sweep_are_those_found_by_trial():

@@ -16,6 +16,7 @@ import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import BinaryIO
 from xml.parsers import expat
 
 from SlicerUSSim.Logic.base.dicom_elements import is_compressed, require_sound_elements
@@ -170,6 +171,55 @@ _GEOMETRY = (
     (("ElementSpacing", "ElementSize", "Offset", "Position", "Origin", "CenterOfRotation"), False),
     (("TransformMatrix", "Rotation", "Orientation"), True),
 )
+
+
+def require_whole_metaimage(path: Path) -> None:
+    """Raise SimulationError for a MetaImage whose compressed voxels are fewer than its DimSize says.
+
+    MetaIO leaves the rest as the memory was. Files of other formats pass, and so do voxels in several files.
+    """
+    if path.suffix.lower() not in (".mha", ".mhd"):
+        return
+    fields = _metaimage_fields(path)
+    voxels = path if fields["ElementDataFile"] == "LOCAL" else path.parent / fields["ElementDataFile"]
+    size = _METAIMAGE_BYTES.get(fields.get("ElementType", "").removesuffix("_ARRAY"))
+    if fields.get("CompressedData", "").lower() not in ("true", "t", "1") or size is None or "HeaderSize" in fields:
+        return
+    if not voxels.is_file():
+        return
+    dimensions = _whole(path, fields, "DimSize")
+    channels = int(fields.get("ElementNumberOfChannels", "1"))
+    slices, one = dimensions[-1], math.prod(dimensions[:-1]) * channels * size
+    unpack, found = zlib.decompressobj(32 + zlib.MAX_WBITS), 0
+    try:
+        with voxels.open("rb") as file:
+            if voxels == path:
+                _skip_metaimage_header(file)
+            while not unpack.eof and (chunk := file.read(_CHUNK)):
+                while chunk and not unpack.eof:
+                    found += len(unpack.decompress(chunk, _CHUNK))
+                    chunk = unpack.unconsumed_tail
+    except zlib.error:
+        raise SimulationError(f"{path}: its compressed content is damaged; copy or export it again") from None
+    text = "x".join(str(n) for n in dimensions)
+    require(
+        found >= slices * one,
+        f"{path}: DimSize promises {text} voxels, {slices * one} bytes, and it has {found} bytes, enough for "
+        f"{found // one} of {slices} slices; copy or export it again",
+    )
+
+
+def _skip_metaimage_header(file: BinaryIO) -> None:
+    for line in file:
+        if line.partition(b"=")[0].strip() == b"ElementDataFile":
+            return
+
+
+#: Bytes of the types of voxels
+_METAIMAGE_BYTES = {
+    "MET_CHAR": 1, "MET_UCHAR": 1, "MET_SHORT": 2, "MET_USHORT": 2, "MET_INT": 4, "MET_UINT": 4, "MET_LONG_LONG": 8,
+    "MET_ULONG_LONG": 8, "MET_FLOAT": 4, "MET_DOUBLE": 8,
+}  # fmt: skip
 
 
 def _metaimage_fields(path: Path) -> dict[str, str]:

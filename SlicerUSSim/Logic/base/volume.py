@@ -25,6 +25,7 @@ from SlicerUSSim.Logic.base.headers import (
     require_readable_name,
     require_sound_header,
     require_spacing,
+    require_whole_metaimage,
     require_whole_nrrd,
 )
 from SlicerUSSim.Logic.base.label_numbers import numbers_of
@@ -421,6 +422,7 @@ def _read_by_itk(path: Path):
         raise SimulationError(f"{path}: cannot be read as an image ({reason})") from None
     require_complete(path)
     require_whole_nrrd(path)
+    require_whole_metaimage(path)
     is_complex = "complex" in image.GetPixelIDTypeAsString()
     require(not is_complex, f"{path}: holds complex numbers, expected real ones; save its magnitude")
     return image

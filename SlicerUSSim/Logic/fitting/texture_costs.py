@@ -77,6 +77,12 @@ class TextureReference:
         }
         self._own = self._numbers(self.reference)
 
+    @property
+    def is_dark(self) -> bool:
+        """Whether no patch of the reference is bright enough to be compared: T1 is NaN."""
+        levels, lags = self._own[0]
+        return not ((levels >= DARK) & np.isfinite(lags).all(axis=1)).any()
+
     def misfit(self, image: np.ndarray) -> TextureMisfit:
         """T1 and T2 of an image (rows, columns) uint8 against the reference."""
         image = as_image("image", image)

@@ -121,6 +121,14 @@ def fit(
     free = parameters_seen(free, simulator, tracked)
     masks = [tracked.mask] * len(tracked.images)
     given, patient = tracked, simulator
+    references = [TextureReference(image, tracked.grid.pixel_spacing_mm, tracked.mask) for image in tracked.images]
+    for number, reference in zip(tracked.numbers, references, strict=True):
+        if reference.is_dark:
+            _log.warning(
+                "image %d is dark in all that is left of the probe's field (%.0f %% of it): its texture cannot be "
+                "compared, and the fit says little; expected an image of the patient",
+                number, 100.0 * tracked.mask.sum() / max(tracked.grid.field(tracked.probe).sum(), 1),
+            )  # fmt: skip
     if speckle and len(tracked.images) == 1:
         _log.warning(
             "the speckle of 1 image is fitted (%d): grey map, smoothing and texture of one place may not hold at "
@@ -178,7 +186,6 @@ def fit(
     if speckle or deform:
         was = _similarities(given, before, settings or SimilaritySettings())
         appearance = replace(appearance, similarity_before=was, cost_before=float(np.mean([one.total for one in was])))
-    references = [TextureReference(image, tracked.grid.pixel_spacing_mm, tracked.mask) for image in tracked.images]
     textures = ([r.misfit(i) for r, i in zip(references, images, strict=True)] for images in (before, after))
     return Fit(
         appearance, registration, tracked, before, after, *textures, speckle=found, deformation=deformation,

@@ -90,7 +90,7 @@ def estimate_field(
     images = np.asarray(images)
     stack = images if images.ndim == 3 else images[None]
     require(stack.ndim == 3 and stack.size > 0, f"images have shape {images.shape}, expected (n, rows, columns)")
-    bright = _field_pixels(stack.max(axis=0))
+    bright = bright_region(stack)
     scale = np.asarray((1.0, 1.0) if pixel_spacing_mm is None else pixel_spacing_mm, float)
     require(
         scale.shape == (2,) and bool((scale > 0).all()), f"pixel spacing is {pixel_spacing_mm}, expected (x, y) in mm"
@@ -108,7 +108,12 @@ def estimate_field(
         scale, origin = size * scale, size * origin
     image_to_probe = np.diag([*scale, 1.0, 1.0])
     image_to_probe[:2, 3] = -origin
-    probe = probe_from_dict({"kind": kind, **geometry, **probe_parameters}, "estimated probe")
+    try:
+        probe = probe_from_dict({"kind": kind, **geometry, **probe_parameters}, "estimated probe")
+    except SimulationError as error:
+        raise SimulationError(
+            f"{error}; pixels are {scale[0]:.3g} x {scale[1]:.3g} mm large, check the calibration"
+        ) from None
     field = ImagedField.of(probe, image_to_probe, bright.shape)
     overlap = float((field.mask & bright).sum() / (field.mask | bright).sum())
     require(
@@ -131,7 +136,7 @@ def place_field(images: np.ndarray, pixel_spacing_mm: tuple[float, float], probe
     """
     images = np.asarray(images)
     stack = images if images.ndim == 3 else images[None]
-    bright = _field_pixels(stack.max(axis=0))
+    bright = bright_region(stack)
     scale = np.asarray(pixel_spacing_mm, float)
     outline = probe.outline_mm()[:, :2]
     low = np.floor(outline.min(axis=0) / scale).astype(int) - 1
@@ -164,6 +169,7 @@ def draw_field(path: str | os.PathLike, image: np.ndarray, field: ImagedField) -
 
     shown = np.repeat(np.asarray(image, np.uint8)[..., None], 3, axis=2)
     hidden = ImagedField.of(field.probe, field.image_to_probe, field.mask.shape).mask & ~field.mask
+    shown[hidden, :2] //= 2
     shown[hidden, 2] = np.maximum(shown[hidden, 2], 110)  # blue: in the field, but cut off or drawn over
     picture = Image.fromarray(shown)
     draw = ImageDraw.Draw(picture)
@@ -177,9 +183,12 @@ def draw_field(path: str | os.PathLike, image: np.ndarray, field: ImagedField) -
         save_marked_png(partial, picture)
 
 
-def _field_pixels(brightest: np.ndarray) -> np.ndarray:
-    """(rows, columns) bool: the largest connected bright region, without holes and thin attachments."""
-    bright = ndimage.binary_closing(brightest > _DARK, iterations=3)
+def bright_region(images: np.ndarray) -> np.ndarray:
+    """(rows, columns) bool: the largest connected region bright in any image, without holes and thin attachments.
+
+    Raises SimulationError for black images.
+    """
+    bright = ndimage.binary_closing(images.max(axis=0) > _DARK, iterations=3)
     bright = ndimage.binary_opening(bright, structure=np.ones((9, 9)))
     # Casts: the return types of scipy's functions depend on their arguments, without type annotations for that.
     labels, count = cast(tuple[np.ndarray, int], ndimage.label(bright))

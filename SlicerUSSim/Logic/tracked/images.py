@@ -12,14 +12,19 @@ from SlicerUSSim.Logic.base.errors import SimulationError, require
 from SlicerUSSim.Logic.base.transforms import check_rigid, nearest_rotation
 from SlicerUSSim.Logic.probe.arrays import Probe
 from SlicerUSSim.Logic.probe.image_grid import ImageGrid
-from SlicerUSSim.Logic.tracked.field import ImagedField, estimate_field, place_field
-from SlicerUSSim.Logic.tracked.hidden import spread_images, visible_part
+from SlicerUSSim.Logic.tracked.field import ImagedField, bright_region, estimate_field, place_field
+from SlicerUSSim.Logic.tracked.hidden import look_inverted, spread_images, visible_part
 from SlicerUSSim.Logic.tracked.sequence import TrackedSequence
 
 _log = logging.getLogger(__name__)
 
 #: Largest cosine between the axes of an image that still counts as perpendicular.
 _SKEW = 1e-3
+#: Of the field: an image that is brighter than black, as codecs leave it, in less of it cannot be compared
+_LEAST_SHOWN, _BLACK = 0.02, 4
+#: Least area of a given probe's field by that of what images show, which may have other bright areas beside it, and
+#: largest area by that of an image, which may be cropped
+_LEAST_AREA, _MOST_AREA = 1 / 3, 4.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,8 +74,9 @@ class TrackedImages:
             scanner draws over it is looked for again.
 
         Raises SimulationError for images that do not exist or were not tracked, a skewed calibration, a field that
-        cannot be estimated, and images that are entirely black or of one grey level. A calibration that mirrors,
-        saturated images, and what a file cuts off or a scanner draws over the field (hidden.py) are warned of.
+        cannot be estimated or whose size is not that of what images show, colours in most of it, and images that are
+        black or of one grey level (nearly everywhere). A calibration that mirrors, saturated, inverted or tinted
+        images, and what a file cuts off or a scanner draws over the field (hidden.py) are warned of.
         """
         require(
             sequence.image_type == "BRIGHTNESS",
@@ -96,14 +102,25 @@ class TrackedImages:
         for number, image in zip(kept, images, strict=True):
             require(int(image.max()) > 0, f"image {number} of the sequence is black")
         spacing = _pixel_spacing(matrices[0], path)
+        every = _as_uint8(spread_images(sequence.images))
+        is_inverted = look_inverted(every)
         if field is None:
             field = _located_field(sequence, images, spacing, probe, beam)
-        seen = visible_part(_as_uint8(spread_images(sequence.images)), field.mask, sequence.coloured)
+            if probe is not None and not is_inverted:
+                _require_size(field, every, spacing, path)
+        is_drawn_over = sequence.is_recorded and not is_inverted
+        seen = visible_part(every, field.mask, sequence.coloured, is_recorded=is_drawn_over)
         require(bool(seen.any()), "nothing of the probe's field is seen in the images")
         for number, image in zip(kept, images, strict=True):
             low, high = int(image[seen].min()), int(image[seen].max())
             require(
                 low < high, f"image {number} has the grey level {low} in all of the probe's field, expected a patient"
+            )
+            shown = float((image[seen] > _BLACK).sum() / field.mask.sum())
+            require(
+                shown >= _LEAST_SHOWN,
+                f"image {number} shows something in {shown:.1%} of the probe's field only, where nothing hides it, "
+                f"expected at least {_LEAST_SHOWN:.0%}",
             )
         field = replace(field, mask=seen)
         to_ras = np.eye(4) if reference_to_ras is None else check_rigid("reference_to_ras", reference_to_ras)
@@ -183,13 +200,17 @@ def _located_field(
         _log.info("no probe is given: its geometry is looked for in the images, the rest is the preset's")
         try:
             return estimate_field(every, spacing, **known)
-        except SimulationError:
+        except SimulationError as error:
             if len(every) == len(images):
                 raise
+            of_all = error
             _log.info(
                 "all images together show no probe's field, as where the depth changes: only the chosen ones count"
             )
-            return estimate_field(images, spacing, **known)
+            try:
+                return estimate_field(images, spacing, **known)
+            except SimulationError:
+                raise of_all from None
     if all("ImageToProbe" in entry for entry in sequence.transforms):
         image_to_probe = np.array(sequence.transforms[0]["ImageToProbe"])
         # In this package's probe frame the image is upright and in the plane z = 0; a tracker's marker can be anywhere.
@@ -218,6 +239,18 @@ def _located_field(
             "calibration"
         )
     return replace(ImagedField.of(probe, found.image_to_probe, images.shape[1:]), overlap=found.overlap)
+
+
+def _require_size(field: ImagedField, images: np.ndarray, spacing: tuple[float, float], path: str) -> None:
+    """Raise SimulationError if a given probe's field has another size than what images show: pixels of another size."""
+    x, y = field.probe.outline_mm()[:, :2].T
+    area = 0.5 * abs(float(x @ np.roll(y, 1) - y @ np.roll(x, 1))) / (spacing[0] * spacing[1])
+    shown = int(bright_region(images).sum())
+    require(
+        area >= _LEAST_AREA * shown and area <= _MOST_AREA * images[0].size,
+        f"the probe's field has {area:.0f} pixels of {spacing[0]:.3g} x {spacing[1]:.3g} mm, the images show "
+        f"{shown} of {images[0].size}, expected about as many; check the size of a pixel in {path} or the calibration",
+    )
 
 
 def _probe_pose(image_to_world: np.ndarray, field: ImagedField, path: str) -> np.ndarray:

@@ -34,6 +34,8 @@ SEQUENCE_SUFFIXES = (".igs.mha", ".seq.mha", ".mha", ".mhd", ".seq.nrrd", ".nrrd
 _FRAME_FIELD = re.compile(r"Seq_Frame(\d+)_(.+)")
 #: Field of sequences whose images are simulated
 SIMULATED = "SlicerUSSimSimulated"
+#: Field of sequences whose images are slices of a 3D ultrasound volume
+_CUT = "SlicerUSSimCutFromVolume"
 _ORIENTATION, _TYPE = "UltrasoundImageOrientation", "UltrasoundImageType"
 _OK = "OK"
 #: Fields of ITK and NRRD files that do not belong to a sequence.
@@ -43,6 +45,13 @@ _NOT_OURS = (
 )  # fmt: skip
 #: Difference of the components of a pixel, grey levels, from which on it has a colour; below are codecs
 _COLOURED = 24
+#: Grey levels from which on colours can be told, and spread of colours of an even tint
+_BRIGHT, _TINTED = 40, 4
+#: Of what is bright: more with a colour at its level is a colour map, whose curve holds for at least as many
+_MOST_COLOURED, _ON_CURVE = 0.5, 0.8
+#: Least part of all pixels at a grey level that counts in a colour map; largest step of a colour from such a level to
+#: the next, and how much more per level: red makes a third of a grey level
+_COMMON, _JUMP, _SLOPE = 1e-4, 48, 3
 _OPPOSITE = {"M": "U", "U": "M", "F": "N", "N": "F"}
 
 
@@ -76,7 +85,8 @@ class TrackedSequence:
     #: Other fields of the file, and of every image
     fields: Mapping[str, str] = field(default_factory=dict)
     frame_fields: tuple[Mapping[str, str], ...] = ()
-    #: (rows, columns) bool, pixels that have a colour in any image, such as Doppler's; None without colours
+    #: (rows, columns) bool, pixels that have a colour in any image, such as Doppler's, and in tinted images another one
+    #: than the colour map's; None without colours
     coloured: np.ndarray | None = None
 
     def __post_init__(self) -> None:
@@ -104,6 +114,11 @@ class TrackedSequence:
     def is_simulated(self) -> bool:
         """Whether its images say that this package simulated them, as a twin's and those of `ussim sweep` do."""
         return SIMULATED in self.fields or MADE_BY in self.fields
+
+    @property
+    def is_recorded(self) -> bool:
+        """Whether a scanner may have drawn over its images: neither simulated nor slices of a volume."""
+        return not self.is_simulated and _CUT not in self.fields
 
     # ---- poses -------------------------------------------------------------------------------------------------
 
@@ -205,7 +220,8 @@ class TrackedSequence:
     def read(cls, path: str | os.PathLike) -> TrackedSequence:
         """Read a sequence metafile (.igs.mha, .seq.mha, .mhd, .nrrd), compressed or not, in any image orientation.
 
-        Transforms whose status is not OK were not tracked and are omitted. Colours are converted to grey levels.
+        Transforms whose status is not OK were not tracked and are omitted. Colours are converted to grey levels, those
+        of a colour map with a warning.
         Raises SimulationError for a file that is missing, unreadable or of another format.
         """
         require_path(path)
@@ -281,7 +297,7 @@ class TrackedSequence:
         images = [np.where(inside, slice_under_probe(volume, grid, pose), 0) for pose in poses]
         array = np.clip(np.stack(images), 0, 255).round().astype(np.uint8)
         transforms = tuple({"ImageToProbe": grid.image_to_probe, "ProbeToReference": pose} for pose in poses)
-        return cls(array, transforms, np.arange(len(poses), dtype=float))
+        return cls(array, transforms, np.arange(len(poses), dtype=float), fields={_CUT: "True"})
 
 
 def is_tracked_sequence(path: str | os.PathLike) -> bool:
@@ -466,14 +482,15 @@ class _Pixels(NamedTuple):
 
 def _as_images(array: np.ndarray, components: int, source: str) -> _Pixels:
     """Pixels of an array with or without a slice axis of length 1, and with a colour axis if components > 1."""
-    coloured = None
+    coloured: np.ndarray | None = None
     if components > 1:
         require(components in (3, 4), f"{source}: has {components} components per pixel, expected 1 or colours")
         _log.info("%s: colours become grey (ITU-R BT.601)", source)
-        spread = array[..., :3].max(axis=-1).astype(int) - array[..., :3].min(axis=-1)
-        coloured = (spread > _COLOURED).reshape(-1, *spread.shape[-2:]).any(axis=0)
-        coloured = coloured if coloured.any() else None
-        array = (array[..., :3] @ np.array([0.299, 0.587, 0.114])).round().astype(array.dtype)  # ITU-R BT.601
+        colours = array[..., :3]
+        array = (colours @ np.array([0.299, 0.587, 0.114])).round().astype(array.dtype)  # ITU-R BT.601
+        is_coloured = _are_coloured(colours, array, source)
+        if is_coloured.any():
+            coloured = np.asarray(is_coloured.reshape(-1, *is_coloured.shape[-2:]).any(axis=0), bool)
     if array.ndim == 4:
         require(array.shape[1] == 1, f"{source}: has volumes of {array.shape[1]} slices, expected images")
         array = array[:, 0]
@@ -481,6 +498,50 @@ def _as_images(array: np.ndarray, components: int, source: str) -> _Pixels:
         array = array[None]
     require(array.ndim == 3, f"{source}: has {array.ndim} dimensions, expected columns, rows and images")
     return _Pixels(array, coloured)
+
+
+def _are_coloured(colours: np.ndarray, grey: np.ndarray, source: str) -> np.ndarray:
+    """[...] bool, pixels of [..., 3] colours that are no grey, or where all are tinted, not of the colour map.
+
+    A colour map gives each grey level one colour, so that nearly all pixels lie on one curve; Doppler's do not. That
+    there is one is logged as a warning.
+    """
+    is_coloured = colours.max(axis=-1).astype(int) - colours.min(axis=-1) > _COLOURED
+    if colours.dtype != np.uint8 or not is_coloured.any():
+        return is_coloured
+    is_bright = grey > _BRIGHT
+    for curve in _colour_maps(colours, grey):
+        if float((np.ptp(curve, axis=1)[grey[is_bright]] > _TINTED).mean()) <= _MOST_COLOURED:
+            continue
+        is_off = np.abs(colours - curve[grey]).max(axis=-1) > _COLOURED
+        on_curve = 1.0 - float(is_off[is_bright].mean())
+        if on_curve >= _ON_CURVE:
+            _log.warning(
+                "%s: the images are tinted: %.0f %% of what is bright has the colours of one colour map, of which the "
+                "luminance is taken for the grey level", source, 100.0 * on_curve,
+            )  # fmt: skip
+            return is_off
+    return is_coloured
+
+
+def _colour_maps(colours: np.ndarray, grey: np.ndarray) -> Iterable[np.ndarray]:
+    """(256, 3) int each, what may be the colours of the grey levels: multiples of the commonest hue, then any curve
+    from black on that has no jump."""
+    is_bright = grey > _BRIGHT
+    if not is_bright.any():
+        return
+    hue = np.median(colours[is_bright] / grey[is_bright][:, None], axis=0)
+    yield np.clip(np.outer(np.arange(256), hue), 0, 255).round().astype(int)
+    levels = 256 * grey.ravel().astype(np.intp)
+    curve, number = np.zeros((256, 3), int), np.bincount(grey.ravel(), minlength=256)
+    for channel in range(3):
+        counts = np.bincount(levels + colours[..., channel].ravel(), minlength=256 * 256).reshape(256, 256)
+        curve[:, channel] = (2 * counts.cumsum(axis=1) >= number[:, None]).argmax(axis=1)
+    common = np.flatnonzero(number >= _COMMON * number.sum())
+    if not len(common) or curve[common[0]].max() > _COLOURED:
+        return
+    if (np.abs(np.diff(curve[common], axis=0)).max(axis=1) <= _JUMP + _SLOPE * np.diff(common)).all():
+        yield curve
 
 
 # ---- formats ---------------------------------------------------------------------------------------------------------
