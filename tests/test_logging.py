@@ -307,10 +307,7 @@ def test_files_that_were_asked_for_leave_stdout_empty(files, tmp_path):
         ["sweep", labels, "--sequence", sequence, "--probe", files / "probe.json", "-o", tmp_path / "sweep.igs.mha"],
     ):
         result = ussim(*arguments)
-        *before, last = result.stderr.splitlines()
-        # Three images are too few to tell what a scanner has drawn over them
-        assert all("could not be looked for: 3 different images" in line for line in before), arguments[0]
-        assert result.stdout == "" and last.startswith("wrote "), arguments[0]
+        assert result.stdout == "" and result.stderr.startswith("wrote "), arguments[0]
 
 
 @pytest.mark.slow

@@ -90,11 +90,16 @@ class TrackedExamination:
 
 
 def open_tracked(
-    patient: PatientOptions, recording: SequenceOptions, most: int | None = None, apart: str = ""
+    patient: PatientOptions,
+    recording: SequenceOptions,
+    most: int | None = None,
+    apart: str = "",
+    *,
+    finds_marks: bool = True,
 ) -> TrackedExamination:
     """The TrackedExamination of a command's options; `most` is the default number of images.
 
-    `apart` selects other images, in the format of --frames.
+    `apart` selects other images, in the format of --frames; `finds_marks` as in TrackedImages.of.
 
     Fast checks come before slow computations. Raises SimulationError for inconsistent options.
     """
@@ -127,6 +132,7 @@ def open_tracked(
         beam=examination.probe,
         most=most,
         apart=beside,
+        finds_marks=finds_marks,
     )
     others = None
     if beside:

@@ -28,7 +28,8 @@ def sweep(patient: PatientOptions, recording: SequenceOptions, out: Path) -> Non
 
     require_sequence_name(out)
     check_outputs(out, recording.field)
-    tracked = open_tracked(patient, recording)
+    # The real images are not compared: what is drawn over them is seen in the figure of --field alone
+    tracked = open_tracked(patient, recording, finds_marks=recording.field is not None)
     simulator, display = tracked.examination.simulator, tracked.examination.display
     real = tracked.images
     rows, columns = real.field.mask.shape

@@ -72,7 +72,7 @@ def spread_images(images: np.ndarray) -> np.ndarray:
 
 
 def visible_part(
-    images: np.ndarray, field: np.ndarray, coloured: np.ndarray | None = None, *, is_recorded: bool = True
+    images: np.ndarray, field: np.ndarray, coloured: np.ndarray | None = None, *, finds_marks: bool = True
 ) -> np.ndarray:
     """(rows, columns) bool, the pixels of the field in which all images show the patient.
 
@@ -81,7 +81,7 @@ def visible_part(
     images : (n, rows, columns) uint8, of a recording.
     field : (rows, columns) bool, the probe's imaged field.
     coloured : (rows, columns) bool, pixels that have a colour in any image, such as Doppler's.
-    is_recorded : whether a scanner may have drawn over the images; not so for simulated ones.
+    finds_marks : whether what a scanner draws over the field is looked for; nothing is drawn over simulated images.
 
     What is left out is logged as a warning. Raises SimulationError if most of what is bright has colours.
     """
@@ -107,14 +107,15 @@ def visible_part(
             "%.0f %% of the field is at 255 grey levels: the images are saturated, and levels above are lost",
             100 * float(is_white.mean()),
         )
-    if not is_recorded:
+    if not finds_marks:
         return seen
     images = _different(images, seen)
-    untold = _why_untold(images, seen)
+    low, high = images.min(axis=0).astype(int), images.max(axis=0).astype(int)
+    untold = _why_untold(len(images), low, high, seen)
     if untold:
         _log.warning("text, rulers and other marks in the images could not be looked for: %s", untold)
         return seen
-    drawn = _drawn_over(images, seen, _WHITE if is_saturated else 256)
+    drawn = _drawn_over(len(images), low, high, seen, _WHITE if is_saturated else 256)
     if drawn.any():
         _say(drawn, seen, "are the same in all images, as text, rulers, logos and boxes are")
         seen = seen & ~drawn
@@ -179,11 +180,14 @@ def _different(images: np.ndarray, field: np.ndarray) -> np.ndarray:
     return images[sorted(first.values())]
 
 
-def _why_untold(images: np.ndarray, field: np.ndarray) -> str:
-    """Why what is drawn cannot be told from the patient in these images; empty if it can."""
-    if len(images) < _LEAST_IMAGES:
-        return f"{len(images)} different image{'s' * (len(images) > 1)}, expected at least {_LEAST_IMAGES}"
-    low, high = images.min(axis=0)[field].astype(int), images.max(axis=0)[field].astype(int)
+def _why_untold(images: int, low: np.ndarray, high: np.ndarray, field: np.ndarray) -> str:
+    """Why what is drawn cannot be told from the patient in so many images; empty if it can.
+
+    `low` and `high` are (rows, columns), the least and largest grey levels of all.
+    """
+    if images < _LEAST_IMAGES:
+        return f"{images} different image{'s' * (images > 1)}, expected at least {_LEAST_IMAGES}"
+    low, high = low[field], high[field]
     shows = high > _ALWAYS_DARK
     change = float(np.median((high - low)[shows])) if shows.any() else 0.0
     alike = (high - low <= _SAME) & (low >= _DRAWN)
@@ -195,12 +199,11 @@ def _why_untold(images: np.ndarray, field: np.ndarray) -> str:
     )
 
 
-def _drawn_over(images: np.ndarray, field: np.ndarray, below: int) -> np.ndarray:
+def _drawn_over(images: int, low: np.ndarray, high: np.ndarray, field: np.ndarray, below: int) -> np.ndarray:
     """(rows, columns) bool, bright sharp pixels of the field that stay the same while those around them change.
 
-    Grey levels from `below` on are left, as the patient's in saturated images.
+    `low` and `high` as in _why_untold. Grey levels from `below` on are left, as the patient's in saturated images.
     """
-    low, high = images.min(axis=0).astype(int), images.max(axis=0).astype(int)
     change = high - low
     # Beyond the field its edge goes on: the black beside it is no surroundings of what lies within
     edge = field & ~np.asarray(ndimage.binary_erosion(field, iterations=_RIM), bool) & (high <= _ALWAYS_DARK)
@@ -217,11 +220,11 @@ def _drawn_over(images: np.ndarray, field: np.ndarray, below: int) -> np.ndarray
     told = inside & (is_changing | (brightest <= _ALWAYS_DARK)) & (high < below)
     stands_out = told & (low >= _DRAWN) & (low - around >= _DRAWN)
     stands_out &= beside - ndimage.minimum_filter(beside, 3) >= _SHARP
-    drawn = _marks(stands_out & (change <= most), len(images))
+    drawn = _marks(stands_out & (change <= most), images)
     if not drawn.any():
         return drawn
     # Codecs change some letters of a line more than others
-    share = _ALIKE_SHARE if len(images) >= _MANY_IMAGES else _SAME_SHARE
+    share = _ALIKE_SHARE if images >= _MANY_IMAGES else _SAME_SHARE
     alike = drawn | (stands_out & (change <= np.where(around < _ALWAYS_BRIGHT, share * changes, _SAME)))
     line, _ = _components(np.asarray(ndimage.binary_dilation(alike, iterations=_GAP), bool))
     drawn = alike & np.isin(line, line[drawn])

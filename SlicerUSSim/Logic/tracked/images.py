@@ -57,6 +57,7 @@ class TrackedImages:
         most: int | None = None,
         apart: Sequence[int] = (),
         field: ImagedField | None = None,
+        finds_marks: bool = True,
     ) -> TrackedImages:
         """Prepare images of a sequence.
 
@@ -72,6 +73,7 @@ class TrackedImages:
         beam : probe whose parameters other than the geometry are used for an estimated probe.
         field : the probe and its place in the images, if both are known, as of images that were prepared before; what a
             scanner draws over it is looked for again.
+        finds_marks : whether what a scanner draws over the field is looked for, as for a comparison.
 
         Raises SimulationError for images that do not exist or were not tracked, a skewed calibration, a field that
         cannot be estimated or whose size is not that of what images show, colours in most of it, and images that are
@@ -102,14 +104,15 @@ class TrackedImages:
         for number, image in zip(kept, images, strict=True):
             require(int(image.max()) > 0, f"image {number} of the sequence is black")
         spacing = _pixel_spacing(matrices[0], path)
+        # All images of the recording show more of the field than the few that are fitted
         every = _as_uint8(spread_images(sequence.images))
         is_inverted = look_inverted(every)
         if field is None:
-            field = _located_field(sequence, images, spacing, probe, beam)
+            field = _located_field(sequence, images, every, spacing, probe, beam)
             if probe is not None and not is_inverted:
                 _require_size(field, every, spacing, path)
-        is_drawn_over = sequence.is_recorded and not is_inverted
-        seen = visible_part(every, field.mask, sequence.coloured, is_recorded=is_drawn_over)
+        finds_marks = finds_marks and sequence.is_recorded and not is_inverted
+        seen = visible_part(every, field.mask, sequence.coloured, finds_marks=finds_marks)
         require(bool(seen.any()), "nothing of the probe's field is seen in the images")
         for number, image in zip(kept, images, strict=True):
             low, high = int(image[seen].min()), int(image[seen].max())
@@ -188,12 +191,11 @@ def _pixel_spacing(image_to_world: np.ndarray, path: str) -> tuple[float, float]
 def _located_field(
     sequence: TrackedSequence,
     images: np.ndarray,
+    every: np.ndarray,
     spacing: tuple[float, float],
     probe: Probe | None,
     beam: Probe | None,
 ) -> ImagedField:
-    # All images of the recording show more of the field than the few that are fitted
-    every = _as_uint8(spread_images(sequence.images))
     if probe is None:
         shared = {field.name for field in fields(Probe)}
         known = {} if beam is None else {name: v for name, v in beam.to_dict().items() if name in shared}
