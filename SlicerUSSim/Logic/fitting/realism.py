@@ -15,6 +15,7 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -67,6 +68,11 @@ _GAINS_DB = -80.0, 80.0
 _DEPTH_SHARES = (0.33, 0.5, 0.7, 0.92)
 #: Tissues whose borders are walls, and thin ones that are sheets, where the labels have them
 _WALLS, _SHEETS = ("csf",), ("falx", "tentorium")
+
+
+def control_named(name: str, reference: str) -> str:
+    """The name of a source where the real images are called `reference`, such as those of a twin."""
+    return name.replace(REAL, reference) if name in _CONTROLS else name
 
 
 @dataclass(frozen=True)
@@ -154,11 +160,7 @@ class Realism:
 
     def tables(self, reference: str = REAL) -> list[Table]:
         """(title, heads, rows) of texts, for reports and terminals; `reference` is what the real images are called."""
-        real = self.looks[REAL]
-
-        def shown(name: str) -> str:
-            return name.replace(REAL, reference) if name in _CONTROLS else name
-
+        real, shown = self.looks[REAL], partial(control_named, reference=reference)
         costs = [
             [shown(name), *(_text(self.mean(name)[key], 3) for key in ("paper", "t1", "t2", "sum"))]
             for name in self.costs
@@ -166,7 +168,10 @@ class Realism:
         tables = [(f"Costs against the {reference} images", ["images", "paper's", "T1", "T2", "sum"], costs)]
         depths = [f"{width.depth_mm:.0f} mm" for width in real.widths]
         widths = [
-            [shown(name), *(f"{_text(w.half_height_mm[0])} / {_text(w.half_height_mm[1])}" for w in looks.widths)]
+            [
+                shown(name),
+                *(f"{_text(w.half_height_mm[0])} / {_text(w.half_height_mm[1])}" for w in looks.widths),
+            ]
             for name, looks in self.looks.items()
         ]
         tables.append(("Width of the speckle at half height, axial / lateral, mm", ["depth", *depths], widths))

@@ -19,7 +19,7 @@ from SlicerUSSim.Logic.fitting.identifiability import Spread
 from SlicerUSSim.Logic.fitting.optimization import AGAIN, STAGES, AppearanceResult
 from SlicerUSSim.Logic.fitting.parameters import Parameter
 from SlicerUSSim.Logic.fitting.prediction import FITTED, Prediction
-from SlicerUSSim.Logic.fitting.realism import NEIGHBOURS, Realism
+from SlicerUSSim.Logic.fitting.realism import Realism, control_named
 from SlicerUSSim.Logic.fitting.speckle_fit import SpeckleFit
 from SlicerUSSim.Logic.fitting.texture_costs import TextureReference
 from SlicerUSSim.Logic.imaging.figures import require_matplotlib
@@ -158,7 +158,7 @@ def _predicted(prediction: Prediction, reference: str) -> str:
     ]  # fmt: skip
     rows = [
         [
-            f"{reference} neighbours" if source == NEIGHBOURS else source,
+            control_named(source, reference),
             *("–" if np.isnan(value) else f"{value:.3f}" for value in values),
         ]
         for source, *values in prediction.rows()
