@@ -1,6 +1,6 @@
 """Beams, walls and sheets against single rays and even layers, side by side: docs/images/beams-before-after.png.
 
-    python benchmarks/beams_pictures.py docs/images/beams-before-after.png [--sheet VIEWS.png] [--device NAME]
+    python -m benchmarks.beams_pictures docs/images/beams-before-after.png [--sheet VIEWS.png] [--device NAME]
 
 Above, lines are single rays (`beam="ray"`, as in the paper) and the membrane is an even layer of a millimetre, as in
 tables from before it was a rough sheet; below are the defaults. From the left: a layer oblique to the voxels, a cyst,
@@ -16,11 +16,11 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from contact_sheet import COLUMNS, GAP
 from PIL import Image
 from scipy.spatial.transform import Rotation
-from streaks import PROBES
 
+from benchmarks.contact_sheet import COLUMNS, GAP
+from benchmarks.streaks import PROBES
 from SlicerUSSim.Logic import (
     DisplaySettings,
     PhasedProbe,
@@ -33,9 +33,9 @@ from SlicerUSSim.Logic import (
 from SlicerUSSim.Logic.mri import demo_mri
 from SlicerUSSim.Logic.probe import Probe, craniotomy_pose
 from SlicerUSSim.Logic.tissue import TISSUES
-from SlicerUSSim.Logic.verification import phantoms
-from SlicerUSSim.Logic.verification.brain_phantoms import COLIN27
-from SlicerUSSim.Logic.verification.brain_views import random_pose
+from validation import phantoms
+from validation.brain_phantoms import COLIN27
+from validation.brain_views import random_pose
 
 _SIZE = 396
 #: The random view of each head: one with streaks by single rays

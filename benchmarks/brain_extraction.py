@@ -13,8 +13,8 @@ from scipy import ndimage
 from SlicerUSSim.Logic import Volume
 from SlicerUSSim.Logic.base.errors import SimulationError
 from SlicerUSSim.Logic.mri.brain import find_brain
-from SlicerUSSim.Logic.verification.brain_phantoms import COLIN27
-from SlicerUSSim.Logic.verification.brain_scores import dice
+from validation.brain_phantoms import COLIN27
+from validation.brain_scores import dice
 
 SHARED = Path(__file__).resolve().parents[2] / "shared" / "data"
 

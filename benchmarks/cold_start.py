@@ -1,8 +1,8 @@
 """Time from interpreter start to the first image in a new process with empty kernel caches, and peak memory.
 
-    python benchmarks/cold_start.py [--json FILE]
+    python -m benchmarks.cold_start [--json FILE]
 
-Frame A of `ussim bench`, once from a label map in a file and once from the MRI, on every OpenCL device found.
+Frame A of frames.py, once from a label map in a file and once from the MRI, on every OpenCL device found.
 """
 
 from __future__ import annotations
@@ -16,13 +16,13 @@ import tempfile
 from pathlib import Path
 from time import perf_counter
 
+from benchmarks.frames import FRAMES
+from benchmarks.measuring import output_file
 from SlicerUSSim.Logic import TissueTable, UltrasoundSimulator, Volume, segment_mri
 from SlicerUSSim.Logic.base import write_json
 from SlicerUSSim.Logic.mri import demo_mri
 from SlicerUSSim.Logic.opencl.devices import devices_to_measure
 from SlicerUSSim.Logic.probe import craniotomy_pose
-from SlicerUSSim.Logic.verification.benchmark.files import output_file
-from SlicerUSSim.Logic.verification.benchmark.suite import FRAMES
 
 NAMES = ("csf", "grey matter", "white matter")
 

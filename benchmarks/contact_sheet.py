@@ -1,6 +1,6 @@
 """Random views of a brain side by side in one picture, for the eye.
 
-    python benchmarks/contact_sheet.py PICTURE.png [--views N] [--probe convex] [--brain MRI] [--table TISSUES.json]
+    python -m benchmarks.contact_sheet PICTURE.png [--views N] [--probe convex] [--brain MRI] [--table TISSUES.json]
 
 The brain is Colin27 where Debian's mricron-data is installed, else the MNI152 template, or an MRI of your own. Two
 pictures with different tables or versions show the same views.
@@ -12,12 +12,12 @@ import argparse
 
 import numpy as np
 import SimpleITK as sitk
-from streaks import PROBES
 
+from benchmarks.streaks import PROBES
 from SlicerUSSim.Logic import TissueTable, UltrasoundSimulator, Volume, segment_mri
 from SlicerUSSim.Logic.mri import demo_mri
-from SlicerUSSim.Logic.verification.brain_phantoms import COLIN27
-from SlicerUSSim.Logic.verification.brain_views import random_pose
+from validation.brain_phantoms import COLIN27
+from validation.brain_views import random_pose
 
 COLUMNS, GAP = 6, 4
 

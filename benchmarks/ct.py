@@ -1,6 +1,6 @@
 """Agreement of segment_ct with phantoms whose tissues are known, and the picture of docs/ct.md.
 
-    python benchmarks/ct.py [--picture docs/images/ct-phantoms.png] [--only-picture]
+    python -m benchmarks.ct [--picture docs/images/ct-phantoms.png] [--only-picture]
 
 The table has the Dice coefficient of every tissue in voxels of 1 mm and of 0.7 x 0.7 x 2.5 mm, with 20 and 40 HU of
 noise; what the numbers alone cannot tell apart is one tissue (liver is muscle, an enhancing kidney is blood). The
@@ -30,7 +30,7 @@ from SlicerUSSim.Logic.probe import pose_looking_at
 from SlicerUSSim.Logic.probe.placement import slice_under_probe
 from SlicerUSSim.Logic.tissue import LabelMapping, read_label_map
 from SlicerUSSim.Logic.tissue.presets import colour_of
-from SlicerUSSim.Logic.verification.ct_phantoms import BY_NUMBER, NAMES, CtPhantom, lower_chest, lumbar_spine
+from validation.ct_phantoms import BY_NUMBER, NAMES, CtPhantom, lower_chest, lumbar_spine
 
 _CONVEX = ConvexProbe(radius_mm=50, field_of_view_deg=60, depth_mm=100, frequency_mhz=4.0, focus_mm=50)
 _LINEAR = LinearProbe(width_mm=50, depth_mm=55, frequency_mhz=7.0, focus_mm=30)

@@ -1,9 +1,9 @@
 """Level at the centre of a cyst re its surroundings, against its depth, for three probe presets as a figure.
 
-    python benchmarks/cyst_contrast.py PICTURE.png [--all]
+    python -m benchmarks.cyst_contrast PICTURE.png [--all]
 
 The cyst is a black sphere of 10 mm in uniform tissue without attenuation, the probe has its own focus. Dashed: what the
-diffraction of its apertures and its clutter predict (verification/phantoms.py). Dots: images, mean of four scatterer
+diffraction of its apertures and its clutter predict (validation/phantoms.py). Dots: images, mean of four scatterer
 seeds. With --all, a table of all presets at their transmit focus follows, and no figure is needed for it.
 """
 
@@ -21,8 +21,8 @@ import numpy as np
 from SlicerUSSim.Logic import SimulationSettings, TissueTable, UltrasoundSimulator, Volume
 from SlicerUSSim.Logic.probe import PROBES
 from SlicerUSSim.Logic.probe.arrays import Probe
-from SlicerUSSim.Logic.verification.measurement import depth_window, level_db
-from SlicerUSSim.Logic.verification.phantoms import BACKGROUND, clutter_power
+from validation.measurement import depth_window, level_db
+from validation.phantoms import BACKGROUND, clutter_power
 
 SHOWN = {"phased": "phased, 5 MHz", "abdominal": "convex, 3.5 MHz", "linear": "linear, 9 MHz"}
 RADIUS_MM, SEEDS = 5.0, 4

@@ -1,4 +1,4 @@
-"""Time of a change of the display, with each of the console's effects: python benchmarks/display.py [--device D].
+"""Time of a change of the display, with each of the console's effects: python -m benchmarks.display [--device D].
 
 The limit is 3 ms in addition to a change of gain alone, on two idle cores with Intel's runtime.
 """

@@ -1,6 +1,6 @@
 """Performance of the browser workstation: start-up time, images per second and latency while dragging, memory.
 
-    python benchmarks/dragging.py [--device intel --device pocl] [--seconds 10] [--frames 2000] [--json FILE]
+    python -m benchmarks.dragging [--device intel --device pocl] [--seconds 10] [--frames 2000] [--json FILE]
 
 Starts `ussim serve` with the demo brain, opens it in headless Chromium, drags the probe with the mouse in a slice view
 and in the 3D view. Server, browser and playwright share the processor. Needs playwright and Chromium.
@@ -22,9 +22,9 @@ from typing import Any
 import numpy as np
 from playwright.sync_api import Page, sync_playwright
 
+from benchmarks.measuring import output_file
 from SlicerUSSim.Logic.base import write_json
 from SlicerUSSim.Logic.opencl import list_devices
-from SlicerUSSim.Logic.verification.benchmark.files import output_file
 from SlicerUSSim.Workstation.state import NAMES
 
 FLAGS = [

@@ -1,6 +1,6 @@
 """The falx without an atlas, in parts of heads: against that of the whole head by the atlas, and where there is none.
 
-    python benchmarks/falx_of_parts.py [remind022] [colin27] [FILE=CONTRAST ...]
+    python -m benchmarks.falx_of_parts [remind022] [colin27] [FILE=CONTRAST ...]
 
 ReMIND-022 needs ../shared, Colin27 Debian's mricron-data. Half a minute for each head, after its brain extraction.
 """
@@ -11,12 +11,12 @@ import argparse
 import logging
 
 import numpy as np
-from brain_extraction import SHARED
 from scipy.spatial import KDTree
 
+from benchmarks.brain_extraction import SHARED
 from SlicerUSSim.Logic import SimulationError, Volume, segment_mri
 from SlicerUSSim.Logic.mri.sheets import find_sheets
-from SlicerUSSim.Logic.verification.brain_phantoms import COLIN27, cut_to, part_box
+from validation.brain_phantoms import COLIN27, cut_to, part_box
 
 #: From and to, of the brain's extent along R, A and S
 PARTS = {

@@ -1,10 +1,10 @@
 """Accuracy of the appearance optimisation on twins: simulated patients with known parameters (twins.py).
 
-    python benchmarks/fitting.py twins         # 14 patients: cost, parameters, errors; the paper's Table 1
-    python benchmarks/fitting.py algorithms    # nlopt's global and local algorithms
-    python benchmarks/fitting.py ablation      # the local measure against global histogram and difference
-    python benchmarks/fitting.py registration  # a 4 mm and 4 degree offset, recovered
-    python benchmarks/fitting.py evaluation    # milliseconds of one evaluation against one frame
+    python -m benchmarks.fitting twins         # 14 patients: cost, parameters, errors; the paper's Table 1
+    python -m benchmarks.fitting algorithms    # nlopt's global and local algorithms
+    python -m benchmarks.fitting ablation      # the local measure against global histogram and difference
+    python -m benchmarks.fitting registration  # a 4 mm and 4 degree offset, recovered
+    python -m benchmarks.fitting evaluation    # milliseconds of one evaluation against one frame
 
 Every table is markdown; --patients N takes the first N, --device chooses the device, --json FILE keeps the numbers.
 """
@@ -18,6 +18,7 @@ from time import perf_counter
 
 import numpy as np
 
+from benchmarks.measuring import measured, output_file
 from SlicerUSSim.Logic import DisplaySettings, TissueTable, Volume, optimize_appearance, segment_mri
 from SlicerUSSim.Logic.base import write_json
 from SlicerUSSim.Logic.fitting import AppearanceModel, FreeParameters, SimilaritySettings
@@ -30,9 +31,7 @@ from SlicerUSSim.Logic.imaging import TreeOverflowWarning
 from SlicerUSSim.Logic.mri import demo_mri
 from SlicerUSSim.Logic.probe import ImageGrid
 from SlicerUSSim.Logic.tracked import TrackedImages
-from SlicerUSSim.Logic.verification.benchmark.files import output_file
-from SlicerUSSim.Logic.verification.benchmark.timing import measured
-from SlicerUSSim.Logic.verification.twins import TISSUE, Twin, make_twin
+from validation.twins import TISSUE, Twin, make_twin
 
 #: Poor starting points of the search.
 FAR = {

@@ -1,6 +1,6 @@
 """Time that MRML adds to a frame: the simulator alone and the scene's live update, alternating in one run.
 
-    python benchmarks/live.py [--repeat N] [--device NAME]
+    python -m benchmarks.live [--repeat N] [--device NAME]
 
 Frame A (phased array, 196 scan lines, 73 mm deep) on the MNI152 segmentation. "live" is one change of the probe's
 transform node until the output volume has the new image, through the observers, with an event loop that runs at once.

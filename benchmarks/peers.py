@@ -1,6 +1,6 @@
 """Frame A compared with other simulators in one run: PyMUST's simus, zea's simulators, this model in numpy.
 
-    python benchmarks/peers.py [--device NAME] [--json FILE]
+    python -m benchmarks.peers [--device NAME] [--json FILE]
 
 Needs pip install "SlicerUSSim[demo]" PyMUST zea jax; a simulator that is not installed is skipped.
 
@@ -23,16 +23,15 @@ from collections.abc import Callable
 import numpy as np
 from scipy.integrate import trapezoid
 
+from benchmarks.frames import FRAMES
+from benchmarks.measuring import measured, output_file, timed
 from SlicerUSSim.Logic import SimulationSettings, TissueTable, UltrasoundSimulator, segment_mri
 from SlicerUSSim.Logic.base import write_json
 from SlicerUSSim.Logic.imaging.scattering import sites_per_mm3
 from SlicerUSSim.Logic.mri import demo_mri
 from SlicerUSSim.Logic.opencl.devices import devices_to_measure
 from SlicerUSSim.Logic.probe import craniotomy_pose
-from SlicerUSSim.Logic.verification.benchmark.files import output_file
-from SlicerUSSim.Logic.verification.benchmark.suite import FRAMES
-from SlicerUSSim.Logic.verification.benchmark.timing import measured, timed
-from SlicerUSSim.Logic.verification.numpy_model import NumpyModel
+from tests.reference import NumpyModel
 
 PROBE = FRAMES["A"]
 ELEMENTS, PITCH_M, WIDTH_M, SPEED, FREQUENCY = 64, 0.15e-3, 0.14e-3, 1540.0, 5e6

@@ -1,6 +1,6 @@
 """Speckle with a cyst by every probe preset, side by side in one picture, for the eye.
 
-    python benchmarks/probe_sheet.py PICTURE.png [--folder FOLDER]
+    python -m benchmarks.probe_sheet PICTURE.png [--folder FOLDER]
 
 The tissue is uniform, of 0.5 dB/(cm MHz); at the transmit focus is a black sphere of 10 mm (4 mm for 10 MHz and more).
 With --folder every image is also written unscaled, one PNG each.
@@ -18,7 +18,7 @@ from PIL import Image, ImageDraw
 from SlicerUSSim.Logic import TissueTable, UltrasoundSimulator, Volume
 from SlicerUSSim.Logic.probe import PROBES
 from SlicerUSSim.Logic.probe.arrays import Probe
-from SlicerUSSim.Logic.verification.phantoms import BACKGROUND
+from validation.phantoms import BACKGROUND
 
 COLUMNS, HEIGHT, GAP, TITLE = 4, 224, 6, 16
 

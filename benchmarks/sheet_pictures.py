@@ -1,6 +1,6 @@
 """The pictures of docs/sheets.md: sheets and structures on planes of an MRI, along the axes of the atlas.
 
-    python benchmarks/sheet_pictures.py docs/images [colin27 remind022 mni152] [FILE=CONTRAST ...] [--keep FOLDER]
+    python -m benchmarks.sheet_pictures docs/images [colin27 remind022 mni152] [FILE=CONTRAST ...] [--keep FOLDER]
 
 With --views PICTURE also a view of every head through a craniotomy, by its labels alone and, below, with the sheets.
 Colin27 needs Debian's mricron-data, and ReMIND-022 ../shared; what is not there is left out.
@@ -14,10 +14,10 @@ from typing import Any
 
 import matplotlib.pyplot as plt
 import numpy as np
-from brain_extraction import SHARED
 from matplotlib.lines import Line2D
 from PIL import Image
 
+from benchmarks.brain_extraction import SHARED
 from SlicerUSSim.Logic import Segmentation, TissueTable, UltrasoundSimulator, Volume, segment_mri
 from SlicerUSSim.Logic.base.own_outputs import save_marked_png
 from SlicerUSSim.Logic.mri import demo_mri
@@ -25,7 +25,7 @@ from SlicerUSSim.Logic.mri.pathology import add_tissues
 from SlicerUSSim.Logic.mri.sheets import KINDS, STRUCTURES, Sheets, find_sheets
 from SlicerUSSim.Logic.mri.sheets.head import Head
 from SlicerUSSim.Logic.probe import PROBES, craniotomy_pose
-from SlicerUSSim.Logic.verification.brain_phantoms import COLIN27
+from validation.brain_phantoms import COLIN27
 
 #: Axis of MNI152 (0 is x) and place in mm of every plane
 _PLANES = ((2, 18), (2, 45), (1, -60), (1, 8), (0, 1), (0, 25))

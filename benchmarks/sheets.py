@@ -1,6 +1,6 @@
 """The numbers of docs/sheets.md: how near sheets are to what the images show, each with a control.
 
-    python benchmarks/sheets.py [remind022 turned shifted colin27 mni152] [FILE=CONTRAST ...] [--keep FOLDER]
+    python -m benchmarks.sheets [remind022 turned shifted colin27 mni152] [FILE=CONTRAST ...] [--keep FOLDER]
 
 ReMIND-022 needs ../shared, Colin27 Debian's mricron-data; what is not there is left out. About four minutes in all.
 """
@@ -13,10 +13,10 @@ from pathlib import Path
 from time import perf_counter, process_time
 
 import numpy as np
-from brain_extraction import SHARED
 from scipy import ndimage
 from scipy.spatial import KDTree
 
+from benchmarks.brain_extraction import SHARED
 from SlicerUSSim.Logic import Segmentation, Volume, segment_mri
 from SlicerUSSim.Logic.mri import demo_mri
 from SlicerUSSim.Logic.mri.coregistration import aligned
@@ -26,7 +26,7 @@ from SlicerUSSim.Logic.mri.sheets.falx import FREE_EDGE, falx
 from SlicerUSSim.Logic.mri.sheets.head import Head
 from SlicerUSSim.Logic.mri.sheets.regions import hindbrain, in_tentorium, tentorium_height, ventricles
 from SlicerUSSim.Logic.mri.sheets.ridges import Ridges, large_parts, ridges
-from SlicerUSSim.Logic.verification.brain_phantoms import COLIN27
+from validation.brain_phantoms import COLIN27
 
 _RNG = np.random.default_rng(0)
 

@@ -1,7 +1,7 @@
 """Small scenes with random settings, for OpenCL devices that look for races and accesses out of bounds.
 
-    OCLGRIND_DATA_RACES=1 PYOPENCL_NO_CACHE=1 USSIM_DEVICE=Oclgrind python benchmarks/small_scenes.py OUT [--seeds 0 8]
-    python benchmarks/small_scenes.py OUT [--seeds 0 8]
+    OCLGRIND_DATA_RACES=1 PYOPENCL_NO_CACHE=1 USSIM_DEVICE=Oclgrind python -m benchmarks.small_scenes OUT [--seeds 0 8]
+    python -m benchmarks.small_scenes OUT [--seeds 0 8]
 
 Each seed draws a probe (array, transmission, steering, harmonic, apodisation), settings, tissues (fluid, brain, bone,
 a lossy plate, one that is strong but does not bend, a membrane with a thin sulcus), sheets, a texture, and the grid of

@@ -1,6 +1,6 @@
 """Dark radial streaks by refraction in brains: beams from an aperture, and single rays as the control.
 
-    python benchmarks/streaks.py [--views N] [--device NAME]
+    python -m benchmarks.streaks [--views N] [--device NAME]
 
 Random views of the MNI152 template and, where Debian's mricron-data is installed, Colin27, by a phased and a convex
 array. All tissues have the same scatterers and there are no interface echoes, so that what changes the level of a line
@@ -17,7 +17,7 @@ import numpy as np
 
 from SlicerUSSim.Logic import ConvexProbe, PhasedProbe, SimulationSettings, UltrasoundSimulator
 from SlicerUSSim.Logic.probe import Probe
-from SlicerUSSim.Logic.verification.brain_views import even_brains, random_pose
+from validation.brain_views import even_brains, random_pose
 
 PROBES = {"phased": PhasedProbe(75, 73, scan_lines=192), "convex": ConvexProbe(60, 60, 100, scan_lines=192)}
 DARK_DB, LEAST_SHARE = -12.0, 0.02

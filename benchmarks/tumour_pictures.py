@@ -1,6 +1,6 @@
 """ReMIND-022's tumour, grown from one seed, in ultrasound through three craniotomies.
 
-    python benchmarks/tumour_pictures.py PICTURE [--mask FILE]
+    python -m benchmarks.tumour_pictures PICTURE [--mask FILE]
 
 Above by the labels alone, in the middle with the tumour from the seed, below the MRI in the plane of the image with the
 published segmentation as a line. Needs ../shared; --mask is its brain mask, found if there is none.
@@ -13,8 +13,8 @@ from pathlib import Path
 
 import matplotlib.pyplot as plt
 import numpy as np
-from brain_extraction import SHARED
 
+from benchmarks.brain_extraction import SHARED
 from SlicerUSSim.Logic import (
     DisplaySettings,
     SimulationSettings,

@@ -5,7 +5,7 @@
         -o FOLDER/result.json --report FOLDER/report.html
 
 The "real" images in tracked.igs.mha are simulated with the parameters in truth.json, other speckle and noise;
-labels.nii.gz is the same brain with a slightly wrong segmentation (SlicerUSSim/Logic/verification/twins.py).
+labels.nii.gz is the same brain with a slightly wrong segmentation (validation/twins.py).
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from pathlib import Path
 from SlicerUSSim.Logic import TissueTable, segment_mri
 from SlicerUSSim.Logic.base import write_json
 from SlicerUSSim.Logic.mri import demo_mri
-from SlicerUSSim.Logic.verification import make_twin
+from validation.twins import make_twin
 
 
 def main() -> None:

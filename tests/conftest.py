@@ -30,9 +30,9 @@ from SlicerUSSim.Logic.probe.image_grid import ImageGrid
 from SlicerUSSim.Logic.probe.placement import craniotomy_pose, tilt_sweep
 from SlicerUSSim.Logic.tissue.presets import TISSUES
 from SlicerUSSim.Logic.tracked.sequence import TrackedSequence
-from SlicerUSSim.Logic.verification.ct_phantoms import CtPhantom, lower_chest
 from tests.remembered import segment_once
 from tests.shared_data import SHARED as SHARED, needs_shared as needs_shared
+from validation.ct_phantoms import CtPhantom, lower_chest
 
 _LOCALE = locale.setlocale(locale.LC_ALL)
 

@@ -29,7 +29,7 @@ from SlicerUSSim.Logic.mri.sheets.polydata import as_polydata, read_surfels, req
 from SlicerUSSim.Logic.mri.sheets.regions import tentorium_height
 from SlicerUSSim.Logic.mri.sheets.ridges import ridges
 from SlicerUSSim.Logic.mri.sheets.sulcal import sulci
-from SlicerUSSim.Logic.verification.brain_phantoms import COLIN27
+from validation.brain_phantoms import COLIN27
 
 NORMALS = [(0, 0, 1), (1, 1, 1), (0.3, -0.5, 0.81), (0.1, 0.99, 0.1), (0.7, 0.7, 0.05)]
 

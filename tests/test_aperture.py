@@ -22,11 +22,11 @@ from SlicerUSSim.Logic import (
 )
 from SlicerUSSim.Logic.imaging.aperture import Aperture
 from SlicerUSSim.Logic.probe.arrays import PROBES as STANDARD_PROBES
-from SlicerUSSim.Logic.verification.measurement import echo_near
-from SlicerUSSim.Logic.verification.phantoms import BACKGROUND, STEEL, folds, layered, refracting_wedge
-from SlicerUSSim.Logic.verification.validation.beam_levels import levels_and_widths
-from SlicerUSSim.Logic.verification.wave import speckle_power
 from tests.conftest import block, rigid, simulator
+from validation.beam_levels import levels_and_widths
+from validation.measurement import echo_near
+from validation.phantoms import BACKGROUND, STEEL, folds, layered, refracting_wedge
+from validation.wave import speckle_power
 
 PLAIN = replace(BACKGROUND, attenuation_db_cm_mhz=0.0)
 PROBES = {

@@ -23,12 +23,12 @@ from SlicerUSSim.Logic.mrml.nodes import write_volume  # noqa: E402
 from SlicerUSSim.Logic.probe.placement import pose_looking_at  # noqa: E402
 from SlicerUSSim.Logic.tissue.own_files import write_label_files  # noqa: E402
 from SlicerUSSim.Logic.tissue.table import TissueTable  # noqa: E402
-from SlicerUSSim.Logic.verification.brain_phantoms import phantom, tissue_maps  # noqa: E402
 from tests.conftest import coarse_chest  # noqa: E402
 from tests.test_craniotomy import NAMES, head  # noqa: E402, F401
 from tests.test_craniotomy_nodes import TURN, Bench  # noqa: E402
 from tests.test_lesion_nodes import Scene  # noqa: E402
 from tests.test_lesion_proposals import needs_atlas  # noqa: E402
+from validation.brain_phantoms import phantom, tissue_maps  # noqa: E402
 
 
 def refused(*arguments: object) -> str:

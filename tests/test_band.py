@@ -10,10 +10,10 @@ import pytest
 from SlicerUSSim.Logic import DisplaySettings, SimulationSettings, TissueTable, UltrasoundSimulator
 from SlicerUSSim.Logic.imaging.frame import Frame
 from SlicerUSSim.Logic.probe.arrays import PROBES, Probe
-from SlicerUSSim.Logic.verification.measurement import depth_window, level_db
-from SlicerUSSim.Logic.verification.numpy_model import NumpyModel
-from SlicerUSSim.Logic.verification.phantoms import band_power
 from tests.conftest import SPECKLE, block, rigid
+from tests.reference import NumpyModel
+from validation.measurement import depth_window, level_db
+from validation.phantoms import band_power
 
 WIDE = ("cardiac", "neonatal", "matrix", "hockey_stick")
 SOLID = block(lambda x, y, z: np.ones_like(x), half_mm=(10, 10, 10), spacing_mm=2.0)

@@ -1,4 +1,4 @@
-"""`ussim bench`: lower bounds, tables, comparison, and the report of a wrong image. No test depends on a time."""
+"""Benchmarks: lower bounds, tables, comparison. No test depends on a time."""
 
 from __future__ import annotations
 
@@ -8,21 +8,16 @@ import re
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 from scipy.integrate import trapezoid
 
-from SlicerUSSim.Command.cli import main
-from SlicerUSSim.Logic import ConvexProbe, SimulationError
+from benchmarks.compare import comparison
+from benchmarks.frames import run_benchmark, table_of
+from benchmarks.measuring import Machine, frame_work, output_file, result_file
+from SlicerUSSim.Logic import ConvexProbe
 from SlicerUSSim.Logic.imaging.scattering import scatterer_counts, sites_per_mm3
 from SlicerUSSim.Logic.imaging.stage import Work
 from SlicerUSSim.Logic.opencl.devices import choose_device
 from SlicerUSSim.Logic.probe.image_grid import ImageGrid
-from SlicerUSSim.Logic.verification.benchmark import suite
-from SlicerUSSim.Logic.verification.benchmark.files import output_file, result_file
-from SlicerUSSim.Logic.verification.benchmark.machine import Machine
-from SlicerUSSim.Logic.verification.benchmark.suite import run_benchmark
-from SlicerUSSim.Logic.verification.benchmark.tables import comparison
-from SlicerUSSim.Logic.verification.benchmark.work import frame_work
 from tests.conftest import SPECKLE, block, rigid, simulator
 
 STAGES = {
@@ -94,45 +89,14 @@ def test_two_results_are_compared_row_by_row():
 
 
 @pytest.mark.slow
-def test_the_command_prints_every_stage_and_keeps_the_numbers(tmp_path):
-    path = tmp_path / "bench.json"
-    outcome = CliRunner().invoke(
-        main, ["bench", "--brief", "--repeat", "2", "--device", choose_device()[0].index, "--json", str(path)]
-    )
-    assert outcome.exit_code == 0, outcome.output
-    numbers = json.loads(path.read_text())
-    (device,) = numbers["devices"].values()
+def test_every_stage_has_its_time_and_its_lower_bound(solid):
+    result = run_benchmark([choose_device()[0]], repeat=2, brief=True, progress=lambda text: None)
+    (device,), text = result["devices"].values(), table_of(result)
     assert set(device["frames"]) == {"A"} and set(device["frames"]["A"]["stages"]) >= STAGES
     for stage in STAGES:
         row = device["frames"]["A"]["stages"][stage]
         assert row["floor_ms"] > 0 and 0 < row["best_ms"] <= row["median_ms"]
-        assert re.search(rf"{stage} +[\d.]+ ms", outcome.output)
-    assert numbers["numpy"]["frame A"]["same"] > 0.99
-    assert numbers["wrong"] == [] and "WRONG" not in outcome.output
-
-
-@pytest.mark.slow
-def test_a_wrong_image_is_told_and_exits_with_1(monkeypatch, tmp_path):
-    class Wrong:
-        timings_ms: dict = {"ray tree": 1.0}  # noqa: RUF012
-
-        def __init__(self, simulator) -> None:
-            pass
-
-        def simulate(self, probe, pose):
-            return np.full(ImageGrid.for_probe(probe, None).field(probe).shape, 7, np.uint8)
-
-    monkeypatch.setattr(suite, "NumpyModel", Wrong)
-    outcome = CliRunner().invoke(main, ["bench", "--brief", "--repeat", "1", "--device", choose_device()[0].index])
-    assert outcome.exit_code == 1
-    assert re.search(r"WRONG: .*: frame A: \d+.\d+% of pixels as in numpy, expected 99%", outcome.output)
-
-
-def test_bad_input_is_refused_before_anything_is_measured(tmp_path):
-    with pytest.raises(SimulationError, match="repeat is 0, expected a number between 1 and 10000"):
-        run_benchmark([choose_device()[0]], repeat=0)
-    outcome = CliRunner().invoke(main, ["bench", "--json", str(tmp_path / "nowhere" / "bench.json")])
-    assert outcome.exit_code == 2 and outcome.output.startswith("ussim: ") and "nowhere" in outcome.output
+        assert re.search(rf"{stage} +[\d.]+ ms", text)
 
 
 def test_files_of_the_scripts_are_refused_before_anything_is_measured(tmp_path):

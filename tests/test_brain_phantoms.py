@@ -9,7 +9,7 @@ import pytest
 from scipy import ndimage
 
 from SlicerUSSim.Logic import SimulationError, Volume, segment_mri
-from SlicerUSSim.Logic.verification.brain_phantoms import (
+from validation.brain_phantoms import (
     MEANS,
     TISSUES,
     BrainPhantom,
@@ -20,9 +20,9 @@ from SlicerUSSim.Logic.verification.brain_phantoms import (
     tissue_maps,
     with_ring_tumour,
 )
-from SlicerUSSim.Logic.verification.brain_scores import calibration, dice, scores
-from SlicerUSSim.Logic.verification.labelled_brains import labelled_scan, maps_of_labels
-from SlicerUSSim.Logic.verification.segmentation_controls import NAMES, plain_mixture, true_thresholds
+from validation.brain_scores import calibration, dice, scores
+from validation.labelled_brains import labelled_scan, maps_of_labels
+from validation.segmentation_controls import NAMES, plain_mixture, true_thresholds
 
 BRAINS = ("mni152", "colin27")
 

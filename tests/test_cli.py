@@ -432,8 +432,8 @@ def test_a_volume_replaces_images_of_this_program_only(labels, tmp_path):
 
 def test_bench_replaces_only_its_own_results(tmp_path, monkeypatch):
     measured = {"devices": [], "wrong": [], "machine": {}}
-    monkeypatch.setattr("SlicerUSSim.Logic.verification.benchmark.suite.run_benchmark", lambda *_, **__: measured)
-    monkeypatch.setattr("SlicerUSSim.Logic.verification.benchmark.tables.table_of", lambda _: "")
+    monkeypatch.setattr("benchmarks.suite.run_benchmark", lambda *_, **__: measured)
+    monkeypatch.setattr("benchmarks.tables.table_of", lambda _: "")
     out = tmp_path / "bench.json"
     for _ in range(2):
         result = ussim("bench", "--json", out)

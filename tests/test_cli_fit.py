@@ -26,9 +26,9 @@ from SlicerUSSim.Logic.fitting.tracked_fit import fit
 from SlicerUSSim.Logic.mri.samples import head_mri
 from SlicerUSSim.Logic.probe.placement import tilt_sweep
 from SlicerUSSim.Logic.tracked import TrackedImages, read_pose, write_pose
-from SlicerUSSim.Logic.verification.twins import make_twin
 from tests.conftest import SHARED, example, needs_shared
 from tests.remembered import segment_once
+from validation.twins import make_twin
 
 
 def ussim(*arguments):

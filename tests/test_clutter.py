@@ -17,8 +17,8 @@ from SlicerUSSim.Logic import (
 )
 from SlicerUSSim.Logic.imaging.frame import Frame
 from SlicerUSSim.Logic.probe.arrays import PROBES, Probe, probe_from_dict
-from SlicerUSSim.Logic.verification.measurement import correlation, depth_window, level_db
 from tests.conftest import SPECKLE, block, rigid
+from validation.measurement import correlation, depth_window, level_db
 
 DEPTH_MM = 24.0
 LINEAR = PROBES["linear"]

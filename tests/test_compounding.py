@@ -14,8 +14,8 @@ from SlicerUSSim.Logic.imaging.compounding import Compounder, sweep_grid
 from SlicerUSSim.Logic.imaging.frame import Frame
 from SlicerUSSim.Logic.probe.image_grid import ImageGrid
 from SlicerUSSim.Logic.probe.placement import slide_sweep, tilt_sweep
-from SlicerUSSim.Logic.verification.validation.beams import freehand_sweep
 from tests.conftest import SPECKLE, block, rigid, simulator
+from validation.beams import freehand_sweep
 
 PROBE = ConvexProbe(30, 60, 40)
 

@@ -22,8 +22,8 @@ from SlicerUSSim.Logic.fitting import AppearanceModel, FreeParameters, speckle_w
 from SlicerUSSim.Logic.imaging.grey_map import GREY_MAPS, TABLE_SIZE, estimate_grey_map, grey_table, slope_at
 from SlicerUSSim.Logic.probe import ImageGrid, Probe, probe_from_dict
 from SlicerUSSim.Logic.tracked import TrackedImages
-from SlicerUSSim.Logic.verification.numpy_model import NumpyModel
 from tests.conftest import SHARED, SPECKLE, block, needs_shared, rigid, simulator
+from tests.reference import NumpyModel
 
 EVEN = replace(SPECKLE, texture_db=0.0, specks_per_mm3=0.0)
 SMALL = LinearProbe(8, 12, scan_lines=24, frequency_mhz=4, focus_mm=40, elevation_focus_mm=40)

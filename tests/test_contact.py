@@ -15,8 +15,8 @@ from SlicerUSSim.Logic import (
     UltrasoundSimulator,
 )
 from SlicerUSSim.Logic.imaging.contact import about_contact, line_contact, touching_share
-from SlicerUSSim.Logic.verification.numpy_model import NumpyModel
 from tests.conftest import FLUID, SPECKLE, block, rigid
+from tests.reference import NumpyModel
 
 TABLE = TissueTable({0: FLUID, 1: SPECKLE})
 LINEAR = LinearProbe(40, 30, scan_lines=96, focus_mm=15, aperture_mm=8.0)

@@ -119,7 +119,7 @@ def test_files_in_the_text_exist(page):
 
 
 def test_checks_that_the_model_names_are_made():
-    from SlicerUSSim.Logic.verification.validation import all_checks
+    from validation.run import all_checks
 
     text = " ".join(prose(ROOT / "docs" / "physics.md").split())
     made = {check.name for check in all_checks()}

@@ -14,9 +14,9 @@ from SlicerUSSim.Logic.mri.sheets import Surfels
 from SlicerUSSim.Logic.mri.sheets.polydata import write_surfels
 from SlicerUSSim.Logic.tissue.presets import TISSUES
 from SlicerUSSim.Logic.tissue.sheet_looks import looks_of, with_dura
-from SlicerUSSim.Logic.verification.phantoms import layered
-from SlicerUSSim.Logic.verification.validation import sulci
 from tests.conftest import block
+from validation import sulci
+from validation.phantoms import layered
 
 
 def plane(kind: str, probe_to_ras: np.ndarray, depth_mm: float = 15.0, confidence: float = 1.0) -> Surfels:

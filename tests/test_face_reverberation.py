@@ -9,8 +9,8 @@ import pytest
 
 from SlicerUSSim.Logic import SimulationError, SimulationSettings, TissueTable, UltrasoundSimulator
 from SlicerUSSim.Logic.probe.arrays import PROBES, Probe
-from SlicerUSSim.Logic.verification.numpy_model import NumpyModel
 from tests.conftest import FLUID, block, rigid
+from tests.reference import NumpyModel
 
 BONE = replace(FLUID, name="bone", impedance_mrayl=3.0 * FLUID.impedance_mrayl, attenuation_db_cm_mhz=5.0)
 REFLECTION = 0.5  # of the amplitude, between them

@@ -19,7 +19,7 @@ from SlicerUSSim.Logic.mri.sheets import Surfels, find_sheets
 from SlicerUSSim.Logic.mri.sheets.falx_of_part import falx_of_part
 from SlicerUSSim.Logic.mri.sheets.head import Head
 from SlicerUSSim.Logic.mri.sheets.sulcal import sulci
-from SlicerUSSim.Logic.verification.brain_phantoms import COLIN27, cut_to, part_box
+from validation.brain_phantoms import COLIN27, cut_to, part_box
 
 FLUID, GREY, WHITE, NOISE = 20.0, 100.0, 140.0, 4.0
 #: Top of the corpus callosum and of the brain, and the deep end of other sulci, S mm

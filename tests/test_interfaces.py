@@ -21,8 +21,8 @@ from SlicerUSSim.Logic import (
 from SlicerUSSim.Logic.imaging.borders import HALVED_CUT, WIDE_CUT, gaussian_taps
 from SlicerUSSim.Logic.opencl.layout import CONSTANTS
 from SlicerUSSim.Logic.probe.arrays import PROBES
-from SlicerUSSim.Logic.verification.phantoms import folds, parallel_plates
 from tests.conftest import FLUID, SPECKLE, block, rigid, simulator
+from validation.phantoms import folds, parallel_plates
 
 PROBE = LinearProbe(30, 60, scan_lines=121, focus_mm=30, elevation_focus_mm=30)
 

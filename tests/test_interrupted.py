@@ -18,7 +18,7 @@ from SlicerUSSim.Logic.base.volume import read_array
 from SlicerUSSim.Logic.mri.samples import head_mri
 from SlicerUSSim.Logic.probe import craniotomy_pose
 from SlicerUSSim.Logic.tracked import write_pose
-from SlicerUSSim.Logic.verification.twins import make_twin
+from validation.twins import make_twin
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(sys.platform == "win32", reason="Windows has no SIGINT to send")]
 

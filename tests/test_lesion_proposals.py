@@ -17,7 +17,7 @@ from SlicerUSSim.Logic.mri.atlas import mni152
 from SlicerUSSim.Logic.mri.lesions.growth import grow
 from SlicerUSSim.Logic.mri.lesions.proposal import Proposal, require_own_proposals
 from SlicerUSSim.Logic.tissue.presets import TISSUES
-from SlicerUSSim.Logic.verification.brain_phantoms import (
+from validation.brain_phantoms import (
     phantom,
     tissue_maps,
     with_low_grade_tumour,

@@ -348,7 +348,7 @@ def test_demo_prints_the_path_of_its_figure(files, tmp_path):
 @pytest.mark.slow
 def test_validate_prints_its_numbers_and_not_where_they_are(tmp_path):
     pytest.importorskip("matplotlib", reason="pictures need matplotlib: pip install '.[demo]'")
-    from SlicerUSSim.Logic.verification.validation import all_checks
+    from validation.run import all_checks
 
     result = CliRunner().invoke(main, ["validate", "--only", all_checks()[0].name, "--out", str(tmp_path / "report")])
     assert "Wrote" not in result.stdout and "wrote" not in result.stdout and result.stdout.count("\n") >= 1
@@ -357,8 +357,8 @@ def test_validate_prints_its_numbers_and_not_where_they_are(tmp_path):
 
 def test_bench_prints_json_where_it_is_asked_for(monkeypatch, tmp_path):
     result = {"devices": [], "wrong": []}
-    monkeypatch.setattr("SlicerUSSim.Logic.verification.benchmark.suite.run_benchmark", lambda *_, **__: result)
-    monkeypatch.setattr("SlicerUSSim.Logic.verification.benchmark.tables.table_of", lambda _: "a table")
+    monkeypatch.setattr("benchmarks.suite.run_benchmark", lambda *_, **__: result)
+    monkeypatch.setattr("benchmarks.tables.table_of", lambda _: "a table")
     monkeypatch.chdir(tmp_path)
     assert json.loads(ussim("bench", "--json", "-", "-v").stdout)["wrong"] == []
     assert ussim("bench", "--json", "numbers.json").stdout == "a table\n"

@@ -11,7 +11,7 @@ import pytest
 from SlicerUSSim.Logic import Volume, segment_mri
 from SlicerUSSim.Logic.mri.atlas import mni152
 from SlicerUSSim.Logic.mri.nuclei import nuclear_maps
-from SlicerUSSim.Logic.verification.brain_phantoms import COLIN27, BrainPhantom, TissueMaps, phantom, tissue_maps
+from validation.brain_phantoms import COLIN27, BrainPhantom, TissueMaps, phantom, tissue_maps
 
 #: Share of white matter by which nuclei look in T1, as measured in a scan labelled by FreeSurfer (labelled_brains)
 _LOOK = 0.56

@@ -30,9 +30,10 @@ from SlicerUSSim.Logic.mri.sheets import Surfels
 from SlicerUSSim.Logic.opencl.layout import ACQUISITION, CONSTANTS
 from SlicerUSSim.Logic.probe.arrays import PROBES as STANDARD_PROBES
 from SlicerUSSim.Logic.tissue.tissue import Membrane
-from SlicerUSSim.Logic.verification import numpy_model
-from SlicerUSSim.Logic.verification.numpy_model import NumpyModel
-from SlicerUSSim.Logic.verification.numpy_model.acquisition import (
+from tests import reference as numpy_model
+from tests.conftest import block, rigid
+from tests.reference import NumpyModel
+from tests.reference.acquisition import (
     acquisition_record,
     axial_sigma_mm,
     elevational_quantiles,
@@ -41,7 +42,6 @@ from SlicerUSSim.Logic.verification.numpy_model.acquisition import (
     pulse_taps,
     stratum_centres,
 )
-from tests.conftest import block, rigid
 from tests.test_raytracing import RIB_TISSUES, rib
 
 FLUID = Tissue("fluid", 1520, 1.52, 0.0, 0.0, 0.0, 0.0)

@@ -35,9 +35,9 @@ from SlicerUSSim.Logic.probe import pose_looking_at
 from SlicerUSSim.Logic.probe.beam import FWHM_PER_SIGMA
 from SlicerUSSim.Logic.probe.image_grid import ImageGrid
 from SlicerUSSim.Logic.tissue.tissue import Tissue
-from SlicerUSSim.Logic.verification.twins import make_twin
 from tests.conftest import few_slow_others_long
 from tests.remembered import segment_once
+from validation.twins import make_twin
 
 SMALL = PhasedProbe(70.0, 50.0, scan_lines=80)
 

@@ -23,9 +23,9 @@ from SlicerUSSim.Logic import (
 from SlicerUSSim.Logic.probe import tilt_sweep
 from SlicerUSSim.Logic.probe.arrays import PROBES, Probe, probe_from_dict
 from SlicerUSSim.Logic.probe.beam import FWHM_PER_SIGMA
-from SlicerUSSim.Logic.verification.measurement import correlation, depth_window
-from SlicerUSSim.Logic.verification.phantoms import uniform_speckle
 from tests.conftest import SPECKLE, block, simulator
+from validation.measurement import correlation, depth_window
+from validation.phantoms import uniform_speckle
 
 PROBES_PAGE = Path(__file__).parents[1] / "docs" / "probes.md"
 lines = st.integers(2, 300)

@@ -29,9 +29,9 @@ from scipy.signal import hilbert
 
 from SlicerUSSim.Logic import LinearProbe
 from SlicerUSSim.Logic.probe.beam import FWHM_PER_SIGMA
-from SlicerUSSim.Logic.verification.measurement import correlation, depth_window, echo_near, full_width, level_db
-from SlicerUSSim.Logic.verification.phantoms import band_power
 from tests.conftest import FLUID, SPECKLE, block, rigid, simulator
+from validation.measurement import correlation, depth_window, echo_near, full_width, level_db
+from validation.phantoms import band_power
 
 pymust = pytest.importorskip("pymust", reason="PyMUST is the reference: pip install PyMUST")
 

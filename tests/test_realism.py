@@ -11,7 +11,6 @@ from scipy import ndimage
 from scipy.spatial.transform import Rotation
 from skimage.morphology import local_maxima
 
-from SlicerUSSim.Command.cli import main
 from SlicerUSSim.Logic import (
     ConvexProbe,
     DisplaySettings,
@@ -25,19 +24,20 @@ from SlicerUSSim.Logic import (
     similarity,
 )
 from SlicerUSSim.Logic.base.files import write_json
-from SlicerUSSim.Logic.fitting import TextureReference, measure_realism, neighbours_of, speckle_widths, texture_misfit
-from SlicerUSSim.Logic.fitting.grey_statistics import grey_of_tissues, level_by_depth
-from SlicerUSSim.Logic.fitting.realism import BLURRED, LEVELLED, NEIGHBOURS, REAL, UNIFORM, blurred
-from SlicerUSSim.Logic.fitting.sheet_contrast import line_contrast, sheet_points, surfel_points, wall_points
+from SlicerUSSim.Logic.fitting import TextureReference, neighbours_of, speckle_widths, texture_misfit
+from SlicerUSSim.Logic.fitting.controls import NEIGHBOURS, UNIFORM
 from SlicerUSSim.Logic.fitting.speckle_width import log_speckle_correlation
 from SlicerUSSim.Logic.fitting.texture_costs import local_extrema
 from SlicerUSSim.Logic.mri.samples import head_mri
 from SlicerUSSim.Logic.mri.sheets import Surfels
 from SlicerUSSim.Logic.probe import ImageGrid
 from SlicerUSSim.Logic.tracked import TrackedImages
-from SlicerUSSim.Logic.verification.twins import make_twin
 from tests.conftest import SHARED, SPECKLE, block, needs_shared, rigid
 from tests.remembered import segment_once
+from validation.grey_statistics import grey_of_tissues, level_by_depth
+from validation.realism import BLURRED, LEVELLED, REAL, blurred, main, measure_realism
+from validation.sheet_contrast import line_contrast, sheet_points, surfel_points, wall_points
+from validation.twins import make_twin
 
 SPACING = 0.2, 0.2
 GRID = ImageGrid(300, 240, -24.0, 0.0, SPACING)
@@ -289,7 +289,7 @@ def test_command_says_numbers_with_controls(twin, tmp_path):
     twin.sequence().write(tmp_path / "tracked.igs.mha")
     write_json(tmp_path / "probe.json", twin.probe.to_dict())
     arguments = [
-        "realism", tmp_path / "labels.nii.gz", "--sequence", tmp_path / "tracked.igs.mha", "--probe",
+        tmp_path / "labels.nii.gz", "--sequence", tmp_path / "tracked.igs.mha", "--probe",
         tmp_path / "probe.json", "--json", tmp_path / "realism.json", "--picture", tmp_path / "realism.png",
     ]  # fmt: skip
     done = CliRunner().invoke(main, list(map(str, arguments)))

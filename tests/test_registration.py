@@ -23,8 +23,8 @@ from SlicerUSSim.Logic.base.errors import Cancelled
 from SlicerUSSim.Logic.fitting.registration import Registration, register_poses, rigid_from, rotation_deg
 from SlicerUSSim.Logic.fitting.search import Evaluation
 from SlicerUSSim.Logic.probe.image_grid import ImageGrid
-from SlicerUSSim.Logic.verification.twins import make_twin
 from tests.conftest import FLUID, SPECKLE, block
+from validation.twins import make_twin
 
 PROBE = PhasedProbe(75.0, 60.0, scan_lines=96)
 

@@ -28,8 +28,8 @@ from SlicerUSSim.Logic.mrml.fit_nodes import CostPlot  # noqa: E402
 from SlicerUSSim.Logic.mrml.label_nodes import write_labels  # noqa: E402
 from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic  # noqa: E402
 from SlicerUSSim.Logic.mrml.nodes import ijk_to_ras, node_to_world, nodes_of_class, read_volume, write_volume  # noqa: E402
-from SlicerUSSim.Logic.verification.twins import make_twin  # noqa: E402
 from tests.remembered import segment_once  # noqa: E402
+from validation.twins import make_twin  # noqa: E402
 
 PROBE = PhasedProbe(70.0, 50.0, scan_lines=80)
 

@@ -26,10 +26,10 @@ from SlicerUSSim.Logic.mri.mixture import fit_mixture
 from SlicerUSSim.Logic.mri.neighbours import less_sure
 from SlicerUSSim.Logic.mri.samples import head_mri
 from SlicerUSSim.Logic.mri.segmentation import estimate_noise
-from SlicerUSSim.Logic.verification.brain_phantoms import part_of, phantom, tissue_maps
-from SlicerUSSim.Logic.verification.brain_scores import scores
 from tests.conftest import rigid
 from tests.remembered import segment_once
+from validation.brain_phantoms import part_of, phantom, tissue_maps
+from validation.brain_scores import scores
 
 COLIN27 = Path("/usr/share/mricron/templates/ch2bet.nii.gz")
 

@@ -12,8 +12,8 @@ from SlicerUSSim.Logic.imaging.diffraction import lobes_of
 from SlicerUSSim.Logic.opencl.layout import CONSTANTS
 from SlicerUSSim.Logic.probe.arrays import PROBES, Probe
 from SlicerUSSim.Logic.probe.beam import widening
-from SlicerUSSim.Logic.verification.measurement import correlation, depth_window
 from tests.conftest import SPECKLE, block, rigid
+from validation.measurement import correlation, depth_window
 
 #: The receive aperture is half of the transmit aperture, whose lobes are then not those of reception.
 PROBE = LinearProbe(30, 40, scan_lines=151, focus_mm=24.0, elevation_focus_mm=24.0, receive_f_number=3.0)

@@ -34,10 +34,10 @@ from SlicerUSSim.Logic.opencl.layout import CONSTANTS
 from SlicerUSSim.Logic.tissue import read_label_map
 from SlicerUSSim.Logic.tissue.presets import TISSUES
 from SlicerUSSim.Logic.tissue.table import MAX_LABEL
-from SlicerUSSim.Logic.verification.measurement import level_db
-from SlicerUSSim.Logic.verification.phantoms import band_power
-from SlicerUSSim.Logic.verification.validation import ORIENTATIONS
 from tests.conftest import FLUID, SPECKLE, block, rigid, simulator
+from validation.checks import ORIENTATIONS
+from validation.measurement import level_db
+from validation.phantoms import band_power
 
 PROBES = {
     "linear": LinearProbe(40, 50, scan_lines=161),

@@ -9,10 +9,10 @@ import pytest
 
 from SlicerUSSim.Logic import LinearProbe
 from SlicerUSSim.Logic.probe.arrays import PROBES
-from SlicerUSSim.Logic.verification.measurement import correlation, depth_window, envelope_snr, level_db
-from SlicerUSSim.Logic.verification.validation import ORIENTATIONS
-from SlicerUSSim.Logic.verification.validation.speckle import smallest_cell
 from tests.conftest import SPECKLE, block, rigid, simulator
+from validation.checks import ORIENTATIONS
+from validation.measurement import correlation, depth_window, envelope_snr, level_db
+from validation.speckle import smallest_cell
 
 LINEAR = LinearProbe(40, 50, scan_lines=161, focus_mm=25, elevation_focus_mm=25)
 SOLID = block(lambda x, y, z: np.ones_like(x), half_mm=(48, 48, 48))

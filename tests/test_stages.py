@@ -9,6 +9,8 @@ from typing import cast
 import numpy as np
 import pytest
 
+from benchmarks import frames
+from benchmarks.measuring import Machine
 from SlicerUSSim.Logic import DisplaySettings, LinearProbe, SimulationError
 from SlicerUSSim.Logic.base.settings import FULL_SCALE_DB
 from SlicerUSSim.Logic.fitting.appearance import AppearanceModel
@@ -19,11 +21,9 @@ from SlicerUSSim.Logic.imaging.scattering import LateralBeam
 from SlicerUSSim.Logic.imaging.stage import FrameInputs, Stage, Work
 from SlicerUSSim.Logic.opencl import device as opencl_device
 from SlicerUSSim.Logic.opencl.device import Workspace, kernel_folder
-from SlicerUSSim.Logic.verification.benchmark import suite
-from SlicerUSSim.Logic.verification.benchmark.machine import Machine
-from SlicerUSSim.Logic.verification.numpy_model import NumpyModel
-from SlicerUSSim.Logic.verification.numpy_model.stages import TWINS, twin_of
 from tests.conftest import SPECKLE, block, rigid, simulator
+from tests.reference import NumpyModel
+from tests.reference.stages import TWINS, twin_of
 
 ALL_STAGES = (*stages.IMPULSE_STAGES, *stages.LINEAR_STAGES, *stages.DISPLAY_STAGES)
 #: Its foci lie so deep that the beam hardly changes, for which numpy needs less time
@@ -262,10 +262,10 @@ def test_the_appearance_model_uses_an_added_stage(added):
 
 def test_the_benchmark_uses_an_added_stage(added, monkeypatch):
     found = make()
-    monkeypatch.setattr(suite, "FRAMES", {"A": PROBE})
+    monkeypatch.setattr(frames, "FRAMES", {"A": PROBE})
     for name in ("smoothing", "edge"):  # as fields of DisplaySettings with these defaults
         monkeypatch.setattr(DisplaySettings, name, getattr(ON, name), raising=False)
-    benchmark = suite._DeviceBenchmark(found.device.info, None, 1, print)
+    benchmark = frames._DeviceBenchmark(found.device.info, None, 1, print)
     benchmark.simulator, benchmark.poses = found, {"A": POSE}
     row = benchmark._frame("A", Machine(1e9, 1e9))["stages"][added.name]
     assert row["best_ms"] > 0 and row["floor_ms"] > 0 and row["operations"] > 0

@@ -23,9 +23,9 @@ from SlicerUSSim.Logic import (
 )
 from SlicerUSSim.Logic.mri.samples import head_mri
 from SlicerUSSim.Logic.tissue.texture import volume_shares
-from SlicerUSSim.Logic.verification.measurement import correlation, level_db, region_level_db
 from tests.conftest import SPECKLE, block, rigid
 from tests.remembered import segment_once
+from validation.measurement import correlation, level_db, region_level_db
 
 pytestmark = pytest.mark.usefixtures("segmented_once")
 

@@ -20,8 +20,8 @@ from SlicerUSSim.Logic.mri.plausibility import (
     require_order,
     require_several_tissues,
 )
-from SlicerUSSim.Logic.verification.brain_phantoms import TissueMaps, phantom, tissue_maps, with_ring_tumour
-from SlicerUSSim.Logic.verification.brain_scores import scores
+from validation.brain_phantoms import TissueMaps, phantom, tissue_maps, with_ring_tumour
+from validation.brain_scores import scores
 
 
 @cache

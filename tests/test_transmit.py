@@ -24,11 +24,11 @@ from SlicerUSSim.Logic.opencl.layout import CONSTANTS
 from SlicerUSSim.Logic.probe.arrays import PROBES, probe_from_dict
 from SlicerUSSim.Logic.probe.beam import LEAKED, MOST_ZONES
 from SlicerUSSim.Logic.probe.image_grid import ImageGrid
-from SlicerUSSim.Logic.verification.measurement import correlation, depth_window, level_db
-from SlicerUSSim.Logic.verification.numpy_model import NumpyModel
-from SlicerUSSim.Logic.verification.wave import speckle_half_length
 from tests.conftest import SPECKLE, block, rigid, simulator
+from tests.reference import NumpyModel
 from tests.test_numpy_model import scene
+from validation.measurement import correlation, depth_window, level_db
+from validation.wave import speckle_half_length
 
 LINEAR = LinearProbe(12, 30, scan_lines=24, frequency_mhz=5)
 MODES = {

@@ -21,11 +21,11 @@ from SlicerUSSim.Logic.fitting import AppearanceModel
 from SlicerUSSim.Logic.imaging.unevenness import speck_power, unevenness_table
 from SlicerUSSim.Logic.opencl.layout import TISSUE
 from SlicerUSSim.Logic.tissue.presets import TISSUES
-from SlicerUSSim.Logic.verification.measurement import correlation, level_db
-from SlicerUSSim.Logic.verification.numpy_model import NumpyModel
-from SlicerUSSim.Logic.verification.numpy_model.echoes import unevenness
-from SlicerUSSim.Logic.verification.validation.speckle import one_line_on
 from tests.conftest import SPECKLE, block, rigid
+from tests.reference import NumpyModel
+from tests.reference.echoes import unevenness
+from validation.measurement import correlation, level_db
+from validation.speckle import one_line_on
 
 TURN = np.array([[0.36, 0.48, -0.8], [-0.8, 0.6, 0.0], [0.48, 0.64, 0.6]])
 PROBE = LinearProbe(36, 46, scan_lines=145, focus_mm=25, elevation_focus_mm=25)

@@ -15,10 +15,11 @@ from SlicerUSSim.Command.cli import main
 from SlicerUSSim.Logic import SimulationError
 from SlicerUSSim.Logic.base.settings import SimulationSettings
 from SlicerUSSim.Logic.imaging.simulator import UltrasoundSimulator
-from SlicerUSSim.Logic.verification import phantoms
-from SlicerUSSim.Logic.verification.measurement import echo_near, fit_rayleigh, full_width, level_db
-from SlicerUSSim.Logic.verification.phantoms import Echo
-from SlicerUSSim.Logic.verification.validation import ORIENTATIONS, PROBES, Outcome, Row, all_checks, run, validate
+from validation import phantoms, run
+from validation.checks import ORIENTATIONS, PROBES, Outcome, Row
+from validation.measurement import echo_near, fit_rayleigh, full_width, level_db
+from validation.phantoms import Echo
+from validation.run import all_checks, validate
 
 #: Checks that take longer than some seconds
 _LONG = ("beams behind cysts", "beams in folds", "beams in heads", "beams past strong tissue", "compounded angles",
@@ -137,7 +138,7 @@ def test_wrong_physics_fails_the_check_of_its_phenomenon(monkeypatch, check, wro
 
     (chosen,) = (c for c in all_checks() if c.name == check)
     for module in ("artefacts", "beams", "rays", "speckle"):
-        monkeypatch.setattr(f"SlicerUSSim.Logic.verification.validation.{module}.UltrasoundSimulator", Distorted)
+        monkeypatch.setattr(f"validation.{module}.UltrasoundSimulator", Distorted)
     assert not all(row.passed for row in chosen.measure(ORIENTATIONS["aligned"], None).rows)
 
 

@@ -32,11 +32,11 @@ from SlicerUSSim.Logic.base.volume import read_array  # noqa: E402
 from SlicerUSSim.Logic.mri.samples import head_mri  # noqa: E402
 from SlicerUSSim.Logic.probe.placement import pose_looking_at  # noqa: E402
 from SlicerUSSim.Logic.tissue.own_files import write_label_files  # noqa: E402
-from SlicerUSSim.Logic.verification.brain_phantoms import phantom, tissue_maps, with_low_grade_tumour  # noqa: E402
 from SlicerUSSim.Workstation.state import NAMES  # noqa: E402
 from tests.served import Served, refused, run_script  # noqa: E402
 from tests.test_label_maps import head  # noqa: E402
 from tests.test_lesion_proposals import CENTRE, needs_atlas  # noqa: E402
+from validation.brain_phantoms import phantom, tissue_maps, with_low_grade_tumour  # noqa: E402
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="Chromium is missing: apt-get install chromium")

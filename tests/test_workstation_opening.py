@@ -17,7 +17,6 @@ pytest.importorskip("playwright", reason="browser tests need playwright: pip ins
 from SlicerUSSim.Logic import Volume
 from SlicerUSSim.Logic.imaging.preset import Preset
 from SlicerUSSim.Logic.tracked.sequence import TrackedSequence
-from SlicerUSSim.Logic.verification.ct_phantoms import lumbar_spine
 from SlicerUSSim.Workstation.state import NAMES
 from tests.test_label_maps import head
 from tests.test_parcel import write_series
@@ -36,6 +35,7 @@ from tests.test_workstation import (
     shown,
     state,
 )
+from validation.ct_phantoms import lumbar_spine
 
 
 @pytest.fixture(scope="module")

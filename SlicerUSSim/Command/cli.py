@@ -16,19 +16,16 @@ from typing import Any
 
 import click
 
-from SlicerUSSim.Command.bench import bench
 from SlicerUSSim.Command.demo import demo
 from SlicerUSSim.Command.devices import devices
 from SlicerUSSim.Command.optimize import optimize
 from SlicerUSSim.Command.options import untrusted_option, verbose_option
 from SlicerUSSim.Command.progress import note
-from SlicerUSSim.Command.realism import realism
 from SlicerUSSim.Command.segment import segment
 from SlicerUSSim.Command.serve import serve
 from SlicerUSSim.Command.signals import end_at_signals
 from SlicerUSSim.Command.simulate import simulate
 from SlicerUSSim.Command.sweep import sweep
-from SlicerUSSim.Command.validate import validate
 from SlicerUSSim.Command.volume import volume
 from SlicerUSSim.Logic.base.errors import SimulationError, is_our_warning, user_message
 from SlicerUSSim.Logic.base.version import __version__
@@ -41,10 +38,11 @@ _NO_MORE = {errno.ENOSPC, errno.EDQUOT, errno.EIO, errno.EBADF}
 _LEAST_ADDRESS_SPACE = 500_000_000
 
 
-class _Commands(click.Group):
-    """Reports errors caused by the user as one line on stderr, with exit status 2."""
+class _OneLineErrors(click.Command):
+    """Reports errors caused by the user, and warnings, as one line on stderr; the exit status of errors is 2."""
 
     def main(self, *args: Any, **extra: Any) -> Any:
+        warnings.showwarning = _show_warning
         try:
             return super().main(*args, **extra)
         except OSError as error:
@@ -72,11 +70,18 @@ class _Commands(click.Group):
             ctx.exit(2)
 
 
+class ToolCommand(_OneLineErrors):
+    """A command of a checkout, beside `ussim`."""
+
+
+class _Commands(_OneLineErrors, click.Group):
+    """The subcommands of `ussim`."""
+
+
 @click.group(cls=_Commands, context_settings={"help_option_names": ["-h", "--help"]})
 @click.version_option(__version__, prog_name="ussim")
 def main() -> None:
     """B-mode ultrasound simulated from a patient's MRI."""
-    warnings.showwarning = _show_warning
     if (address_space() or _LEAST_ADDRESS_SPACE) < _LEAST_ADDRESS_SPACE:
         raise SimulationError(str(lack_of_address_space()))
     if threading.current_thread() is threading.main_thread():
@@ -89,7 +94,7 @@ def _show_warning(message: Warning | str, category: type[Warning], *_: Any, **__
         note(f"ussim: warning: {message}")
 
 
-for command in (bench, demo, devices, optimize, realism, segment, serve, simulate, sweep, validate, volume):
+for command in (demo, devices, optimize, segment, serve, simulate, sweep, volume):
     main.add_command(untrusted_option(verbose_option(command)))
 untrusted_option(verbose_option(main))
 

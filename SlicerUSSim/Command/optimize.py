@@ -11,7 +11,7 @@ import click
 
 from SlicerUSSim.Command.options import check_outputs, check_places, gathered
 from SlicerUSSim.Command.patient_options import PatientOptions
-from SlicerUSSim.Command.progress import Curve, Steps, note
+from SlicerUSSim.Command.progress import Curve, note
 from SlicerUSSim.Command.sequence_options import SequenceOptions, TrackedExamination, open_tracked
 from SlicerUSSim.Logic.base.errors import SimulationError, require
 from SlicerUSSim.Logic.base.version import __version__
@@ -42,7 +42,7 @@ _STATE_BYTES = 2**30
 @click.option(
     "--report",
     type=click.Path(path_type=Path),
-    help="Self-contained HTML report, with the numbers of ussim realism, which the result has then as well: .html",
+    help="Self-contained HTML report: .html",
 )
 @click.option("--save-preset", type=click.Path(path_type=Path), help="Preset with the fitted values: .json")
 @click.option(
@@ -71,8 +71,8 @@ def optimize(
     """Fit display and tissue parameters to tracked real ultrasound."""
     from SlicerUSSim.Logic.base.files import read_json, write_json
     from SlicerUSSim.Logic.base.own_outputs import write_own_json
+    from SlicerUSSim.Logic.fitting.controls import neighbours_of
     from SlicerUSSim.Logic.fitting.held_out import predict
-    from SlicerUSSim.Logic.fitting.realism import neighbours_of
     from SlicerUSSim.Logic.fitting.tracked_fit import fit
     from SlicerUSSim.Logic.imaging.figures import require_matplotlib
     from SlicerUSSim.Logic.imaging.preset import Preset
@@ -118,8 +118,6 @@ def optimize(
         to_mri = found.registration.correction @ tracked.reference_to_ras
         write_own_json(save_transform, {"probe_to_ras": to_mri.tolist()})
     if report:
-        found = _measured(found, tracked)
-        write_own_json(out, found.to_dict())  # again: measuring takes long enough to be interrupted
         _write_report(report, found, tracked, patient, recording)
     _tell(found)
     note("wrote " + ", ".join(map(str, places)))
@@ -139,28 +137,11 @@ def _free_parameter(text: str) -> tuple[str, tuple[float, float] | None]:
     return name.strip(), (low, high)
 
 
-def _measured(found: Fit, tracked: TrackedExamination) -> Fit:
-    """The fit with the numbers of `ussim realism`; without them, which is said, where they cannot be measured."""
-    from SlicerUSSim.Logic.fitting.fit_realism import measure_fit
-    from SlicerUSSim.Logic.fitting.realism import neighbours_of
-
-    near = [None if of is None else neighbours_of(tracked.sequence, of) for of in (tracked.images, tracked.others)]
-    with Steps(1) as step:
-        step("numbers of realism for the report")
-        try:
-            return measure_fit(
-                found, tracked.examination.simulator, neighbours=near[0], others=tracked.others,
-                others_neighbours=near[1],
-            )  # fmt: skip
-        except SimulationError as error:  # as of labels of which nothing scatters
-            logging.getLogger(__name__).warning("the report has no numbers of realism: %s", error)
-            return found
-
-
 def _write_report(
     path: Path, found: Fit, tracked: TrackedExamination, patient: PatientOptions, recording: SequenceOptions
 ) -> None:
     """Write --report, with all inputs that are needed to repeat the fit."""
+    from SlicerUSSim.Logic.fitting.controls import control_costs, neighbours_of
     from SlicerUSSim.Logic.fitting.report import write_report
 
     simulator = tracked.examination.simulator
@@ -169,10 +150,17 @@ def _write_report(
         f"{recording.sequence}, images {', '.join(map(str, tracked.images.numbers))}. Probe: {tracked.images.probe}. "
         f"Settings: {simulator.settings}."
     )
+    fitted, near = found.simulator or simulator, neighbours_of(tracked.sequence, tracked.images)
+    try:
+        with fitted.with_tissues(found.appearance.tissues):
+            controls = control_costs(found.tracked, found.after, fitted, found.appearance.display, near)
+    except SimulationError as error:  # as of labels of which nothing scatters
+        logging.getLogger(__name__).warning("the report has no controls: %s", error)
+        controls = None
     write_report(
-        path, found.appearance, found.tracked, found.before, found.after, found.simulator or simulator,
+        path, found.appearance, found.tracked, found.before, found.after, fitted,
         subtitle=f"{Path(recording.sequence).name} on {Path(patient.source).name}", provenance=provenance,
-        prediction=found.prediction, realism=found.realism, speckle=found.speckle,
+        prediction=found.prediction, controls=controls, speckle=found.speckle,
         reference="twin" if tracked.sequence.is_simulated else "real",
     )  # fmt: skip
 

@@ -1,4 +1,4 @@
-"""Fit of simulated to real images: image similarity, free parameters, search, registration, report, realism.
+"""Fit of simulated to real images: image similarity, free parameters, search, registration, controls, report.
 
 `fit` is the complete fit to tracked images; `optimize_appearance` is the optimisation without registration.
 """
@@ -9,7 +9,7 @@ from SlicerUSSim.Logic.base.lazy import lazy_exports
 
 if TYPE_CHECKING:
     from .appearance import AppearanceModel as AppearanceModel
-    from .fit_realism import measure_fit as measure_fit
+    from .controls import neighbours_of as neighbours_of
     from .held_out import predict as predict
     from .image_similarity import (
         Similarity as Similarity,
@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     from .optimization import AppearanceResult as AppearanceResult, optimize_appearance as optimize_appearance
     from .parameters import FreeParameters as FreeParameters
     from .prediction import Prediction as Prediction
-    from .realism import Realism as Realism, measure_realism as measure_realism, neighbours_of as neighbours_of
     from .registration import Registration as Registration, register_poses as register_poses
     from .report import write_report as write_report
     from .search import Progress as Progress

@@ -10,13 +10,12 @@ import numpy as np
 
 from SlicerUSSim.Logic.base.errors import require
 from SlicerUSSim.Logic.base.settings import DisplaySettings
-from SlicerUSSim.Logic.fitting.image_similarity import SimilaritySettings, similarity
+from SlicerUSSim.Logic.fitting.controls import FITTED, NEIGHBOURS, UNIFORM, Cost, costs_against, uniform_tissues
+from SlicerUSSim.Logic.fitting.image_similarity import SimilaritySettings
 from SlicerUSSim.Logic.fitting.parameters import DISPLAY_BOUNDS, GROUPS, TISSUES, Bounds
-from SlicerUSSim.Logic.fitting.prediction import FITTED, Prediction
-from SlicerUSSim.Logic.fitting.realism import NEIGHBOURS, UNIFORM, Cost, uniform_tissues
+from SlicerUSSim.Logic.fitting.prediction import Prediction
 from SlicerUSSim.Logic.fitting.search import Progress
 from SlicerUSSim.Logic.fitting.settings import FitSettings
-from SlicerUSSim.Logic.fitting.texture_costs import TextureReference
 from SlicerUSSim.Logic.fitting.tracked_fit import Fit, fit as fit_images, simulated
 from SlicerUSSim.Logic.imaging.simulator import UltrasoundSimulator
 from SlicerUSSim.Logic.tracked.images import TrackedImages
@@ -52,7 +51,7 @@ def predict(
     free, display, speckle, max_evaluations, restarts : as they were for the fit; the uniform tissue is fitted with the
         same, since a cost has several minima.
     neighbours, fitted_neighbours : per image of `others`, and of the fitted ones, real images near it
-        (realism.neighbours_of); without them there is no floor.
+        (controls.neighbours_of); without them there is no floor.
 
     Raises SimulationError for images that were fitted too, and if no tissue has scatterers.
     """
@@ -84,7 +83,7 @@ def predict(
     fitted = {FITTED: found.after, UNIFORM: control.after}
 
     def costs(sources: Mapping[str, Sequence[np.ndarray]], tracked: TrackedImages, near) -> dict[str, list[Cost]]:
-        cost = _costs_against(tracked, settings or SimilaritySettings())
+        cost = costs_against(tracked, settings, tracked.mask & tracked.grid.field(tracked.probe))
         table = {name: [cost(image, n) for n, image in enumerate(each)] for name, each in sources.items()}
         if near is not None:
             table[NEIGHBOURS] = [cost(image, n) for n, beside in enumerate(near) for image in beside]
@@ -104,20 +103,6 @@ def as_fitted(found: Fit, others: TrackedImages) -> TrackedImages:
     if found.registration is not None:
         others = replace(others, poses=[found.registration.correction @ pose for pose in others.poses])
     return replace(others, probe=found.tracked.probe)  # whose point spread function a fit may have changed
-
-
-def _costs_against(tracked: TrackedImages, settings: SimilaritySettings) -> Callable[[np.ndarray, int], Cost]:
-    spacing, inside = tracked.grid.pixel_spacing_mm, tracked.mask & tracked.grid.field(tracked.probe)
-    references = [TextureReference(image, spacing, tracked.mask) for image in tracked.images]
-
-    def cost(image: np.ndarray, number: int) -> Cost:
-        paper = similarity(
-            image, tracked.images[number], spacing, patch_mm=settings.patch_mm, bins=settings.bins,
-            sad_weight=settings.sad_weight, mask=inside,
-        )  # fmt: skip
-        return Cost(paper, references[number].misfit(image))
-
-    return cost
 
 
 def _free_of_one(free: Iterable[str] | Mapping[str, Bounds | None]) -> dict[str, Bounds | None]:

@@ -11,10 +11,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from SlicerUSSim.Logic.fitting.realism import UNIFORM, Cost, Realism
-
-#: Name of the fit's own images among the sources
-FITTED = "simulated"
+from SlicerUSSim.Logic.fitting.controls import FITTED, UNIFORM, Cost, mean_cost
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,14 +26,10 @@ class Prediction:
     predicted: dict[str, list[Cost]]
     #: {source: (rows, columns) uint8 images of `numbers`}
     images: dict[str, list[np.ndarray]] = field(repr=False)
-    #: Of `numbers`; None unless it was measured (fit_realism.py)
-    realism: Realism | None = None
 
     def mean(self, source: str, name: str = "paper", *, fitted: bool = False) -> float:
         """Mean of a source's "paper", "t1", "t2" or "sum"; NaN where there is none."""
-        costs = (self.fitted if fitted else self.predicted).get(source, [])
-        values = [value for cost in costs if np.isfinite(value := cost.to_dict()[name])]
-        return float(np.mean(values)) if values else float("nan")
+        return mean_cost((self.fitted if fitted else self.predicted).get(source, []))[name]
 
     @property
     def of_uniform(self) -> float:
@@ -74,12 +67,10 @@ class Prediction:
                 for source, each in costs.items()
             }
 
-        realism = {} if self.realism is None else {"realism": self.realism.to_dict()}
         return {
             "fitted_images": self.fitted_numbers,
             "images": self.numbers,
             "of_uniform": self.of_uniform if np.isfinite(self.of_uniform) else None,
             "fitted": plain(self.fitted),
             "predicted": plain(self.predicted),
-            **realism,
         }

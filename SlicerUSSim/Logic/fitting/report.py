@@ -6,7 +6,7 @@ import base64
 import html
 import io
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from string import Template
 from tempfile import TemporaryDirectory
@@ -15,11 +15,11 @@ import numpy as np
 
 from SlicerUSSim.Logic.base.files import written_whole
 from SlicerUSSim.Logic.base.own_outputs import marked_html
+from SlicerUSSim.Logic.fitting.controls import FITTED, Cost, mean_cost
 from SlicerUSSim.Logic.fitting.identifiability import Spread
 from SlicerUSSim.Logic.fitting.optimization import AGAIN, STAGES, AppearanceResult
 from SlicerUSSim.Logic.fitting.parameters import Parameter
-from SlicerUSSim.Logic.fitting.prediction import FITTED, Prediction
-from SlicerUSSim.Logic.fitting.realism import Realism, control_named
+from SlicerUSSim.Logic.fitting.prediction import Prediction
 from SlicerUSSim.Logic.fitting.speckle_fit import SpeckleFit
 from SlicerUSSim.Logic.fitting.texture_costs import TextureReference
 from SlicerUSSim.Logic.imaging.figures import require_matplotlib
@@ -49,15 +49,15 @@ def write_report(
     provenance: str = "",
     prediction: Prediction | None = None,
     reference: str = "real",
-    realism: Realism | None = None,
+    controls: Mapping[str, Sequence[Cost]] | None = None,
     speckle: SpeckleFit | None = None,
 ) -> None:
     """Write the report; on failure an existing file is kept.
 
     `before` and `after` are the simulated images (rows, columns) for those of `tracked`; `prediction` adds the costs of
     other images with their controls, and the simulated ones. `reference` is what the images of `tracked` are called:
-    those of a twin are not real. `realism` adds the tables of `ussim realism` with their controls, of the fitted images
-    and, where the prediction has them, of the others; `speckle` adds what the fit of the speckle found.
+    those of a twin are not real. `controls` adds the costs of the fitted images beside their controls (control_costs);
+    `speckle` adds what the fit of the speckle found.
     Raises SimulationError without matplotlib and if the file cannot be written.
     """
     require_matplotlib()
@@ -92,7 +92,7 @@ def write_report(
         ).replace(_REFERENCE, html.escape(reference)),
         "reference": html.escape(reference),
         "histograms": _histograms(tracked, before, after, simulator, reference),
-        "realism": "" if realism is None else _realism(realism, prediction, reference),
+        "controls": "" if controls is None else _controls(controls, reference),
         "speckle": "" if speckle is None else _speckle(speckle),
         "curve": _curve(result),
         "parameters": "\n".join(_parameter_row(result, parameter) for parameter in result.parameters),
@@ -156,13 +156,7 @@ def _predicted(prediction: Prediction, reference: str) -> str:
     heads = [
         "images", f"fitted ({listed[0]}): cost", "with texture", f"predicted ({listed[1]}): cost", "with texture"
     ]  # fmt: skip
-    rows = [
-        [
-            control_named(source, reference),
-            *("–" if np.isnan(value) else f"{value:.3f}" for value in values),
-        ]
-        for source, *values in prediction.rows()
-    ]
+    rows = [[_named(source, reference), *map(_number, values)] for source, *values in prediction.rows()]
     return f"""<h2>Images that were not fitted</h2>
 {_table(heads, rows)}
 <p class="dim">The predicted images cost {prediction.of_uniform:.2f} of what one uniform tissue without anatomy, fitted
@@ -170,34 +164,25 @@ in the same way, costs there; {html.escape(reference)} neighbours are the images
 texture: + T1 + T2 / 2.</p>"""
 
 
-def _realism(realism: Realism, prediction: Prediction | None, reference: str) -> str:
-    """The tables of the fitted images and, folded away, of the predicted ones."""
+def _controls(controls: Mapping[str, Sequence[Cost]], reference: str) -> str:
+    """A table of the costs of the fitted images, beside those of the controls."""
     of = html.escape(reference)
-    others = None if prediction is None else prediction.realism
-    folded = ""
-    if others is not None:
-        folded = f"""<details><summary>The same of the images that were not fitted ({_listed(others)})</summary>
-<p class="dim">Uniform tissue, fitted, has display and tissue fitted to the same images as the simulated ones.</p>
-{_tables(others, reference)}</details>"""
-    return f"""<h2>How much the images are like {of} ones</h2>
-<p class="dim">The numbers of <code>ussim realism</code>, of the fitted images ({_listed(realism)}). Simulated are those
-after the fit. Beside them are controls. {of.capitalize()} neighbours, the images before and after in the recording, are
-the floor that nothing needs to go below. Uniform tissue is the tissue that fills most instead of all, at the gain that
-gives it the {of} images' mean grey level; with the {of} level, the same speckle on their own local mean.
-{of.capitalize()}, blurred (by 2 pixels) is what a cost that sees speckle must refuse. The sum is the paper's cost + T1
-+ T2 / 2; T1 is the size of grains, T2 their number.</p>
-{_tables(realism, reference)}
-{folded}"""
+    means = {_named(source, reference): mean_cost(costs) for source, costs in controls.items()}
+    rows = [[name, *(_number(value) for value in mean.values())] for name, mean in means.items()]
+    return f"""<h2>Costs beside the controls</h2>
+<p class="dim">Uniform tissue is the tissue that fills most instead of all, at the gain that gives it the {of} images'
+mean grey level; {of} neighbours, the images before and after in the recording, are the floor. T1 is the size of grains,
+T2 their number; the sum is the paper's cost + T1 + T2 / 2.</p>
+{_table(["images", "the paper's cost", "T1", "T2", "sum"], rows)}"""
 
 
-def _listed(realism: Realism) -> str:
-    return ", ".join(map(str, realism.numbers))
+def _named(source: str, reference: str) -> str:
+    """The name of a source, where `reference` is what the real images are called."""
+    return source.replace("real", reference)
 
 
-def _tables(realism: Realism, reference: str) -> str:
-    return "\n".join(
-        f"<h3>{html.escape(title)}</h3>\n{_table(heads, rows)}" for title, heads, rows in realism.tables(reference)
-    )
+def _number(value: float) -> str:
+    return "–" if np.isnan(value) else f"{value:.3f}"
 
 
 def _speckle(speckle: SpeckleFit) -> str:

@@ -33,7 +33,6 @@ from SlicerUSSim.Logic.tracked.images import TrackedImages
 
 if TYPE_CHECKING:
     from SlicerUSSim.Logic.fitting.prediction import Prediction
-    from SlicerUSSim.Logic.fitting.realism import Realism
 
 _log = logging.getLogger(__name__)
 
@@ -68,8 +67,6 @@ class Fit:
     simulator: UltrasoundSimulator | None = field(default=None, repr=False)
     #: None unless other images were predicted (prediction.py)
     prediction: Prediction | None = None
-    #: None unless it was measured (fit_realism.py)
-    realism: Realism | None = None
 
     def to_dict(self) -> dict:
         """Plain values for JSON."""
@@ -82,11 +79,9 @@ class Fit:
             for before, after in zip(self.texture_before, self.texture_after, strict=True)
         ]
         prediction = {} if self.prediction is None else {"prediction": self.prediction.to_dict()}
-        realism = {} if self.realism is None else {"realism": self.realism.to_dict()}
         numbers = self.tracked.numbers
         return {
             **self.appearance.to_dict(), **found, **speckle, "texture": texture, "numbers": numbers, **prediction,
-            **realism,
         }  # fmt: skip
 
 

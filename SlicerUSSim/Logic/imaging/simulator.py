@@ -124,7 +124,7 @@ class UltrasoundSimulator:
         packed = _packed_texture(texture, labels, self.settings)
         membership = None if texture is None else texture.membership()
         self.medium = Medium(labels, tissues, self.device, packed, membership, sheets)
-        #: The stages of stages.py, also for the appearance model and verification
+        #: The stages of stages.py, also for the appearance model
         self.impulse_stages = [stage(self.device) for stage in stages.IMPULSE_STAGES]
         self.linear_stages = [stage(self.device) for stage in stages.LINEAR_STAGES]
         self.display_stages = [stage(self.device) for stage in stages.DISPLAY_STAGES]

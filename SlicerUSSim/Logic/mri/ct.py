@@ -112,7 +112,7 @@ def segment_ct(
     an image without a patient, and organs that do not lie in what they are made of.
 
     >>> from SlicerUSSim.Logic import segment_ct
-    >>> from SlicerUSSim.Logic.verification.ct_phantoms import lumbar_spine
+    >>> from validation.ct_phantoms import lumbar_spine
     >>> found = segment_ct(lumbar_spine((2.0, 2.0, 4.0)).ct)
     >>> found.tissue_names
     ('skin', 'fat', 'muscle', 'blood', 'cancellous bone', 'bone')

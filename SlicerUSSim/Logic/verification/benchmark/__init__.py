@@ -1,1 +1,0 @@
-"""`ussim bench`: time per stage and per frame on every OpenCL device, compared with lower bounds."""
