@@ -48,7 +48,7 @@ def labels(head):
 def test_help_names_the_commands():
     result = ussim("--help")
     assert result.exit_code == 0
-    for command in ("demo", "segment", "simulate", "devices"):
+    for command in ("check", "demo", "segment", "simulate", "devices"):
         assert command in result.output
 
 
@@ -428,20 +428,6 @@ def test_a_volume_replaces_images_of_this_program_only(labels, tmp_path):
         result = ussim(*volume)
         assert result.exit_code == 2 and f"{out}: exists and is not as" in result.stderr
         assert out.read_bytes() == content
-
-
-def test_bench_replaces_only_its_own_results(tmp_path, monkeypatch):
-    measured = {"devices": [], "wrong": [], "machine": {}}
-    monkeypatch.setattr("benchmarks.suite.run_benchmark", lambda *_, **__: measured)
-    monkeypatch.setattr("benchmarks.tables.table_of", lambda _: "")
-    out = tmp_path / "bench.json"
-    for _ in range(2):
-        result = ussim("bench", "--json", out)
-        assert result.exit_code == 0, result.output
-    out.write_text(out.read_text().replace('"wrong": []', '"wrong": ["noted by hand"]'))
-    result = ussim("bench", "--json", out)
-    assert result.exit_code == 2 and f"{out}: exists and is not as" in result.stderr
-    assert "noted by hand" in out.read_text()
 
 
 def test_a_device_that_fails_is_one_line_too(labels, tmp_path, monkeypatch):

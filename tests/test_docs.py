@@ -16,7 +16,7 @@ from SlicerUSSim.Command.cli import main
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
-TOP_FOLDERS = ("SlicerUSSim", "kernels", "tests", "benchmarks", "examples", "docs")
+TOP_FOLDERS = ("SlicerUSSim", "kernels", "validation", "tests", "benchmarks", "examples", "docs")
 SOURCES = sorted(
     path
     for folder in TOP_FOLDERS

@@ -348,21 +348,12 @@ def test_demo_prints_the_path_of_its_figure(files, tmp_path):
 @pytest.mark.slow
 def test_validate_prints_its_numbers_and_not_where_they_are(tmp_path):
     pytest.importorskip("matplotlib", reason="pictures need matplotlib: pip install '.[demo]'")
+    from validation.__main__ import main as validation
     from validation.run import all_checks
 
-    result = CliRunner().invoke(main, ["validate", "--only", all_checks()[0].name, "--out", str(tmp_path / "report")])
+    result = CliRunner().invoke(validation, ["--only", all_checks()[0].name, "--out", str(tmp_path / "report")])
     assert "Wrote" not in result.stdout and "wrote" not in result.stdout and result.stdout.count("\n") >= 1
     assert f"wrote {tmp_path / 'report' / 'report.md'}" in result.stderr
-
-
-def test_bench_prints_json_where_it_is_asked_for(monkeypatch, tmp_path):
-    result = {"devices": [], "wrong": []}
-    monkeypatch.setattr("benchmarks.suite.run_benchmark", lambda *_, **__: result)
-    monkeypatch.setattr("benchmarks.tables.table_of", lambda _: "a table")
-    monkeypatch.chdir(tmp_path)
-    assert json.loads(ussim("bench", "--json", "-", "-v").stdout)["wrong"] == []
-    assert ussim("bench", "--json", "numbers.json").stdout == "a table\n"
-    assert [path.name for path in tmp_path.iterdir()] == ["numbers.json"]
 
 
 def test_where_there_is_no_terminal_what_takes_long_is_told_in_few_lines(monkeypatch, capsys):

@@ -171,7 +171,7 @@ def test_a_focused_transmit_beam_is_as_wide_at_and_away_from_its_focus(depth):
     lines = np.arange(0.0, 2.01, 0.1)
     image = focused_lines(np.zeros(1), np.full(1, depth), np.ones(1), lines, depth + np.arange(-0.4, 0.41, 0.02))
     lines, echo = np.union1d(-lines, lines), both_sides(np.abs(image).max(axis=0))
-    width = float(focused_probe().beam_sigma_mm(depth)[0]) * FWHM_PER_SIGMA  # which `ussim validate` finds in the image
+    width = float(focused_probe().beam_sigma_mm(depth)[0]) * FWHM_PER_SIGMA  # found in images by validation/beams.py
     assert width == pytest.approx(full_width(lines, echo), rel=0.15)
 
 
@@ -274,7 +274,7 @@ HALF = 2.0 * np.sqrt(np.log(2.0))
 def test_speckle_correlates_as_of_a_focused_wave_in_and_away_from_its_focus(
     mhz, f_number, pitch_mm, elements, focus, depths
 ):
-    """Within 10 %: the phase of our beam has the curvature for it. `ussim validate` finds the length in images."""
+    """Within 10 %: the phase of our beam has the curvature for it. validation/speckle.py finds the length in images."""
     param, spacing, lateral = array_of(mhz, f_number, pitch_mm, elements), 0.1, np.arange(0.0, 3.51, 0.1)
     delays = pymust.txdelay(0.0, focus * 1e-3, param)
     ours = LinearProbe(

@@ -11,11 +11,11 @@ from click.testing import CliRunner
 from hypothesis import given, strategies as st
 from scipy.spatial.transform import Rotation
 
-from SlicerUSSim.Command.cli import main
 from SlicerUSSim.Logic import SimulationError
 from SlicerUSSim.Logic.base.settings import SimulationSettings
 from SlicerUSSim.Logic.imaging.simulator import UltrasoundSimulator
 from validation import phantoms, run
+from validation.__main__ import main
 from validation.checks import ORIENTATIONS, PROBES, Outcome, Row
 from validation.measurement import echo_near, fit_rayleigh, full_width, level_db
 from validation.phantoms import Echo
@@ -29,9 +29,9 @@ _LONG = ("beams behind cysts", "beams in folds", "beams in heads", "beams past s
          "slice thickness", "small curved walls", "sparse speckle", "speckle correlation", "speckle everywhere",
          "speckle statistics", "steered lines", "thickness of sheets", "thin sulci", "turned planes", "uneven tissue",
          "walls and lines", "walls near ends", "wires and cysts")  # fmt: skip
-#: Those of them that the tests have aligned and oblique alone, and `ussim validate` diagonal, too: of speckle and beams
-#: in tissue whose steps of voxels echo nothing, of sheets re smooth ones in the same voxels, and of planes and walls
-#: that the check itself turns in their voxels
+#: Those of them that the tests have aligned and oblique alone, and the whole validation diagonal, too: of speckle and
+#: beams in tissue whose steps of voxels echo nothing, of sheets re smooth ones in the same voxels, and of planes and
+#: walls that the check itself turns in their voxels
 _IN_TWO = ("beams behind cysts", "beams in folds", "beams past strong tissue", "compounding", "cyst contrast",
            "flanks and lines", "flat layers", "frequency downshift", "planes along diagonals", "planes in small maps",
            "planes with edges", "rough sheets", "slice thickness", "small curved walls", "sparse speckle",
@@ -170,7 +170,7 @@ def test_the_command_says_what_is_off_and_exits_with_one(tmp_path, monkeypatch):
         return Outcome((replace(good.measure(rotation, device).rows[0], predicted=2.0),))
 
     monkeypatch.setattr(run, "all_checks", lambda: (replace(good, measure=off),))
-    result = CliRunner().invoke(main, ["validate", "--out", str(tmp_path)])
+    result = CliRunner().invoke(main, ["--out", str(tmp_path)])
     assert result.exit_code == 1
     assert "out of limits: thin sheet, fraction of rays that hit it, linear, oblique: 1" in result.output
     assert json.loads((tmp_path / "report.json").read_text())["passed"] is False
@@ -178,15 +178,15 @@ def test_the_command_says_what_is_off_and_exits_with_one(tmp_path, monkeypatch):
 
 
 def test_the_command_exits_with_zero_when_all_is_well_and_two_for_a_wrong_name(tmp_path):
-    assert CliRunner().invoke(main, ["validate", "--out", str(tmp_path), "--only", "thin sheet"]).exit_code == 0
-    result = CliRunner().invoke(main, ["validate", "--out", str(tmp_path), "--only", "gravity"])
+    assert CliRunner().invoke(main, ["--out", str(tmp_path), "--only", "thin sheet"]).exit_code == 0
+    result = CliRunner().invoke(main, ["--out", str(tmp_path), "--only", "gravity"])
     assert result.exit_code == 2 and "check is 'gravity', expected part of" in result.stderr
 
 
 @pytest.mark.slow
 def test_the_command_replaces_only_its_own_reports(tmp_path):
     def run_it(*only):
-        return CliRunner().invoke(main, ["validate", "--out", str(tmp_path), *(f"--only={text}" for text in only)])
+        return CliRunner().invoke(main, ["--out", str(tmp_path), *(f"--only={text}" for text in only)])
 
     assert run_it("thin sheet").exit_code == 0
     (picture,) = tmp_path.glob("*.png")

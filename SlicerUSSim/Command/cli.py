@@ -16,6 +16,7 @@ from typing import Any
 
 import click
 
+from SlicerUSSim.Command.check import check
 from SlicerUSSim.Command.demo import demo
 from SlicerUSSim.Command.devices import devices
 from SlicerUSSim.Command.optimize import optimize
@@ -94,7 +95,7 @@ def _show_warning(message: Warning | str, category: type[Warning], *_: Any, **__
         note(f"ussim: warning: {message}")
 
 
-for command in (demo, devices, optimize, segment, serve, simulate, sweep, volume):
+for command in (check, demo, devices, optimize, segment, serve, simulate, sweep, volume):
     main.add_command(untrusted_option(verbose_option(command)))
 untrusted_option(verbose_option(main))
 

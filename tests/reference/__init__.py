@@ -5,7 +5,7 @@ decides between two branches of a ray or two tissues of a scatterer. It is some 
 
 It computes everything from the user's inputs: label map, tissue table, settings, fields of the probe, pose, display. A
 wrong value in the simulator's record, lines, pulse or medium is therefore visible as a wrong image. The following is
-shared with the simulator, and therefore only checked against theory by `ussim validate`:
+shared with the simulator, and therefore only checked against theory by `python -m validation`:
 
 - the equations themselves, with their hashes, polynomials and the lattice of scatterers;
 - the names and number formats of layout.py, the block of samples with linear interpolation of widths, and

@@ -153,7 +153,7 @@ class Stage(ABC):
     def on_host(self, frame: HostFrame) -> None:
         """The same in plain numpy, written from the equations and not from `run`, as a reference for tests of `run`.
 
-        Not defined for the first eight stages: theirs are in verification/numpy_model.
+        Not defined for the first eight stages: theirs are in tests/reference/stages.py.
         """
         raise NotImplementedError(f"stage {self.name!r} has no twin in numpy")
 
