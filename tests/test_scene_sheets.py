@@ -70,7 +70,14 @@ def bench_with_probe() -> tuple[Scene, object]:
 
 
 @pytest.mark.slow
-def test_segment_finds_sheets_and_images_show_them():
+def test_segment_finds_sheets_and_images_show_them(monkeypatch):
+    found = []
+
+    def find(*arguments, **options):
+        found.append(find_sheets(*arguments, **options))
+        return found[-1]
+
+    monkeypatch.setattr("SlicerUSSim.Logic.mrml.logic.find_sheets", find)
     bench, presenter = bench_with_probe()
     parent = bench.add("LinearTransform", "to world")
     parent.SetMatrixTransformToParent(vtk_matrix(TURN))
@@ -90,11 +97,10 @@ def test_segment_finds_sheets_and_images_show_them():
     shown = bench.logic.lastFrame.image
 
     result = segment_once(HEAD, classes=None, thin_sulci=False)
-    sheets = find_sheets(HEAD, result, contrast="t1")
     preset, pose = bench.logic.preset, np.linalg.inv(TURN) @ node_to_world(parameters.probe_transform)
     simulator = UltrasoundSimulator(
         result.labels, TissueTable.brain(result.tissue_names), preset.settings, texture=result.texture(),
-        sheets=sheets.surfels,
+        sheets=found[0].surfels,
     )  # fmt: skip
     expected = simulator.simulate(preset.probe, pose, preset.display, noise_seed=seed_of_pose(pose)).image
 
