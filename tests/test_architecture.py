@@ -3,22 +3,21 @@
     python -m tests.test_architecture [ROOT]
 
 prints rooms, levels and imports of the tree that holds SlicerUSSim/, to compare two states of it. A room is a package
-of Logic/ (or a single file there), Widget, Workstation, Command or the file that Slicer loads. What counts are imports
-at the top of a file, inside functions and for types alone; but not what a face re-exports, since an import of a name
-from a face counts as an import of the module that defines it.
+of Logic/ (or a single file there), Widget, Workstation, Command or the file that Slicer loads. Imports count at the top
+of a file, inside functions and for types alone; but not what a face re-exports, since an import of a name from a face
+counts as an import of the module that defines it.
 """
 
 from __future__ import annotations
 
 import ast
-import json
 import re
-import subprocess
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
+from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
-from typing import TypeVar
 
 import pytest
 
@@ -39,10 +38,8 @@ HEAVY = {
     "nlopt": set(),
     "slicer": {"mrml", "module", "Widget", "Workstation"},
 }
-#: Other names of the same
-_LIBRARIES = {"vtkmodules": "vtk"}
-
-Node = TypeVar("Node")
+#: Packages of the checkout that use the product and are not installed with it
+CHECKOUT = {"validation", "benchmarks", "tests", "examples"}
 
 
 @dataclass(frozen=True)
@@ -57,7 +54,7 @@ class Import:
 
 
 class Tree:
-    """The modules of a source tree and their imports.
+    """The modules of a source tree and their imports. Each file is parsed once.
 
     Parameters
     ----------
@@ -65,11 +62,15 @@ class Tree:
     """
 
     def __init__(self, root: Path) -> None:
-        folder = root / PACKAGE
-        self.paths = {_module_name(path, root): path for path in sorted(folder.rglob("*.py"))}
-        self.sources = {name: ast.parse(path.read_text(encoding="utf-8")) for name, path in self.paths.items()}
+        self.paths = {_module_name(path, root): path for path in sorted((root / PACKAGE).rglob("*.py"))}
+        texts = {name: path.read_text(encoding="utf-8") for name, path in self.paths.items()}
+        self.sources = {name: ast.parse(text) for name, text in texts.items()}
         #: {package: {name: module that defines it}}
-        self.faces = {name: _exports(name, source) for name, source in self.sources.items() if _is_face(source)}
+        self.faces = {
+            name: _exports(name, self.sources[name])
+            for name, text in texts.items()
+            if re.search(r"^lazy_exports\(", text, re.MULTILINE)
+        }
         self.imports = [found for name in self.paths for found in self.imports_of(name, self.sources[name])]
 
     def imports_of(self, importer: str, source: ast.Module) -> Iterator[Import]:
@@ -93,14 +94,14 @@ class Tree:
                 base = parts[: len(parts) - node.level + is_package]
                 package = ".".join([*base, *([node.module] if node.module else [])])
             yield from (self._home(f"{package}.{alias.name}") for alias in node.names)
-        elif isinstance(node, ast.Call) and ast.unparse(node.func).endswith("import_module"):
+        elif isinstance(node, ast.Call) and _called(node) == "import_module":
             yield from (self._home(str(name.value)) for name in node.args[:1] if isinstance(name, ast.Constant))
 
     def _home(self, name: str) -> str:
         """The module that `name` is or comes from; for what is not of this tree, the library."""
-        if name.split(".")[0] != PACKAGE:
-            library = name.split(".")[0]
-            return _LIBRARIES.get(library, library)
+        library = name.split(".")[0]
+        if library != PACKAGE:
+            return "vtk" if library == "vtkmodules" else library
         while name not in self.paths:
             package, _, last = name.rpartition(".")
             if last in self.faces.get(package, {}):
@@ -110,6 +111,7 @@ class Tree:
             name = package
         return name
 
+    @cached_property
     def edges(self) -> set[tuple[str, str]]:
         """(importer, imported), both modules of this tree, neither a face."""
         return {
@@ -119,6 +121,7 @@ class Tree:
             and found.importer != found.imported
         }  # fmt: skip
 
+    @cached_property
     def rooms(self) -> dict[str, list[str]]:
         """{room: its modules}."""
         rooms: dict[str, list[str]] = {}
@@ -127,21 +130,18 @@ class Tree:
                 rooms.setdefault(room_of(name), []).append(name)
         return rooms
 
+    @cached_property
     def room_edges(self) -> dict[str, set[str]]:
         """{room: rooms that it imports}."""
-        found: dict[str, set[str]] = {room: set() for room in self.rooms()}
-        for importer, imported in self.edges():
+        found: dict[str, set[str]] = {room: set() for room in self.rooms}
+        for importer, imported in self.edges:
             if room_of(importer) != room_of(imported):
                 found[room_of(importer)].add(room_of(imported))
         return found
 
-    def libraries(self, *, at_top: bool) -> dict[str, set[str]]:
-        """{module: libraries it imports}, all of them or those at the top of the file."""
-        found: dict[str, set[str]] = {}
-        for entry in self.imports:
-            if entry.imported not in self.paths and (entry.at_top or not at_top):
-                found.setdefault(entry.importer, set()).add(entry.imported)
-        return found
+    def importers(self, library: str, *, at_top: bool = False) -> set[str]:
+        """Modules that import a library, anywhere or at the top of their files."""
+        return {found.importer for found in self.imports if found.imported == library and found.at_top >= at_top}
 
 
 def _module_name(path: Path, root: Path) -> str:
@@ -159,13 +159,13 @@ def room_of(module: str) -> str:
     return parts[0] if parts[0] in ("Widget", "Workstation", "Command") else "module"
 
 
-def _is_type_checking(node: ast.AST) -> bool:
-    return isinstance(node, ast.If) and ast.unparse(node.test) in ("TYPE_CHECKING", "typing.TYPE_CHECKING")
+def _called(node: ast.Call) -> str:
+    return getattr(node.func, "attr", getattr(node.func, "id", ""))
 
 
 def _in_type_checking(source: ast.Module) -> Iterator[ast.AST]:
-    for node in ast.walk(source):
-        if isinstance(node, ast.If) and _is_type_checking(node):
+    for node in source.body:
+        if isinstance(node, ast.If) and ast.unparse(node.test) in ("TYPE_CHECKING", "typing.TYPE_CHECKING"):
             for statement in node.body:
                 yield from ast.walk(statement)
 
@@ -173,13 +173,9 @@ def _in_type_checking(source: ast.Module) -> Iterator[ast.AST]:
 def _executed(node: ast.AST) -> Iterator[ast.AST]:
     """The statements that run when the file is imported: all outside functions."""
     for child in ast.iter_child_nodes(node):
-        if not isinstance(child, (ast.FunctionDef, ast.AsyncFunctionDef, ast.Lambda)):
+        if not isinstance(child, (ast.FunctionDef, ast.AsyncFunctionDef, ast.Lambda, ast.expr)):
             yield child
             yield from _executed(child)
-
-
-def _is_face(source: ast.Module) -> bool:
-    return any(isinstance(node, ast.Call) and ast.unparse(node.func) == "lazy_exports" for node in ast.walk(source))
 
 
 def _exports(package: str, source: ast.Module) -> dict[str, str]:
@@ -191,48 +187,15 @@ def _exports(package: str, source: ast.Module) -> dict[str, str]:
     }
 
 
-def circles(edges: Mapping[Node, set[Node]]) -> list[list[Node]]:
-    """Groups of nodes that reach each other (Tarjan's strongly connected components of more than one)."""
-    order: dict[Node, int] = {}
-    low: dict[Node, int] = {}
-    stack: list[Node] = []
-    found: list[list[Node]] = []
+def levels(edges: dict[str, set[str]]) -> dict[str, int]:
+    """{room: 1 for one that imports none, else one more than the highest it imports}.
 
-    def visit(node: Node) -> None:
-        order[node] = low[node] = len(order)
-        stack.append(node)
-        for following in edges.get(node, ()):
-            if following not in order:
-                visit(following)
-                low[node] = min(low[node], low[following])
-            elif following in stack:
-                low[node] = min(low[node], order[following])
-        if low[node] == order[node]:
-            group = stack[stack.index(node) :]
-            del stack[stack.index(node) :]
-            if len(group) > 1:
-                found.append(group)
-
-    for node in list(edges):
-        if node not in order:
-            visit(node)
+    Raises graphlib.CycleError, which names the rooms, if rooms import each other in a circle.
+    """
+    found: dict[str, int] = {}
+    for room in TopologicalSorter(edges).static_order():
+        found[room] = 1 + max((found[other] for other in edges[room]), default=0)
     return found
-
-
-def levels(edges: Mapping[str, set[str]]) -> dict[str, int]:
-    """{room: 1 for one that imports none, else one more than the highest it imports}; rooms in a circle share one."""
-    group = {member: tuple(members) for members in circles(edges) for member in members}
-    known: dict[str, int] = {}
-
-    def level(room: str) -> int:
-        if room not in known:
-            members = group.get(room, (room,))
-            below = {other for member in members for other in edges.get(member, ())} - set(members)
-            value = 1 + max(map(level, below), default=0)
-            known.update(dict.fromkeys(members, value))
-        return known[room]
-
-    return {room: level(room) for room in edges}
 
 
 @pytest.fixture(scope="module")
@@ -241,28 +204,28 @@ def tree() -> Tree:
 
 
 def test_the_rooms_are_those_of_the_design(tree):
-    assert set(tree.rooms()) == set(ORDER)
+    assert set(tree.rooms) == set(ORDER)
 
 
 def test_no_room_imports_one_that_stands_on_it(tree):
-    edges = tree.room_edges()
-    assert circles(edges) == []
     wrong = {
-        f"{room} -> {other}" for room, others in edges.items() for other in others
+        f"{room} -> {other}" for room, others in tree.room_edges.items() for other in others
         if ORDER.index(other) >= ORDER.index(room)
     }  # fmt: skip
-    assert wrong == set()
-    assert edges["base"] == set()
+    assert wrong == set() and tree.room_edges["base"] == set()
+    assert {other for other, imported in tree.room_edges.items() if "Workstation" in imported} == {"Command"}
 
 
 def test_no_modules_of_a_room_import_each_other_in_a_circle(tree):
-    for room, members in tree.rooms().items():
-        edges = {module: {b for a, b in tree.edges() if a == module and b in members} for module in members}
-        assert circles(edges) == [], room
+    edges: dict[str, set[str]] = {module: set() for members in tree.rooms.values() for module in members}
+    for importer, imported in tree.edges:
+        if room_of(importer) == room_of(imported):
+            edges[importer].add(imported)
+    levels(edges)
 
 
-def test_only_the_command_knows_the_workstation(tree):
-    assert {other for other, imported in tree.room_edges().items() if "Workstation" in imported} == {"Command"}
+def test_the_product_imports_nothing_of_the_checkout_alone(tree):
+    assert {library: tree.importers(library) for library in CHECKOUT} == {name: set() for name in CHECKOUT}
 
 
 def test_examples_and_benchmarks_know_no_workstation_and_no_panel(tree):
@@ -276,34 +239,19 @@ def test_examples_and_benchmarks_know_no_workstation_and_no_panel(tree):
 
 
 def test_slicer_and_qt_stay_where_they_belong(tree):
-    in_logic = {n: found for n, found in tree.libraries(at_top=False).items() if n.startswith(f"{PACKAGE}.Logic")}
-    assert {room_of(name) for name, found in in_logic.items() if "slicer" in found} == {"mrml"}
-    assert not {name for name, found in in_logic.items() if found & {"qt", "ctk", "PySide6", "trame", "click"}}
+    logic = {name for name in tree.paths if name.startswith(f"{PACKAGE}.Logic")}
+    assert {room_of(name) for name in tree.importers("slicer") & logic} == {"mrml"}
+    for library in ("qt", "ctk", "PySide6", "trame", "click"):
+        assert not tree.importers(library) & logic, library
 
 
-def test_heavy_libraries_are_imported_by_functions_or_in_the_rooms_that_live_on_them(tree):
-    at_top = tree.libraries(at_top=True)
-    found = {
-        library: {room_of(name) for name, libraries in at_top.items() if library in libraries} for library in HEAVY
-    }
-    assert {library: rooms - HEAVY[library] for library, rooms in found.items() if rooms - HEAVY[library]} == {}
-
-
-def test_help_imports_no_library_that_takes_long():
-    code = """
-import json, sys
-from click.testing import CliRunner
-from SlicerUSSim.Command.cli import main
-for arguments in (["--help"], ["simulate", "--help"], ["segment", "--help"], ["optimize", "--help"]):
-    assert CliRunner().invoke(main, arguments).exit_code == 0
-print(json.dumps(sorted({name.split(".")[0] for name in sys.modules})))
-"""
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert not {*HEAVY, "vtkmodules", "numpy", "scipy", "nibabel", "PIL", "trame"} & set(json.loads(done.stdout))
+def test_heavy_libraries_are_imported_at_the_top_only_where_they_may_be(tree):
+    for library, rooms in HEAVY.items():
+        assert set(map(room_of, tree.importers(library, at_top=True))) <= rooms, library
 
 
 def test_what_reads_the_imports_finds_them_all(tmp_path):
-    """The reader of imports: relative and lazy imports, names from faces, imports for types only, cycles and levels."""
+    """Relative and lazy imports, names from faces, imports for types alone, circles and levels."""
     files = {
         "Logic/low/__init__.py": "from x import lazy_exports\nif TYPE_CHECKING:\n    from .a import A as A\n"
         "lazy_exports(globals())\n",
@@ -311,38 +259,37 @@ def test_what_reads_the_imports_finds_them_all(tmp_path):
         "Logic/high/b.py": "from SlicerUSSim.Logic.low import A\ndef f():\n    import vtkmodules.util\n",
         "Logic/high/c.py": "from . import b\nif TYPE_CHECKING:\n    from ..low.a import A\n",
         "Logic/round.py": "import importlib\nimportlib.import_module('SlicerUSSim.Logic.high.c')\n",
-        "Widget/d.py": "import SlicerUSSim.Logic.round\n",
+        "Widget/d.py": "import SlicerUSSim.Logic.round\ndef f():\n    from tests.conftest import block\n",
     }
     for name, text in files.items():
         path = tmp_path / PACKAGE / name
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(text)
     found = Tree(tmp_path)
-    names = {(a.removeprefix(f"{PACKAGE}."), b.removeprefix(f"{PACKAGE}.")) for a, b in found.edges()}
+    names = {(a.removeprefix(f"{PACKAGE}."), b.removeprefix(f"{PACKAGE}.")) for a, b in found.edges}
     assert names == {
         ("Logic.high.b", "Logic.low.a"), ("Logic.high.c", "Logic.high.b"), ("Logic.high.c", "Logic.low.a"),
         ("Logic.round", "Logic.high.c"), ("Widget.d", "Logic.round"),
     }  # fmt: skip
-    assert levels(found.room_edges()) == {"low": 1, "high": 2, "round": 3, "Widget": 4}
-    assert found.libraries(at_top=False)[f"{PACKAGE}.Logic.high.b"] == {"vtk"}
-    assert f"{PACKAGE}.Logic.high.b" not in found.libraries(at_top=True)
-    assert found.libraries(at_top=True)[f"{PACKAGE}.Logic.low.a"] == {"json"}
-    assert [sorted(group) for group in circles({"a": {"b"}, "b": {"c"}, "c": {"b"}, "d": {"a"}})] == [["b", "c"]]
-    assert levels({"a": {"b"}, "b": {"c"}, "c": {"b"}, "d": {"a"}}) == {"a": 2, "b": 1, "c": 1, "d": 3}
+    assert levels(found.room_edges) == {"low": 1, "high": 2, "round": 3, "Widget": 4}
+    assert found.importers("vtk") == {f"{PACKAGE}.Logic.high.b"} and not found.importers("vtk", at_top=True)
+    assert found.importers("json", at_top=True) == {f"{PACKAGE}.Logic.low.a"}
+    assert found.importers("tests") == {f"{PACKAGE}.Widget.d"}
+    with pytest.raises(CycleError):
+        levels({"a": {"b"}, "b": {"c"}, "c": {"b"}, "d": {"a"}})
 
 
 def main(root: Path) -> None:
     """Print rooms, levels and imports."""
     tree = Tree(root)
-    edges = tree.room_edges()
+    edges = tree.room_edges
     floor = levels(edges)
     for room in sorted(edges, key=lambda name: (floor[name], name)):
         print(f"{floor[room]:3d}  {room:16s} {', '.join(sorted(edges[room], key=lambda name: floor[name]))}")
-    between = sum(room_of(a) != room_of(b) for a, b in tree.edges())
+    between = sum(room_of(a) != room_of(b) for a, b in tree.edges)
     print(
         f"{len(tree.paths) - len(tree.faces)} modules, {len(edges)} rooms, {max(floor.values())} levels, "
-        f"{sum(map(len, edges.values()))} imports between rooms, {between} between modules of different rooms, "
-        f"{len(circles(edges))} circles between rooms"
+        f"{sum(map(len, edges.values()))} imports between rooms, {between} between modules of different rooms"
     )
 
 

@@ -47,11 +47,8 @@ class Bench:
         grid = self.add("ScalarVolume", "grid")
         write_volume(grid, labels)
         grid.SetAndObserveTransformNodeID(parent.GetID())
-        self.whole, self.probe, self.to_world = (
-            self.add(kind, "tissues"),
-            self.add("LinearTransform", "Probe"),
-            to_world,
-        )
+        self.whole, self.probe = self.add(kind, "tissues"), self.add("LinearTransform", "Probe")
+        self.to_world = to_world
         write_labels(self.whole, labels, names, grid)
         mark_as_made(self.whole)
         self.logic.parameters.labels, self.logic.parameters.probe_transform = self.whole, self.probe
@@ -78,9 +75,8 @@ def expected(labels: Volume, pose: np.ndarray, diameter_mm: float) -> float:
     return opened(labels, NAMES, disc_opening(labels, NAMES, pose, diameter_mm))[1]
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_the_disc_under_the_probe_is_opened_in_labels_of_their_own_and_closed_again(kind, head):  # noqa: F811
-    bench = Bench(head, kind)
+def test_a_disc_is_opened_in_labels_of_its_own_and_closed_again(head):  # noqa: F811
+    bench = Bench(head)
     before = bench.tissues(bench.whole)
     assert bench.presenter.canOpenCraniotomy()[0] and not bench.presenter.canCloseCraniotomy()[0]
     bench.presenter.setValue("scene.craniotomy_mm", 30.0)
@@ -124,21 +120,6 @@ def test_an_opening_follows_the_probe(head):  # noqa: F811
     assert bench.presenter.notes().count("craniotomy: ") == 1
 
 
-@pytest.mark.slow
-def test_the_beam_reaches_the_brain_through_it_alone(head):  # noqa: F811
-    bench = Bench(head)
-    image = bench.add("ScalarVolume", "image")
-    bench.logic.placeProbe(bench.whole, bench.probe)
-    shut = bench.logic.simulate(bench.whole, bench.probe, image).image
-    bench.presenter.openCraniotomy()
-    bench.logic.placeProbe(bench.labels, bench.probe)
-    place = (np.linalg.inv(TURN) @ node_to_world(bench.probe))[:3, 3]
-    assert np.linalg.norm(place) == pytest.approx(60.0, abs=3.0)  # on the brain
-    through = bench.logic.simulate(bench.labels, bench.probe, image).image
-    deep = slice(shut.shape[0] // 2, None)
-    assert through[deep].mean() > 2.0 * shut[deep].mean() + 5.0
-
-
 def test_markups_and_masks_are_opened(head):  # noqa: F811
     bench = Bench(head)
     curve = bench.add("MarkupsClosedCurve", "curve")
@@ -152,10 +133,10 @@ def test_markups_and_masks_are_opened(head):  # noqa: F811
     bench.presenter.openCraniotomy()
     before = bench.tissues(bench.whole)
     gone = np.argwhere(bench.tissues(bench.labels) != before)
-    along = gone @ np.diag([1.5] * 3) - 84.0
-    assert np.abs(along[:, 2]).max() == pytest.approx(19.5, abs=1.5) and np.abs(along[:, 1]).max() <= 10.0
+    along = 2.0 * gone - 84.0
+    assert np.abs(along[:, 2]).max() == pytest.approx(19.0, abs=1.5) and np.abs(along[:, 1]).max() <= 10.0
     mask = bench.add("LabelMapVolume", "mask")
-    above = head.with_array(((head.array > 2) & (np.arange(head.array.shape[0])[:, None, None] > 100)).astype(np.uint8))
+    above = head.with_array(((head.array > 2) & (np.arange(head.array.shape[0])[:, None, None] > 75)).astype(np.uint8))
     write_labels(mask, above, ("opening",), bench.whole)
     bench.logic.parameters.opening = mask
     bench.presenter.openCraniotomy()
@@ -171,9 +152,6 @@ def test_what_cannot_be_opened_changes_nothing(head):  # noqa: F811
     bench.presenter.openCraniotomy()
     assert "there is no brain under the craniotomy" in bench.view.errors[-1] and bench.labels is bench.whole
     assert [node.GetName() for node in nodes_of_class(bench.scene, "vtkMRMLVolumeNode")] == names
-    brain = Bench(head.with_array(np.where(head.array == 2, 2, 0).astype(np.uint8)))
-    brain.presenter.openCraniotomy()
-    assert "as those of a brain without its skull: there is nothing to open" in brain.view.errors[-1]
     mine = bench.add("LabelMapVolume", "mine")
     write_labels(mine, head, NAMES, bench.whole)
     with pytest.raises(SimulationError, match="was not made by this module, or edited since, and is not replaced"):
@@ -204,7 +182,7 @@ def test_place_follows_the_labels_and_takes_the_largest_piece(head):  # noqa: F8
     assert model.GetParentTransformNode() is moved
 
 
-def test_the_labels_themselves_are_no_opening_and_edits_are_not_lost_unsaid(head):  # noqa: F811
+def test_the_labels_are_no_opening_and_edits_are_not_lost_unsaid(head):  # noqa: F811
     bench = Bench(head)
     bench.logic.parameters.opening = bench.whole
     bench.presenter.openCraniotomy()
@@ -212,13 +190,13 @@ def test_the_labels_themselves_are_no_opening_and_edits_are_not_lost_unsaid(head
     bench.logic.parameters.opening = None
     bench.presenter.openCraniotomy()
     first = bench.labels
-    first.GetImageData().SetScalarComponentFromDouble(56, 56, 56, 0, 2.0)
+    first.GetImageData().SetScalarComponentFromDouble(42, 42, 42, 0, 2.0)
     first.GetImageData().Modified()
     bench.presenter.openCraniotomy()
-    assert bench.labels is not first and f"what was edited in {'LabelMapVolume'}" in bench.presenter.notes()
+    assert bench.labels is not first and "what was edited in LabelMapVolume" in bench.presenter.notes()
 
 
-def test_gel_is_between_skin_and_probe_as_in_the_commands_unless_the_user_says_otherwise(head):  # noqa: F811
+def test_gel_is_between_skin_and_probe_unless_the_user_says_otherwise(head):  # noqa: F811
     bench = Bench(head)
     bench.move(pose_looking_at((0.0, 0.0, 88.0), (0.0, 0.0, 0.0)))  # 10 mm off the skin
     image = bench.add("ScalarVolume", "image")
@@ -232,9 +210,8 @@ def test_gel_is_between_skin_and_probe_as_in_the_commands_unless_the_user_says_o
     bench.logic.preset = plain
     bench.presenter.setValue("scene.gel", False)
     immersed = bench.logic.simulate(bench.whole, bench.probe, image).image
-    assert (
-        gel.mean() < 0.5 * immersed.mean() and immersed.max() > gel.max() + 50 and "gel " not in bench.presenter.notes()
-    )
+    assert gel.mean() < 0.5 * immersed.mean() and immersed.max() > gel.max() + 50
+    assert "gel " not in bench.presenter.notes()
     bench.presenter.setValue("scene.gel", True)
     bench.presenter.openCraniotomy()  # filled with saline
     assert bench.logic.settings(bench.labels).contact_gap_mm is None and "gel " not in bench.presenter.notes()
@@ -265,7 +242,7 @@ def test_place_aims_at_a_tumour_below_the_opening_and_the_notes_say_so(head):  #
 
 
 @pytest.mark.parametrize("to_world", [np.eye(4), TURN], ids=["plain", "turned"])
-def test_a_disc_opens_over_the_lesion_that_was_laid_over_the_labels_as_in_commands(head, to_world):  # noqa: F811
+def test_a_disc_opens_over_the_lesion_that_was_laid_over_the_labels(head, to_world):  # noqa: F811
     """At the start of the page with --add and --craniotomy auto it was where a craniotomy is by default."""
     place = np.array([38.0, -20.0, 20.0])
     bench = Bench(head, to_world=to_world)
@@ -320,16 +297,11 @@ def test_the_notes_follow_the_probe_over_bone_and_openings(head):  # noqa: F811
     assert bench.view.refreshed == refreshed + 1  # so that the notes are shown anew
     assert closed in bench.presenter.notes() and "the opening is elsewhere" in bench.presenter.notes()
     bench.presenter.setLive(False)
-    assert bench.presenter.noteLines == tuple(
-        line for line in bench.presenter.notes().splitlines() if closed not in line
-    )
-    brain = Bench(head.with_array(np.where(head.array == 2, 2, 0).astype(np.uint8)))
-    brain.presenter.placeProbe()
-    assert closed not in brain.presenter.notes() and not brain.view.errors
+    assert not [line for line in bench.presenter.noteLines if closed in line]
 
 
 @pytest.mark.slow
-def test_a_view_is_placed_in_an_opening_that_is_there_and_said_to_be_elsewhere_otherwise(head):  # noqa: F811
+def test_a_view_is_placed_in_an_opening_or_said_to_be_elsewhere(head):  # noqa: F811
     bench = Bench(head)
 
     def radius() -> float:
@@ -354,9 +326,9 @@ def test_a_view_is_placed_in_an_opening_that_is_there_and_said_to_be_elsewhere_o
 def test_hidden_segments_of_an_opening_stay_closed_and_are_said_to(head):  # noqa: F811
     bench = Bench(head)
     z, _, x = np.indices(head.array.shape)
-    above = (head.array > 2) & (z > 100)
+    above = (head.array > 2) & (z > 75)
     opening = bench.add("Segmentation", "opening")
-    both = head.with_array(np.where(above, np.where(x > 56, 2, 1), 0).astype(np.uint8))
+    both = head.with_array(np.where(above, np.where(x > 42, 2, 1), 0).astype(np.uint8))
     write_labels(opening, both, ("left", "right"), bench.whole)
     opening.CreateDefaultDisplayNodes()
     first, second = opening.GetSegmentation().GetSegmentIDs()
@@ -373,9 +345,8 @@ def test_hidden_segments_of_an_opening_stay_closed_and_are_said_to(head):  # noq
     assert "all its segments are hidden, expected a visible one to open" in bench.view.errors[-1]
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_an_opening_is_there_after_the_scene_was_kept_as_values_and_can_be_closed(kind, head):  # noqa: F811
-    bench = Bench(head, kind)
+def test_an_opening_is_kept_with_the_scene_and_can_then_be_closed(head):  # noqa: F811
+    bench = Bench(head, "Segmentation")
     bench.presenter.openCraniotomy()
     assert not bench.view.errors
     bench.presenter.simulate()

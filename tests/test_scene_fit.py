@@ -11,14 +11,7 @@ slicer = pytest.importorskip("slicer", reason="Slicer's MRML libraries: pip inst
 
 from vtkmodules.util.numpy_support import vtk_to_numpy  # noqa: E402
 
-from SlicerUSSim.Logic import (  # noqa: E402
-    PhasedProbe,
-    Preset,
-    SimulationError,
-    TissueTable,
-    Volume,
-)
-from SlicerUSSim.Logic.base.errors import Cancelled  # noqa: E402
+from SlicerUSSim.Logic import PhasedProbe, Preset, SimulationError, TissueTable, Volume  # noqa: E402
 from SlicerUSSim.Logic.base.vtk_data import vtk_matrix  # noqa: E402
 from SlicerUSSim.Logic.fitting import tracked_fit  # noqa: E402
 from SlicerUSSim.Logic.fitting.registration import Registration, rigid_from  # noqa: E402
@@ -36,7 +29,7 @@ PROBE = PhasedProbe(70.0, 50.0, scan_lines=80)
 
 @pytest.fixture(scope="module")
 def brain():
-    segmentation = segment_once(head_mri(2.0))
+    segmentation = segment_once(head_mri(3.0))
     return segmentation, make_twin(
         segmentation.labels, TissueTable.brain(segmentation.tissue_names), 3, probe=PROBE, frames=3
     )
@@ -112,7 +105,7 @@ def test_a_tracked_sequence_is_fitted_where_its_transforms_say(scene, found):
 
 
 @pytest.mark.slow
-def test_images_that_a_sequence_node_takes_for_one_keep_their_own_transforms(brain, scene, found):
+def test_images_at_almost_the_same_time_keep_their_own_transforms(brain, scene, found):
     own = Scene(brain, step_s=3e-4)
     poses = own.optimize(max_evaluations=1).tracked.poses
     for pose, expected in zip(poses, found.tracked.poses, strict=True):
@@ -127,7 +120,7 @@ def test_frames_are_chosen_by_number(scene):
 
 @pytest.mark.slow
 def test_images_that_are_not_fitted_are_predicted(scene):
-    found = scene.optimize(validate=[1], max_evaluations=60)
+    found = scene.optimize(validate=[1], max_evaluations=20)
     assert found.tracked.numbers == [0, 2] and found.prediction is not None
     assert found.prediction.numbers == [1]
     assert len(found.prediction.predicted["real neighbours"]) == 2
@@ -139,7 +132,6 @@ def test_images_that_are_not_fitted_are_predicted(scene):
 def test_cost_is_plotted_in_the_scene(scene, found):
     (chart,) = nodes_of_class(scene.scene, "vtkMRMLPlotChartNode")
     assert chart.GetNumberOfPlotSeriesNodes() == 2
-    table = chart.GetNthPlotSeriesNode(0).GetTableNode().GetTable()
     scene.optimize(max_evaluations=30, plot=CostPlot(scene.scene))  # again: the same nodes
     assert len(nodes_of_class(scene.scene, "vtkMRMLPlotChartNode")) == 1
     table = chart.GetNthPlotSeriesNode(0).GetTableNode().GetTable()
@@ -149,29 +141,18 @@ def test_cost_is_plotted_in_the_scene(scene, found):
 
 
 @pytest.mark.slow
-def test_a_fit_changes_the_preset_only_when_applied_and_can_be_reverted(brain):
-    own = Scene(brain)
-    before = own.logic.preset
-    found = own.optimize(free=["gain_db", "white matter.mu0"])
-    assert own.logic.preset == before
-    was = own.logic.applyFit(found)
-    assert was == before
-    after = own.logic.preset
-    assert after.display.gain_db == found.appearance.after["gain_db"]
-    assert after.tissues[3].mu0 == found.appearance.after["white matter.mu0"]
-    assert after.tissues[2] == before.tissues[2]
-    assert own.logic.revertFit(found, was) == []
-    assert own.logic.preset == before
-
-
-@pytest.mark.slow
-def test_values_that_were_set_after_apply_stay_when_it_is_taken_back(brain):
+def test_a_fit_is_applied_and_reverted_without_what_was_set_since(brain):
     """Revert dropped a tissue's value that was typed in the meantime."""
     own = Scene(brain)
     before = own.logic.preset
     found = own.optimize(free=["gain_db", "white matter.mu0"])
+    assert own.logic.preset == before
     was = own.logic.applyFit(found)
     after, csf = own.logic.preset, before.tissues.tissue("csf")
+    assert was == before and after.display.gain_db == found.appearance.after["gain_db"]
+    assert after.tissues.tissue("white matter").mu0 == found.appearance.after["white matter.mu0"]
+    assert own.logic.revertFit(found, was) == [] and own.logic.preset == before
+    own.logic.applyFit(found)
     typed = replace(csf, mu0=0.33, sources={})
     own.logic.preset = replace(after, tissues=after.tissues.with_tissue(typed)).changed("probe", frequency_mhz=3.0)
     assert own.logic.revertFit(found, was) == ["probe frequency_mhz", "csf mu0"]
@@ -229,7 +210,6 @@ def test_moved_patient_and_tracking_together_change_nothing(brain, found):
     assert again.appearance.after == pytest.approx(found.appearance.after, abs=0.05)
     nodes = {"real": own.volume("real")}
     own.logic.showFit(again, own.labels, nodes, 0)
-    other = {"real": own.volume("other")}
     still = Scene(brain)
     other = {"real": still.volume("real")}
     still.logic.showFit(found, still.labels, other, 0)
@@ -272,7 +252,7 @@ def test_geometry_can_be_estimated(scene):
 
 @pytest.mark.slow
 def test_registration_is_written_as_a_transform_of_the_tracking(brain, monkeypatch):
-    monkeypatch.setattr(tracked_fit, "_ROUNDS", ((8.0, 60), (4.0, 40)))  # how well: test_registration
+    monkeypatch.setattr(tracked_fit, "_ROUNDS", ((8.0, 10),))  # how well: test_registration
     own = Scene(brain)
     away = np.eye(4)
     away[:3, 3] = 1.5, -1.0, 2.0
@@ -280,16 +260,14 @@ def test_registration_is_written_as_a_transform_of_the_tracking(brain, monkeypat
     room = own.scene.AddNewNodeByClass("vtkMRMLLinearTransformNode", "off")
     room.SetMatrixTransformToParent(vtk_matrix(away))
     first.SetAndObserveTransformNodeID(room.GetID())
-    found = own.optimize(register=True, max_evaluations=60)
+    found = own.optimize(register=True, max_evaluations=5)
     registration = own.scene.AddNewNodeByClass("vtkMRMLLinearTransformNode", "registration")
     own.logic.writeRegistration(found, own.labels, registration)
     assert np.allclose(node_to_world(registration), found.registration.correction)
     assert found.registration.cost_after <= found.registration.cost_before
-    with pytest.raises(SimulationError, match="without registration"):
-        own.logic.writeRegistration(own.optimize(max_evaluations=5), own.labels, registration)
 
 
-def test_a_registration_of_labels_that_were_moved_is_written_for_where_they_are(brain):
+def test_a_registration_of_moved_labels_is_written_for_where_they_are(brain):
     """What moves a point of the ultrasound beside the labels moves it in the room as well."""
     own = Scene(brain)
     room = own.scene.AddNewNodeByClass("vtkMRMLLinearTransformNode", "room")
@@ -306,21 +284,6 @@ def test_a_registration_of_labels_that_were_moved_is_written_for_where_they_are(
         own.logic.writeRegistration(Fit(None, moved, None, [], []), own.labels, room)
     assert np.allclose(node_to_world(room), to_world)
     assert np.allclose(node_to_world(node) @ to_world @ point, to_world @ correction @ point, atol=1e-6)
-
-
-@pytest.mark.slow
-def test_cancelling_leaves_the_scene_as_it_was(brain):
-    own = Scene(brain)
-    before = own.logic.preset
-
-    def stop(progress):
-        if progress.evaluations == 5:
-            raise Cancelled
-
-    with pytest.raises(Cancelled):
-        own.optimize(progress=stop)
-    assert own.logic.preset == before
-    assert own.optimize(max_evaluations=10).appearance.cost_before > 0
 
 
 def test_bad_nodes_are_one_clear_line(scene):

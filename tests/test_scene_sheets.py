@@ -9,17 +9,16 @@ import pytest
 
 slicer = pytest.importorskip("slicer", reason="MRML nodes come with slicer-core: pip install '.[slicer]'")
 
-from SlicerUSSim.Logic import TissueTable, UltrasoundSimulator, Volume, segment_mri  # noqa: E402
+from SlicerUSSim.Logic import TissueTable, UltrasoundSimulator, Volume  # noqa: E402
 from SlicerUSSim.Logic.base.vtk_data import vtk_matrix  # noqa: E402
 from SlicerUSSim.Logic.imaging.noise import seed_of_pose  # noqa: E402
-from SlicerUSSim.Logic.mri.settings import SheetSettings  # noqa: E402
 from SlicerUSSim.Logic.mri.sheets import KINDS, Surfels, find_sheets  # noqa: E402
-from SlicerUSSim.Logic.mri.sheets.finding import ALL_KINDS  # noqa: E402
 from SlicerUSSim.Logic.mrml.label_nodes import read_labels, write_labels  # noqa: E402
 from SlicerUSSim.Logic.mrml.nodes import node_to_world, write_volume  # noqa: E402
 from SlicerUSSim.Logic.mrml.sheet_nodes import read_sheets, sheets_version, write_sheets  # noqa: E402
 from SlicerUSSim.Logic.tissue.presets import TISSUES  # noqa: E402
 from tests.conftest import coarse_chest  # noqa: E402
+from tests.remembered import segment_once  # noqa: E402
 from tests.test_craniotomy_nodes import TURN  # noqa: E402
 from tests.test_lesion_nodes import HEAD, Scene  # noqa: E402
 from tests.test_lesion_proposals import CENTRE, brain, needs_atlas  # noqa: E402
@@ -71,7 +70,14 @@ def bench_with_probe() -> tuple[Scene, object]:
 
 
 @pytest.mark.slow
-def test_segment_finds_sheets_and_images_show_them_as_those_of_the_command():
+def test_segment_finds_sheets_and_images_show_them(monkeypatch):
+    found = []
+
+    def find(*arguments, **options):
+        found.append(find_sheets(*arguments, **options))
+        return found[-1]
+
+    monkeypatch.setattr("SlicerUSSim.Logic.mrml.logic.find_sheets", find)
     bench, presenter = bench_with_probe()
     parent = bench.add("LinearTransform", "to world")
     parent.SetMatrixTransformToParent(vtk_matrix(TURN))
@@ -90,13 +96,11 @@ def test_segment_finds_sheets_and_images_show_them_as_those_of_the_command():
     presenter.simulate()
     shown = bench.logic.lastFrame.image
 
-    mri = HEAD
-    result = segment_mri(mri, classes=None, thin_sulci=False)
-    sheets = find_sheets(mri, result, contrast="t1")
+    result = segment_once(HEAD, classes=None, thin_sulci=False)
     preset, pose = bench.logic.preset, np.linalg.inv(TURN) @ node_to_world(parameters.probe_transform)
     simulator = UltrasoundSimulator(
         result.labels, TissueTable.brain(result.tissue_names), preset.settings, texture=result.texture(),
-        sheets=sheets.surfels,
+        sheets=found[0].surfels,
     )  # fmt: skip
     expected = simulator.simulate(preset.probe, pose, preset.display, noise_seed=seed_of_pose(pose)).image
 
@@ -116,7 +120,7 @@ def test_segment_finds_sheets_and_images_show_them_as_those_of_the_command():
 
 
 @pytest.mark.slow
-def test_the_tissue_of_the_falx_that_is_drawn_is_in_the_panel_and_changes_images():
+def test_the_tissue_of_a_drawn_falx_is_in_the_panel_and_changes_images():
     bench, presenter = bench_with_probe()
     presenter.segment()
     presenter.placeProbe()
@@ -146,8 +150,7 @@ def test_the_tissue_of_the_falx_that_is_drawn_is_in_the_panel_and_changes_images
     assert change[near].mean() > 5.0 and np.abs(change[~near]).mean() < 0.3
 
 
-@pytest.mark.slow
-def test_sheets_of_a_user_are_kept_and_a_model_of_something_else_is_one_line():
+def test_sheets_of_a_user_are_kept_and_another_model_is_one_line():
     bench, presenter = bench_with_probe()
     parameters = bench.logic.parameters
     mine = bench.add("Model", "mine")
@@ -156,11 +159,6 @@ def test_sheets_of_a_user_are_kept_and_a_model_of_something_else_is_one_line():
     parameters.sheets = mine
     presenter.segment()
     assert parameters.sheets is mine and "images show the sheets in 'mine'" in presenter.notes()
-    count = mine.GetPolyData().GetNumberOfCells()
-    presenter.setValue("scene.sheet_find", True)
-    presenter.segment()
-    assert parameters.sheets is not mine and mine.GetPolyData().GetNumberOfCells() == count
-    assert "'mine' was loaded by others and is kept, but not shown any more" in presenter.notes()
     presenter.placeProbe()
     presenter.simulate()
     parameters.sheets = parameters.outline  # a model without sheets
@@ -181,23 +179,16 @@ def test_what_has_no_sheets_is_said_before_anything_is_computed():
     assert "Head sheets" not in names
 
 
-def test_the_settings_of_sheets_name_what_can_be_found():
-    assert SheetSettings().kinds == ALL_KINDS and not SheetSettings().find
-    chosen = SheetSettings.of_kinds(["falx", "corpus callosum"], find=True)
-    assert chosen.kinds == ("falx", "corpus callosum") and chosen.find
-
-
 # ---- organs of a CT --------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", [pytest.param("LabelMapVolume", marks=pytest.mark.slow), "Segmentation"])
-def test_organs_of_a_ct_are_laid_over_its_tissues_wherever_their_node_lies(kind):
+def test_organs_of_a_ct_are_laid_over_its_tissues_wherever_their_node_lies():
     bench, phantom = Scene(), coarse_chest()
     write_volume(bench.mri, phantom.ct)
     liver = Volume((phantom.organs.array == 5).astype(np.uint8), np.linalg.inv(TURN) @ phantom.organs.ijk_to_ras)
     assert liver.array.sum() > 1000
-    organs = bench.add(kind, "organs")
+    organs = bench.add("Segmentation", "organs")
     write_labels(organs, liver, ("liver",), organs)
     parent = bench.add("LinearTransform", "to world")
     parent.SetMatrixTransformToParent(vtk_matrix(TURN))
@@ -214,15 +205,14 @@ def test_organs_of_a_ct_are_laid_over_its_tissues_wherever_their_node_lies(kind)
 
 
 @pytest.mark.slow
-def test_organs_without_names_are_read_by_totalsegmentators_numbers_whatever_tissues_there_are():
+def test_organs_without_names_are_read_by_totalsegmentators_numbers():
     """After Segment of a CT, they were taken for the tissues that it had found: a kidney for fat."""
     bench, phantom = Scene(), coarse_chest()
     organs = bench.add("LabelMapVolume", "organs")
     write_volume(organs, phantom.organs)
-    for tissues in (bench.logic.preset.tissues, TissueTable.named(("skin", "fat", "muscle", "blood", "bone"))):
-        found = read_labels(organs, tissues, of_ct=True)
-        assert found.names == ("kidney", "liver", "lung")
-        assert "taken for the numbers of TotalSegmentator CT (2 kidney right" in found.taken_for
+    found = read_labels(organs, TissueTable.named(("skin", "fat", "muscle", "blood", "bone")), of_ct=True)
+    assert found.names == ("kidney", "liver", "lung")
+    assert "taken for the numbers of TotalSegmentator CT (2 kidney right" in found.taken_for
 
 
 # ---- lesions that are proposed ---------------------------------------------------------------------------------------
@@ -240,7 +230,7 @@ def proposing() -> tuple[Scene, object, np.ndarray]:
 
 
 @needs_atlas
-def test_a_point_shown_in_a_view_proposes_a_lesion_that_is_laid_over_the_tissues_when_it_is_accepted():
+def test_a_point_in_a_view_proposes_a_lesion_that_is_laid_on_when_accepted():
     bench, presenter, true = proposing()
     parameters = bench.logic.parameters
     assert presenter.canPropose() == (False, "Segment this MRI first")
@@ -262,6 +252,10 @@ def test_a_point_shown_in_a_view_proposes_a_lesion_that_is_laid_over_the_tissues
     assert parameters.proposal.GetDisplayNode().GetVisibility()
     with pytest.raises(ValueError, match="not in tuple"):  # nothing is laid over the tissues
         bench.voxels("tumour", parameters.labels)
+    first = parameters.proposal
+    presenter.discardProposal()
+    assert parameters.proposal is None and first.GetScene() is None and "proposal: " not in presenter.notes()
+    presenter.proposeAtPoint()
     presenter.acceptProposal()
     assert not presenter.view.errors and parameters.proposal is None and "proposal: " not in presenter.notes()
     laid = bench.voxels("tumour", parameters.labels)
@@ -269,43 +263,15 @@ def test_a_point_shown_in_a_view_proposes_a_lesion_that_is_laid_over_the_tissues
     assert list(parameters.lesions.GetSegmentation().GetSegmentIDs())
 
 
-@needs_atlas
-@pytest.mark.slow
-def test_a_proposal_without_a_point_is_discarded_and_a_named_one_is_taken_at_the_users_word():
-    bench, presenter, _ = proposing()
-    parameters = bench.logic.parameters
-    bench.logic.proposals.segmented(bench.mri, brain("low")[0])
-    presenter.proposeLesions()
-    first = parameters.proposal
-    assert first is not None and not presenter.view.errors
-    presenter.discardProposal()
-    assert parameters.proposal is None and first.GetScene() is None and "proposal: " not in presenter.notes()
-    parameters.seed = bench.add("MarkupsFiducial", "point")
-    parameters.seed.AddControlPointWorld(*CENTRE)
-    presenter.setValue("scene.lesion_as", "oedema")
-    presenter.proposeAtPoint()
-    segmentation = parameters.proposal.GetSegmentation()
-    assert [segmentation.GetSegment(name).GetName() for name in segmentation.GetSegmentIDs()] == ["oedema"]
-    bench.logic.proposals.segmented(bench.mri, brain("healthy")[0])
-    presenter.proposeLesions()
-    assert parameters.proposal is None and "proposal: no lesion proposed" in presenter.notes()
-
-
 @pytest.mark.slow
 @needs_atlas
-@pytest.mark.parametrize(
-    ("seed", "words"),
-    [
-        ((28.0, -22.0, 28.0), "white matter that looks healthy"),
-        ((0.0, 0.0, -70.0), "mm outside the brain"),
-        ((4.0, 8.0, 16.0), "fluid that looks like CSF"),
-    ],
-)
-def test_a_point_in_no_lesion_is_one_line_and_proposes_nothing(seed, words):
+def test_a_point_in_no_lesion_is_one_line_and_proposes_nothing():
     bench, presenter, _ = proposing()
     bench.logic.proposals.segmented(bench.mri, brain("healthy")[0])
     bench.logic.parameters.seed = bench.add("MarkupsFiducial", "point")
-    bench.logic.parameters.seed.AddControlPointWorld(*seed)
+    bench.logic.parameters.seed.AddControlPointWorld(28.0, -22.0, 28.0)
     presenter.proposeAtPoint()
     (line,) = presenter.view.errors
-    assert words in line and "\n" not in line and bench.logic.parameters.proposal is None
+    assert "white matter that looks healthy" in line and "\n" not in line
+    presenter.proposeLesions()
+    assert bench.logic.parameters.proposal is None and "proposal: no lesion proposed" in presenter.notes()

@@ -22,7 +22,7 @@ from tests.test_pathology import ball, empty, moved  # noqa: E402
 pytestmark = pytest.mark.usefixtures("segmented_once")
 
 KINDS = ["LabelMapVolume", "Segmentation"]
-MRI = head_mri(3.0)
+MRI = head_mri(3.5)
 LESION = ball(moved(empty((2.0, 2.0, 2.0), np.eye(3), 20), 30.0, 10.0, 35.0), 8.0, np.array([30.0, 10.0, 35.0]))
 
 

@@ -7,12 +7,10 @@ import importlib.metadata
 import json
 import logging
 import os
-import pkgutil
 import re
 import subprocess
 import sys
 import textwrap
-import time
 import types
 import typing
 from pathlib import Path
@@ -33,8 +31,6 @@ from tests.slicer_factory import load_source_as_module  # noqa: E402
 ROOT = Path(__file__).parents[1]
 MODULE_FILE = ROOT / "SlicerUSSim" / "USSim.py"
 RESOURCES = ROOT / "SlicerUSSim" / "Resources"
-#: What Slicer gets of the package
-PACKAGES = ("Logic", "Widget")
 
 
 @pytest.fixture(scope="module")
@@ -84,9 +80,11 @@ class Session:
         self.widget = module.USSimWidget(parent)
         self.widget.setup()
         self.widget.enter()
-        self.ui, self.panel = self.widget.ui, self.widget.panel
-        self.logic = self.widget.logic.ultrasound
-        self.parameters = self.logic.parameters
+
+    ui = property(lambda self: self.widget.ui)
+    panel = property(lambda self: self.widget.panel)
+    logic = property(lambda self: self.widget.logic.ultrasound)
+    parameters = property(lambda self: self.logic.parameters)
 
     def add(self, kind: str, name: str):
         return self.scene.AddNewNodeByClass(f"vtkMRML{kind}Node", name)
@@ -94,7 +92,7 @@ class Session:
     def head(self):
         """A small head, as loading an MRI would add it."""
         node = self.add("ScalarVolume", "Head")
-        self.logic_module("mrml.nodes").write_volume(node, self.logic_module("mri.samples").head_mri(3.0))
+        self.logic_module("mrml.nodes").write_volume(node, self.logic_module("mri.samples").head_mri(4.0))
         return node
 
     def segmented(self):
@@ -147,16 +145,6 @@ def session(module):
 # ---- loading ---------------------------------------------------------------------------------------------------------
 
 
-def test_every_submodule_imports_from_the_package_of_the_module(module):
-    package = sys.modules["SlicerUSSim"]
-    assert list(package.__path__) == [str(MODULE_FILE.parent)] and not getattr(package, "__file__", None)
-    imported = []
-    for folder in PACKAGES:
-        for info in pkgutil.walk_packages([str(MODULE_FILE.parent / folder)], f"SlicerUSSim.{folder}."):
-            imported.append(Path(importlib.import_module(info.name).__file__))
-    assert len(imported) > 70 and all(file.is_relative_to(MODULE_FILE.parent) for file in imported)
-
-
 def test_start_up_imports_nothing_that_takes_time_or_may_be_missing():
     code = """
         import os, sys
@@ -202,29 +190,22 @@ def test_start_up_imports_nothing_that_takes_time_or_may_be_missing():
     assert done.returncode == 0 and done.stdout.strip().endswith("fine"), done.stderr[-2000:]
 
 
-def test_a_slicer_without_packages_of_the_panel_asks_for_them_and_shows_it_then(module, simulation_error, monkeypatch):
+def test_without_its_packages_the_panel_asks_for_them_and_is_shown_then(module, simulation_error, monkeypatch):
     def declined() -> None:
         raise simulation_error()("the installation was declined")
 
-    module.app.errors.clear()
     monkeypatch.setitem(sys.modules, "SlicerUSSim.Widget.panel", None)  # importing it fails
     monkeypatch.setattr(module, "ensurePackages", declined)
-    slicer.mrmlScene = slicer.vtkMRMLScene()
-    parent = stand_in.QtWidgets.QWidget()
-    stand_in.QtWidgets.QVBoxLayout(parent)
-    parent.isEntered = True
-    widget = module.USSimWidget(parent)
-    widget.setup()
-    widget.enter()
+    session = Session(module)
+    widget = session.widget
     widget.onSceneEndChange(None, None)
     assert widget.panel is None and module.app.errors == ["the installation was declined"]
     monkeypatch.delitem(sys.modules, "SlicerUSSim.Widget.panel")
     monkeypatch.setattr(module, "ensurePackages", lambda: None)
     widget.installButton.click()
-    assert widget.panel is not None and widget.ui.segmentButton and not widget.installButton.isVisibleTo(parent)
-    widget.cleanup()
-    parent.deleteLater()
-    module.app.processEvents()
+    assert widget.panel is not None and widget.ui.segmentButton
+    assert not widget.installButton.isVisibleTo(session.parent)
+    session.close()
 
 
 def test_requirements_are_those_of_the_package_without_what_slicer_brings():
@@ -244,17 +225,6 @@ def test_requirements_are_those_of_the_package_without_what_slicer_brings():
 def _distribution(requirement: str) -> tuple[str, str]:
     name, rest = re.match(r"([\w-]+)(.*)", requirement).groups()
     return name.lower(), rest.replace("'", '"').replace(" ", "")
-
-
-def test_the_module_describes_itself(module):
-    class Parent:
-        path = str(MODULE_FILE)
-
-    described = module.USSim(Parent())
-    parent = described.parent
-    assert parent.title and parent.categories == ["Ultrasound"] and "Salehi" in parent.acknowledgementText
-    assert "MRI" in parent.helpText and "<a href=" in parent.helpText
-    assert (RESOURCES / "Icons" / "USSim.png").exists()
 
 
 def test_sample_data_is_registered_with_a_checksum_and_a_thumbnail(module, monkeypatch):
@@ -296,7 +266,7 @@ def test_the_parameter_node_is_the_scenes(module):
             assert issubclass(getattr(slicer, kind), hints[name]), name
 
 
-def test_the_parameter_node_has_the_declared_defaults_and_both_sides_read_what_the_other_wrote(session):
+def test_slicer_and_module_read_what_the_other_wrote_in_the_parameter_node(session):
     parameters, typed = session.parameters, session.widget.logic.getParameterNode()
     declared = importlib.import_module("SlicerUSSim.Logic.mrml.parameter_node").VALUE_PARAMETERS
     for name in typed.names:
@@ -307,17 +277,6 @@ def test_the_parameter_node_has_the_declared_defaults_and_both_sides_read_what_t
     assert session.ui.contrastComboBox.currentText() == "flair" and not session.ui.showInSliceCheckBox.isChecked()
     parameters.filter_radius, parameters.real = 4, session.head()
     assert typed.filter_radius == 4 and typed.real is parameters.real
-
-
-@pytest.mark.slow
-def test_the_modules_own_test_passes(module):
-    module.app.testing = True
-    slicer.mrmlScene = slicer.vtkMRMLScene()
-    try:
-        module.USSimTest().runTest()
-    finally:
-        module.app.testing = False
-    assert module.app.shown[-1] == "Test passed"
 
 
 # ---- the widgets -----------------------------------------------------------------------------------------------------
@@ -336,16 +295,11 @@ def controls_of(session) -> dict[str, tuple]:
     return {control.value: (control, widget) for control, widget in session.panel._controls if control.value}
 
 
-def test_every_widget_the_panel_names_is_there(session):
-    names = set(re.findall(r"\bui\.(\w+)", (ROOT / "SlicerUSSim" / "Widget" / "panel.py").read_text()))
-    assert len(names) > 10 and not {name for name in names if not hasattr(session.ui, name)}
-    for name, widget in vars(session.ui).items():
-        assert widget.objectName() == name and session.parent.isAncestorOf(widget)
-
-
-def test_every_declared_parameter_that_is_shown_is_in_the_panel_with_tip_unit_and_range(session):
+def test_every_shown_parameter_is_in_the_panel_with_tip_unit_and_range(session):
     controls, shown = controls_of(session), shown_parameters()
     assert set(controls) == set(shown) and len(shown) > 30
+    for control, widget in session.panel._controls:
+        assert len(widget.toolTip()) > 10, control.name
     for name, entry in shown.items():
         widget = controls[name][1]
         assert entry.tip in widget.toolTip(), name
@@ -362,23 +316,6 @@ def test_every_declared_parameter_that_is_shown_is_in_the_panel_with_tip_unit_an
             assert [widget.itemText(n) for n in range(widget.count())] == list(entry.choices)
 
 
-def test_labels_stand_beside_their_widgets(session):
-    """Every value that is no tick, every node and every list has a label in its line."""
-    for control, widget in session.panel._controls:
-        form = widget.parentWidget().layout()
-        if not isinstance(form, stand_in.QtWidgets.QFormLayout) or control.kind in ("button", "table", "words"):
-            continue
-        label = form.labelForField(widget)
-        assert label.text() == ("" if control.kind == "tick" else f"{control.label}:"), control.name
-        assert label.toolTip() == control.tip
-
-
-def test_every_control_has_a_tool_tip(session):
-    for control, widget in session.panel._controls:
-        assert len(widget.toolTip()) > 10, control.name
-    assert len(session.panel._controls) > 60
-
-
 def test_every_node_selector_has_the_scene_and_the_classes_of_its_role(session):
     selectors = [(control, widget) for control, widget in session.panel._controls if control.kind == "node"]
     roles = importlib.import_module("SlicerUSSim.Logic.mrml.parameter_node").NODE_PARAMETERS
@@ -392,7 +329,7 @@ def test_every_node_selector_has_the_scene_and_the_classes_of_its_role(session):
 def test_every_value_of_the_panel_accepts_both_ends_of_its_range(session):
     preset_module = session.logic_module("imaging.preset")
     presenter = session.panel.presenter
-    for probe in session.logic_module("probe.arrays").PROBES.values():
+    for probe in {probe.kind: probe for probe in session.logic_module("probe.arrays").PROBES.values()}.values():
         session.logic.preset = preset_module.Preset(probe)
         for name, (control, _) in controls_of(session).items():
             shown = presenter.value(name)
@@ -400,7 +337,7 @@ def test_every_value_of_the_panel_accepts_both_ends_of_its_range(session):
                 continue
             if control.kind in ("slider", "number"):
                 assert control.range.low <= shown <= control.range.high, (name, probe)
-                for end in (control.range.low, control.range.high, shown):
+                for end in (control.range.low, control.range.high):
                     presenter.setValue(name, float(end))  # as widgets hold whole numbers
                     assert presenter.value(name) == pytest.approx(end) or control.range.none_at == end, name
             else:
@@ -425,7 +362,7 @@ def test_whole_numbers_and_ticks_of_widgets_reach_the_declared_types(session):
     assert session.ui.seedSpinBox.property("value") == 4_000_000_000 and not session.app.errors
 
 
-def test_a_scene_made_by_hand_with_a_wrong_value_is_shown_and_can_be_mended(session):
+def test_a_wrong_value_in_a_scene_is_shown_and_can_be_mended(session):
     session.parameters.mri = session.head()
     session.parameters.node.SetParameter("contrast", "T3")
     assert session.ui.contrastComboBox.currentText() == "t1"
@@ -433,46 +370,6 @@ def test_a_scene_made_by_hand_with_a_wrong_value_is_shown_and_can_be_mended(sess
     assert session.app.errors == ["scene: contrast is 'T3', expected one of t1, t1gd, t2, flair, ct"]
     session.ui.contrastComboBox.setCurrentText("t2")
     assert session.parameters.segmentation.contrast == "t2"
-
-
-def test_a_section_with_a_value_and_a_button_is_a_declaration_a_line_and_a_method(module, monkeypatch):
-    declaration = importlib.import_module("SlicerUSSim.Logic.base.declaration")
-    parameter_node = importlib.import_module("SlicerUSSim.Logic.mrml.parameter_node")
-    controls = importlib.import_module("SlicerUSSim.Widget.controls")
-    panel = importlib.import_module("SlicerUSSim.Widget.panel")
-    presenter = importlib.import_module("SlicerUSSim.Widget.presenter").PanelPresenter
-    pressed = []
-
-    # 1. the declaration of the value
-    entry = declaration.Parameter(
-        name="margin_mm", type=float, default=2.0, label="Margin", tip="What is left around the brain", unit="mm",
-        bounds=(0, 50), shown=declaration.Shown(0, 20, 0.5),
-    )  # fmt: skip
-    monkeypatch.setitem(parameter_node.VALUE_PARAMETERS, "margin_mm", entry)
-    value = parameter_node.ValueParameter(entry)
-    monkeypatch.setattr(parameter_node.SceneParameters, "margin_mm", value, raising=False)
-    # 2. the method of the presenter
-    monkeypatch.setattr(
-        presenter, "extract", lambda self: pressed.append(self.logic.parameters.margin_mm), raising=False
-    )
-    monkeypatch.setattr(presenter, "canExtract", lambda self: (not pressed, "It is done"), raising=False)
-    # 3. the section
-    button = controls.button("extract", "Extract", "Find the brain in the MRI", enabled="canExtract")
-    section = controls.Section("Brain", True, (controls.value("scene.margin_mm"), button))
-    sections = panel.panel_sections()
-    monkeypatch.setattr(panel, "panel_sections", lambda: (*sections, section))
-
-    session = Session(module)
-    try:
-        assert session.ui.marginSpinBox.property("value") == 2.0 and session.ui.marginSpinBox.suffix() == " mm"
-        session.ui.marginSpinBox.setValue(4.5)
-        assert session.parameters.node.GetParameter("margin_mm") == "4.5"
-        session.ui.extractButton.click()
-        assert pressed == [4.5]
-        session.panel.refresh()
-        assert not session.ui.extractButton.isEnabled() and session.ui.extractButton.toolTip() == "It is done"
-    finally:
-        session.close()
 
 
 def test_a_new_display_parameter_is_in_the_panel_by_its_declaration_alone(module, monkeypatch):
@@ -500,26 +397,35 @@ def test_a_new_display_parameter_is_in_the_panel_by_its_declaration_alone(module
 # ---- working with it -------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.slow
 def test_the_first_image_takes_a_volume_and_two_clicks(session):
     session.parameters.mri = None
     assert not session.ui.segmentButton.isEnabled() and not session.ui.liveCheckBox.isEnabled()
-    session.head()
-    session.widget.enter()  # the only volume is used as the MRI
-    assert session.parameters.mri.GetName() == "Head" and session.ui.segmentButton.isEnabled()
-    session.ui.segmentButton.click()
+    session.segmented()
     labels = session.parameters.labels
-    assert labels.GetName() == "Head tissues" and labels.GetSegmentation().GetNumberOfSegments() == 4
+    assert labels.GetName() == "Head tissues" and labels.GetSegmentation().GetNumberOfSegments() == 3
     assert session.ui.labelsSelector.currentNode() is labels
+    session.ui.sliceViewComboBox.setCurrentText("Yellow")
     session.ui.liveCheckBox.setChecked(True)
     assert session.logic.isLive and not session.app.errors
     assert session.image().mean() > 5
     assert session.parameters.output.GetParentTransformNode() is session.parameters.probe_transform
     assert session.parameters.outline.GetPolyData().GetNumberOfPoints() > 50
     assert session.parameters.probe_transform.GetDisplayNode().GetEditorVisibility()
+    # The slice view stands in the plane of the probe.
+    view = session.panel.sliceNode()
+    assert view.GetLayoutName() == "Yellow"
+    pose = session.logic_module("mrml.nodes").node_to_world(session.parameters.probe_transform)
+    matrix = np.array(view.GetSliceToRAS().GetData()).reshape(4, 4)
+    np.testing.assert_allclose(matrix[:3, 0], pose[:3, 0], atol=1e-9)
+    np.testing.assert_allclose(matrix[:3, 1], -pose[:3, 1], atol=1e-9)
+    np.testing.assert_allclose((np.linalg.inv(pose) @ matrix)[2, 3], 0, atol=1e-9)
+    composites = [session.scene.GetNthNodeByClass(n, "vtkMRMLSliceCompositeNode") for n in range(2)]
+    ids = {c.GetLayoutName(): c.GetForegroundVolumeID() for c in composites}
+    assert ids["Yellow"] == session.parameters.output.GetID() and ids["Red"] is None
+    session.ui.showInSliceCheckBox.setChecked(False)
+    assert session.panel.sliceNode() is None and session.parameters.show_in_slice is False
 
 
-@pytest.mark.slow
 def test_the_image_follows_the_probe_and_the_controls_from_the_event_loop(session):
     session.segmented()
     session.ui.liveCheckBox.setChecked(True)
@@ -527,7 +433,6 @@ def test_the_image_follows_the_probe_and_the_controls_from_the_event_loop(sessio
     for name, change in {
         "probe": lambda: [session.move(0.1) for _ in range(50)],
         "gain": lambda: session.ui.gainSlider.setValue(12.0),
-        "depth": lambda: session.ui.depthSlider.setValue(60.0),
         "kind": lambda: session.ui.kindComboBox.setCurrentText("convex"),
         "tissue": lambda: session.ui.tissueTable.item(3, 4).setText("0.9"),
     }.items():
@@ -544,65 +449,37 @@ def test_the_image_follows_the_probe_and_the_controls_from_the_event_loop(sessio
     assert (session.image() == images[-1]).all() and not session.logic.isLive
 
 
-def test_the_slice_view_stands_in_the_plane_of_the_probe(session):
-    session.segmented()
-    session.ui.sliceViewComboBox.setCurrentText("Yellow")
-    session.ui.simulateButton.click()
-    view = session.panel.sliceNode()
-    assert view.GetLayoutName() == "Yellow"
-    nodes = importlib.import_module("SlicerUSSim.Logic.mrml.nodes")
-    pose = nodes.node_to_world(session.parameters.probe_transform)
-    matrix = np.array(view.GetSliceToRAS().GetData()).reshape(4, 4)
-    np.testing.assert_allclose(matrix[:3, 0], pose[:3, 0], atol=1e-9)
-    np.testing.assert_allclose(matrix[:3, 1], -pose[:3, 1], atol=1e-9)
-    np.testing.assert_allclose((np.linalg.inv(pose) @ matrix)[2, 3], 0, atol=1e-9)
-    composites = [session.scene.GetNthNodeByClass(n, "vtkMRMLSliceCompositeNode") for n in range(2)]
-    ids = {c.GetLayoutName(): c.GetForegroundVolumeID() for c in composites}
-    assert ids["Yellow"] == session.parameters.output.GetID() and ids["Red"] is None
-    session.ui.showInSliceCheckBox.setChecked(False)
-    assert session.panel.sliceNode() is None and session.parameters.show_in_slice is False
-
-
-def test_a_wrong_value_is_one_message_and_the_old_one_stays(session):
-    session.segmented()
-    before = session.ui.tissueTable.item(1, 1).text()
-    session.ui.tissueTable.item(1, 1).setText("fast")
-    assert len(session.app.errors) == 1 and "'fast', expected a number" in session.app.errors[0]
-    assert session.ui.tissueTable.item(1, 1).text() == before
-    session.ui.tissueTable.item(1, 1).setText("-3")
-    assert "speed_of_sound_m_s is -3.0, expected a number between 100 and 10000" in session.app.errors[1]
-    assert session.ui.tissueTable.item(1, 1).text() == before
-
-
-def test_tissues_can_be_taken_from_presets_and_reset(session):
-    session.segmented()
-    ui = session.ui
-    names = [ui.tissueTable.item(line, 0).text() for line in range(ui.tissueTable.rowCount())]
+def test_tissues_are_edited_taken_from_presets_and_reset(session):
+    table, ui = session.segmented().ui.tissueTable, session.ui
+    names = [table.item(line, 0).text() for line in range(table.rowCount())]
     assert names == ["coupling", "csf", "grey matter", "white matter", "leptomeninges"]
+    before = table.item(1, 1).text()
+    for text, message in (
+        ("fast", "'fast', expected a number"),
+        ("-3", "speed_of_sound_m_s is -3.0, expected a number between 100 and 10000"),
+    ):
+        table.item(1, 1).setText(text)
+        assert message in session.app.errors.pop() and table.item(1, 1).text() == before
+    assert not session.app.errors
     line = names.index("grey matter")
-    ui.tissueTable.setCurrentCell(line, 0)
+    table.setCurrentCell(line, 0)
     ui.tissuePresetComboBox.setCurrentText("liver")
     ui.assignTissueButton.click()
-    assert ui.tissueTable.item(line, 0).text() == "grey matter" and ui.tissueTable.item(line, 1).text() == "1578"
-    assert "Szabo" in ui.tissueTable.item(line, 1).toolTip()
-    ui.tissueTable.item(line, 4).setText("0,5")  # a comma is a point
+    assert table.item(line, 0).text() == "grey matter" and table.item(line, 1).text() == "1578"
+    assert "Szabo" in table.item(line, 1).toolTip()
+    table.item(line, 4).setText("0,5")  # a comma is a point
     assert session.logic.preset.tissues.for_names(["grey matter"])[1].mu0 == 0.5
-    assert ui.tissueTable.item(line, 4).toolTip() == "set by hand"
+    assert table.item(line, 4).toolTip() == "set by hand"
     ui.resetTissuesButton.click()
-    assert ui.tissueTable.item(line, 1).text() == "1541"
-
-
-def test_a_tissue_the_preset_did_not_have_can_be_edited(session):
-    session.segmented()
-    segmentation = session.parameters.labels.GetSegmentation()
-    segmentation.GetNthSegment(1).SetName("My Tumor")
+    assert table.item(line, 1).text() == "1541"
+    # One that the preset does not have
+    session.parameters.labels.GetSegmentation().GetNthSegment(1).SetName("My Tumor")
     session.panel.refresh()
-    names = [session.ui.tissueTable.item(n, 0).text() for n in range(session.ui.tissueTable.rowCount())]
-    line = names.index("tumour")
-    session.ui.tissueTable.item(line, 4).setText("0.77")
+    names = [table.item(line, 0).text() for line in range(table.rowCount())]
+    table.item(names.index("tumour"), 4).setText("0.77")
     assert not session.app.errors
-    table = session.logic.tissues(session.parameters.labels)
-    assert [tissue.mu0 for tissue in table.values() if tissue.name == "tumour"] == [0.77]
+    tissues = session.logic.tissues(session.parameters.labels)
+    assert [tissue.mu0 for tissue in tissues.values() if tissue.name == "tumour"] == [0.77]
 
 
 def test_presets_go_through_files_of_the_command(session, tmp_path, monkeypatch):
@@ -648,25 +525,18 @@ def test_cancel_stops_the_segmentation_and_leaves_nothing(session):
     assert session.ui.segmentButton.isEnabled() and not session.ui.progressWidget.isVisibleTo(session.parent)
 
 
-@pytest.mark.slow  # two segmentations and the extraction of a brain
+@pytest.mark.slow  # the extraction of a brain
 @needs_shared
-def test_the_brain_of_a_whole_head_is_a_mask_node_and_cancel_stops_its_extraction(session):
-    """ReMIND-022's T1 with the skull, at 3 mm (../shared/data)."""
+def test_the_brain_of_a_whole_head_is_a_mask_node_and_can_be_cancelled(session):
+    """ReMIND-022's T1 with the skull, at 4 mm (../shared/data)."""
     volume = session.logic_module("base.volume").Volume
     whole = volume.read(SHARED / "remind022" / "t1_contrast.nii.gz")
-    coarse = volume(np.ascontiguousarray(whole.array[::3, ::3, ::3]), whole.ijk_to_ras @ np.diag([3.0, 3.0, 3.0, 1.0]))
+    coarse = volume(np.ascontiguousarray(whole.array[::4, ::4, ::4]), whole.ijk_to_ras @ np.diag([4.0, 4.0, 4.0, 1.0]))
     node = session.add("ScalarVolume", "Whole")
     session.logic_module("mrml.nodes").write_volume(node, coarse)
     session.parameters.mri = node
-    begun = []
-
-    def press_cancel():
-        begun.append(time.monotonic())
-        session.ui.cancelButton.click()
-
-    stand_in.QtCore.QTimer.singleShot(1500, press_cancel)
+    stand_in.QtCore.QTimer.singleShot(500, session.ui.cancelButton.click)
     session.ui.segmentButton.click()
-    assert begun and time.monotonic() - begun[0] < 20.0
     assert session.parameters.labels is None and session.parameters.mask is None and not session.app.errors
     assert session.scene.GetNumberOfNodesByClass("vtkMRMLLabelMapVolumeNode") == 0
     session.ui.segmentButton.click()
@@ -674,9 +544,7 @@ def test_the_brain_of_a_whole_head_is_a_mask_node_and_cancel_stops_its_extractio
     brain = session.parameters.mask
     assert brain.GetName() == "Whole brain" and "whole head: brain extracted" in session.ui.notesLabel.text()
     inside = session.logic_module("mrml.nodes").read_volume(brain).array > 0
-    assert 1000 < inside.sum() * 0.027 < 1700
-    session.ui.segmentButton.click()  # with the mask, which nobody has edited
-    assert session.parameters.mask is brain and "brain mask as given" in session.ui.notesLabel.text()
+    assert 1000 < inside.sum() * 0.064 < 1700
 
 
 def test_errors_of_every_button_are_one_line(session):
@@ -712,7 +580,7 @@ def test_a_sequence_is_simulated_and_its_browser_plays_it(session):
     images = session.scene.GetFirstNodeByName("sweep ultrasound")
     assert images.GetNumberOfDataNodes() == 3 and browser.IsSynchronizedSequenceNode(images, True)
     assert session.ui.statusLabel.text() == "3 images in 'sweep ultrasound'"
-    # The next ones take their place; of other transforms they are others
+    # The next ones take their place; of other transforms they are others.
     session.ui.simulateSequenceButton.click()
     assert session.parameters.image_sequence is images and not session.app.errors
     other = session.add("Sequence", "other sweep")
@@ -721,20 +589,15 @@ def test_a_sequence_is_simulated_and_its_browser_plays_it(session):
     session.ui.simulateSequenceButton.click()
     assert not session.app.errors and images.GetNumberOfDataNodes() == 3
     assert session.parameters.image_sequence.GetName() == "other sweep ultrasound"
-
-
-def test_a_sequence_that_fails_leaves_no_node_behind(session):
-    session.segmented()
-    transforms = session.add("Sequence", "scaled")
-    item = slicer.vtkMRMLLinearTransformNode()
-    item.ApplyTransformMatrix(
-        importlib.import_module("SlicerUSSim.Logic.base.vtk_data").vtk_matrix(np.diag([2.0, 1, 1, 1]))
-    )
-    transforms.SetDataNodeAtValue(item, "0")
-    session.ui.transformSequenceSelector.setCurrentNode(transforms)
+    # One that fails leaves no node behind.
+    scaled = session.add("Sequence", "scaled")
+    item.SetMatrixTransformToParent(session.logic_module("base.vtk_data").vtk_matrix(np.diag([2.0, 1, 1, 1])))
+    scaled.SetDataNodeAtValue(item, "0")
+    session.ui.transformSequenceSelector.setCurrentNode(scaled)
+    count = session.scene.GetNumberOfNodesByClass("vtkMRMLSequenceNode")
     session.ui.simulateSequenceButton.click()
     assert "item 0 of Sequence 'scaled' is not rigid" in session.app.errors[0]
-    assert session.scene.GetNumberOfNodesByClass("vtkMRMLSequenceNode") == 1
+    assert session.scene.GetNumberOfNodesByClass("vtkMRMLSequenceNode") == count
 
 
 def test_choosing_other_nodes_while_live_goes_on_with_those(session):
@@ -813,20 +676,6 @@ def test_the_panel_fits_compares_applies_and_reverts(session):
     assert not session.app.errors
 
 
-@pytest.mark.slow
-def test_blinking_goes_on_until_it_is_switched_off(session):
-    with_real_image(session).ui.fitButton.click()
-    composite = session.scene.GetFirstNodeByClass("vtkMRMLSliceCompositeNode")
-    session.ui.blinkCheckBox.setChecked(True)
-    seen = set()
-    deadline = time.monotonic() + 60.0  # twice a second, on a machine that may be busy
-    while len(seen) < 2 and time.monotonic() < deadline:
-        session.app.processEvents()
-        seen.add(composite.GetForegroundOpacity())
-    assert seen == {0.0, 1.0}
-    session.ui.blinkCheckBox.setChecked(False)
-
-
 def test_cancel_stops_a_fit_and_changes_nothing(session):
     with_real_image(session)
     before = session.logic.preset
@@ -846,42 +695,14 @@ def test_errors_of_a_fit_are_one_line(session):
     images = session.add("Sequence", "images")
     images.SetDataNodeAtValue(session.parameters.real, "0")
     session.parameters.real = images
-    session.ui.fitFramesLineEdit.setText("7")
-    session.ui.fitFramesLineEdit.editingFinished.emit()
-    session.ui.fitButton.click()
-    assert "image 7 does not exist, expected 0 to 0" in session.app.errors[1]
     session.ui.fitFramesLineEdit.setText("first")
     session.ui.fitFramesLineEdit.editingFinished.emit()
     session.ui.fitButton.click()
-    assert "frames are 'first', expected numbers such as 0,5,10" in session.app.errors[2]
+    assert "frames are 'first', expected numbers such as 0,5,10" in session.app.errors[1]
     session.panel.presenter.fits.apply()
     session.panel.presenter.fits.revert()
     session.panel.presenter.fits.compare("after", 0)
-    assert len(session.app.errors) == 6 and not any("\n" in message for message in session.app.errors)
-
-
-@pytest.mark.slow
-def test_the_panel_predicts_images_that_are_not_fitted(session):
-    with_real_image(session)
-    ui = session.ui
-
-    def predict(text: str) -> None:
-        ui.fitValidateLineEdit.setText(text)
-        ui.fitValidateLineEdit.editingFinished.emit()
-        ui.fitButton.click()
-
-    predict("1")
-    assert session.app.errors == ["a single image leaves none to predict, expected a sequence"]
-    images = session.add("Sequence", "images")
-    for time_s in ("0", "1"):
-        images.SetDataNodeAtValue(session.parameters.real, time_s)
-    session.parameters.real = images
-    predict("1")
-    assert session.parameters.fit_validate == "1" and len(session.app.errors) == 1
-    assert "fitted: images 0   predicted: images 1" in ui.fitLabel.text()
-    assert "of the uniform tissue's" in ui.fitLabel.text()
-    predict("0:2")
-    assert "all images are predicted, expected some to fit" in session.app.errors[1]
+    assert len(session.app.errors) == 5 and not any("\n" in message for message in session.app.errors)
 
 
 def test_closing_the_scene_and_leaving_the_module_is_survived(session):
@@ -959,19 +780,6 @@ def test_a_preset_beyond_the_sliders_is_shown_as_it_is(session, tmp_path):
     assert session.ui.depthSlider.property("value") == 350.0 and not session.app.errors
 
 
-@pytest.mark.slow
-def test_a_probe_that_looks_away_is_told_beside_the_tick_box(session):
-    session.segmented()
-    session.ui.placeButton.click()
-    for start in (session.ui.simulateButton.click, lambda: session.ui.liveCheckBox.setChecked(True)):
-        session.move(500.0)
-        start()
-        assert "looks past the volume" in session.ui.statusLabel.text() and not session.app.errors
-        session.move(-500.0)
-    session.process()
-    assert "looks past" not in session.ui.statusLabel.text()
-
-
 @pytest.fixture
 def bare_slicer(module, monkeypatch):
     """A Slicer before 5.11, without pyopencl until pip is asked for it, and with versions of its own."""
@@ -1004,21 +812,19 @@ def test_packages_are_installed_without_changing_what_slicer_has(bare_slicer):
     assert len(bare_slicer.app.installed) == len(bare_slicer.app.questions) == 1  # all is there
 
 
-def test_a_package_of_slicers_that_is_too_old_is_named_and_left_alone(bare_slicer, simulation_error):
-    bare_slicer.versions["scipy"] = "1.9"
-    message = r'needs scipy>=1.10, but this Slicer has 1.9, .* slicer.util.pip_install\("scipy>=1.10"\)'
-    with pytest.raises(simulation_error(), match=message):
-        bare_slicer.ensure()
-    assert not bare_slicer.app.installed and not bare_slicer.app.questions
-
-
-def test_what_pip_says_is_one_line(bare_slicer, simulation_error, monkeypatch):
+def test_packages_that_are_too_old_or_fail_to_install_are_one_line(bare_slicer, simulation_error, monkeypatch):
     def fail(arguments):
         raise RuntimeError("Collecting pyopencl\nERROR: no space left on device\n")
 
     monkeypatch.setattr(slicer.util, "pip_install", fail)
     with pytest.raises(simulation_error(), match=r"not installed \(ERROR: no space left on device\)$"):
         bare_slicer.ensure()
+    bare_slicer.app.questions.clear()
+    bare_slicer.versions["scipy"] = "1.9"  # Slicer's own, which is left alone
+    message = r'needs scipy>=1.10, but this Slicer has 1.9, .* slicer.util.pip_install\("scipy>=1.10"\)'
+    with pytest.raises(simulation_error(), match=message):
+        bare_slicer.ensure()
+    assert not bare_slicer.app.installed and not bare_slicer.app.questions
 
 
 def test_a_slicer_that_has_pip_ensure_is_left_to_it(bare_slicer, simulation_error, monkeypatch):
@@ -1136,7 +942,7 @@ def test_selectors_offer_only_what_fits(session):
 
 
 @pytest.mark.slow
-def test_deleting_the_output_while_live_ends_live_and_takes_no_other_volume(session):
+def test_deleting_the_live_output_takes_no_other_volume(session):
     """Slicer's selector goes on to the next node: live images were then written into the FLAIR of the patient."""
     session.segmented()
     session.ui.liveCheckBox.setChecked(True)
@@ -1157,16 +963,3 @@ def test_deleting_the_output_while_live_ends_live_and_takes_no_other_volume(sess
     assert not session.app.errors
     session.ui.liveCheckBox.setChecked(True)
     assert session.parameters.output not in (None, own, flair)
-
-
-def test_the_stand_in_for_the_selector_goes_on_to_the_next_node_as_slicers_does(module):
-    scene = slicer.vtkMRMLScene()
-    selector = stand_in.NodeComboBox()
-    selector.nodeTypes = ["vtkMRMLScalarVolumeNode"]
-    selector.setMRMLScene(scene)
-    first, second = (scene.AddNewNodeByClass("vtkMRMLScalarVolumeNode", name) for name in ("first", "second"))
-    chosen = []
-    selector.setCurrentNode(first)
-    selector.currentNodeChanged.connect(chosen.append)
-    scene.RemoveNode(first)
-    assert chosen == [second] and selector.currentNode() is second

@@ -111,11 +111,15 @@ def segment_ct(
     Raises SimulationError for an image that is constant or not finite, a label map, an MRI, numbers in another unit,
     an image without a patient, and organs that do not lie in what they are made of.
 
-    >>> from SlicerUSSim.Logic import segment_ct
-    >>> from validation.ct_phantoms import lumbar_spine
-    >>> found = segment_ct(lumbar_spine((2.0, 2.0, 4.0)).ct)
+    >>> import numpy as np
+    >>> from SlicerUSSim.Logic import Volume, segment_ct
+    >>> y, x = np.indices((60, 60)) - 30
+    >>> r = np.hypot(x, y)  # a leg: a bone with its marrow in muscle and fat
+    >>> hu = np.select([r < 6, r < 9, r < 22, r < 26], [200.0, 900.0, 50.0, -100.0], -1000.0)
+    >>> ct = np.random.default_rng(0).normal(hu, 10.0, (20, 60, 60)).astype(np.float32)
+    >>> found = segment_ct(Volume(ct, np.diag([2.0, 2.0, 2.0, 1.0])))
     >>> found.tissue_names
-    ('skin', 'fat', 'muscle', 'blood', 'cancellous bone', 'bone')
+    ('skin', 'fat', 'muscle', 'cancellous bone', 'bone')
     """
     require_kind("ct", ct, Volume, "Volume.read reads a file")
     require(

@@ -187,7 +187,7 @@ def segment_mri(
 
     >>> from SlicerUSSim.Logic import segment_mri
     >>> from SlicerUSSim.Logic.mri import head_mri
-    >>> segmentation = segment_mri(head_mri(spacing_mm=3.0), contrast="t1")
+    >>> segmentation = segment_mri(head_mri(spacing_mm=4.0), contrast="t1")
     >>> segmentation.tissue_names  # of labels 1, 2, 3
     ('csf', 'grey matter', 'white matter')
     >>> segmentation.labels.array.dtype
