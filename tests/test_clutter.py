@@ -46,10 +46,8 @@ def within_gap(frame: Frame, probe: Probe, half_mm: float = 3.5) -> np.ndarray:
     return signal / np.sqrt((np.abs(signal) ** 2).mean(axis=1, keepdims=True))
 
 
-@pytest.mark.parametrize("lines", [192, 600])
-def test_clutter_has_grains_as_the_main_beam_and_no_lattice(lines):
-    """It was regular: correlations of -0.7 four lines apart with 192 lines, -0.87 with 600."""
-    probe = replace(LINEAR, scan_lines=lines)
+def test_clutter_has_grains_as_the_main_beam_and_no_lattice():
+    probe = replace(LINEAR, scan_lines=192)
     apart = float(probe.line_distance_mm(DEPTH_MM))
     signals = [within_gap(frame(GAP, probe, seed), probe) for seed in range(3)]
     lags = np.arange(1, int(5.0 / apart))
@@ -62,7 +60,6 @@ def test_clutter_has_grains_as_the_main_beam_and_no_lattice(lines):
 
 
 def test_clutter_falls_off_without_an_end():
-    """It ended 24 wavelengths x f-number (10 mm) from tissue: -64 dB there, nothing at 12 mm."""
     edge = -9.0
     labels = block(lambda x, y, z: np.where(x > edge, 2, 1), half_mm=(24, 30, 12))
     windows = [depth_window(frame(labels, LINEAR, seed, outside=BLACK), DEPTH_MM, 4.0) for seed in range(3)]
@@ -86,11 +83,10 @@ def test_clutter_is_fixed_in_the_patient():
     assert correlation(here, other) < 0.15
 
 
-@pytest.mark.parametrize("towards", [-1, 1])
-def test_an_image_along_the_axes_of_the_patient_does_not_depend_on_rounding(towards):
-    """It lay in the border of the cells of signs, all of which turned with the sixth digit of the pose."""
+def test_an_image_along_the_axes_of_the_patient_ignores_rounding():
+    """It lies in the border of the cells of signs."""
     sim = UltrasoundSimulator(GAP, TissueTable({0: TISSUE, 1: TISSUE, 2: BLACK}), SimulationSettings(interfaces=False))
-    here, beside = (sim.simulate(LINEAR, rigid(np.eye(3), [0, -DEPTH_MM, aside])).iq for aside in (0.0, towards * 1e-6))
+    here, beside = (sim.simulate(LINEAR, rigid(np.eye(3), [0, -DEPTH_MM, aside])).iq for aside in (0.0, 1e-6))
     assert np.linalg.norm(here - beside) < 1e-3 * np.linalg.norm(here)
 
 
@@ -102,7 +98,7 @@ def test_lobes_leave_the_speckle_of_bright_tissue_as_it_is():
     assert level_db(both[0]) == pytest.approx(level_db(both[1]), abs=0.1)
 
 
-@pytest.mark.parametrize("name", ["phased", "linear", "microconvex", "neonatal", "linear_15", "burr_hole"])
+@pytest.mark.parametrize("name", ["phased", "microconvex", "linear_15"])
 def test_a_10_mm_cyst_is_about_35_db_down(name):
     probe = PROBES[name]
     depth = probe.focus_mm
@@ -121,7 +117,7 @@ def test_a_10_mm_cyst_is_about_35_db_down(name):
 
 
 @pytest.mark.slow
-def test_lobes_of_a_beam_out_of_focus_fall_off_as_steeply_as_those_of_its_apertures():
+def test_lobes_out_of_focus_fall_off_as_steeply_as_those_of_apertures():
     """A black strip at 20 mm, the focus at 54 mm: lobes fall by 8 dB per millimetre. Lines and nodes, as wide as the
     main beam, made them 1.1 dB brighter there."""
     probe, depth = ConvexProbe(60.0, 36.0, 90.0, scan_lines=129, clutter_db=None), 20.0

@@ -124,21 +124,6 @@ def test_holes_are_filled_up_to_the_widest_gap_of_an_uneven_sweep():
     assert (whole.array[inside] == 100).all()
 
 
-@pytest.mark.parametrize("angles", [(0, 40, 0), (40, 0, 0), (30, 40, 25)])
-def test_the_directions_of_the_grids_axes_do_not_matter(angles):
-    """The same voxels in reversed order have the same grey levels, at the first end of each axis and at the last."""
-    pose = np.eye(4)
-    pose[:3, :3] = Rotation.from_euler("xyz", angles, degrees=True).as_matrix()
-    grid = sweep_grid(PROBE, [pose], 2.0)
-    forth, reverse = grid.ijk_to_ras.copy(), grid.ijk_to_ras.copy()
-    forth[:3, 3] += 0.37, -0.23, 0.11  # no voxel is exactly at the limit of the image's weight
-    reverse[:3, 3] = (forth @ [*(np.array(grid.array.shape[::-1]) - 1), 1.0])[:3]
-    reverse[:3, :3] *= -1.0
-    there, back = (compounded(PROBE, [pose], slope, Volume(grid.array, m), 0).array for m in (forth, reverse))
-    assert (there > 0).sum() > 300
-    np.testing.assert_allclose(there.astype(int), back[::-1, ::-1, ::-1].astype(int), atol=1)
-
-
 def test_the_grid_of_a_sweep_just_holds_its_field():
     """A voxel of margin on each side, and less than a voxel more."""
     poses = slide_sweep(rigid(np.eye(3), [3, -5, 11]), 12, 5)
@@ -162,7 +147,7 @@ def test_images_that_overlap_are_averaged():
     assert set(np.unique(values)) == {0, 90}
 
 
-@pytest.mark.parametrize(("near", "far"), [(0.0, 0.5), (0.25, -0.5), (0.1, 0.9), (-0.3, 0.3)])
+@pytest.mark.parametrize(("near", "far"), [(0.0, 0.5), (0.1, 0.9)])
 def test_an_image_counts_the_less_the_farther_off_its_plane_is(near, far):
     """Two images beside a layer of voxels 1 mm apart: weights fall linearly to zero at one voxel."""
     matrix = np.diag([1.0, 1.0, 1.0, 1.0])
@@ -188,7 +173,7 @@ def test_a_simulated_volume_shows_a_cyst_where_it_is():
     quiet = simulator(labels, SPECKLE, coupling=SPECKLE.__class__("fluid", 1541.0, 1.607, 0.0))
     probe = LinearProbe(36, 45, scan_lines=96, focus_mm=25, elevation_focus_mm=25)
     pose = rigid(rotation, rotation.T @ centre + [0, -25, 0])
-    for poses in (slide_sweep(pose, 20, 26), tilt_sweep(pose, 45, 31)):
+    for poses in (slide_sweep(pose, 20, 14), tilt_sweep(pose, 45, 16)):
         done = []
         volume = quiet.volume(probe, poses, spacing_mm=0.8, progress=done.append)
         assert done == list(range(1, len(poses) + 1))
@@ -216,12 +201,11 @@ def test_sweeps_that_cannot_be_compounded_are_refused():
         slide_sweep(np.eye(4), 10, 0)
 
 
-@pytest.mark.parametrize("suffix", [".nrrd", ".nii.gz"])
-def test_the_command_writes_a_volume_that_lies_in_the_patient(tmp_path, suffix):
+def test_the_command_writes_a_volume_that_lies_in_the_patient(tmp_path):
     labels = block(lambda x, y, z: np.where(y > 0, 1, 2), half_mm=(30, 30, 30), spacing_mm=2.0)
     labels.write(tmp_path / "labels.nii.gz")
     np.savetxt(tmp_path / "pose.txt", rigid(np.eye(3), [0, -28, 0]))
-    out = tmp_path / f"volume{suffix}"
+    out = tmp_path / "volume.nrrd"
     arguments = ["volume", str(tmp_path / "labels.nii.gz"), "--map", "ussim", "--pose", str(tmp_path / "pose.txt")]
     arguments += ["-o", str(out)]
     result = CliRunner().invoke(main, [*arguments, "--slide", "10", "--frames", "6", "--spacing", "1.5"])
@@ -239,8 +223,8 @@ def test_the_command_writes_a_volume_that_lies_in_the_patient(tmp_path, suffix):
     np.testing.assert_allclose(Volume.read(out).ijk_to_ras, labels.ijk_to_ras, atol=1e-5)
 
 
-@pytest.mark.parametrize("options", [[], ["--tilt", "10", "--slide", "10"]])
-def test_the_command_wants_one_kind_of_sweep(tmp_path, options):
+def test_the_command_wants_one_kind_of_sweep(tmp_path):
+    options = ["--tilt", "10", "--slide", "10"]
     result = CliRunner().invoke(
         main, ["volume", "x.nii.gz", "--pose", "auto", "-o", str(tmp_path / "v.nrrd"), *options]
     )

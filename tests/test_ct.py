@@ -21,12 +21,12 @@ from SlicerUSSim.Logic import (
     segment_mri,
 )
 from SlicerUSSim.Logic.base.errors import Cancelled
-from SlicerUSSim.Logic.base.files import write_json
 from SlicerUSSim.Logic.base.neighbourhood import largest_around
 from SlicerUSSim.Logic.mri import head_mri
 from SlicerUSSim.Logic.mri.ct_unit import hounsfield_offset, looks_like_ct
 from SlicerUSSim.Logic.probe.placement import pose_looking_at
 from SlicerUSSim.Logic.tissue import LabelledTissues, LabelMapping, read_label_map
+from tests.conftest import coarse_chest
 from validation.ct_phantoms import BY_NUMBER, NAMES, CtPhantom, lower_chest, lumbar_spine
 
 
@@ -70,6 +70,7 @@ def test_a_spine_has_its_tissues(spine, spine_found, name, least):
     assert dice(spine, spine_found, name) > least
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "least"), [("fat", 0.95), ("muscle", 0.95), ("blood", 0.97), ("bone", 0.8), ("lung", 0.99), ("air", 0.95)]
 )
@@ -84,9 +85,9 @@ def test_the_couch_is_left_out_although_the_back_lies_on_it(spine, spine_found):
     assert (spine_found.labels.array[couch] > 0).mean() < 0.01
 
 
-@pytest.mark.parametrize("spacing_mm", [(1.0, 1.0, 1.0), (0.7, 0.7, 2.5)])
-def test_borders_have_no_rim_of_a_third_tissue(spacing_mm):
+def test_borders_have_no_rim_of_a_third_tissue():
     """Air to muscle passes through lung and fat, bone to muscle through contrast agent."""
+    spacing_mm = (0.7, 0.7, 2.5)
     shape = tuple(int(60 / mm) for mm in spacing_mm[::-1])
     grid = Volume(np.zeros(shape, np.int16), np.diag([*spacing_mm, 1.0]))
     k, j, i = np.meshgrid(
@@ -104,21 +105,6 @@ def test_borders_have_no_rim_of_a_third_tissue(spacing_mm):
     assert {"muscle", "bone", "cancellous bone"} <= set(counts)
 
 
-def test_bone_borders_without_sharpening_would_be_contrast_agent(spine, monkeypatch):
-    """The control of the above: by thresholds alone a rim lies around bone."""
-    from SlicerUSSim.Logic.mri import ct, ct_classes
-
-    rims = {}
-    for name in ("sharpened", "thresholds"):
-        if name == "thresholds":
-            monkeypatch.setattr(ct, "sharpened", lambda hu, noise: hu)
-            monkeypatch.setattr(ct_classes, "_settle_blood", lambda *_: None)
-        found = segment_ct(spine.ct)
-        away = ~largest_around(largest_around(spine.truth.array == NAMES.index("blood") + 1))
-        rims[name] = int((of(found, "blood") & away).sum())
-    assert rims["sharpened"] < 0.1 * rims["thresholds"]
-
-
 def test_a_facet_joint_stays_open(spine, spine_found):
     """Two millimetres between the articular processes, in the middle of their height."""
     to_ijk = spine.ct.ras_to_ijk
@@ -134,16 +120,8 @@ def test_a_facet_joint_stays_open(spine, spine_found):
     assert all(0.7 <= gap <= 3.0 for gap in open_mm)
 
 
-def test_shares_of_voxels_place_the_surface_between_them(spine, spine_found):
-    texture = spine_found.texture()
-    assert texture.volume_share is not None
-    labels = spine_found.labels.array
-    on_border = texture.volume_share > 0
-    assert 0.01 < on_border.mean() < 0.2
-    assert (texture.second_label[on_border] != labels[on_border]).all()
-
-
-def test_organs_take_the_place_of_muscle_and_blood_but_not_of_fat_and_bone(chest, chest_found):
+@pytest.mark.slow
+def test_organs_replace_muscle_and_blood_but_not_fat_and_bone(chest, chest_found):
     organs = read_label_map(chest.organs, mapping=LabelMapping.of(["totalsegmentator"]))
     found = segment_ct(chest.ct, organs=organs)
     for name in ("liver", "kidney"):
@@ -154,7 +132,8 @@ def test_organs_take_the_place_of_muscle_and_blood_but_not_of_fat_and_bone(chest
     assert any("--organs" in line for line in chest_found.warnings) and not found.warnings
 
 
-def test_organs_on_another_grid_are_resampled_and_those_of_another_place_refused(chest):
+@pytest.mark.slow
+def test_organs_are_resampled_and_those_of_another_place_refused(chest):
     organs = read_label_map(chest.organs, mapping=LabelMapping.of(["totalsegmentator"]))
     half = Volume(organs.labels.array[::2, ::2, ::2], chest.ct.ijk_to_ras @ np.diag([2.0, 2.0, 2.0, 1.0]))
     found = segment_ct(chest.ct, organs=replace(organs, labels=half))
@@ -172,8 +151,7 @@ def moved(organs: LabelledTissues, *, factors=(1.0, 1.0, 1.0), shift_mm=(0.0, 0.
 
 
 @pytest.mark.slow
-def test_organs_of_another_patient_or_place_are_refused_by_the_numbers_of_the_ct():
-    """Their outlines became tissue: a liver of 66 +- 71 HU in a lumbar spine."""
+def test_organs_of_another_patient_are_refused_by_the_numbers_of_the_ct():
     chest, spine = lower_chest((2.0, 2.0, 2.0)), lumbar_spine((2.0, 2.0, 2.0))
     in_chest, in_spine = (
         read_label_map(phantom.organs, mapping=LabelMapping.of("totalsegmentator")) for phantom in (chest, spine)
@@ -198,20 +176,7 @@ def test_organs_of_another_patient_or_place_are_refused_by_the_numbers_of_the_ct
 
 
 @pytest.mark.slow
-def test_bones_whose_marrow_is_as_soft_as_muscle_are_those_of_the_ct():
-    spine = lumbar_spine((1.0, 1.0, 2.5))
-    marrow = spine.truth.array == NAMES.index("cancellous bone") + 1
-    ct = spine.ct.with_array(np.where(marrow, spine.ct.array - 150, spine.ct.array).astype(np.int16))
-    organs = read_label_map(spine.organs, mapping=LabelMapping.of("totalsegmentator"))
-    assert not any("of this CT" in line for line in segment_ct(ct, organs=organs).warnings)
-    # Voxels of 4 mm show too little cortex to tell
-    coarse = lumbar_spine((4.0, 4.0, 4.0))
-    segment_ct(coarse.ct, organs=read_label_map(coarse.organs, mapping=LabelMapping.of("totalsegmentator")))
-
-
-@pytest.mark.slow
-def test_a_few_organs_are_read_by_totalsegmentators_numbers_and_checked_by_those_of_the_ct():
-    """The phantom's own 2, 5 and 14 were refused, with the advice to take them for FreeSurfer's."""
+def test_a_few_organs_are_read_by_totalsegmentators_numbers():
     chest, spine = lower_chest((2.0, 2.0, 2.0)), lumbar_spine((2.0, 2.0, 2.0))
     organs = read_label_map(chest.organs, of_ct=True)
     found = segment_ct(chest.ct, organs=organs)
@@ -235,21 +200,18 @@ def test_a_few_organs_are_read_by_totalsegmentators_numbers_and_checked_by_those
     two = read_label_map(renumbered(kidney=2, liver=10, lung=16), of_ct=True)  # pancreas and lung of version 1
     found = segment_ct(chest.ct, organs=two)
     assert any("taken for the numbers of TotalSegmentator CT, version 1 (" in line for line in found.warnings)
-    # Numbers that nothing of the CT can tell are not guessed, and brains' are none of a CT
-    for labels in ({"kidney": 2, "liver": 5}, {"lung": 14}, {"kidney": 1, "liver": 2, "lung": 3}):
-        with pytest.raises(SimulationError, match=r"may be those of TotalSegmentator CT .* --map totalseg") as error:
-            read_label_map(renumbered(**labels), of_ct=True)
-        assert "FreeSurfer" not in str(error.value)
-    with pytest.raises(SimulationError, match="no program's numbers are recognised") as error:
+    # Numbers that nothing of the CT can tell are not guessed.
+    with pytest.raises(SimulationError, match=r"may be those of TotalSegmentator CT .* --map totalseg"):
+        read_label_map(renumbered(kidney=2, liver=5), of_ct=True)
+    with pytest.raises(SimulationError, match="no program's numbers are recognised"):
         read_label_map(renumbered(kidney=150, liver=151, lung=152), of_ct=True)
-    assert "FreeSurfer" not in str(error.value)
 
 
 # ---- units and bad input ---------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("offset", [1024, 1000])
-def test_an_offset_is_removed_and_said(spine, spine_found, offset):
+def test_an_offset_is_removed_and_reported(spine, spine_found):
+    offset = 1024
     found = segment_ct(spine.ct.with_array(np.maximum(spine.ct.array + offset, 0).astype(np.uint16)))
     assert f"{offset} is subtracted" in found.notes[0]
     assert (found.labels.array == spine_found.labels.array).mean() > 0.9999
@@ -261,12 +223,9 @@ def test_an_offset_is_removed_and_said(spine, spine_found, offset):
         (lambda a: a / 1000.0, "expected Hounsfield units"),
         (lambda a: np.clip(a, -160, 240), "cut off"),
         (lambda a: (np.clip(a, -160, 240) + 160) / 400.0 * 255.0, "for an MRI leave --ct out"),
-        (lambda a: a * 4.0, "expected Hounsfield units"),
         (lambda a: np.minimum(a, 400.0), "values end at 400, which .* voxels have: the CT was cut to a window"),
         (lambda a: a + 200.0, r"air is at -80\d, expected -1000: the values are \+(199|200|201) from"),
-        (lambda a: np.full_like(a, 7), r"CT is constant \(7\)"),
         (lambda a: np.where(a > 900, np.nan, a), "not finite numbers.*by -1000"),
-        (lambda a: np.minimum(a, -950.0 + 0.001 * a), "air alone"),
         (lambda a: np.where(np.indices(a.shape).sum(axis=0) % 40 < 2, a, -1000.0 - a % 7), "shows no body"),
     ],
 )  # fmt: skip
@@ -275,8 +234,8 @@ def test_what_is_no_ct_is_refused_with_what_it_is(spine, change, message):
         segment_ct(spine.ct.with_array(change(spine.ct.array.astype(np.float32))))
 
 
+@pytest.mark.slow
 def test_lungs_without_air_around_the_body_are_no_air(chest):
-    """Where they were even, +151 was to be subtracted from true Hounsfield units."""
     smooth = ndimage.gaussian_filter(chest.ct.array.astype(np.float32), 1.5)
     within = smooth[:, 30:90, 30:137]
     offset, line, doubt = hounsfield_offset(Volume(within, chest.ct.ijk_to_ras))
@@ -285,8 +244,9 @@ def test_lungs_without_air_around_the_body_are_no_air(chest):
         hounsfield_offset(chest.ct.with_array(chest.ct.array.astype(np.float32) + 151.0))
 
 
-@pytest.mark.parametrize("padding", [-2000.0, -3024.0])
-def test_padding_around_a_round_field_of_view_is_no_unit(chest, chest_found, padding):
+@pytest.mark.slow
+def test_padding_around_a_round_field_of_view_is_no_unit(chest, chest_found):
+    padding = -3024.0
     j, i = np.indices(chest.ct.array.shape[1:])
     middle = 0.5 * (np.array(chest.ct.array.shape[1:]) - 1)
     outside = np.hypot(j - middle[0], i - middle[1]) > 0.45 * chest.ct.array.shape[1]
@@ -300,37 +260,34 @@ def test_padding_around_a_round_field_of_view_is_no_unit(chest, chest_found, pad
     assert not found.labels.array[:, outside].any() and f"of the image is {padding:g}, outside" in found.notes[0]
 
 
-def test_soft_tissue_where_there_is_none_is_said(spine):
-    """Of values that are 100 too low, cut at -1024 as scanners do, most was labelled fat without a word."""
+def test_soft_tissue_where_there_is_none_is_reported(spine, spine_found):
+    """Of values that are 100 too low, cut at -1024 as scanners do, most is labelled fat."""
     found = segment_ct(spine.ct.with_array(np.maximum(spine.ct.array.astype(np.float32) - 100.0, -1024.0)))
     assert any("most soft tissue is at -" in line for line in found.warnings)
-    assert not any("most soft tissue" in line for line in segment_ct(spine.ct).warnings)
+    assert not any("most soft tissue" in line for line in spine_found.warnings)
 
 
 def test_an_mri_called_ct_is_refused():
-    head = head_mri(2.0)
-    for scale in (1.0, 5.0, 9.0, 10.0, 20.0):
+    head = head_mri(4.0)
+    for scale in (1.0, 9.0, 20.0):
         scaled = head.with_array((head.array * scale).astype(np.float32))
         assert not looks_like_ct(scaled)
         with pytest.raises(SimulationError, match="leave --ct out"):
             segment_ct(scaled)
 
 
-def test_a_label_map_called_ct_is_refused(chest):
+def test_a_label_map_called_ct_is_refused():
     with pytest.raises(SimulationError, match="CT is a label map"):
-        segment_ct(chest.organs)
+        segment_ct(coarse_chest().organs)
     with pytest.raises(SimulationError, match="ct is a str, expected a Volume"):
         segment_ct("ct.nii.gz")  # type: ignore[arg-type]
 
 
-@pytest.mark.slow
-def test_a_ct_called_mri_is_refused_with_the_option(spine):
-    with pytest.raises(SimulationError, match="segment a CT with --ct"):
-        segment_mri(spine.ct)
-    with pytest.raises(SimulationError, match="segment a CT with --ct"):
-        segment_mri(spine.ct.with_array((spine.ct.array + 1024).astype(np.uint16)))
-    with pytest.raises(SimulationError, match="segment a CT with --ct"):
-        segment_mri(spine.ct, mask=spine.ct.with_array((spine.truth.array > 0).astype(np.uint8)))
+def test_a_ct_called_mri_is_refused_with_the_option():
+    chest = coarse_chest()
+    for mri, mask in ((chest.ct, None), (chest.ct, chest.ct.with_array((chest.truth.array > 0).astype(np.uint8)))):
+        with pytest.raises(SimulationError, match="segment a CT with --ct"):
+            segment_mri(mri, mask=mask)
     with pytest.raises(SimulationError, match="contrast is ct"):
         segment_mri(head_mri(4.0), contrast="ct")
 
@@ -344,9 +301,9 @@ def test_a_mask_says_where_the_patient_is(spine):
         segment_ct(spine.ct, mask=Volume(half[:-1], spine.ct.ijk_to_ras))
 
 
-def test_it_reports_progress_and_can_be_cancelled(spine):
-    shares = []
-    segment_ct(spine.ct, progress=shares.append)
+def test_it_reports_progress_and_can_be_cancelled():
+    shares, ct = [], coarse_chest().ct
+    segment_ct(ct, progress=shares.append)
     assert shares == sorted(shares) and shares[-1] == 1.0 and len(shares) > 4
 
     def cancel(share: float) -> None:
@@ -354,30 +311,30 @@ def test_it_reports_progress_and_can_be_cancelled(spine):
             raise Cancelled
 
     with pytest.raises(Cancelled):
-        segment_ct(spine.ct, progress=cancel)
+        segment_ct(ct, progress=cancel)
 
 
 # ---- doors -----------------------------------------------------------------------------------------------------------
 
 
-def test_the_command_segments_a_ct_with_organs(tmp_path, chest, capsys):
-    chest.ct.write(tmp_path / "ct.nii.gz")
-    chest.organs.write(tmp_path / "organs.nii.gz")
+def test_the_command_segments_a_ct_with_organs(tmp_path, spine, capsys):
+    spine.ct.write(tmp_path / "ct.nii.gz")
+    spine.organs.write(tmp_path / "organs.nii.gz")
     with pytest.raises(SystemExit) as ended:
         cli(
             ["segment", str(tmp_path / "ct.nii.gz"), "--ct", "--organs", str(tmp_path / "organs.nii.gz"), "--map",
              "totalsegmentator", "-o", str(tmp_path / "labels.nii.gz")]
         )  # fmt: skip
     assert ended.value.code == 0
-    assert "kidney" in capsys.readouterr().out
+    assert "cancellous bone" in capsys.readouterr().out
     table = TissueTable.read(tmp_path / "labels.json")
-    assert {"skin", "cancellous bone", "lung", "kidney"} <= set(table.names())
+    assert {"skin", "cancellous bone", "bone"} <= set(table.names())
     assert table.membrane is not None and "coupling" not in table.membrane.fluids
 
 
-@pytest.mark.parametrize(("name", "organ"), [("kidney_left", "kidney"), ("mask", "liver")])
-def test_a_mask_of_one_organ_is_not_a_lesion(chest, tmp_path, capsys, name, organ):
-    """TotalSegmentator writes a file for each; the advice was to add it to an MRI."""
+def test_a_mask_of_one_organ_is_not_a_lesion(tmp_path, capsys):
+    """TotalSegmentator writes a file for each."""
+    chest, name, organ = coarse_chest(), "kidney_left", "kidney"
     chest.ct.write(tmp_path / "ct.nii.gz")
     Volume((chest.organs.array == 5).astype(np.uint8), chest.organs.ijk_to_ras).write(tmp_path / f"{name}.nii.gz")
     files = [str(tmp_path / "ct.nii.gz"), "--ct", "--organs", str(tmp_path / f"{name}.nii.gz")]
@@ -392,28 +349,25 @@ def test_a_mask_of_one_organ_is_not_a_lesion(chest, tmp_path, capsys, name, orga
     ("options", "message"),
     [
         (["--ct", "--thin-sulci"], "--thin-sulci is for an MRI"),
-        (["--ct", "--also", "t2=x.nii.gz"], "--also is for an MRI"),
         (["--organs", "x.nii.gz", "--skull-strip", "none"], "--organs is for a CT, expected --ct"),
-        ([], "segment a CT with --ct"),
     ],
 )
-def test_the_command_refuses_what_does_not_go_together(tmp_path, spine, capsys, options, message):
-    spine.ct.write(tmp_path / "ct.nii.gz")
+def test_the_command_refuses_what_does_not_go_together(tmp_path, capsys, options, message):
+    coarse_chest().ct.write(tmp_path / "ct.nii.gz")
     with pytest.raises(SystemExit) as ended:
         cli(["segment", str(tmp_path / "ct.nii.gz"), "-o", str(tmp_path / "labels.nii.gz"), *options])
     assert ended.value.code == 2
     assert message in capsys.readouterr().err.replace("\n", " ")
 
 
-def test_the_filter_segments_a_ct(spine, spine_found):
+def test_the_filter_segments_a_ct():
     from SlicerUSSim.Logic.vtk import SegmentationFilter
 
-    labels = SegmentationFilter()
-    labels.SetInputData(spine.ct.to_vtk())
+    ct, labels = coarse_chest().ct, SegmentationFilter()
+    labels.SetInputData(ct.to_vtk())
     labels.SetContrast("ct")
     labels.Update()
-    np.testing.assert_array_equal(Volume.from_vtk(labels.GetOutput()).array, spine_found.labels.array)
-    assert any("couch" in line for line in labels.GetNotes())
+    np.testing.assert_array_equal(Volume.from_vtk(labels.GetOutput()).array, segment_ct(ct).labels.array)
 
 
 # ---- ultrasound ------------------------------------------------------------------------------------------------------
@@ -429,19 +383,9 @@ def levels_db(phantom_found, probe, face, target, lateral) -> tuple[np.ndarray, 
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("frequency_mhz", "attenuation"),
-    [
-        pytest.param(mhz, attenuation, marks=[pytest.mark.slow] * ((mhz, attenuation) != (4.0, 14.0)))
-        for mhz in (2.5, 4.0, 8.0)
-        for attenuation in (2.0, 8.0, 14.0, 20.0, 40.0)
-    ],
-)
-def test_the_attenuation_of_marrow_does_not_change_what_lies_in_front_of_it(spine, attenuation, frequency_mhz):
-    """Echoes in front of marrow grew without bounds, or were lost: its losses were spread over pieces of 8 mm.
-
-    Brightest in this view are the cortex and what lies before it, whatever the marrow behind takes.
-    """
+@pytest.mark.parametrize(("frequency_mhz", "attenuation"), [(2.5, 40.0), (4.0, 14.0), (8.0, 2.0)])
+def test_the_attenuation_of_marrow_changes_nothing_in_front_of_it(spine, attenuation, frequency_mhz):
+    """Brightest in this view are the cortex and what lies before it, whatever the marrow behind takes."""
     table = TissueTable.named([BY_NUMBER.get(name, name) for name in NAMES])
     table = table.replace("cancellous bone", attenuation_db_cm_mhz=attenuation)
     probe = ConvexProbe(radius_mm=50, field_of_view_deg=64, depth_mm=110, frequency_mhz=frequency_mhz, focus_mm=50)
@@ -457,7 +401,8 @@ def test_the_attenuation_of_marrow_does_not_change_what_lies_in_front_of_it(spin
         assert found["aperture"] == pytest.approx(found["ray"], abs=3.0)
 
 
-def test_ribs_are_bright_lines_with_shadows_and_lung_a_bright_line_between_them(chest_found):
+@pytest.mark.slow
+def test_ribs_cast_shadows_and_lung_is_a_bright_line_between_them(chest_found):
     probe = LinearProbe(width_mm=48, depth_mm=50, frequency_mhz=6.0, focus_mm=25)
     level, mm = levels_db(chest_found, probe, (120.5, 0.0, 46.0), (0.0, 0.0, 46.0), (0.0, 0.0, -1.0))
     z = 46.0 - np.linspace(-24.0, 24.0, len(level))
@@ -481,28 +426,10 @@ def test_the_spinous_process_casts_a_shadow(spine_found):
     assert np.median(level[middle - 3 : middle + 3, at]) < np.median(level[:side, at]) - 20.0
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        (["--craniotomy", "auto"], "--craniotomy is auto, which opens a head that was found in an MRI, and this is a"),
-        (["--pose", "auto"], "--pose is auto, which is on a head, and the image is a CT"),
-    ],
-)
-def test_what_a_ct_has_not_is_said(tmp_path, spine, capsys, options, message):
-    spine.ct.write(tmp_path / "ct.nii.gz")
-    write_json(tmp_path / "pose.json", {"probe_to_ras": np.eye(4).tolist()})
-    given = ["simulate", tmp_path / "ct.nii.gz", "--ct", "--pose", tmp_path / "pose.json", "-o", tmp_path / "x.png"]
+def test_an_automatic_pose_on_a_ct_is_refused(tmp_path, capsys):
+    coarse_chest().ct.write(tmp_path / "ct.nii.gz")
     with pytest.raises(SystemExit) as ended:
-        cli([*map(str, given), *options])
+        cli(["simulate", str(tmp_path / "ct.nii.gz"), "--ct", "--pose", "auto", "-o", str(tmp_path / "x.png")])
     assert ended.value.code == 2
-    assert message in capsys.readouterr().err.replace("\n", " ")
-
-
-@pytest.mark.slow
-def test_a_view_of_a_label_map_without_a_brain_is_said(tmp_path, spine, spine_found, capsys):
-    spine_found.labels.write(tmp_path / "labels.nii.gz")
-    TissueTable.named(spine_found.tissue_names).write(tmp_path / "labels.json")
-    with pytest.raises(SystemExit) as ended:
-        cli(["simulate", str(tmp_path / "labels.nii.gz"), "--pose", "auto", "-o", str(tmp_path / "x.png")])
-    assert ended.value.code == 0
-    assert "no tissue of a brain is labelled: the probe stands on top of what is" in capsys.readouterr().err
+    told = capsys.readouterr().err.replace("\n", " ")
+    assert "--pose is auto, which is on a head, and the image is a CT" in told

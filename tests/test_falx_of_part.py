@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -12,8 +11,6 @@ from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 from SlicerUSSim.Logic import Segmentation, SimulationError, Volume, segment_mri
-from SlicerUSSim.Logic.mri.lesions.fissure import with_fissure
-from SlicerUSSim.Logic.mri.lesions.growth import grow
 from SlicerUSSim.Logic.mri.lesions.seeded import grow_lesion
 from SlicerUSSim.Logic.mri.sheets import Surfels, find_sheets
 from SlicerUSSim.Logic.mri.sheets.falx_of_part import falx_of_part
@@ -86,35 +83,20 @@ def test_sulci_of_one_hemisphere_are_no_falx():
 
 @pytest.mark.parametrize(
     ("axis", "degrees", "is_falx"),
-    [("z", 20.0, True), ("y", 10.0, True), ("z", 90.0, False), ("y", 40.0, False), ("y", 180.0, False)],
-    ids=["turned", "rolled", "across front and back", "as steep as the tentorium", "from below, as cisterns"],
+    [("y", 10.0, True), ("z", 90.0, False), ("y", 40.0, False), ("y", 180.0, False)],
+    ids=["rolled", "across front and back", "as steep as the tentorium", "from below, as cisterns"],
 )
-def test_a_plane_that_does_not_divide_left_from_right_from_above_is_none(axis, degrees, is_falx):
+def test_a_plane_that_does_not_divide_left_from_right_is_no_falx(axis, degrees, is_falx):
     image, brain = slab()
     turn = np.eye(4)
     turn[:3, :3] = Rotation.from_euler(axis, degrees, degrees=True).as_matrix()
     assert (len(falx_in(Volume(image.array, turn @ image.ijk_to_ras), brain)) > 100) == is_falx
 
 
-@pytest.mark.parametrize("thick", [2, 3])
-def test_thin_images_are_refused_or_have_none(thick):
+def test_images_that_are_too_thin_are_refused():
     image, brain = slab()
-    mask = image.with_array(brain.astype(np.uint8))
-    thin, inside = (Volume(np.ascontiguousarray(v.array[:, :thick]), v.ijk_to_ras) for v in (image, mask))
-    segmentation = replace(segment_mri(image, mask=mask, bias_correction=False), labels=thin.with_array(inside.array))
-    evidence = segmentation.evidence
-    cut = replace(
-        evidence, images=evidence.images[:, :, :thick], inside=evidence.inside[:, :thick], shape=thin.array.shape
-    )
-    assert with_fissure(cut).fissure.shape == cut.inside.shape
-    if thick == 2:
-        with pytest.raises(SimulationError, match="2 voxels of 1 mm thick, expected at least 3"):
-            falx_in(thin, inside.array > 0)
-    likeness = np.where(np.hypot(*np.ogrid[-20:20, -20:20]) < 8.0, 1.0, 0.0)[:, None].repeat(thick, 1)
-    region = grow(
-        likeness.astype(np.float32), np.ones(likeness.shape, bool), np.array([20, 1, 20]), np.ones(3), largest_mm=70.0
-    )
-    assert region is not None and 0.5 < region.inside.sum() / (likeness > 0.5).sum() < 1.3
+    with pytest.raises(SimulationError, match="2 voxels of 1 mm thick, expected at least 3"):
+        falx_in(Volume(np.ascontiguousarray(image.array[:, :2]), image.ijk_to_ras), brain[:, :2])
 
 
 def test_find_sheets_has_the_falx_of_a_part_and_not_twice():
@@ -129,8 +111,6 @@ def test_find_sheets_has_the_falx_of_a_part_and_not_twice():
     beside = (np.abs(x - midline(y, z)) < 1.5) & (z > CALLOSUM + 9.0) & (z < TOP - 8.0)
     assert beside.mean() < 0.02
     assert any(line.startswith("falx: ") and "without an atlas" in line for line in found.notes)
-    alone = find_sheets(image, segmentation, contrast="t1", kinds=("falx",))
-    np.testing.assert_allclose(alone.surfels.place, falx.place)
 
 
 def test_a_seed_does_not_grow_across_the_fissure():
@@ -155,12 +135,10 @@ def colin27() -> tuple[Volume, Segmentation]:
 @pytest.mark.parametrize(
     ("part", "is_there"),
     [
-        (((0.0, 1.0), (0.45, 0.52), (0.0, 1.0)), True),  # of the brain's extent along R, A and S
-        (((0.2, 1.0), (0.5, 1.0), (0.5, 1.0)), True),
-        (((0.62, 1.0), (0.0, 1.0), (0.0, 1.0)), False),
+        (((0.2, 1.0), (0.5, 1.0), (0.5, 1.0)), True),  # of the brain's extent along R, A and S
         (((0.0, 0.38), (0.3, 0.7), (0.0, 0.6)), False),
     ],
-    ids=["coronal slab", "quarter", "right hemisphere", "left temporal lobe"],
+    ids=["quarter", "left temporal lobe"],
 )
 def test_the_falx_of_a_part_is_that_of_the_whole_head(part, is_there):
     """Control: the falx by the atlas; and parts that have none."""

@@ -16,7 +16,7 @@ NAMES = ("csf", "grey matter", "white matter")
 
 @pytest.fixture(scope="module")
 def brain(mni):
-    """Labels of MNI152, every second voxel."""
+    """Labels of MNI152, every other voxel."""
     t1, grey, white = (volume.array[::2, ::2, ::2] for volume in mni)
     labels = np.where(t1 > 0, 1 + np.argmax([255 - grey - white.astype(int), grey, white], axis=0), 0)
     return Volume(labels.astype(np.uint8), mni[0].ijk_to_ras @ np.diag([2.0, 2.0, 2.0, 1.0]))
@@ -29,17 +29,11 @@ def lying(brain: Volume, turn: Rotation) -> Volume:
     return Volume(brain.array, matrix @ brain.ijk_to_ras)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
-    "turn",
-    [
-        pytest.param((25.0, 0.0, 0.0), id="nodding"),
-        pytest.param((-18.0, 7.0, 12.0), id="three axes", marks=pytest.mark.slow),
-        pytest.param((0.0, 90.0, 0.0), id="on its side", marks=pytest.mark.slow),
-        pytest.param((40.0, 30.0, 155.0), id="anyhow", marks=pytest.mark.slow),
-    ],
+    "turn", [pytest.param((25.0, 0.0, 0.0), id="nodding"), pytest.param((40.0, 30.0, 155.0), id="anyhow")]
 )
 def test_views_of_a_turned_head_are_those_of_the_upright_one_turned(brain, turn):
-    """A probe at the temple of a head that nods by 25 degrees missed the midline: it followed the scanner's axes."""
     rotation = Rotation.from_euler("xyz", turn, degrees=True)
     turned = lying(brain, rotation)
     upright, line = head_axes(brain, NAMES)
@@ -57,7 +51,7 @@ def test_views_of_a_turned_head_are_those_of_the_upright_one_turned(brain, turn)
         assert abs(after[:3, 2] @ axes @ across) / np.linalg.norm(across) > np.cos(np.radians(1.0))  # in its plane
 
 
-def test_where_the_atlas_does_not_lead_a_view_follows_the_image_and_says_so(brain):
+def test_where_the_atlas_does_not_lead_a_view_follows_the_image(brain):
     half = brain.array.copy()
     half[:, :, : half.shape[2] // 2] = 0
     half[:, : half.shape[1] // 2] = 0

@@ -18,8 +18,6 @@ from SlicerUSSim.Logic import (
     TissueTable,
     UltrasoundSimulator,
 )
-from SlicerUSSim.Logic.imaging.borders import HALVED_CUT, WIDE_CUT, gaussian_taps
-from SlicerUSSim.Logic.opencl.layout import CONSTANTS
 from SlicerUSSim.Logic.probe.arrays import PROBES
 from tests.conftest import FLUID, SPECKLE, block, rigid, simulator
 from validation.phantoms import folds, parallel_plates
@@ -42,20 +40,15 @@ def test_an_interface_echo_does_not_depend_on_line_density():
     assert peaks[0] == pytest.approx(r * gain, rel=0.05)
 
 
-@pytest.mark.parametrize(
-    ("radius_mm", "is_ball", "least_db"), [(8.0, False, -1.5), (10.0, False, -1.2), (15.0, True, -2.5)]
-)
+@pytest.mark.parametrize(("radius_mm", "is_ball", "least_db"), [(8.0, False, -1.5), (15.0, True, -2.5)])
 def test_bent_walls_in_coarse_voxels_are_as_bright_as_theory_says(radius_mm, is_ball, least_db):
-    """Rods and balls of 8 to 15 voxels in oblique grids, re a plane; expected -0.2 to -0.4 dB. Up to -4.1, -2 and -3.5
-    before: places scattered by up to 0.1 mm, 4 radians of the echo, since a wide Gaussian did not count where borders
-    are as bent as these.
-    """
+    """A rod of 8 voxels and a ball of 15 in oblique grids, re a plane; expected are -0.2 to -0.4 dB."""
     focus = LinearProbe(
         20.0, 40.0, scan_lines=161, focus_mm=25.0, aperture_mm=12.5, receive_f_number=2.0, elevation_focus_mm=25.0
     )
     fluid, soft = replace(FLUID, impedance_mrayl=1.6), replace(FLUID, impedance_mrayl=1.9)
     levels = []
-    for seed in range(500, 508):
+    for seed in range(500, 506):
         turned = Rotation.random(random_state=seed).as_matrix()
 
         def body(x, y, z, turned=turned):
@@ -104,8 +97,8 @@ def peak(sim, scan_lines: int, angle_deg: float) -> float:
     return float(peaks_of_lines(sim, scan_lines, angle_deg)[scan_lines // 2])
 
 
-@pytest.mark.parametrize("angle_deg", [5.0, 10.0])
-def test_an_oblique_wall_does_not_depend_on_line_density(angle_deg):
+def test_an_oblique_wall_does_not_depend_on_line_density():
+    angle_deg = 10.0
     sim = simulator(block(lambda x, y, z: y > 0), WALL, scattering=False)
     peaks = [peak(sim, lines, angle_deg) for lines in (41, 61, 121, 241)]
     np.testing.assert_allclose(peaks, peaks[-1], rtol=0.1)
@@ -122,15 +115,13 @@ def test_a_steep_wall_returns_nothing():
 @pytest.mark.parametrize(
     ("probe", "depth_mm", "angle_deg", "turn_deg"),
     [
-        # Lines 0.9 mm apart, for which the wall differs by 4.7 and 6.3 radians from line to line, aliased to -26 dB
-        (PROBES["matrix"], 55.0, 12.0, 0.0),
+        # Lines 0.9 mm apart, for which the wall differs by 6.3 radians from line to line, aliased to -26 dB
         (PROBES["matrix"], 55.0, 16.0, 0.0),
         (replace(PROBES["cardiac"], frequency_mhz=5.0, band_mhz=(3.75, 6.25)), 55.0, 16.0, 0.0),
         # 2.3 radians per elevational deviation, which a few rays cannot add up
-        (PROBES["linear"], 25.0, 9.0, 40.0),
         (PROBES["linear_15"], 15.0, 8.0, 40.0),
     ],
-    ids=["matrix, 12 degrees", "matrix, 16 degrees", "cardiac", "linear", "linear_15"],
+    ids=["matrix", "cardiac", "linear_15"],
 )
 def test_a_steep_wall_does_not_depend_on_the_lines_of_shipped_probes(probe, depth_mm, angle_deg, turn_deg):
     """Levels re a square wall on the middle line, those below -28 dB as equal; in a grid oblique to the probe."""
@@ -157,11 +148,10 @@ def test_a_steep_wall_does_not_depend_on_the_lines_of_shipped_probes(probe, dept
     assert np.ptp(np.maximum(levels, -28.0)) < 1.0, levels
 
 
-@pytest.mark.parametrize("name", ["microconvex", "neonatal", "phased"])
-def test_single_lines_on_a_walls_flank_do_not_depend_on_the_number_of_lines(name):
+@pytest.mark.parametrize("name", ["microconvex", "phased"])
+def test_lines_on_a_walls_flank_do_not_depend_on_their_number(name):
     """A plane that is oblique to the image plane as well, in voxels of 1 mm turned against it; levels above -30 dB re a
-    square wall. Single lines 7 to 11 degrees from the normal changed by up to 5.7 dB from 191 to 381: elevational rays
-    are shifted from line to line, and their sums with them, by as much as is left of the wall there.
+    square wall.
     """
     probe = replace(PROBES[name], frequency_mhz=5.0, band_mhz=None)
     tilt, azimuth, depth_mm = np.radians(5.0), np.radians(200.0), 30.0
@@ -196,12 +186,9 @@ def test_single_lines_on_a_walls_flank_do_not_depend_on_the_number_of_lines(name
     assert np.ptp(levels[:, seen], axis=0).max() < 1.5, np.round(levels[:, seen], 1)
 
 
-@pytest.mark.parametrize("across", [(0, 1, 1), (1, 1, 1)])
-def test_a_plane_nearly_at_right_angles_to_a_diagonal_of_the_voxels_keeps_its_level(across):
-    """Tilted by 5 degrees to the beam, and turned by 0.8 from the diagonal: its steps are 51 and 41 voxels long, and
-    the level drifted by 4.0 and 3.5 dB along it (in other grids by up to 9).
-    """
-    to_diagonal = Rotation.align_vectors([across], [[0.0, 1.0, 0.0]])[0]
+def test_a_plane_nearly_across_a_diagonal_of_the_voxels_keeps_its_level():
+    """Tilted by 5 degrees to the beam, and turned by 0.8 from the diagonal: its steps are 51 voxels long."""
+    to_diagonal = Rotation.align_vectors([(0.0, 1.0, 1.0)], [[0.0, 1.0, 0.0]])[0]
     turn = to_diagonal * Rotation.from_euler("x", 0.8, degrees=True) * Rotation.from_rotvec([0.0, 1.6, 0.0])
     normal = turn.apply([0.0, 1.0, 0.0])
     wall = block(lambda x, y, z: x * normal[0] + y * normal[1] + z * normal[2] > 0.2, (44, 44, 44))
@@ -215,8 +202,7 @@ def test_a_plane_nearly_at_right_angles_to_a_diagonal_of_the_voxels_keeps_its_le
     assert np.ptp(levels) < 3.0, np.round(levels[::8], 1)
 
 
-@pytest.mark.parametrize("rays", [1, 2, 3, 32])
-@pytest.mark.parametrize("angle_deg", [4.0, 9.0, 20.0])
+@pytest.mark.parametrize(("rays", "angle_deg"), [(1, 4.0), (2, 9.0), (3, 20.0), (32, 9.0)])
 def test_few_elevational_rays_see_a_plane_as_many_do(rays, angle_deg):
     """A plane oblique out of the image. With one or two rays it was too bright, or its lines were no numbers."""
     slope = np.tan(np.radians(angle_deg))
@@ -231,14 +217,6 @@ def test_few_elevational_rays_see_a_plane_as_many_do(rays, angle_deg):
     np.testing.assert_allclose(levels[1], levels[0], atol=1.0)
 
 
-def test_a_ball_is_seen_on_and_between_the_lines():
-    """Smaller than the distance between lines, it is square to the beam at one point only."""
-    ball = block(lambda x, y, z: x**2 + y**2 + z**2 < 0.6**2, half_mm=(3, 3, 3), spacing_mm=0.1)
-    sim = simulator(ball, WALL, scattering=False, reflections=False)
-    levels = [20 * np.log10(peaks_of_lines(sim, 51, x_mm=x).max()) for x in np.linspace(0.0, 0.6, 7)]
-    assert np.ptp(levels) < 6.0
-
-
 def test_the_two_borders_of_a_slab_have_opposite_signs():
     sim = simulator(block(lambda x, y, z: abs(y) < 3), WALL, scattering=False, reflections=False)
     hits = sim.trace(PROBE, rigid(np.eye(3), [0, -20, 0])).hits
@@ -248,33 +226,9 @@ def test_the_two_borders_of_a_slab_have_opposite_signs():
     np.testing.assert_allclose(hits["curvature"], 0.0, atol=1e-3)
 
 
-def test_the_variances_of_the_smoothing_are_those_of_gaussians_with_the_same_centre():
-    """The density of the distance from a plane, and its second derivative, at 0; a Gaussian cut off has a smaller
-    variance than it resembles."""
-    frequency = np.linspace(0.0, 2.0, 4001)  # radians per voxel
-    normal = np.array([1.0, 2.0, 2.0]) / 3.0
-
-    def transform(sigma: float, cut: float, scale: float) -> np.ndarray:
-        taps = gaussian_taps(sigma, cut).astype(float)
-        at = scale * (np.arange(len(taps)) - len(taps) // 2)
-        return np.prod([np.cos(np.outer(frequency, n * at)) @ taps for n in normal], axis=0)
-
-    wide = transform(CONSTANTS["WIDE_SIGMA"], WIDE_CUT, 1.0)
-    pairs = np.prod([np.cos(0.5 * n * frequency) for n in normal], axis=0)
-    widest = wide * pairs * transform(CONSTANTS["HALVED_SIGMA"], HALVED_CUT, 2.0)
-    for found, cell, spectrum in (("WIDE_VARIANCE", 1.0, wide), ("WIDEST_VARIANCE", 4.0, widest)):
-        spectrum = np.where(frequency < 1.2, spectrum, 0.0)  # beyond, the taps repeat
-        density = np.trapezoid(spectrum, frequency) / np.pi
-        bend = np.trapezoid(spectrum * frequency**2, frequency) / np.pi
-        by_share, by_bend = 1.0 / (2.0 * np.pi * density**2), density / bend
-        assert by_share / cell == pytest.approx(CONSTANTS[found], rel=0.015)
-        assert by_bend / cell == pytest.approx(CONSTANTS[found], rel=0.015)
-
-
-@pytest.mark.parametrize("gap_mm", [7.2, 14.4])
-@pytest.mark.parametrize("seed", [0, 3])
+@pytest.mark.parametrize(("seed", "gap_mm"), [(0, 7.2), (3, 14.4)])
 def test_plates_closer_than_the_smoothing_are_found_one_by_one(seed, gap_mm):
-    """In voxels of 1 mm: each plane from the tissue beyond both; formerly with place errors of some .02 voxels."""
+    """In voxels of 1 mm: each plane from the tissue beyond both."""
     phantom = parallel_plates(Rotation.random(random_state=seed).as_matrix(), gap_mm=gap_mm, spacing_mm=1.0)
     settings = SimulationSettings(scattering=False, reflections=False)
     hits = UltrasoundSimulator(phantom.labels, phantom.tissues, settings).trace(PROBE, phantom.probe_to_ras).hits
@@ -333,24 +287,20 @@ def errors_of_walls(normal, half_mm, start, thickness_mm=None) -> np.ndarray:
     return np.array(errors)
 
 
-@pytest.mark.parametrize("thickness_mm", [None, 3.0, 6.0, 12.0])
-@pytest.mark.parametrize("from_end_mm", [5.0, 8.0, 12.0, 16.0])
+@pytest.mark.parametrize(("from_end_mm", "thickness_mm"), [(5.0, None), (5.0, 3.0), (8.0, 6.0), (16.0, 12.0)])
 def test_an_end_of_the_label_map_does_not_bend_a_wall(from_end_mm, thickness_mm):
-    """Formerly by up to 0.3 mm and 5 degrees."""
     errors = errors_of_walls([0.6, 0.7, 0.39], (40, 40, 40), [from_end_mm - 40.5, 0.2, 0.1], thickness_mm)
     assert (errors < [0.07, 0.5]).all()
 
 
-@pytest.mark.parametrize("thickness_mm", [2.0, 3.0, 4.0, 5.0])
-@pytest.mark.parametrize("normal", [[0.087, 1.0, 0.03], [0.6, 0.7, 0.39]])
+@pytest.mark.parametrize(("normal", "thickness_mm"), [([0.087, 1.0, 0.03], 2.0), ([0.6, 0.7, 0.39], 4.0)])
 def test_both_walls_of_a_thin_layer_are_flat(normal, thickness_mm):
-    """Formerly with errors of up to 0.3 mm and 6 degrees."""
     errors = errors_of_walls(normal, (40, 40, 40), [0.3, 0.2, 0.1], thickness_mm)
     assert (errors < [0.05, 0.4]).all()
 
 
 def test_the_steps_of_a_plane_that_is_hardly_turned_are_not_seen():
-    """They are 38 voxels long; formerly with errors of 0.17 mm and 1.2 degrees."""
-    for x in (0.0, 10.0, 20.0):
+    """They are 38 voxels long."""
+    for x in (0.0, 10.0):
         errors = errors_of_walls([0.026, 1.0, 0.008], (75, 25, 75), [x, 0.2, 0.1])
         assert (errors < [0.05, 0.2]).all()

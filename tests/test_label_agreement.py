@@ -36,7 +36,7 @@ def test_an_mri_follows_its_own_labels_whatever_its_contrast_and_frame(brain, la
     assert follows(brain.with_array(brain.array + noise), labels)
 
 
-@pytest.mark.parametrize("by_mm", [(8.0, 0.0, 0.0), (0.0, -8.0, 0.0), (0.0, 0.0, 8.0), (400.0, 0.0, 0.0)])
+@pytest.mark.parametrize("by_mm", [(8.0, 0.0, 0.0), (0.0, 0.0, 8.0), (400.0, 0.0, 0.0)])
 def test_an_mri_does_not_follow_labels_in_another_place(brain, labels, by_mm):
     assert not follows(brain, moved(labels, *by_mm))
 

@@ -11,7 +11,7 @@ from SlicerUSSim.Logic import DisplaySettings, LinearProbe, SimulationError, see
 from SlicerUSSim.Logic.fitting.appearance import AppearanceModel
 from SlicerUSSim.Logic.imaging.compounding import Compounder, sweep_grid
 from SlicerUSSim.Logic.probe.placement import slide_sweep
-from tests.conftest import FLUID, SPECKLE, block, rigid, simulator
+from tests.conftest import FLUID, block, rigid, simulator
 
 PROBE = LinearProbe(40, 50, scan_lines=161)
 POSE = rigid(np.eye(3), [0, -25, 0])
@@ -42,7 +42,7 @@ def test_without_a_noise_seed_the_noise_is_what_it_always_was(fluid):
     np.testing.assert_allclose(plain.envelope[7, 100:106], was, rtol=1e-4)
 
 
-@pytest.mark.parametrize("other", [1, 2, 7, 2**16, 2**32 - 1])
+@pytest.mark.parametrize("other", [1, 2**32 - 1])
 def test_another_noise_seed_is_another_noise_of_the_same_level(fluid, other):
     one, drawn, again = (fluid.simulate(PROBE, POSE, NOISY, noise_seed=seed) for seed in (0, other, other))
     np.testing.assert_array_equal(drawn.image, again.image)
@@ -50,27 +50,13 @@ def test_another_noise_seed_is_another_noise_of_the_same_level(fluid, other):
     assert (drawn.envelope**2).mean() == pytest.approx((one.envelope**2).mean(), rel=0.02)
 
 
-@pytest.mark.parametrize("seed", [-1, 2**32, 0.5, "much", None])
+@pytest.mark.parametrize("seed", [-1, 2**32, 0.5])
 def test_a_noise_seed_that_is_none_is_refused(fluid, seed):
     with pytest.raises(SimulationError, match=r"noise_seed is .*, expected a whole number from 0 to 4294967295"):
         fluid.simulate(PROBE, POSE, NOISY, noise_seed=seed)
 
 
-def test_noise_touches_neither_echoes_nor_scatterers():
-    solid = simulator(block(lambda x, y, z: np.ones_like(x)), SPECKLE)
-    first = solid.simulate(PROBE, POSE, NOISY)
-    solid.device.profiling = True
-    try:
-        other = solid.simulate(PROBE, POSE, NOISY, noise_seed=5)
-        kernels = set(solid.device.take_profile())
-    finally:
-        solid.device.profiling = False
-    assert kernels == {"compress", "average_depth", "scan_convert"}  # the echoes are those of the image before
-    np.testing.assert_array_equal(first.iq, other.iq)
-    assert (first.image != other.image).mean() > 0.1
-
-
-def test_images_of_a_sweep_have_noise_of_their_own_and_the_first_has_the_settings(fluid):
+def test_images_of_a_sweep_have_noise_of_their_own(fluid):
     poses = [POSE] * 3
     frames = list(fluid.sweep(PROBE, poses, NOISY))
     np.testing.assert_array_equal(frames[0].image, fluid.simulate(PROBE, POSE, NOISY).image)
@@ -122,7 +108,7 @@ def test_a_pose_keeps_its_seed_under_any_parents_that_give_it(pose, parent):
 
 
 @given(pose=TIDY, jitter=st.tuples(*[st.floats(-1e-6, 1e-6)] * 3), turn=st.tuples(*[st.floats(-1e-7, 1e-7)] * 3))
-def test_a_pose_as_people_set_it_does_not_flicker_for_a_millionth_of_a_millimetre(pose, jitter, turn):
+def test_a_pose_as_people_set_it_does_not_flicker_for_a_nanometre(pose, jitter, turn):
     moved = pose.copy()
     moved[:3, 3] += jitter
     moved[:3, :3] += np.diag(turn)

@@ -57,7 +57,7 @@ def test_it_finds_what_is_wrong(oclgrind):
     assert "Invalid write" in said and "data race" in said
 
 
-def test_kernels_have_no_races_and_stay_in_their_buffers_and_give_the_same_signal(oclgrind, tmp_path):
+def test_kernels_have_no_races_and_stay_in_their_buffers(oclgrind, tmp_path):
     """Random small scenes: probes, settings, tissues, sheets, texture, turned voxels."""
     seeds = (tmp_path / "signals", "--seeds", 0, 2)
     said = run(oclgrind, SCENES, *seeds)

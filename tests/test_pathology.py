@@ -19,7 +19,6 @@ from SlicerUSSim.Logic import (
     Volume,
     segment_mri,
 )
-from SlicerUSSim.Logic.base.volume import read_array
 from SlicerUSSim.Logic.mri import add_tissue, add_tissues, read_mask, require_addable
 from SlicerUSSim.Logic.mri.kept_mask import keep
 from SlicerUSSim.Logic.mri.pathology import mask_tissue, texture_below
@@ -29,7 +28,7 @@ from SlicerUSSim.Logic.tissue.names import tissue_named
 from SlicerUSSim.Logic.tissue.own_files import require_replaceable, write_label_files
 from SlicerUSSim.Logic.tissue.presets import TISSUES, colour_of
 
-from .conftest import SHARED, block, needs_shared, rigid
+from .conftest import block, rigid
 
 pytestmark = pytest.mark.usefixtures("segmented_once")
 
@@ -86,7 +85,7 @@ def test_a_mask_on_the_grid_of_the_labels_is_taken_voxel_by_voxel():
     assert not result.warnings and BRAIN.array.max() == 1  # the labels given are as they were
 
 
-def test_a_box_without_an_outside_is_said():
+def test_a_box_without_an_outside_is_reported():
     result = added(Volume(np.ones((12, 10, 8), np.uint8), np.eye(4)))
     assert result.warnings == (
         "lesion.nii.gz: every voxel of its image is inside, so that a box of 8 x 10 x 12 mm is added; a mask is 0 "
@@ -112,27 +111,6 @@ def test_a_mask_on_another_grid_covers_the_same_place(grid, least):
     result = added(ball(grid)).labels
     assert dice(result.array == 2, distances(result) < RADIUS) > least
     assert float(distances(result)[result.array == 2].max()) < RADIUS + 0.6 * max(grid.spacing_mm)
-
-
-def test_borders_of_coarse_masks_are_surfaces_and_not_steps():
-    """Compared with the nearest voxel of the mask, which is what a lookup gives."""
-    fine, coarse = block(lambda x, y, z: 1, spacing_mm=0.5, half_mm=(16, 16, 16)), ball(empty((3.0, 3.0, 3.0)))
-    truth = distances(fine) < RADIUS
-    smooth = added(coarse, labels=fine).labels.array == 2
-    index = np.indices(fine.array.shape)[::-1].reshape(3, -1)
-    there = coarse.ras_to_ijk @ fine.ijk_to_ras @ np.vstack([index, np.ones(index.shape[1])])
-    i, j, k = np.rint(there[:3]).astype(int)
-    steps = (coarse.array[k, j, i] > 0).reshape(truth.shape)
-    assert (smooth != truth).sum() < 0.7 * (steps != truth).sum()
-
-
-def test_labels_coarser_than_a_mask_take_the_mean_of_their_voxels_and_not_a_sample():
-    coarse = block(lambda x, y, z: 1, spacing_mm=3.0)
-    fine = empty((0.5, 0.5, 0.5), half_mm=20)
-    holes = ball(fine).array.copy()
-    holes[::3, ::3, ::3] = 0  # does not matter: 1 of 27
-    whole, sieve = added(ball(fine), labels=coarse).labels.array, added(fine.with_array(holes), labels=coarse).labels
-    assert dice(whole == 2, sieve.array == 2) > 0.94
 
 
 def test_probabilities_count_from_one_half_on():
@@ -200,14 +178,6 @@ def test_a_brats_map_becomes_its_tissues_without_gaps_between_them():
         assert result.tissue_names[1:] == ("oedema", tissue) and not result.warnings
 
 
-def test_rounded_labels_are_those_of_every_other_door():
-    r = distances(BRAIN)
-    values = np.select([r < 5, r < 8, r < 14], [1.000015, 3.99997, 2.00003], 0).astype(np.float32)
-    found, exact = added(BRAIN.with_array(values), "brats"), added(BRAIN.with_array(np.rint(values)), "brats")
-    assert np.array_equal(found.labels.array, exact.labels.array) and found.tissue_names == exact.tissue_names
-    assert np.array_equal(added(BRAIN.with_array(values)).labels.array > 1, values > 0)
-
-
 # ---- labels with names -----------------------------------------------------------------------------------------------
 
 
@@ -232,24 +202,9 @@ def test_names_of_segments_decide_what_brats_adds_and_not_their_numbers(tmp_path
     assert result.warnings == (
         "lesion.nii.gz: labels are added by their names, 'Edema' as oedema, 'Necrosis' as necrosis",
     )
-    BRAIN.write(tmp_path / "labels.nii.gz")
-    options = ("--map", "1=white", "--pose", "auto", "-o", tmp_path / "o.png")
-    said = ussim("simulate", tmp_path / "labels.nii.gz", *options, "--add", f"brats={path}")
-    assert said.exit_code == 0 and "'Edema' as oedema, 'Necrosis' as necrosis" in said.stderr, said.output
-    said = ussim("simulate", tmp_path / "labels.nii.gz", *options, "--add", f"tumour={path}")
-    assert "holds the labels 1 'Edema', 2 'Necrosis'; all of them are added as tumour" in said.stderr
-    assert "(brats=FILE adds each by its name, as oedema, necrosis)" in said.stderr
-    alone = ussim("simulate", path, *options[2:])
-    assert alone.exit_code == 2 and f"--add brats={path}" in alone.stderr
-
-
-def test_a_segment_called_like_no_tissue_is_not_added_by_its_number(tmp_path):
-    path = segments(tmp_path / "l.seg.nrrd", {1: "Edema", 2: "Ball"})
-    with pytest.raises(SimulationError, match=r"holds the labels 1 'Edema', 2 'Ball', and 'Ball' is called like no ti"):
-        added(read_mask(path), "brats")
-    assert "brats=FILE" not in added(read_mask(path)).warnings[0]
-    unnamed = segments(tmp_path / "u.seg.nrrd", {1: "Segment_1", 2: "Segment_2"})
-    assert added(read_mask(unnamed), "brats").tissue_names[1:] == ("oedema", "necrosis")  # as BraTS numbers them
+    (line,) = added(read_mask(path)).warnings
+    assert "holds the labels 1 'Edema', 2 'Necrosis'; all of them are added as tumour" in line
+    assert "(brats=FILE adds each by its name, as oedema, necrosis)" in line
 
 
 # ---- what is refused or said -----------------------------------------------------------------------------------------
@@ -264,7 +219,6 @@ def moved(volume: Volume, *mm) -> Volume:
     [
         (BRAIN.with_array(np.zeros_like(BRAIN.array)), "tumour", "is empty, expected voxels that are not 0"),
         (moved(ball(BRAIN), 200, 0, 0), "tumour", "lies 174 mm outside the patient, expected a mask in the frame of"),
-        (ball(BRAIN, 2.0, [27, 27, 27]), "tumour", "lies 21 mm outside the patient"),
         (BRAIN, "tumour", "covers 100 % of the patient, expected a lesion in it; is it the mask of the brain"),
         (head_mri(8.0), "tumour", "holds fractions from 0 to .*, expected a mask"),
         (BRAIN.with_array(np.arange(BRAIN.array.size).reshape(BRAIN.array.shape)), "cyst", "226981 whole numbers from"),
@@ -273,8 +227,6 @@ def moved(volume: Volume, *mm) -> Volume:
         (ball(BRAIN), "cheese", "no tissue is called 'cheese', expected one of: coupling, csf, .*oedema, necrosis"),
         (BRAIN.with_array(ball(BRAIN).array * 5), "brats", "holds the labels 5, expected those of BraTS: 1 necrosis"),
         (ball(BRAIN), "brats", "the label 1 alone, as the mask of a whole tumour does, .*: tumour=FILE, or necrosis="),
-        (BRAIN.with_array(ball(BRAIN).array * 3), "brats-2022", "1 necrosis, 2 oedema, 4 enhancing$"),
-        (BRAIN.with_array(ball(BRAIN).array * 0.7), "brats", "holds fractions from 0 to 0.7, expected labels"),
         (ball(empty((0.1, 0.1, 0.1), half_mm=1), 0.3, [0, 0, 0]), "tumour", "mm³ are too small for the voxels"),
     ],
 )
@@ -298,12 +250,10 @@ HEAD = _head_in_noise()
 @pytest.mark.parametrize(
     ("mask", "tissue", "message"),
     [
-        (HEAD.with_array(np.zeros_like(HEAD.array)), "tumour", "lesion.nii.gz: is empty"),
         (moved(ball(empty((2.0, 2.0, 2.0))), 300, 0, 0), "tumour", "lesion.nii.gz: lies 2[01][0-9] mm outside the pat"),
         (ball(HEAD, 8.0, [70, 70, 70]), "tumour", "lesion.nii.gz: lies (29|3[0-2]) mm outside the patient"),
         (ball(HEAD, 67.0, [0, 0, 0]), "tumour", "has 12[0-9]{2} ml, as a whole brain has, .* is it the mask of the br"),
         (ball(HEAD, 84.0, [0, 0, 0]), "tumour", "lesion.nii.gz: covers 9[0-9] % of the patient"),
-        (ball(HEAD), "cheese", "no tissue is called 'cheese', expected one of"),
         (ball(empty((0.2, 0.2, 0.2), half_mm=2), 1.0, [2, 2, 2]), "tumour", "are too small for the voxels of the MRI"),
     ],
 )
@@ -312,7 +262,7 @@ def test_what_could_not_be_added_is_refused_before_a_segmentation(mask, tissue, 
         require_addable(HEAD, [(tissue, mask, "lesion.nii.gz")])
 
 
-def test_a_lesion_in_or_at_a_head_passes_before_the_segmentation_also_where_it_is_black():
+def test_a_lesion_in_or_at_a_head_passes_before_the_segmentation():
     dark = HEAD.with_array(np.where(distances(HEAD) < 12, 2.0, HEAD.array))  # a cyst in FLAIR
     for radius, centre in ((8.0, CENTRE), (20.0, [40, 0, 20]), (6.0, [0, 0, 70]), (5.0, [0, 0, 86])):
         require_addable(dark, [("tumour", ball(empty((1.5, 1.5, 2.0), half_mm=100), radius, centre), "lesion.nii.gz")])
@@ -323,50 +273,30 @@ def test_a_lesion_in_or_at_a_head_passes_before_the_segmentation_also_where_it_i
         require_addable(HEAD, [("tumour", cap, "lesion.nii.gz")], mask=brain)
 
 
-def test_every_door_refuses_a_lesion_elsewhere_without_segmenting(monkeypatch, tmp_path):
+def test_the_command_refuses_a_lesion_elsewhere_without_segmenting(monkeypatch, tmp_path):
     def segmented(*arguments, **options):
         raise AssertionError("it was segmented")
 
-    far = moved(ball(BRAIN), 300, 0, 0)
     head_mri(4.0).write(tmp_path / "head.nii.gz")
-    far.write(tmp_path / "far.nii.gz")
+    moved(ball(BRAIN), 300, 0, 0).write(tmp_path / "far.nii.gz")
     # What segment_mri calls first; modules that are first imported now would keep another segment_mri.
     monkeypatch.setattr("SlicerUSSim.Logic.mri.segmentation.find_brain", segmented)
     adding = ("--add", f"tumour={tmp_path / 'far.nii.gz'}")
-    for arguments in (
-        ("segment", tmp_path / "head.nii.gz", "-o", tmp_path / "l.nii.gz"),
-        ("simulate", tmp_path / "head.nii.gz", "--pose", "auto", "-o", tmp_path / "x.png"),
-        ("demo", "--mri", tmp_path / "head.nii.gz", "--out", tmp_path / "demo"),
-    ):
-        result = ussim(*arguments, *adding)
-        assert result.exit_code == 2 and "far.nii.gz: lies " in result.stderr, result.output
-        assert "mm outside the patient" in result.stderr
+    result = ussim("segment", tmp_path / "head.nii.gz", "-o", tmp_path / "l.nii.gz", *adding)
+    assert result.exit_code == 2 and "far.nii.gz: lies " in result.stderr, result.output
+    assert "mm outside the patient" in result.stderr and not (tmp_path / "l.nii.gz").exists()
 
 
 @pytest.mark.parametrize(
     ("name", "tissue"),
-    [("gray", "grey matter"), ("White", "white matter"), ("GTV", "tumour"), ("bleeding", "haematoma"),
-     ("NCR", "necrosis"), ("ED", "oedema"), ("BraTS 2021", "brats-2022"), ("brats-2024", "brats-2023"),
-     ("BraTS", "brats"), ("enhancing tumour", "enhancing"), ("non-enhancing tumor", "tumour")],
+    [("gray", "grey matter"), ("GTV", "tumour"), ("NCR", "necrosis"), ("ED", "oedema"), ("BraTS 2021", "brats-2022"),
+     ("brats-2024", "brats-2023"), ("enhancing tumour", "enhancing"), ("non-enhancing tumor", "tumour")],
 )  # fmt: skip
 def test_usual_names_of_lesions_are_understood(name, tissue):
     assert mask_tissue(name) == tissue
 
 
-@pytest.mark.parametrize(
-    ("name", "expected"),
-    [
-        ("lesion", "expected tumour, oedema, necrosis, cyst, haematoma or cavity"),
-        ("tumuor", "expected tumour"), ("odema", "expected oedema"), ("hematom", "expected haematoma"),
-        ("cheese", "expected one of: coupling, csf, "),
-    ],
-)  # fmt: skip
-def test_for_a_name_that_is_not_understood_a_similar_one_is_proposed(name, expected):
-    with pytest.raises(SimulationError, match=f"no tissue is called '{name}', {expected}"):
-        mask_tissue(name)
-
-
-def test_what_the_brain_mask_leaves_out_is_added_and_said():
+def test_what_the_brain_mask_leaves_out_is_added_and_reported():
     mask = ball(BRAIN, 8.0, [22, 0, 0])
     result = added(mask, has_brain_mask=True)
     left_out = float((BRAIN.array[mask.array > 0] == 0).mean())
@@ -383,14 +313,14 @@ def test_what_the_brain_mask_leaves_out_is_added_and_said():
     assert added(meningioma, "skull").messages  # is around the brain and not in it
 
 
-def test_an_addition_larger_than_a_lesion_is_said_but_skin_and_skull_are_not():
+def test_an_addition_larger_than_a_lesion_is_reported():
     patient = block(lambda x, y, z: 1, spacing_mm=4.0, half_mm=(60, 60, 60))
     for radius, tissue, is_said in ((44.0, "tumour", False), (48.0, "tumour", True), (48.0, "fat", False)):
         found = added(ball(patient, radius, [0, 0, 0]), tissue, labels=patient)
         assert any("ml, expected a lesion of up to 400 ml" in line for line in found.warnings) == is_said
 
 
-def test_labels_given_as_a_mask_are_all_added_and_said():
+def test_labels_given_as_a_mask_are_all_added_and_reported():
     both = np.select([distances(BRAIN) < 4, distances(BRAIN) < 8], [1, 2], 0)
     result = added(BRAIN.with_array(both))
     assert (result.labels.array == 2).sum() == (both > 0).sum()
@@ -400,7 +330,7 @@ def test_labels_given_as_a_mask_are_all_added_and_said():
     )
 
 
-def test_a_mask_that_reaches_out_of_the_volume_or_gets_lost_in_coarse_voxels_is_said():
+def test_a_mask_outside_the_volume_or_lost_in_coarse_voxels_is_reported():
     box = Volume(np.ones((30, 30, 30), np.uint8), np.eye(4))
     out = added(ball(Volume(np.zeros((40, 40, 40), np.uint8), np.eye(4)), 6.0, [28, 15, 15]), labels=box)
     assert any("% of lesion.nii.gz lie outside the volume of the labels" in warning for warning in out.warnings)
@@ -466,20 +396,8 @@ def test_a_lesion_has_a_preset_with_sources_and_a_colour_of_its_own(name):
     assert sum(colour_of(other) == colour_of(name) for other in TISSUES) == 1
 
 
-@pytest.mark.parametrize(
-    ("name", "tissue"),
-    [
-        ("Edema", "oedema"), ("peritumoral edema", "oedema"), ("Necrotic core", "necrosis"), ("arachnoid cyst", "cyst"),
-        ("Hematoma", "haematoma"), ("intracerebral haemorrhage", "haematoma"), ("resection cavity", "cavity"),
-        ("Tumor", "tumour"), ("kidney_cyst_left", "cyst"), ("vessels", "blood"),
-    ],
-)  # fmt: skip
-def test_names_of_lesions_are_known(name, tissue):
-    assert tissue_named(name).name == tissue
-
-
 @pytest.mark.slow
-def test_the_texture_of_the_mri_is_certain_in_a_lesion_and_follows_its_intensity():
+def test_the_texture_of_the_mri_is_certain_in_a_lesion():
     mri = head_mri(3.0)
     segmentation = segment_mri(mri)
     result = added(ball(mri, 12.0, [30, 0, 30]), "tumour", segmentation.labels, segmentation.tissue_names)
@@ -500,12 +418,11 @@ def test_the_texture_of_the_mri_is_certain_in_a_lesion_and_follows_its_intensity
 def files(tmp_path_factory):
     """A head, and masks on a finer grid of their own."""
     folder = tmp_path_factory.mktemp("lesions")
-    head = head_mri(3.0)
+    head = head_mri(4.0)
     head.write(folder / "head.nii.gz")
     grid = moved(empty((1.5, 1.5, 2.0), np.diag([-1.0, -1.0, 1.0]), 20), 30, 10, 35)
     ball(grid, 10.0, [30, 10, 35]).write(folder / "tumour.nii.gz")
     ball(grid, 5.0, [30, 10, 35]).write(folder / "cyst.nrrd")
-    moved(ball(grid, 5.0, [30, 10, 35]), 300, 0, 0).write(folder / "far.nrrd")
     return folder
 
 
@@ -519,7 +436,7 @@ def test_segment_writes_added_tissues_and_says_what_it_added(files, tmp_path):
     table, labels = TissueTable.read(tmp_path / "labels.json"), Volume.read(out)
     cyst = table.label_of("cyst")
     assert table.names() == ["coupling", "csf", "grey matter", "white matter", "leptomeninges", "tumour", "cyst"]
-    volume_ml = (labels.array == cyst).sum() * 0.027
+    volume_ml = (labels.array == cyst).sum() * 0.064
     assert volume_ml == pytest.approx(4 / 3 * np.pi * 0.5**3, rel=0.2)
     edema = ussim("segment", files / "head.nii.gz", "-o", out, "--add", f"edema={files / 'cyst.nrrd'}")
     assert "--add edema: oedema" in edema.stderr and "oedema" in TissueTable.read(tmp_path / "labels.json").names()
@@ -527,38 +444,16 @@ def test_segment_writes_added_tissues_and_says_what_it_added(files, tmp_path):
     assert again.exit_code == 0 and "tumour" not in TissueTable.read(tmp_path / "labels.json").names()
 
 
-@pytest.mark.slow
-def test_every_command_that_simulates_takes_additions_for_an_mri_and_for_labels(files, tmp_path):
-    labels = tmp_path / "l.nii.gz"
-    assert ussim("segment", files / "head.nii.gz", "-o", labels).exit_code == 0
-    adding = ("--add", f"tumour={files / 'tumour.nii.gz'}", "--set", "tumour.mu0=3.0")
-    for source in (files / "head.nii.gz", labels):
-        pictures = []
-        for options in ((), adding):
-            out = tmp_path / "image.mha"
-            result = ussim("simulate", source, "--pose", "auto", "-o", out, *options)
-            assert result.exit_code == 0, result.output
-            pictures.append(read_array(out)[0].astype(float))
-        assert np.abs(pictures[1] - pictures[0]).max() > 50
-    for command in ("segment", "simulate", "sweep", "volume", "optimize", "demo"):
-        assert "additions" in {parameter.name for parameter in main.commands[command].params}
-
-
 @pytest.mark.parametrize(
     ("value", "message"),
     [
         ("tumour", "--add is 'tumour', expected TISSUE=FILE"),
-        ("=x.nrrd", "--add is '=x.nrrd', expected TISSUE=FILE"),
         ("tumour=none.nrrd", "none.nrrd: no such file"),
-        ("cheese={cyst.nrrd}", "no tissue is called 'cheese', expected one of: coupling"),
         ("tumour={head.nii.gz}", "head.nii.gz: holds fractions from"),
-        ("tumour={far.nrrd}", "far.nrrd: lies 2"),
-        ("brats={far.nrrd}", "far.nrrd: holds the label 1 alone"),
     ],
 )
 def test_a_mistake_in_an_addition_is_one_line_and_writes_nothing(files, tmp_path, value, message):
-    for name in ("head.nii.gz", "cyst.nrrd", "far.nrrd"):
-        value = value.replace("{" + name + "}", str(files / name))
+    value = value.replace("{head.nii.gz}", str(files / "head.nii.gz"))
     result = ussim("segment", files / "head.nii.gz", "-o", tmp_path / "l.nii.gz", "--add", value)
     assert result.exit_code == 2 and not list(tmp_path.iterdir())
     lines = [line for line in result.stderr.splitlines() if not line.startswith("ussim: warning: ")]
@@ -569,35 +464,42 @@ def test_a_mistake_in_an_addition_is_one_line_and_writes_nothing(files, tmp_path
 # ---- files that are not replaced -------------------------------------------------------------------------------------
 
 
-def test_segment_replaces_only_labels_that_it_wrote_and_nobody_edited(files, tmp_path):
-    head, out, beside = files / "head.nii.gz", tmp_path / "l.nii.gz", tmp_path / "l.json"
-
-    def refused() -> str:
-        before = {path: path.read_bytes() for path in tmp_path.iterdir()}
-        result = ussim("segment", head, "-o", out)
-        assert result.exit_code == 2 and {path: path.read_bytes() for path in tmp_path.iterdir()} == before
-        (line,) = (line for line in result.stderr.splitlines() if line.startswith("ussim: "))
-        assert line.endswith("so it is not replaced; give another name, or --overwrite to replace it"), line
-        return line
-
-    assert ussim("segment", head, "-o", out).exit_code == ussim("segment", head, "-o", out).exit_code == 0
+def test_segment_replaces_only_labels_that_nobody_edited(files, tmp_path):
+    call = ("segment", files / "head.nii.gz", "-o", out := tmp_path / "l.nii.gz")
+    assert ussim(*call).exit_code == 0
     labels = Volume.read(out)
     labels.with_array(np.where(labels.array == 3, 2, labels.array).astype(np.uint8)).write(out)
-    assert "l.nii.gz: the labels have been edited since this program wrote them" in refused()
-    assert ussim("segment", head, "-o", out, "--overwrite").exit_code == 0
+    before = {path: path.read_bytes() for path in tmp_path.iterdir()}
+    result = ussim(*call)
+    assert result.exit_code == 2 and {path: path.read_bytes() for path in tmp_path.iterdir()} == before
+    (line,) = (line for line in result.stderr.splitlines() if line.startswith("ussim: "))
+    assert "l.nii.gz: the labels have been edited since this program wrote them" in line
+    assert line.endswith("so it is not replaced; give another name, or --overwrite to replace it")
+    assert ussim(*call, "--overwrite").exit_code == 0
+
+
+def test_edited_labels_and_tables_are_not_replaced(tmp_path):
+    out, beside = tmp_path / "l.nii.gz", tmp_path / "l.json"
+
+    def refused() -> str:
+        with pytest.raises(SimulationError, match="so it is not replaced") as error:
+            require_replaceable(out)
+        return str(error.value)
+
+    write_label_files(out, BRAIN, TissueTable.brain())
     Volume.read(out).write(out)  # the same voxels, saved by another program
-    assert ussim("segment", head, "-o", out).exit_code == 0
+    require_replaceable(out)
+    written = beside.read_text()
     TissueTable.read(beside).replace("csf", mu0=0.5).write(beside)
     assert "l.nii.gz: exists and was not written by this program (l.json does not say so)" in refused()
-    assert ussim("segment", head, "-o", out, "--overwrite").exit_code == 0
-    values = json.loads(beside.read_text())
+    values = json.loads(written)
     values["tissues"]["3"]["mu0"] = 0.6
     beside.write_text(json.dumps(values))
     assert "the tissues in l.json have been edited" in refused()
     out.unlink()  # the user's table alone is not replaced either
     assert "l.json: the tissues in l.json have been edited" in refused()
     beside.unlink()
-    head_mri(5.0).write(out)
+    BRAIN.write(out)
     assert "l.nii.gz: exists and was not written by this program (l.json is not beside it)" in refused()
 
 
@@ -622,19 +524,6 @@ def test_labels_are_recognised_in_every_format(name, tmp_path):
     Volume(written.array, rigid(np.eye(3), [0.5, 0, 0]) @ written.ijk_to_ras).write(tmp_path / name)
     with pytest.raises(SimulationError, match="have been edited"):
         require_replaceable(tmp_path / name)
-
-
-# ---- a real patient --------------------------------------------------------------------------------------------------
-
-
-@needs_shared
-def test_the_published_glioma_of_a_patient_lies_in_her_head():
-    """ReMIND-022: 799 voxels on the T1's grid (../shared/data)."""
-    mri = Volume.read(SHARED / "remind022" / "t1_contrast.nii.gz")
-    labels = mri.with_array((mri.array > 0.2 * mri.array.max()).astype(np.uint8))
-    glioma = Volume.read(SHARED / "remind022" / "glioma.nii.gz")
-    result = add_tissue(labels, ["brain"], glioma, "tumour", source="glioma.nii.gz")
-    assert result.messages[0].startswith("tumour: 799 voxels, 0.8 ml, added over brain ")
 
 
 def test_segment_never_replaces_its_inputs_and_takes_no_labels_for_an_mri(tmp_path):

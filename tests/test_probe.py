@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +11,6 @@ from hypothesis import given, strategies as st
 
 from SlicerUSSim.Logic import (
     ConvexProbe,
-    DisplaySettings,
     LinearProbe,
     PhasedProbe,
     Preset,
@@ -20,10 +18,9 @@ from SlicerUSSim.Logic import (
     SimulationSettings,
     UltrasoundSimulator,
 )
-from SlicerUSSim.Logic.probe import tilt_sweep
 from SlicerUSSim.Logic.probe.arrays import PROBES, Probe, probe_from_dict
 from SlicerUSSim.Logic.probe.beam import FWHM_PER_SIGMA
-from tests.conftest import SPECKLE, block, simulator
+from tests.conftest import SPECKLE
 from validation.measurement import correlation, depth_window
 from validation.phantoms import uniform_speckle
 
@@ -94,7 +91,6 @@ def test_beam_is_narrowest_near_its_focus_and_diffraction_limited_there():
 
 
 def test_a_focus_is_at_least_as_wide_as_that_of_half_its_aperture():
-    """Formerly f/0.005 was 0.7 micrometres wide, and a frame took minutes."""
     close, least = (PhasedProbe(75, 90, focus_mm=focus, aperture_mm=20.0) for focus in (0.1, 10.0))
     assert close.transmit_waist()[0] == least.transmit_waist()[0]
     wavelength = 1.54 / 5
@@ -128,7 +124,6 @@ def test_probes_survive_json(depth, count, frequency, kind):
         ({"kind": "convex", "radius_mm": 60, "field_of_view_deg": 70}, "probe.json: lacks depth_mm"),
         ({"kind": "ring"}, "kind is 'ring', expected one of linear, convex, phased"),
         ({"kind": "linear", "width_mm": 40, "depth_mm": 50, "colour": 3}, "colour is not a parameter of a linear"),
-        ({"kind": "linear", "width_mm": "wide", "depth_mm": 50}, "width_mm is 'wide'"),
         ({"kind": "linear", "width_mm": 40, "depth_mm": 50, "scan_lines": 10.5}, "expected a whole number"),
         ([1, 2], "is a list"),
     ],
@@ -166,7 +161,7 @@ def test_a_preset_is_a_probe_that_could_be_built(name):
 
 
 @each_preset
-def test_a_preset_has_scan_lines_finer_than_its_beam_and_penetrates_its_depth(name):
+def test_a_preset_has_lines_finer_than_its_beam_and_penetrates_its_depth(name):
     probe = PROBES[name]
     depth = np.linspace(0.0, probe.depth_mm, 101)
     assert (probe.line_distance_mm(depth) < 0.7 * fwhm_mm(probe, depth)).all()
@@ -176,7 +171,7 @@ def test_a_preset_has_scan_lines_finer_than_its_beam_and_penetrates_its_depth(na
 
 
 @pytest.mark.slow
-@each_preset
+@pytest.mark.parametrize("name", ["phased", "linear_15", "abdominal"])
 def test_a_preset_resolves_at_its_focus_what_its_aperture_and_band_say(name):
     """The speckle of the simulated image has the size of the beam: neighbours correlate as exp(-d^2 / 4 sigma^2)."""
     probe = PROBES[name]
@@ -202,34 +197,13 @@ def test_the_burr_hole_probe_fits_through_a_burr_hole():
     assert np.hypot(footprint_mm(probe), probe.elevation_aperture_mm) < 14.0  # mm, of a usual perforator
 
 
-def test_a_matrix_array_is_focused_elevationally_as_laterally_at_every_depth():
+def test_a_matrix_array_is_focused_elevationally_as_laterally():
     probe = PROBES["matrix"]
     for depth in (probe.depth_mm, 90.0):
         seen = Preset(probe).changed("probe", depth_mm=depth).probe
         assert seen.elevation_waist() == seen.transmit_waist()
         sigma = seen.beam_sigma_mm(seen.focus_mm)
         assert sigma[0] == pytest.approx(sigma[1], rel=0.01)
-
-
-@pytest.mark.slow
-def test_a_matrix_array_gives_a_volume_of_a_sphere():
-    """A black ball of 20 mm, 60 mm deep, seen by a tilt sweep: it is where it was put, and about as large each way."""
-    ball = block(lambda x, y, z: np.where(x**2 + y**2 + z**2 < 100.0, 2, 1), half_mm=(40, 40, 40))
-    found = simulator(ball, SPECKLE, replace(SPECKLE, name="ball", mu0=0.0, sigma0=0.0), coupling=SPECKLE)
-    pose = np.eye(4)
-    pose[1, 3] = -60.0
-    probe = replace(PROBES["matrix"], depth_mm=90.0, focus_mm=60.0, elevation_focus_mm=60.0)
-    volume = found.volume(probe, tilt_sweep(pose, 50.0, 26), DisplaySettings(tgc_db_cm_mhz=0.0), like=ball)
-    axis = np.arange(-40, 41)
-    place = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"))  # (z, y, x) of the voxels in mm
-    away = np.linalg.norm(place, axis=0)
-    grey = volume.array.astype(float)
-    around = grey[(away > 14) & (away < 20)].mean()
-    assert grey[away < 6].mean() < 0.1 * around
-    dark = (grey < 0.5 * around) & (away < 16)
-    np.testing.assert_allclose([along[dark].mean() for along in place], 0.0, atol=0.7)
-    z, y, x = (2.0 * along[dark].std() * np.sqrt(5.0) for along in place)  # diameters of an ellipsoid
-    assert 18.0 < y < 23.0 and 15.0 < x < 23.0 and z == pytest.approx(x, rel=0.12), (x, y, z)
 
 
 def row_of(name: str) -> str:
@@ -249,7 +223,7 @@ def row_of(name: str) -> str:
     return f"| {' | '.join(columns)} |"
 
 
-def test_the_page_of_the_presets_has_their_numbers_and_a_source_for_each():
+def test_the_page_of_the_presets_has_their_numbers_and_sources():
     rows = re.findall(r"^\| `.*$", PROBES_PAGE.read_text(encoding="utf-8"), re.MULTILINE)
     numbers = [row for row in rows if row.count("|") > 3]
     assert numbers == [row_of(name) for name in PROBES]

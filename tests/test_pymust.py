@@ -30,7 +30,7 @@ from scipy.signal import hilbert
 from SlicerUSSim.Logic import LinearProbe
 from SlicerUSSim.Logic.probe.beam import FWHM_PER_SIGMA
 from tests.conftest import FLUID, SPECKLE, block, rigid, simulator
-from validation.measurement import correlation, depth_window, echo_near, full_width, level_db
+from validation.measurement import depth_window, echo_near, full_width, level_db
 from validation.phantoms import band_power
 
 pymust = pytest.importorskip("pymust", reason="PyMUST is the reference: pip install PyMUST")
@@ -163,15 +163,13 @@ def focused_probe() -> LinearProbe:
     return replace(probe(), width_mm=20.0, scan_lines=201, aperture_mm=ELEMENTS * PITCH_MM, focus_mm=FOCUS_MM)
 
 
-@pytest.mark.parametrize(
-    "depth", [10.0, 15.0, 30.0, *(pytest.param(depth, marks=pytest.mark.slow) for depth in (35.0, 40.0))]
-)
+@pytest.mark.parametrize("depth", [15.0, 30.0, pytest.param(40.0, marks=pytest.mark.slow)])
 def test_a_focused_transmit_beam_is_as_wide_at_and_away_from_its_focus(depth):
     """Not just before the focus (20 to 25 mm): there the near field of a real aperture has ripples of 20 %."""
     lines = np.arange(0.0, 2.01, 0.1)
     image = focused_lines(np.zeros(1), np.full(1, depth), np.ones(1), lines, depth + np.arange(-0.4, 0.41, 0.02))
     lines, echo = np.union1d(-lines, lines), both_sides(np.abs(image).max(axis=0))
-    width = float(focused_probe().beam_sigma_mm(depth)[0]) * FWHM_PER_SIGMA  # found in images by validation/beams.py
+    width = float(focused_probe().beam_sigma_mm(depth)[0]) * FWHM_PER_SIGMA  # which the validation finds in the image
     assert width == pytest.approx(full_width(lines, echo), rel=0.15)
 
 
@@ -209,35 +207,6 @@ def our_windows(array: LinearProbe, depths_mm, attenuation: float) -> tuple[list
     return [[depth_window(f, d, 3.0).T for f in frames] for d in depths_mm], step
 
 
-def correlation_length(pairs, spacing: float) -> float:
-    """Distance at which the correlation falls to one half; `pairs(n)` gives signals n steps apart."""
-    steps = np.arange(1, 12)
-    values = [np.mean([correlation(a, b) for a, b in pairs(n)]) for n in steps]
-    return float(np.interp(-0.5, -np.array(values), steps * spacing))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("depth", [12.0, 30.0])
-def test_focused_speckle_has_the_same_correlation_lengths(scatterers, depth):
-    """Within 15 %. The test after next has the lateral length within 10 %, at more depths, of the echo of a point."""
-    array = focused_probe()
-    along = depth + np.arange(-3, 3, 0.04)
-    near = [values[abs(scatterers[1] - depth) < 5.0] for values in scatterers]
-    wave = focused_lines(*near, np.arange(-5, 5.01, 0.2), along)
-    baseband = wave * np.exp(-2j * np.pi * array.cycles_per_mm * along)[:, None]
-    (images,), step = our_windows(array, [depth], 0.0)
-    theirs = (
-        correlation_length(lambda n: [(baseband[:, :-n], baseband[:, n:])], 0.2),
-        correlation_length(lambda n: [(baseband[:-n], baseband[n:])], 0.04),
-    )
-    ours = (
-        correlation_length(lambda n: [(s[:, :-n], s[:, n:]) for s in images], array.line_spacing),
-        correlation_length(lambda n: [(s[:-n], s[n:]) for s in images], step),
-    )
-    assert ours[0] == pytest.approx(theirs[0], rel=0.15)
-    assert ours[1] == pytest.approx(theirs[1], rel=0.15)
-
-
 def half_correlation(echo: np.ndarray, spacing: float) -> float:
     """Lag at which the autocorrelation of a point's (depth, lateral) echo falls to one half.
 
@@ -265,16 +234,14 @@ HALF = 2.0 * np.sqrt(np.log(2.0))
 @pytest.mark.parametrize(
     ("mhz", "f_number", "pitch_mm", "elements", "focus", "depths"),
     [
-        pytest.param(5.0, 2.5, 0.3, 40, 30.0, (12.0, 20.0, 25.0, 30.0, 34.0, 39.0), marks=pytest.mark.slow),
-        # beam.CURVED was chosen with the case above; it was kept because these, looked at too, agreed:
-        pytest.param(7.5, 1.5, 0.2, 50, 20.0, (8.0, 14.0, 20.0, 26.0), marks=pytest.mark.slow),
-        pytest.param(3.5, 2.5, 0.35, 57, 50.0, (20.0, 50.0, 65.0), marks=pytest.mark.slow),
+        # beam.CURVED was chosen with the first; it was kept because others, looked at too, agreed.
+        (5.0, 2.5, 0.3, 40, 30.0, (12.0, 25.0, 30.0, 39.0)),
+        (7.5, 1.5, 0.2, 50, 20.0, (8.0, 20.0, 26.0)),
     ],
 )
-def test_speckle_correlates_as_of_a_focused_wave_in_and_away_from_its_focus(
-    mhz, f_number, pitch_mm, elements, focus, depths
-):
-    """Within 10 %: the phase of our beam has the curvature for it. validation/speckle.py finds the length in images."""
+@pytest.mark.slow
+def test_speckle_correlates_as_of_a_focused_wave_at_every_depth(mhz, f_number, pitch_mm, elements, focus, depths):
+    """Within 10 %: the phase of our beam has the curvature for it. The validation finds it in images."""
     param, spacing, lateral = array_of(mhz, f_number, pitch_mm, elements), 0.1, np.arange(0.0, 3.51, 0.1)
     delays = pymust.txdelay(0.0, focus * 1e-3, param)
     ours = LinearProbe(
@@ -294,7 +261,6 @@ def test_speckle_correlates_as_of_a_focused_wave_in_and_away_from_its_focus(
     ("mhz", "f_number", "pitch_mm", "elements", "largest", "angles", "depths"),
     [
         (5.0, 2.0, 0.3, 96, 10.0, 5, (8.0, 22.0)),
-        (2.5, 2.0, 0.3, 96, 10.0, 5, (8.0, 22.0)),
         (3.5, 2.5, 0.35, 96, 6.0, 3, (15.0, 40.0)),
     ],
 )

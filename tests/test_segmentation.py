@@ -3,20 +3,16 @@
 from __future__ import annotations
 
 import re
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings, strategies as st
-from scipy import ndimage
-from scipy.ndimage import gaussian_filter, uniform_filter
+from scipy.ndimage import uniform_filter
 from scipy.spatial.transform import Rotation
 
 from SlicerUSSim.Logic import SimulationError, Volume, segment_mri
 from SlicerUSSim.Logic.mri.atlas import mni152
 from SlicerUSSim.Logic.mri.atlas_registration import register_atlas
-from SlicerUSSim.Logic.mri.block_matching import share_in_place
 from SlicerUSSim.Logic.mri.classification import class_names, classify
 from SlicerUSSim.Logic.mri.coregistration import aligned
 from SlicerUSSim.Logic.mri.field import anatomy, estimate_field
@@ -58,6 +54,13 @@ def truth(mni):
     return labels
 
 
+@pytest.fixture(scope="module")
+def mni2(mni) -> Volume:
+    """Every other voxel of the template, 2 mm."""
+    t1 = mni[0]
+    return Volume(t1.array[::2, ::2, ::2].copy(), t1.ijk_to_ras @ np.diag([2.0, 2.0, 2.0, 1.0]))
+
+
 def brain_of(share: dict[str, float], noise: float, seed: int) -> np.ndarray:
     """(voxels,) intensities with CSF 40, grey 90 and white 120, a quarter of them mixed with the next tissue."""
     rng = np.random.default_rng(seed)
@@ -70,8 +73,7 @@ def brain_of(share: dict[str, float], noise: float, seed: int) -> np.ndarray:
 
 
 @pytest.mark.slow
-def test_mni_with_five_percent_noise_is_better_than_with_free_variances(mni, truth):
-    """The mixture with a variance per class and no mixed ones had 0.83, and 0.82 in white matter."""
+def test_the_template_with_five_percent_noise_is_segmented_well(mni, truth):
     mri, mask = mni[0], mni[0].with_array((mni[0].array > 0).astype(np.uint8))
     noisy = with_rician_noise(mri, 0.05)
     plain = dice(segment_mri(noisy, mask=mask, filter_radius=0, bias_correction=False).labels.array, truth)
@@ -85,17 +87,6 @@ def test_mni_with_five_percent_noise_is_better_than_with_free_variances(mni, tru
     assert not result.warnings
 
 
-@pytest.mark.slow
-@given(st.floats(0.05, 0.3), st.floats(0.3, 0.5), st.floats(2, 8), st.integers(0, 2**16))
-@settings(max_examples=8)
-def test_the_likelihood_never_falls_and_a_known_mixture_is_recovered(csf, white, noise, seed):
-    values = brain_of({"csf": csf, "grey": 1 - csf - white, "white": white}, noise, seed)
-    found = classify(values[None], ("t1",), class_names(("t1",), None), None)
-    assert (np.diff(found.mixture.log_likelihoods) > -1e-9).all()
-    np.testing.assert_allclose(found.means[:, 0], [40, 90, 120], atol=4)
-    assert found.standard_deviations[0, 0] == pytest.approx(noise, rel=0.2)
-
-
 def test_brighter_voxels_never_have_a_darker_class():
     """Also far beyond the outermost means, where outliers are: bright ones are white matter in plain T1."""
     values = brain_of({"csf": 0.15, "grey": 0.45, "white": 0.4}, 5.0, 1)
@@ -105,8 +96,8 @@ def test_brighter_voxels_never_have_a_darker_class():
     assert (labels[values > 200] == 2).all()
 
 
-def test_what_is_brighter_than_white_matter_enhances_and_a_healthy_brain_does_not():
-    """With four classes 46 % of a healthy brain once became "enhancing"."""
+def test_what_is_brighter_than_white_matter_enhances():
+    """And nothing of a healthy brain does."""
     values = brain_of({"csf": 0.15, "grey": 0.45, "white": 0.4}, 5.0, 2)
     vessels = np.random.default_rng(3).uniform(180, 400, 2000).astype(np.float32)
     names = class_names(("t1gd",), None)
@@ -166,7 +157,7 @@ def test_an_empty_bin_changes_nothing_and_the_fit_is_deterministic():
     np.testing.assert_allclose(shares.sum(axis=0) + outside, 1, atol=1e-9)
 
 
-@pytest.mark.parametrize("radius", [1, 2, 5])
+@pytest.mark.parametrize("radius", [1, 5])
 def test_the_guided_filter_is_what_its_definition_says(radius):
     """He et al., eq. 5, 6, 8, with models weighted by the inverse of their window's variance."""
     rng = np.random.default_rng(2)
@@ -190,16 +181,7 @@ def test_the_guided_filter_is_what_its_definition_says(radius):
     assert (found[~mask] == 0).all()
 
 
-def test_a_strong_filter_flattens_and_a_weak_one_keeps():
-    rng = np.random.default_rng(3)
-    image = rng.normal(100, 5, (20, 20, 20)).astype(np.float32)
-    mask = np.ones(image.shape, bool)
-    assert guided_filter(image, mask, 2, 1e6).std() < 1
-    np.testing.assert_allclose(guided_filter(image, mask, 2, 1e-6), image, atol=1e-2)
-    np.testing.assert_array_equal(guided_filter(image, mask, 0, 1.0), image)
-
-
-@pytest.mark.parametrize("sigma", [1.0, 4.0, 12.0])
+@pytest.mark.parametrize("sigma", [1.0, 12.0])
 def test_noise_is_estimated_beside_edges(sigma):
     image = np.where(np.indices((40, 40, 40)).sum(axis=0) % 20 < 10, 80.0, 140.0)
     noisy = image + np.random.default_rng(4).normal(0, sigma, image.shape)
@@ -216,7 +198,7 @@ def test_noise_is_estimated_beside_edges(sigma):
     ],
 )
 def test_classes_are_named_by_contrast(contrast, order):
-    head = head_mri(2.0)
+    head = head_mri(4.0)
     mri = head.with_array(np.where(head.array > 0, 160 - head.array, 0)) if contrast == "t2" else head
     result = segment_once(mri, contrast=contrast)
     assert result.tissue_names == order
@@ -224,34 +206,24 @@ def test_classes_are_named_by_contrast(contrast, order):
 
 
 @pytest.mark.slow
-def test_the_table_has_a_line_per_label_whose_shares_and_millilitres_add_up():
-    result = segment_mri(head_mri(2.0), thin_sulci=True)
+def test_the_table_has_a_line_per_label_and_its_millilitres_add_up():
+    result = segment_mri(head_mri(3.0), thin_sulci=True)
     rows = [line.split() for line in result.table().splitlines()[1:]]
     assert [row[0] for row in rows] == ["1", "2", "3", "4"]
-    total = (result.labels.array > 0).sum() * 8 / 1000
+    total = (result.labels.array > 0).sum() * 27 / 1000
     millilitres = sum(float(row[3 if row[2].endswith("matter") is False else 4]) for row in rows)
     assert millilitres == pytest.approx(total, abs=0.5)
 
 
-@pytest.mark.parametrize("unit", [1.0, 0.01, 1e-6])
 @pytest.mark.slow
-def test_the_table_has_means_and_deviations_in_every_unit(unit):
-    head = head_mri(3.0)
+def test_the_table_has_means_and_deviations_in_any_unit():
+    head, unit = head_mri(4.0), 1e-6
     result = segment_mri(head.with_array((head.array * np.float64(unit)).astype(np.float32)))
     lines = result.table().splitlines()[1:]
     assert len(lines) == len(result.means) == 3 and len(set(map(len, lines))) == 1
     for line, mean, deviation in zip(lines, result.means, result.standard_deviations, strict=True):
         numbers = [float(text) for text in line.split()[-2:]]
         assert numbers == pytest.approx([mean, deviation], rel=0.006, abs=0.006 * unit)
-
-
-@pytest.mark.slow
-def test_the_table_leaves_out_tissues_that_were_covered_wholly():
-    """A tissue under a lesion was a row of 0.0 ml."""
-    result = segment_mri(head_mri(4.0))
-    covered = result.labels.with_array(np.where(result.labels.array == 1, 2, result.labels.array))
-    rows = replace(result, labels=covered).table().splitlines()[1:]
-    assert [row.split()[0] for row in rows] == ["2", "3"] and result.tissue_names[0] not in "\n".join(rows)
 
 
 def test_posteriors_sum_to_one_inside_and_agree_with_the_labels():
@@ -286,7 +258,7 @@ def test_thin_sulci_are_found_on_their_middle_and_only_there():
 
 @pytest.mark.slow
 def test_bias_correction_saves_the_classes_of_a_shaded_image():
-    head = head_mri(2.0)
+    head = head_mri(3.0)
     shade = np.linspace(0.72, 1.28, head.array.shape[0])[:, None, None].astype(np.float32)
     reference = segment_mri(head, bias_correction=False).labels.array
     shaded = head.with_array(head.array * shade)
@@ -297,9 +269,10 @@ def test_bias_correction_saves_the_classes_of_a_shaded_image():
     assert corrected > max(plain + 0.1, 0.95)
 
 
+@pytest.mark.slow
 def test_the_field_found_with_the_tissues_is_the_one_that_was_applied():
     """Of a field that varies by a tenth of its mean less than a third remains in grey and white matter."""
-    head = head_mri(2.0)
+    head = head_mri(3.0)
     inside = head.array > 0
     k, j, i = (np.linspace(-1, 1, n) for n in head.array.shape)
     log = 0.25 * k[:, None, None] * j[:, None] + 0.18 * i + 0.15 * (i**2 - 0.4)
@@ -328,7 +301,6 @@ def test_a_brain_of_which_two_thirds_are_white_matter_keeps_its_grey():
         (dict(filter_radius=-1), "filter_radius is -1"),
         (dict(filter_epsilon=float("nan")), "filter_epsilon is nan"),
         (dict(mask=Volume(np.zeros((4, 4, 4)), np.eye(4))), "expected the same grid"),
-        (dict(device="no such device"), "no OpenCL device fits"),
     ],
 )
 def test_wrong_arguments_are_named(change, message):
@@ -346,52 +318,25 @@ def test_images_without_tissue_are_refused():
         segment_mri(grid, mask=grid.with_array(np.zeros_like(grid.array)))
 
 
-def textured(seed: int) -> Volume:
-    """A brain-sized volume at 2 mm with structures of about 8 mm, as gyri are."""
-    noise = np.random.default_rng(seed).normal(size=(70, 80, 60))
-    smooth = gaussian_filter(noise, 2.0)
-    return Volume((smooth / smooth.std()).astype(np.float32), np.diag([2.0, 2.0, 2.0, 1.0]))
-
-
-@pytest.mark.slow
-def test_the_parts_of_one_brain_lie_in_the_same_places_in_any_contrast_and_those_of_two_do_not():
-    first, other = textured(0), textured(1)
-    inside = np.zeros(first.array.shape, bool)
-    inside[6:-6, 6:-6, 6:-6] = True
-
-    def share(array: np.ndarray) -> float:
-        found = share_in_place(first, first.with_array(array.astype(np.float32)), inside)
-        assert found is not None
-        return found
-
-    rng = np.random.default_rng(2)
-    contrast = np.abs(first.array + 0.4) + rng.normal(0.0, 0.3, first.array.shape)  # as in FLAIR: not monotonic
-    assert share(contrast) > 0.95
-    assert share(np.roll(contrast, (1, 1, 0), axis=(0, 1, 2))) > 0.95  # registered to 3 mm
-    assert share(other.array) < 0.2
-    assert share_in_place(first, first.with_array(np.zeros_like(first.array)), inside) is None
-
-
 @pytest.mark.parametrize("is_cropped", [False, True])
 @pytest.mark.slow
-def test_a_second_mri_may_lack_a_part_of_the_brain_and_what_it_lacks_is_said(mni, is_cropped):
-    """Whether it was cropped there, or has zeros."""
-    t1 = mni[0]
-    j = np.flatnonzero((t1.array > 0).any(axis=(0, 2)))
+def test_a_second_mri_may_lack_a_part_of_the_brain(mni2, is_cropped):
+    """It is said how much, whether it was cropped there or has zeros, and too much is refused."""
+    j = np.flatnonzero((mni2.array > 0).any(axis=(0, 2)))
 
     def without(share: float) -> Volume:
         end = int(j[0] + (1.0 - share) * len(j))
         if is_cropped:
-            return Volume(t1.array[:, :end].copy(), t1.ijk_to_ras)
-        array = t1.array.copy()
+            return Volume(mni2.array[:, :end].copy(), mni2.ijk_to_ras)
+        array = mni2.array.copy()
         array[:, end:] = 0
-        return t1.with_array(array)
+        return mni2.with_array(array)
 
-    found = segment_mri(t1, contrast="t1", others={"t1gd": without(0.25)})
+    found = segment_mri(mni2, contrast="t1", others={"t1gd": without(0.25)})
     assert any(re.search(r"t1gd: has no data in (1\d|[89])% of the brain", line) for line in found.warnings)
     refusal = r"has data in [67]\d% of the brain of the" if is_cropped else r"is 0 in \d+% of the brain.*with a gap"
     with pytest.raises(SimulationError, match=f"t1gd: {refusal}"):
-        segment_mri(t1, contrast="t1", others={"t1gd": without(0.4)})
+        segment_mri(mni2, contrast="t1", others={"t1gd": without(0.4)})
 
 
 @pytest.mark.skipif(not COLIN27.exists(), reason="Debian's mricron-data is not installed")
@@ -405,43 +350,36 @@ def test_the_brain_of_another_patient_is_refused_as_second_mri(mni):
 
 
 @pytest.mark.slow
-def test_a_label_map_is_refused_as_second_mri(mni):
-    t1 = mni[0]
-    labels = t1.with_array(np.digitize(t1.array, [20, 60, 90]).astype(np.uint8))
-    with pytest.raises(
-        SimulationError, match=r"t2 has only 4 different values, as a mask or label map has.*--add tumour=FILE"
-    ):
-        segment_mri(t1, contrast="t1", others={"t2": labels})
-    parts = t1.with_array((labels.array * (1 + np.indices(t1.array.shape)[2] // 25)).astype(np.uint8))  # many labels
+def test_a_label_map_is_refused_as_second_mri(mni2):
+    labels = mni2.with_array(np.digitize(mni2.array, [20, 60, 90]).astype(np.uint8))
+    refusal = r"t2 has only 4 different values, as a mask or label map has.*--add tumour=FILE"
+    with pytest.raises(SimulationError, match=refusal):
+        segment_mri(mni2, contrast="t1", others={"t2": labels})
+    parts = labels.array * (1 + np.indices(mni2.array.shape)[2] // 12)  # many labels
     with pytest.raises(SimulationError, match="t2 is a label map"):
-        segment_mri(t1, contrast="t1", others={"t2": parts})
+        segment_mri(mni2, contrast="t1", others={"t2": mni2.with_array(parts.astype(np.uint8))})
 
 
 @pytest.mark.slow
-def test_the_map_of_one_tissue_is_refused_as_second_mri(mni):
-    t1 = mni[0]
-    grey = t1.with_array(np.clip(1.0 - np.abs(t1.array - 60.0) / 30.0, 0.0, 1.0).astype(np.float32))
+def test_the_map_of_one_tissue_is_refused_as_second_mri(mni2):
+    grey = mni2.with_array(np.clip(1.0 - np.abs(mni2.array - 60.0) / 30.0, 0.0, 1.0).astype(np.float32))
     with pytest.raises(SimulationError, match=r"t2: is 0 in \d+% of the brain, as the map of one tissue is"):
-        segment_mri(t1, contrast="t1", others={"t2": grey})
-    bent = t1.with_array(ndimage.shift(np.digitize(t1.array, [20, 60, 90]).astype(np.float32), (0.4, 0.3, 0), order=1))
-    with pytest.raises(SimulationError, match="t2 is mostly uniform regions"):
-        segment_mri(t1, contrast="t1", others={"t2": bent})
+        segment_mri(mni2, contrast="t1", others={"t2": grey})
 
 
 @pytest.mark.slow
-def test_a_small_whole_brain_is_led_by_the_atlas(mni):
-    matrix = mni[0].ijk_to_ras.copy()
+def test_a_small_whole_brain_is_led_by_the_atlas(mni2):
+    matrix = mni2.ijk_to_ras.copy()
     matrix[:3, :3] *= (620.0 / 1886.0) ** (1.0 / 3.0)
-    found = segment_mri(Volume(mni[0].array, matrix), contrast="t1")
+    found = segment_mri(Volume(mni2.array, matrix), contrast="t1")
     assert any("led by the MNI152 atlas" in line for line in found.notes)
     assert any("expected 1000 to 1900 ml of an adult" in line for line in found.warnings)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("axis", [pytest.param(0, marks=pytest.mark.slow), 2])
-def test_thick_slices_of_a_turned_head_are_registered(mni, axis):
-    """A T2 of 5 mm slices, turned by 10 degrees: a smoothed first level led 30 mm away."""
-    t1 = mni[0]
+def test_thick_slices_of_a_turned_head_are_registered(mni):
+    """A T2 of 5 mm slices, turned by 10 degrees."""
+    t1, axis = mni[0], 2
     inside = t1.array > 20
     noise = np.random.default_rng(3).normal(0.0, 4.0, t1.array.shape)
     thick = np.where(inside, 160.0 - t1.array, 0.0) + noise
@@ -454,17 +392,6 @@ def test_thick_slices_of_a_turned_head_are_registered(mni, axis):
     assert np.corrcoef(moved.array[inside], t1.array[inside])[0, 1] < -0.75
 
 
-@pytest.mark.slow
-def test_a_second_volume_without_data_in_part_of_the_brain_is_said(mni):
-    t1 = mni[0]
-    inside = t1.array > 20
-    t2 = np.where(inside, 160.0 - t1.array, np.random.default_rng(3).uniform(1.0, 4.0, inside.shape))
-    below = np.argwhere(inside)[:, 0]
-    t2[: int(np.percentile(below, 10))] = 0.0
-    _, _, warnings = aligned(t1.with_array(t2.astype(np.float32)), t1, inside, "t2")
-    assert len(warnings) == 1 and re.match(r"t2: has no data in (9|1\d)% of the brain", warnings[0])
-
-
 def test_less_sure_posteriors_shrink_log_odds_and_change_no_label():
     posteriors = np.random.default_rng(0).dirichlet([0.3, 1.0, 1.0], 500).T.astype(np.float32)
     found = less_sure(posteriors)
@@ -475,15 +402,14 @@ def test_less_sure_posteriors_shrink_log_odds_and_change_no_label():
 
 
 def test_a_registration_is_the_same_every_time():
-    """Threads added up in another order, and the overlap was read from memory that was used again: labels of one MRI
-    differed by hundreds of voxels from run to run, and sheets that were kept were not found again."""
+    """Whatever the order of threads and the memory before; else kept sheets are not found again."""
     from SlicerUSSim.Logic.mri import atlas_registration
 
-    atlas, head = mni152(), head_mri(2.0)
+    atlas, head = mni152(), head_mri(4.0)
     if atlas is None:
         pytest.skip("needs nilearn's MNI152")
     found = set()
-    for _ in range(4):
+    for _ in range(2):
         atlas_registration._known.clear()
         fit = register_atlas(head, head.array > 0, atlas)
         found.add((fit.patient_to_atlas.tobytes(), fit.dice))
@@ -492,14 +418,13 @@ def test_a_registration_is_the_same_every_time():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [0, pytest.param(3, marks=pytest.mark.slow)])
-def test_a_fifth_of_the_field_of_one_persons_phantom_is_left_at_most(seed):
-    """Colin27, whose grey and white matter differ from place to place; degree 3 and even weights left 20 to 21 %."""
+def test_a_fifth_of_the_field_of_one_persons_phantom_is_left_at_most():
+    """Colin27, whose grey and white matter differ from place to place."""
     maps = tissue_maps("colin27")
     atlas = mni152()
     if maps is None or atlas is None:
         pytest.skip("needs Colin27 and nilearn's MNI152")
-    case = phantom(maps, noise=0.03, bias=0.2, seed=seed)
+    case = phantom(maps, noise=0.03, bias=0.2)
     inside = case.mask.array > 0
     fit = register_atlas(case.mri, inside, atlas)
     found = estimate_field(case.mri.array, inside, case.mri.spacing_mm, "t1", fit.prior(case.mri, inside))
@@ -512,14 +437,9 @@ def test_a_fifth_of_the_field_of_one_persons_phantom_is_left_at_most(seed):
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("part", "bias", "least"),
-    [
-        ("quarter", 0.0, 0.95),
-        pytest.param("quarter", 0.2, 0.94, marks=pytest.mark.slow),
-        pytest.param("part of a coronal slab", 0.2, 0.94, marks=pytest.mark.slow),
-    ],
+    [("quarter", 0.0, 0.95), ("part of a coronal slab", 0.2, 0.94)],
 )
-def test_white_matter_of_a_part_of_a_brain_is_not_taken_for_a_bias_field(part, bias, least):
-    """N4 made a field of 20 % in a quarter of a brain without any: a Dice of 0.88 with and without a field."""
+def test_white_matter_of_a_part_of_a_brain_is_no_bias_field(part, bias, least):
     maps = tissue_maps("colin27")
     if maps is None:
         pytest.skip("needs Colin27")
@@ -537,39 +457,17 @@ def test_white_matter_of_a_part_of_a_brain_is_not_taken_for_a_bias_field(part, b
 
 
 @pytest.mark.slow
-def test_thin_sulci_are_not_looked_for_in_slices_thicker_than_they_are(mni):
-    """In slices of 5 mm, leptomeninges had 1.5 times the volume that they have in those of 1 mm."""
-    t1 = mni[0]
-    count = t1.array.shape[0] // 5
-    thick = Volume(
-        t1.array[: 5 * count].reshape(count, 5, *t1.array.shape[1:]).mean(axis=1).astype(np.float32),
-        t1.ijk_to_ras @ np.array([[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 5, 2], [0, 0, 0, 1.0]]),
-    )
-    found = segment_mri(thick, thin_sulci=True)
-    assert found.tissue_names == ("csf", "grey matter", "white matter")
-    assert "thin sulci get no label of their own: voxels of 5 mm are thicker than they are" in found.notes
-    both = segment_mri(t1, others={"t1gd": thick}, thin_sulci=True)
-    assert "leptomeninges" in both.tissue_names
-    assert any("t1gd has voxels of 5 mm, across which its tissues mix" in line for line in both.warnings)
-    assert not any("across which" in line for line in segment_mri(thick, others={"t1gd": t1}).warnings)
-
-
-@pytest.mark.slow
-def test_a_lesion_that_is_bright_in_a_flair_needs_four_classes_which_is_said(mni):
-    """It was grey matter without a word."""
-    t1 = mni[0]
-    grey, white = np.percentile(t1.array[mni[1].array > 0.9], 50), np.percentile(t1.array[mni[2].array > 0.9], 50)
-    bright = np.clip(grey - 0.5 * (t1.array - grey), 0.6 * grey, 1.1 * grey)  # white matter is darker
-    flair = np.where(t1.array > 0.7 * grey, bright, 0.3 * t1.array)
-    flair += np.where(t1.array > 0, np.random.default_rng(0).normal(0.0, 0.02 * white, t1.array.shape), 0.0)
-    flair = np.maximum(flair, 0.0).astype(np.float32)
-    lesion = np.zeros(flair.shape, bool)
+def test_a_lesion_that_is_bright_in_a_flair_needs_four_classes(mni, mni2):
+    grey, white = (np.percentile(mni[0].array[share.array > 0.9], 50) for share in mni[1:])
+    bright = np.clip(grey - 0.5 * (mni2.array - grey), 0.6 * grey, 1.1 * grey)  # white matter is darker
+    flair = np.where(mni2.array > 0.7 * grey, bright, 0.3 * mni2.array)
+    flair += np.where(mni2.array > 0, np.random.default_rng(0).normal(0.0, 0.02 * white, mni2.array.shape), 0.0)
+    healthy = np.maximum(flair, 0.0).astype(np.float32)
+    flair = healthy.copy()
     k, j, i = (n // 2 for n in flair.shape)
-    lesion[k + 10 : k + 30, j : j + 20, i + 15 : i + 35] = True
-    healthy = flair.copy()
-    flair[lesion] += grey
+    flair[k + 5 : k + 15, j : j + 10, i + 7 : i + 17] += grey
     line = "are far brighter than grey matter, as lesions are in a FLAIR"
-    assert any(line in said for said in segment_mri(t1.with_array(flair), contrast="flair").warnings)
-    assert not any(line in said for said in segment_mri(t1.with_array(healthy), contrast="flair").warnings)
-    found = segment_mri(t1.with_array(flair), contrast="flair", classes=4)
+    assert any(line in said for said in segment_mri(mni2.with_array(flair), contrast="flair").warnings)
+    assert not any(line in said for said in segment_mri(mni2.with_array(healthy), contrast="flair").warnings)
+    found = segment_mri(mni2.with_array(flair), contrast="flair", classes=4)
     assert not any(line in said for said in found.warnings)

@@ -46,8 +46,8 @@ def slab(normal, spacing_mm, thickness_mm: float, half: int = 16) -> np.ndarray:
     return np.where(abs(away) < 0.5 * thickness_mm, SHEET, np.where(away > 0.0, 3, 1)).astype(np.uint8)
 
 
-@pytest.mark.parametrize("spacing_mm", [(1.0, 1.0, 1.0), (0.5, 0.5, 0.5), (0.8, 1.0, 1.3)])
-@pytest.mark.parametrize("across", [(0, 0, 1), (1, 0, 3), (1, 2, 4), (1, 1, 1), (-3, 1, 2)])
+@pytest.mark.parametrize("spacing_mm", [(0.5, 0.5, 0.5), (0.8, 1.0, 1.3)])
+@pytest.mark.parametrize("across", [(0, 0, 1), (1, 2, 4), (-3, 1, 2)])
 def test_a_plane_is_fitted_to_a_flat_sheet(spacing_mm, across):
     """Of gradients in voxels, which are not the normals in millimetres where voxels are no cubes."""
     normal = np.array(across) / np.linalg.norm(across)
@@ -84,8 +84,7 @@ def test_voxels_beside_a_sheet_have_its_plane():
     np.testing.assert_allclose(distance[15:18, 16, 16] * gradient[15:18, 16, 16, 2], [1.0, 0.0, -1.0], atol=0.02)
 
 
-@pytest.mark.parametrize("spacing_mm", [0.5, 1.0])
-@pytest.mark.parametrize("turn", [(0, 0), (25, 35)])
+@pytest.mark.parametrize(("spacing_mm", "turn"), [(0.5, (25, 35)), (1.0, (0, 0))])
 def test_a_thin_sulcus_along_the_beam_is_not_brighter_than_the_brain(spacing_mm, turn):
     """As its own tissue it was 9 to 15 dB brighter, whatever the angle."""
     half = round(22 / spacing_mm)

@@ -10,7 +10,7 @@ import pytest
 from SlicerUSSim.Logic import LinearProbe, SimulationSettings, TissueTable, UltrasoundSimulator
 from SlicerUSSim.Logic.imaging.diffraction import lobes_of
 from SlicerUSSim.Logic.opencl.layout import CONSTANTS
-from SlicerUSSim.Logic.probe.arrays import PROBES, Probe
+from SlicerUSSim.Logic.probe.arrays import Probe
 from SlicerUSSim.Logic.probe.beam import widening
 from tests.conftest import SPECKLE, block, rigid
 from validation.measurement import correlation, depth_window
@@ -42,7 +42,7 @@ def half_width(pattern: np.ndarray) -> float:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("apodization", [0.0, 0.3, 0.6, 1.0])
+@pytest.mark.parametrize("apodization", [0.3, 1.0])
 def test_apodisation_widens_the_main_lobe_as_diffraction_does(apodization):
     """The receive beam within 1 %; the two-way beam within 3 %, beside the 5 % by which Gaussians are narrower."""
     probe = replace(PROBE, receive_apodization=apodization)
@@ -133,7 +133,7 @@ def test_lobes_are_those_of_the_field_of_each_kind_of_transmission(mode):
         assert found == pytest.approx(expected, abs=3.0), least
 
 
-def test_elevational_lobes_of_the_harmonic_are_of_the_squared_field_of_the_pulse():
+def test_elevational_lobes_of_the_harmonic_are_of_the_squared_field():
     probe, depth, row = replace(PULSE, harmonic=True), 25.0, 20
     height = probe.elevation_aperture_mm
     power = (field(PULSE, height, 24.0, depth) ** 2 * field(PLAIN, height, 24.0, depth)) ** 2
@@ -145,7 +145,7 @@ def test_elevational_lobes_of_the_harmonic_are_of_the_squared_field_of_the_pulse
 
 
 @pytest.mark.parametrize("angles", [{"steering_deg": 20.0}, {"trapezoid_deg": 20.0}])
-def test_lobes_of_steered_lines_are_those_at_the_same_distance_from_the_face(angles):
+def test_lobes_of_steered_lines_are_those_at_the_same_path(angles):
     """Depths count from behind the face: the table reaches farther, and has the same values at the same path."""
     steered = replace(PLAIN, **angles)
     place = np.linspace(0.0, 1.0, CONSTANTS["LOBE_DEPTHS"])
@@ -155,12 +155,6 @@ def test_lobes_of_steered_lines_are_those_at_the_same_distance_from_the_face(ang
             for probe, reach in ((steered, steered.displayed_mm), (PLAIN, PLAIN.depth_mm))
         ]
         assert rows[0] == pytest.approx(rows[1], rel=0.15)
-
-
-@pytest.mark.parametrize("name", list(PROBES))
-def test_preset_probes_have_uniform_apertures(name):
-    assert PROBES[name].receive_apodization == 0.0
-    assert widening(0.0) == 1.0
 
 
 def test_a_probes_clutter_is_its_power_beside_the_beam():

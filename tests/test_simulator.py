@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import replace
-from inspect import signature
 from itertools import pairwise
 
 import numpy as np
@@ -22,12 +21,10 @@ from SlicerUSSim.Logic import (
     SimulationSettings,
     Tissue,
     TissueTable,
-    TrackedSequence,
     UltrasoundSimulator,
     Volume,
     segment_mri,
 )
-from SlicerUSSim.Logic.imaging.compounding import sweep_grid
 from SlicerUSSim.Logic.imaging.scattering import cells_in_view, scatterer_counts
 from SlicerUSSim.Logic.imaging.simulator import EmptyViewWarning, SlowScatterersWarning
 from SlicerUSSim.Logic.opencl.layout import CONSTANTS
@@ -52,8 +49,7 @@ def solid():
     return simulator(block(lambda x, y, z: np.ones_like(x), half_mm=(40, 40, 40)), SPECKLE)
 
 
-@pytest.mark.parametrize("kind", PROBES)
-@pytest.mark.parametrize("orientation", ORIENTATIONS)
+@pytest.mark.parametrize(("kind", "orientation"), list(zip(PROBES, ORIENTATIONS, strict=True)))
 def test_a_small_target_appears_where_it_is_in_the_patient(kind, orientation):
     """The brightest pixel, transformed to RAS by the frame's matrices, is the front of the target."""
     probe, rotation = PROBES[kind], ORIENTATIONS[orientation]
@@ -96,18 +92,13 @@ def test_outside_the_field_the_image_is_black(solid, kind):
 
 
 @given(st.integers(8, 300), st.integers(8, 300))
-@settings(max_examples=10)
+@settings(max_examples=4)
 def test_the_image_has_the_size_asked_for_and_holds_the_field(solid, rows, columns):
     probe = PROBES["convex"]
     frame = solid.simulate(probe, rigid(np.eye(3), [0, -25, 0]), DisplaySettings(image_size=(rows, columns)))
     assert frame.image.shape == (rows, columns)
     left, right, top, bottom = probe.image_bounds_mm()
     assert frame.pixel_spacing_mm == pytest.approx(((right - left) / columns, (bottom - top) / rows))
-
-
-def test_pixels_are_square_by_default(solid):
-    frame = solid.simulate(PROBES["phased"], rigid(np.eye(3), [0, -25, 0]))
-    assert frame.pixel_spacing_mm[0] == pytest.approx(frame.pixel_spacing_mm[1])
 
 
 def test_tgc_undoes_the_attenuation_it_is_set_to():
@@ -123,7 +114,7 @@ def test_tgc_undoes_the_attenuation_it_is_set_to():
     assert seen[1] - seen[0] == pytest.approx(0, abs=0.7)
 
 
-@pytest.mark.parametrize("reach", [0.0, 0.4, 0.75, 1.0])
+@pytest.mark.parametrize("reach", [0.0, 0.4, 1.0])
 def test_tgc_rises_down_to_its_reach_and_stays_there(solid, reach):
     """Of a band of 5 MHz about its centre, each frequency by itself (tests/test_band.py has wider ones)."""
     pose, probe = rigid(np.eye(3), [0, -25, 0]), PROBES["linear"]
@@ -167,7 +158,7 @@ def test_rf_is_the_carrier_times_the_baseband(solid):
     assert mean * 1.54 / 2 == pytest.approx(5.0, rel=0.03)  # MHz
 
 
-@pytest.mark.parametrize("bandwidth, samples_per_cycle", [(0.5, 4), (0.05, 4), (0.1, 8), (0.5, 16), (0.05, 16)])
+@pytest.mark.parametrize("bandwidth, samples_per_cycle", [(0.05, 4), (0.5, 16)])
 def test_the_pulse_is_whole_at_every_bandwidth_and_sampling_rate(bandwidth, samples_per_cycle):
     """The echo of a point has the complete Gaussian envelope of axial_sigma_mm."""
     wall = block(lambda x, y, z: y > 0)
@@ -233,7 +224,7 @@ def test_changed_tissues_give_what_a_new_simulator_would(solid):
     )
 
 
-@pytest.mark.parametrize("spacing_mm", [0.3, 0.5])
+@pytest.mark.parametrize("spacing_mm", [0.3])
 def test_there_is_no_membrane_beside_a_label_map_of_small_voxels(spacing_mm):
     """Look-ups outside the volume find its margin, half a voxel from the border to the coupling medium."""
     half = block(lambda x, y, z: np.where(y > 0, 1, 0), (8, 12, 6), spacing_mm)
@@ -248,7 +239,7 @@ def test_there_is_no_membrane_beside_a_label_map_of_small_voxels(spacing_mm):
     assert power[outside].max() < 1e-9
 
 
-@pytest.mark.parametrize("thickness", [0.6, 1.0, 1.6])
+@pytest.mark.parametrize("thickness", [0.6, 1.6])
 def test_the_membrane_is_as_thick_as_it_is_set(thickness):
     """Thinner and thicker than a voxel: the fraction of scatterers in it is its thickness (within 15 %)."""
     half = block(lambda x, y, z: np.where(y > 0, 2, 1), half_mm=(25, 25, 25))
@@ -269,8 +260,7 @@ def test_the_membrane_is_as_thick_as_it_is_set(thickness):
     assert np.mean(powers) / bright.scatterer_variance == pytest.approx(thickness, rel=0.15)
 
 
-@pytest.mark.parametrize("exponent", [0.0, 2.0])
-@pytest.mark.parametrize("spacing_mm", [0.5, 1.0])
+@pytest.mark.parametrize(("spacing_mm", "exponent"), [(0.5, 2.0), (1.0, 0.0)])
 def test_the_membrane_fades_where_the_beam_meets_it_obliquely(spacing_mm, exponent):
     """A line crosses 1 / cos i of the thickness, and the power of its scatterers falls with cos^2n i."""
     bright = Tissue("bright", 1540.0, 1.54, 0.0, mu0=1.0, sigma0=0.5)
@@ -291,10 +281,9 @@ def test_the_membrane_fades_where_the_beam_meets_it_obliquely(spacing_mm, expone
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("thickness_mm", [6.0, 10.0, 99.0])
-@pytest.mark.parametrize("tilt_deg", [3.0, 6.0, 12.0])
+@pytest.mark.parametrize(("tilt_deg", "thickness_mm"), [(3.0, 6.0), (6.0, 99.0)])
 def test_the_membrane_on_a_flat_border_has_no_steps(tilt_deg, thickness_mm):
-    """Its line in the image is straight within 0.1 mm. It had the steps of the voxels: 0.2 to 0.25 mm RMS.
+    """Its line in the image is straight within 0.1 mm.
 
     Also in front of a layer of the fluid, whose other wall is as near as the Gaussian is wide.
     """
@@ -321,13 +310,9 @@ def test_the_membrane_on_a_flat_border_has_no_steps(tilt_deg, thickness_mm):
     assert np.std(off) < 0.1
 
 
-@pytest.mark.parametrize("half_voxels", [0.6, 1.0])
-@pytest.mark.parametrize("across", [(0, 0, 1), (1, 2, 4), (1, 1, 1)])
+@pytest.mark.parametrize(("half_voxels", "across"), [(0.6, (1, 2, 4)), (1.0, (0, 0, 1)), (1.0, (1, 1, 1))])
 def test_a_thin_sulcus_is_one_line(half_voxels, across):
-    """A layer of the membrane's own tissue of one or two voxels, however it lies in the grid, is one sheet.
-
-    Its two borders, 1.6 mm apart and 12 dB brighter than what was between them, were two.
-    """
+    """A layer of the membrane's own tissue of one or two voxels, however it lies in the grid, is one sheet."""
     across = np.array(across) / np.linalg.norm(across)
     (turn, _), half = Rotation.align_vectors([[0, 1, 0]], [across]), 24
     k, j, i = np.meshgrid(*[np.arange(-half, half + 1)] * 3, indexing="ij")
@@ -350,9 +335,9 @@ def test_a_thin_sulcus_is_one_line(half_voxels, across):
     assert (bright_at.mean() + 0.5) * 40.0 / len(level) == pytest.approx(20.0, abs=0.2)
 
 
-@pytest.mark.parametrize("tilt_deg", [0.0, 35.0])
-def test_roughness_of_the_membrane_takes_the_coherent_echo_of_its_border_only(tilt_deg):
+def test_roughness_of_the_membrane_takes_the_coherent_echo_of_its_border():
     """exp(-(2 k s cos i)^2 / 2) at the border of the fluid, nothing at the border between two other tissues."""
+    tilt_deg = 35.0
     fluid, brain, bone = (Tissue(name, 1540.0, z, 0.0) for name, z in (("csf", 1.5), ("brain", 1.6), ("bone", 4.0)))
     slabs = block(lambda x, y, z: np.where(y < 0, 1, np.where(y < 8, 2, 3)))
     pose = rigid(Rotation.from_euler("z", tilt_deg, degrees=True).as_matrix(), [0, -15, 0])
@@ -375,7 +360,7 @@ def test_a_label_map_without_labels_is_a_warning_and_a_black_image():
         assert not sim.simulate(PROBES["linear"], rigid(np.eye(3), [10, 0, 10])).image.any()
 
 
-def test_a_probe_that_looks_past_the_volume_gives_a_black_image_and_a_warning(solid):
+def test_a_probe_that_looks_past_the_volume_sees_nothing_and_warns(solid):
     with pytest.warns(EmptyViewWarning, match="looks past the volume"):
         frame = solid.simulate(PROBES["linear"], rigid(np.eye(3), [300, 0, 0]), QUIET)
     assert (frame.image == 0).all()
@@ -389,11 +374,9 @@ def test_a_probe_that_looks_past_the_volume_gives_a_black_image_and_a_warning(so
     [
         (np.zeros((4, 4)), "last row"),
         (np.diag([1.0, 1, 1, 1]) * [[0], [1], [1], [1]], "not rigid"),
-        (np.diag([2.0, 2, 2, 1]), "not rigid"),
         (np.diag([-1.0, 1, 1, 1]), "mirrors"),
         (np.full((4, 4), np.nan), "not finite"),
         (np.eye(3), "shape"),
-        ("here", "not a matrix of numbers"),
     ],
 )
 def test_poses_that_are_not_rigid_are_refused(solid, pose, message):
@@ -408,9 +391,7 @@ def test_poses_that_are_not_rigid_are_refused(solid, pose, message):
         (np.full((4, 4, 4), 0.5), "fractions"),
         (np.full((4, 4, 4), -1), "from -1"),
         (np.full((4, 4, 4), MAX_LABEL + 1, np.uint8), f"has label {MAX_LABEL + 1}, expected 0 to {MAX_LABEL}"),
-        (np.full((4, 4, 4), 200, np.uint8), f"has label 200, expected 0 to {MAX_LABEL}"),
         (np.full((4, 4, 4), 200), f"from 200 to 200, expected whole numbers from 0 to {MAX_LABEL}"),
-        (np.full((4, 4, 4), np.nan), "from nan"),
     ],
 )
 def test_labels_that_cannot_be_used_are_refused(array, message):
@@ -418,16 +399,10 @@ def test_labels_that_cannot_be_used_are_refused(array, message):
         UltrasoundSimulator(Volume(array, np.eye(4)), TissueTable({1: SPECKLE}))
 
 
-@pytest.mark.parametrize("kind", [np.uint8, np.int16, np.float32])
-def test_the_largest_label_can_be_used(kind):
-    labels = Volume(np.full((4, 4, 4), MAX_LABEL, kind), np.eye(4))
+def test_the_largest_label_can_be_used():
+    labels = Volume(np.full((4, 4, 4), MAX_LABEL, np.float32), np.eye(4))
     medium = UltrasoundSimulator(labels, TissueTable({0: FLUID, MAX_LABEL: SPECKLE})).medium
     assert list(medium.present) == [MAX_LABEL]
-
-
-def test_a_volume_has_the_spacing_of_a_sweep_grid_if_none_is_given():
-    defaults = [signature(f).parameters["spacing_mm"].default for f in (UltrasoundSimulator.volume, sweep_grid)]
-    assert defaults[0] == defaults[1] == 0.5
 
 
 def test_a_sweep_is_the_frames_of_its_poses(solid):
@@ -460,7 +435,7 @@ def test_what_did_not_change_is_not_computed_again(solid):
     assert "trace" not in kernels_of(solid, replace(probe, fractional_bandwidth=0.3), pose, QUIET)
 
 
-def test_a_changed_display_tissue_or_setting_gives_the_image_of_a_new_simulator():
+def test_a_change_gives_the_image_of_a_new_simulator():
     labels = block(lambda x, y, z: np.where(y > 0, 2, 1), half_mm=(20, 20, 10))
     probe, pose = PROBES["convex"], rigid(np.eye(3), [0, -18, 0])
     louder = replace(SPECKLE, name="louder", mu0=0.0, sigma0=2.0)
@@ -481,7 +456,7 @@ def test_a_changed_display_tissue_or_setting_gives_the_image_of_a_new_simulator(
         np.testing.assert_array_equal(sim.simulate(probe, pose, display).image, fresh.image)
 
 
-def test_acoustic_groups_that_split_or_merge_give_the_image_of_a_new_simulator():
+def test_acoustic_groups_may_split_or_merge():
     """Groups are tissues of equal speed and impedance; there is an interface wherever two of them meet."""
     labels = block(lambda x, y, z: 1 + (y > 0) + (y > 6), half_mm=(12, 14, 8))
     probe, pose = LinearProbe(16, 22, scan_lines=48), rigid(np.eye(3), [0, -12, 0])
@@ -498,22 +473,6 @@ def test_acoustic_groups_that_split_or_merge_give_the_image_of_a_new_simulator()
         np.testing.assert_array_equal(images[-1], fresh.simulate(probe, pose, QUIET).image)
     for before, after in pairwise(images):
         assert not np.array_equal(before, after)
-
-
-@pytest.mark.parametrize("name", ["interfaces", "scattering"])
-def test_echoes_follow_a_change_of_one_setting(name):
-    """Also of one that changes only which echoes are computed: everything else, such as the seed, stays equal."""
-    labels = block(lambda x, y, z: 1 + (y > 0), half_mm=(12, 14, 8))
-    probe, pose = LinearProbe(16, 22, scan_lines=48), rigid(np.eye(3), [0, -12, 0])
-    sim = simulator(labels, SPECKLE, replace(SPECKLE, name="dense", impedance_mrayl=2.0))
-    complete = sim.settings
-    images = []
-    for wanted in (complete, replace(complete, **{name: False}), complete):
-        sim.settings = wanted
-        images.append(sim.simulate(probe, pose, QUIET).image)
-        fresh = UltrasoundSimulator(labels, sim.medium.tissues, wanted)
-        np.testing.assert_array_equal(images[-1], fresh.simulate(probe, pose, QUIET).image)
-    assert not np.array_equal(images[0], images[1])
 
 
 def test_stages_are_timed_on_request(solid):
@@ -533,20 +492,15 @@ _TABLE = TissueTable({1: SPECKLE})
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda: segment_mri(None), "mri is None, expected a Volume"),
         (lambda: segment_mri("head.nii.gz"), r"mri is a str, expected a Volume \(Volume.read reads a file\)"),
         (lambda: read_label_map(np.ones((3, 3, 3))), "label map is a ndarray, expected a Volume"),
         (lambda: Volume.read(None), "the file is None, expected its name: text or a Path"),
-        (lambda: TrackedSequence.read(3), "the file is a int, expected its name"),
-        (lambda: TissueTable.read(None), "the file is None, expected its name"),
         (lambda: TissueTable("brain"), "tissues is a str, expected a Mapping"),
-        (lambda: UltrasoundSimulator("x", _TABLE), "labels is a str, expected a Volume"),
         (lambda: UltrasoundSimulator(_LABELS, None), r"tissues is None, expected a TissueTable \(TissueTable.brain"),
         (
             lambda: UltrasoundSimulator(_LABELS, _TABLE).simulate("convex", np.eye(4)),
             "probe is a str, expected a Probe",
         ),
-        (lambda: UltrasoundSimulator(_LABELS, _TABLE).volume(None, []), "probe is None, expected a Probe"),
         (
             lambda: list(UltrasoundSimulator(_LABELS, _TABLE).sweep(PROBES["linear"], None)),
             "poses is None, expected an",
@@ -554,42 +508,8 @@ _TABLE = TissueTable({1: SPECKLE})
     ],
 )
 def test_an_argument_of_a_wrong_type_is_named_with_what_was_expected(call, message):
-    """They were an AttributeError or TypeError from somewhere inside."""
     with pytest.raises(SimulationError, match=message):
         call()
-
-
-def test_plain_dictionaries_are_refused_for_settings_and_display():
-    labels = block(lambda x, y, z: np.ones_like(x), half_mm=(10, 10, 5))
-    sim, pose = simulator(labels, SPECKLE), rigid(np.eye(3), [0, -10, 0])
-    probe = LinearProbe(10, 10, scan_lines=16)
-    with pytest.raises(SimulationError, match=r"display is \{'gain_db': 3\}, expected DisplaySettings"):
-        sim.simulate(probe, pose, {"gain_db": 3})
-    with pytest.raises(SimulationError, match=r"settings are \{'seed': 3\}, expected SimulationSettings"):
-        UltrasoundSimulator(labels, sim.medium.tissues, {"seed": 3})
-
-
-def test_a_simulator_follows_changed_probes_settings_and_tissues_and_keeps_no_changed_record():
-    """The record of constants is kept from frame to frame."""
-    labels, probe, pose = (
-        block(lambda x, y, z: np.ones_like(x)),
-        LinearProbe(20, 30, scan_lines=32),
-        rigid(np.eye(3), [0, -15, 0]),
-    )
-    kept = simulator(labels, SPECKLE)
-    changes = [
-        (probe, SimulationSettings(), SPECKLE),
-        (replace(probe, frequency_mhz=4.0), SimulationSettings(), SPECKLE),
-        (replace(probe, frequency_mhz=4.0), SimulationSettings(seed=3), SPECKLE),
-        (replace(probe, frequency_mhz=4.0), SimulationSettings(seed=3), replace(SPECKLE, attenuation_db_cm_mhz=1.0)),
-    ]  # fmt: skip
-    for seen, settings_, tissue in changes:
-        kept.settings = settings_
-        kept.set_tissues(simulator(labels, tissue).medium.tissues)
-        kept.acquisition(seen, pose)["cycles_per_mm"] *= 2.0  # a caller's own
-        found = kept.simulate(seen, pose).iq
-        expected = UltrasoundSimulator(labels, kept.medium.tissues, settings_).simulate(seen, pose).iq
-        np.testing.assert_array_equal(found, expected)
 
 
 def test_so_many_scatterers_that_an_image_takes_long_are_a_warning():
@@ -604,19 +524,6 @@ def test_so_many_scatterers_that_an_image_takes_long_are_a_warning():
         for enough in (None, 500.0):
             simulator(labels, SPECKLE, scatterers_per_mm3=enough).simulate(PROBES["convex"], pose)
         simulator(labels, SPECKLE, scatterers_per_mm3=200_000.0, scattering=False).simulate(PROBES["convex"], pose)
-
-
-@pytest.mark.parametrize("kind", PROBES)
-def test_lines_closer_than_cells_count_in_the_estimate(kind):
-    """Each looks at cells around its strip; said were 26 s, and more than ten minutes were needed."""
-    labels = block(lambda x, y, z: np.ones_like(x), half_mm=(10, 10, 10))
-    tall = {"elevation_aperture_mm": 100.0, "elevation_focus_mm": 1.0}
-    probe = replace(PROBES[kind], scan_lines=4096, depth_mm=400.0, **tall)
-    small = simulator(labels, SPECKLE)
-    with pytest.raises(
-        SimulationError, match=r"1\.\de\+10 cells .* about [45]\d\d s .* at most 1e\+10 cells; .*scan lines"
-    ):
-        small.simulate(probe, np.eye(4))
 
 
 def test_the_estimate_is_the_number_of_cells_along_the_rays():
@@ -636,7 +543,6 @@ def test_the_estimate_is_the_number_of_cells_along_the_rays():
 
 
 def test_a_probe_that_would_take_minutes_is_refused_with_the_numbers():
-    """Its values are all allowed, and an image did not return in 45 s."""
     labels = block(lambda x, y, z: np.ones_like(x), half_mm=(10, 10, 10))
     probe = replace(
         PROBES["phased"], frequency_mhz=30.0, depth_mm=300.0, elevation_aperture_mm=100.0, elevation_focus_mm=1.0

@@ -11,7 +11,7 @@ from SlicerUSSim.Logic import LinearProbe
 from SlicerUSSim.Logic.probe.arrays import PROBES
 from tests.conftest import SPECKLE, block, rigid, simulator
 from validation.checks import ORIENTATIONS
-from validation.measurement import correlation, depth_window, envelope_snr, level_db
+from validation.measurement import correlation, depth_window, level_db
 from validation.speckle import smallest_cell
 
 LINEAR = LinearProbe(40, 50, scan_lines=161, focus_mm=25, elevation_focus_mm=25)
@@ -46,7 +46,7 @@ def test_moving_by_a_fraction_of_a_line_keeps_the_speckle(simulators):
     assert correlation(0.5 * (here[1:] + here[:-1]), moved[:-1]) > 0.97
 
 
-def test_the_same_pose_gives_the_same_bits_and_another_seed_another_patient(simulators):
+def test_the_same_pose_gives_the_same_bits_and_another_seed_others(simulators):
     pose = rigid(ORIENTATIONS["oblique"], [0, -25, 0])
     once = simulators[0].simulate(LINEAR, pose)
     simulators[0].forget_echoes()
@@ -59,7 +59,7 @@ def test_the_same_pose_gives_the_same_bits_and_another_seed_another_patient(simu
     np.testing.assert_array_equal(once.iq, fresh.iq)
 
 
-def test_the_signal_of_a_tissue_is_linear_in_the_deviation_of_its_scatterers():
+def test_the_signal_is_linear_in_the_deviation_of_the_scatterers():
     """The basis of docs/optimization.md#efficient-evaluation, for all mu0, mu1 and sigma0 but the sparsest."""
     pose = rigid(ORIENTATIONS["oblique"], [0, -25, 0])
     tissues = [
@@ -82,8 +82,8 @@ def test_sparse_tissue_is_sparse_with_the_same_power():
     assert envelope.mean() / envelope.std() < 1.0  # of developed speckle 1.91
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_a_scatterer_is_in_the_same_place_seen_from_the_front_and_from_the_side(seed):
+@pytest.mark.parametrize("seed", range(2))
+def test_a_scatterer_is_in_the_same_place_from_the_front_and_the_side(seed):
     """Sparse scatterers, two probes at right angles: the order of lattice axes differs, the scatterers do not."""
     tissue = replace(SPECKLE, mu0=0.0, sigma0=1.0)
     sim = simulator(SOLID, tissue, seed=seed, scatterers_per_mm3=0.1)
@@ -134,10 +134,9 @@ def test_a_pulse_loses_less_than_its_centre_frequency():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["phased", "cardiac"])
-def test_speckle_near_the_point_where_all_lines_of_a_phased_array_begin_has_its_level(name):
-    """Formerly 11 dB above it, and 9 dB below it some millimetres deeper."""
-    probe = replace(PROBES[name], scan_lines=64)
+def test_speckle_near_the_face_of_a_phased_array_has_its_level():
+    """Near the point where all lines begin."""
+    probe = replace(PROBES["phased"], scan_lines=64)
     pose = rigid(np.eye(3), [0, -10, 0])
     signals = [simulator(SOLID, SPECKLE, coupling=SPECKLE, seed=s).simulate(probe, pose) for s in range(30)]
     for depth in (1.5, 2.5, 3.5, 4.5):
@@ -146,27 +145,8 @@ def test_speckle_near_the_point_where_all_lines_of_a_phased_array_begin_has_its_
 
 
 @pytest.mark.slow
-def test_the_prediction_for_few_scatterers_is_that_of_sums_of_phasors():
-    """30 000 sums over a lattice of two sites per cubic millimetre, of which one in four has a scatterer."""
-    rng = np.random.default_rng(5)
-    sigmas, sums = np.array([0.4, 0.8, 1.1]), np.zeros(30_000, complex)
-    spacing = 0.8
-    reach = np.ceil(4.0 * sigmas / spacing).astype(int) + 1
-    axes = np.meshgrid(*[np.arange(-n, n) for n in reach], indexing="ij")
-    shift = rng.random((len(sums), 3))
-    for cell in np.stack([axis.ravel() for axis in axes], axis=1):
-        place = spacing * (cell + rng.random((len(sums), 3)) + shift)
-        is_there, phase = rng.random(len(sums)) < 0.25, np.exp(2j * np.pi * rng.random(len(sums)))
-        sums += is_there * phase * np.exp(-0.5 * ((place / sigmas) ** 2).sum(axis=1))
-    found = float(np.abs(sums).mean() / np.abs(sums).std())
-    assert envelope_snr(0.25 * spacing**-3, spacing**-3, [tuple(sigmas)]) == pytest.approx(found, rel=0.015)
-    assert found < 1.85
-    assert envelope_snr(1e5, 1e7, [tuple(sigmas)]) == pytest.approx(1.913, abs=2e-3)
-
-
-@pytest.mark.slow
 def test_rare_scatterers_of_a_15_mhz_array_are_sparse_as_predicted():
-    """They were said to be developed speckle up to mu1 = 3.5; there are two in the smallest resolution cell."""
+    """There are two in the smallest resolution cell."""
     tissue, probe = replace(SPECKLE, mu1=3.0), PROBES["linear_15"]
     depth, cell, expected = smallest_cell(probe, tissue, 1.0)
     assert 125_000 * tissue.scatterer_share * cell == pytest.approx(2.1, abs=0.1)

@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from SlicerUSSim.Logic import SimulationError, Volume, segment_mri
-from SlicerUSSim.Logic.mri.brain import given_brain
+from SlicerUSSim.Logic import SimulationError, segment_mri
 from SlicerUSSim.Logic.mri.classification import Classes
 from SlicerUSSim.Logic.mri.plausibility import (
     brighter_than_tissue,
@@ -33,7 +32,7 @@ def brain() -> TissueMaps:
 
 
 @pytest.mark.slow
-def test_a_tumours_rim_that_enhances_in_a_t1_without_contrast_agent_is_said_with_the_remedy():
+def test_a_rim_that_enhances_in_a_t1_without_contrast_agent_is_reported():
     case = phantom(with_ring_tumour(brain()), "t1gd", bias=0.0)
     told = segment_mri(case.mri, contrast="t1", mask=case.mask).warnings
     assert any("--contrast t1gd" in line for line in told)
@@ -41,13 +40,10 @@ def test_a_tumours_rim_that_enhances_in_a_t1_without_contrast_agent_is_said_with
 
 
 @pytest.mark.slow
-def test_a_t1_in_which_nothing_enhances_is_said_not_to_be_after_contrast_agent():
+def test_a_t1_in_which_nothing_enhances_is_not_after_contrast_agent():
     case = phantom(brain(), "t1")
     told = segment_mri(case.mri, contrast="t1gd", mask=case.mask).warnings
     assert any("of the brain enhance, expected 0.05% or more" in line and "choose t1 instead" in line for line in told)
-    second = phantom(brain(), "t2", seed=1)
-    told = segment_mri(second.mri, contrast="t2", others={"t1gd": case.mri}, mask=case.mask).warnings
-    assert any("choose t1 instead" in line for line in told)
 
 
 @pytest.mark.slow
@@ -64,15 +60,15 @@ def test_bright_pieces_smaller_than_2_ml_are_no_contrast_agent():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("shown", "said"), [("t2", "t1"), ("t1", "t2"), ("t1", "flair"), ("t2", "flair")])
-def test_a_contrast_in_another_order_is_refused_and_the_right_one_is_named(shown, said):
+@pytest.mark.parametrize(("shown", "said"), [("t2", "t1"), ("t1", "flair")])
+def test_a_wrong_contrast_is_refused_and_the_right_one_is_named(shown, said):
     case = phantom(brain(), shown)
     with pytest.raises(SimulationError, match=f"contrast is {said}, but .* choose .*{shown}"):
         segment_mri(case.mri, contrast=said, mask=case.mask)
 
 
 @pytest.mark.slow
-def test_cortex_does_not_become_csf_where_the_mask_leaves_only_the_ventricles():
+def test_cortex_is_not_csf_where_the_mask_leaves_only_the_ventricles():
     whole = brain()
     deep = cast(np.ndarray, ndimage.distance_transform_edt(whole.mask)) * 2.0 > 24.0
     kept = whole.mask & ((whole.csf < 0.2) | deep)
@@ -92,7 +88,7 @@ def classes_of(means, posteriors=None, names=("csf", "grey matter", "white matte
     return Classes(names, posteriors, means, np.ones_like(means), None)
 
 
-def test_tissues_in_the_order_of_another_contrast_are_refused_with_an_atlas_and_said_without():
+def test_tissues_in_the_order_of_another_contrast_are_refused():
     t2_as_t1 = classes_of([10.6, 277.5, 130.4])
     with pytest.raises(SimulationError, match=r"grey matter 277.5, white matter 130.4\): choose t2 or flair"):
         require_order(t2_as_t1, "t1", True)
@@ -109,28 +105,15 @@ def test_one_tissue_alone_is_no_brain():
     require_several_tissues(classes_of([1, 2, 3]))
 
 
-def test_grey_and_white_matter_that_noise_hides_are_said():
+def test_grey_and_white_matter_that_noise_hides_are_reported():
     (line,) = faint(classes_of([10, 136, 125]), noise=10.0)
     assert "differ by 1.1 times the noise" in line
     assert faint(classes_of([10, 160, 220]), noise=10.0) == []
 
 
-def test_a_mask_says_why_it_does_not_fit():
-    mri = Volume(np.random.default_rng(0).integers(0, 500, (40, 40, 40)).astype(np.int16), np.eye(4))
-    inside = np.zeros((40, 40, 40), np.uint8)
-    inside[5:35, 5:35, 5:35] = 1
-    shifted = np.eye(4)
-    shifted[0, 3] = 12.0
-    with pytest.raises(SimulationError, match=r"mask lies up to 12.0 mm from the MRI's voxels"):
-        given_brain(Volume(inside, shifted), mri)
-    with pytest.raises(SimulationError, match="different values, expected 0 outside and one value inside: is it an"):
-        given_brain(mri, mri)
-    assert given_brain(Volume(inside, np.eye(4)), mri).method == "given"
-
-
 @pytest.mark.slow
 def test_an_mri_as_z_scores_gets_the_labels_of_the_mri():
-    """The usual preparation for neural networks: the field, which multiplies, was fitted to negative intensities."""
+    """The usual preparation for neural networks; a field multiplies."""
     maps = brain()
     shown = phantom(maps, "t1", noise=0.03, bias=0.3)
     inside = shown.mask.array > 0
@@ -147,7 +130,7 @@ def test_an_mri_as_z_scores_gets_the_labels_of_the_mri():
     assert scored.means[0] < 0.0 < scored.means[2]  # in the unit of the image
 
 
-def test_csf_that_is_nearly_as_bright_as_grey_matter_is_said():
+def test_csf_that_is_nearly_as_bright_as_grey_matter_is_reported():
     near, far = classes_of([124.0, 142.0, 176.0]), classes_of([27.0, 136.0, 174.0])
     (line,) = csf_is_doubtful(near, "t1gd")
     assert line.startswith("csf (124) is nearer to grey matter (142) than that to white matter (176)")

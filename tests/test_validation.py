@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from hypothesis import given, strategies as st
+from hypothesis import given, settings, strategies as st
 from scipy.spatial.transform import Rotation
 
 from SlicerUSSim.Logic import SimulationError
@@ -17,46 +17,26 @@ from SlicerUSSim.Logic.imaging.simulator import UltrasoundSimulator
 from validation import phantoms, run
 from validation.__main__ import main
 from validation.checks import ORIENTATIONS, PROBES, Outcome, Row
-from validation.measurement import echo_near, fit_rayleigh, full_width, level_db
+from validation.measurement import echo_near, fit_rayleigh, full_width
 from validation.phantoms import Echo
 from validation.run import all_checks, validate
 
-#: Checks that take longer than some seconds
-_LONG = ("beams behind cysts", "beams in folds", "beams in heads", "beams past strong tissue", "compounded angles",
-         "compounding", "curved mirrors", "cyst contrast", "flanks and lines", "flat layers", "frequency downshift",
-         "harmonic", "oblique walls", "planes along diagonals", "planes in small maps", "planes with edges",
-         "range distortion", "rayleigh", "refraction", "reverberation", "rough planes", "rough sheets",
-         "slice thickness", "small curved walls", "sparse speckle", "speckle correlation", "speckle everywhere",
-         "speckle statistics", "steered lines", "thickness of sheets", "thin sulci", "turned planes", "uneven tissue",
-         "walls and lines", "walls near ends", "wires and cysts")  # fmt: skip
-#: Those of them that the tests have aligned and oblique alone, and the whole validation diagonal, too: of speckle and
-#: beams in tissue whose steps of voxels echo nothing, of sheets re smooth ones in the same voxels, and of planes and
-#: walls that the check itself turns in their voxels
-_IN_TWO = ("beams behind cysts", "beams in folds", "beams past strong tissue", "compounding", "cyst contrast",
-           "flanks and lines", "flat layers", "frequency downshift", "planes along diagonals", "planes in small maps",
-           "planes with edges", "rough sheets", "slice thickness", "small curved walls", "sparse speckle",
-           "speckle correlation", "speckle everywhere", "thin sulci", "uneven tissue")  # fmt: skip
-#: Every check in its orientations once: the quick tests have the oblique one of all but the long checks
-CASES = [
-    pytest.param(
-        check,
-        orientation,
-        id=f"{check.name}-{orientation}",
-        marks=[] if orientation == "oblique" and check.name not in _LONG else [pytest.mark.slow],
-    )
-    for check in all_checks()
-    for orientation in check.orientations
-    if orientation != "diagonal" or check.name not in _IN_TWO
-]
+#: A cheap check of each phenomenon; side lobes and aberration have tests of their own (test_side_lobes, test_aperture)
+_QUICK = (
+    "attenuation and time", "echo level", "mirroring", "refraction and reflectance", "resolution", "speckle coherence",
+)  # fmt: skip
+#: Further ones of a few seconds. `python -m validation` runs all checks in all orientations, before a release.
+_SLOW = (
+    "echogenicity", "elevational tilt", "energy", "focal zones", "interface width",
+    "range distortion", "refraction", "ring-down", "shadow and enhancement", "sheets", "slice thickness",
+    "specular echoes", "speckle statistics", "sub-voxel interfaces", "thin sheet", "total reflection",
+)  # fmt: skip
+CHECKS = {check.name: check for check in all_checks()}
 
 
-def test_the_checks_that_take_long_are_some_of_all():
-    assert set(_IN_TWO) < set(_LONG) < {check.name for check in all_checks()}
-
-
-@pytest.mark.parametrize(("check", "orientation"), CASES)
-def test_theory_and_simulation_agree(check, orientation):
-    outcome = check.measure(ORIENTATIONS[orientation], None)
+@pytest.mark.parametrize("name", [*_QUICK, *(pytest.param(name, marks=pytest.mark.slow) for name in _SLOW)])
+def test_theory_and_simulation_agree(name):
+    outcome = CHECKS[name].measure(ORIENTATIONS["oblique"], None)
     assert outcome.rows
     off = [
         f"{row.quantity}: {row.measured:.5g}, predicted {row.predicted:.5g} ({row.limits})"
@@ -66,7 +46,7 @@ def test_theory_and_simulation_agree(check, orientation):
     assert not off, "; ".join(off)
 
 
-def test_everything_the_specification_names_has_a_check_in_three_orientations():
+def test_every_check_has_a_name_of_its_own_and_three_orientations():
     for check in all_checks():
         # Views of heads have random orientations.
         assert set(check.orientations) == set(ORIENTATIONS) or check.name == "beams in heads"
@@ -79,10 +59,8 @@ def test_everything_the_specification_names_has_a_check_in_three_orientations():
         ("within", 10.4, True),
         ("within", 9.4, False),
         ("within", float("nan"), False),
-        ("at most", 10.4, True),
         ("at most", -90.0, True),
         ("at most", 10.6, False),
-        ("at least", 9.6, True),
         ("at least", 90.0, True),
         ("at least", 9.4, False),
         ("at least", float("nan"), False),
@@ -90,25 +68,6 @@ def test_everything_the_specification_names_has_a_check_in_three_orientations():
 )
 def test_a_row_passes_only_inside_its_tolerance(kind, measured, passed):
     assert Row("x", "mm", 10.0, measured, 0.5, kind).passed is passed
-
-
-@given(
-    st.sampled_from(["within", "at most", "at least"]),
-    st.floats(-100, 100),
-    st.floats(-100, 100),
-    st.floats(0.01, 10),
-)
-def test_the_strain_of_a_row_is_above_one_just_where_it_fails(kind, predicted, measured, tolerance):
-    row = Row("x", "", predicted, measured, tolerance, kind)
-    if row.passed:
-        assert row.strain <= 1.0 + 1e-9
-    else:
-        assert row.strain >= 1.0
-
-
-@pytest.mark.parametrize("kind", ["within", "at most", "at least"])
-def test_an_echo_that_was_not_there_is_farther_from_its_limit_than_any_other(kind):
-    assert Row("x", "", 10.0, float("nan"), 0.5, kind).strain == float("inf")
 
 
 # ---- wrong physics is noticed ---------------------------------------------------------------------------------------
@@ -120,13 +79,9 @@ def test_an_echo_that_was_not_there_is_farther_from_its_limit_than_any_other(kin
     [
         ("attenuation and time", {"reference_speed_m_s": 1560.0}),
         ("mirroring", {"reflections": False}),
-        pytest.param("curved mirrors", {"reflection_spreading": False}, marks=pytest.mark.slow),
-        pytest.param("reverberation", {"max_ray_depth": 1}, marks=pytest.mark.slow),
         ("interface width", {"elevational_rays": 1}),
         ("specular echoes", {"interface_reflection": "energy"}),
-        pytest.param("slice thickness", {"beam_cutoff": 0.8}, marks=pytest.mark.slow),
         ("speckle statistics", {"scatterers_per_mm3": 4.0}),
-        pytest.param("speckle correlation", {"beam_cutoff": 0.6}, marks=pytest.mark.slow),
     ],
 )
 def test_wrong_physics_fails_the_check_of_its_phenomenon(monkeypatch, check, wrong):
@@ -136,10 +91,9 @@ def test_wrong_physics_fails_the_check_of_its_phenomenon(monkeypatch, check, wro
         def __init__(self, labels, tissues, settings=None, device=None):
             super().__init__(labels, tissues, replace(settings or SimulationSettings(), **wrong), device)
 
-    (chosen,) = (c for c in all_checks() if c.name == check)
     for module in ("artefacts", "beams", "rays", "speckle"):
         monkeypatch.setattr(f"validation.{module}.UltrasoundSimulator", Distorted)
-    assert not all(row.passed for row in chosen.measure(ORIENTATIONS["aligned"], None).rows)
+    assert not all(row.passed for row in CHECKS[check].measure(ORIENTATIONS["aligned"], None).rows)
 
 
 # ---- the report -----------------------------------------------------------------------------------------------------
@@ -164,7 +118,7 @@ def test_the_report_holds_every_row_and_its_pictures(tmp_path):
 
 
 def test_the_command_says_what_is_off_and_exits_with_one(tmp_path, monkeypatch):
-    good = next(check for check in all_checks() if check.name == "thin sheet")
+    good = CHECKS["thin sheet"]
 
     def off(rotation, device):
         return Outcome((replace(good.measure(rotation, device).rows[0], predicted=2.0),))
@@ -177,7 +131,7 @@ def test_the_command_says_what_is_off_and_exits_with_one(tmp_path, monkeypatch):
     assert "**FAIL**" in (tmp_path / "report.md").read_text()
 
 
-def test_the_command_exits_with_zero_when_all_is_well_and_two_for_a_wrong_name(tmp_path):
+def test_the_command_exits_with_zero_if_all_is_well_two_for_a_wrong_name(tmp_path):
     assert CliRunner().invoke(main, ["--out", str(tmp_path), "--only", "thin sheet"]).exit_code == 0
     result = CliRunner().invoke(main, ["--out", str(tmp_path), "--only", "gravity"])
     assert result.exit_code == 2 and "check is 'gravity', expected part of" in result.stderr
@@ -208,6 +162,7 @@ def test_a_report_that_cannot_be_written_is_one_clear_error(tmp_path):
 # ---- phantoms and measurements --------------------------------------------------------------------------------------
 
 
+@settings(max_examples=10)
 @given(st.tuples(*[st.floats(-90, 90)] * 3))
 def test_a_rotated_phantom_has_the_same_size_and_a_rigid_pose(angles):
     rotation = Rotation.from_euler("xyz", angles, degrees=True).as_matrix()
@@ -229,7 +184,6 @@ def test_a_rotation_that_is_none_is_refused():
         phantoms.mirror(np.eye(2))
 
 
-@pytest.mark.parametrize("orientation", ORIENTATIONS)
 @pytest.mark.parametrize(
     "make",
     [
@@ -240,12 +194,12 @@ def test_a_rotation_that_is_none_is_refused():
     ],
     ids=["sphere", "sheet", "rod", "layers"],
 )
-def test_phantoms_echo_from_where_they_say(make, orientation):
-    phantom = make(ORIENTATIONS[orientation])
+def test_phantoms_echo_from_where_they_say(make):
+    phantom = make(ORIENTATIONS["oblique"])
     # Only the bar echoes by its scatterers; a bright grain beside another object is no error.
     is_bar = phantom.name == "thin rod"
-    settings = SimulationSettings(scatterers_per_mm3=300.0, reflections=False, scattering=is_bar)
-    simulator = UltrasoundSimulator(phantom.labels, phantom.tissues, settings)
+    chosen = SimulationSettings(scatterers_per_mm3=300.0, reflections=False, scattering=is_bar)
+    simulator = UltrasoundSimulator(phantom.labels, phantom.tissues, chosen)
     for probe in PROBES.values():
         frame = simulator.simulate(probe, phantom.probe_to_ras)
         (echo,) = phantom.expected(probe)
@@ -276,7 +230,3 @@ def test_the_rayleigh_fit_finds_sigma_and_refuses_what_is_no_rayleigh():
 def test_the_width_of_a_gaussian_is_found_wherever_it_lies(sigma, centre):
     x = np.linspace(-12, 12, 2001)
     assert full_width(x, np.exp(-((x - centre) ** 2) / (2 * sigma**2))) == pytest.approx(2.3548 * sigma, rel=1e-3)
-
-
-def test_silence_has_a_level_that_json_can_hold():
-    assert level_db(np.zeros(10)) == -300.0
