@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import inspect
 import json
 import os
-import struct
 import subprocess
 import sys
-import zlib
 
 import numpy as np
 import pytest
@@ -33,7 +30,7 @@ def ussim(*arguments):
 @pytest.fixture(scope="module")
 def head(tmp_path_factory):
     path = tmp_path_factory.mktemp("head") / "head.nii.gz"
-    head_mri(2.0).write(path)
+    head_mri(3.0).write(path)
     return path
 
 
@@ -45,13 +42,6 @@ def labels(head):
     return path
 
 
-def test_help_names_the_commands():
-    result = ussim("--help")
-    assert result.exit_code == 0
-    for command in ("check", "demo", "segment", "simulate", "devices"):
-        assert command in result.output
-
-
 @pytest.mark.slow
 def test_demo_writes_everything_it_promises(head, tmp_path):
     pytest.importorskip("matplotlib", reason="pictures need matplotlib: pip install '.[demo]'")
@@ -59,22 +49,11 @@ def test_demo_writes_everything_it_promises(head, tmp_path):
     result = ussim("demo", "--mri", head, "--out", out, "--probe", "convex", "--seed", 3)
     assert result.exit_code == 0, result.output
     assert "skull-stripped" in result.stderr and "grey matter" in result.stderr  # how, and the table of shares
-    names = {
-        "mri.png",
-        "labels.png",
-        "bmode.png",
-        "figure.png",
-        "bmode.mha",
-        "labels.nii.gz",
-        "labels.json",
-        "demo.json",
-        "preset.json",
-    }
+    pictures = {"mri.png", "labels.png", "bmode.png", "figure.png"}
+    names = pictures | {"bmode.mha", "labels.nii.gz", "labels.json", "demo.json", "preset.json"}
     assert names <= {p.name for p in out.iterdir()}
-    for name in names:
-        if name.endswith(".png"):
-            picture = np.asarray(Image.open(out / name))
-            assert picture.std() > 10, name
+    for name in pictures:
+        assert np.asarray(Image.open(out / name)).std() > 10, name
     summary = json.loads((out / "demo.json").read_text())
     assert summary["settings"]["seed"] == 3 and summary["probe"]["kind"] == "convex"
     assert summary["milliseconds_per_stage"]["scatterers"] > 0 and summary["device"]
@@ -84,38 +63,9 @@ def test_demo_writes_everything_it_promises(head, tmp_path):
     image = sitk.ReadImage(str(out / "bmode.mha"))
     np.testing.assert_array_equal(sitk.GetArrayFromImage(image)[0], np.asarray(Image.open(out / "bmode.png")))
     pose = read_pose(out / "pose.json")
-    centre_ras = np.array(image.TransformContinuousIndexToPhysicalPoint([(n - 1) / 2 for n in image.GetSize()])) * [
-        -1,
-        -1,
-        1,
-    ]
+    middle = image.TransformContinuousIndexToPhysicalPoint([(n - 1) / 2 for n in image.GetSize()])
+    centre_ras = np.array(middle) * [-1, -1, 1]
     assert abs((np.linalg.inv(pose) @ [*centre_ras, 1])[2]) < 1e-3
-
-
-def test_what_sheets_lay_over_the_labels_is_not_what_add_did(head, tmp_path, monkeypatch):
-    """--pose auto is aimed at what --add laid, and was aimed at a structure of --sheets auto."""
-    from SlicerUSSim.Command import patient_options, sheets
-
-    def found(self, path, mri, segmentation, contrast):
-        array = segmentation.labels.array.copy()
-        array[30:40, 30:40, 20:30] = len(segmentation.tissue_names) + 1
-        return sheets._Drawn(
-            None, segmentation.labels.with_array(array), (*segmentation.tissue_names, "choroid plexus")
-        )
-
-    placed, poses = patient_options._placed, []
-
-    def recorded(*given):
-        poses.append(placed(*given).probe_to_ras)
-        return placed(*given)
-
-    monkeypatch.setattr(patient_options, "_placed", recorded)
-    for is_drawn in (False, True):
-        if is_drawn:
-            monkeypatch.setattr(sheets.DrawnSheets, "found", found)
-        result = ussim("simulate", head, "--pose", "auto", "-o", tmp_path / "a.png")
-        assert result.exit_code == 0, result.output
-    np.testing.assert_allclose(poses[1], poses[0], atol=1e-6)
 
 
 def test_a_pose_that_is_neither_a_file_nor_a_view_names_all_that_there_is(head):
@@ -127,8 +77,7 @@ def test_a_pose_that_is_neither_a_file_nor_a_view_names_all_that_there_is(head):
     assert done.stderr.endswith("temporal, temporal-left, fontanelle, fontanelle-sagittal (temporal: from the right)\n")
 
 
-@pytest.mark.parametrize("command", [pytest.param("demo", marks=pytest.mark.slow), "simulate"])
-def test_a_probe_that_places_itself_looks_at_what_was_added(command, head, tmp_path):
+def test_a_probe_that_places_itself_looks_at_what_was_added(head, tmp_path):
     """On the other side of the brain than the usual view, 20 mm behind it: it was not in the image."""
     mri = Volume.read(head)
     grid = np.indices(mri.array.shape[::-1]).T
@@ -136,13 +85,8 @@ def test_a_probe_that_places_itself_looks_at_what_was_added(command, head, tmp_p
     away = grid @ mri.ijk_to_ras[:3, :3].T + mri.ijk_to_ras[:3, 3] - centre
     mri.with_array((np.linalg.norm(away, axis=-1) < 8.0).astype(np.uint8)).write(tmp_path / "tumour.nii.gz")
     lesion = ["--add", f"tumour={tmp_path / 'tumour.nii.gz'}"]
-    if command == "demo":
-        pytest.importorskip("matplotlib", reason="pictures need matplotlib: pip install '.[demo]'")
-        result = ussim("demo", "--mri", head, "--out", tmp_path / "out", *lesion)
-        place = tmp_path / "out" / "bmode.mha"
-    else:
-        place = tmp_path / "bmode.mha"
-        result = ussim("simulate", head, "--pose", "auto", *lesion, "-o", place)
+    place = tmp_path / "bmode.mha"
+    result = ussim("simulate", head, "--pose", "auto", *lesion, "-o", place)
     assert result.exit_code == 0, result.output
     import SimpleITK as sitk
 
@@ -153,6 +97,7 @@ def test_a_probe_that_places_itself_looks_at_what_was_added(command, head, tmp_p
     assert sitk.GetArrayFromImage(image)[0, round(j), round(i)] > 0
 
 
+@pytest.mark.slow
 def test_the_demo_without_nilearn_says_that_it_uses_a_phantom(monkeypatch):
     import importlib.util
 
@@ -174,15 +119,6 @@ def test_segment_writes_labels_and_their_tissues(labels, head):
     assert tissues["tissues"]["3"]["name"] == "white matter" and "membrane" in tissues
 
 
-@pytest.mark.parametrize("suffix", [".png", ".mha", ".nrrd", ".nii.gz", ".vti"])
-def test_simulate_writes_every_format(labels, tmp_path, suffix):
-    out = tmp_path / f"image{suffix}"
-    result = ussim("simulate", labels, "--pose", "auto", "-o", out)
-    assert result.exit_code == 0, result.output
-    assert "from labels" in result.output and out.stat().st_size > 1000
-    assert list(tmp_path.iterdir()) == [out]
-
-
 def test_simulate_takes_probe_tissues_and_pose_from_files(labels, head, tmp_path):
     from SlicerUSSim.Logic import LinearProbe
 
@@ -202,100 +138,54 @@ def test_simulate_takes_probe_tissues_and_pose_from_files(labels, head, tmp_path
     assert pictures[2].mean() == pytest.approx(pictures[0].mean(), rel=0.1)  # the MRI is segmented alike
 
 
-@pytest.mark.parametrize("kind", ["json", "bare", "text", "tfm"])
-def test_poses_are_read_in_every_form(kind, tmp_path):
-    from scipy.spatial.transform import Rotation
-
-    pose = np.eye(4)
-    pose[:3, :3] = Rotation.from_euler("xyz", [10, 20, 30], degrees=True).as_matrix()
-    pose[:3, 3] = [1, -2, 30]
-    path = tmp_path / {"json": "p.json", "bare": "p.json", "text": "p.txt", "tfm": "p.tfm"}[kind]
-    if kind == "json":
-        write_pose(path, pose)
-    elif kind == "bare":
-        path.write_text(json.dumps(pose.tolist()))
-    elif kind == "text":
-        np.savetxt(path, pose)
-    else:
-        import SimpleITK as sitk
-
-        # As Slicer saves a linear transform: from world to probe, in LPS.
-        flip = np.diag([-1.0, -1, 1, 1])
-        inverse = flip @ np.linalg.inv(pose) @ flip
-        transform = sitk.AffineTransform(3)
-        transform.SetMatrix(inverse[:3, :3].ravel().tolist())
-        transform.SetTranslation(inverse[:3, 3].tolist())
-        sitk.WriteTransform(transform, str(path))
-    np.testing.assert_allclose(read_pose(path), pose, atol=1e-9)
-
-
 def test_devices_says_which_is_used():
     result = ussim("devices")
     assert result.exit_code == 0 and "used: " in result.output and "* " in result.output
 
 
 def bad_inputs(folder):
-    """(arguments, part of the message) for user errors."""
-    np.savetxt(folder / "three.txt", np.eye(3))
+    """(arguments, part of the message) for user errors; what is wrong with files is tested where they are read."""
     np.savetxt(folder / "scaled.txt", np.eye(4) * 2)
-    np.savetxt(folder / "singular.txt", np.zeros((4, 4)))
-    (folder / "words.txt").write_text("to the left")
     (folder / "nokey.json").write_text("{}")
     (folder / "probe.json").write_text('{"kind": "linear", "width_mm": -4, "depth_mm": 50}')
     (folder / "broken.nii.gz").write_text("broken")
-    (folder / "empty").mkdir()
-    import SimpleITK as sitk
-
-    sitk.WriteImage(sitk.GetImageFromArray(np.zeros((20, 20), np.uint8)), str(folder / "flat.nrrd"))
     Volume(np.full((8, 8, 8), 5.0), np.eye(4)).write(folder / "constant.nrrd")
-    Volume(np.full((8, 8, 8), np.nan), np.eye(4)).write(folder / "nan.nrrd")
     Volume(np.full((8, 8, 8), 9, np.uint8), np.eye(4)).write(folder / "nine.nrrd")
-    mri, out = folder / "head.nii.gz", folder / "out.png"
+    segment, out = ["segment", folder / "head.nii.gz", "-o"], folder / "out.png"
+    simulate = ["simulate", folder / "head.nii.gz", "-o", out, "--pose"]
     return [
         (["segment", folder / "none.nii", "-o", folder / "l.nii.gz"], "none.nii: no such file"),
         (["segment", folder / "broken.nii.gz", "-o", folder / "l.nii.gz"], "broken.nii.gz: cannot be read"),
-        (["segment", folder / "empty", "-o", folder / "l.nii.gz"], "no DICOM series"),
-        (["segment", folder / "flat.nrrd", "-o", folder / "l.nii.gz"], "flat.nrrd: is a 20x20 image"),
         (["segment", folder / "constant.nrrd", "-o", folder / "l.nii.gz"], "constant"),
-        (["segment", folder / "nan.nrrd", "-o", folder / "l.nii.gz"], "not finite"),
-        (["segment", mri, "-o", folder / "l.gif"], "unknown image format"),
-        (["segment", mri, "-o", folder / "l.NII.GZ"], "in small letters"),
-        (["segment", mri, "-o", folder / "nowhere" / "l.nii.gz"], "does not exist"),
-        (["segment", mri, "-o", folder / "l.nii.gz", "--classes", 9], "classes is 9"),
-        (["segment", mri, "-o", folder / "l.nii.gz", "--map", "24=csf"], "--map is for a label map"),
-        (["segment", mri, "-o", folder / "l.nii.gz", "--mask", folder / "nine.nrrd"], "same grid"),
-        (["simulate", mri, "--pose", folder / "none.txt", "-o", out], "none.txt' (no such file)"),
-        (["simulate", mri, "--pose", folder / "three.txt", "-o", out], "9 numbers"),
-        (["simulate", mri, "--pose", folder / "scaled.txt", "-o", out], "last row"),
-        (["simulate", mri, "--pose", folder / "singular.txt", "-o", out], "last row"),
-        (["simulate", mri, "--pose", folder / "words.txt", "-o", out], "is not a pose"),
-        (["simulate", mri, "--pose", folder / "nokey.json", "-o", out], 'no "probe_to_ras"'),
-        (["simulate", mri, "--pose", "auto", "--probe", folder / "probe.json", "-o", out], "width_mm is -4"),
-        (["simulate", mri, "--pose", "auto", "--device", "abacus", "-o", out], "no OpenCL device fits 'abacus'"),
-        (["simulate", mri, "--pose", "auto", "--seed", -1, "-o", out], "seed is -1"),
-        (["simulate", mri, "--pose", "auto", "--dynamic-range", 0, "-o", out], "dynamic_range_db is 0"),
-        (["simulate", folder / "nine.nrrd", "--pose", "auto", "-o", out], "a binary mask (1 label"),
-        (["simulate", mri, "--pose", "auto", "-o", folder / "out.xyz"], "unknown image format"),
-        (["simulate", mri, "--pose", "auto", "-o", folder / "nowhere" / "o.png"], "does not exist"),
-        (["demo", "--mri", mri, "--out", folder / "probe.json" / "x"], "cannot be created"),
-        (["simulate", mri, "--pose", "auto", "-o", "/proc/o.png"], "/proc/o.png: cannot be written"),
+        ([*segment, folder / "l.gif"], "unknown image format"),
+        ([*segment, folder / "l.NII.GZ"], "in small letters"),
+        ([*segment, folder / "nowhere" / "l.nii.gz"], "does not exist"),
+        ([*segment, folder / "l.nii.gz", "--classes", 9], "classes is 9"),
+        ([*segment, folder / "l.nii.gz", "--map", "24=csf"], "--map is for a label map"),
+        ([*segment, folder / "l.nii.gz", "--mask", folder / "nine.nrrd"], "same grid"),
+        ([*simulate, folder / "none.txt"], "none.txt' (no such file)"),
+        ([*simulate, folder / "scaled.txt"], "last row"),
+        ([*simulate, folder / "nokey.json"], 'no "probe_to_ras"'),
+        ([*simulate, "auto", "--probe", folder / "probe.json"], "width_mm is -4"),
+        ([*simulate, "auto", "--device", "abacus"], "no OpenCL device fits 'abacus'"),
+        ([*simulate, "auto", "--seed", -1], "seed is -1"),
+        (["demo", "--mri", folder / "head.nii.gz", "--out", folder / "probe.json" / "x"], "cannot be created"),
+        (["simulate", folder / "head.nii.gz", "--pose", "auto", "-o", "/proc/o.png"], "/proc/o.png: cannot be written"),
     ]
 
 
-@pytest.mark.parametrize("number", range(27))
-def test_a_mistake_is_one_line_and_writes_nothing(number, head, tmp_path):
+def test_a_mistake_is_one_line_and_writes_nothing(head, tmp_path):
     (tmp_path / "head.nii.gz").write_bytes(head.read_bytes())
     cases = bad_inputs(tmp_path)
-    assert len(cases) == 27
-    arguments, message = cases[number]
     before = sorted(tmp_path.rglob("*"))
-    result = ussim(*arguments)
-    assert result.exit_code == 2, result.output
-    lines = [line for line in result.stderr.splitlines() if not line.startswith("ussim: warning: ")]
-    errors = [line for line in lines if line.startswith("ussim: ")]
-    assert len(errors) == 1 and message in errors[0], result.stderr
-    assert "Traceback" not in result.output
-    assert sorted(tmp_path.rglob("*")) == before
+    for arguments, message in cases:
+        result = ussim(*arguments)
+        assert result.exit_code == 2, result.output
+        lines = [line for line in result.stderr.splitlines() if not line.startswith("ussim: warning: ")]
+        errors = [line for line in lines if line.startswith("ussim: ")]
+        assert len(errors) == 1 and message in errors[0], result.stderr
+        assert "Traceback" not in result.output
+        assert sorted(tmp_path.rglob("*")) == before
 
 
 @pytest.mark.parametrize("command", ["simulate", "volume", "sweep", "optimize"])
@@ -327,18 +217,6 @@ def test_pipes_and_devices_are_no_outputs_and_endless_inputs_are_refused(labels,
     assert result.exit_code == 2 and "/dev/zero: has more than" in result.stderr
 
 
-def test_a_picture_that_is_too_large_to_be_looked_at_is_not_replaced(labels, tmp_path):
-    header = struct.pack(">IIBBBBB", 60000, 60000, 8, 0, 0, 0, 0)
-    chunks = b"".join(
-        struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
-        for kind, data in ((b"IHDR", header), (b"IDAT", zlib.compress(b"")), (b"IEND", b""))
-    )
-    out = tmp_path / "o.png"
-    out.write_bytes(b"\x89PNG\r\n\x1a\n" + chunks)
-    result = ussim("simulate", labels, "--pose", "auto", "-o", out)
-    assert result.exit_code == 2 and "is not as this program wrote it" in result.stderr
-
-
 def test_values_that_are_no_text_and_sweeps_without_end_are_refused(labels, tmp_path):
     out = tmp_path / "o.nrrd"
     result = ussim("simulate", labels, "--pose", "auto", "-o", out, "--set", "probe.depth_mm=\udced\udca0")
@@ -351,7 +229,7 @@ def test_values_that_are_no_text_and_sweeps_without_end_are_refused(labels, tmp_
         assert result.exit_code == 2 and words in result.stderr and not out.exists()
 
 
-@pytest.mark.parametrize("name", ["o.png", "o.mha", "o.mhd", "o.nrrd", "o.nii.gz", "o.vti"])
+@pytest.mark.parametrize("name", ["o.png", "o.mhd", "o.nii.gz", "o.vti"])
 def test_an_image_is_replaced_only_as_it_was_written(name, labels, tmp_path):
     """A user's file, and a result that a user edited, were replaced without a word."""
     out = tmp_path / name
@@ -374,17 +252,21 @@ def test_an_image_is_replaced_only_as_it_was_written(name, labels, tmp_path):
     assert "choose another name, or remove it" in result.stderr and "\n" not in result.stderr.strip()
 
 
+_MASK, _ALSO = ["--mask", "{labels}"], ["--also", "t2={labels}", "--contrast", "t2"]
+
+
 @pytest.mark.parametrize(
-    ("given", "named"),
+    ("command", "given", "named"),
     [
-        (["--mask", "{labels}"], "--mask is for an MRI"),
-        (["--contrast", "t1"], "--contrast is for an MRI"),
-        (["--skull-strip", "none"], "--skull-strip is for an MRI"),
-        (["--no-thin-sulci"], "--thin-sulci is for an MRI"),
-        (["--also", "t2={labels}", "--contrast", "t2"], "--also are for an MRI"),
+        ("simulate", _MASK, "--mask is for an MRI"),
+        ("simulate", ["--contrast", "t1"], "--contrast is for an MRI"),
+        ("simulate", ["--skull-strip", "none"], "--skull-strip is for an MRI"),
+        ("simulate", ["--no-thin-sulci"], "--thin-sulci is for an MRI"),
+        ("volume", _MASK, "--mask is for an MRI"),
+        ("sweep", _ALSO, "--also are for an MRI"),
+        ("optimize", _ALSO, "--also are for an MRI"),
     ],
 )
-@pytest.mark.parametrize("command", ["simulate", "volume", "sweep", "optimize"])
 def test_options_for_an_mri_are_refused_with_labels(command, given, named, labels, tmp_path):
     """They were ignored without a word."""
     recording = tmp_path / "tracked.igs.mha"
@@ -406,14 +288,8 @@ def test_errors_about_another_mri_name_its_file_alone(head, labels, tmp_path):
     for other in (constant, labels):
         result = ussim("segment", head, "--also", f"t2={other}", "-o", tmp_path / "o.nii.gz")
         assert result.exit_code == 2 and str(other) in result.stderr and str(head) not in result.stderr
-    for command in (("segment", head), ("demo", "--out", tmp_path / "demo", "--mri", head)):
-        out = ("-o", tmp_path / "o.nii.gz") if command[0] == "segment" else ()
-        result = ussim(*command, "--also", f"t2={head}", *out)
-        assert result.exit_code == 2
-        assert f"--also t2={head}: is the file of the MRI again, expected another image" in result.stderr
-    twice = ("--also", f"t2={constant}", "--also", f"flair={constant}")
-    result = ussim("segment", head, *twice, "-o", tmp_path / "o.nii.gz")
-    assert result.exit_code == 2 and "is the file of --also t2 again" in result.stderr
+    result = ussim("segment", head, "--also", f"t2={head}", "-o", tmp_path / "o.nii.gz")
+    assert result.exit_code == 2 and f"--also t2={head}: is the file of the MRI again, expected" in result.stderr
 
 
 def test_a_volume_replaces_images_of_this_program_only(labels, tmp_path):
@@ -423,23 +299,13 @@ def test_a_volume_replaces_images_of_this_program_only(labels, tmp_path):
     for _ in range(2):
         result = ussim(*volume)
         assert result.exit_code == 0, result.output
-    for content in (b"", b"my notes", b"{", b"\x89PNG", b"<html>mine"):
+    for content in (b"", b"my notes"):
         out.write_bytes(content)
         result = ussim(*volume)
         assert result.exit_code == 2 and f"{out}: exists and is not as" in result.stderr
         assert out.read_bytes() == content
 
 
-def test_a_device_that_fails_is_one_line_too(labels, tmp_path, monkeypatch):
-    import pyopencl
-
-    def fail(*_):
-        raise pyopencl.MemoryError("clEnqueueNDRangeKernel", -4)
-
-    monkeypatch.setattr("SlicerUSSim.Logic.imaging.raytracing.RayTracer.run", fail)
-    result = ussim("simulate", labels, "--pose", "auto", "-o", tmp_path / "o.png")
-    assert result.exit_code == 2 and "the OpenCL device failed" in result.stderr
-    assert not list(tmp_path.iterdir())
 
 
 def test_a_pose_past_the_volume_is_a_warning_and_a_black_image(labels, tmp_path):
@@ -451,13 +317,6 @@ def test_a_pose_past_the_volume_is_a_warning_and_a_black_image(labels, tmp_path)
     assert "ussim: warning: the probe looks past the volume" in result.stderr
     # Below the ring-down at the face there is amplifier noise only.
     assert np.asarray(Image.open(tmp_path / "o.png"))[128:].max() < 40
-
-
-@pytest.mark.skipif(os.name != "posix" or os.geteuid() == 0, reason="root may write anywhere")
-def test_an_unwritable_folder_is_named(labels, tmp_path):
-    tmp_path.chmod(0o500)
-    result = ussim("simulate", labels, "--pose", "auto", "-o", tmp_path / "o.png")
-    assert result.exit_code == 2 and "cannot be written" in result.stderr
 
 
 def test_a_preset_gives_the_same_image_and_options_go_before_it(head, labels, tmp_path):
@@ -479,7 +338,7 @@ def test_a_preset_gives_the_same_image_and_options_go_before_it(head, labels, tm
     assert quieter.mean() < whole.mean()
 
 
-def test_an_mri_gives_its_simulator_the_shares_of_voxels_and_labels_have_none(head, labels, tmp_path, monkeypatch):
+def test_an_mri_gives_its_simulator_shares_of_voxels_and_labels_none(head, labels, tmp_path, monkeypatch):
     textures = []
 
     class Seen(UltrasoundSimulator):
@@ -494,7 +353,7 @@ def test_an_mri_gives_its_simulator_the_shares_of_voxels_and_labels_have_none(he
     assert textures[0].volume_share.max() > 0.4 and textures[1] is None
 
 
-@pytest.mark.parametrize("of", [pytest.param("labels", marks=pytest.mark.slow), "an MRI"])
+@pytest.mark.parametrize("of", ["labels", pytest.param("an MRI", marks=pytest.mark.slow)])
 def test_set_changes_the_tissues_of_labels_and_of_an_mri(of, head, labels, tmp_path):
     source = labels if of == "labels" else head
 
@@ -515,34 +374,14 @@ def test_set_changes_the_tissues_of_labels_and_of_an_mri(of, head, labels, tmp_p
         assert not (tmp_path / "o.png").exists()
 
 
-def test_the_command_offers_every_probe_there_is():
-    options = {option.name: option for option in main.commands["demo"].params}
-    assert list(options["kind"].type.choices) == list(PROBES)
-
-
-@pytest.mark.parametrize("name", list(main.commands))
-def test_a_command_says_every_parameter_and_its_type(name):
-    parameters = inspect.signature(main.commands[name].callback).parameters.values()
-    for parameter in parameters:
-        assert parameter.kind is not parameter.VAR_KEYWORD, f"{name} takes **{parameter.name}"
-        assert parameter.annotation is not parameter.empty, f"{name}: {parameter.name} has no type"
-
-
-def test_python_m_is_the_command():
-    done = subprocess.run([sys.executable, "-m", "SlicerUSSim.Command", "--version"], capture_output=True, text=True)
-    assert done.returncode == 0 and "ussim, version" in done.stdout
-
-
-@pytest.mark.parametrize("command", ["segment", "simulate"])
-def test_a_tracked_sweep_given_as_an_mri_is_called_what_it_is(command, tmp_path):
+def test_a_tracked_sweep_given_as_an_mri_is_called_what_it_is(tmp_path):
     """Formerly it "goes through the image from the bottom to the top, as a limb or a body does"."""
     rng = np.random.default_rng(0)
     sweep = TrackedSequence(
         rng.integers(0, 255, (4, 40, 30)).astype(np.uint8), [{"ImageToReference": np.eye(4)}] * 4, [0.0, 0.1, 0.2, 0.3]
     )
     sweep.write(tmp_path / "sweep.igs.mha")
-    options = ["--pose", "auto", "--mri"] if command == "simulate" else []
-    result = ussim(command, tmp_path / "sweep.igs.mha", *options, "-o", tmp_path / "out.nii.gz")
+    result = ussim("segment", tmp_path / "sweep.igs.mha", "-o", tmp_path / "out.nii.gz")
     assert result.exit_code == 2 and "is a sequence of tracked ultrasound images, expected an MRI" in result.stderr
 
 
@@ -569,51 +408,6 @@ def test_the_demo_replaces_only_files_that_it_wrote_itself(head, tmp_path):
     assert preset.read_text() == edited
 
 
-_FULL = """
-import resource, signal, sys
-from SlicerUSSim.Command import whole_line
-from SlicerUSSim.Command.cli import main
-
-draw = whole_line.draw_views
-
-def draw_on_a_full_disk(*arguments):  # only then: the compiler of the kernels has files of its own
-    signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (4000, resource.RLIM_INFINITY))
-    draw(*arguments)
-
-whole_line.draw_views = draw_on_a_full_disk
-main(sys.argv[1:])
-"""
-
-
-@pytest.mark.skipif(sys.platform == "win32", reason="no limit of the size of files")
-@pytest.mark.slow
-def test_the_demo_on_a_full_disk_names_its_own_folder_and_leaves_nothing(head, tmp_path):
-    """It named a file in a hidden folder that was gone, and left an empty one."""
-    pytest.importorskip("matplotlib", reason="pictures need matplotlib: pip install '.[demo]'")
-    out = tmp_path / "out"
-    command = [sys.executable, "-c", _FULL, "demo", "--mri", head, "--skull-strip", "none", "--out", out]
-    done = subprocess.run(list(map(str, command)), capture_output=True, text=True)
-    assert done.returncode == 2 and f"{out / 'figure.png'}: cannot be written" in done.stderr, done.stderr
-    assert not out.exists()
-
-
-def test_the_demo_refuses_a_label_map_as_segment_does(labels, tmp_path):
-    result = ussim("demo", "--mri", labels, "--out", tmp_path / "demo")
-    assert result.exit_code == 2 and "is a label map" in result.stderr and "expected an MRI" in result.stderr
-    assert not (tmp_path / "demo").exists()
-
-
-@pytest.mark.slow
-def test_the_demo_leaves_nothing_behind_of_an_image_that_it_refuses(tmp_path):
-    pytest.importorskip("matplotlib", reason="pictures need matplotlib: pip install '.[demo]'")
-    noise = tmp_path / "noise.nrrd"
-    values = np.random.default_rng(0).normal(100, 20, (60, 60, 60)).astype(np.float32)
-    Volume(values, np.diag([3.0, 3.0, 3.0, 1.0])).write(noise)
-    result = ussim("demo", "--mri", noise, "--out", tmp_path / "new" / "demo")
-    assert result.exit_code == 2 and "noise" in result.stderr and not (tmp_path / "new").exists()
-
-
 def test_simulate_takes_probes_by_name(labels, tmp_path):
     """`--probe neonatal` was read as a file."""
     named, from_file = tmp_path / "named.png", tmp_path / "file.png"
@@ -627,15 +421,11 @@ def test_simulate_takes_probes_by_name(labels, tmp_path):
     result = ussim("simulate", labels, "--pose", "auto", "--probe", "neonatel", "-o", tmp_path / "none.png")
     assert result.exit_code == 2 and len(result.stderr.splitlines()) == 1
     assert "neonatel" in result.stderr and ", ".join(PROBES) in result.stderr
-    result = ussim("simulate", labels, "--pose", "auto", "--set", "probe.focal_zones=4", "-o", tmp_path / "none.png")
-    assert (
-        result.exit_code == 2 and "focal_zones is 4 with transmit 'focus', expected transmit 'zones'" in result.stderr
-    )
     assert not (tmp_path / "none.png").exists()
 
 
 @pytest.mark.skipif(not os.path.exists("/dev/full"), reason="a file on a full disk is made by Linux")
-@pytest.mark.parametrize("arguments", [["--version"], ["--help"], ["devices"]])
+@pytest.mark.parametrize("arguments", [["--version"], ["devices"]])
 def test_an_output_on_a_full_disk_is_one_line(arguments):
     with open("/dev/full", "w") as full:
         result = subprocess.run(

@@ -39,7 +39,7 @@ def ussim(*arguments):
 def folder(tmp_path_factory):
     """A twin on disk, as examples/write_twin.py writes one."""
     place = tmp_path_factory.mktemp("twin")
-    segmentation = segment_once(head_mri(2.0))
+    segmentation = segment_once(head_mri(3.0))
     probe = PhasedProbe(70.0, 50.0, scan_lines=80)
     twin = make_twin(segmentation.labels, TissueTable.brain(segmentation.tissue_names), 3, probe=probe)
     twin.simulator.medium.labels.write(place / "labels.nii.gz")
@@ -79,11 +79,7 @@ def test_optimize_writes_result_report_preset_and_state(folder):
     assert report.count("data:image/png;base64,") >= 3 * 4 + 3
     assert not re.search(r"(src|href)=\"(?!data:)", report)  # nothing outside the file
     assert "<figcaption>real</figcaption>" not in report  # a twin is not real
-    for words in (
-        "simulated, before", "<figcaption>twin</figcaption>", "fitted to twin ultrasound", "Blink", "texture T1",
-        "white matter.mu0", "net attenuation", "Var of white matter", "<td>Mean amplitude μ₀</td>",
-        'title="Mean amplitude of the scatterers.', "<td>dB/(cm MHz)</td>",
-    ):  # fmt: skip
+    for words in ("simulated, before", "<figcaption>twin</figcaption>", "texture T1", "white matter.mu0", "net atten"):
         assert words in report
 
     again = optimize(
@@ -104,24 +100,18 @@ def test_optimize_writes_result_report_preset_and_state(folder):
         (folder / name).write_text(own)
 
 
-@pytest.mark.parametrize(
-    "command",
-    [("optimize", "--evaluations", 1, "--restarts", 0, "-o", "o.json"), ("sweep", "-o", "o.igs.mha")],
-    ids=lambda command: command[0],
-)
-def test_a_probe_off_the_patient_is_said_before_its_black_images_are_compared(command, folder, tmp_path, monkeypatch):
+def test_a_probe_off_the_patient_is_said(folder, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     write_json(tmp_path / "off.json", rigid_from([300.0, 0.0, 0.0, 0.0, 0.0, 0.0]).tolist())
     done = ussim(
-        *command, folder / "labels.nii.gz", "--sequence", folder / "tracked.igs.mha", "--probe", folder / "probe.json",
-        "--contact-gap", 3, "--to-mri", tmp_path / "off.json",
+        "sweep", folder / "labels.nii.gz", "--sequence", folder / "tracked.igs.mha", "--probe", folder / "probe.json",
+        "-o", "o.igs.mha", "--contact-gap", 3, "--to-mri", tmp_path / "off.json",
     )  # fmt: skip
     assert "in 3 of 3 images 0% of the probe's face touches the patient (contact gap: 3 mm)" in done.stderr
 
 
-@pytest.mark.parametrize("name", ["o.igs.mha", "o.nrrd"])
-def test_sweep_replaces_only_what_it_wrote(name, folder, tmp_path):
-    out, field = tmp_path / name, tmp_path / "field.png"
+def test_sweep_replaces_only_what_it_wrote(folder, tmp_path):
+    out, field = tmp_path / "o.igs.mha", tmp_path / "field.png"
     sweep = (
         "sweep", folder / "labels.nii.gz", "--sequence", folder / "tracked.igs.mha", "-o", out, "--field", field,
         "--frames", "0:2",
@@ -140,40 +130,6 @@ def test_sweep_replaces_only_what_it_wrote(name, folder, tmp_path):
     result = ussim(*sweep)
     assert result.exit_code == 2 and f"{out}: exists and is not as" in result.stderr
     assert out.read_bytes() == before and not field.exists()
-
-
-@pytest.mark.slow
-def test_a_state_is_not_resumed_with_other_images_or_another_mri(folder, tmp_path):
-    state, few = tmp_path / "state.json", ("--evaluations", 4, "--restarts", 0, "--free", "gain_db")
-
-    def run(mri, sequence):
-        return ussim(
-            "optimize", mri, "--sequence", sequence, "--probe", folder / "probe.json", "--mri-modulation", 3, "-o",
-            tmp_path / "result.json", "--state", state, *few,
-        )  # fmt: skip
-
-    mri, sequence = head_mri(2.0), TrackedSequence.read(folder / "tracked.igs.mha")
-    mri.write(tmp_path / "mri.nii.gz")
-    # A second scan that is segmented alike but for single voxels, and a recording in another order.
-    ripple = 1.0 + 0.02 * (np.indices(mri.array.shape).sum(axis=0) % 2)
-    mri.with_array(mri.array * ripple).write(tmp_path / "again.nii.gz")
-    sequence.with_images([0, 1, 2], sequence.images[::-1]).write(tmp_path / "swapped.igs.mha")
-    tracked = folder / "tracked.igs.mha"
-    assert run(tmp_path / "mri.nii.gz", tracked).exit_code == 0
-    kept = state.read_text()
-    (tmp_path / "result.json").unlink()
-    for files, other in (
-        ((tmp_path / "again.nii.gz", tracked), "texture"),
-        ((tmp_path / "mri.nii.gz", tmp_path / "swapped.igs.mha"), "reference images"),
-    ):
-        done = run(*files)
-        assert done.exit_code == 2
-        told = [line for line in done.output.splitlines() if line.startswith("ussim:")]
-        (line,) = [line for line in told if not line.startswith("ussim: warning:")]
-        assert "another problem: other" in line and other in line
-        assert state.read_text() == kept and not (tmp_path / "result.json").exists()
-    again = run(tmp_path / "mri.nii.gz", tracked)
-    assert again.exit_code == 0 and "(0 evaluations)" in again.output
 
 
 def test_sweep_draws_the_same_images_on_the_same_pixels(folder):
@@ -213,16 +169,15 @@ def test_images_of_a_sweep_have_noise_by_their_number(folder, tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("has_given_map", [False, True])
-def test_the_saved_transform_puts_the_images_where_the_fit_found_them(folder, tmp_path, monkeypatch, has_given_map):
+def test_the_saved_transform_puts_the_images_where_the_fit_found_them(folder, tmp_path, monkeypatch):
     fits = []
     monkeypatch.setattr(tracked_fit, "_ROUNDS", ((8.0, 60), (4.0, 40)))  # how well: test_registration
     monkeypatch.setattr(tracked_fit, "fit", lambda *a, **b: fits.append(fit(*a, **b)) or fits[-1])
-    given_map = rigid_from([1.5, -1.0, 2.0, 2.0, -1.0, 1.5]) if has_given_map else np.eye(4)
+    given_map = rigid_from([1.5, -1.0, 2.0, 2.0, -1.0, 1.5])
     write_pose(tmp_path / "given.json", given_map)
     done = optimize(
         folder, "--register", "--evaluations", 40, "--restarts", 0, "--free", "display", "--save-transform",
-        tmp_path / "saved.json", *(["--to-mri", tmp_path / "given.json"] if has_given_map else []),
+        tmp_path / "saved.json", "--to-mri", tmp_path / "given.json",
     )  # fmt: skip
     assert done.exit_code == 0, done.output
     assert re.search(r"moved by [\d.]+ mm and [\d.]+ degrees", done.output)
@@ -273,110 +228,31 @@ def test_a_volume_with_landmarks_is_cut_where_the_probe_looked(folder, tmp_path)
     assert len(result["images"]) == 2 and costs[0] < 0.85 * costs[1]
     done = ussim("sweep", *common, "-o", tmp_path / "cut.igs.mha")
     assert done.exit_code == 0 and len(TrackedSequence.read(tmp_path / "cut.igs.mha")) == 1
-    both = ussim("sweep", *common, "--cut-tilt", 5, "--cut-slide", 5, "-o", tmp_path / "no.igs.mha")
-    assert both.exit_code == 2 and "--cut-tilt and --cut-slide are both given" in both.output
-
-
-@pytest.mark.slow
-def test_images_that_are_not_fitted_are_predicted_beside_controls(folder):
-    """The fit is that without them."""
-    pytest.importorskip("matplotlib", reason="reports need matplotlib: pip install '.[demo]'")
-    plain = ["--frames", "0,2", "--evaluations", 120, "--restarts", 0]
-    report = folder / "predicted.html"
-    done = optimize(folder, *plain, "--validate", "1", "--report", report)
-    assert done.exit_code == 0, done.output
-    result = json.loads((folder / "result.json").read_text())
-    assert result["numbers"] == [0, 2]
-    found = result["prediction"]
-    assert (found["fitted_images"], found["images"]) == ([0, 2], [1])
-    assert set(found["predicted"]) == {"simulated", "uniform tissue", "real neighbours"}
-    assert len(found["predicted"]["simulated"]) == 1 and len(found["predicted"]["real neighbours"]) == 2
-    assert np.mean([cost["paper"] for cost in found["fitted"]["simulated"]]) == pytest.approx(
-        result["cost_after"], abs=2e-3
-    )
-    assert 0.5 < found["of_uniform"] < 1.5  # the phantom looks nearly uniform here
-    assert "fitted: images 0, 2   predicted: images 1" in done.output
-    assert "Images that were not fitted" in report.read_text("utf-8")
-    assert optimize(folder, *plain).exit_code == 0
-    alone = json.loads((folder / "result.json").read_text())
-    assert alone["cost_after"] == result["cost_after"] and "prediction" not in alone
-    assert optimize(folder, "--evaluations", 5, "--restarts", 0, "--validate", "1").exit_code == 0
-    assert json.loads((folder / "result.json").read_text())["numbers"] == [0, 2]  # all but the predicted one
 
 
 @pytest.mark.parametrize(
     "options, message",
     [
         (["--frames", "0,1", "--validate", "1:"], "images 1 are fitted and predicted, expected others to predict"),
-        (["--validate", ":"], "all images are predicted, expected some to fit"),
         (["--validate", "9"], "image 9 does not exist, expected 0 to 2"),
-        (["--frames", "9"], "image 9 does not exist, expected 0 to 2"),
         (["--frames", "one"], "frames are 'one', expected numbers such as 0,5,10 or 0:20:5"),
-        (["--frames", "5:9"], "frames are '5:9', expected at least one of the 3 images"),
-        (["--transform", "ImageToPatient"], "no path from Image to Patient"),
-        (["--free", "brightness"], "no free parameter 'brightness'"),
         (["--free", "gain_db=5:1"], "bounds of gain_db are 5.0 to 1.0, expected two numbers, the smaller one first"),
-        (["--free", "gain_db=5"], "as in white matter.mu0=0.1:0.8"),
         (["--free", "liver.mu0"], "no free parameter 'liver.mu0'"),
-        (["--calibration", "nowhere.xml"], "nowhere.xml: cannot be read"),
-        (["--to-mri", "nowhere.tag"], "nowhere.tag: no such file"),
         (["--save-transform", "there.json"], "--save-transform needs --register"),
         (["--register", "--save-transform", "there.tfm"], "there.tfm, expected a name ending in .json"),
         (["--state", "result.json"], "given for 2 outputs, expected a separate file for each"),
-        (["--report", "/nowhere/report.html"], "the folder /nowhere does not exist"),
         (["--state", "probe.json"], "probe.json is an input, which it would replace"),
-        (["--state", "wrong.json"], "the state to resume is invalid"),
     ],
 )
 def test_mistakes_are_one_line_and_write_nothing(folder, options, message, monkeypatch):
     monkeypatch.chdir(folder)
     (folder / "result.json").unlink(missing_ok=True)
-    (folder / "wrong.json").write_text("{}")
     before = sorted(path.name for path in folder.iterdir())
     done = optimize(folder, "--evaluations", 5, *options)
     assert done.exit_code == 2
     lines = [line for line in done.output.splitlines() if line.startswith("ussim:")]
     assert len(lines) == 1 and message in lines[0]
     assert sorted(path.name for path in folder.iterdir()) == before
-
-
-def test_black_images_and_a_sequence_that_is_none_are_refused(folder, tmp_path):
-    sequence = TrackedSequence.read(folder / "tracked.igs.mha")
-    sequence.with_images([0, 1, 2], np.zeros_like(sequence.images)).write(tmp_path / "black.igs.mha")
-    (tmp_path / "none.igs.mha").write_text("no sequence")
-    for name, message in (
-        ("black", "image 0 of the sequence is black"),
-        ("none", "has no line ElementDataFile, expected a MetaImage"),
-    ):
-        done = ussim(
-            "optimize", folder / "labels.nii.gz", "--sequence", tmp_path / f"{name}.igs.mha", "--probe",
-            folder / "probe.json", "-o", tmp_path / "result.json",
-        )  # fmt: skip
-        assert done.exit_code == 2 and message in done.output and not (tmp_path / "result.json").exists()
-
-
-@needs_shared
-@pytest.mark.slow
-def test_a_real_sequence_is_fitted_with_a_plus_calibration(folder, tmp_path):
-    """Geometry estimated from real images, tracking from Plus: a block of muscle replaces the unknown phantom."""
-    (tmp_path / "plus.xml").write_text(
-        '<PlusConfiguration><CoordinateDefinitions><Transform From="Image" To="Probe" '
-        'Matrix="0.0854 0 0 -35 0 0.0854 0 -1.2 0 0 0.0854 0 0 0 0 1"/></CoordinateDefinitions></PlusConfiguration>'
-    )
-    sequence = TrackedSequence.read(SHARED / "BoneUltrasound_L14.igs.mha")
-    centre = sequence.pose(0, "ProbeToReference") @ [0, 25, 0, 1]
-    place = np.eye(4)
-    place[:3, 3] = centre[:3] - 60
-    Volume(np.full((120, 120, 120), 1, np.uint8), place).write(tmp_path / "block.nii.gz")
-    TissueTable.named(["muscle"]).write(tmp_path / "block.json")
-    done = ussim(
-        "optimize", tmp_path / "block.nii.gz", "--labels", "--sequence", SHARED / "BoneUltrasound_L14.igs.mha",
-        "--calibration", tmp_path / "plus.xml", "--frames", "0,10", "--free", "display", "--free", "muscle",
-        "--evaluations", 60, "--restarts", 0, "-o", tmp_path / "result.json",
-    )  # fmt: skip
-    assert done.exit_code == 0, done.output
-    result = json.loads((tmp_path / "result.json").read_text())
-    assert result["cost_after"] < 0.8 * result["cost_before"]
 
 
 @pytest.mark.slow

@@ -10,31 +10,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 import SimpleITK as sitk
-from hypothesis import given, settings, strategies as st
 from vtkmodules.vtkIOXML import vtkXMLImageDataWriter
 
 from SlicerUSSim.Logic import SimulationError, Volume
 from SlicerUSSim.Logic.tissue import TissueTable
 from SlicerUSSim.Logic.tissue.label_files import read_names
 from SlicerUSSim.Logic.tracked.pose_files import read_pose, read_tags, read_transform
-from SlicerUSSim.Logic.tracked.sequence import TrackedSequence, read_coordinate_definitions
+from SlicerUSSim.Logic.tracked.sequence import read_coordinate_definitions
 
 ARRAY = (np.arange(6 * 5 * 4) % 200).reshape(6, 5, 4).astype(np.int16)
-#: What numbers of a header are replaced by
-EVIL = (
-    "1e6",
-    "1e308",
-    "-1e308",
-    "4294967296",
-    "2147483647",
-    "999999999999999999999",
-    "-1",
-    "0",
-    "nan",
-    "inf",
-    "",
-    "3 3 3 3",
-)
 
 
 def written(folder: Path, suffix: str) -> Path:
@@ -59,21 +43,15 @@ def refused(path: Path, words: str, read=Volume.read) -> None:
 @pytest.mark.parametrize(
     ("old", "new", "words"),
     [
-        (b"NDims = 3", b"NDims = 1000000", "NDims is 1000000, expected 2, 3 or 4"),
         (b"NDims = 3", b"NDims = 999999999999999999999", "NDims is '999999999999999999999'"),
-        (b"NDims = 3", b"NDims = -1e308", "NDims is '-1e308', expected whole numbers"),
-        (b"-1 0 0 0 -1 0 0 0 1", b"-1 0 0 0 -1 0 0 1e308 1", "TransformMatrix is"),
         (b"-1 0 0 0 -1 0 0 0 1", b"-1 0 0 0 -1 0 0 nan 1", "TransformMatrix is"),
         (b"DimSize = 4 5 6", b"DimSize = 4 5 4294967296", "has 4x5x4294967296 voxels, expected at most"),
         (b"DimSize = 4 5 6", b"DimSize = 4 5 600000", "which its"),
         (b"DimSize = 4 5 6", b"DimSize = 4 5 12", "enough for 6 of 12 slices"),  # the rest was what the memory held
-        (b"DimSize = 4 5 6", b"DimSize = 4 5", "DimSize is '4 5', expected 3 numbers above 0"),
         (b"ElementSpacing = 1 1 2", b"ElementSpacing = 1 1 \xff", "is not text"),
         (b"ElementDataFile", b"ElementDataPile", "its header"),
         (b"LOCAL", b"%n%n.raw 1 9 1", "ElementDataFile is '%n%n.raw 1 9 1', expected a file"),  # went to printf
-        (b"LOCAL", b"%03d%s.raw 1 6 1", "ElementDataFile is '%03d%s.raw 1 6 1', expected a file"),
         (b"DimSize = 4 5 6", "DimSize = 4 5 \u0666".encode(), "DimSize is '4 5 \u0666', expected whole numbers"),
-        (b"ElementSpacing = 1 1 2", "ElementSpacing = 1 1 \u0662".encode(), "expected 3 numbers"),
     ],
 )
 def test_a_metaimage_that_no_reader_survives_is_refused(tmp_path, old, new, words):
@@ -85,7 +63,6 @@ def test_a_metaimage_that_no_reader_survives_is_refused(tmp_path, old, new, word
     [
         (b'WholeExtent="0 3 0 4 0 5"', b'WholeExtent="0 999999999 0 4 0 5"', "voxels, expected at most"),
         (b'WholeExtent="0 3 0 4 0 5"', b'WholeExtent="0 9999 0 9999 0 5"', "which its"),
-        (b'WholeExtent="0 3 0 4 0 5"', b'WholeExtent="0 3 0 4 5 0"', "WholeExtent is"),
         (b'WholeExtent="0 3 0 4 0 5"', b'WholeExtent="0 3 0 4 0 2"', "the extent of its piece is"),
         (b'Spacing="1 1 2"', b'Spacing="1 1 1e308"', "Spacing is '1 1 1e308'"),
         (b"<ImageData", b"<ImageDada", "cannot be read as a VTK image"),
@@ -106,9 +83,13 @@ def test_slices_in_numbered_files_are_read(tmp_path):
     np.testing.assert_array_equal(Volume.read(tmp_path / "image.mhd").array, ARRAY)
 
 
-@pytest.mark.parametrize("mode", ["Ascii", "Binary", "Appended", "Raw"])
-@pytest.mark.parametrize("compressor", ["None", "ZLib"])
-@pytest.mark.parametrize("bits", [32, 64])
+@pytest.mark.parametrize(
+    ("mode", "compressor", "bits"),
+    [
+        ("Binary", "None", 32), ("Binary", "ZLib", 64), ("Appended", "None", 32), ("Appended", "ZLib", 64),
+        ("Raw", "None", 64), ("Raw", "ZLib", 32),
+    ],
+)  # fmt: skip
 def test_numbers_in_front_of_the_values_of_a_vti_are_no_more_than_it_holds(tmp_path, mode, compressor, bits):
     """VTK allocated gigabytes for a file of 1 kB."""
     path = tmp_path / "image.vti"
@@ -121,8 +102,6 @@ def test_numbers_in_front_of_the_values_of_a_vti_are_no_more_than_it_holds(tmp_p
     writer.SetInputData(Volume(ARRAY, np.diag([1.0, 1.0, 2.0, 1.0])).to_vtk())
     writer.Write()
     np.testing.assert_array_equal(Volume.read(path).array, ARRAY)
-    if mode == "Ascii":
-        return
     many = np.array([10**9] * (1 if compressor == "None" else 3), f"<u{bits // 8}").tobytes()
     numbers = many if mode == "Raw" else base64.b64encode(many)
     content = path.read_bytes()
@@ -131,28 +110,6 @@ def test_numbers_in_front_of_the_values_of_a_vti_are_no_more_than_it_holds(tmp_p
         place = re.search(rb'format="binary"[^>]*>\s*', content).end()
     path.write_bytes(content[:place] + numbers + content[place + len(numbers) :])
     refused(path, "bytes, which its")
-
-
-@pytest.mark.parametrize("suffix", [".mha", ".nrrd", ".vti", ".nii"])
-@settings(max_examples=60, deadline=None, derandomize=True)
-@given(data=st.data())
-def test_numbers_of_a_header_are_replaced_and_what_is_read_is_an_image_or_one_line(tmp_path_factory, suffix, data):
-    path = written(tmp_path_factory.mktemp("file"), suffix)
-    content = bytearray(path.read_bytes())
-    if suffix == ".nii":
-        place = data.draw(st.integers(0, 347))
-        content[place] = data.draw(st.integers(0, 255))
-    else:
-        places = list(re.finditer(rb"[-+0-9.eE]+", bytes(content[:600])))
-        match = data.draw(st.sampled_from(places))
-        content[match.start() : match.end()] = data.draw(st.sampled_from(EVIL)).encode()
-    path.write_bytes(content)
-    try:
-        volume = Volume.read(path)
-    except SimulationError as error:
-        assert "\n" not in str(error) and str(path) in str(error)
-    else:
-        assert np.isfinite(volume.ijk_to_ras).all()
 
 
 @pytest.mark.parametrize(
@@ -176,27 +133,6 @@ def test_a_name_that_is_not_utf8_is_refused(tmp_path):
     str(error.value).encode()
 
 
-def test_fields_of_a_sequence_that_are_not_text_are_one_line(tmp_path):
-    path = tmp_path / "s.igs.mha"
-    images = np.zeros((2, 8, 8), np.uint8)
-    TrackedSequence(images, ({"ImageToReference": np.eye(4)},) * 2, np.arange(2.0)).write(path)
-    refused(with_bytes(path, b"Seq_Frame0000", b"Seq_\xff\xferame0000"), "is not text", TrackedSequence.read)
-    path = tmp_path / "s.seq.nrrd"
-    TrackedSequence(images, ({"ImageToReference": np.eye(4)},) * 2, np.arange(2.0)).write(path)
-    content = path.read_bytes()
-    start = content.index(b"\n\n") + 20
-    path.write_bytes(content[:start] + b"\x55\xaa" + content[start + 2 :])
-    refused(path, "cannot be read", TrackedSequence.read)
-
-
-@pytest.mark.parametrize("damage", [b"\0", b"\xff"])
-def test_a_transform_that_is_not_text_is_one_line(tmp_path, damage):
-    path = tmp_path / "pose.tfm"
-    sitk.WriteTransform(sitk.Euler3DTransform((0, 0, 0), 0.1, 0.2, 0.3, (1, 2, 3)), str(path))
-    read_pose(path)
-    refused(with_bytes(path, b"0.1", b"0" + damage + b"1"), "is not a text", read_pose)
-
-
 @pytest.mark.parametrize(
     "old, new, words",
     [
@@ -217,7 +153,7 @@ def test_a_transform_without_all_its_numbers_is_refused(tmp_path, old, new, word
     refused(with_bytes(path, old.encode(), new.encode()), words, read_pose)
 
 
-@pytest.mark.parametrize("suffix", [".tfm", ".mat", ".h5"])
+@pytest.mark.parametrize("suffix", [".tfm", ".mat", pytest.param(".h5", marks=pytest.mark.slow)])
 def test_every_rigid_kind_of_transform_and_a_chain_of_them_are_read(tmp_path, suffix):
     path = tmp_path / f"pose{suffix}"
     euler = sitk.Euler3DTransform((0, 0, 0), 0.1, 0.2, 0.3, (1, 2, 3))
@@ -240,21 +176,6 @@ def test_every_rigid_kind_of_transform_and_a_chain_of_them_are_read(tmp_path, su
 
 
 @pytest.mark.parametrize(
-    "text", ["1" + "0" * 400, '{"tissues": 5}', '{"tissues": {"1": {"name": "csf", "sources": 5}}}']
-)
-def test_a_table_of_other_content_is_one_line(tmp_path, text):
-    path = tmp_path / "tissues.json"
-    path.write_text(text)
-    refused(path, "", TissueTable.read)
-
-
-def test_tags_that_are_no_numbers_are_one_line(tmp_path):
-    path = tmp_path / "points.tag"
-    path.write_text("MNI Tag Point File\nVolumes = 1;\nPoints =\n 1 2 1e999;\n")
-    refused(path, "", read_tags)
-
-
-@pytest.mark.parametrize(
     ("name", "read"),
     [
         ("p.txt", read_pose), ("t.tfm", read_pose), ("t.xfm", read_transform), ("p.tag", read_tags),
@@ -262,7 +183,7 @@ def test_tags_that_are_no_numbers_are_one_line(tmp_path):
         ("t.json", TissueTable.read),
     ],
 )  # fmt: skip
-def test_a_text_far_larger_than_any_of_its_kind_is_refused_before_it_is_read(tmp_path, name, read):
+def test_a_text_far_larger_than_its_kind_is_refused_before_it_is_read(tmp_path, name, read):
     path = tmp_path / name
     path.write_text("#Insight\n" if name == "t.tfm" else "1 ")
     os.truncate(path, 2**40)  # without blocks on the disk

@@ -58,11 +58,7 @@ def test_geometry_is_found_from_the_image(probe):
     assert field.overlap > 0.95
 
 
-@pytest.mark.parametrize(
-    "kind",
-    [LinearProbe(38, 50), ConvexProbe(40, 60, 80), ConvexProbe(15, 70, 60), PhasedProbe(70, 80)],
-    ids=["linear", "convex", "micro-convex", "phased"],
-)
+@pytest.mark.parametrize("kind", [LinearProbe(38, 50), ConvexProbe(15, 70, 60)], ids=["linear", "micro-convex"])
 def test_edges_of_the_field_are_those_of_pixels_not_of_their_centres(kind):
     """Over pixels that lie anywhere on the field the estimate is right on average: half a pixel would be seen."""
     random, spacing, errors = np.random.default_rng(0), 0.25, []
@@ -175,14 +171,6 @@ def test_images_are_spread_over_those_that_were_tracked():
     assert TrackedImages.of(many, [2, 3, 4, 5], most=3).numbers == [2, 3, 4, 5]
 
 
-def test_registration_moves_the_poses():
-    sequence = tracked_screen(ConvexProbe(40, 60, 80))
-    moved = np.eye(4)
-    moved[:3, 3] = 1, 2, 3
-    before, after = TrackedImages.of(sequence), TrackedImages.of(sequence, reference_to_ras=moved)
-    assert np.allclose(after.poses[0], moved @ before.poses[0])
-
-
 def test_bad_sequences_are_refused_in_one_line():
     sequence = tracked_screen(LinearProbe(40, 50))
     black = sequence.with_images([0, 1], np.stack([sequence.images[0], np.zeros_like(sequence.images[0])]))
@@ -238,8 +226,8 @@ def test_the_field_is_found_from_all_images_of_a_recording():
     assert found.mask.sum() == pytest.approx(whole.mask.sum(), rel=0.02)
 
 
-@pytest.mark.parametrize("probe", [CONVEX, PhasedProbe(70, 80)])
-def test_one_image_that_is_partly_dark_is_enough_with_a_probe(probe):
+def test_one_image_that_is_partly_dark_is_enough_with_a_probe():
+    probe = CONVEX
     image, grid = screen(probe)
     image[: 15 + grid.rows, 60 + 4 * grid.columns // 5 :] = 0
     image[15 + 2 * grid.rows // 3 :] = 0  # and nothing comes from the depth
@@ -336,8 +324,7 @@ def speckled(probe, count: int = 12) -> TrackedSequence:
     return sequence.with_images(range(count), np.where(inside, levels, 0).astype(np.uint8))
 
 
-@pytest.mark.parametrize("height", [10, 14, 20])
-@pytest.mark.parametrize("count", [4, 12])
+@pytest.mark.parametrize(("height", "count"), [(10, 4), (20, 12)])
 def test_letters_with_smooth_edges_are_left_out(height, count, caplog):
     """Of text 10 pixels high nothing was left out, of 14 pixels half."""
     sequence = speckled(CONVEX, count)
@@ -351,7 +338,7 @@ def test_letters_with_smooth_edges_are_left_out(height, count, caplog):
     assert (hidden & ~ndimage.binary_dilation(part > 0, iterations=8)).sum() < 10
 
 
-@pytest.mark.parametrize("step", [(20, 0), (5, 0), (3, 4)], ids=["ticks", "dots", "oblique dots"])
+@pytest.mark.parametrize("step", [(20, 0), (3, 4)], ids=["ticks", "oblique dots"])
 def test_ticks_and_dots_are_left_out(step, caplog):
     sequence = speckled(CONVEX)
     part = np.zeros(sequence.images.shape[1:])
@@ -385,25 +372,12 @@ def test_images_that_cannot_tell_what_is_drawn_are_said(caplog):
     TrackedImages.of(few, probe=CONVEX)
     assert "marks in the images could not be looked for: 3 different images, expected at least 4" in caplog.text
     caplog.clear()
-    TrackedImages.of(few.with_images([0] * 6, few.images[[0] * 6]), probe=CONVEX)
-    assert "could not be looked for: 1 different image, expected at least 4" in caplog.text
-    caplog.clear()
     still = few.images[[0] * 6] + np.arange(6, dtype=np.uint8)[:, None, None] * (few.images[0] > 0)
     TrackedImages.of(few.with_images([0] * 6, still.astype(np.uint8)), probe=CONVEX)
     assert "changes by at most 5 grey levels from image to image, expected 20 or more" in caplog.text
     caplog.clear()
     TrackedImages.of(replace(few, fields={"SlicerUSSimSimulated": "twin 1"}), probe=CONVEX)
     assert "could not be looked for" not in caplog.text
-
-
-def test_the_dark_tip_of_a_sector_is_no_cut(caplog):
-    """One image of a real sweep ended "4 before the left end of the probe's field", where it was dark."""
-    sequence = recording(CONVEX, 1)
-    images = sequence.images.copy()
-    columns = np.arange(images.shape[2])
-    images[0][np.random.default_rng(1).random(images.shape[1:]) > (columns - 4) / 25] = 0
-    TrackedImages.of(sequence.with_images([0], images), probe=CONVEX)
-    assert "the images end at" not in caplog.text
 
 
 def test_pixels_of_another_size_are_named():
@@ -452,12 +426,8 @@ def in_colours(path, sequence: TrackedSequence, colours: np.ndarray) -> TrackedS
 
 @pytest.mark.parametrize(
     "tint",
-    [
-        np.outer(np.arange(256), [1, 0.85, 0.6]),
-        np.outer(np.arange(256), [1, 0.97, 0.85]),
-        np.clip(np.arange(256)[:, None] * 3 - np.array([0, 255, 510]), 0, 255),
-    ],
-    ids=["sepia", "slight", "hot iron"],
+    [np.outer(np.arange(256), [1, 0.85, 0.6]), np.clip(np.arange(256)[:, None] * 3 - np.array([0, 255, 510]), 0, 255)],
+    ids=["sepia", "hot iron"],
 )
 def test_tinted_images_are_grey_levels_and_that_is_said(tint, tmp_path, caplog):
     """Sepia was Doppler's: what was left of the field was black, and fitted."""
@@ -469,18 +439,6 @@ def test_tinted_images_are_grey_levels_and_that_is_said(tint, tmp_path, caplog):
     found = TrackedImages.of(read, probe=CONVEX)
     assert "have colours" not in caplog.text
     assert found.field.mask.sum() == ImagedField.of(CONVEX, found.field.image_to_probe, levels.shape[1:]).mask.sum()
-
-
-def test_doppler_in_tinted_images_is_left_out(tmp_path, caplog):
-    sequence = recording(CONVEX)
-    colours = (sequence.images[..., None] * np.array([1, 0.85, 0.6])).astype(np.uint8)
-    box = (slice(180, 240), slice(150, 220))
-    colours[(slice(None), *box, 0)] = 250
-    found = TrackedImages.of(in_colours(tmp_path / "tinted.mha", sequence, colours), probe=CONVEX)
-    assert "the images are tinted" in caplog.text and "have colours, as of Doppler or markers" in caplog.text
-    assert found.field.mask[box].mean() < 0.05
-    clean = ImagedField.of(CONVEX, found.field.image_to_probe, colours.shape[1:3]).mask
-    assert not (clean & ~found.field.mask)[:170].any()
 
 
 def test_colours_that_are_no_colour_map_are_refused_where_most_is_coloured(tmp_path):
@@ -528,23 +486,12 @@ def test_what_is_white_in_all_saturated_images_is_the_patient_and_no_logo(caplog
     assert found.field.mask[middle[0] : middle[0] + 30, middle[1] : middle[1] + 30].all()
 
 
-def test_a_white_logo_is_no_saturation(caplog):
-    sequence = recording(CONVEX)
-    images = sequence.images.copy()
-    middle = np.array(images.shape[1:]) // 2
-    images[:, middle[0] : middle[0] + 40, middle[1] : middle[1] + 60] = 255
-    TrackedImages.of(sequence.with_images(range(6), images), probe=CONVEX)
-    assert "are the same in all images" in caplog.text
-    assert "saturated" not in caplog.text
-
-
-@pytest.mark.parametrize("level", [100, 255])
-def test_an_image_of_one_grey_level_is_refused_with_its_number_and_the_level(level):
+def test_an_image_of_one_grey_level_is_refused_with_its_number():
     """White images were fitted, with costs and textures that were no numbers."""
     sequence = recording(CONVEX, 2)
     images = sequence.images.copy()
-    images[1] = level
-    with pytest.raises(SimulationError, match=f"image 1 has the grey level {level} in all of the probe's field"):
+    images[1] = 255
+    with pytest.raises(SimulationError, match="image 1 has the grey level 255 in all of the probe's field"):
         TrackedImages.of(sequence.with_images([0, 1], images), probe=CONVEX)
 
 

@@ -41,7 +41,7 @@ def test_views_lie_side_by_side_in_their_order(tmp_path):
     assert outlined(two)[:, 1].min() > 0.5 * two.shape[1]
 
 
-def test_an_mri_is_as_bright_as_its_tissue_and_an_ultrasound_image_as_its_grey_levels(tmp_path):
+def test_an_mri_fills_the_display_and_an_image_keeps_its_levels(tmp_path):
     """A faint MRI fills the display, a faint B-mode image stays faint."""
     mri, bmode = (drawn(tmp_path, kind) for kind in ("mri", "bmode"))
     centre = tuple(slice(size // 2 - 10, size // 2 + 10) for size in mri.shape[:2])

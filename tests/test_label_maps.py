@@ -112,42 +112,12 @@ def refused(*arguments) -> str:
     return errors[0]
 
 
-def test_the_workstation_refuses_a_label_map_as_an_mri_and_names_the_file(tmp_path, monkeypatch):
-    """It was shown, with a warning that named no file."""
-    monkeypatch.chdir(tmp_path)
-    tumour((1, 3, 2)).write("map.nii.gz")
-    message = refused("serve", "map.nii.gz")
-    assert message.startswith("ussim: map.nii.gz: a tumour's labels (as BraTS")
-    assert "with MRI --add brats=map.nii.gz, or simulate it alone (ussim simulate) with --map 1=necrosis" in message
-    head().write("aseg.nii.gz")
-    assert "expected an MRI; use it as it is (--labels aseg.nii.gz)" in refused("serve", "aseg.nii.gz")
-
-
 def test_probabilities_of_a_lesion_in_place_of_an_mri_get_the_hint(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     mask = tumour((1, 1, 1))
-    soft = 0.8 * ndimage.gaussian_filter(mask.array.astype(np.float32), 2.0)
-    mask.with_array(soft).write("soft.nii.gz")
-    for command in (("segment", "-o", "out.nii.gz"), ("simulate", "--pose", "auto", "-o", "a.png")):
-        assert "the probabilities of a lesion are added to an MRI with --add tumour=FILE" in refused(
-            *command, "soft.nii.gz"
-        )
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("largest, spacing", [(1.0, 2), (255.0, 2), (1.0, 1)])
-def test_probabilities_of_a_tissue_in_place_of_an_mri_get_the_hint(tmp_path, monkeypatch, mni, largest, spacing):
-    """A map of grey matter was "a small head, a wrong voxel size, or no head", or a T2 by its order of brightness."""
-    monkeypatch.chdir(tmp_path)
-    grey = mni[1]
-    share = grey.array.astype(np.float32) / grey.array.max()
-    share = ndimage.gaussian_filter(share, 0.7)[::2, ::2, ::2] if spacing > 1 else share
-    values = largest * share / share.max()
-    matrix = grey.ijk_to_ras @ np.diag([spacing, spacing, spacing, 1.0])
-    Volume(np.round(values).astype(np.uint8) if largest > 1 else values, matrix).write("grey.nii.gz")
-    message = refused("segment", "-o", "out.nii.gz", "grey.nii.gz")
-    assert f"the probabilities of a tissue (values from 0 to {largest:g}), use the MRI from which" in message
-    assert ("--add tumour=FILE" in message) == (largest == 1.0)
+    mask.with_array(0.8 * ndimage.gaussian_filter(mask.array.astype(np.float32), 2.0)).write("soft.nii.gz")
+    message = refused("segment", "-o", "out.nii.gz", "soft.nii.gz")
+    assert "the probabilities of a lesion are added to an MRI with --add tumour=FILE" in message
 
 
 # ---- names -----------------------------------------------------------------------------------------------------------
@@ -190,16 +160,14 @@ def test_the_nearest_tissue_is_not_taken_for_a_tissue():
 # ---- programs, by their numbers alone --------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("dtype", [np.int16, np.int32, np.float32])
-@pytest.mark.parametrize("suffix", [".nii.gz", ".nrrd"])
 @pytest.mark.parametrize(
-    ("labels", "title", "tissues"),
+    ("labels", "title", "tissues", "suffix", "dtype"),
     [
-        (ASEG, "FreeSurfer aseg", 5),
-        (SYNTHSEG, "FreeSurfer's numbers, as SynthSeg uses them", 3),
-        (APARC, "FreeSurfer or FastSurfer aparc+aseg", 5),
-        (WMPARC, "FreeSurfer wmparc", 5),
-        (DESTRIEUX, "FreeSurfer aparc.a2009s+aseg", 5),
+        (ASEG, "FreeSurfer aseg", 5, ".nii.gz", np.int16),
+        (SYNTHSEG, "FreeSurfer's numbers, as SynthSeg uses them", 3, ".nrrd", np.float32),
+        (APARC, "FreeSurfer or FastSurfer aparc+aseg", 5, ".nii.gz", np.int32),
+        (WMPARC, "FreeSurfer wmparc", 5, ".nii.gz", np.float32),
+        (DESTRIEUX, "FreeSurfer aparc.a2009s+aseg", 5, ".nrrd", np.int16),
     ],
     ids=["aseg", "synthseg", "aparc", "wmparc", "a2009s"],
 )
@@ -235,16 +203,6 @@ def test_a_part_of_a_body_is_recognised_by_its_places():
     assert read_label_map(made(abdomen)).message.startswith("TotalSegmentator CT: 13 labels to ")
 
 
-def test_a_part_of_a_body_that_two_tasks_number_alike_is_called_so():
-    """The upper abdomen of an MR was called TotalSegmentator CT, whose first nine labels are the same."""
-    shared = {n: name for n, name in numbered(MR).items() if n in (1, 2, 3, 4, 5, 6, 7, 8, 9)}
-    assert read_label_map(made(shared)).message.startswith("TotalSegmentator CT or MR: 9 labels to ")
-    said = read_label_map(made(shared), mapping=LabelMapping.of("totalsegmentator-mr"))
-    assert said.message.startswith("TotalSegmentator MR: 9 labels to ")
-    lungs = {**shared, 10: "lung_left"}  # and with names in the header, nine of ten are those of CT
-    assert read_label_map(made(lungs), lungs).message.startswith("TotalSegmentator MR: 10 labels to ")
-
-
 def test_tissues_of_a_head_without_their_names_are_not_taken_for_organs(tmp_path):
     """Nine shells as `ussim segment --outside` numbers them, without their .json, were read as organs of an abdomen."""
     grid = np.stack(np.meshgrid(*[np.arange(64.0)] * 3, indexing="ij"))
@@ -274,11 +232,6 @@ def test_two_tissues_for_one_label_are_refused(tmp_path):
     assert LabelMapping.of(["24=csf", "24=CSF"]).by_label == {24: "csf"}
 
 
-def test_more_than_62_labels_are_merged_by_tissue_before_they_are_counted():
-    found = read_label_map(made(numbered(CT)))
-    assert len(found.relabelled) == 118 and found.labels.array.max() == len(found.names) < 20
-
-
 def test_numbers_alone_do_not_make_a_program():
     """The controls: the same numbers elsewhere in the body, and atlases of others with the same range of numbers."""
     rng = np.random.default_rng(5)
@@ -294,7 +247,7 @@ def test_numbers_alone_do_not_make_a_program():
         read_label_map(made(shuffled))
 
 
-def test_labels_that_several_programs_use_alike_are_an_error_that_names_them():
+def test_labels_that_several_programs_use_alike_are_refused():
     # Spleen, kidneys and liver have the same numbers in all of TotalSegmentator's; 30 to 33 have not.
     shared = {n: numbered(CT)[n] for n in (1, 2, 3, 5)}
     assert "TotalSegmentator" not in str(refusal_of(made(shared)))  # too few structures to be sure
@@ -323,7 +276,7 @@ def few(labels: tuple[int, ...]) -> Volume:
     return Volume(array, np.diag([2.0, 2.0, 2.0, 1.0]))
 
 
-def test_too_few_labels_of_a_program_are_refused_with_the_program_whose_numbers_they_are():
+def test_too_few_labels_are_refused_with_the_program_they_may_be_of():
     refusal = str(refusal_of(few((90, 91)), mapping=LabelMapping.of("92=0")))
     assert "if the numbers are those of TotalSegmentator CT (90 brain, 91 skull)" in refusal
     assert "--map totalsegmentator" in refusal
@@ -371,12 +324,6 @@ def tumour(labels: tuple[int, int, int]) -> Volume:
                   np.diag([3.0, 3.0, 3.0, 1.0]))  # fmt: skip
 
 
-def test_the_remedy_for_a_lesion_without_a_file_has_the_place_of_a_file():
-    """It was --add 'brats=label map'."""
-    with pytest.raises(SimulationError, match=r"^label map: a tumour's labels .* with --add brats=FILE, or simulate"):
-        read_label_map(tumour((1, 3, 2)))
-
-
 @pytest.mark.parametrize(("labels", "title"), [((1, 2, 4), "BraTS 2017 to 2022"), ((1, 2, 3), "BraTS since 2023")])
 @pytest.mark.parametrize("stored", [np.uint8, np.float32])
 def test_a_tumour_of_brats_is_no_patient(labels, title, stored, tmp_path):
@@ -398,46 +345,30 @@ def test_a_binary_mask_is_no_patient_unless_the_user_says_what_it_is(tmp_path):
     assert f"{path}: a binary mask (1 label, 67 ml), not a patient's tissues" in message
     assert f"--add tumour={path}, or simulate it alone with --map 255=tumour (ussim simulate)" in message
     assert "--mask" not in message
-    brain = tmp_path / "brain.nii.gz"
-    mask.with_array(mask.array > -1).write(brain)  # everything
-    message = refused("simulate", brain, "--pose", "auto", "-o", tmp_path / "o.png")
-    assert f"if it is the mask of a brain, give it with that brain's MRI as --mask {brain}" in message
-    assert "--add" not in message
+    everything = str(refusal_of(mask.with_array(mask.array > -1)))
+    assert "if it is the mask of a brain, give it with that brain's MRI as --mask" in everything
+    assert "--add" not in everything
     for tissue in ("liver", "tumour"):
-        result = ussim("simulate", path, "--map", f"255={tissue}", "--pose", "auto", "-o", tmp_path / f"{tissue}.png")
-        assert result.exit_code == 0 and "glioma.nii.gz: mapped: 1 label to 1 tissue" in result.stderr, result.output
-    table = tmp_path / "tissues.json"
-    TissueTable({255 % 62: TISSUES["liver"]}).write(table)
-    assert "a binary mask" in refused("simulate", path, "--tissues", table, "--pose", "auto", "-o", tmp_path / "o.png")
+        found = read_label_file(path, mask, LabelMapping.of(f"255={tissue}"))
+        assert found.message == "mapped: 1 label to 1 tissue" and found.names == (tissue,)
+    table = TissueTable({255 % 62: TISSUES["liver"]})
+    with pytest.raises(SimulationError, match="a binary mask"):
+        read_label_file(path, mask, table=table)
 
 
-@pytest.mark.parametrize("command", [("demo", "--out", "demo", "--mri"), ("segment", "-o", "out.nii.gz")])
-def test_commands_for_an_mri_say_what_a_label_map_is_for_and_no_option_that_they_lack(command, tmp_path, monkeypatch):
+def test_a_command_for_an_mri_says_what_a_label_map_is_for(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     tumour((255, 255, 255)).write("glioma.nii.gz")
-    message = refused(*command, "glioma.nii.gz")
-    assert message.endswith(
-        "a binary mask (1 label, 67 ml), not a patient's tissues; add it to an MRI's tissues with --add "
-        "tumour=glioma.nii.gz, or simulate it alone (ussim simulate) with --map 255=tumour"
-    )
-    brats = tumour((1, 3, 2))
-    brats.write("map.nii.gz")
-    message = refused(*command, "map.nii.gz")
-    assert "a tumour's labels (as BraTS" in message and "--add brats=map.nii.gz, or simulate it alone" in message
-    assert message.endswith("if it is a brain, use ussim simulate with --map ussim")
-    Path("map.nii.gz").unlink()
+    tumour((1, 3, 2)).write("brats.nii.gz")
     unknown = head()
     unknown.with_array(np.where(unknown.array == 3, 515, unknown.array)).write("unknown.nii.gz")
-    few((90, 91)).write("few.nii.gz")
-    for name, count in (("unknown.nii.gz", 8), ("few.nii.gz", 2)):
-        message = refused(*command, name)
-        assert "--map" not in message and len(message) < 200
-        assert (
-            f"{name}: is a label map ({count} labels), expected an MRI; use it as it is (ussim simulate {name}"
-            in message
-        )
-    assert "--map" not in ussim("demo", "--help").stdout
-    assert {path.name for path in tmp_path.iterdir()} == {"glioma.nii.gz", "unknown.nii.gz", "few.nii.gz"}
+    for name, message in (
+        ("glioma", "add it to an MRI's tissues with --add tumour=glioma.nii.gz, or simulate it alone (ussim simulate)"),
+        ("brats", "--add brats=brats.nii.gz, or simulate it alone"),
+        ("unknown", "unknown.nii.gz: is a label map (8 labels), expected an MRI; use it as it is (ussim simulate unkn"),
+    ):
+        assert message in refused("segment", "-o", "out.nii.gz", f"{name}.nii.gz")
+    assert not Path("out.nii.gz").exists()
 
 
 def test_a_lesion_with_a_name_is_no_patient_but_an_organ_is():
@@ -452,17 +383,14 @@ def test_a_lesion_with_a_name_is_no_patient_but_an_organ_is():
 
 def test_unknown_labels_are_listed_with_volumes_and_a_remedy_that_works(tmp_path):
     volume = head()
-    array = volume.array.copy()
-    array[:6, :6, :6] = 512
-    path, out = tmp_path / "seg.nii.gz", tmp_path / "o.png"
-    volume.with_array(array).write(path)
-    message = refused("simulate", path, "--pose", "auto", "-o", out)
-    assert "seg.nii.gz: no tissue is called label 512 (5.8 ml); map them with --map 512=TISSUE" in message
-    mapping = tmp_path / "mapping.json"
-    mapping.write_text(json.dumps({"512": "skull", "3": "csf", "42": 0}))
-    for options in (("--map", mapping), ("--map", "512=skull", "--map", "Left-Cerebral-Cortex=csf", "--map", "42=0")):
-        result = ussim("simulate", path, *options, "--pose", "auto", "-o", out)
-        assert result.exit_code == 0 and "FreeSurfer aseg: 9 labels to 4 tissues" in result.stderr, result.output
+    volume.array[:6, :6, :6] = 512
+    message = str(refusal_of(volume))
+    assert "no tissue is called label 512 (5.8 ml); map them with --map 512=TISSUE" in message
+    file = tmp_path / "mapping.json"
+    file.write_text(json.dumps({"512": "skull", "3": "csf", "42": 0}))
+    for texts in ([str(file)], ["512=skull", "Left-Cerebral-Cortex=csf", "42=0"]):
+        found = read_label_map(volume, mapping=LabelMapping.of(texts))
+        assert found.message == "FreeSurfer aseg: 9 labels to 4 tissues"
 
 
 def test_a_mapping_goes_before_names_and_numbers_and_removes_labels():
@@ -487,29 +415,21 @@ def test_a_mapping_goes_before_names_and_numbers_and_removes_labels():
     ("text", "message"),
     [
         ("csf", "--map is 'csf', expected LABEL=TISSUE such as 24=csf"),
-        ("24=", "--map is '24=', expected LABEL=TISSUE"),
-        ("=csf", "--map is '=csf', expected LABEL=TISSUE"),
-        ("24=csf=2", "--map is '24=csf=2', expected LABEL=TISSUE"),
         ("24=chese", "--map 24=chese: no tissue 'chese', expected 0"),
-        ("24=live", "no tissue 'live', expected 0 (nothing) or one of: liver"),
         ("-1=csf", "label is -1, expected a whole number from 0 to 99999"),
-        ("2.5=csf", "label is 2.5, expected a whole number"),
-        ("100000=csf", "label is 100000, expected a whole number from 0 to 99999"),
         ("none.json", "none.json: cannot be read"),
-        ("list.json", "list.json: is a list, expected a mapping such as"),
         ("nested.json", "label 24 is"),
         ("broken.json", "broken.json: is not JSON"),
         ("twice.json", "twice.json: is not JSON"),
         ("table.json", "is a tissue table, give it with --tissues"),
-        ("empty.txt", "empty.txt: has no names of labels"),
         ("two.txt", "two.txt: label 1 has two names, 'CSF' and 'Skull'"),
     ],
 )
 def test_a_bad_mapping_is_one_line(text, message, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     files = {
-        "list.json": "[1]", "nested.json": '{"24": {"csf": 1}}', "broken.json": "{", "table.json": '{"tissues": {}}',
-        "twice.json": '{"1": "csf", "1": "fat"}', "empty.txt": "nothing\n",
+        "nested.json": '{"24": {"csf": 1}}', "broken.json": "{", "table.json": '{"tissues": {}}',
+        "twice.json": '{"1": "csf", "1": "fat"}',
         "two.txt": "1 CSF 0 0 0 0\n1 Skull 0 0 0 0\n",
     }  # fmt: skip
     for name, content in files.items():
@@ -523,29 +443,17 @@ def test_a_bad_mapping_is_one_line(text, message, tmp_path, monkeypatch):
     ("changed", "message"),
     [
         (lambda labels: labels + 0.3 * (labels > 0), "uniform regions of few values with fractions"),
-        (lambda labels: labels * 0.3, "uniform regions of few values with fractions"),
         (lambda labels: labels + np.random.default_rng(0).normal(0, 1e-3, labels.shape), "label map"),
         (lambda labels: labels, "label map"),
     ],
 )
-def test_labels_are_no_mri_also_with_fractions_and_noise_and_in_python(changed, message, tmp_path):
+def test_labels_are_no_mri_also_with_fractions_and_noise(changed, message):
     labels = freesurfer(ASEG)
-    labels = labels.with_array(changed(labels.array.astype(np.float32)))
     with pytest.raises(SimulationError, match=message):
-        segment_mri(labels)
-    labels.write(tmp_path / "labels.nii.gz")
-    assert message in refused("segment", tmp_path / "labels.nii.gz", "-o", tmp_path / "out.nii.gz")
+        segment_mri(labels.with_array(changed(labels.array.astype(np.float32))))
 
 
-def test_a_mapping_of_an_mri_is_refused(tmp_path):
-    path = tmp_path / "mri.nii.gz"
-    Volume(np.random.default_rng(0).normal(100, 9, (20, 20, 20)).astype(np.float32), np.eye(4)).write(path)
-    assert "is read as an image, and --map is for a label map" in refused(
-        "simulate", path, "--map", "1=csf", "--pose", "auto", "-o", tmp_path / "o.png"
-    )
-
-
-def test_a_tissue_table_that_has_every_label_goes_before_names_and_programs(tmp_path):
+def test_a_table_that_has_every_label_goes_before_names_and_programs(tmp_path):
     path = tmp_path / "seg.nii.gz"
     volume = brain({"csf": 2, "grey matter": 3, "white matter": 41})
     volume.write(path)
@@ -638,12 +546,11 @@ def layered(path, values: tuple[int, ...]) -> Volume:
     return base.with_array(np.where(tumour > 0, 4, np.where(base.array > 0, 1, 0)))
 
 
-@pytest.mark.parametrize("values", [(1, 2, 3, 1), (1, 2, 3, 4), (7, 2, 9, 2)])
-def test_overlapping_segments_of_slicer_are_one_label_map_with_the_last_on_top(values, tmp_path):
+@pytest.mark.parametrize("values", [(1, 2, 3, 1), (7, 2, 9, 2)])
+def test_overlapping_segments_of_slicer_are_read_with_the_last_on_top(values, tmp_path):
     path = tmp_path / "head.seg.nrrd"
     truth = layered(path, values)
-    volume = Volume.read(path)
-    found = read_label_file(path, volume)
+    found = read_label_file(path, Volume.read(path))
     assert sorted(found.names) == ["csf", "grey matter", "tumour", "white matter"]
     tumour = found.labels.array == found.names.index("tumour") + 1
     assert np.array_equal(tumour, truth.array == 4) and np.array_equal(found.labels.array > 0, truth.array > 0)
@@ -658,13 +565,13 @@ def test_several_components_without_segments_are_refused_with_a_remedy(tmp_path)
 
     image = sitk.GetImageFromArray(np.zeros((10, 10, 10, 2), np.uint8), isVector=True)
     sitk.WriteImage(image, str(tmp_path / "two.nrrd"))
-    message = refused("simulate", tmp_path / "two.nrrd", "--pose", "auto", "-o", tmp_path / "o.png")
-    assert "has 2 components per voxel, expected 1; save one of them, or a label map" in message
+    with pytest.raises(SimulationError, match="has 2 components per voxel, expected 1; save one of them, or a label"):
+        Volume.read(tmp_path / "two.nrrd")
     image.SetMetaData("Segment0_Name", "Tumor")
     image.SetMetaData("Segment0_Layer", "5")
     sitk.WriteImage(image, str(tmp_path / "two.seg.nrrd"))
-    message = refused("simulate", tmp_path / "two.seg.nrrd", "--pose", "auto", "-o", tmp_path / "o.png")
-    assert "segment 'Tumor' is in layer 5, expected less than 2" in message
+    with pytest.raises(SimulationError, match="segment 'Tumor' is in layer 5, expected less than 2"):
+        Volume.read(tmp_path / "two.seg.nrrd")
 
 
 def test_a_header_that_expands_without_limit_is_not_read(tmp_path):
@@ -717,87 +624,83 @@ def probability_maps(folder, names: dict[str, str]) -> Volume:
 def test_tissue_probability_maps_are_combined_and_said(program, tmp_path):
     labels = probability_maps(tmp_path, NAMES[program])
     for tissue, name in NAMES[program].items():
-        result = ussim("simulate", tmp_path / name, "--pose", "auto", "-o", tmp_path / "o.png")
-        assert result.exit_code == 0, result.output
-        assert f"{name}: a tissue probability map ({program}, {tissue}), combined with" in result.stderr
-    path = tmp_path / name
-    found = read_label_file(path, Volume.read(path))
-    assert found.names == ("csf", "grey matter", "white matter")
-    assert np.mean(found.labels.array == labels.array) > 0.97  # but for voxels at the borders
+        path = tmp_path / name
+        found = read_label_file(path, Volume.read(path))
+        assert f"a tissue probability map ({program}, {tissue}), combined with" in found.message
+        assert found.names == ("csf", "grey matter", "white matter")
+        assert np.mean(found.labels.array == labels.array) > 0.97  # but for voxels at the borders
 
 
 def test_a_probability_map_without_the_others_is_refused(tmp_path):
+    def refusal(name: str) -> str:
+        with pytest.raises(SimulationError) as caught:
+            read_label_file(tmp_path / name, Volume.read(tmp_path / name))
+        return str(caught.value)
+
     probability_maps(tmp_path, NAMES["SPM"])
     (tmp_path / "c3T1.nii").unlink()
-    message = refused("simulate", tmp_path / "c1T1.nii", "--pose", "auto", "-o", tmp_path / "o.png")
-    assert "a tissue probability map (SPM, grey matter), not an MRI; put c3T1.nii beside it, or give the MRI" in message
+    assert "a tissue probability map (SPM, grey matter), not an MRI; put c3T1.nii beside it, or" in refusal("c1T1.nii")
     (tmp_path / "c1T1.nii").rename(tmp_path / "grey.nii")
-    assert "a probability map (values from 0 to 1, most of them certain), not an MRI" in refused(
-        "simulate", tmp_path / "grey.nii", "--pose", "auto", "-o", tmp_path / "o.png"
-    )
+    assert "a probability map (values from 0 to 1, most of them certain), not an MRI" in refusal("grey.nii")
     labels = probability_maps(tmp_path, NAMES["SPM"])
     Volume(labels.array[1:].astype(np.float32) * 0.3, labels.ijk_to_ras).write(tmp_path / "c2T1.nii")
-    assert "c2T1.nii: has another grid than c1T1.nii" in refused(
-        "simulate", tmp_path / "c1T1.nii", "--pose", "auto", "-o", tmp_path / "o.png"
-    )
+    assert "c2T1.nii: has another grid than c1T1.nii" in refusal("c1T1.nii")
+
+
+@pytest.fixture(scope="module")
+def small_mni(mni) -> tuple[Volume, Volume]:
+    """(T1, white matter as 41 and grey as 42) of the MNI152 in voxels of 2 mm."""
+    t1, grey, white = (volume.array[::2, ::2, ::2] for volume in mni)
+    matrix = mni[0].ijk_to_ras @ np.diag([2.0, 2.0, 2.0, 1.0])
+    return Volume(t1, matrix), Volume(np.where(white > 0.5, 41, np.where(grey > 0.5, 42, 0)).astype(np.int16), matrix)
 
 
 @pytest.mark.slow
-def test_an_mri_scaled_to_one_is_an_mri(mni):
-    from SlicerUSSim.Logic.tissue.label_sources import is_label_file
-
+def test_an_mri_in_other_units_is_an_mri(mni):
     t1 = mni[0]
     scaled = t1.with_array((t1.array / t1.array.max()).astype(np.float32))
-    assert not is_label_file(Path("t1.nii.gz"), scaled)
-    assert not is_label_file(Path("c1_t1.nii.gz"), scaled)  # called as SPM's maps are
-    assert not is_label_file(Path("t1.nii.gz"), t1)
+    for name in ("t1.nii.gz", "c1_t1.nii.gz"):  # or called as SPM's maps are
+        assert not is_label_file(Path(name), scaled)
+    for shift in (0, 1, 120, 400):
+        assert not t1.with_array(t1.array.astype(np.int16) - shift).looks_like_labels()
+    z = (t1.array - t1.array.mean()) / t1.array.std()
+    assert not t1.with_array(np.rint(z * 4).astype(np.int8)).looks_like_labels()
 
 
-def test_a_label_map_resampled_with_interpolation_is_refused(mni):
-    from SlicerUSSim.Logic.tissue.label_sources import is_label_file
-
-    _, grey, white = mni
-    labels = np.where(white.array > 0.5, 41, np.where(grey.array > 0.5, 42, 0)).astype(np.float32)
-    bent = mni[0].with_array(ndimage.shift(labels, (0.4, 0.3, 0.2), order=1))
+def test_a_label_map_resampled_with_interpolation_is_refused(small_mni):
+    t1, labels = small_mni
+    bent = t1.with_array(ndimage.shift(labels.array.astype(np.float32), (0.4, 0.3, 0.2), order=1))
     with pytest.raises(SimulationError, match=r"aseg\.nii\.gz: is mostly uniform regions of whole"):
         is_label_file(Path("aseg.nii.gz"), bent)
-    shifted = mni[0].with_array(ndimage.shift(mni[0].array.astype(np.float32), (0, 0, 0.5), order=1))
+    shifted = t1.with_array(ndimage.shift(t1.array.astype(np.float32), (0, 0, 0.5), order=1))
     assert not is_label_file(Path("t1.nii.gz"), shifted)  # half of its voxels are whole numbers
 
 
-def test_labels_with_rounding_errors_are_labels(mni):
-    _, grey, white = mni
-    labels = np.where(white.array > 0.5, 41, np.where(grey.array > 0.5, 42, 0))
-    rounded = mni[0].with_array((labels + 1e-4).astype(np.float32))
+def test_labels_with_rounding_errors_are_labels(small_mni):
+    t1, labels = small_mni
+    rounded = t1.with_array((labels.array + 1e-4).astype(np.float32))
     assert rounded.looks_like_labels()
     mapping = LabelMapping.of({41: "white matter", 42: "grey matter"})
-    found, exact = (read_label_map(each, mapping=mapping) for each in (rounded, mni[0].with_array(labels)))
+    found, exact = (read_label_map(each, mapping=mapping) for each in (rounded, labels))
     assert np.array_equal(found.labels.array, exact.labels.array)
-    faint = mni[0].with_array((mni[0].array * 1e-6).astype(np.float32))  # an MRI in other units
+    faint = t1.with_array((t1.array * 1e-6).astype(np.float32))  # an MRI in other units
     assert not faint.looks_like_labels()
 
 
-def test_a_label_map_with_a_negative_label_is_no_mri(mni):
-    _, grey, white = mni
-    labels = np.where(white.array > 0.5, 41, np.where(grey.array > 0.5, 42, 0)).astype(np.int16)
-    labels[:2] = -5
-    assert mni[0].with_array(labels).looks_like_labels()
+def test_a_label_map_with_negative_labels_is_no_mri_and_refused(small_mni):
+    t1, labels = small_mni
+    labels = labels.with_array(np.where(np.indices(labels.array.shape)[0] < 2, -5, labels.array))
+    assert labels.looks_like_labels()
     with pytest.raises(SimulationError, match="a label map with negative labels, has values from -5 to 42, expected"):
-        read_label_map(mni[0].with_array(labels))
+        read_label_map(labels)
     for offset in (100, 1):  # an MRI whose background is negative
-        assert not mni[0].with_array(mni[0].array.astype(np.int16) - offset).looks_like_labels()
-
-
-def test_a_label_map_whose_background_is_negative_is_refused_as_one(tmp_path):
-    path = tmp_path / "aseg.nii.gz"
-    volume = head()
-    volume.with_array((volume.array - 1).astype(np.int16)).write(path)  # eight labels, all one too low
-    message = refused("simulate", path, "--pose", "auto", "-o", tmp_path / "o.png")
-    assert "aseg.nii.gz: a label map with negative labels, has values from -1 to" in message
+        assert not t1.with_array(t1.array.astype(np.int16) - offset).looks_like_labels()
+    low = head()
+    message = str(refusal_of(low.with_array((low.array - 1).astype(np.int16))))  # eight labels, all one too low
     assert message.endswith("set its background to 0, or add 1 if all labels are one too low")
 
 
-def test_labels_stored_as_bytes_with_a_scale_are_rounded_and_said(mni, tmp_path):
+def test_labels_stored_as_bytes_with_a_scale_are_rounded_and_said(small_mni, tmp_path):
     path = tmp_path / "aseg.nii.gz"
     exact, scale = freesurfer(SYNTHSEG), 60 / 255  # as nibabel stores floats of 0 to 60 in bytes
     stored = np.rint(exact.array / scale).astype(np.float32) * np.float32(scale)
@@ -808,46 +711,38 @@ def test_labels_stored_as_bytes_with_a_scale_are_rounded_and_said(mni, tmp_path)
     found, truth = read_label_file(path, volume), read_label_map(exact)
     assert found.message == truth.message and np.array_equal(found.labels.array, truth.labels.array)
     assert "was stored with a scale; labels are rounded by up to 0.1" in found.warnings[-1] and not truth.warnings
+    t1 = small_mni[0]
     for scale in (0.1, 0.2118, 1.01, 2.5):  # an MRI that is stored so
-        assert not mni[0].with_array(mni[0].array.astype(np.float32) * np.float32(scale)).looks_like_labels()
+        assert not t1.with_array(t1.array.astype(np.float32) * np.float32(scale)).looks_like_labels()
 
 
 # ---- label map or MRI ------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("levels", [208, 54, 28, 15, 11])
+@pytest.mark.parametrize("levels", [28, 11])
 def test_an_mri_of_few_grey_levels_is_an_mri(levels, mni):
     t1 = mni[0]
     reduced = t1.with_array((t1.array.astype(int) * levels // 208).astype(np.float32 if levels == 28 else np.uint8))
     assert not reduced.looks_like_labels()
 
 
-def test_a_label_map_is_one_in_every_resolution():
-    for spacing in (2.0, 4.0, 8.0):
-        assert head(spacing).looks_like_labels()
-    assert freesurfer(WMPARC, dtype=np.float32).looks_like_labels()
-
-
-def test_an_mri_enlarged_by_nearest_neighbours_is_an_mri(mni):
-    small = mni[0].array[::2, ::2, ::2]
+def test_an_mri_enlarged_by_nearest_neighbours_is_an_mri(mni, parcels):
+    small = mni[0].array[::3, ::3, ::3]
     for scale in (1, 1.37):
         twice = np.kron(small, np.ones((2, 2, 2))) * scale
         enlarged = Volume(twice.astype(np.uint8 if scale == 1 else np.float32), np.eye(4))
         assert not is_label_file(Path("t1.nii.gz"), enlarged)
-    assert Volume(
-        np.kron(parcellation(mni, 150)[::3, ::3, ::3], np.ones((2, 2, 2), int)), np.eye(4)
-    ).looks_like_labels()
+    assert Volume(np.kron(parcels, np.ones((2, 2, 2), int)), np.eye(4)).looks_like_labels()
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("mm", [3, 5, 8])
-@pytest.mark.parametrize("regions", [0, 150])
-def test_a_parcellation_is_no_mri_in_coarse_voxels(mm, regions, mni):
+@pytest.mark.parametrize("mm", [3, 8])
+def test_a_parcellation_is_no_mri_in_coarse_voxels(mm, mni):
     """Cortex and white matter in random parcels, with wmparc's numbers; at 8 mm less than half of neighbours agree."""
-    labels = parcellation(mni, regions)[mm // 2 :: mm, mm // 2 :: mm, mm // 2 :: mm]
-    assert Volume(labels, np.eye(4)).looks_like_labels()
-    t1 = ndimage.gaussian_filter(mni[0].array.astype(float), mm / 2.5)[mm // 2 :: mm, mm // 2 :: mm, mm // 2 :: mm]
-    for levels in (24, 64, 128, 256, 2000):
+    coarse = (slice(mm // 2, None, mm),) * 3
+    assert Volume(parcellation(mni, 150)[coarse], np.eye(4)).looks_like_labels()
+    t1 = ndimage.gaussian_filter(mni[0].array.astype(float), mm / 2.5)[coarse]
+    for levels in (24, 256, 2000):
         assert not Volume(np.rint(t1 / t1.max() * levels).astype(np.int16), np.eye(4)).looks_like_labels()
 
 
@@ -866,14 +761,18 @@ def parcellation(mni, regions: int) -> np.ndarray:
     return labels
 
 
+@pytest.fixture(scope="module")
+def parcels(mni) -> np.ndarray:
+    return parcellation(mni, 150)[::3, ::3, ::3]
+
+
 @pytest.mark.parametrize("change", ["negative", "large", "one large", "wrapped"])
-def test_labels_out_of_range_are_refused_as_labels(change, mni, tmp_path):
-    labels = parcellation(mni, 150)[::3, ::3, ::3]
+def test_labels_out_of_range_are_refused_as_labels(change, parcels, tmp_path):
     out = {
-        "negative": np.where(labels > 3100, -labels, labels),
-        "large": labels * 1000,
-        "one large": np.where(labels == 2001, 600_000_001, labels),
-        "wrapped": labels.astype(np.uint8).astype(np.int8),
+        "negative": np.where(parcels > 3100, -parcels, parcels),
+        "large": parcels * 1000,
+        "one large": np.where(parcels == 2001, 600_000_001, parcels),
+        "wrapped": parcels.astype(np.uint8).astype(np.int8),
     }[change]
     path = tmp_path / "labels.nii.gz"
     Volume(out, np.diag([3.0, 3.0, 3.0, 1.0])).write(path)
@@ -882,22 +781,12 @@ def test_labels_out_of_range_are_refused_as_labels(change, mni, tmp_path):
     assert not (tmp_path / "o.nii.gz").exists()
 
 
-@pytest.mark.slow
-def test_an_mri_with_negative_numbers_is_an_mri(mni):
-    t1 = mni[0]
-    for shift in (1, 40, 120, 400):
-        assert not t1.with_array(t1.array.astype(np.int16) - shift).looks_like_labels()
-    z = (t1.array - t1.array.mean()) / t1.array.std()
-    assert not t1.with_array(np.rint(z * 4).astype(np.int8)).looks_like_labels()
-
-
-@pytest.mark.parametrize("background", [-1.0, -2.0, 5.0])
-def test_an_mri_whose_background_is_a_whole_number_is_no_interpolated_label_map(background, mni):
-    t1 = mni[0]
-    inside = t1.array > 0
-    scaled = np.where(inside, t1.array / 104.3 - 1.0, background).astype(np.float32)
+def test_an_mri_with_a_whole_background_is_no_interpolated_label_map(mni):
+    t1 = mni[0].array[:90]
+    inside = t1 > 0
+    scaled = np.where(inside, t1 / 104.3 - 1.0, -1.0).astype(np.float32)
     scaled[inside & (np.indices(inside.shape).sum(axis=0) % 9 == 0)] = 1.0  # clipped
-    assert not is_label_file(Path("t1.nii.gz"), t1.with_array(scaled))
+    assert not is_label_file(Path("t1.nii.gz"), Volume(scaled, np.eye(4)))
 
 
 @pytest.mark.parametrize("change", ["smoothed by half a voxel", "smoothed by a voxel", "cubic spline"])
@@ -917,14 +806,11 @@ def test_a_label_map_that_was_smoothed_is_called_so(change, tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("sigma", [0.0, 0.7, 2.0])
-@pytest.mark.parametrize("levels", [None, 255])
-def test_a_smoothed_mri_or_tissue_map_is_no_smoothed_label_map(sigma, levels, mni):
+@pytest.mark.parametrize("sigma", [0.7, 2.0])
+def test_a_smoothed_mri_or_tissue_map_is_no_smoothed_label_map(sigma, mni):
     for volume in mni:
         image = volume.array.astype(np.float32)
-        if levels is not None:
-            image = np.rint(levels * image / image.max())
-        assert not is_smoothed(ndimage.gaussian_filter(image, sigma) if sigma else image)
+        assert not is_smoothed(ndimage.gaussian_filter(np.rint(255 * image / image.max()), sigma))
 
 
 def test_a_head_of_freesurfer_is_simulated_as_float_and_whole_numbers(tmp_path):

@@ -28,7 +28,6 @@ from tests.test_label_maps import (
     probability_maps,
     refusal_of,
     refused,
-    ussim,
 )
 
 NAMES = ("csf", "grey matter", "white matter")
@@ -50,7 +49,7 @@ def in_order(numbers: tuple[int, int, int], *, has_sulci: bool = False) -> Volum
 
 
 @pytest.mark.parametrize("has_sulci", [False, True])
-def test_three_tissues_are_read_in_our_order_only_and_the_right_one_is_proposed_for_others(has_sulci):
+def test_three_tissues_are_read_in_our_order_and_refused_in_others(has_sulci):
     for csf, grey, white in permutations((1, 2, 3)):
         numbers = (csf, grey, white)
         volume = in_order(numbers, has_sulci=has_sulci)
@@ -65,48 +64,34 @@ def test_three_tissues_are_read_in_our_order_only_and_the_right_one_is_proposed_
         assert [found.names[found.relabelled[number] - 1] for number in truth] == list(truth.values())
 
 
-def test_spms_order_with_ventricles_only_is_refused_by_the_command_with_a_remedy_that_works(tmp_path):
-    """Its ventricles are deep and touch label 2, as white matter does in our order."""
-    path = tmp_path / "seg.nii.gz"
-    in_order((3, 1, 2)).write(path)
-    message = refused("simulate", path, "--pose", "auto", "-o", tmp_path / "o.png")
-    assert re.search(r"1 grey matter \(\d+%\), 2 white matter \(\d+%\), 3 csf \(\d%\)", message), message
-    remedy = re.search(r"--map 1=grey --map 2=white --map 3=csf", message)
-    assert remedy is not None
-    result = ussim("simulate", path, *remedy[0].split(), "--pose", "auto", "-o", tmp_path / "o.png")
-    assert result.exit_code == 0, result.output
-
-
-def test_other_numbers_get_a_proposal_but_no_tissues():
-    message = str(refusal_of(in_order((10, 150, 250))))
-    assert "labels 10, 150, 250 are in no known program's order" in message
-    assert message.endswith("--map 10=csf --map 150=grey --map 250=white")
+@pytest.mark.parametrize("numbers", [(10, 150, 250), (2, 3, 4), (120, 121, 122)])
+def test_other_numbers_get_a_proposal_but_no_tissues(numbers):
+    """2 to 4 were moved by one: CSF was grey matter, and white matter leptomeninges; FreeSurfer never writes 120."""
+    message = str(refusal_of(in_order(numbers, has_sulci=True)))
+    assert message.endswith("--map {}=csf --map {}=grey --map {}=white".format(*numbers)), message
+    assert "FreeSurfer" not in message
 
 
 def test_a_tumour_as_label_4_is_no_leptomeninges():
-    """9 ml deep in white matter became leptomeninges, as did deep nuclei."""
+    """9 ml deep in white matter became leptomeninges, as did deep nuclei, and a lesion as thin as the slices."""
     brain_ = in_order((1, 2, 3), has_sulci=True)
     z, y, x = np.indices(brain_.array.shape) * 3.0 - 73.5
     ball = np.hypot(np.hypot(x - 30, y), z) < 13
     message = str(refusal_of(brain_.with_array(np.where(ball, 4, brain_.array))))
     assert "3 white matter" in message and "4 something else (" in message
     assert message.endswith("--map 1=csf --map 2=grey --map 3=white --map 4=TISSUE")
+    thin = np.zeros(ball.shape, bool)
+    thin[24:26, 24:27, 36:39] = True  # 6 mm, two voxels
+    assert (brain_.array[thin] == 3).all()
+    assert "4 something else" in str(refusal_of(brain_.with_array(np.where(thin, 4, brain_.array))))
     radius = np.sqrt(x**2 + y**2 + z**2)
     sulci = (np.abs(radius - 62) < 4) & (np.abs(np.sin(x / 9)) < 0.3) & (brain_.array == 2)
     found = read_label_map(brain_.with_array(np.where(sulci, 4, brain_.array)))
     assert "leptomeninges" in found.names
 
 
-def test_a_lesion_as_thin_as_the_slices_is_no_leptomeninges_in_white_matter():
-    brain_ = in_order((1, 2, 3), has_sulci=True)
-    lesion = np.zeros(brain_.array.shape, bool)
-    lesion[24:26, 24:27, 36:39] = True  # 6 mm thick, two voxels
-    assert (brain_.array[lesion] == 3).all()
-    assert "4 something else" in str(refusal_of(brain_.with_array(np.where(lesion, 4, brain_.array))))
-
-
 @pytest.mark.parametrize(("numbers", "thin"), [((3, 2, 1), 4), ((1, 3, 2), 4), ((1, 2, 3), 5)])
-def test_what_segment_wrote_of_other_contrasts_without_its_table_is_refused_with_its_order(numbers, thin):
+def test_labels_of_other_contrasts_are_refused_with_their_order(numbers, thin):
     """The advice was to leave all of it out."""
     brain_ = in_order(numbers, has_sulci=True)
     z, y, x = np.indices(brain_.array.shape) * 3.0 - 73.5
@@ -125,20 +110,6 @@ def test_what_segment_wrote_of_other_contrasts_without_its_table_is_refused_with
         assert found.names == ("csf", "grey matter", "white matter", "enhancing", "leptomeninges")
         array[14:35, 14:35, 14:35] = 4  # a fifth of the brain
         assert "--map 4=TISSUE" in str(refusal_of(brain_.with_array(array)))
-
-
-def test_tissues_from_2_to_4_are_refused_with_their_order_and_not_moved_by_one():
-    """CSF was read as grey matter, grey as white matter, and white matter as leptomeninges."""
-    message = str(refusal_of(in_order((2, 3, 4), has_sulci=True)))
-    assert message.endswith("--map 2=csf --map 3=grey --map 4=white"), message
-
-
-def test_three_organs_beside_each_other_get_no_proposal():
-    array = np.zeros((60, 60, 60), np.uint8)
-    for label, j in ((1, 2), (2, 22), (3, 42)):
-        array[5:55, j : j + 16, 5:55] = label
-    message = str(refusal_of(Volume(array, np.diag([3.0, 3.0, 3.0, 1.0]))))
-    assert "no program's numbers are recognised" in message and "if that is right" not in message
 
 
 # ---- the head's way up -----------------------------------------------------------------------------------------------
@@ -170,7 +141,7 @@ def moved(volume: Volume, *, flip: str = "", turned: tuple[float, float, float] 
 TILTS = [(0, 0, 0), (45, 0, 0), (-45, 0, 0), (0, 40, 0), (0, 0, -40), (30, 20, 20), (-30, -20, 20)]
 
 
-@pytest.mark.parametrize("structures", [("cerebellum", "brain stem"), ("cerebellum",), ("brain stem",)])
+@pytest.mark.parametrize("structures", [("cerebellum", "brain stem"), ("cerebellum",)])
 def test_a_head_that_is_tilted_is_no_head_upside_down(structures):
     for turned in TILTS:
         found = read_label_map(moved(whole_head(structures=structures), turned=turned))
@@ -242,15 +213,6 @@ def test_one_structure_below_the_cerebrum_is_enough_for_a_head_upside_down():
         assert f"by its header, {structure} lies above the cerebrum's centre by" in message and "upside" in message
 
 
-def test_a_head_upside_down_is_one_clear_line_of_the_command(tmp_path):
-    path = tmp_path / "aseg.nii.gz"
-    moved(whole_head(), flip="z").write(path)
-    message = refused("simulate", path, "--pose", "auto", "-o", tmp_path / "o.png")
-    assert f"{path}: by its header, brain stem and cerebellum lie above the cerebrum's centre by" in message
-    assert "the head is upside down; correct the orientation in its header" in message
-    assert not (tmp_path / "o.png").exists()
-
-
 def test_names_are_judged_as_numbers_are_and_the_users_own_tissues_are_not():
     mirrored = moved(whole_head(), flip="z")
     of_label = {label: freesurfer_names()[label] for label in np.unique(mirrored.array).tolist() if label}
@@ -310,15 +272,10 @@ def test_a_body_in_three_layers_is_no_brain_and_read_by_its_numbering():
     assert "no program's numbers are recognised" in str(refusal_of(double))
 
 
-def test_numbers_that_freesurfer_has_but_never_writes_are_not_proposed_as_its():
-    message = str(refusal_of(in_order((120, 121, 122))))
-    assert "FreeSurfer" not in message
-
-
 # ---- probability maps in larger numbers ------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("scale", "dtype"), [(255, np.uint8), (100, np.uint8), (255, np.float32), (100, np.float32)])
+@pytest.mark.parametrize(("scale", "dtype"), [(255, np.uint8), (100, np.float32)])
 def test_probability_maps_up_to_100_or_255_are_combined(scale, dtype, tmp_path):
     labels = probability_maps(tmp_path, SPM)
     for name in SPM.values():
@@ -332,7 +289,7 @@ def test_probability_maps_up_to_100_or_255_are_combined(scale, dtype, tmp_path):
         assert np.mean(found.labels.array == labels.array) > 0.97  # but for voxels at the borders
 
 
-def test_a_probability_map_up_to_255_alone_is_refused_if_it_is_nearly_binary(tmp_path):
+def test_a_nearly_binary_probability_map_alone_is_refused(tmp_path):
     white = brain({"csf": 0, "grey matter": 0, "white matter": 1})
     fine = ndimage.gaussian_filter(ndimage.zoom(white.array.astype(np.float32), 2, order=0), 0.7)
     for name in ("white.nii.gz", "c2T1.nii.gz"):
@@ -351,12 +308,8 @@ def test_a_mask_or_label_map_up_to_255_is_no_probability_map(tmp_path):
 T2 = {"white matter": "T2_pve_0.nii.gz", "grey matter": "T2_pve_1.nii.gz", "csf": "T2_pve_2.nii.gz"}
 
 
-@pytest.mark.parametrize("scale", [1, 100])
-def test_fasts_maps_of_a_t2_are_refused_with_the_order_that_their_places_show(scale, tmp_path):
+def test_fasts_maps_of_a_t2_are_refused_with_the_order_of_their_places(tmp_path):
     labels = probability_maps(tmp_path, T2)
-    for name in T2.values():
-        volume = Volume.read(tmp_path / name)
-        volume.with_array((scale * volume.array).astype(np.float32)).write(tmp_path / name)
     path, out = tmp_path / "T2_pve_0.nii.gz", tmp_path / "o.png"
     message = refused("simulate", path, "--pose", "auto", "-o", out)
     assert "(labels 1 T2_pve_0.nii.gz, 2 T2_pve_1.nii.gz, 3 T2_pve_2.nii.gz)" in message
@@ -387,58 +340,44 @@ def test_maps_named_by_tissue_are_refused_only_if_another_order_is_sure(tmp_path
 
 def test_a_fourth_map_by_brightness_is_refused_and_not_left_out(tmp_path):
     probability_maps(tmp_path, FAST)
-    for name in FAST.values():
-        volume = Volume.read(tmp_path / name)
-        volume.write(tmp_path / "T1_pve_3.nii.gz")
-        message = refused("simulate", tmp_path / name, "--pose", "auto", "-o", tmp_path / "o.png")
-        assert "of 4 classes (FSL FAST, T1_pve_3.nii.gz), expected 3" in message and "-n 3" in message
-    assert "of 4 classes" in refused(
-        "simulate", tmp_path / "T1_pve_3.nii.gz", "--pose", "auto", "-o", tmp_path / "o.png"
-    )
+    fourth = tmp_path / "T1_pve_3.nii.gz"
+    Volume.read(tmp_path / FAST["csf"]).write(fourth)
+    for path in (tmp_path / FAST["grey matter"], fourth):
+        with pytest.raises(SimulationError, match=r"of 4 classes .*, expected 3.*-n 3"):
+            read_label_file(path, Volume.read(path))
 
 
 def test_cat12s_partial_volume_map_is_read_as_its_nearest_tissues(tmp_path):
     labels = brain({"csf": 1, "grey matter": 2, "white matter": 3})
     fine = ndimage.gaussian_filter(ndimage.zoom(labels.array.astype(np.float32), 2, order=0), 0.7)
     p0 = Volume(np.rint(fine * 85).astype(np.float32) / np.float32(85), np.diag([1.5, 1.5, 1.5, 1.0]))
-    path = tmp_path / "p0T1.nii"
-    p0.write(path)
-    result = ussim("simulate", path, "--pose", "auto", "-o", tmp_path / "o.png")
-    assert result.exit_code == 0 and "p0T1.nii: CAT12's partial volume map (p0), 3 tissues: 1 csf" in result.stderr
     with pytest.raises(SimulationError, match="is a partial volume map of three tissues, as CAT12's p0"):
         segment_mri(p0)
-    found = read_label_file(path, p0)
+    found = read_label_file(tmp_path / "p0T1.nii", p0)
+    assert found.message.startswith("CAT12's partial volume map (p0), 3 tissues: 1 csf")
     assert found.names == NAMES and np.mean(found.labels.array[::2, ::2, ::2] == labels.array) > 0.95
 
 
-def test_a_modulated_map_is_refused_as_one_and_not_with_the_contrast_that_it_resembles(tmp_path):
+@pytest.mark.parametrize("name", ["mwp1T1.nii", "smwc1T1.nii", "m0wp1T1.nii"])
+def test_a_modulated_map_is_refused_as_one(name, tmp_path):
+    """It was refused with the contrast that it resembles."""
     probability_maps(tmp_path, SPM)
     grey = Volume.read(tmp_path / SPM["grey matter"])
-    for name in ("mwp1T1.nii", "smwc1T1.nii", "m0wp1T1.nii"):
-        grey.with_array(grey.array * np.float32(1.3)).write(tmp_path / name)
-        for arguments in (("segment", tmp_path / name, "-o", tmp_path / "l.nii.gz"),
-                          ("simulate", tmp_path / name, "--pose", "auto", "-o", tmp_path / "o.png")):  # fmt: skip
-            message = refused(*arguments)
-            assert f"{name}: a modulated tissue map ({name[:-6]}, volumes" in message and "c1, c2, c3 of SPM" in message
+    grey.with_array(grey.array * np.float32(1.3)).write(tmp_path / name)
+    message = refused("segment", tmp_path / name, "-o", tmp_path / "l.nii.gz")
+    assert f"{name}: a modulated tissue map ({name[:-6]}, volumes" in message and "c1, c2, c3 of SPM" in message
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("cut_at", [100, *(pytest.param(n, marks=pytest.mark.slow) for n in (97, 80))])
-def test_an_mri_up_to_3_is_no_partial_volume_map(cut_at, mni, tmp_path):
+@pytest.mark.parametrize("cut_at", [100, 80])  # also with the brightest cut off, as pictures have
+def test_an_mri_of_their_range_is_no_tissue_map_whatever_it_is_called(cut_at, mni, tmp_path):
     t1 = mni[0].array.astype(np.float32)
     top = np.percentile(t1[t1 > 0], cut_at)
-    scaled = mni[0].with_array(np.minimum(t1, top) / np.float32(top) * np.float32(3))
-    assert not is_label_file(tmp_path / "p0T1.nii", scaled)
+    share = np.minimum(t1, top) / np.float32(top)
+    assert not is_label_file(tmp_path / "p0T1.nii", mni[0].with_array(share * np.float32(3)))
     assert not is_label_file(tmp_path / "mwp1T1.nii", mni[0])
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("cut_at", [*(pytest.param(n, marks=pytest.mark.slow) for n in (100, 97, 80)), 60])
-def test_an_mri_up_to_100_or_255_is_no_probability_map_whatever_it_is_called(cut_at, mni, tmp_path):
-    t1 = mni[0].array.astype(float)
-    top = np.percentile(t1[t1 > 0], cut_at)  # also with the brightest cut off, as pictures have
     for scale in (100, 255):
-        volume = mni[0].with_array(np.rint(np.minimum(t1, top) / top * scale).astype(np.uint8))
+        volume = mni[0].with_array(np.rint(share * scale).astype(np.uint8))
         for name in SPM.values():
             volume.with_array(volume.array).write(tmp_path / name)
         for name in ("t1.nii.gz", *SPM.values()):  # with two companions, which add up to three times as much
@@ -462,15 +401,6 @@ def test_a_brain_of_an_impossible_size_is_said(scale):
     mapping = LabelMapping.of(dict(enumerate(NAMES, 1)))
     doubts = [line for line in read_label_map(sized, mapping=mapping).warnings if "size of the voxels" in line]
     assert bool(doubts) == (scale != 1.0), doubts
-
-
-def test_very_many_unknown_labels_are_one_short_line_that_thinks_of_an_mri():
-    """An MRI of bytes that was cut off while it was copied was answered by 247 options."""
-    intensities = np.random.default_rng(0).integers(0, 250, (24, 24, 24)).astype(np.uint8)
-    intensities[:2] = 0
-    message = str(refusal_of(Volume(intensities, np.eye(4))))
-    assert "if these are intensities of an MRI, its file may be incomplete" in message
-    assert message.count("--map") < 20 and len(message) < 1500
 
 
 def test_a_mirrored_freesurfer_map_of_few_structures_says_so():
@@ -499,8 +429,8 @@ def kept(volume: Volume, axis: int, low: float, high: float) -> Volume:
 @pytest.mark.parametrize(
     ("axis", "low", "high", "sides"),
     [
-        (0, -80, 4, "the right"), (0, -4, 80, "the left"), (1, 0, 80, "the back"), (1, -80, 0, "the front"),
-        (2, 10, 80, "the bottom"), (2, -80, 10, "the top"), (1, -30, 30, "the back and the front"),
+        (0, -80, 4, "the right"), (1, 0, 80, "the back"), (2, -80, 10, "the top"),
+        (1, -30, 30, "the back and the front"),
     ],
 )  # fmt: skip
 def test_a_brain_that_was_cut_is_said_to_be_a_part_and_where_it_was_cut(axis, low, high, sides):
@@ -522,99 +452,48 @@ def test_a_part_of_a_brain_is_not_judged_by_where_the_whole_has_its_centre():
         read_label_map(moved(kept(whole_head(), 2, -80, 10), flip="y"), mapping=LabelMapping.of("freesurfer"))
 
 
-def test_a_part_with_an_oblique_cut_is_said_by_its_volume_and_not_refused_as_upside_down():
-    whole = whole_head()
-    ijk = np.indices(whole.array.shape)[::-1].reshape(3, -1)
-    _, y, z = (whole.ijk_to_ras[:3, :3] @ ijk + whole.ijk_to_ras[:3, 3:]).reshape(3, *whole.array.shape)
-    lower = whole.with_array(np.where(z + 0.4 * y < -20, whole.array, 0))
-    warnings = read_label_map(lower, mapping=LabelMapping.of("freesurfer")).warnings
-    assert any("a part of a brain, of which the rest is the coupling medium" in line for line in warnings), warnings
-
-
-def test_a_whole_brain_whose_sides_have_one_name_is_no_half():
-    whole = whole_head()
-    merged = whole.array.copy()
-    for right, left in ((41, 2), (42, 3), (43, 4), (49, 10), (47, 8)):
-        merged[merged == right] = left
-    assert not read_label_map(whole.with_array(merged), mapping=LabelMapping.of("freesurfer")).warnings
-
-
-def test_one_hemisphere_by_the_names_of_its_labels_is_said_however_its_medial_face_lies():
+def test_one_hemisphere_is_said_however_its_medial_face_lies():
     turned = moved(whole_head(), turned=(0, 0, 30))
     left = turned.with_array(np.where(np.isin(turned.array, [2, 3, 4, 8, 10]), turned.array, 0))
     (warning,) = read_label_map(left, mapping=LabelMapping.of("freesurfer")).warnings
     assert "cut off at the right" in warning
 
 
-def test_a_left_hemisphere_is_not_read_as_organs_whose_numbers_and_places_fit_by_chance():
-    """Cortex (3) is left of white matter (2), putamen (12) of caudate (11), amygdala (18) below fluid (24).
-
-    Such are left and right kidney, left and right adrenal gland, and the vertebrae L5 and T11 of TotalSegmentator.
-    """
-    labels = [2, 3, 4, 8, 10, 11, 12, 13, 16, 17, 18, 24]
-    volume = Volume(np.zeros((60, 60, 60), np.int16), np.diag([3.0, 3.0, 3.0, 1.0]))
-    places = {3: (20, 8), 2: (20, 20), 12: (20, 24), 11: (20, 36), 18: (8, 28), 24: (40, 28)}  # (k, i)
-    for n, label in enumerate(labels):
-        k, i = places.get(label, (20, 28))
-        volume.array[k : k + 4, 4 * n : 4 * n + 4, i : i + 4] = label
-    message = str(refusal_of(volume))
-    assert "fit FreeSurfer and TotalSegmentator" in message and message.endswith("with --map freesurfer"), message
+def turned_by_10_degrees(volume: Volume, order: int) -> Volume:
+    """Whole numbers interpolated with splines of an order."""
+    turn = Rotation.from_euler("z", 10, degrees=True).as_matrix()
+    offset = (np.eye(3) - turn) @ np.array(volume.array.shape) / 2
+    return volume.with_array(np.rint(ndimage.affine_transform(volume.array.astype(float), turn, offset, order=order)))
 
 
-@pytest.mark.parametrize("way", ["turned", "by half a voxel"])
-def test_labels_that_were_interpolated_and_rounded_are_said_and_nearest_neighbours_are_not(way):
+def test_labels_that_were_interpolated_and_rounded_are_said():
     whole = whole_head()
-    if way == "turned":
-        turn = Rotation.from_euler("z", 10, degrees=True).as_matrix()
-        offset = (np.eye(3) - turn) @ np.array(whole.array.shape) / 2
-    else:
-        turn, offset = np.eye(3), np.array([0, 0, 0.5])
-    nearest, linear = (
-        whole.with_array(np.rint(ndimage.affine_transform(whole.array.astype(float), turn, offset, order=order)))
-        for order in (0, 1)
-    )
+    nearest, linear = (turned_by_10_degrees(whole, order) for order in (0, 1))
     assert not read_label_map(nearest).warnings
-    message = str(refusal_of(linear))  # 2 and 41 have any number between them, some of which FreeSurfer has not
-    assert "resampled with interpolation and rounded" in message and "nearest neighbours" in message
-    if way != "turned":  # then nearly all numbers in between are none of FreeSurfer's
-        return
+    halfway = whole.with_array(np.rint(ndimage.shift(whole.array.astype(float), (0, 0, 0.5), order=1)))
+    for volume in (linear, halfway):  # 2 and 41 have any number between them, some of which FreeSurfer has not
+        message = str(refusal_of(volume))
+        assert "resampled with interpolation and rounded" in message and "nearest neighbours" in message
     known = np.isin(linear.array, list(freesurfer_names()))
     linear = linear.with_array(np.where(known, linear.array, 0))
     warnings = read_label_map(linear, mapping=LabelMapping.of("freesurfer")).warnings
     assert any("resampled with interpolation and rounded" in line for line in warnings), warnings
 
 
-@pytest.mark.parametrize("voxel_mm", [2.0, 4.0])
-def test_layers_of_a_head_lie_between_others_and_are_not_said_to_be_interpolated(voxel_mm):
+def test_layers_of_a_head_are_not_said_to_be_interpolated():
     """Skin, scalp, skull and marrow are numbered in their order, so that each is between its neighbours' numbers."""
     names = ("csf", "grey matter", "white matter", "leptomeninges", "skin", "scalp", "skull", "cancellous bone", "air")
-    layers = (
-        (50.0, 3),
-        (62.0, 2),
-        (64.0, 4),
-        (66.0, 1),
-        (67.0, 0),
-        (69.0, 7),
-        (72.0, 8),
-        (75.0, 7),
-        (83.0, 6),
-        (86.0, 5),
-    )
-    axis = np.arange(-92.0, 92.1, voxel_mm)
+    radii = (50.0, 62.0, 64.0, 66.0, 67.0, 69.0, 72.0, 75.0, 83.0, 86.0)
+    axis = np.arange(-92.0, 92.1, 4.0)
     z, y, x = np.meshgrid(axis, axis, axis, indexing="ij")
     radius, labels = np.sqrt(x**2 + y**2 + z**2), np.zeros((len(axis),) * 3, np.uint8)
-    for outer, number in reversed(layers):
+    for outer, number in reversed(list(zip(radii, (3, 2, 4, 1, 0, 7, 8, 7, 6, 5), strict=True))):
         labels[radius <= outer] = number
     labels[(np.abs(y) < 12) & (x**2 + (z + 20) ** 2 < 12**2)] = 1
     labels[(x**2 + (y - 79) ** 2 + (z + 30) ** 2) < 5**2] = 9
-    whole = Volume(labels, np.diag([voxel_mm, voxel_mm, voxel_mm, 1.0]))
-    assert share_between(labels)[0] > (0.17 if voxel_mm > 3 else 0.0)  # by the numbers alone it is doubtful
-    turn = Rotation.from_euler("z", 10, degrees=True).as_matrix()
-    offset = (np.eye(3) - turn) @ np.array(labels.shape) / 2
-    nearest, linear = (
-        whole.with_array(np.rint(ndimage.affine_transform(labels.astype(float), turn, offset, order=order)))
-        for order in (0, 1)
-    )
+    whole = Volume(labels, np.diag([4.0, 4.0, 4.0, 1.0]))
+    assert share_between(labels)[0] > 0.17  # by the numbers alone it is doubtful
+    nearest, linear = (turned_by_10_degrees(whole, order) for order in (0, 1))
     told = [read_label_map(one, dict(enumerate(names, 1))).warnings for one in (whole, nearest, linear)]
     doubted = [any("resampled with interpolation" in line for line in lines) for lines in told]
     assert doubted == [False, False, True], told

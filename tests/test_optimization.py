@@ -80,24 +80,9 @@ def test_images_become_alike(twin, result):
     for image, reference, before in zip(images, twin.references, result.similarity_before, strict=True):
         assert abs(image[field].mean() - reference[field].mean()) < 5.0
         assert before.total > 0.0
-
-
-@pytest.mark.slow
-def test_costs_are_those_of_whole_simulations(twin, result):
-    from SlicerUSSim.Logic import similarity
-
-    field = ImageGrid.for_probe(twin.probe, None).field(twin.probe)
-    for tissues, display, cost in (
-        (twin.simulator.medium.tissues, twin.display, result.cost_before),
-        (result.tissues, result.display, result.cost_after),
-    ):
-        with twin.simulator.with_tissues(tissues):
-            frames = [twin.simulator.simulate(twin.probe, pose, display) for pose in twin.poses]
-        costs = [
-            similarity(f.image, r, f.pixel_spacing_mm, mask=field).total
-            for f, r in zip(frames, twin.references, strict=True)
-        ]
-        assert cost == pytest.approx(np.mean(costs), abs=2e-3)
+    sources = white(result.tissues).sources
+    assert sources["mu0"] == "fitted to tracked ultrasound" and "Szabo" in sources["speed_of_sound_m_s"]
+    assert white(twin.simulator.medium.tissues).mu0 == 0.33 and twin.simulator.settings.seed == twin.seed  # as before
 
 
 @pytest.mark.slow
@@ -127,7 +112,7 @@ def test_it_says_what_cannot_be_known(result):
     assert json.loads(json.dumps(result.to_dict()))["identifiability"]["cost_tolerance"] > 0
 
 
-@pytest.mark.parametrize("seed", few_slow_others_long(3, 1))
+@pytest.mark.parametrize("seed", few_slow_others_long(3, 0))
 def test_restarts_reach_the_fit_and_its_interval_holds_the_truth(brain, seed):
     """Along the parameters restarts stopped in the valley of TGC and attenuation: 8 of 25 reached the fit's cost."""
     twin = make_twin(*brain, seed, probe=SMALL)
@@ -136,35 +121,6 @@ def test_restarts_reach_the_fit_and_its_interval_holds_the_truth(brain, seed):
     fall = result.identifiability["net attenuation in white matter"]
     true = white(twin.true_tissues).attenuation_db_cm_mhz - twin.true_display.tgc_db_cm_mhz
     assert fall.is_determined and fall.low - 0.1 <= 2 * SMALL.frequency_mhz * true <= fall.high + 0.1
-
-
-@pytest.mark.slow
-def test_equally_good_is_what_another_draw_of_the_speckle_could_make_of_the_best(result):
-    """The tolerance, how many solutions lie within it, and that no other widens a spread."""
-    found = result.identifiability
-
-    def of(stage):
-        return [entry for entry in result.history if entry.stage == stage]
-
-    first = min(of("polish"), key=lambda entry: entry.cost)
-    fitted = result.parameters.units(result.tissues, result.display)
-    went_on = not np.allclose(fitted, first.units, atol=1e-6)  # from a restart, to a better fit
-    best = result.cost_after if went_on else first.cost
-    redrawn = [of(f"redraw {n}")[0].cost for n in (1, 2)]
-    tolerance = max(np.std([first.cost, *redrawn]), 0.01 * best)
-    assert found.cost_tolerance == pytest.approx(tolerance, rel=1e-3) and tolerance < 0.1 * best
-    tolerance = found.cost_tolerance
-    entries = [entry for stage in ("local", "polish", AGAIN, "draw") for entry in of(stage)]
-    as_good = [entry for entry in entries if entry.cost <= best + tolerance]
-    assert 0 < len(as_good) < len(entries)
-    again = [min(of(f"restart {n}"), key=lambda entry: entry.cost) for n in (1, 2)]
-    gained = first.cost - best
-    again = [entry for entry, cost in zip(again, redrawn, strict=True) if entry.cost - cost + gained <= tolerance]
-    assert found.restarts_as_good == len(again) and found.solutions == len(as_good) + len(again)
-    values = np.array([result.parameters.values(np.array(entry.units)) for entry in [*as_good, *again]])
-    for parameter, column in zip(result.parameters, values.T, strict=True):
-        spread = found[parameter.name]
-        assert (spread.low, spread.high) == pytest.approx((column.min(), column.max())), parameter.name
 
 
 @pytest.mark.slow
@@ -223,7 +179,7 @@ def restarted_in_a_curved_valley(budget):
     return found.restarts_as_good, stages
 
 
-def test_a_restart_that_stopped_above_the_fit_goes_on_along_the_axes_where_it_stopped():
+def test_a_restart_that_stopped_above_the_fit_goes_on_along_its_axes():
     as_good, stages = restarted_in_a_curved_valley(300)
     assert as_good == 4
     assert all(len(stage) <= 300 for stage in stages)
@@ -253,39 +209,21 @@ def test_the_last_search_sees_what_whole_simulations_show(twin):
 
 
 @pytest.mark.slow
-def test_sources_say_what_was_fitted(result):
-    sources = white(result.tissues).sources
-    assert sources["mu0"] == "fitted to tracked ultrasound" and "Szabo" in sources["speed_of_sound_m_s"]
-
-
-@pytest.mark.slow
-def test_simulator_is_left_as_it_was(twin, result):
-    assert white(twin.simulator.medium.tissues).mu0 == 0.33
-    assert twin.simulator.settings.seed == twin.seed
-
-
-@pytest.mark.parametrize(
-    "algorithms",
-    [
-        pytest.param(("GN_DIRECT_L", "LN_SBPLX"), marks=pytest.mark.slow),
-        pytest.param(("GN_CRS2_LM", "LN_NELDERMEAD"), marks=pytest.mark.slow),
-        pytest.param((None, "LN_COBYLA"), marks=pytest.mark.slow),
-    ],
-)
-def test_other_algorithms_find_it_too(twin, result, algorithms):
+def test_other_algorithms_find_it_too(twin, result):
+    algorithms = "GN_CRS2_LM", "LN_NELDERMEAD"
     other = optimise(twin, ["display", "white matter"], max_evaluations=600, algorithms=algorithms)
     assert other.cost_after < 1.25 * result.cost_after
 
 
 def test_a_single_parameter_can_be_free(twin):
-    result = optimise(twin, ["gain_db"], max_evaluations=40)
+    result = optimise(twin, ["gain_db"], max_evaluations=20)
     assert result.cost_after < result.cost_before
 
 
 def test_bounds_are_kept(twin):
-    result = optimise(twin, {"gain_db": (-1, 1), "white matter.mu0": (0.2, 0.3)}, max_evaluations=60)
+    result = optimise(twin, {"gain_db": (-1, 1), "white matter.mu0": (0.2, 0.3)}, max_evaluations=24)
     assert -1 <= result.after["gain_db"] <= 1 and 0.2 <= result.after["white matter.mu0"] <= 0.3
-    narrow = optimise(twin, {"gain_db": (20, 21)}, max_evaluations=30)
+    narrow = optimise(twin, {"gain_db": (20, 21)}, max_evaluations=16)
     assert narrow.at_bounds == ["gain_db"] and narrow.to_dict()["at_bounds"] == ["gain_db"]
 
 
@@ -294,7 +232,7 @@ def test_bounds_are_kept(twin):
 
 @pytest.mark.slow
 def test_the_same_problem_gives_the_same_answer(twin):
-    one, other = (optimise(twin, ["display"], max_evaluations=60, restarts=1) for _ in range(2))
+    one, other = (optimise(twin, ["display"], max_evaluations=40, restarts=1) for _ in range(2))
     assert one.after == other.after and one.history == other.history
 
 
@@ -303,18 +241,18 @@ def test_an_interrupted_run_is_resumed_without_computing_again(twin):
     reached = []
 
     def stop(progress):
-        if progress.evaluations == 45:
+        if progress.evaluations == 25:
             raise Cancelled
 
     with pytest.raises(Cancelled):
-        optimise(twin, ["display"], max_evaluations=80, progress=stop, checkpoint=reached.append)
+        optimise(twin, ["display"], max_evaluations=40, progress=stop, checkpoint=reached.append)
     state = json.loads(json.dumps(reached[-1]))
-    assert len(state["history"]) == 45
-    whole = optimise(twin, ["display"], max_evaluations=80)
-    resumed = optimise(twin, ["display"], max_evaluations=80, resume=state)
+    assert len(state["history"]) == 25
+    whole = optimise(twin, ["display"], max_evaluations=40)
+    resumed = optimise(twin, ["display"], max_evaluations=40, resume=state)
     assert resumed.after == whole.after and resumed.history == whole.history
-    assert resumed.evaluations == whole.evaluations - 45
-    assert optimise(twin, ["display"], max_evaluations=80, resume=resumed.state).evaluations == 0
+    assert resumed.evaluations == whole.evaluations - 25
+    assert optimise(twin, ["display"], max_evaluations=40, resume=resumed.state).evaluations == 0
     with pytest.raises(SimulationError, match="another problem"):
         optimise(twin, ["gain_db"], resume=state)
     with pytest.raises(SimulationError, match="state to resume is invalid"):
@@ -322,13 +260,13 @@ def test_an_interrupted_run_is_resumed_without_computing_again(twin):
 
 
 @pytest.mark.slow
-def test_a_longer_run_goes_on_from_a_shorter_one_to_where_it_would_have_come_alone(twin):
-    short = optimise(twin, ["display"], max_evaluations=60, restarts=1)
-    whole = optimise(twin, ["display"], max_evaluations=100, restarts=2)
-    resumed = optimise(twin, ["display"], max_evaluations=100, restarts=2, resume=json.loads(json.dumps(short.state)))
+def test_a_longer_run_goes_on_from_a_shorter_one_as_if_it_were_alone(twin):
+    short = optimise(twin, ["display"], max_evaluations=40, restarts=1)
+    whole = optimise(twin, ["display"], max_evaluations=60, restarts=2)
+    resumed = optimise(twin, ["display"], max_evaluations=60, restarts=2, resume=json.loads(json.dumps(short.state)))
     assert resumed.history == whole.history and resumed.after == whole.after
     assert resumed.to_dict()["identifiability"] == whole.to_dict()["identifiability"]
-    assert whole.evaluations - resumed.evaluations >= 24  # the global search of the shorter one
+    assert whole.evaluations - resumed.evaluations >= 16  # the global search of the shorter one
 
 
 def test_breaking_off_early_again_loses_nothing_of_what_was_reached(twin):
@@ -351,7 +289,7 @@ def hybrid(labels: Volume, tissues, mri: Volume) -> UltrasoundSimulator:
 
 
 @pytest.mark.slow
-def test_a_state_is_refused_if_any_input_is_another_and_the_line_says_which(twin):
+def test_a_state_is_refused_if_any_input_is_another(twin):
     medium, mri = twin.simulator.medium, head_mri(2.0)
     start = hybrid(medium.labels, medium.tissues, mri)
     masks = [ImageGrid.for_probe(twin.probe, None).field(twin.probe)] * 3
@@ -375,16 +313,12 @@ def test_a_state_is_refused_if_any_input_is_another_and_the_line_says_which(twin
     moved[2][0, 3] += 1e-3
     settings = replace(start.settings, seed=4)
     loud = medium.tissues.replace("csf", sigma0=0.01)
-    membrane = medium.tissues.with_membrane(replace(medium.tissues.membrane, thickness_mm=0.9))
     for changes, other in (
         ({"simulator": hybrid(medium.labels, medium.tissues, other_mri)}, "texture"),
         ({"simulator": hybrid(medium.labels.with_array(painted), medium.tissues, mri)}, "labels, texture"),
         ({"simulator": hybrid(medium.labels, loud, mri)}, "tissues"),
-        ({"simulator": hybrid(medium.labels, membrane, mri)}, "tissues"),
         ({"references": [*twin.references[:2], dot]}, "reference images"),
-        ({"references": twin.references[::-1]}, "reference images"),
         ({"masks": [half, *masks[1:]]}, "masks"),
-        ({"masks": None}, "masks"),
         ({"poses": moved}, "poses"),
         ({"probe": replace(twin.probe, frequency_mhz=4.0)}, "probe"),
         ({"display": replace(twin.display, tgc_db_cm_mhz=0.3)}, "display"),
@@ -410,17 +344,6 @@ def test_a_replay_ends_where_the_runs_part():
     assert costs == [7.0, 0.3, 0.5] and search.computed == 2
     other = Search(lambda units: float(units[0]), lambda units: {}, 9, replayed=past)
     assert other.evaluate("polish", np.array([0.1])) == 0.1  # another stage
-
-
-@pytest.mark.slow
-def test_progress_tells_the_best_and_ends_at_one(twin):
-    told = []
-    result = optimise(twin, ["display"], max_evaluations=60, restarts=1, progress=told.append)
-    assert [p.evaluations for p in told] == list(range(1, len(told) + 1))
-    assert all(0 < p.share <= 1 for p in told) and len(told) <= told[0].limit
-    polish = [p for p in told if p.stage == "polish"]
-    assert polish[-1].best_cost == min(p.cost for p in polish)
-    assert polish[-1].best.keys() == result.after.keys()
 
 
 def test_what_a_progress_function_raises_comes_through(twin):
@@ -452,7 +375,7 @@ def changes(units):
 
 
 @pytest.mark.parametrize("start", [(0.1, 0.2, 0.3), (0.9, 0.1, 0.2), (0.95, 0.9, 0.1)])
-def test_along_the_axes_of_its_changes_a_search_reaches_the_bottom_of_a_narrow_valley(start):
+def test_along_its_axes_a_search_reaches_the_bottom_of_a_valley(start):
     start, lowest = np.array(start), narrow_valley(np.array([0.6, 0.6, 0.9]))
     axes = search_axes(changes, start)
     plain, along = Search(narrow_valley, lambda units: {}, 80), Search(narrow_valley, lambda units: {}, 80)
@@ -462,18 +385,7 @@ def test_along_the_axes_of_its_changes_a_search_reaches_the_bottom_of_a_narrow_v
     assert best == pytest.approx([0.6, 0.6, 0.9], abs=0.05)
 
 
-def test_along_axes_a_search_keeps_within_bounds_and_finds_a_best_point_there():
-    def cost(units):
-        return float((units[0] + 0.1) ** 2 + (units[1] - 0.4) ** 2)
-
-    search = Search(cost, lambda units: {}, 100)
-    turned = np.array([[0.8, -0.6], [0.6, 0.8]])
-    best = search.minimise("LN_BOBYQA", "here", np.array([0.7, 0.9]), 100, 0.1, turned)
-    assert best == pytest.approx([0.0, 0.4], abs=0.02)
-    assert all(0.0 <= value <= 1.0 for entry in search.history for value in entry.units)
-
-
-def test_axes_are_the_directions_that_change_images_in_steps_that_change_them_equally():
+def test_axes_are_steps_that_change_images_equally():
     def of(units):
         return np.array([[4.0 * (units[0] - units[1]), 2.0 * (units[0] + units[1])], [0.0, 0.0]])
 
@@ -493,20 +405,6 @@ def test_patches_have_means_and_standard_deviations_of_the_pixels_inside():
     assert (mean[0], deviation[0]) == pytest.approx((first.mean(), first.std()))
     last = image[10:, 10:20] / 255
     assert mean.shape == (4,) and (mean[3], deviation[3]) == pytest.approx((last.mean(), last.std()))
-
-
-def test_each_algorithm_is_the_one_named_but_for_a_single_parameter():
-    """BOBYQA needs two parameters or more, so one parameter is searched by another."""
-
-    def path(algorithm, start):
-        search = Search(lambda units: float(((units - 0.3) ** 2).sum()), lambda units: {}, 30)
-        search.minimise(algorithm, "here", np.array(start), 30)
-        return [entry.units for entry in search.history]
-
-    names = "LN_BOBYQA", "LN_SBPLX", "LN_NELDERMEAD"
-    paths = {name: path(name, [0.8, 0.6, 0.1]) for name in names}
-    assert paths[names[0]] != paths[names[1]] != paths[names[2]] != paths[names[0]]
-    assert path("LN_BOBYQA", [0.8]) == path("LN_SBPLX", [0.8])
 
 
 # ---- mistakes --------------------------------------------------------------------------------------------------------
@@ -549,7 +447,7 @@ def real_brain(mni):
 PATIENTS = PhasedProbe(75.0, 60.0, scan_lines=128)
 
 
-@pytest.mark.parametrize("seed", few_slow_others_long(14, 2))
+@pytest.mark.parametrize("seed", few_slow_others_long(14, 1))
 def test_fourteen_patients_with_a_known_display(real_brain, seed):
     twin = make_twin(*real_brain, seed, probe=PATIENTS, display_is_known=True)
     result = optimise(twin, ["white matter"], max_evaluations=150)
@@ -568,7 +466,7 @@ def net_fall(tissue: Tissue, display: DisplaySettings) -> float:
     return (loss_db - gained_db) / path - display.tgc_db_cm_mhz
 
 
-@pytest.mark.parametrize("seed", few_slow_others_long(14, 2))
+@pytest.mark.parametrize("seed", few_slow_others_long(14, 1))
 def test_fourteen_patients_with_everything_free(real_brain, seed):
     twin = make_twin(*real_brain, seed, probe=PATIENTS)
     result = optimise(twin, ["display", "white matter"], max_evaluations=600)  # the default number
@@ -583,7 +481,7 @@ def test_fourteen_patients_with_everything_free(real_brain, seed):
 # ---- what a search of all parameters leaves ------------------------------------------------------------------------
 
 
-def _fit_of_a_thin_sheet(evaluations: int, restarts: int, seed: int = 0):
+def _fit_of_a_thin_sheet(evaluations: int, restarts: int):
     """(Fit, {level: least change of the cost when it alone changes by 2 dB}) of a brain with a falx of two voxels."""
     labels = np.ones((50, 50, 50), np.uint8)
     labels[:, :, 22:24], labels[20:22], labels[12] = 2, 3, 4
@@ -598,8 +496,7 @@ def _fit_of_a_thin_sheet(evaluations: int, restarts: int, seed: int = 0):
         real = simulator.simulate(probe, pose, DisplaySettings(gain_db=5.0, dynamic_range_db=50.0)).image
     simulator.settings = replace(simulator.settings, seed=simulator.settings.seed + 5)  # other speckle
     found = optimize_appearance(
-        simulator, probe, [pose], [real], free=["display", "tissues"], max_evaluations=evaluations, restarts=restarts,
-        seed=seed,
+        simulator, probe, [pose], [real], free=["display", "tissues"], max_evaluations=evaluations, restarts=restarts
     )  # fmt: skip
     model = AppearanceModel(simulator, probe, [pose], found.parameters.varied())
     cost = AppearanceCost(model, found.parameters, [real], None, tissues, DisplaySettings(), SimilaritySettings())
@@ -615,16 +512,15 @@ def _fit_of_a_thin_sheet(evaluations: int, restarts: int, seed: int = 0):
 
 
 @pytest.mark.slow
-def test_the_level_of_no_tissue_alone_is_left_where_a_search_of_all_has_carried_it():
+def test_the_level_of_no_tissue_is_left_where_a_search_has_carried_it():
     """A falx ended 5 dB too dark, and was not to be seen, though a brighter one cost less."""
     _, changes = _fit_of_a_thin_sheet(150, 0)
     assert len(changes) == 4 and min(changes.values()) > -5e-4, changes
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("evaluations", "seed"), [(60, 0), (90, 2)])
-def test_a_restart_that_fits_better_is_gone_on_from_and_no_other(evaluations, seed):
-    once, again = (_fit_of_a_thin_sheet(evaluations, restarts, seed)[0] for restarts in (0, 2))
+def test_a_restart_that_fits_better_is_gone_on_from_and_no_other():
+    once, again = (_fit_of_a_thin_sheet(60, restarts)[0] for restarts in (0, 2))
     assert again.cost_after <= once.cost_after + 1e-6
     went_on = any(entry.stage == AGAIN for entry in again.history)
     assert went_on or again.cost_after == pytest.approx(once.cost_after, abs=1e-6)

@@ -16,12 +16,10 @@ from SlicerUSSim.Logic import (
     TrackedSequence,
     UltrasoundSimulator,
 )
-from SlicerUSSim.Logic.base.errors import Cancelled
 from SlicerUSSim.Logic.fitting import fit_speckle
 from SlicerUSSim.Logic.fitting.point_spread import BAND_SIGMA, PointSpread, point_spread
-from SlicerUSSim.Logic.fitting.speckle_fit import SpeckleFit, with_point_spread
+from SlicerUSSim.Logic.fitting.speckle_fit import with_point_spread
 from SlicerUSSim.Logic.fitting.speckle_width import SpeckleWidth
-from SlicerUSSim.Logic.fitting.texture_costs import TextureMisfit
 from SlicerUSSim.Logic.probe import ImageGrid, tilt_sweep
 from SlicerUSSim.Logic.tracked import TrackedImages
 from tests.conftest import block, rigid
@@ -74,21 +72,7 @@ def test_a_probe_whose_speckle_is_too_fine_gets_the_true_one_back():
 
 
 @pytest.mark.slow
-def test_the_trial_can_be_cancelled():
-    """A probe that cannot be tried is no error, and its errors are of the same kind."""
-    made = UltrasoundSimulator(LABELS, EVEN, SimulationSettings(seed=2, ring_down=False))
-    misfit = TextureMisfit(0.2, 0.4)
-    first = SpeckleFit(SHOWN, EVEN, 1.0, misfit, misfit, True)
-
-    def stop(share: float) -> None:
-        raise Cancelled
-
-    with pytest.raises(Cancelled):
-        with_point_spread(made, recorded(), first, SHOWN, stop)
-
-
-@pytest.mark.slow
-def test_what_is_wide_by_smoothing_is_not_taken_for_the_point_spread_function():
+def test_what_is_wide_by_smoothing_is_not_taken_for_the_point_spread():
     """The true probe, whose images a scanner smooths: its widths would say another one."""
     tracked = replace(recorded(0.2), probe=TRUE)
     made = UltrasoundSimulator(LABELS, EVEN, SimulationSettings(seed=2, ring_down=False))

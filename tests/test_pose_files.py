@@ -38,7 +38,13 @@ def test_a_pose_is_read_as_it_was_written_in_every_format(suffix, tmp_path):
     assert len(list(tmp_path.iterdir())) == 1
 
 
-def test_itk_files_are_from_the_world_to_the_probe_in_lps_as_slicer_writes_them(tmp_path):
+def test_a_pose_is_read_from_a_bare_matrix_in_json(tmp_path):
+    pose = pose_of_angles([1.0, -2.0, 30.0], [10.0, 20.0, 30.0])
+    (tmp_path / "pose.json").write_text(str(pose.tolist()))
+    np.testing.assert_allclose(read_pose(tmp_path / "pose.json"), pose, atol=1e-9)
+
+
+def test_itk_files_are_from_the_world_to_the_probe_in_lps_as_slicers(tmp_path):
     sitk = pytest.importorskip("SimpleITK")
     write_pose(tmp_path / "pose.tfm", pose_of_angles([10.0, 20.0, 30.0], [0, 0, 0]))
     transform = sitk.ReadTransform(str(tmp_path / "pose.tfm"))

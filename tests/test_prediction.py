@@ -23,10 +23,10 @@ from SlicerUSSim.Logic.probe import ImageGrid, tilt_sweep
 from SlicerUSSim.Logic.tracked import TrackedImages
 from tests.conftest import block, rigid
 
-PROBE = ConvexProbe(12.0, 70.0, 40.0, scan_lines=120)
+PROBE = ConvexProbe(12.0, 70.0, 40.0, scan_lines=80)
 LABELS = block(lambda x, y, z: 1 + (np.hypot(x - 3.0, y + 2.0) < 11.0), half_mm=(36, 32, 12))
 TISSUES = TissueTable.named(["white matter", "csf"])
-PLAIN = DisplaySettings(gain_db=4.0, noise_db=None, image_size=(200, 220))
+PLAIN = DisplaySettings(gain_db=4.0, noise_db=None, image_size=(140, 154))
 FREE = ["gain_db", "tissues"]
 
 
@@ -47,7 +47,7 @@ def recording():
 @pytest.fixture(scope="module")
 def found(recording):
     fitted, _ = recording[1].split([1, 3, 4])
-    return fit(simulator(2), fitted, free=FREE, display=PLAIN, max_evaluations=60, restarts=0)
+    return fit(simulator(2), fitted, free=FREE, display=PLAIN, max_evaluations=40, restarts=0)
 
 
 def test_the_tissues_predict_what_one_tissue_cannot(recording, found):
@@ -56,7 +56,7 @@ def test_the_tissues_predict_what_one_tissue_cannot(recording, found):
     near = [neighbours_of(sequence, of) for of in (others, found.tracked)]
     made = predict(
         found, simulator(2), others, free=FREE, display=PLAIN, neighbours=near[0], fitted_neighbours=near[1],
-        max_evaluations=60,
+        max_evaluations=40,
     )  # fmt: skip
     assert made.fitted_numbers == [0, 2] and made.numbers == [1, 4]
     assert made.of_uniform < 0.8
@@ -69,7 +69,7 @@ def test_the_tissues_predict_what_one_tissue_cannot(recording, found):
     assert any("fitted: images 0, 2   predicted: images 1, 4" in line for line in made.lines())
     # The control has no anatomy: levels to the left and right of the ball's middle are those of the same depths
     image = made.images["uniform tissue"][0].astype(float)
-    assert abs(image[60:120, 60:100].mean() - image[60:120, 120:160].mean()) < 12.0
+    assert abs(image[42:84, 42:70].mean() - image[42:84, 84:112].mean()) < 12.0
 
 
 def test_a_registration_moves_the_predicted_images_too(recording, found, caplog):

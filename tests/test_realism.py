@@ -8,11 +8,9 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 from scipy import ndimage
-from scipy.spatial.transform import Rotation
 from skimage.morphology import local_maxima
 
 from SlicerUSSim.Logic import (
-    ConvexProbe,
     DisplaySettings,
     LinearProbe,
     PhasedProbe,
@@ -23,20 +21,17 @@ from SlicerUSSim.Logic import (
     UltrasoundSimulator,
     similarity,
 )
-from SlicerUSSim.Logic.base.files import write_json
+from SlicerUSSim.Logic.base.files import read_json, write_json
 from SlicerUSSim.Logic.fitting import TextureReference, neighbours_of, speckle_widths, texture_misfit
 from SlicerUSSim.Logic.fitting.controls import NEIGHBOURS, UNIFORM
 from SlicerUSSim.Logic.fitting.speckle_width import log_speckle_correlation
 from SlicerUSSim.Logic.fitting.texture_costs import local_extrema
 from SlicerUSSim.Logic.mri.samples import head_mri
-from SlicerUSSim.Logic.mri.sheets import Surfels
-from SlicerUSSim.Logic.probe import ImageGrid
+from SlicerUSSim.Logic.probe import ImageGrid, probe_from_dict
 from SlicerUSSim.Logic.tracked import TrackedImages
 from tests.conftest import SHARED, SPECKLE, block, needs_shared, rigid
 from tests.remembered import segment_once
-from validation.grey_statistics import grey_of_tissues, level_by_depth
 from validation.realism import BLURRED, LEVELLED, REAL, blurred, main, measure_realism
-from validation.sheet_contrast import line_contrast, sheet_points, surfel_points, wall_points
 from validation.twins import make_twin
 
 SPACING = 0.2, 0.2
@@ -65,7 +60,7 @@ def test_texture_costs_see_what_the_papers_cost_takes_for_a_neighbour():
     assert texture_misfit(image, image, SPACING).total == 0.0
 
 
-@pytest.mark.parametrize("changed", [(0.3, 1.2), (0.45, 0.8), (0.2, 0.5)])
+@pytest.mark.parametrize("changed", [(0.3, 1.2), (0.2, 0.5)])
 def test_texture_cost_is_least_at_the_true_width(changed):
     image = speckle((0.3, 0.8), 0)
     same = texture_misfit(speckle((0.3, 0.8), 5), image, SPACING).total
@@ -94,14 +89,6 @@ def test_pixels_of_one_level_side_by_side_are_one_maximum():
     assert [np.count_nonzero(found) for found in local_extrema(np.full((50, 50), 200, np.uint8))] == [1, 1]
 
 
-def test_texture_reference_refuses_other_shapes_and_types():
-    reference = TextureReference(speckle((0.3, 0.8)), SPACING)
-    with pytest.raises(SimulationError, match="shape"):
-        reference.misfit(np.zeros((4, 4), np.uint8))
-    with pytest.raises(SimulationError, match="uint8"):
-        texture_misfit(np.zeros((4, 4)), np.zeros((4, 4), np.uint8), SPACING)
-
-
 def test_law_is_that_of_log_compressed_speckle():
     """Against a Monte-Carlo estimate of the correlation of the logs of two exponential variables."""
     random = np.random.default_rng(0)
@@ -114,15 +101,16 @@ def test_law_is_that_of_log_compressed_speckle():
         assert float(log_speckle_correlation(np.array([distance]), 1.0)[0]) == pytest.approx(measured, abs=0.01)
 
 
-@pytest.mark.parametrize("sigma", [(0.25, 0.6), (0.35, 1.5), (0.5, 1.0)])
+@pytest.mark.parametrize("sigma", [(0.25, 0.6), pytest.param((0.35, 1.5), marks=pytest.mark.slow)])
 def test_width_of_known_speckle(sigma):
     """The percentile that keeps texture out is below the mean of windows, the more the fewer grains one has."""
     images = [speckle(sigma, seed) for seed in range(2)]
-    for width in speckle_widths(images, PROBE, GRID, [15.0, 30.0, 45.0]):
+    for width in speckle_widths(images, PROBE, GRID, [15.0, 45.0]):
         assert 0.75 * sigma[0] < width.axial_mm < 1.03 * sigma[0]
         assert 0.8 * sigma[1] < width.lateral_mm < 1.03 * sigma[1]
 
 
+@pytest.mark.slow
 def test_width_of_speckle_is_not_widened_by_structure_larger_than_it():
     """Slow bright bands, as of tissue, in both directions; without the means that are subtracted it were +40 %."""
     rows, columns = np.indices((300, 240)) * 0.2
@@ -135,11 +123,8 @@ def test_width_of_speckle_is_not_widened_by_structure_larger_than_it():
     assert 0.75 * 0.3 < width.axial_mm < 1.1 * 0.3 and 0.75 * 0.8 < width.lateral_mm < 1.1 * 0.8
 
 
-@pytest.mark.parametrize(
-    "probe",
-    [LinearProbe(36, 50, scan_lines=181), ConvexProbe(30.0, 60.0, 50.0, scan_lines=400),
-     PhasedProbe(80.0, 50.0, scan_lines=256)],
-)  # fmt: skip
+@pytest.mark.slow
+@pytest.mark.parametrize("probe", [LinearProbe(36, 50, scan_lines=181), PhasedProbe(80.0, 50.0, scan_lines=256)])
 def test_width_of_simulated_speckle_is_that_of_the_probe(probe):
     """-4 to +9 % axially and -6 to +14 % laterally were found by trial (here up to 18: lines are interpolated)."""
     solid = block(lambda x, y, z: np.ones_like(x), half_mm=(50, 40, 12))
@@ -163,101 +148,17 @@ def test_images_without_speckle_have_no_width():
     assert np.isnan(width.axial_mm) and width.windows == 0
 
 
-def test_grey_levels_of_tissues_tell_bright_tails():
-    rows = np.indices((300, 240))[0]
-    region = np.where(rows < 150, 1, 2)
-    random = np.random.default_rng(0)
-    grey = np.where(
-        rows < 150, 100 + 12 * random.normal(size=region.shape), 60 + 18 * random.exponential(size=region.shape)
-    )
-    image = np.clip(np.rint(grey), 0, 255).astype(np.uint8)
-    found = grey_of_tissues(
-        [image], [region], {1: "even", 2: "spotted", 3: "absent"}, GRID, np.ones(region.shape, bool)
-    )
-    assert list(found) == ["even", "spotted"]
-    assert found["even"].mean == pytest.approx(100, abs=1) and found["even"].deviation == pytest.approx(12, rel=0.05)
-    assert found["even"].skewness == pytest.approx(0.0, abs=0.05) and found["spotted"].skewness == pytest.approx(
-        2, rel=0.15
-    )
-    assert found["spotted"].percentile_99 > 2.5 * abs(found["spotted"].percentile_1)
-    assert found["even"].histogram.sum() == pytest.approx(1.0, abs=1e-3)
-
-
-def test_level_by_depth_follows_the_beams():
-    """Rings about the apex of a convex array, not rows, have one depth."""
-    probe = ConvexProbe(30.0, 60.0, 50.0)
-    grid = ImageGrid.for_probe(probe, (300, 340))
-    columns, rows = np.meshgrid(np.arange(340), np.arange(300))
-    x, y = (grid.image_to_probe @ np.stack([columns, rows, 0 * rows, 1 + 0 * rows]).reshape(4, -1))[:2]
-    depth = np.hypot(x, y + 30.0).reshape(rows.shape) - 30.0
-    image = np.clip(4.0 * depth, 0, 255).astype(np.uint8)
-    at, level = level_by_depth([image], probe, grid, grid.field(probe))
-    np.testing.assert_allclose(level[1:-1], 4.0 * at[1:-1], atol=2.0)
-
-
-@pytest.mark.parametrize(("contrast", "sigma_mm"), [(60.0, 0.5), (90.0, 0.8)])
-def test_contrast_and_width_of_a_sheet(contrast, sigma_mm):
-    """A line across the beam, between two 45 degrees to it, over noise."""
-    rows, columns = np.indices((300, 240)) * 0.2
-    away = np.where(columns < 24.0, rows - 30.0, (rows - 30.0 - (columns - 24.0)) / np.sqrt(2.0))
-    labels = (np.abs(away) < 0.5).astype(np.uint8)
-    noise = 6.0 * np.random.default_rng(0).normal(size=labels.shape)
-    image = np.clip(60 + contrast * np.exp(-0.5 * (away / sigma_mm) ** 2) + noise, 0, 255).astype(np.uint8)
-    inside = np.ones(labels.shape, bool)
-    found = line_contrast([image], [sheet_points(labels, [1], GRID)], PROBE, GRID, inside)
-    assert [line.angle_deg for line in found] == [(0, 30), (30, 60)]
-    for line in found:
-        assert line.contrast == pytest.approx(contrast, rel=0.15) and line.chance < 0.2 * contrast
-        assert line.width_mm == pytest.approx(2.355 * sigma_mm, rel=0.25)
-    nothing = np.clip(60 + noise, 0, 255).astype(np.uint8)
-    for line in line_contrast([nothing], [sheet_points(labels, [1], GRID)], PROBE, GRID, inside):
-        assert line.contrast == pytest.approx(line.chance, abs=3.0)
-
-
-def test_the_line_of_a_sheet_that_was_found_is_where_it_crosses_the_image():
-    """A plane at 45 degrees to the beam, oblique to the image: as the line that labels have there."""
-    pose = rigid(Rotation.from_euler("xyz", (20, -30, 50), degrees=True).as_matrix(), [5.0, -3.0, 12.0])
-    normal = np.array([1.0, -1.0, 0.8]) / np.linalg.norm([1.0, -1.0, 0.8])
-    u = np.array([1.0, 1.0, 0.0]) / np.sqrt(2.0)
-    a, b = (grid.ravel() for grid in np.meshgrid(np.arange(-30.0, 30.0, 0.5), np.arange(-8.0, 8.0, 0.5)))
-    place = np.array([0.0, 30.0, 0.0]) + a[:, None] * u + b[:, None] * np.cross(normal, u)
-    surfels = Surfels.of("falx", place @ pose[:3, :3].T + pose[:3, 3], (pose[:3, :3] @ normal)[None] + 0 * place,
-                         0.4, 1.0, 0.25)  # fmt: skip
-    points = surfel_points(surfels, pose, GRID)
-    assert len(points.place) > 50
-    x, depth = points.place.T
-    assert np.abs((depth - 30.0 - x) / np.sqrt(2.0)).max() < 0.6
-    np.testing.assert_allclose(np.abs(points.normal @ np.array([1.0, -1.0]) / np.sqrt(2.0)), 1.0, atol=1e-5)
-    rows, columns = np.indices((300, 240)) * 0.2
-    away = (rows - 30.0 - (columns - 24.0)) / np.sqrt(2.0)
-    image = np.clip(60 + 80.0 * np.exp(-0.5 * (away / 0.5) ** 2), 0, 255).astype(np.uint8)
-    (line,) = line_contrast([image], [points], PROBE, GRID, np.ones(image.shape, bool))
-    assert line.angle_deg == (30, 60) and line.contrast == pytest.approx(80.0, rel=0.15)
-    # A sheet in the image plane has no line.
-    flat = Surfels.of("falx", place @ pose[:3, :3].T + pose[:3, 3], pose[:3, 2][None] + 0 * place, 0.4, 1.0, 0.25)
-    assert len(surfel_points(flat, pose, GRID).place) == 0
-
-
-def test_contrast_of_a_wall_is_above_the_tissue_and_not_above_the_fluid():
-    rows, _ = np.indices((300, 240)) * 0.2
-    labels = (np.abs(rows - 30.0) < 6.0).astype(np.uint8)
-    edge = np.exp(-0.5 * ((np.abs(rows - 30.0) - 6.0) / 0.5) ** 2)
-    image = np.clip(np.where(labels, 0.0, 80.0) + 70.0 * edge, 0, 255).astype(np.uint8)
-    (line,) = line_contrast([image], [wall_points(labels, [1], GRID)], PROBE, GRID, np.ones(labels.shape, bool))
-    assert line.angle_deg == (0, 30) and 55 < line.contrast <= 75
-
-
 @pytest.fixture(scope="module")
 def twin():
-    segmentation = segment_once(head_mri(2.0))
-    probe = PhasedProbe(70.0, 50.0, scan_lines=128)
+    segmentation = segment_once(head_mri(3.0))
+    probe = PhasedProbe(70.0, 50.0, scan_lines=96)
     return make_twin(segmentation.labels, TissueTable.brain(segmentation.tissue_names), 3, probe=probe)
 
 
 @pytest.mark.slow
 def test_realism_of_the_images_themselves_is_perfect_and_controls_are_not(twin):
-    tracked = TrackedImages.of(twin.sequence(), probe=twin.probe)
     sequence = twin.sequence()
+    tracked = TrackedImages.of(sequence, probe=twin.probe)
     found = measure_realism(
         tracked, {"itself": tracked.images}, twin.simulator, neighbours=neighbours_of(sequence, tracked)
     )
@@ -269,17 +170,10 @@ def test_realism_of_the_images_themselves_is_perfect_and_controls_are_not(twin):
     real, uniform = (np.mean([i[tracked.mask].mean() for i in found.images[name]]) for name in (REAL, UNIFORM))
     assert uniform == pytest.approx(real, abs=1.0)  # at the gain for it
     assert found.mean(LEVELLED)["paper"] < found.mean(UNIFORM)["paper"]
-    for levelled, real in zip(found.images[LEVELLED], found.images[REAL], strict=True):
-        inside = ndimage.binary_erosion(tracked.mask, iterations=40)
-        means = [ndimage.gaussian_filter(image.astype(float), 25)[inside] for image in (levelled, real)]
-        assert np.abs(means[0] - means[1]).mean() < 3.0  # but for what is clipped at black
-    plain = json.loads(json.dumps(found.to_dict(), allow_nan=False))
-    assert plain["costs"]["itself"]["mean"]["sum"] == 0.0
+    json.dumps(found.to_dict(), allow_nan=False)
     assert {title.split()[0] for title, _, _ in found.tables()} >= {"Costs", "Width", "Local", "Grey", "Mean"}
     with pytest.raises(SimulationError, match="name of a control"):
         measure_realism(tracked, {"real": tracked.images}, twin.simulator)
-    with pytest.raises(SimulationError, match="equal numbers"):
-        measure_realism(tracked, {"one": tracked.images[:1]}, twin.simulator)
 
 
 @pytest.mark.slow
@@ -294,26 +188,10 @@ def test_command_says_numbers_with_controls(twin, tmp_path):
     ]  # fmt: skip
     done = CliRunner().invoke(main, list(map(str, arguments)))
     assert done.exit_code == 0, done.output
-    for words in (
-        "simulated",
-        "uniform tissue",
-        "real neighbours",
-        "uniform, real level",
-        "real, blurred",
-        "T1",
-        "Width of the speckle",
-    ):
+    for words in ("simulated", "uniform, real level", "real neighbours", "real, blurred", "Width of the speckle"):
         assert words in done.output
     assert json.loads((tmp_path / "realism.json").read_text())["costs"]["simulated"]["mean"]["sum"] >= 0.0
     assert (tmp_path / "realism.png").stat().st_size > 10_000
-
-
-def test_an_image_without_a_bright_patch_is_dark():
-    """Its T1 is no number, and a fit says so."""
-    image = speckle((0.3, 0.8))
-    assert not TextureReference(image, SPACING).is_dark
-    assert TextureReference(image // 30, SPACING).is_dark
-    assert np.isnan(TextureReference(image // 30, SPACING).misfit(image).autocorrelation)
 
 
 @pytest.mark.slow
@@ -324,11 +202,6 @@ def test_costs_of_a_real_sweep_are_those_found_by_trial():
     It counted what the file cuts off as black in all images, which made every cost a little lower.
     """
     sweep = SHARED / "brain_sweep"
-    if not sweep.is_dir():
-        pytest.skip("the real sweep is not there")
-    from SlicerUSSim.Logic.base.files import read_json
-    from SlicerUSSim.Logic.probe import probe_from_dict
-
     sequence = TrackedSequence.read(sweep / "brain_sweep.igs.mha")
     tracked = TrackedImages.of(sequence, [3, 4, 5, 14], probe=probe_from_dict(read_json(sweep / "probe.json"), "probe"))
     before, image, after, other = tracked.images

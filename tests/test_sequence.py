@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import re
-import sys
 from itertools import pairwise
 from pathlib import Path
 
@@ -71,13 +69,13 @@ def test_a_missing_transform_is_named_with_what_there_is():
     assert not sequence.has_pose(0, "ImageToTracker") and sequence.has_pose(0, "TrackerToProbe")
 
 
-@pytest.mark.parametrize("name", ["Image", "To", "ImageTo", "ToReference", ""])
+@pytest.mark.parametrize("name", ["Image", "ToReference"])
 def test_a_name_that_is_no_transform_is_refused(name):
     with pytest.raises(SimulationError, match="expected two frames joined by To"):
         chain().pose(0, name)
 
 
-@pytest.mark.parametrize("number", [-1, 3, 100, 0.5])
+@pytest.mark.parametrize("number", [-1, 3, 0.5])
 def test_an_image_that_does_not_exist_is_named(number):
     with pytest.raises(SimulationError, match=f"image {number} does not exist, expected 0 to 2"):
         chain().pose(number, "ImageToProbe")
@@ -109,8 +107,10 @@ def test_shapes_that_do_not_fit_are_refused():
 # ---- files -----------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("compress", [True, False])
-@pytest.mark.parametrize("suffix", [".igs.mha", ".seq.mha", ".mha", ".mhd", ".nrrd", ".seq.nrrd"])
+@pytest.mark.parametrize(
+    ("suffix", "compress"),
+    [(".igs.mha", True), (".seq.mha", False), (".mha", True), (".mhd", False), (".nrrd", False), (".seq.nrrd", True)],
+)
 def test_what_is_written_is_read_back(tmp_path, suffix, compress):
     sequence = chain()
     path = tmp_path / f"sweep{suffix}"
@@ -173,8 +173,6 @@ MARKED_FAR = np.arange(2 * 3 * 4, dtype=np.uint8).reshape(2, 3, 4)  # [n, toward
     "orientation, pixels",
     [
         ("MF", MARKED_FAR),
-        ("MFA", MARKED_FAR),
-        ("UF", MARKED_FAR[:, :, ::-1]),
         ("UFD", MARKED_FAR[:, :, ::-1]),
         ("MN", MARKED_FAR[:, ::-1, :]),
         ("UN", MARKED_FAR[:, ::-1, ::-1]),
@@ -229,7 +227,6 @@ def test_slicer_reads_the_transforms_that_are_written(tmp_path):
     [
         (("UltrasoundImageOrientation = MF", "UltrasoundImageOrientation = QX"), "'QX', expected a code such as MF"),
         (("1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1", "1 0 0"), "has 3 numbers, expected 16"),
-        (("1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1", "one"), "expected 16 numbers"),
         (("Timestamp = 10.5", "Timestamp = noon"), "'noon', expected seconds"),
         (("Seq_Frame0001_Timestamp", "Seq_Frame0007_Timestamp"), "has the field Seq_Frame0007_Timestamp"),
         (("Seq_Frame0000_ProbeToTrackerTransform =", "Seq_Frame0000_ProbeTransform ="), "ProbeTo"),
@@ -289,22 +286,6 @@ def test_minc1_is_read_with_its_place(tmp_path):
     (tmp_path / "broken.mnc").write_bytes((tmp_path / "volume.mnc").read_bytes()[:60])
     with pytest.raises(SimulationError, match=r"broken\.mnc: cannot be read as MINC 1"):
         Volume.read(tmp_path / "broken.mnc")
-
-
-@pytest.mark.parametrize(
-    ("name", "module", "distribution"), [("s.seq.nrrd", "nrrd", "pynrrd"), ("slice.mnc", "nibabel", "nibabel")]
-)
-def test_a_package_that_only_some_files_need_is_named_where_it_is_missing(
-    tmp_path, monkeypatch, name, module, distribution
-):
-    """3D Slicer's Python has neither, and the module for Slicer does not install them."""
-    write_minc1(tmp_path / "slice.mnc", np.ones((1, 4, 4)), (0, 0, 0), (1, 1, 1), np.eye(3))
-    (tmp_path / "s.seq.nrrd").write_text("NRRD0004\n")
-    monkeypatch.setitem(sys.modules, module, None)
-    read = TrackedSequence.read if module == "nrrd" else Volume.read
-    wanted = f"needs {distribution}; install it with: pip install {distribution}"
-    with pytest.raises(SimulationError, match=f"{re.escape(name)}: .* {wanted}$"):
-        read(tmp_path / name)
 
 
 def test_minc_slices_become_a_sequence(tmp_path):
@@ -383,7 +364,6 @@ def test_calibrations_are_read_from_plus_configurations_and_matrices(tmp_path):
     ("points", "words"),
     [
         ([[0, 0, 0], [9, 0, 0]], "2 pairs of landmarks, expected three or more"),
-        ([[0, 0, 0]], "1 pair of landmarks"),
         ([[0, 0, 0], [9, 9, 9], [20, 20, 20.5]], r"landmarks in the ultrasound lie within 0\.\d+ mm of a line"),
     ],
 )
@@ -429,15 +409,6 @@ def test_real_sequences_are_read_and_tracked(name):
     assert 0.05 < np.median(steps) < 5.0  # a hand at 12 images per second
     with pytest.raises(SimulationError, match="calibration ImageToProbe"):
         sequence.pose(0, "ImageToReference")
-
-
-@needs_shared
-def test_real_sequence_written_again_is_the_same(tmp_path):
-    sequence = TrackedSequence.read(SHARED / "SpinePhantomFreehand.igs.mha").select([0, 20])
-    sequence.write(tmp_path / "again.seq.nrrd")
-    again = TrackedSequence.read(tmp_path / "again.seq.nrrd")
-    assert np.array_equal(again.images, sequence.images)
-    assert np.allclose(again.pose(1, "ProbeToReference"), sequence.pose(1, "ProbeToReference"), atol=1e-4)
 
 
 @needs_shared

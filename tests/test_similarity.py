@@ -117,10 +117,3 @@ def test_bad_input_is_refused_in_one_line():
         with pytest.raises(SimulationError) as caught:
             similarity(*arguments, **options)
         assert message in str(caught.value) and "\n" not in str(caught.value)
-
-
-def test_the_public_name_can_be_called_whatever_was_imported_before():
-    import SlicerUSSim.Logic.fitting.image_similarity  # noqa: F401
-    from SlicerUSSim.Logic import similarity as found
-
-    assert found(np.zeros((8, 8), np.uint8), np.zeros((8, 8), np.uint8), (1.0, 1.0)).total == 0.0

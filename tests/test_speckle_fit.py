@@ -7,9 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 
-from SlicerUSSim.Command.cli import main
 from SlicerUSSim.Logic import (
     ConvexProbe,
     DisplaySettings,
@@ -19,7 +17,6 @@ from SlicerUSSim.Logic import (
     TrackedSequence,
     UltrasoundSimulator,
 )
-from SlicerUSSim.Logic.base.files import write_json
 from SlicerUSSim.Logic.fitting import fit, fit_speckle
 from SlicerUSSim.Logic.fitting.speckle_fit import with_estimated_map, with_preset_texture
 from SlicerUSSim.Logic.fitting.speckle_width import speckle_widths, width_misfit
@@ -99,14 +96,6 @@ def test_fit_with_speckle_beats_the_fit_without(tracked):
     assert written["speckle"]["grey_map_found"] is True
 
 
-@pytest.mark.slow
-def test_the_speckle_of_one_image_is_fitted_and_that_is_said(tracked, caplog):
-    fit(
-        simulator(), tracked[1].only([1]), speckle=True, free=["gain_db"], display=PLAIN, max_evaluations=10, restarts=0
-    )  # fmt: skip
-    assert "the speckle of 1 image is fitted (1): grey map, smoothing and texture" in caplog.text
-
-
 def test_textures_of_presets_are_for_even_tissues_only():
     own = TISSUES.replace("tumour", texture_db=1.0)
     assert with_preset_texture(own).tissue("tumour").texture_db == 1.0
@@ -118,20 +107,3 @@ def test_dark_images_have_no_speckle_to_fit(tracked):
     with pytest.raises(SimulationError, match="as bright as 15 grey levels"):
         fit_speckle(simulator(), dark, TISSUES, PLAIN)
     assert with_estimated_map(PLAIN, dark) == (PLAIN, False)
-
-
-@pytest.mark.slow
-def test_command_fits_the_speckle(tracked, tmp_path):
-    LABELS.write(tmp_path / "labels.nii.gz")
-    TISSUES.write(tmp_path / "labels.json")
-    tracked[0].write(tmp_path / "tracked.igs.mha")
-    write_json(tmp_path / "probe.json", PROBE.to_dict())
-    arguments = [
-        "optimize", tmp_path / "labels.nii.gz", "--sequence", tmp_path / "tracked.igs.mha", "--probe",
-        tmp_path / "probe.json", "-o", tmp_path / "result.json", "--save-preset", tmp_path / "preset.json", "--speckle",
-        "--free", "gain_db", "--evaluations", 20, "--restarts", 0,
-    ]  # fmt: skip
-    done = CliRunner().invoke(main, list(map(str, arguments)))
-    assert done.exit_code == 0, done.output
-    assert "texture T1" in done.output and "speckle: smoothing" in done.output
-    assert json.loads((tmp_path / "preset.json").read_text())["display"]["smoothing_axial_mm"] > 0.0

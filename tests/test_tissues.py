@@ -8,9 +8,7 @@ from dataclasses import replace
 import pytest
 from hypothesis import given, strategies as st
 
-from SlicerUSSim.Logic import Membrane, SimulationError, SimulationSettings, Tissue, TissueTable
-from SlicerUSSim.Logic.base.settings import DisplaySettings
-from SlicerUSSim.Logic.tissue.names import tissue_named
+from SlicerUSSim.Logic import Membrane, SimulationError, Tissue, TissueTable
 from SlicerUSSim.Logic.tissue.presets import TISSUES
 
 PARAMETERS = {"speed_of_sound_m_s", "impedance_mrayl", "attenuation_db_cm_mhz", "mu0", "mu1", "sigma0"}
@@ -35,19 +33,7 @@ def test_every_number_of_a_preset_has_a_source(name):
     assert all(TISSUES[name].sources.values())
 
 
-@pytest.mark.parametrize(
-    "name", ["csf", "grey matter", "white matter", "tumour", "falx", "skull", "scalp", "blood", "coupling"]
-)
-def test_brain_presets_exist(name):
-    assert tissue_named(name).name == name
-
-
-@pytest.mark.parametrize("name", ["fat", "muscle", "liver", "kidney", "bone", "air", "water", "gel"])
-def test_body_presets_exist(name):
-    assert tissue_named(name.upper()).name == name
-
-
-def test_white_matter_is_a_few_decibels_above_grey_and_leptomeninges_above_both():
+def test_white_matter_is_brighter_than_grey_and_leptomeninges_than_both():
     variance = {name: TISSUES[name].scatterer_variance for name in ("grey matter", "white matter", "leptomeninges")}
     assert 1.5 < variance["white matter"] / variance["grey matter"] < 6
     assert variance["leptomeninges"] > 4 * variance["white matter"]
@@ -82,18 +68,6 @@ def test_a_table_from_before_sheets_were_rough_keeps_its_even_layer():
     assert TissueTable.from_dict(old).membrane == replace(TissueTable.brain().membrane, roughness_mm=0.05)
 
 
-def test_replace_changes_one_tissue_and_the_membrane_by_name():
-    table = TissueTable.brain()
-    changed = table.replace("white matter", mu0=0.3).replace("leptomeninges", mu0=0.1)
-    assert changed[table.label_of("white matter")].mu0 == 0.3
-    assert changed.membrane.tissue.mu0 == 0.1
-    assert table[table.label_of("white matter")].mu0 == 0.33  # the old table is as it was
-    with pytest.raises(SimulationError, match="no tissue named 'bone'"):
-        table.replace("bone", mu0=0.3)
-    with pytest.raises(SimulationError, match="'mu9' is not a tissue parameter"):
-        table.replace("white matter", mu9=0.3)
-
-
 def test_replace_changes_every_label_of_a_name_and_the_membrane_with_them():
     """Left and right hemisphere have separate labels; sulci can be labelled and also be the membrane."""
     louder = replace(TISSUES["white matter"], speed_of_sound_m_s=1550.0)
@@ -106,25 +80,6 @@ def test_replace_changes_every_label_of_a_name_and_the_membrane_with_them():
     assert changed == table.with_tissue(changed[2]).replace("white matter", mu0=0.5)  # the equivalent call
 
 
-@pytest.mark.parametrize(
-    "arguments, changes, message",
-    [
-        (
-            ["bone"],
-            {"mu0": 0.3},
-            "no tissue named 'bone', expected one of: coupling, csf, grey matter, white",
-        ),
-        (["csf"], {"mu9": 1}, "'mu9' is not a tissue parameter that can be replaced, expected one of: speed_of_sound"),
-        (["csf"], {"name": "liquor"}, "'name' is not a tissue parameter that can be replaced, expected one of: speed"),
-        (["csf"], {"mu0": 1e6}, "tissue 'csf': mu0 is 1000000.0, expected a number between -100 and 100"),
-    ],
-)
-def test_replace_refuses_names_and_parameters_that_are_none(arguments, changes, message):
-    with pytest.raises(SimulationError) as caught:
-        TissueTable.brain().replace(*arguments, **changes)
-    assert message in str(caught.value) and "\n" not in str(caught.value)
-
-
 def test_a_name_means_the_same_tissue_to_labels_membrane_and_label_maps():
     quiet, loud = (replace(TISSUES["white matter"], mu0=mu0) for mu0 in (0.1, 0.9))
     table = TissueTable({1: quiet, 2: loud}).for_names(["White-Matter", "white matter"])
@@ -133,12 +88,6 @@ def test_a_name_means_the_same_tissue_to_labels_membrane_and_label_maps():
     assert tuned[2].mu0 == tuned.membrane.tissue.mu0 == 1.3
     both = TissueTable({1: quiet, 2: replace(loud, name="White Matter")}).for_names(["White Matter", "WHITE_MATTER"])
     assert (both[1].mu0, both[2].mu0) == (0.9, 0.1)  # an exact name has precedence over a similar one
-
-
-def test_a_full_table_refuses_another_tissue():
-    full = TissueTable({label: replace(TISSUES["bone"], name=f"bone {label}") for label in range(63)})
-    with pytest.raises(SimulationError, match="tissue label is 63, expected a whole number from 0 to 62"):
-        full.with_tissue(TISSUES["csf"])
 
 
 @pytest.mark.parametrize(
@@ -178,25 +127,6 @@ def test_tables_refuse_labels_and_files_they_cannot_use(tmp_path):
             TissueTable.read(path)
     with pytest.raises(SimulationError, match="cannot be read"):
         TissueTable.read(tmp_path / "none.json")
-
-
-@pytest.mark.parametrize(
-    "settings, message",
-    [
-        (lambda: SimulationSettings(seed=-1), "seed is -1"),
-        (lambda: SimulationSettings(elevational_rays=2.5), "expected a whole number"),
-        (lambda: SimulationSettings(interface_reflection="loud"), "expected one of pressure, energy"),
-        (lambda: DisplaySettings(dynamic_range_db=0), "dynamic_range_db is 0"),
-        (
-            lambda: DisplaySettings(image_size=(0, 5)),
-            r"image_size is \(0, 5\), expected 2 whole numbers between 8 and 8192",
-        ),
-        (lambda: DisplaySettings(noise_db=float("inf")), "noise_db is inf"),
-    ],
-)
-def test_settings_check_themselves(settings, message):
-    with pytest.raises(SimulationError, match=message):
-        settings()
 
 
 def test_a_tissue_replaces_all_of_its_name_and_a_new_one_gets_a_free_label():

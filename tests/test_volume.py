@@ -39,6 +39,10 @@ def numbered(shape=(3, 4, 5)) -> np.ndarray:
     return np.arange(np.prod(shape), dtype=np.int16).reshape(shape)
 
 
+#: An MRI, as a series of which tests damage copies
+SERIES = Volume(numbered((6, 40, 50)), np.diag([-1.0, -1.0, 2.5, 1.0]))
+
+
 @pytest.mark.parametrize("kind", ["vtk", "sitk"])
 @given(matrix=geometries())
 def test_geometry_survives_vtk_and_itk(kind, matrix):
@@ -133,11 +137,10 @@ def test_images_that_are_not_3d_are_refused(tmp_path, shape):
         Volume.read(tmp_path / "i.nrrd")
 
 
-@pytest.mark.parametrize("left", [200, 1000, -10])
-@pytest.mark.parametrize("number", [3, 5])
+@pytest.mark.parametrize(("number", "left"), [(3, 200), (5, 1000), (3, -10)])
 def test_a_damaged_file_among_those_of_a_series_is_named(tmp_path, number, left):
     """The volume ended before the last image, which was cut short in a full disk, without a word."""
-    write_dicom(Volume(numbered((6, 40, 50)), np.diag([-1.0, -1.0, 2.5, 1.0])), tmp_path)
+    write_dicom(SERIES, tmp_path)
     file = tmp_path / f"{number}.dcm"
     file.write_bytes(file.read_bytes()[:left])
     with pytest.raises(
@@ -147,14 +150,13 @@ def test_a_damaged_file_among_those_of_a_series_is_named(tmp_path, number, left)
 
 
 def test_other_objects_beside_the_images_of_a_series_are_no_damaged_images(tmp_path):
-    volume = Volume(numbered((6, 40, 50)), np.diag([-1.0, -1.0, 2.5, 1.0]))
-    write_dicom(volume, tmp_path)
+    write_dicom(SERIES, tmp_path)
     whole = (tmp_path / "3.dcm").read_bytes()
     pixels = whole.index(b"\xe0\x7f\x10\x00")
     state = whole[:pixels].replace(tag(0x0008, 0x0060) + b"\2\0\0\0MR", tag(0x0008, 0x0060) + b"\2\0\0\0PR")
     (tmp_path / "state.dcm").write_bytes(state)
     (tmp_path / "DICOMDIR").write_bytes(whole[:200])
-    np.testing.assert_array_equal(Volume.read(tmp_path).array, volume.array)
+    np.testing.assert_array_equal(Volume.read(tmp_path).array, SERIES.array)
 
 
 def test_names_of_patients_stay_out_of_messages_logs_and_files(tmp_path, caplog):
@@ -181,7 +183,7 @@ def test_descriptions_and_names_of_files_are_logged_only_if_asked(tmp_path, capl
     """Both may be names of patients."""
     caplog.set_level("INFO" if is_verbose else "WARNING")
     place = tmp_path / "DICOM" / "Doe_Jane"
-    write_dicom(Volume(numbered((6, 40, 50)), np.diag([-1.0, -1.0, 2.5, 1.0])), place)
+    write_dicom(SERIES, place)
     for file in list(place.iterdir()):
         whole = file.read_bytes()
         at, text = whole.index(tag(0x10, 0x10)), b"T1 of Jane"
@@ -212,22 +214,22 @@ def of_size(dicom: bytes, rows: int, columns: int, frames: int = 0) -> bytes:
     return bytes(content)
 
 
-@pytest.mark.parametrize("name", ["0.dcm", "IM0"])
 @pytest.mark.parametrize(
-    ("size", "words"),
+    ("how", "name", "size", "words"),
     [
-        ((65535, 65535), "voxels.* expected at most 2147483648 in all"),
-        ((9000, 9000), r"promises .* voxels, \d+ bytes, which its \d+ bytes cannot hold; copy or export it again"),
-        ((40, 50, 500), r"promises .* voxels, \d+ bytes, which its \d+ bytes cannot hold; copy or export it again"),
-        ((40, 50, 2000000), "voxels.* expected at most 2147483648 in all"),
+        ("one", "0.dcm", (65535, 65535), "voxels.* expected at most 2147483648 in all"),
+        ("one", "IM0", (40, 50, 2000000), "voxels.* expected at most 2147483648 in all"),
+        ("one", "IM0", (9000, 9000), r"promises .* voxels, \d+ bytes, which its \d+ bytes cannot hold; copy or export"),
+        ("series", "0.dcm", (40, 50, 500), r"promises .* voxels, \d+ bytes, which its \d+ bytes cannot hold; copy or"),
+        ("series", "IM0", (65535, 65535), "voxels.* expected at most 2147483648 in all"),
+        ("folder", "IM0", (9000, 9000), r"promises .* voxels, \d+ bytes, which its \d+ bytes cannot hold; copy or"),
     ],
 )
-@pytest.mark.parametrize("how", ["one", "series", "folder"])
 def test_what_a_dicom_file_promises_is_bounded_before_it_is_read(tmp_path, monkeypatch, name, size, words, how):
     """Without a suffix, and as one of a series, ITK asked for the memory that the header says."""
     import SimpleITK as sitk
 
-    write_dicom(Volume(numbered((6, 40, 50)), np.diag([-1.0, -1.0, 2.5, 1.0])), tmp_path)
+    write_dicom(SERIES, tmp_path)
     whole = (tmp_path / "0.dcm").read_bytes()
     if how == "one":
         for path in tmp_path.iterdir():
@@ -247,11 +249,16 @@ def with_length(dicom: bytes, at: int, length: int) -> bytes:
     return dicom[:at] + length.to_bytes(4, "little") + dicom[at + 4 :]
 
 
-@pytest.mark.parametrize("where", ["meta", "type", "patient", "sequence", "explicit", "no prefix"])
-@pytest.mark.parametrize("door", ["file", "folder", "array"])
+@pytest.mark.parametrize(
+    ("where", "door"),
+    [
+        ("meta", "file"), ("type", "file"), ("sequence", "file"), ("explicit", "file"), ("no prefix", "file"),
+        ("patient", "folder"), ("patient", "array"),
+    ],
+)  # fmt: skip
 def test_a_length_far_beyond_the_end_of_a_dicom_file_is_refused(tmp_path, where, door):
     """GDCM filled 4 GB with zeros for a file of 1.5 kB."""
-    write_dicom(Volume(numbered((6, 40, 50)), np.diag([-1.0, -1.0, 2.5, 1.0])), tmp_path)
+    write_dicom(SERIES, tmp_path)
     whole = (tmp_path / "3.dcm").read_bytes()
     patient = whole.index(tag(0x10, 0x10))
     if where == "meta":  # its version, explicit as all of that part
@@ -277,32 +284,16 @@ def test_a_length_far_beyond_the_end_of_a_dicom_file_is_refused(tmp_path, where,
         read(tmp_path if door == "folder" else tmp_path / "3.dcm")
 
 
-def test_sequences_and_compressed_pixels_are_no_damage(tmp_path):
-    write_dicom(Volume(numbered((6, 40, 50)), np.diag([-1.0, -1.0, 2.5, 1.0])), tmp_path)
-    code = tag(0x08, 0x0100) + b"\x08\0\0\0" + b"T-A0100 "
-    for open_ended in (False, True):
-        end = tag(0xFFFE, 0xE00D) + bytes(4) if open_ended else b""
-        length = b"\xff" * 4 if open_ended else len(code).to_bytes(4, "little")
-        item = tag(0xFFFE, 0xE000) + length + code + end
-        end = tag(0xFFFE, 0xE0DD) + bytes(4) if open_ended else b""
-        length = b"\xff" * 4 if open_ended else len(item).to_bytes(4, "little")
-        for path in tmp_path.iterdir():
-            whole = path.read_bytes()
-            at = whole.index(tag(0x10, 0x10))
-            path.write_bytes(whole[:at] + tag(0x08, 0x2218) + length + item + end + whole[at:])
-        assert Volume.read(tmp_path).array.shape == (6, 40, 50)
-
-
 def test_a_compressed_series_of_one_grey_level_is_read(tmp_path):
     """Its files are far smaller than its voxels."""
-    volume = Volume(np.full((12, 512, 512), 7, np.int16), np.diag([-1.0, -1.0, 2.5, 1.0]))
+    volume = Volume(np.full((12, 256, 256), 7, np.int16), np.diag([-1.0, -1.0, 2.5, 1.0]))
     write_dicom(volume, tmp_path, compressor="JPEG2000")
     assert sum(path.stat().st_size for path in tmp_path.iterdir()) < volume.array.nbytes / 100
     for path in (tmp_path, tmp_path / "3.dcm"):
         np.testing.assert_array_equal(Volume.read(path).array, volume.array)
 
 
-@pytest.mark.parametrize("door", ["folder", "file", "array"])
+@pytest.mark.parametrize("door", ["folder", "array"])
 def test_compressed_dicom_is_decoded_in_another_process(tmp_path, monkeypatch, door):
     """Decoders print several lines about a damaged one, and are where image libraries are broken into."""
     write_dicom(Volume(numbered((12, 40, 50)), np.diag([-1.0, -1.0, 2.5, 1.0])), tmp_path, compressor="JPEG2000")
@@ -317,7 +308,7 @@ def test_compressed_dicom_is_decoded_in_another_process(tmp_path, monkeypatch, d
 def test_a_folder_with_more_files_than_any_study_is_refused(tmp_path, monkeypatch, below):
     monkeypatch.setattr("SlicerUSSim.Logic.base.dicom._MOST_FILES", 5)
     place = tmp_path / "below" if below else tmp_path
-    write_dicom(Volume(numbered((6, 40, 50)), np.diag([-1.0, -1.0, 2.5, 1.0])), place)
+    write_dicom(SERIES, place)
     with pytest.raises(SimulationError, match="has more than 5 files in it, give the folder of the series"):
         Volume.read(tmp_path)
 
@@ -339,13 +330,14 @@ def tag(group: int, element: int) -> bytes:
         ((0x28, 0x30), b"0\\0 ", r"has voxels of 0 x 0 mm, expected 0\.01 to 50 mm"),
         ((0x28, 0x30), b"3\\1 ", r"has the pixel spacing 3\\1, and \d\.dcm 1\\1, expected one in all images"),
         ((0x28, 0x10), b"\x20\0", r"has the number of rows 32, and \d\.dcm 40, expected one in all images"),
-        ((0x20, 0x32), None, r"has the position '' \(DICOM tag 0020,0032\), expected 3 numbers"),
+        ((0x28, 0x101), b"\x09\0", r"has the BitsStored 9, and \d\.dcm \d+, expected one in all"),
+        ((0x28, 0x103), b"\0\0", r"has the PixelRepresentation 0, and \d\.dcm \d+, expected one in all"),
         ((0x20, 0x37), None, r"has the orientation '' \(DICOM tag 0020,0037\), expected 6 numbers"),
     ],
 )
 def test_images_that_are_no_volume_together_are_refused(tmp_path, where, value, words):
     """Mixed orientations, places and spacings that are missing or no numbers, images of several sizes."""
-    write_dicom(Volume(numbered((6, 40, 50)), np.diag([-1.0, -1.0, 2.5, 1.0])), tmp_path)
+    write_dicom(SERIES, tmp_path)
     file = tmp_path / "3.dcm"
     content = file.read_bytes()
     at = content.index(tag(*where))
@@ -372,47 +364,29 @@ def with_bits(dicom: bytes, element: int, value: int) -> bytes:
     return dicom[:at] + value.to_bytes(2, "little") + dicom[at + 2 :]
 
 
-@pytest.mark.parametrize("door", ["folder", "file", "array"])
-@pytest.mark.parametrize("which", ["3.dcm", "*.dcm"])
 @pytest.mark.parametrize(
-    ("change", "words"),
+    ("door", "which", "change", "words"),
     [
-        (lambda whole: with_pixels(whole, bytes(1000)), r"have 1000 bytes, expected 4000 for 40 rows, 50 columns"),
-        (lambda whole: with_pixels(whole, bytes(3998)), r"have 3998 bytes, expected 4000"),
-        (lambda whole: with_bits(whole, 0x100, 32), r"have 4000 bytes, expected 8000 .* 32 bits \(BitsAllocated\)"),
-        (lambda whole: with_bits(whole, 0x100, 8), r"have 4000 bytes, expected 2000 .* 8 bits \(BitsAllocated\)"),
+        ("folder", "3.dcm", lambda whole: with_pixels(whole, bytes(1000)), r"have 1000 bytes, expected 4000 for 40 ro"),
+        ("file", "*.dcm", lambda whole: with_pixels(whole, bytes(3998)), r"have 3998 bytes, expected 4000"),
+        ("array", "3.dcm", lambda whole: with_pixels(whole, bytes(3998)), r"have 3998 bytes, expected 4000"),
+        ("folder", "*.dcm", lambda whole: with_bits(whole, 0x100, 32), r"expected 8000 .* 32 bits \(BitsAllocated\)"),
+        ("array", "3.dcm", lambda whole: with_bits(whole, 0x100, 8), r"expected 2000 .* 8 bits \(BitsAllocated\)"),
+        ("file", "3.dcm", lambda whole: with_bits(whole, 0x100, 8), r"has the BitsAllocated 8, and \d\.dcm 16, expec"),
     ],
 )
 def test_dicom_pixels_of_another_size_than_its_header_says_are_refused(tmp_path, change, words, which, door):
     """GDCM reads the missing ones as zeros without a word."""
-    write_dicom(Volume(numbered((6, 40, 50)).astype(np.int16), np.diag([-1.0, -1.0, 2.5, 1.0])), tmp_path)
+    write_dicom(SERIES, tmp_path)
     for file in tmp_path.glob(which):
         file.write_bytes(change(file.read_bytes()))
-    if which == "3.dcm" and "bits" in words:  # it differs from the others, then, which is said first
-        words += r"|has the BitsAllocated \d+, and \d\.dcm 16, expected one in all images"
-    if which == "3.dcm" and door == "array":
-        assert_refused = pytest.raises(SimulationError, match=rf"3\.dcm: its pixels {words}")
-    else:
-        assert_refused = pytest.raises(SimulationError, match=rf"\d\.dcm:?.*({words})")
-    with assert_refused:
-        read_array(tmp_path / "3.dcm") if door == "array" else Volume.read(
-            tmp_path if door == "folder" else tmp_path / "3.dcm"
-        )
+    read = read_array if door == "array" else Volume.read
+    with pytest.raises(SimulationError, match=rf"\d\.dcm:?.*{words}"):
+        read(tmp_path if door == "folder" else tmp_path / "3.dcm")
 
 
-@pytest.mark.parametrize(("element", "value", "name"), [(0x101, 9, "BitsStored"), (0x103, 0, "PixelRepresentation")])
-def test_slices_whose_pixels_are_stored_otherwise_are_refused(tmp_path, element, value, name):
-    write_dicom(Volume(numbered((6, 40, 50)).astype(np.int16), np.diag([-1.0, -1.0, 2.5, 1.0])), tmp_path)
-    file = tmp_path / "3.dcm"
-    file.write_bytes(with_bits(file.read_bytes(), element, value))
-    with pytest.raises(SimulationError, match=rf"3\.dcm has the {name} {value}, and \d\.dcm \d+, expected one in all"):
-        Volume.read(tmp_path)
-
-
-@pytest.mark.parametrize("open_ended", [False, True])
-def test_the_size_of_a_small_picture_in_a_dicom_file_is_not_that_of_the_image(tmp_path, open_ended):
-    volume = Volume(numbered((6, 40, 50)).astype(np.int16), np.diag([-1.0, -1.0, 2.5, 1.0]))
-    write_dicom(volume, tmp_path)
+def test_the_size_of_a_small_picture_in_a_dicom_file_is_not_the_images(tmp_path):
+    write_dicom(SERIES, tmp_path)
 
     def element(group, number, value):
         return tag(group, number) + len(value).to_bytes(4, "little") + value
@@ -421,16 +395,13 @@ def test_the_size_of_a_small_picture_in_a_dicom_file_is_not_that_of_the_image(tm
         element(0x28, number, value.to_bytes(2, "little"))
         for number, value in ((2, 1), (0x10, 8), (0x11, 8), (0x100, 8))
     ) + element(0x7FE0, 0x10, bytes(64))
-    if open_ended:
-        item = tag(0xFFFE, 0xE000) + b"\xff" * 4 + picture + tag(0xFFFE, 0xE00D) + bytes(4)
-        icon = tag(0x88, 0x200) + b"\xff" * 4 + item + tag(0xFFFE, 0xE0DD) + bytes(4)
-    else:
-        icon = element(0x88, 0x200, element(0xFFFE, 0xE000, picture))
+    item = tag(0xFFFE, 0xE000) + b"\xff" * 4 + picture + tag(0xFFFE, 0xE00D) + bytes(4)
+    icon = tag(0x88, 0x200) + b"\xff" * 4 + item + tag(0xFFFE, 0xE0DD) + bytes(4)
     for file in tmp_path.iterdir():
         whole = file.read_bytes()
         at = whole.index(tag(0x28, 0x02) + b"\2\0\0\0")
         file.write_bytes(whole[:at] + icon + whole[at:])
-    np.testing.assert_array_equal(Volume.read(tmp_path).array, volume.array)
+    np.testing.assert_array_equal(Volume.read(tmp_path).array, SERIES.array)
     whole = (tmp_path / "3.dcm").read_bytes()
     at = whole.rindex(tag(0x7FE0, 0x10)) + 4
     (tmp_path / "3.dcm").write_bytes(whole[:at] + (1000).to_bytes(4, "little") + bytes(1000))
@@ -438,25 +409,7 @@ def test_the_size_of_a_small_picture_in_a_dicom_file_is_not_that_of_the_image(tm
         Volume.read(tmp_path)
 
 
-@pytest.mark.parametrize("name", ["image.nii", "image.nii.gz"])
-def test_a_truncated_or_damaged_nifti_file_is_refused(name, tmp_path):
-    """ITK reads the missing voxels as 0 without a word."""
-    rng = np.random.default_rng(0)
-    Volume(rng.integers(0, 1000, (40, 41, 42)).astype(np.int16), np.eye(4)).write(tmp_path / name)
-    whole = (tmp_path / name).read_bytes()
-    Volume.read(tmp_path / name)
-    for share in (0.95, 0.5):
-        (tmp_path / name).write_bytes(whole[: int(share * len(whole))])
-        with pytest.raises(SimulationError, match=rf"{name}: the file is incomplete, \d+ of 138112 bytes"):
-            Volume.read(tmp_path / name)
-    if name.endswith(".gz"):
-        middle = len(whole) // 2
-        (tmp_path / name).write_bytes(whole[:middle] + bytes([whole[middle] ^ 16]) + whole[middle + 1 :])
-        with pytest.raises(SimulationError, match=rf"{name}: .*(file|content) is damaged"):
-            Volume.read(tmp_path / name)
-
-
-@pytest.mark.parametrize("name", ["i.nii.gz", "i.nrrd", "i.nhdr", "i.mha", "i.vti", "i.mgz"])
+@pytest.mark.parametrize("name", ["i.nii", "i.nii.gz", "i.nrrd", "i.nhdr", "i.mha", "i.vti", "i.mgz"])
 def test_a_file_whose_last_bytes_are_missing_is_refused(name, tmp_path):
     """All voxels may be there, but nothing says so: checksums and ends of files were not looked at."""
     rng = np.random.default_rng(0)
@@ -468,11 +421,11 @@ def test_a_file_whose_last_bytes_are_missing_is_refused(name, tmp_path):
     Volume.read(tmp_path / name)
     file = next(tmp_path.glob("*.raw*")) if name == "i.nhdr" else tmp_path / name
     whole = file.read_bytes()
-    for missing in (*range(1, 12), 20):
+    for missing in (1, 2, 4, 8, 11, 20, len(whole) // 2):
         file.write_bytes(whole.rstrip(b"\n" if name == "i.vti" else b"")[:-missing])
         with pytest.raises(SimulationError, match=re.escape(name)):
             Volume.read(tmp_path / name)
-    if name not in ("i.vti", "i.mha"):
+    if name not in ("i.vti", "i.mha", "i.nii"):
         file.write_bytes(whole[:-7] + bytes([whole[-7] ^ 1]) + whole[-6:])  # of the checksum
         with pytest.raises(SimulationError, match=re.escape(name)):
             Volume.read(tmp_path / name)
@@ -503,8 +456,6 @@ def test_a_name_that_would_be_written_as_another_is_refused(name, tmp_path):
 
 
 def test_what_is_wrong_with_an_unreadable_image_is_said(tmp_path):
-    import SimpleITK as sitk
-
     nibabel = pytest.importorskip("nibabel")
     values = np.arange(60, dtype=np.int16).reshape(3, 4, 5)
     Volume(values, np.eye(4)).write(tmp_path / "good.nii.gz")
@@ -512,14 +463,11 @@ def test_what_is_wrong_with_an_unreadable_image_is_said(tmp_path):
     (tmp_path / "empty.nrrd").write_bytes(b"")
     (tmp_path / "text.nii.gz").write_text("no image")
     nibabel.save(nibabel.Nifti2Image(values, np.eye(4)), tmp_path / "second.nii.gz")
-    complex_values = sitk.GetImageFromArray(values.astype(np.complex64))
-    sitk.WriteImage(complex_values, str(tmp_path / "complex.nii.gz"))
     for name, message in {
         "packed.nii": r"it is compressed by gzip: rename it to packed\.nii\.gz",
         "empty.nrrd": "it is empty, 0 bytes",
         "text.nii.gz": "it is not compressed by gzip, as its name says",
         "second.nii.gz": "it is NIfTI-2, expected NIfTI-1",
-        "complex.nii.gz": "holds complex numbers, expected real ones",
     }.items():
         with pytest.raises(SimulationError, match=f"{name}: .*{message}"):
             Volume.read(tmp_path / name)
@@ -636,14 +584,16 @@ def test_voxels_within_the_head_that_are_no_numbers_are_refused(tmp_path, place,
 def test_voxels_of_others_stay_beside_a_header(tmp_path):
     """A user's file whose name looks like ours, voxels of a header with the same stem, and of a copied header."""
     theirs = tmp_path / "a.0123456789abcdef.raw"
+    plain = tmp_path / "a.raw"  # as ITK would call ours
     theirs.write_bytes(b"the MRI")
+    plain.write_bytes(b"another MRI")
     images = [Volume(numbered((20, 20, 20)) + n, np.eye(4)) for n in range(4)]
     images[0].write(tmp_path / "a.mhd")
     images[1].write(tmp_path / "a.nhdr")
     (tmp_path / "copy.mhd").write_bytes((tmp_path / "a.mhd").read_bytes())
     images[2].write(tmp_path / "a.mhd")
     images[3].write(tmp_path / "a.mhd")
-    assert theirs.read_bytes() == b"the MRI"
+    assert theirs.read_bytes() == b"the MRI" and plain.read_bytes() == b"another MRI"
     for name, image in (("a.mhd", images[3]), ("a.nhdr", images[1]), ("copy.mhd", images[0])):
         assert np.array_equal(Volume.read(tmp_path / name).array, image.array)
     assert len(list(tmp_path.glob("a.*.raw*"))) == 4  # those of images[2] are gone
@@ -672,6 +622,7 @@ for _ in range(15):
 """
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="processes are forked")
 def test_runs_that_write_one_header_at_once_leave_the_voxels_that_it_names(tmp_path):
     """One removed the voxels that another had moved, but not named yet."""
@@ -691,18 +642,6 @@ def test_voxels_that_a_header_names_but_we_did_not_write_stay(tmp_path):
     assert theirs.is_file()
 
 
-@pytest.mark.parametrize("new", ["a.mhd", "a.nhdr"])
-def test_the_voxels_of_another_header_are_not_replaced(new, tmp_path):
-    """Both keep them in a file of their own: the labels of a patient replaced her MRI."""
-    volume = Volume(np.arange(60, dtype=np.int16).reshape(3, 4, 5), np.eye(4))
-    (tmp_path / "a.raw").write_bytes(b"the MRI")
-    volume.write(tmp_path / new)
-    volume.with_array(volume.array + 1).write(tmp_path / new)
-    np.testing.assert_array_equal(Volume.read(tmp_path / new).array, volume.array + 1)
-    assert (tmp_path / "a.raw").read_bytes() == b"the MRI"
-    assert len(list(tmp_path.iterdir())) == 3  # the voxels of the header before are gone
-
-
 _FULL = """
 import resource, signal, sys
 import nibabel
@@ -710,29 +649,32 @@ import numpy as np
 from SlicerUSSim.Logic.base.errors import SimulationError
 from SlicerUSSim.Logic.base.volume import Volume
 
-Volume(np.ones((10, 10, 10), np.uint8), np.eye(4)).write(sys.argv[1])
+for name in sys.argv[1:]:
+    Volume(np.ones((10, 10, 10), np.uint8), np.eye(4)).write(name)
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 resource.setrlimit(resource.RLIMIT_FSIZE, (40 * 40 * 64, 40 * 40 * 64))
 for size in (80, 64):  # of 64, only the header does not fit
-    try:
-        array = np.random.default_rng(0).integers(0, 256, (40, 40, size)).astype(np.uint8)
-        Volume(array, np.eye(4)).write(sys.argv[1])
-        print("written")
-    except SimulationError as error:
-        print(error)
+    array = np.random.default_rng(0).integers(0, 256, (40, 40, size)).astype(np.uint8)
+    for name in sys.argv[1:]:
+        try:
+            Volume(array, np.eye(4)).write(name)
+            print("written", name)
+        except SimulationError as error:
+            print(error)
 """
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="no limit of the size of files")
-@pytest.mark.parametrize("name", ["v.nii.gz", "v.nii", "v.nrrd", "v.mha", "v.vti"])
-def test_a_file_that_does_not_fit_on_the_disk_leaves_the_one_before(name, tmp_path):
+def test_a_file_that_does_not_fit_on_the_disk_leaves_the_one_before(tmp_path):
     """Of a NIfTI file ITK did not say so: the file before was replaced by an empty one."""
-    done = subprocess.run([sys.executable, "-c", _FULL, name], cwd=tmp_path, capture_output=True, text=True)
-    assert done.returncode == 0 and done.stdout.count(f"{name}: cannot be written") == 2, done.stdout
-    assert done.stderr == ""  # ITK and VTK told of it in words of their own
-    kept = Volume.read(tmp_path / name)
-    assert kept.array.shape == (10, 10, 10) and (kept.array == 1).all()
-    assert [file.name for file in tmp_path.iterdir()] == [name]
+    names = ["v.mha", "v.nii", "v.nii.gz", "v.nrrd", "v.vti"]
+    done = subprocess.run([sys.executable, "-c", _FULL, *names], cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == 0 and done.stderr == ""  # ITK and VTK told of it in words of their own
+    assert sorted(file.name for file in tmp_path.iterdir()) == names
+    for name in names:
+        assert done.stdout.count(f"{name}: cannot be written") == 2, done.stdout
+        kept = Volume.read(tmp_path / name)
+        assert kept.array.shape == (10, 10, 10) and (kept.array == 1).all()
 
 
 def test_a_minc_file_is_not_begun_where_it_may_not_fit(tmp_path, monkeypatch):
@@ -743,39 +685,3 @@ def test_a_minc_file_is_not_begun_where_it_may_not_fit(tmp_path, monkeypatch):
     with pytest.raises(SimulationError, match=r"v\.mnc: cannot be written \(may need 8000 bytes, .* 7999 left\)"):
         Volume(np.zeros((20, 20, 20), np.uint8), np.eye(4)).write(tmp_path / "v.mnc")
     assert (Volume.read(tmp_path / "v.mnc").array == 1).all() and len(list(tmp_path.iterdir())) == 1
-
-
-_THREADS = """
-import os, sys, threading
-import nibabel
-import numpy as np
-from SlicerUSSim.Logic import Volume
-from SlicerUSSim.Logic.base.files import messages_withheld
-
-entered, both, left = threading.Event(), threading.Barrier(2), threading.Event()
-
-def first():
-    with messages_withheld():
-        entered.set()
-        both.wait()
-        os.write(2, b"of the first\\n")
-    left.set()
-
-def second():
-    entered.wait()
-    with messages_withheld():
-        both.wait()
-        left.wait()
-        os.write(2, b"of the second\\n")
-
-threads = [threading.Thread(target=one) for one in (first, second)]
-for thread in threads: thread.start()
-for thread in threads: thread.join()
-print(os.fstat(2).st_nlink, flush=True)  # 0 of a temporary file
-print("after", file=sys.stderr)
-"""
-
-
-def test_stderr_is_itself_again_after_threads_have_withheld_messages():
-    done = subprocess.run([sys.executable, "-c", _THREADS], capture_output=True, text=True)
-    assert done.stderr == "of the first\nof the second\nafter\n" and done.stdout == "1\n"
