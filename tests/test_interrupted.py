@@ -12,9 +12,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from SlicerUSSim.Logic import PhasedProbe, TissueTable, TrackedSequence, Volume, segment_mri
+from SlicerUSSim.Logic import PhasedProbe, TissueTable, Volume, segment_mri
 from SlicerUSSim.Logic.base.files import read_json, write_json
-from SlicerUSSim.Logic.base.volume import read_array
 from SlicerUSSim.Logic.mri.samples import head_mri
 from SlicerUSSim.Logic.probe import craniotomy_pose
 from SlicerUSSim.Logic.tracked import write_pose
@@ -25,15 +24,6 @@ pytestmark = [pytest.mark.slow, pytest.mark.skipif(sys.platform == "win32", reas
 FIT = "labels.nii.gz --sequence tracked.igs.mha --probe probe.json --free gain_db --restarts 0"
 COMMANDS = {
     "segment": ("segment mri.nii.gz -o out.nii.gz", {"out.nii.gz": Volume.read}),
-    "simulate": ("simulate labels.nii.gz --pose pose.json -o out.mha", {"out.mha": read_array}),
-    "sweep": (
-        "sweep labels.nii.gz --sequence tracked.igs.mha --probe probe.json -o out.igs.mha",
-        {"out.igs.mha": TrackedSequence.read},
-    ),
-    "volume": (
-        "volume labels.nii.gz --pose pose.json --tilt 20 --frames 6 --spacing 1 -o out.nrrd",
-        {"out.nrrd": Volume.read},
-    ),
     "optimize": (f"optimize {FIT} --evaluations 60 -o out.json", {"out.json": read_json}),
 }
 
@@ -83,7 +73,7 @@ def test_a_command_that_is_interrupted_leaves_nothing_half_done(name, inputs, tm
     made = {path.name for path in tmp_path.iterdir()} - inputs.keys()
     assert made >= outputs.keys()
     interrupted = 0
-    for share in (0.3, 0.6, 0.8, 0.9, 0.97):
+    for share in (0.6, 0.9):
         for file in made:
             (tmp_path / file).unlink(missing_ok=True)
         process = start(tmp_path, command)
@@ -147,7 +137,6 @@ cli.main(["compute"])
     ("number", "before"),
     [
         (signal.SIGINT, ""),
-        (signal.SIGTERM, ""),
         # As in the background of a shell script
         (signal.SIGTERM, "import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)"),
     ],

@@ -238,7 +238,7 @@ def test_nothing_waits_for_the_disk(tmp_path):
     assert logic.parameters.mri is not None
 
 
-def test_a_patient_for_whom_there_is_no_room_is_not_kept_which_is_said_once(tmp_path, monkeypatch):
+def test_a_patient_without_room_is_not_kept_which_is_said_once(tmp_path, monkeypatch):
     session, told = Kept(tmp_path / "own"), []
     session.goes_on.set()
     autosave, logic, _, calls, _ = autosave_of(session, told)

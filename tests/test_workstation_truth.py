@@ -7,7 +7,6 @@ import re
 import shutil
 import zipfile
 from pathlib import Path
-from time import monotonic
 
 import numpy as np
 import pytest
@@ -21,7 +20,6 @@ from vtkmodules.vtkIOXML import vtkXMLImageDataReader
 
 from SlicerUSSim.Logic import Volume
 from SlicerUSSim.Logic.base.volume import read_array
-from SlicerUSSim.Logic.mri.samples import head_mri
 from SlicerUSSim.Logic.tracked.sequence import TrackedSequence
 from SlicerUSSim.Workstation.scene_files import read_scene
 from SlicerUSSim.Workstation.state import NAMES
@@ -31,13 +29,14 @@ from tests.test_workstation import (
     cost,
     dismiss_messages,
     download,
+    drawn,
     errors,
     eventually,
     first_page as first_page,
-    fit,
     new_image,
     open_head,
     open_new_patient,
+    picture,
     pixels,
     pose,
     pytestmark as pytestmark,
@@ -47,9 +46,8 @@ from tests.test_workstation import (
     settled,
     shown,
     state,
+    views,
 )
-from tests.test_workstation_sessions import sector_rows
-from tests.test_workstation_waiting import cancelled
 
 
 @pytest.fixture(scope="module")
@@ -186,24 +184,13 @@ def output_of_scene(bundle: Path, folder: Path):
 
 
 @pytest.mark.slow
-def test_a_live_image_is_saved_where_it_was_taken_and_follows_the_probe_after_that(page, tmp_path):
+def test_a_live_image_is_saved_where_it_was_taken(page, tmp_path):
     shutil.copy(download(page, "nrrd"), tmp_path / "live.nrrd")
     _, in_scene = output_of_scene(download(page, "mrb"), tmp_path)
     np.testing.assert_allclose(in_scene, read_array(tmp_path / "live.nrrd")[1], atol=1e-3)
     with new_image(page):
         page.keyboard.press("a")
     assert page.locator("#frozen").is_hidden()
-
-
-@pytest.mark.slow
-def test_while_a_fit_runs_the_image_is_marked_frozen(head_page):
-    page = head_page
-    fit(page, 100_000)
-    page.locator("#cancel").wait_for()
-    page.locator("#frozen").wait_for()
-    click(page, "#cancel")
-    page.locator("#frozen").wait_for(state="hidden")
-    settled(page)
 
 
 @pytest.mark.slow
@@ -223,7 +210,7 @@ def test_the_cost_is_blank_where_the_probe_sees_nothing(head_page):
 
 
 @pytest.mark.slow
-def test_a_new_patient_clears_image_ruler_and_cost_at_once_and_the_probe_is_placed_anew(head_page, files, tmp_path):
+def test_a_new_patient_clears_image_ruler_cost_and_pose_at_once(head_page, files, tmp_path):
     page = head_page
     for _ in range(6):
         page.keyboard.press("Shift+ArrowLeft")
@@ -283,23 +270,6 @@ def test_a_saved_scene_holds_this_patient_only_and_a_patient_can_be_closed(page,
 
 
 @pytest.mark.slow
-def test_the_last_segment_is_undone_on_the_page(page, files):
-    open_new_patient(page, files / "head.nii.gz")
-    notes, before = shown(page, "notesLabel"), np.asarray(Image.open(download(page, "png")))
-    thin = shown(page, "thinSulciCheckBox")
-    page.evaluate("on => window.trame.trigger('set', ['thinSulciCheckBox', on])", not thin)
-    with new_image(page):
-        click(page, "#segmentButton")
-        eventually(page, lambda: shown(page, "notesLabel") != notes)
-    assert not np.array_equal(np.asarray(Image.open(download(page, "png"))), before)
-    with new_image(page):
-        click(page, "#undoSegmentButton")
-    assert np.array_equal(np.asarray(Image.open(download(page, "png"))), before) and shown(page, "notesLabel") == notes
-    page.evaluate("on => window.trame.trigger('set', ['thinSulciCheckBox', on])", thin)
-    settled(page)
-
-
-@pytest.mark.slow
 def test_an_upload_shows_how_far_it_is_can_be_cancelled_and_images_go_on(page, files):
     """Of 216 MB nothing was shown for 49 s, and no image came meanwhile."""
     session = page.context.new_cdp_session(page)
@@ -316,7 +286,7 @@ def test_an_upload_shows_how_far_it_is_can_be_cancelled_and_images_go_on(page, f
         page.keyboard.press("a")
         page.wait_for_function("n => window.ussim.images > n && window.ussim.uploading", arg=count)
         click(page, "#upload-cancel")
-        page.wait_for_function("!window.ussim.uploading", timeout=1000)
+        page.wait_for_function("!window.ussim.uploading")
         assert page.locator("#upload").is_hidden()
     finally:
         session.send("Network.emulateNetworkConditions", {**slow, "uploadThroughput": -1})
@@ -324,30 +294,11 @@ def test_an_upload_shows_how_far_it_is_can_be_cancelled_and_images_go_on(page, f
     assert state(page, NAMES.title) == before and not errors(page)
 
 
-@pytest.mark.slow
-def test_cancel_ends_a_segmentation_within_a_second_and_images_go_on(page, tmp_path):
-    head_mri(1.0).write(tmp_path / "fine.nii.gz")
-    open_new_patient(page, tmp_path / "fine.nii.gz")
-    notes = shown(page, "notesLabel")
-    page.evaluate("window.trame.trigger('set', ['skullStripComboBox', 'atlas'])")
-    page.evaluate("window.trame.trigger('set', ['maskSelector', ''])")
-    settled(page)
-    click(page, "#segmentButton")
-    page.locator("#cancel").wait_for()
-    page.wait_for_timeout(300)
-    took = cancelled(page)
-    start = monotonic()
-    with new_image(page):
-        page.keyboard.press("a")
-    answered = monotonic() - start  # on a busy machine all takes longer
-    assert took < 1.0 + 3.0 * answered and shown(page, "notesLabel") == notes and not errors(page)
-
-
 # ---- images of a sequence --------------------------------------------------------------------------------------------
 
 
 @pytest.mark.slow
-def test_the_images_of_simulate_sequence_are_shown_and_played_where_they_were_taken(page, files, tmp_path):
+def test_simulated_sequences_are_shown_and_played_where_they_were_taken(page, files, tmp_path):
     """The page made images that it could not show."""
     open_new_patient(page, files / "head.nii.gz", files / "sweep.igs.mha")
     eventually(page, lambda: state(page, NAMES.sequence.length) == 6)
@@ -399,6 +350,14 @@ def test_the_images_of_simulate_sequence_are_shown_and_played_where_they_were_ta
     # Those of a patient go with him
     open_new_patient(page, files / "labels.nii.gz")
     assert page.locator("#simulated-player").count() == 0 and not errors(page)
+
+
+def sector_rows(page) -> int:
+    """Rows that the outline of the imaged field covers in the slice view of the image plane."""
+    drawn(page)
+    red, green, blue = np.moveaxis(picture(page, views(page)[1].bounding_box()), -1, 0)
+    rows, _ = np.nonzero((red > 110) & (green > 80) & (blue < 0.6 * green))
+    return int(np.ptp(rows)) if rows.size else 0
 
 
 @pytest.mark.slow
