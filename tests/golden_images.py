@@ -24,6 +24,7 @@ SIZE = (224, 192)
 #: Height of the patient's surface and of the middle, mm
 _TOP = 84.0
 _SPACING = 1.5
+POSE = pose_looking_at((0.0, 0.0, _TOP + 1.0), (0.0, 0.0, 0.0))
 
 
 def patient() -> tuple[Volume, TissueTable]:
@@ -49,9 +50,8 @@ def patient() -> tuple[Volume, TissueTable]:
 def images() -> dict[str, np.ndarray]:
     """{name of a probe: (rows, columns) uint8}, with each probe's defaults, 1 mm above the brain."""
     simulator = UltrasoundSimulator(*patient())
-    pose = pose_looking_at((0.0, 0.0, _TOP + 1.0), (0.0, 0.0, 0.0))
     display = DisplaySettings(image_size=SIZE)
-    return {name: simulator.simulate(probe, pose, display, noise_seed=1).image for name, probe in PROBES.items()}
+    return {name: simulator.simulate(probe, POSE, display, noise_seed=1).image for name, probe in PROBES.items()}
 
 
 def golden(name: str) -> np.ndarray | None:
