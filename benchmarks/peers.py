@@ -1,4 +1,4 @@
-"""Frame A compared with other simulators in one run: PyMUST's simus, zea's simulators, this model in numpy.
+"""Frame A compared with other simulators in one run: PyMUST's simus and zea's simulators.
 
     python -m benchmarks.peers [--device NAME] [--json FILE]
 
@@ -24,14 +24,13 @@ import numpy as np
 from scipy.integrate import trapezoid
 
 from benchmarks.frames import FRAMES
-from benchmarks.measuring import measured, output_file, timed
+from benchmarks.measuring import measured, output_file
 from SlicerUSSim.Logic import SimulationSettings, TissueTable, UltrasoundSimulator, segment_mri
 from SlicerUSSim.Logic.base import write_json
 from SlicerUSSim.Logic.imaging.scattering import sites_per_mm3
 from SlicerUSSim.Logic.mri import demo_mri
 from SlicerUSSim.Logic.opencl.devices import devices_to_measure
 from SlicerUSSim.Logic.probe import craniotomy_pose
-from tests.reference import NumpyModel
 
 PROBE = FRAMES["A"]
 ELEMENTS, PITCH_M, WIDTH_M, SPEED, FREQUENCY = 64, 0.15e-3, 0.14e-3, 1540.0, 5e6
@@ -56,8 +55,6 @@ def main() -> None:
 
         rows[f"SlicerUSSim, {info.platform}"] = {"frame_ms": measured(frame, 30)["best_ms"]}
     ours = min(row["frame_ms"] for row in rows.values())
-    model = NumpyModel(UltrasoundSimulator(segmentation.labels, tissues, device=devices[0]))
-    rows["the same model in numpy"] = {"frame_ms": min(timed(lambda: model.simulate(PROBE, pose)) for _ in range(2))}
 
     in_beam = scatterers_in_beam(SimulationSettings())
     for name, module, transmission in (

@@ -306,8 +306,6 @@ def test_a_volume_replaces_images_of_this_program_only(labels, tmp_path):
         assert out.read_bytes() == content
 
 
-
-
 def test_a_pose_past_the_volume_is_a_warning_and_a_black_image(labels, tmp_path):
     pose = np.eye(4)
     pose[:3, 3] = [500, 0, 0]

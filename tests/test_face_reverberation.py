@@ -10,7 +10,6 @@ import pytest
 from SlicerUSSim.Logic import SimulationError, SimulationSettings, TissueTable, UltrasoundSimulator
 from SlicerUSSim.Logic.probe.arrays import PROBES, Probe
 from tests.conftest import FLUID, block, rigid
-from tests.reference import NumpyModel
 
 BONE = replace(FLUID, name="bone", impedance_mrayl=3.0 * FLUID.impedance_mrayl, attenuation_db_cm_mhz=5.0)
 REFLECTION = 0.5  # of the amplitude, between them
@@ -52,17 +51,6 @@ def test_without_a_face_and_where_nothing_comes_back_to_it_there_is_no_image():
     # At 35 degrees reflected rays pass beside the face, at 12 they meet it so obliquely that their echo vanishes
     assert peak(plate(35.0), probe, 2.0 * DEPTH_MM)[1] < level - 100.0
     assert peak(plate(12.0), probe, 2.0 * DEPTH_MM)[1] < level - 60.0
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["linear", pytest.param("convex", marks=pytest.mark.slow)])
-def test_the_numpy_model_has_the_same_image(name):
-    simulator = plate(3.0)
-    probe, pose = replace(PROBES[name], scan_lines=48, depth_mm=40.0), rigid(np.eye(3), [0.0, -DEPTH_MM, 0.0])
-    frame, twin = simulator.simulate(probe, pose), NumpyModel(simulator).simulate(probe, pose)
-    assert np.abs(frame.image.astype(int) - twin).max() <= 1
-    plain = simulator.simulate(replace(probe, face_reflection=0.0), pose)
-    assert (frame.image != plain.image).sum() > 100
 
 
 def test_a_face_reflects_no_more_than_all():

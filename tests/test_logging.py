@@ -253,5 +253,3 @@ def test_validate_prints_its_numbers_and_not_where_they_are(tmp_path):
     result = CliRunner().invoke(validation, ["--only", all_checks()[0].name, "--out", str(tmp_path / "report")])
     assert "Wrote" not in result.stdout and "wrote" not in result.stdout and result.stdout.count("\n") >= 1
     assert f"wrote {tmp_path / 'report' / 'report.md'}" in result.stderr
-
-

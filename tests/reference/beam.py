@@ -1,122 +1,89 @@
-"""Widths of the beam in float32 (kernels/common.clh)."""
+"""Widths of the beam by a record of layout.ACQUISITION (docs/physics.md#4-beam-and-pulse)."""
 
 from __future__ import annotations
 
 import numpy as np
 from scipy import special
 
-from tests.reference.elementary import f32
-
-_WHOLE = f32(1)
-_LEAST_FREQUENCY = 0.2
-
 
 class Beam:
-    """Widths of the beam along the path (Probe.beam_sigma_mm)."""
+    """The beam of one frame. Path lengths are millimetres, frequencies relative to that of the transmitted pulse."""
 
-    def __init__(self, acquisition: np.ndarray) -> None:
-        self.acquisition = acquisition
+    def __init__(self, record: np.ndarray) -> None:
+        names = [name for name in record.dtype.names or () if record.dtype[name].base != np.uint32]
+        #: The fields as Python floats or arrays of them
+        self.of = {name: record[name].astype(float)[()] for name in names}
 
-    def frequency_after(self, loss: np.ndarray | np.float32) -> np.ndarray:
-        """The mean of the band's power after a loss in nepers both ways, re the frequency of the transmitted pulse.
+    def frequency_after(self, loss: np.ndarray) -> np.ndarray:
+        """The mean of the band's power after a loss in nepers both ways.
 
         Of a Gaussian about 1 - w loss with the amplitude's variance w, from zero frequency on.
         """
-        shift = float(self.acquisition["downshift"])
+        shift = self.of["downshift"]
         if shift == 0.0:
             return np.ones_like(loss)
-        sigma, centre = np.sqrt(shift), 1.0 - shift * np.maximum(np.asarray(loss, float), 0.0)
+        centre = 1.0 - shift * np.maximum(loss, 0.0)
         # exp(-z^2) / erfc(-z) = 1 / erfcx(-z)
-        mean = centre + sigma / np.sqrt(np.pi) / special.erfcx(np.minimum(-centre / sigma, 1e4))
-        return f32(np.maximum(mean, _LEAST_FREQUENCY))
+        mean = centre + np.sqrt(shift / np.pi) / special.erfcx(np.minimum(-centre / np.sqrt(shift), 1e4))
+        return np.maximum(mean, 0.2)
 
     def gain_of_band(self, loss: np.ndarray) -> np.ndarray:
         """The logarithm of the amplitude by which an echo exceeds that of its centre frequency."""
-        shift = float(self.acquisition["downshift"])
+        shift = self.of["downshift"]
         if shift == 0.0:
             return np.zeros_like(loss)
-        # Of the power: w loss^2 + log erfc(-z), where log erfc(-z) = log erfcx(-z) - z^2, and w loss^2 - z^2 is
-        # 2 loss - 1 / w
-        lost = np.maximum(np.asarray(loss, float), 0.0)
-        z = (1.0 - shift * lost) / np.sqrt(shift)
-        near = 0.5 * shift * lost**2 + 0.5 * np.log(special.erfc(-np.maximum(z, 0.0)))
-        far = lost - 0.5 / shift + 0.5 * np.log(special.erfcx(-np.minimum(z, 0.0)))
-        return f32(np.where(z >= 0.0, near, far) - 0.5 * np.log(special.erfc(-1.0 / np.sqrt(shift))))
+        z, lost = (1.0 - shift * loss) / np.sqrt(shift), np.maximum(loss, 0.0)
+        parts = special.log_ndtr(np.sqrt(2.0) * z) - special.log_ndtr(np.sqrt(2.0 / shift))
+        return 0.5 * (shift * lost**2 + parts)
 
-    def elevation_sigma(self, s: np.ndarray, frequency: np.ndarray | np.float32 = _WHOLE) -> np.ndarray:
-        b = (s - self.acquisition["elevation_focus"]) / self.acquisition["elevation_rayleigh"]
-        return self.acquisition["elevation_sigma"] * np.sqrt(frequency ** f32(-2) + b * b)
+    def elevation_sigma(self, s: np.ndarray, frequency: np.ndarray | float = 1.0) -> np.ndarray:
+        away = (s - self.of["elevation_focus"]) / self.of["elevation_rayleigh"]
+        return self.of["elevation_sigma"] * np.hypot(1.0 / frequency, away)
 
-    def elevational_cycles(self, s: np.ndarray, frequency: np.ndarray | np.float32) -> np.ndarray:
+    def elevational_cycles(self, s: np.ndarray, frequency: np.ndarray) -> np.ndarray:
         """Cycles per squared millimetre by which the phase of the two-way elevational beam is behind off its axis."""
-        heights = self.acquisition["speckle_height_mm"]
-        at = np.clip(s / self.acquisition["depth_mm"], 0.0, 1.0)
-        height = np.interp(at, np.linspace(0.0, 1.0, len(heights)), heights) / frequency
+        heights = self.of["speckle_height_mm"]
         if not heights.any():
             return np.zeros_like(s)
+        place = np.clip(s / self.of["depth_mm"], 0.0, 1.0)
+        height = np.interp(place, np.linspace(0.0, 1.0, len(heights)), heights) / frequency
         sigma = self.elevation_sigma(s, frequency)
-        return f32(np.sqrt(np.maximum(height**-2.0 - sigma**-2.0, 0.0)) / sigma / (4.0 * np.pi))
+        return np.sqrt(np.maximum(height**-2.0 - sigma**-2.0, 0.0)) / sigma / (4.0 * np.pi)
 
-    def transmit_focus(self, s: float) -> float:
-        """The focus of the zone that is narrowest at path length s; s itself if every depth is in focus."""
-        zones = int(self.acquisition["transmit_zones"])
-        if zones == 0:
-            return s
-        return float(self.acquisition["transmit_focus"][int(self._zones(np.array(s), f32(1)).argmin(axis=0))])
-
-    def _zones(self, s: np.ndarray, stretch: np.ndarray | np.float32) -> np.ndarray:
-        """(zones, ...) variances of the transmit beam."""
-        fields = [
-            self.acquisition[f"transmit_{name}"][: self.acquisition["transmit_zones"]]
-            for name in ("sigma", "focus", "rayleigh")
-        ]
-        return np.stack(
-            [
-                sigma * sigma * (stretch * stretch + ((s - focus) / length) ** 2)
-                for sigma, focus, length in zip(*fields, strict=True)
-            ]
-        )
-
-    def one_way(self, s: np.ndarray, frequency: np.ndarray | np.float32 = _WHOLE) -> tuple[np.ndarray, np.ndarray]:
+    def _one_way(self, s: np.ndarray, frequency: np.ndarray | float) -> tuple[np.ndarray, np.ndarray]:
         """Variances of the lateral transmit and receive beams."""
-        acquisition, stretch = self.acquisition, f32(1) / frequency
-        if acquisition["transmit_zones"] == 0:
-            least = acquisition["transmit_sigma"][0]
-            transmit2 = (stretch * np.maximum(s * acquisition["transmit_sigma_slope"], least)) ** 2
+        of, zones = self.of, int(self.of["transmit_zones"])
+        if zones == 0:
+            transmit = np.maximum(s * of["transmit_sigma_slope"], of["transmit_sigma"][0]) / frequency
         else:
-            transmit2 = self._zones(s, stretch).min(axis=0)
-        receive = stretch * np.maximum(s * acquisition["receive_sigma_slope"], acquisition["receive_sigma_min"])
-        return transmit2, receive * receive
+            transmit = np.min([
+                sigma * np.hypot(1.0 / frequency, (s - focus) / length)
+                for sigma, focus, length in zip(
+                    *(of[f"transmit_{name}"][:zones] for name in ("sigma", "focus", "rayleigh")), strict=True
+                )
+            ], axis=0)  # fmt: skip
+        receive = np.maximum(s * of["receive_sigma_slope"], of["receive_sigma_min"]) / frequency
+        return transmit**2, receive**2
 
-    def lateral_sigma(self, s: np.ndarray, frequency: np.ndarray | np.float32 = _WHOLE) -> np.ndarray:
-        transmit2, receive2 = self.one_way(s, frequency)
+    def lateral_sigma(self, s: np.ndarray, frequency: np.ndarray | float = 1.0) -> np.ndarray:
+        transmit2, receive2 = self._one_way(s, frequency)
         return np.sqrt(transmit2 * receive2 / (transmit2 + receive2))
 
-    def lateral_curvature(self, s: np.ndarray, frequency: np.ndarray | np.float32 = _WHOLE) -> np.ndarray:
+    def lateral_curvature(self, s: np.ndarray, frequency: np.ndarray | float) -> np.ndarray:
         """Radians per squared millimetre by which the phase of the two-way beam is bent."""
-        if not self.acquisition["wavefront_curvature"]:
-            return np.zeros_like(s)
-        transmit2, receive2 = self.one_way(s, frequency)
-        share = self.acquisition["wavefront_curvature"]
-        return np.sqrt(np.maximum(share * (receive2 ** f32(-2) - transmit2 ** f32(-2)), f32(0)))
+        transmit2, receive2 = self._one_way(s, frequency)
+        return np.sqrt(np.maximum(self.of["wavefront_curvature"] * (receive2**-2.0 - transmit2**-2.0), 0.0))
 
     def line_distance(self, s: np.ndarray) -> np.ndarray:
         """Between neighbouring traced lines at path length s plus where they begin (line_start)."""
-        step = self.acquisition["line_spacing"] / f32(self.acquisition["lateral_rays"])
-        along = np.ones_like(s) if self.acquisition["linear"] else self.acquisition["apex_radius_mm"] + s
-        return np.maximum(step * along, f32(1e-4))
+        step = self.of["line_spacing"] / self.of["lateral_rays"]
+        return np.maximum(step * (1.0 if self.of["linear"] else self.of["apex_radius_mm"] + s) + 0.0 * s, 1e-4)
 
-    def line_start(self, line: np.ndarray | int) -> np.ndarray:
+    def line_start(self, line: np.ndarray | float) -> np.ndarray:
         """Displayed depth at which lines leave the face; `line` in scan lines from the first."""
-        acquisition = self.acquisition
-        position = acquisition["first_line"] + acquisition["line_spacing"] * f32(line)
-        if not acquisition["steered"]:
-            return f32(0) * position
-        if acquisition["linear"]:
-            return acquisition["start_mm"] + position * acquisition["steering_sin"] / acquisition["steering_cos"]
-        return acquisition["apex_radius_mm"] * (f32(1) / np.cos(position) - f32(1))
-
-    def traced_start(self, line: np.ndarray) -> np.ndarray:
-        """The same of traced lines."""
-        scan_line = f32(line - int(self.acquisition["guard_lines"])) / f32(self.acquisition["lateral_rays"])
-        return f32(self.line_start(scan_line))
+        position = self.of["first_line"] + self.of["line_spacing"] * line
+        if not self.of["steered"]:
+            return 0.0 * position
+        if self.of["linear"]:
+            return self.of["start_mm"] + position * self.of["steering_sin"] / self.of["steering_cos"]
+        return self.of["apex_radius_mm"] * (1.0 / np.cos(position) - 1.0)

@@ -6,7 +6,7 @@ import numpy as np
 
 from SlicerUSSim.Logic.base.settings import SimulationSettings
 from SlicerUSSim.Logic.imaging.signals import RayTree
-from SlicerUSSim.Logic.imaging.stage import DeviceFrame, FrameInputs, Stage, Work
+from SlicerUSSim.Logic.imaging.stage import DeviceFrame, Stage, Work
 from SlicerUSSim.Logic.opencl.device import Device, Workspace
 from SlicerUSSim.Logic.opencl.layout import CONSTANTS
 from SlicerUSSim.Logic.probe.arrays import Probe
@@ -70,7 +70,7 @@ class Aperture(Stage):
             self._beams, (1 + depths, traced), frame.acquisition_buffer, frame.screens, shades, all_soft, frame.beams
         )
 
-    def work(self, frame: FrameInputs, tree: RayTree) -> Work:
+    def work(self, frame: DeviceFrame, tree: RayTree) -> Work:
         fields = frame.acquisition
         if not fields["aperture_beams"]:
             return Work(1, 0)

@@ -11,7 +11,7 @@ from SlicerUSSim.Logic.base.settings import FULL_SCALE_DB
 from SlicerUSSim.Logic.imaging.console import gains_across, gains_along
 from SlicerUSSim.Logic.imaging.noise import noise_key
 from SlicerUSSim.Logic.imaging.signals import RayTree
-from SlicerUSSim.Logic.imaging.stage import SAMPLE_BYTES, DeviceFrame, FrameInputs, Stage, Work
+from SlicerUSSim.Logic.imaging.stage import SAMPLE_BYTES, DeviceFrame, Stage, Work
 from SlicerUSSim.Logic.opencl.device import Device, Workspace
 from SlicerUSSim.Logic.opencl.layout import CONSTANTS
 from SlicerUSSim.Logic.probe.arrays import Probe
@@ -99,7 +99,7 @@ class PulseFilter(Stage):
             np.int32(frame.scanned.stride),
         )
 
-    def work(self, frame: FrameInputs, tree: RayTree) -> Work:
+    def work(self, frame: DeviceFrame, tree: RayTree) -> Work:
         lines, samples = frame.line_shape
         taps = pulse_taps(frame.axial_sigma_mm / float(frame.acquisition["sample_mm"])).size
         return Work(2 * lines * samples * SAMPLE_BYTES, 4 * taps * lines * samples)
@@ -200,7 +200,7 @@ class Compressor(Stage):
             self._across = gains.tobytes(), self.device.upload(gains)
         return self._across[1]
 
-    def work(self, frame: FrameInputs, tree: RayTree) -> Work:
+    def work(self, frame: DeviceFrame, tree: RayTree) -> Work:
         lines, samples = frame.line_shape
         return Work((SAMPLE_BYTES + 5) * lines * samples, _PER_SAMPLE * lines * samples)
 

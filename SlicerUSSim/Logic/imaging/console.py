@@ -5,12 +5,11 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy import ndimage
 
 from SlicerUSSim.Logic.base.settings import FULL_SCALE_DB, DisplaySettings
 from SlicerUSSim.Logic.imaging.grey_map import TABLE_SIZE, grey_table, is_linear
 from SlicerUSSim.Logic.imaging.signals import RayTree
-from SlicerUSSim.Logic.imaging.stage import DeviceFrame, FrameInputs, HostFrame, Stage, Work
+from SlicerUSSim.Logic.imaging.stage import DeviceFrame, Stage, Work
 from SlicerUSSim.Logic.opencl.device import Device, Workspace
 
 if TYPE_CHECKING:
@@ -57,18 +56,10 @@ class EnvelopeSmoothing(Stage):
             self._taps[sigma] = self.device.upload(gaussian_taps(sigma))
         return self._taps[sigma]
 
-    def work(self, frame: FrameInputs, tree: RayTree) -> Work:
+    def work(self, frame: DeviceFrame, tree: RayTree) -> Work:
         lines, samples = frame.line_shape
         taps = [len(gaussian_taps(sigma)) for sigma in smoothing_sigmas(frame) if sigma > 0.0]
         return Work(8 * len(taps) * lines * samples, 2 * sum(taps) * lines * samples)
-
-    def on_host(self, frame: HostFrame) -> None:
-        for axis, sigma in zip((1, 0), smoothing_sigmas(frame), strict=True):
-            if sigma > 0.0:
-                taps = gaussian_taps(sigma).astype(float)
-                frame.envelope = ndimage.correlate1d(
-                    frame.envelope.astype(float), taps, axis=axis, mode="nearest"
-                ).astype(np.float32)
 
 
 class GreyMapping(Stage):
@@ -106,17 +97,9 @@ class GreyMapping(Stage):
         )
         frame.grey = grey
 
-    def work(self, frame: FrameInputs, tree: RayTree) -> Work:
+    def work(self, frame: DeviceFrame, tree: RayTree) -> Work:
         lines, samples = frame.line_shape
         return Work(5 * lines * samples, 30 * lines * samples) if _maps(frame) else Work(0, 0)
-
-    def on_host(self, frame: HostFrame) -> None:
-        if not _maps(frame):
-            return
-        level_db = 20.0 * np.log10(np.maximum(frame.envelope.astype(float), 1e-15))
-        part = 1.0 + (level_db - (FULL_SCALE_DB - frame.display.gain_db)) / frame.display.dynamic_range_db
-        grey = np.interp(part, np.linspace(0.0, 1.0, TABLE_SIZE), grey_table(frame.display))
-        frame.grey = (grey + 0.5).astype(np.uint8)
 
 
 class EdgeEnhancement(Stage):
@@ -146,25 +129,14 @@ class EdgeEnhancement(Stage):
         )
         frame.grey = sharp
 
-    def work(self, frame: FrameInputs, tree: RayTree) -> Work:
+    def work(self, frame: DeviceFrame, tree: RayTree) -> Work:
         if frame.display.edge_enhancement == 0.0:
             return Work(0, 0)
         lines, samples = frame.line_shape
         return Work(2 * lines * samples, (2 * _EDGE_SAMPLES + 1) * (2 * _EDGE_LINES + 1) * lines * samples)
 
-    def on_host(self, frame: HostFrame) -> None:
-        if frame.display.edge_enhancement == 0.0:
-            return
-        lines, samples = frame.grey.shape
-        step, grey = _edge_step(frame), frame.grey.astype(float)
-        across = np.clip(np.arange(lines)[:, None] + np.arange(-_EDGE_LINES, _EDGE_LINES + 1), 0, lines - 1)
-        along = np.arange(samples)[:, None] + step * np.arange(-_EDGE_SAMPLES, _EDGE_SAMPLES + 1)
-        mean = grey[:, np.clip(along, 0, samples - 1)].mean(axis=2)[across].mean(axis=1)
-        sharp = grey + frame.display.edge_enhancement * (grey - mean)
-        frame.grey = (np.clip(sharp, 0.0, 255.0) + 0.5).astype(np.uint8)
 
-
-def smoothing_sigmas(frame: FrameInputs) -> tuple[float, float]:
+def smoothing_sigmas(frame: DeviceFrame) -> tuple[float, float]:
     """Sigmas of the smoothing along the lines in samples and across them in lines; 0 for none.
 
     The lateral one is an angle, at the apex of a sector. On a linear array, whose lines have one distance, it is that
@@ -199,10 +171,10 @@ def gains_across(display: DisplaySettings, lines: int) -> np.ndarray:
     return np.interp(np.linspace(0.0, 1.0, lines), np.linspace(0.0, 1.0, 5), knots).astype(np.float32)
 
 
-def _maps(frame: FrameInputs) -> bool:
+def _maps(frame: DeviceFrame) -> bool:
     return any(smoothing_sigmas(frame)) or not is_linear(frame.display)
 
 
-def _edge_step(frame: FrameInputs) -> int:
+def _edge_step(frame: DeviceFrame) -> int:
     """Samples between those of the mean."""
     return max(round(_EDGE_MM / _EDGE_SAMPLES / float(frame.acquisition["sample_mm"])), 1)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from SlicerUSSim.Logic.imaging.signals import RayTree, TreeBuffers
-from SlicerUSSim.Logic.imaging.stage import DeviceFrame, FrameInputs, Stage, Work
+from SlicerUSSim.Logic.imaging.stage import DeviceFrame, Stage, Work
 from SlicerUSSim.Logic.opencl.device import Device, Workspace
 from SlicerUSSim.Logic.opencl.layout import CONSTANTS, HIT, SEGMENT
 
@@ -108,7 +108,7 @@ class RayTracer(Stage):
             few=True,
         )
 
-    def work(self, frame: FrameInputs, tree: RayTree) -> Work:
+    def work(self, frame: DeviceFrame, tree: RayTree) -> Work:
         rays = 1 + int(frame.acquisition["elevational_rays"])
         steps = float(tree.segments["length_mm"].sum()) * rays / (0.5 * float(frame.acquisition["voxel_mm"]))
         borders = len(tree.hits) * rays / (rays - 1)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from SlicerUSSim.Logic.imaging.signals import RayTree
-from SlicerUSSim.Logic.imaging.stage import DeviceFrame, FrameInputs, Stage, Work
+from SlicerUSSim.Logic.imaging.stage import DeviceFrame, Stage, Work
 from SlicerUSSim.Logic.opencl.device import Device, Workspace
 
 _PER_PIXEL = 80  # operations
@@ -50,7 +50,7 @@ class ScanConverter(Stage):
             frame.image,
         )
 
-    def work(self, frame: FrameInputs, tree: RayTree) -> Work:
+    def work(self, frame: DeviceFrame, tree: RayTree) -> Work:
         grid, (lines, samples) = frame.grid, frame.line_shape
         pixels, averaged = grid.rows * grid.columns, grid.pixel_spacing_mm[1] / float(frame.acquisition["sample_mm"])
         return Work(2 * lines * samples + 9 * pixels, averaged * lines * samples + _PER_PIXEL * pixels)

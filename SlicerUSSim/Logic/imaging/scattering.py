@@ -12,7 +12,7 @@ from SlicerUSSim.Logic.imaging.diffraction import lobes_of
 from SlicerUSSim.Logic.imaging.raytracing import ray_centres
 from SlicerUSSim.Logic.imaging.side_lobes import DARK, Tables, elevational_lobe_record, lines_together
 from SlicerUSSim.Logic.imaging.signals import EchoLines, RayTree
-from SlicerUSSim.Logic.imaging.stage import SAMPLE_BYTES, DeviceFrame, FrameInputs, Stage, Work
+from SlicerUSSim.Logic.imaging.stage import SAMPLE_BYTES, DeviceFrame, Stage, Work
 from SlicerUSSim.Logic.imaging.unevenness import is_uneven, unevenness_table
 from SlicerUSSim.Logic.opencl.device import Device, Workspace
 from SlicerUSSim.Logic.opencl.layout import ACQUISITION, CONSTANTS, HIT, WALL
@@ -117,7 +117,7 @@ class Scatterers(Stage):
             heavy=True,
         )
 
-    def work(self, frame: FrameInputs, tree: RayTree) -> Work:
+    def work(self, frame: DeviceFrame, tree: RayTree) -> Work:
         probe, traced, (_, samples) = frame.probe, int(frame.acquisition["traced_lines"]), frame.line_shape
         inside, looked_at = scatterer_counts(frame, tree.segments, self.device.chunk)
         if frame.settings.side_lobes:
@@ -168,7 +168,7 @@ class InterfaceEchoes(Stage):
             few=True,
         )
 
-    def work(self, frame: FrameInputs, tree: RayTree) -> Work:
+    def work(self, frame: DeviceFrame, tree: RayTree) -> Work:
         acquisition, probe, hits = frame.acquisition, frame.probe, tree.hits
         path = hits["path_mm"].astype(float)
         near = 2.7 * frame.settings.beam_cutoff * probe.beam_sigma_mm(path)[0] / probe.line_distance_mm(path)
@@ -214,7 +214,7 @@ class LateralBeam(Stage):
             stride,
         )
 
-    def work(self, frame: FrameInputs, tree: RayTree) -> Work:
+    def work(self, frame: DeviceFrame, tree: RayTree) -> Work:
         acquisition, probe, (scan_lines, samples) = frame.acquisition, frame.probe, frame.line_shape
         traced = int(acquisition["traced_lines"])
         depth = np.arange(samples) * float(acquisition["sample_mm"])
@@ -265,7 +265,7 @@ def lattice_sites(tissues: np.ndarray, acquisition: np.ndarray) -> np.ndarray:
 
 
 def scatterer_counts(
-    frame: FrameInputs, segments: np.ndarray, chunk: int, together: int | None = None
+    frame: DeviceFrame, segments: np.ndarray, chunk: int, together: int | None = None
 ) -> tuple[float, float]:
     """(number of scatterers inside the strips of all ray segments, number of lattice cells to examine for them).
 

@@ -13,7 +13,7 @@ import numpy as np
 from SlicerUSSim.Logic.imaging.diffraction import lateral_weights
 from SlicerUSSim.Logic.imaging.noise import stirred
 from SlicerUSSim.Logic.imaging.signals import RayTree
-from SlicerUSSim.Logic.imaging.stage import SAMPLE_BYTES, DeviceFrame, FrameInputs, Stage, Work
+from SlicerUSSim.Logic.imaging.stage import SAMPLE_BYTES, DeviceFrame, Stage, Work
 from SlicerUSSim.Logic.opencl.device import Device
 from SlicerUSSim.Logic.opencl.layout import CONSTANTS
 from SlicerUSSim.Logic.probe.arrays import Probe
@@ -61,7 +61,7 @@ class SideLobes(Stage):
             heavy=True,
         )
 
-    def work(self, frame: FrameInputs, tree: RayTree) -> Work:
+    def work(self, frame: DeviceFrame, tree: RayTree) -> Work:
         if not frame.settings.side_lobes:
             return Work(0.0, 0.0)
         lines, samples = frame.line_shape

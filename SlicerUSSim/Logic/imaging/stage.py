@@ -1,8 +1,8 @@
-"""Stage, and the frames under computation on which stages work.
+"""Stage, and the frame under computation on which stages work.
 
 A new *display* stage, which changes grey levels or pixels but not echoes, is one class and one line: a Stage with
-`run`, `work` and `on_host`, and its place in stages.DISPLAY_STAGES. Simulator, appearance model, benchmark and numpy
-model use this list. Its user settings are fields of DisplaySettings, read from `frame.display`.
+`run` and `work`, and its place in stages.DISPLAY_STAGES. Simulator, appearance model and benchmark use this list. Its
+user settings are fields of DisplaySettings, read from `frame.display`.
 """
 
 from __future__ import annotations
@@ -37,8 +37,12 @@ class Work:
 
 
 @dataclass(eq=False)
-class FrameInputs:
-    """Inputs of the stages of one frame."""
+class DeviceFrame:
+    """A frame under computation on the device: its inputs, and the signals passed between stages.
+
+    A stage replaces signals by its own buffers and does not change those that it reads, since frames of which only the
+    display has changed start again from `iq`.
+    """
 
     probe: Probe
     settings: SimulationSettings
@@ -50,34 +54,10 @@ class FrameInputs:
     grid: ImageGrid
     #: Seed of the amplifier noise (noise.py)
     noise_seed: int
-    #: (scan lines,) float32 factor of contact.line_contact; None where the patient lies in the coupling medium
-    contact: np.ndarray | None = field(default=None, kw_only=True)
-
-    @property
-    def line_shape(self) -> tuple[int, int]:
-        """(scan lines, samples) of the signals along lines; samples are whole blocks."""
-        return int(self.acquisition["scan_lines"]), int(self.acquisition["samples"])
-
-    @property
-    def display_record(self) -> np.ndarray:
-        """() record of layout.DISPLAY: what `display` says, which kernels take by value."""
-        record = np.zeros((), DISPLAY)
-        for name in DISPLAY.names or ():
-            value = getattr(self.display, name)
-            record[name] = np.nan if value is None else value
-        return record
-
-
-@dataclass(eq=False)
-class DeviceFrame(FrameInputs):
-    """A frame under computation on the device: its inputs, and the signals passed between stages.
-
-    A stage replaces signals by its own buffers and does not change those that it reads, since frames of which only the
-    display has changed start again from `iq`.
-    """
-
     acquisition_buffer: Buffer
     medium: Medium
+    #: (scan lines,) float32 factor of contact.line_contact; None where the patient lies in the coupling medium
+    contact: np.ndarray | None = None
     #: Whether a border of its tissues may reflect rays
     reflects: bool = field(init=False)
     #: What soft tissue does to beams: float4 [screen line][depth] of aperture.cl
@@ -105,6 +85,20 @@ class DeviceFrame(FrameInputs):
     #: uint8 [row][column]
     image: Buffer = field(init=False)
 
+    @property
+    def line_shape(self) -> tuple[int, int]:
+        """(scan lines, samples) of the signals along lines; samples are whole blocks."""
+        return int(self.acquisition["scan_lines"]), int(self.acquisition["samples"])
+
+    @property
+    def display_record(self) -> np.ndarray:
+        """() record of layout.DISPLAY: what `display` says, which kernels take by value."""
+        record = np.zeros((), DISPLAY)
+        for name in DISPLAY.names or ():
+            value = getattr(self.display, name)
+            record[name] = np.nan if value is None else value
+        return record
+
     def download(self, signal: str) -> np.ndarray:
         """A copy on the host of "iq", "envelope", "grey" (scan lines, samples) or "image" (rows, columns)."""
         shape = (self.grid.rows, self.grid.columns) if signal == "image" else self.line_shape
@@ -112,20 +106,6 @@ class DeviceFrame(FrameInputs):
 
 
 _SIGNAL_TYPES = {"iq": np.complex64, "envelope": np.float32, "grey": np.uint8, "image": np.uint8}
-
-
-@dataclass(eq=False)
-class HostFrame(FrameInputs):
-    """The same on the host, in numpy, for Stage.on_host. Here, too, a stage replaces arrays by its own."""
-
-    #: (scan lines, samples) complex64 baseband signal
-    iq: np.ndarray = field(init=False)
-    #: (scan lines, samples) float32 after noise and time-gain compensation
-    envelope: np.ndarray = field(init=False)
-    #: (scan lines, samples) uint8 grey levels along the scan lines
-    grey: np.ndarray = field(init=False)
-    #: (rows, columns) uint8
-    image: np.ndarray = field(init=False)
 
 
 class Stage(ABC):
@@ -142,22 +122,10 @@ class Stage(ABC):
         """Enqueue the stage without waiting."""
 
     @abstractmethod
-    def work(self, frame: FrameInputs, tree: RayTree) -> Work:
+    def work(self, frame: DeviceFrame, tree: RayTree) -> Work:
         """The minimum work of any implementation of the stage for a frame with this ray tree.
 
         Bytes of all data read or written are counted once. Operations are counted in the kernel's source; additions,
         multiplications and integer operations count equally. The estimate is accurate to a few tens of percent, enough
         to distinguish twice the lower bound from ten times the lower bound.
         """
-
-    def on_host(self, frame: HostFrame) -> None:
-        """The same in plain numpy, written from the equations and not from `run`, as a reference for tests of `run`.
-
-        Not defined for the first eight stages: theirs are in tests/reference/stages.py.
-        """
-        raise NotImplementedError(f"stage {self.name!r} has no twin in numpy")
-
-    @classmethod
-    def has_own_twin(cls) -> bool:
-        """Whether the class has an on_host."""
-        return cls.on_host is not Stage.on_host

@@ -1,4 +1,4 @@
-"""The stages of an image, in order: shared by simulator, appearance model, benchmark and numpy model.
+"""The stages of an image, in order: shared by simulator, appearance model and benchmark.
 
 How to add one is in docs/architecture.md#adding-a-stage.
 """
