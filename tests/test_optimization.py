@@ -36,7 +36,7 @@ from SlicerUSSim.Logic.probe.beam import FWHM_PER_SIGMA
 from SlicerUSSim.Logic.probe.image_grid import ImageGrid
 from SlicerUSSim.Logic.tissue.tissue import Tissue
 from tests.conftest import few_slow_others_long
-from tests.remembered import segment_once
+from tests.test_label_maps import head_tissues
 from validation.twins import make_twin
 
 SMALL = PhasedProbe(70.0, 50.0, scan_lines=80)
@@ -44,8 +44,7 @@ SMALL = PhasedProbe(70.0, 50.0, scan_lines=80)
 
 @pytest.fixture(scope="module")
 def brain():
-    segmentation = segment_once(head_mri(2.0))
-    return segmentation.labels, TissueTable.brain(segmentation.tissue_names)
+    return head_tissues(2.0)
 
 
 @pytest.fixture(scope="module")
