@@ -108,8 +108,9 @@ def test_a_probe_off_the_patient_is_said(folder, tmp_path, monkeypatch):
     assert "in 3 of 3 images 0% of the probe's face touches the patient (contact gap: 3 mm)" in done.stderr
 
 
-def test_sweep_replaces_only_what_it_wrote(folder, tmp_path):
-    out, field = tmp_path / "o.igs.mha", tmp_path / "field.png"
+@pytest.mark.parametrize("name", ["o.igs.mha", pytest.param("o.nrrd", marks=pytest.mark.slow)])
+def test_sweep_replaces_only_what_it_wrote(name, folder, tmp_path):
+    out, field = tmp_path / name, tmp_path / "field.png"
     sweep = (
         "sweep", folder / "labels.nii.gz", "--sequence", folder / "tracked.igs.mha", "-o", out, "--field", field,
         "--frames", "0:2",
@@ -269,7 +270,7 @@ def test_the_example_writes_a_twin_that_optimize_reads(mni, tmp_path, monkeypatc
     assert abs(result["display"]["dynamic_range_db"] - truth["display"]["dynamic_range_db"]) < 15
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @needs_shared
 def test_real_speckle_and_noise_can_be_fitted(tmp_path, monkeypatch, capsys):
     pytest.importorskip("matplotlib", reason="the example draws: pip install '.[demo]'")

@@ -207,13 +207,6 @@ def test_the_last_search_sees_what_whole_simulations_show(twin):
     assert last.cost == pytest.approx(whole, abs=1e-5)
 
 
-@pytest.mark.slow
-def test_other_algorithms_find_it_too(twin, result):
-    algorithms = "GN_CRS2_LM", "LN_NELDERMEAD"
-    other = optimise(twin, ["display", "white matter"], max_evaluations=600, algorithms=algorithms)
-    assert other.cost_after < 1.25 * result.cost_after
-
-
 def test_a_single_parameter_can_be_free(twin):
     result = optimise(twin, ["gain_db"], max_evaluations=20)
     assert result.cost_after < result.cost_before
@@ -446,7 +439,7 @@ def real_brain(mni):
 PATIENTS = PhasedProbe(75.0, 60.0, scan_lines=128)
 
 
-@pytest.mark.parametrize("seed", few_slow_others_long(14, 1))
+@pytest.mark.parametrize("seed", few_slow_others_long(14, 0))
 def test_fourteen_patients_with_a_known_display(real_brain, seed):
     twin = make_twin(*real_brain, seed, probe=PATIENTS, display_is_known=True)
     result = optimise(twin, ["white matter"], max_evaluations=150)
