@@ -23,11 +23,10 @@ from SlicerUSSim.Logic.base.files import write_json
 from SlicerUSSim.Logic.fitting import tracked_fit
 from SlicerUSSim.Logic.fitting.registration import rigid_from
 from SlicerUSSim.Logic.fitting.tracked_fit import fit
-from SlicerUSSim.Logic.mri.samples import head_mri
 from SlicerUSSim.Logic.probe.placement import tilt_sweep
 from SlicerUSSim.Logic.tracked import TrackedImages, read_pose, write_pose
 from tests.conftest import SHARED, example, needs_shared
-from tests.remembered import segment_once
+from tests.test_label_maps import head_tissues
 from validation.twins import make_twin
 
 
@@ -39,9 +38,8 @@ def ussim(*arguments):
 def folder(tmp_path_factory):
     """A twin on disk, as examples/write_twin.py writes one."""
     place = tmp_path_factory.mktemp("twin")
-    segmentation = segment_once(head_mri(3.0))
     probe = PhasedProbe(70.0, 50.0, scan_lines=80)
-    twin = make_twin(segmentation.labels, TissueTable.brain(segmentation.tissue_names), 3, probe=probe)
+    twin = make_twin(*head_tissues(3.0), 3, probe=probe)
     twin.simulator.medium.labels.write(place / "labels.nii.gz")
     twin.simulator.medium.tissues.write(place / "labels.json")
     twin.sequence().write(place / "tracked.igs.mha")
@@ -60,7 +58,7 @@ def optimize(folder, *options):
 def test_optimize_writes_result_report_preset_and_state(folder):
     pytest.importorskip("matplotlib", reason="reports need matplotlib: pip install '.[demo]'")
     done = optimize(
-        folder, "--evaluations", 60, "--restarts", 1, "--report", folder / "report.html", "--save-preset",
+        folder, "--evaluations", 30, "--restarts", 1, "--report", folder / "report.html", "--save-preset",
         folder / "preset.json", "--state", folder / "state.json", "--free", "display", "--free",
         "white matter.mu0=0.1:0.9",
     )  # fmt: skip
@@ -83,7 +81,7 @@ def test_optimize_writes_result_report_preset_and_state(folder):
         assert words in report
 
     again = optimize(
-        folder, "--evaluations", 60, "--restarts", 1, "--state", folder / "state.json", "--free", "display", "--free",
+        folder, "--evaluations", 30, "--restarts", 1, "--state", folder / "state.json", "--free", "display", "--free",
         "white matter.mu0=0.1:0.9",
     )  # fmt: skip
     assert "(0 evaluations)" in again.output
@@ -110,8 +108,9 @@ def test_a_probe_off_the_patient_is_said(folder, tmp_path, monkeypatch):
     assert "in 3 of 3 images 0% of the probe's face touches the patient (contact gap: 3 mm)" in done.stderr
 
 
-def test_sweep_replaces_only_what_it_wrote(folder, tmp_path):
-    out, field = tmp_path / "o.igs.mha", tmp_path / "field.png"
+@pytest.mark.parametrize("name", ["o.igs.mha", pytest.param("o.nrrd", marks=pytest.mark.slow)])
+def test_sweep_replaces_only_what_it_wrote(name, folder, tmp_path):
+    out, field = tmp_path / name, tmp_path / "field.png"
     sweep = (
         "sweep", folder / "labels.nii.gz", "--sequence", folder / "tracked.igs.mha", "-o", out, "--field", field,
         "--frames", "0:2",
@@ -171,12 +170,12 @@ def test_images_of_a_sweep_have_noise_by_their_number(folder, tmp_path):
 @pytest.mark.slow
 def test_the_saved_transform_puts_the_images_where_the_fit_found_them(folder, tmp_path, monkeypatch):
     fits = []
-    monkeypatch.setattr(tracked_fit, "_ROUNDS", ((8.0, 60), (4.0, 40)))  # how well: test_registration
+    monkeypatch.setattr(tracked_fit, "_ROUNDS", ((8.0, 24), (4.0, 16)))  # how well: test_registration
     monkeypatch.setattr(tracked_fit, "fit", lambda *a, **b: fits.append(fit(*a, **b)) or fits[-1])
     given_map = rigid_from([1.5, -1.0, 2.0, 2.0, -1.0, 1.5])
     write_pose(tmp_path / "given.json", given_map)
     done = optimize(
-        folder, "--register", "--evaluations", 40, "--restarts", 0, "--free", "display", "--save-transform",
+        folder, "--register", "--evaluations", 12, "--restarts", 0, "--free", "display", "--save-transform",
         tmp_path / "saved.json", "--to-mri", tmp_path / "given.json",
     )  # fmt: skip
     assert done.exit_code == 0, done.output
@@ -271,7 +270,7 @@ def test_the_example_writes_a_twin_that_optimize_reads(mni, tmp_path, monkeypatc
     assert abs(result["display"]["dynamic_range_db"] - truth["display"]["dynamic_range_db"]) < 15
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @needs_shared
 def test_real_speckle_and_noise_can_be_fitted(tmp_path, monkeypatch, capsys):
     pytest.importorskip("matplotlib", reason="the example draws: pip install '.[demo]'")

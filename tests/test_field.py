@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -200,14 +201,15 @@ def test_real_images_show_the_field_of_the_38_mm_probe_that_took_them(name, dept
 # ---- what hides the field --------------------------------------------------------------------------------------------
 
 
-def recording(probe, count: int = 6, **changes) -> TrackedSequence:
+@cache
+def recording(probe, count: int = 6) -> TrackedSequence:
     """Images of one probe with other speckle each, whose calibration is that of its own frame."""
     grid = ImageGrid.for_probe(probe, None)
     inside = grid.field(probe)
     random = np.random.default_rng(3)
     images = np.where(inside, random.integers(20, 200, (count, grid.rows, grid.columns)), 0).astype(np.uint8)
     transforms = ({"ImageToProbe": grid.image_to_probe, "ProbeToReference": np.eye(4)},) * count
-    return TrackedSequence(images, transforms, np.arange(float(count)), **changes)
+    return TrackedSequence(images, transforms, np.arange(float(count)))
 
 
 CONVEX = ConvexProbe(40, 60, 80)
@@ -315,6 +317,7 @@ def drawn_over(sequence: TrackedSequence, part: np.ndarray, level: int = 240) ->
     return sequence.with_images(range(len(sequence)), images)
 
 
+@cache
 def speckled(probe, count: int = 12) -> TrackedSequence:
     """A recording whose speckle has grains, and whose images have much in common, as those of a slow sweep."""
     sequence = recording(probe, count + 2)

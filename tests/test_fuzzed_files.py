@@ -164,7 +164,8 @@ def surfels() -> Surfels:
 def inputs(name: str) -> int:
     """Inputs to try of a format."""
     wanted = int(os.environ.get("USSIM_FUZZ", "150"))
-    return max(wanted // 20, 6) if FORMATS[name].in_child else wanted
+    costs = 20 if FORMATS[name].in_child else 3 if name in ("IM", "dcm", "dcms") else 1
+    return max(wanted // costs, 6)
 
 
 @st.composite

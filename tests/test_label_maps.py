@@ -15,6 +15,7 @@ from scipy.spatial import cKDTree
 from SlicerUSSim.Command.cli import main
 from SlicerUSSim.Logic import SimulationError, TissueTable, Volume
 from SlicerUSSim.Logic.mri import segment_mri
+from SlicerUSSim.Logic.mri.samples import head_mri
 from SlicerUSSim.Logic.tissue import LabelMapping, names_of_file, read_label_file, read_label_map
 from SlicerUSSim.Logic.tissue.freesurfer import freesurfer_names
 from SlicerUSSim.Logic.tissue.interpolated_labels import is_smoothed
@@ -98,6 +99,13 @@ def head(spacing_mm: float = 3.0) -> Volume:
     matrix = np.diag([spacing_mm] * 3 + [1.0])
     matrix[:3, 3] = -(n - 1) / 2 * spacing_mm
     return Volume(array, matrix)
+
+
+def head_tissues(spacing_mm: float) -> tuple[Volume, TissueTable]:
+    """(labels, their tissues) of the phantom head_mri by its grey levels: 40 csf, 85 grey and 110 white matter."""
+    mri = head_mri(spacing_mm)
+    labels = mri.with_array(np.digitize(mri.array, (10.0, 62.5, 97.5)).astype(np.uint8))
+    return labels, TissueTable.brain(("csf", "grey matter", "white matter"))
 
 
 def ussim(*arguments):
@@ -720,8 +728,8 @@ def test_labels_stored_as_bytes_with_a_scale_are_rounded_and_said(small_mni, tmp
 
 
 @pytest.mark.parametrize("levels", [28, 11])
-def test_an_mri_of_few_grey_levels_is_an_mri(levels, mni):
-    t1 = mni[0]
+def test_an_mri_of_few_grey_levels_is_an_mri(levels, small_mni):
+    t1 = small_mni[0]
     reduced = t1.with_array((t1.array.astype(int) * levels // 208).astype(np.float32 if levels == 28 else np.uint8))
     assert not reduced.looks_like_labels()
 
@@ -746,11 +754,11 @@ def test_a_parcellation_is_no_mri_in_coarse_voxels(mm, mni):
         assert not Volume(np.rint(t1 / t1.max() * levels).astype(np.int16), np.eye(4)).looks_like_labels()
 
 
-def parcellation(mni, regions: int) -> np.ndarray:
+def parcellation(mni, regions: int, step: int = 1) -> np.ndarray:
     """(k, j, i) int32 labels of the MNI152's grey and white matter: lobes as in an aseg, and parcels of each."""
-    _, grey, white = mni
+    grey, white = (volume.array[::step, ::step, ::step] for volume in mni[1:])
     random = np.random.default_rng(0)
-    tissue = np.where(white.array > 0.5, 2, np.where(grey.array > 0.5, 3, 0))
+    tissue = np.where(white > 0.5, 2, np.where(grey > 0.5, 3, 0))
     labels = np.zeros(tissue.shape, np.int32)
     for number in (2, 3):
         where = np.argwhere(tissue == number)
@@ -763,7 +771,7 @@ def parcellation(mni, regions: int) -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def parcels(mni) -> np.ndarray:
-    return parcellation(mni, 150)[::3, ::3, ::3]
+    return parcellation(mni, 150, step=3)
 
 
 @pytest.mark.parametrize("change", ["negative", "large", "one large", "wrapped"])

@@ -21,7 +21,7 @@ from SlicerUSSim.Logic.probe.image_grid import ImageGrid
 from SlicerUSSim.Logic.probe.placement import craniotomy_pose, tilt_sweep
 from SlicerUSSim.Logic.tracked.images import TrackedImages
 from SlicerUSSim.Logic.tracked.sequence import TrackedSequence
-from tests.remembered import segment_once
+from tests.test_label_maps import head_tissues
 
 OURS = logging.getLogger("SlicerUSSim")
 PROBE = LinearProbe(40, 50, scan_lines=64)
@@ -49,15 +49,13 @@ def ussim(*arguments):
 def files(tmp_path_factory):
     """A head, its labels with their tissues, and a tracked sequence of it."""
     folder = tmp_path_factory.mktemp("patient")
-    mri = head_mri(3.0)
-    mri.write(folder / "head.nii.gz")
-    segmentation = segment_once(mri)
-    segmentation.labels.write(folder / "labels.nii.gz")
-    tissues = TissueTable.brain(segmentation.tissue_names)
+    head_mri(3.0).write(folder / "head.nii.gz")
+    labels, tissues = head_tissues(3.0)
+    labels.write(folder / "labels.nii.gz")
     tissues.write(folder / "labels.json")
     (folder / "probe.json").write_text(json.dumps(PROBE.to_dict()))
-    poses = tilt_sweep(craniotomy_pose(segmentation.labels, PROBE), 10.0, 3)
-    images = [frame.image for frame in UltrasoundSimulator(segmentation.labels, tissues).sweep(PROBE, poses)]
+    poses = tilt_sweep(craniotomy_pose(labels, PROBE), 10.0, 3)
+    images = [frame.image for frame in UltrasoundSimulator(labels, tissues).sweep(PROBE, poses)]
     to_probe = ImageGrid.for_probe(PROBE, None).image_to_probe
     transforms = tuple({"ImageToProbe": to_probe, "ProbeToReference": pose} for pose in poses)
     TrackedSequence(np.stack(images), transforms, 0.1 * np.arange(3)).write(folder / "sweep.igs.mha")

@@ -36,7 +36,7 @@ from SlicerUSSim.Logic.probe.beam import FWHM_PER_SIGMA
 from SlicerUSSim.Logic.probe.image_grid import ImageGrid
 from SlicerUSSim.Logic.tissue.tissue import Tissue
 from tests.conftest import few_slow_others_long
-from tests.remembered import segment_once
+from tests.test_label_maps import head_tissues
 from validation.twins import make_twin
 
 SMALL = PhasedProbe(70.0, 50.0, scan_lines=80)
@@ -44,8 +44,7 @@ SMALL = PhasedProbe(70.0, 50.0, scan_lines=80)
 
 @pytest.fixture(scope="module")
 def brain():
-    segmentation = segment_once(head_mri(2.0))
-    return segmentation.labels, TissueTable.brain(segmentation.tissue_names)
+    return head_tissues(2.0)
 
 
 @pytest.fixture(scope="module")
@@ -206,13 +205,6 @@ def test_the_last_search_sees_what_whole_simulations_show(twin):
     whole = similarity(frame.image, twin.references[0], frame.pixel_spacing_mm, mask=field).total
     assert abs(before[0] - whole) > 1e-4
     assert last.cost == pytest.approx(whole, abs=1e-5)
-
-
-@pytest.mark.slow
-def test_other_algorithms_find_it_too(twin, result):
-    algorithms = "GN_CRS2_LM", "LN_NELDERMEAD"
-    other = optimise(twin, ["display", "white matter"], max_evaluations=600, algorithms=algorithms)
-    assert other.cost_after < 1.25 * result.cost_after
 
 
 def test_a_single_parameter_can_be_free(twin):
@@ -447,7 +439,7 @@ def real_brain(mni):
 PATIENTS = PhasedProbe(75.0, 60.0, scan_lines=128)
 
 
-@pytest.mark.parametrize("seed", few_slow_others_long(14, 1))
+@pytest.mark.parametrize("seed", few_slow_others_long(14, 0))
 def test_fourteen_patients_with_a_known_display(real_brain, seed):
     twin = make_twin(*real_brain, seed, probe=PATIENTS, display_is_known=True)
     result = optimise(twin, ["white matter"], max_evaluations=150)

@@ -50,11 +50,6 @@ def fills_the_memory(path: Path) -> int:
 
 
 @reader
-def ends(path: Path) -> None:
-    os._exit(0)
-
-
-@reader
 def tells(path: Path) -> tuple[str, str]:
     import SlicerUSSim
 
@@ -123,7 +118,6 @@ def test_a_folder_is_not_trusted_in_other_threads_too(sent):
     [
         (crashes, r"cannot be read \(the library that reads it crashed: SIGSEGV\)"),
         (fills_the_memory, r"cannot be read \(it needs more memory than there is\)"),
-        (ends, r"cannot be read \(the library that reads it ended the reading process with status 0\)"),
         (raises, r"cannot be read \(KeyError: 'no such tag'\)"),
         (returns_a_call, r"cannot be read \(its reader gave no answer: posix.mkdir is no value"),
     ],
