@@ -39,13 +39,7 @@ UNITS = {
 }  # fmt: skip
 #: (class, parameter) of all that is declared
 DECLARED = [(kind, entry) for _, kind, _ in SECTIONS for entry in parameters_of(kind)]
-EACH = pytest.mark.parametrize(
-    ("kind", "entry"), DECLARED, ids=[f"{kind.__name__}.{entry.name}" for kind, entry in DECLARED]
-)
 NUMBERS = [(kind, entry) for kind, entry in DECLARED if entry.type in (int, float)]
-EACH_NUMBER = pytest.mark.parametrize(
-    ("kind", "entry"), NUMBERS, ids=[f"{kind.__name__}.{entry.name}" for kind, entry in NUMBERS]
-)
 
 
 def ussim(*arguments):
@@ -55,69 +49,59 @@ def ussim(*arguments):
 # ---- what is declared ------------------------------------------------------------------------------------------------
 
 
-@EACH
-def test_a_parameter_has_a_label_and_a_tip(kind, entry):
-    for text in (entry.label, entry.tip):
-        assert text and text == text.strip() and "\n" not in text
-    assert entry.label[0].isupper() and not entry.label.endswith(".")
-    # Formula signs and names of choices begin as they are written.
-    assert entry.tip[0].isupper() or not entry.tip[0].isalpha() or re.match(r"\w+: |n in ", entry.tip), entry.tip
-    for text in (entry.tip, entry.note, entry.source):
-        assert not text.endswith("."), text
+def test_a_parameter_has_a_label_a_tip_and_the_unit_of_its_name():
+    for _, entry in DECLARED:
+        for text in (entry.label, entry.tip):
+            assert text and text == text.strip() and "\n" not in text, entry.name
+        assert entry.label[0].isupper() and not entry.label.endswith("."), entry.label
+        # Formula signs and names of choices begin as they are written.
+        assert entry.tip[0].isupper() or not entry.tip[0].isalpha() or re.match(r"\w+: |n in ", entry.tip), entry.tip
+        for text in (entry.tip, entry.note, entry.source):
+            assert not text.endswith("."), text
+        suffix = next((suffix for suffix in UNITS if entry.name.endswith(suffix)), None)
+        assert suffix is None or entry.unit == UNITS[suffix], entry.name
 
 
-@EACH
-def test_a_parameter_has_the_unit_that_its_name_says(kind, entry):
-    suffix = next((suffix for suffix in UNITS if entry.name.endswith(suffix)), None)
-    if suffix is not None:
-        assert entry.unit == UNITS[suffix]
+def test_a_default_is_a_value_that_is_accepted():
+    for kind, entry in DECLARED:
+        declared = next(field for field in fields(kind) if field.name == entry.name)
+        if declared.default is not MISSING:
+            assert entry.checked(kind.__name__, entry.default) == entry.default == declared.default
+        elif declared.default_factory is not MISSING:
+            assert entry.checked(kind.__name__, declared.default_factory()) == declared.default_factory()
+        else:
+            assert entry.is_required, entry.name
 
 
-@EACH
-def test_a_default_is_a_value_that_is_accepted(kind, entry):
-    declared = next(field for field in fields(kind) if field.name == entry.name)
-    if declared.default is not MISSING:
-        assert entry.checked(kind.__name__, entry.default) == entry.default == declared.default
-    elif declared.default_factory is not MISSING:
-        assert entry.checked(kind.__name__, declared.default_factory()) == declared.default_factory()
-    else:
-        assert entry.is_required
+def test_what_is_shown_and_fitted_lies_within_the_bounds():
+    for _, entry in NUMBERS:
+        low, high = entry.bounds
+        assert low < high and all(map(math.isfinite, entry.bounds)), entry.name
+        if isinstance(entry.shown, Shown):
+            shown = entry.shown
+            assert shown.low < shown.high and shown.step > 0
+            if shown.none_at is not None:
+                assert entry.can_be_none and shown.low <= shown.none_at < shown.high
+                assert shown.value(shown.none_at) is None and shown.number(None) == shown.none_at
+            for number in (shown.low, shown.high):
+                value = shown.value(number)
+                assert value is None or (low <= value <= high and shown.number(value) == pytest.approx(number))
+        else:
+            assert entry.shown is None, entry.name
+        if entry.fit is not None:
+            assert low <= entry.fit.low < entry.fit.high <= high and entry.fit.tolerance > 0
+            assert entry.fit.low > 0 or not entry.fit.is_logarithmic
 
 
-@EACH_NUMBER
-def test_numbers_have_bounds_and_what_is_shown_and_fitted_lies_within(kind, entry):
-    assert entry.bounds is not None
-    low, high = entry.bounds
-    assert low < high and all(map(math.isfinite, entry.bounds))
-    if isinstance(entry.shown, Shown):
-        shown = entry.shown
-        assert shown.low < shown.high and shown.step > 0
-        if shown.none_at is not None:
-            assert entry.can_be_none and shown.low <= shown.none_at < shown.high
-            assert shown.value(shown.none_at) is None and shown.number(None) == shown.none_at
-        for number in (shown.low, shown.high):
-            value = shown.value(number)
-            if value is not None:
-                assert low <= value <= high
-                assert shown.number(value) == pytest.approx(number)
-    else:
-        assert entry.shown is None
-    if entry.fit is not None:
-        assert low <= entry.fit.low < entry.fit.high <= high and entry.fit.tolerance > 0
-        assert entry.fit.low > 0 or not entry.fit.is_logarithmic
-
-
-@EACH_NUMBER
-def test_the_bounds_themselves_are_accepted_and_what_is_beyond_is_not(kind, entry):
-    owner, (low, high) = kind.__name__, entry.bounds
-    for value in (low, high):
-        value = entry.type(value)
-        assert entry.checked(owner, value) == value
-        assert entry.from_text(owner, repr(value)) == value
-    step = 1 if entry.type is int else 1e-6 * max(abs(low), abs(high))
-    for value in (entry.type(low - step), entry.type(high + step)):
-        with pytest.raises(SimulationError, match=re.escape(f"{owner}: {entry.name} is {value!r}, expected ")):
-            entry.checked(owner, value)
+def test_the_bounds_themselves_are_accepted_and_what_is_beyond_is_not():
+    for kind, entry in NUMBERS:
+        owner, (low, high) = kind.__name__, entry.bounds
+        for value in (entry.type(low), entry.type(high)):
+            assert entry.checked(owner, value) == entry.from_text(owner, repr(value)) == value
+        step = 1 if entry.type is int else 1e-6 * max(abs(low), abs(high))
+        for value in (entry.type(low - step), entry.type(high + step)):
+            with pytest.raises(SimulationError, match=re.escape(f"{owner}: {entry.name} is {value!r}, expected ")):
+                entry.checked(owner, value)
 
 
 def test_options_and_names_of_those_that_have_one_are_unique():
@@ -207,7 +191,7 @@ def test_a_text_stands_for_a_value(entry, text, value):
     ("entry", "texts"),
     [
         (WHOLE, ["5.0", "1e3", "five", "", "true", "1_000", "none", "9" * 5000]),
-        (REAL, ["nan", "inf", "-infinity", "five", "", "1_0", "1e999", "none", "1,5"]),
+        (REAL, ["nan", "-infinity", "five", "", "1_0", "0x10", "\u0663", "1e999", "none", "1,5"]),
         (TICK, ["1", "yes", "on", ""]),
         (CHOICE, ["A", "none", ""]),
         (PAIR, ["8", "8,9,10", "8,9.0", "a,b", ""]),
@@ -258,87 +242,48 @@ def membrane(**values):
 BAD = [
     # the whole file
     ("", "is not JSON (Expecting value: line 1 column 1 (char 0))"),
-    ("{", "is not JSON (Expecting property name enclosed in double quotes: line 1 column 2 (char 1))"),
     ("[]", "is a list, expected an object"),
     ("null", "is null, expected an object"),
-    ('"preset"', "is a text, expected an object"),
-    ("3", "is a number, expected an object"),
-    ("true", "is true or false, expected an object"),
     ("[" * 17 + "]" * 17, "is nested deeper than 16 levels"),
     ('{"display": ' * 100_000, "is nested deeper than 16 levels"),
     (" " * (4 * 2**20 + 1), "has 4194305 bytes, expected at most 4194304"),
     ('{"display": {"gain_db": 1, "gain_db": 2}}', "is not JSON ('gain_db' is given twice)"),
-    ('{"tissues": {"1": {}, "1": {}}}', "is not JSON ('1' is given twice)"),
     ('{"display": {"gain_db": NaN}}', "is not JSON (NaN is not a number)"),
-    ('{"display": {"gain_db": -Infinity}}', "is not JSON (-Infinity is not a number)"),
     ('{"display": {"gain_db": 1e999}}', "display: gain_db is inf, expected a number between -200 and 200"),
     ('{"settings": {"seed": ' + "9" * 5000 + "}}", "is not JSON (Exceeds the limit"),
     ({"probes": {}}, "has 'probes', expected probe, display, settings, tissues, membrane"),
     ({"x" * 5000: {}}, "has 'xxx"),
     # display and settings
     ({"display": None}, "display: is null, expected an object"),
-    ({"display": [1]}, "display: is a list, expected an object"),
     (display(gain=3), "display: 'gain' is unknown, expected one of gain_db, dynamic_range_db, tgc_db_cm_mhz"),
     (display(gain_db="3"), "display: gain_db is '3', expected a number between -200 and 200"),
-    (display(gain_db=None), "display: gain_db is None, expected a number between -200 and 200"),
-    (display(gain_db=True), "display: gain_db is True, expected a number between -200 and 200"),
-    (display(dynamic_range_db=0), "display: dynamic_range_db is 0, expected a number between 1 and 200"),
-    (display(noise_db="none"), "display: noise_db is 'none', expected a number between -300 and 100 or none"),
-    (display(image_size=512), "display: image_size is 512, expected 2 whole numbers between 8 and 8192 or none"),
     (display(image_size=[512, 512.0]), "display: image_size is [512, 512.0], expected 2 whole numbers"),
     (settings(seed=3.0), "settings: seed is 3.0, expected a whole number between 0 and 4294967295"),
-    (settings(seed=-1), "settings: seed is -1, expected a whole number between 0 and 4294967295"),
-    (settings(max_ray_depth=True), "settings: max_ray_depth is True, expected a whole number between 0 and 16"),
-    (settings(max_ray_depth="6"), "settings: max_ray_depth is '6', expected a whole number between 0 and 16"),
-    (settings(scattering="false"), "settings: scattering is 'false', expected true or false"),
     (settings(scattering=0), "settings: scattering is 0, expected true or false"),
     (settings(interface_reflection="r"), "settings: interface_reflection is 'r', expected one of pressure, energy"),
-    (settings(interface_reflection=None), "settings: interface_reflection is None, expected one of pressure, energy"),
-    (settings(intensity_threshold=0), "settings: intensity_threshold is 0, expected a number between 1e-12 and 1"),
     # probe
     ({"probe": []}, 'probe: is a list, expected an object with a "kind"'),
-    ({"probe": {}}, "probe: lacks kind, expected one of linear, convex, phased"),
     ({"probe": {"depth_mm": 70}}, "probe: lacks kind, expected one of linear, convex, phased"),
-    ({"probe": {"kind": "sector"}}, "probe: kind is 'sector', expected one of linear, convex, phased"),
     ({"probe": {"kind": ["linear"]}}, "probe: kind is ['linear'], expected one of linear, convex, phased"),
-    ({"probe": {"kind": None}}, "probe: kind is None, expected one of linear, convex, phased"),
     ({"probe": {"kind": "linear", "depth_mm": 50}}, "probe: lacks width_mm"),
     ({"probe": {**_LINEAR, "radius_mm": 4}}, "probe: radius_mm is not a parameter of a linear probe, expected one of "),
-    ({"probe": {**_LINEAR, "depth_mm": "50"}}, "probe: depth_mm is '50', expected a number between 1 and 400"),
-    ({"probe": {**_LINEAR, "depth_mm": None}}, "probe: depth_mm is None, expected a number between 1 and 400"),
     ({"probe": {**_LINEAR, "focus_mm": 0}}, "probe: focus_mm is 0, expected a number between 0.1 and 1000 or none"),
-    ({"probe": {**_LINEAR, "scan_lines": 192.0}}, "probe: scan_lines is 192.0, expected a whole number between 2 and"),
     # tissues
-    ({"tissues": []}, 'tissues is a list, expected {"tissues": {"1": {...}}}'),
     ({"tissues": None}, 'tissues is null, expected {"tissues": {"1": {...}}}'),
     ({"tissues": {"01": _TISSUE}}, "tissue label is '01', expected a whole number from 0 to 62"),
-    ({"tissues": {"1.0": _TISSUE}}, "tissue label is '1.0', expected a whole number from 0 to 62"),
-    ({"tissues": {" 1": _TISSUE}}, "tissue label is ' 1', expected a whole number from 0 to 62"),
     ({"tissues": {"٣": _TISSUE}}, "tissue label is '٣', expected a whole number from 0 to 62"),
     ({"tissues": {"63": _TISSUE}}, "tissue label is '63', expected a whole number from 0 to 62"),
-    ({"tissues": {"-1": _TISSUE}}, "tissue label is '-1', expected a whole number from 0 to 62"),
-    ({"tissues": {"csf": _TISSUE}}, "tissue label is 'csf', expected a whole number from 0 to 62"),
     ({"tissues": {"1": "csf"}}, "tissue 1: is a text, expected an object"),
     ({"tissues": {"1": {"name": "x"}}}, "tissue 1: lacks speed_of_sound_m_s, impedance_mrayl, attenuation_db_cm_mhz"),
     (tissue(colour="red"), "tissue 1: 'colour' is unknown, expected one of name, speed_of_sound_m_s, impedance_mrayl"),
-    (tissue(name=5), "tissue 1: name is 5, expected text"),
-    (tissue(name=" "), "tissue 1: tissue name is ' ', expected one line of printable text"),
     (tissue(name="a\nb"), "tissue 1: tissue name is 'a\\nb', expected one line of printable text"),
-    (tissue(name="\ud800"), "tissue 1: tissue name is '\\ud800', expected one line of printable text"),
-    (tissue(mu0="0.5"), "tissue 1: mu0 is '0.5', expected a number between -100 and 100"),
     (tissue(speed_of_sound_m_s=15), "tissue 1: speed_of_sound_m_s is 15, expected a number between 100 and 10000"),
-    (tissue(sources=["Duck"]), "tissue 1: sources is ['Duck'], expected an object of texts"),
     (tissue(sources={"mu0": 5}), "tissue 1: sources is {'mu0': 5}, expected an object of texts"),
     # membrane
     ({"membrane": {"tissue": _TISSUE}}, 'lacks tissues, expected {"tissues": {"1": {...}}}'),
-    ({"tissues": {}, "membrane": 5}, "membrane: is a number, expected an object"),
     ({"tissues": {}, "membrane": {}}, "membrane: lacks tissue"),
     (membrane(tissue=None), "membrane: tissue: is null, expected an object"),
-    (membrane(tissue={"name": "x"}), "membrane: tissue: lacks speed_of_sound_m_s"),
     (membrane(fluids="csf"), "membrane: fluids is 'csf', expected a list of texts"),
-    (membrane(fluids=[1]), "membrane: fluids is [1], expected a list of texts"),
-    (membrane(thickness_mm=[1]), "membrane: thickness_mm is [1], expected a number between 0 and 10"),
-    (membrane(width_mm=1), "membrane: 'width_mm' is unknown, expected one of tissue, thickness_mm, fluids"),
 ]  # fmt: skip
 
 
@@ -348,7 +293,7 @@ def _id(case) -> str:
 
 
 @pytest.mark.parametrize(("content", "message"), BAD, ids=[_id(content) for content, _ in BAD])
-def test_a_bad_preset_is_one_line_that_names_file_place_and_what_is_expected(tmp_path, content, message):
+def test_a_bad_preset_is_one_line_that_names_file_and_place(tmp_path, content, message):
     path = tmp_path / "bad.json"
     path.write_text(content if isinstance(content, str) else json.dumps(content), encoding="utf-8")
     with pytest.raises(SimulationError) as caught:
@@ -356,16 +301,15 @@ def test_a_bad_preset_is_one_line_that_names_file_place_and_what_is_expected(tmp
     assert str(caught.value).startswith(f"{path}: {message}")
     assert "\n" not in str(caught.value) and len(str(caught.value)) < len(str(path)) + 500
 
-    done = ussim("simulate", tmp_path / "no.nii", "--pose", "auto", "--preset", path, "-o", tmp_path / "o.png")
-    assert done.exit_code == 2 and done.output == f"ussim: {caught.value}\n"
-
 
 def test_a_file_that_is_no_text_is_refused(tmp_path):
     path = tmp_path / "bad.json"
-    for content in (b"\xff\xfe{}", b"\x00", bytes(range(256)), b"\xef\xbb\xbf{}"):
+    for content in (b"\xff\xfe{}", b"\x00", b"\xef\xbb\xbf{}"):
         path.write_bytes(content)
-        with pytest.raises(SimulationError, match=r"bad\.json: is not JSON \("):
+        with pytest.raises(SimulationError, match=r"bad\.json: is not JSON \(") as caught:
             Preset.read(path)
+    done = ussim("simulate", tmp_path / "no.nii", "--pose", "auto", "--preset", path, "-o", tmp_path / "o.png")
+    assert done.exit_code == 2 and done.output == f"ussim: {caught.value}\n"
 
 
 JSON_VALUES = st.recursive(
@@ -414,30 +358,17 @@ def test_any_bytes_are_a_preset_or_refused(tmp_path_factory, content):
 
 # ---- options ---------------------------------------------------------------------------------------------------------
 
-SIMULATING = ("simulate", "sweep", "volume", "optimize")
 
-
-@pytest.mark.parametrize("name", SIMULATING)
-def test_every_declared_option_of_display_and_settings_is_one_of_the_commands_that_simulate(name):
-    options = {option.name: option for option in main.commands[name].params}
-    for kind in (DisplaySettings, SimulationSettings):
-        for entry in parameters_of(kind):
-            if entry.option:
-                assert options[entry.name].opts == [f"--{entry.option.split('/')[0]}"]
-    assert {"contrast", "thin_sulci", "changes"} <= set(options)
-
-
-def test_help_says_label_unit_what_it_does_and_the_default():
+def test_declared_options_are_those_of_the_commands_that_simulate():
+    for name in ("simulate", "sweep", "volume", "optimize"):
+        options = {option.name: option for option in main.commands[name].params}
+        for kind in (DisplaySettings, SimulationSettings):
+            for entry in parameters_of(kind):
+                if entry.option:
+                    assert options[entry.name].opts == [f"--{entry.option.split('/')[0]}"]
+        assert {"contrast", "thin_sulci", "changes"} <= set(options)
     said = " ".join(ussim("simulate", "--help").output.split())
-    for text in (
-        "Gain [dB]: brightness of all echoes (default: the preset's, 0).",
-        "none: where they are at hand (default: the preset's, none).",
-        "--contrast [t1|t1gd|t2|flair|ct] Contrast of the MRI, which gives the order of the tissues by intensity; ct: "
-        "a CT in Hounsfield units (default: t1).",
-    ):
-        assert text in said
-    said = " ".join(ussim("optimize", "--help").output.split())
-    assert "--evaluations INTEGER" in said and "(default: 500)." in said
+    assert "Gain [dB]: brightness of all echoes (default: the preset's, 0)." in said
 
 
 def options_of(*texts):
@@ -479,19 +410,12 @@ def test_options_go_before_the_preset_and_set_before_them(tmp_path):
     ("options", "message"),
     [
         (["--gain", "500"], "--gain: gain_db is 500.0, expected a number between -200 and 200"),
-        (["--gain", "loud"], "--gain: gain_db is 'loud', expected a number between -200 and 200"),
-        (["--gain", "nan"], "--gain: gain_db is nan, expected a number between -200 and 200"),
         (["--seed", "3.0"], "--seed: seed is '3.0', expected a whole number between 0 and 4294967295"),
         (["--contrast", "pd"], "--contrast: contrast is 'pd', expected one of t1, t1gd, t2, flair, ct"),
         (["--set", "gain_db"], "--set is 'gain_db', expected NAME=VALUE, such as display.gain_db=3"),
-        (["--set", "=3"], "--set is '=3', expected NAME=VALUE"),
-        (["--set", "gain_db=3"], "--set: no parameter 'gain_db', expected display.gain_db"),
         (["--set", "display.gian_db=3"], "--set: no parameter 'display.gian_db', expected display.gain_db"),
-        (["--set", "probe.colour=3"], "--set: no parameter 'probe.colour', expected probe.kind, probe.frequency_mhz"),
         (["--set", "white matter.mu=3"], "--set: no parameter 'white matter.mu', expected white matter.mu1"),
         (["--set", "foo.bar=3"], "--set: no parameter 'foo.bar', expected probe, display, settings, membrane or"),
-        (["--set", "settings.seed=3.0"], "--set settings.seed: seed is '3.0', expected a whole number between 0 and"),
-        (["--set", "white matter.mu0=x"], "--set white matter.mu0: mu0 is 'x', expected a number between -100 and 100"),
         (["--set", "membrane.thickness_mm=11"], "--set membrane.thickness_mm: thickness_mm is 11.0, expected a number"),
         (["--set", "probe.radius_mm=30"], "probe: radius_mm is not a parameter of a phased probe"),
     ],
@@ -499,24 +423,6 @@ def test_options_go_before_the_preset_and_set_before_them(tmp_path):
 def test_an_option_that_is_wrong_is_one_line_that_names_it(options, message):
     said = options_of(*options)
     assert said.startswith(f"ussim: {message}") and said.count("\n") == 1
-
-
-@pytest.mark.parametrize(
-    ("command", "message"),
-    [
-        (["segment", "no.nii", "-o", "l.nii.gz", "--classes", "x"], "--classes: classes is 'x', expected a whole"),
-        (["segment", "no.nii", "-o", "l.nii.gz", "--radius", "-1"], "--radius: filter_radius is -1, expected a whole"),
-        (["optimize", "no.nii", "--sequence", "no.mha", "-o", "r.json", "--evaluations", "0"],
-         "--evaluations: evaluations is 0, expected a whole number between 1 and 1000000"),
-        (["optimize", "no.nii", "--sequence", "no.mha", "-o", "r.json", "--restarts", "many"],
-         "--restarts: restarts is 'many', expected a whole number between 0 and 100"),
-        (["demo", "--seed", "x"], "--seed: seed is 'x', expected a whole number"),
-        (["serve", "--contrast", "pd"], "--contrast: contrast is 'pd', expected one of t1, t1gd, t2, flair, ct"),
-    ],
-)  # fmt: skip
-def test_options_of_other_commands_are_checked_alike(command, message):
-    done = ussim(*command)
-    assert done.exit_code == 2 and done.output.startswith(f"ussim: {message}") and done.output.count("\n") == 1
 
 
 def test_set_changes_tissues_and_membrane_by_name():
@@ -571,12 +477,6 @@ def test_tuples_of_numbers_say_which_numbers_they_take():
     assert kind(np.array([1.0, 2.5])).size == (1.0, 2.5)
     with pytest.raises(SimulationError, match="size is 5, expected 2 numbers between 0 and 9"):
         kind(5)
-
-
-@pytest.mark.parametrize("text", ["\u0663", "1_0", "0x10", "", "1,5"])
-def test_only_plain_numbers_are_numbers_in_texts(text):
-    with pytest.raises(SimulationError, match=r"gain_db is .*expected a number"):
-        parameter_of(DisplaySettings, "gain_db").from_text("here", text)
 
 
 @given(st.lists(st.text(alphabet="abc ", min_size=1).filter(lambda t: t == t.strip()), max_size=4))

@@ -62,7 +62,7 @@ def test_other_parameters_stay_as_they_are():
     assert tissues[3].sigma0 == TISSUES[3].sigma0 and tissues[3].mu0 != TISSUES[3].mu0
 
 
-def test_tissues_stands_for_echogenicity_and_attenuation_of_every_tissue_with_scatterers():
+def test_tissues_stands_for_those_with_scatterers():
     names = [f"{tissue}.{name}" for tissue in ("grey matter", "white matter", "leptomeninges")
              for name in ("echogenicity_db", "attenuation_db_cm_mhz")]  # fmt: skip
     assert of(["tissues"]).names == names

@@ -124,7 +124,7 @@ def test_a_scene_has_the_same_image_after_it_was_kept_as_values(kind):
     assert [(tissue, source) for tissue, _, source in found] == [("tumour", "tumour.nii.gz (segment 'tumour')")]
 
 
-def test_taking_a_record_copies_no_voxels_and_its_version_changes_with_them():
+def test_a_record_copies_no_voxels_and_its_version_changes_with_them():
     logic = segmented()
     parameters = logic.parameters
     before = nodes_version(parameters)
@@ -141,26 +141,7 @@ def test_taking_a_record_copies_no_voxels_and_its_version_changes_with_them():
     assert np.array_equal(labels.array, kept)  # it is replaced and not changed
 
 
-def test_sheets_stay_where_a_hardened_transform_moved_them():
-    scene = slicer.vtkMRMLScene()
-    parameters = SceneParameters(scene)
-    parameters.mri = add(scene, "ScalarVolume")
-    write_volume(parameters.mri, head_mri(4.0))
-    one = np.ones(3, np.float32)
-    surfels = Surfels(np.zeros((3, 3), np.float32), np.tile([0, 0, 1], (3, 1)).astype(np.float32), one, one, one,
-                      np.zeros(3, np.uint8))  # fmt: skip
-    parameters.sheets = add(scene, "Model", "falx")
-    parameters.sheets.SetAndObservePolyData(as_polydata(surfels))
-    shift = vtkTransform()
-    shift.Translate(0, 0, 9)
-    parameters.sheets.ApplyTransform(shift)
-    record = written_and_read(record_scene(scene))
-    again = in_new_scene(record)
-    points = again.parameters.sheets.GetPolyData().GetBounds()
-    assert points[4] == points[5] == 9.0
-
-
-def test_a_scene_without_choices_has_its_first_volume_as_mri_and_names_what_is_left_out():
+def test_a_scene_without_choices_has_its_first_volume_as_mri():
     scene = slicer.vtkMRMLScene()
     for name in ("one", "two"):
         write_volume(add(scene, "ScalarVolume", name), head_mri(4.0))
@@ -170,7 +151,7 @@ def test_a_scene_without_choices_has_its_first_volume_as_mri_and_names_what_is_l
         record_scene(slicer.vtkMRMLScene())
 
 
-def test_values_that_this_version_does_not_take_are_said_and_have_their_default():
+def test_values_of_other_versions_are_told_and_have_their_default():
     logic = segmented()
     values = {**recorded_values(logic.parameters), "contrast": "t9", "what_is_that": "1"}
     again = UltrasoundSceneLogic(slicer.vtkMRMLScene())
@@ -252,7 +233,7 @@ def live_update(logic: UltrasoundSceneLogic) -> None:
 
 
 @pytest.mark.parametrize("kind", ["LabelMapVolume", "Segmentation"])
-def test_a_scene_tells_a_frozen_image_from_a_live_one_that_was_left_where_it_was_taken(kind):
+def test_a_scene_tells_a_frozen_image_from_a_live_one(kind):
     """Both are where the probe is if that has not moved, and the frozen one came back live."""
     logic = segmented(kind)
     live_update(logic)
@@ -273,7 +254,7 @@ def test_a_scene_tells_a_frozen_image_from_a_live_one_that_was_left_where_it_was
     assert record_scene(logic.scene).frozen is not None
 
 
-def test_a_restored_image_is_of_the_tissues_beside_it_if_it_was_when_it_was_kept():
+def test_a_restored_image_is_of_the_tissues_it_was_kept_with():
     logic = segmented()
     live_update(logic)
     logic.stopLiveUpdate()
@@ -288,7 +269,7 @@ def test_a_restored_image_is_of_the_tissues_beside_it_if_it_was_when_it_was_kept
         assert again.areOfTissues() == (False, False)
 
 
-def test_an_image_of_a_simulated_sequence_keeps_its_number_which_is_the_seed_of_its_noise():
+def test_an_image_of_a_sequence_keeps_its_number_the_seed_of_its_noise():
     logic = segmented()
     parameters, scene = logic.parameters, logic.scene
     transforms, images = add(scene, "Sequence", "sweep"), add(scene, "Sequence", "sweep ultrasound")
@@ -326,7 +307,7 @@ def recorded_images(scene):
     return node, tracked, to_ras
 
 
-def test_real_images_of_a_scene_keep_their_probe_and_registration_whatever_depth_is_set_now():
+def test_real_images_keep_their_probe_and_registration():
     """A depth that a user had set since was taken for a wrong calibration, and the registration for none."""
     logic = UltrasoundSceneLogic(slicer.vtkMRMLScene())
     sequences = slicer.vtkSlicerSequencesLogic()  # which also registers the browser's class

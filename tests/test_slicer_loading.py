@@ -125,13 +125,6 @@ def stale_wheel(wheel, tmp_path) -> Path:
 
 @pytest.mark.slow
 @needs_slicer
-def test_from_the_sources():
-    folder = ROOT / "SlicerUSSim"
-    assert_loaded_from(load(folder), folder / "USSim.py", folder, ROOT / "kernels")
-
-
-@pytest.mark.slow
-@needs_slicer
 def test_from_a_folder_of_another_name(tmp_path):
     folder = tmp_path / "SlicerUSSim-main" / "xyz"
     shutil.copytree(ROOT / "SlicerUSSim", folder, ignore=_IGNORED)
@@ -150,26 +143,11 @@ def test_from_a_wheel(wheel):
 
 @pytest.mark.slow
 @needs_slicer
-def test_the_folder_counts_where_a_wheel_is_installed_too(wheel):
-    folder = ROOT / "SlicerUSSim"
-    assert_loaded_from(load(folder, site=wheel), folder / "USSim.py", folder, ROOT / "kernels")
-
-
-@pytest.mark.slow
-@needs_slicer
 def test_the_folder_counts_where_another_version_was_imported_first(stale_wheel):
     folder = ROOT / "SlicerUSSim"
     first = "from SlicerUSSim.Logic.base import version; assert version.__version__ == '0.0.1'"
     result = load(folder, site=stale_wheel, first=first)
     assert_loaded_from(result, folder / "USSim.py", folder, ROOT / "kernels")
-
-
-@pytest.mark.slow
-@needs_slicer
-def test_the_first_of_two_module_paths_counts(wheel):
-    """As for every module of Slicer."""
-    folder = wheel / "SlicerUSSim"
-    assert_loaded_from(load(folder, ROOT / "SlicerUSSim"), folder / "USSim.py", folder, folder / "kernels")
 
 
 def test_a_wheel_holds_what_is_not_python_too(wheel):

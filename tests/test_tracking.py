@@ -110,7 +110,7 @@ def test_a_server_that_goes_is_found_again_when_it_comes_back(link):
     ours.send(IMAGE)  # to nobody: not an error
 
 
-def test_only_the_chosen_transform_moves_the_probe_and_only_where_it_is_rigid(link):
+def test_only_the_chosen_transform_moves_the_probe_where_it_is_rigid(link):
     with socket.create_server(("127.0.0.1", 0)) as listener:
         ours, poses = link(*listener.getsockname()[:2], device="ProbeToReference")
         peer, _ = listener.accept()
