@@ -387,7 +387,8 @@ def wide_vertex(is_enhanced: bool) -> tuple[Head, np.ndarray]:
     return head, at[0, :, 0]
 
 
-@pytest.mark.parametrize("is_enhanced", [True, pytest.param(False, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("is_enhanced", [True, False])
 def test_a_falx_in_wide_fluid_at_the_vertex_stays_off_the_gyri(is_enhanced):
     head, at = wide_vertex(is_enhanced)
     found = falx(head)
@@ -545,6 +546,7 @@ def test_sheets_of_colin27_are_where_its_image_and_aal_show_them():
             UltrasoundSimulator(found.labels, tissues, sheets=wrong)
 
 
+@pytest.mark.slow
 def test_sheets_of_a_file_that_was_transformed_are_where_its_points_are(tmp_path):
     """Other programs leave the arrays as they were."""
     from vtkmodules.vtkCommonTransforms import vtkTransform

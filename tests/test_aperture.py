@@ -175,19 +175,14 @@ def test_right_behind_opaque_tissue_its_edge_is_as_wide_as_the_beam(top_mm, rms_
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("name", "top_mm"), [("bone", 20.0), ("lossy plate", 26.0)])
-def test_frames_do_not_step_where_strong_tissue_ends(name, top_mm):
+def test_frames_do_not_step_where_strong_tissue_ends():
     """As the probe comes nearer in steps of 0.1 mm, 2 mm behind a plate's edge, near known depths."""
-    plates = {
-        "bone": Tissue("bone", 3198.0, 6.364, 3.54),
-        "lossy plate": replace(PLAIN, impedance_mrayl=1.29 * PLAIN.impedance_mrayl, attenuation_db_cm_mhz=13.0),
-    }
-    bottom = top_mm + 5.0
+    bone, top_mm, bottom = Tissue("bone", 3198.0, 6.364, 3.54), 20.0, 25.0
 
     def plate(x, y, z):
         return 1 + ((x > PLATE_EDGE) & (y > top_mm - 22.0) & (y < bottom - 22.0))
 
-    found = simulator(block(plate, (40, 44, 12), 0.5), PLAIN, plates[name], coupling=PLAIN, reflections=False)
+    found = simulator(block(plate, (40, 44, 12), 0.5), PLAIN, bone, coupling=PLAIN, reflections=False)
     probe = LinearProbe(30, 48, scan_lines=121, focus_mm=30, elevation_focus_mm=30, frequency_mhz=5.0)
     for aside in (-0.75, 0.0, 0.25, 0.5):
         line, levels = int(np.argmin(np.abs(probe.line_positions() - aside))), []

@@ -201,6 +201,7 @@ def test_sweeps_that_cannot_be_compounded_are_refused():
         slide_sweep(np.eye(4), 10, 0)
 
 
+@pytest.mark.slow
 def test_the_command_writes_a_volume_that_lies_in_the_patient(tmp_path):
     labels = block(lambda x, y, z: np.where(y > 0, 1, 2), half_mm=(30, 30, 30), spacing_mm=2.0)
     labels.write(tmp_path / "labels.nii.gz")

@@ -265,7 +265,7 @@ def test_what_could_not_be_added_is_refused_before_a_segmentation(mask, tissue, 
 def test_a_lesion_in_or_at_a_head_passes_before_the_segmentation():
     dark = HEAD.with_array(np.where(distances(HEAD) < 12, 2.0, HEAD.array))  # a cyst in FLAIR
     for radius, centre in ((8.0, CENTRE), (20.0, [40, 0, 20]), (6.0, [0, 0, 70]), (5.0, [0, 0, 86])):
-        require_addable(dark, [("tumour", ball(empty((1.5, 1.5, 2.0), half_mm=100), radius, centre), "lesion.nii.gz")])
+        require_addable(dark, [("tumour", ball(empty((2.5, 2.5, 3.0), half_mm=100), radius, centre), "lesion.nii.gz")])
     brain = HEAD.with_array((distances(HEAD, [0, 0, 0]) < 68).astype(np.uint8))
     cap = ball(HEAD, 6.0, [0, 0, 82])
     require_addable(HEAD, [("tumour", cap, "lesion.nii.gz")])

@@ -260,7 +260,7 @@ def test_speckle_correlates_as_of_a_focused_wave_at_every_depth(mhz, f_number, p
 @pytest.mark.parametrize(
     ("mhz", "f_number", "pitch_mm", "elements", "largest", "angles", "depths"),
     [
-        (5.0, 2.0, 0.3, 96, 10.0, 5, (8.0, 22.0)),
+        pytest.param(5.0, 2.0, 0.3, 96, 10.0, 5, (8.0, 22.0), marks=pytest.mark.slow),
         (3.5, 2.5, 0.35, 96, 6.0, 3, (15.0, 40.0)),
     ],
 )

@@ -227,7 +227,7 @@ def test_the_table_has_means_and_deviations_in_any_unit():
 
 
 def test_posteriors_sum_to_one_inside_and_agree_with_the_labels():
-    result = segment_once(head_mri(2.0))
+    result = segment_once(head_mri(3.0))
     posteriors = result.posteriors
     inside = result.labels.array > 0
     assert posteriors.shape == (3, *inside.shape) and posteriors.dtype == np.float32
@@ -290,7 +290,7 @@ def test_the_field_found_with_the_tissues_is_the_one_that_was_applied():
 
 def test_a_brain_of_which_two_thirds_are_white_matter_keeps_its_grey():
     """Starts with less white matter once put both means into the one peak: 110 and 110 instead of 85 and 110."""
-    np.testing.assert_allclose(segment_once(head_mri(2.0)).means, [40, 85, 110], atol=2)
+    np.testing.assert_allclose(segment_once(head_mri(3.0)).means, [40, 85, 110], atol=2)
 
 
 @pytest.mark.parametrize(

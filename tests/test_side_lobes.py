@@ -56,9 +56,9 @@ def test_apodisation_widens_the_main_lobe_as_diffraction_does(apodization):
     assert found * np.sqrt(2.0 * np.log(2.0)) == pytest.approx(0.95 * expected, rel=0.03)
 
 
-@pytest.mark.parametrize("apodization", [0.0, 1.0])
-def test_images_are_as_wide_as_the_apodised_pattern(apodization):
+def test_images_are_as_wide_as_the_apodised_pattern():
     """The correlation of speckle of neighbouring lines is that of the pattern with itself."""
+    apodization = 1.0
     probe = replace(PROBE, receive_apodization=apodization)
     pattern = two_way(probe, 24.0)
     whole = np.concatenate([pattern[:0:-1], pattern])
@@ -111,7 +111,6 @@ PULSE = replace(PLAIN, frequency_mhz=0.5 * PLAIN.frequency_mhz)  # whose second 
 #: name: (probe, depth, amplitude of the field on transmission); foci of the zones at 8, 24 and 40 mm, 8 mm is nearer
 MODES = {
     "zones, behind the first": (replace(PLAIN, transmit="zones"), 15.0, lambda: field(PLAIN, 8.0 / 3.0, 8.0, 15.0)),
-    "harmonic, in focus": (replace(PULSE, harmonic=True), 25.0, lambda: field(PULSE, 12.0, 24.0, 25.0) ** 2),
     "harmonic, out of focus": (replace(PULSE, harmonic=True), 12.5, lambda: field(PULSE, 12.0, 24.0, 12.5) ** 2),
     "angles": (
         replace(PLAIN, transmit="angles", transmit_angles=41), 15.0,

@@ -27,9 +27,9 @@ _QUICK = (
 )  # fmt: skip
 #: Further ones of a few seconds. `python -m validation` runs all checks in all orientations, before a release.
 _SLOW = (
-    "echogenicity", "elevational tilt", "energy", "focal zones", "interface width",
-    "range distortion", "refraction", "ring-down", "shadow and enhancement", "sheets", "slice thickness",
-    "specular echoes", "speckle statistics", "sub-voxel interfaces", "thin sheet", "total reflection",
+    "echogenicity", "elevational tilt", "energy", "focal zones", "interface width", "range distortion", "refraction",
+    "ring-down", "shadow and enhancement", "sheets", "specular echoes", "speckle statistics", "sub-voxel interfaces",
+    "thin sheet", "total reflection",
 )  # fmt: skip
 CHECKS = {check.name: check for check in all_checks()}
 
