@@ -5,12 +5,9 @@ from __future__ import annotations
 import base64
 import contextlib
 import io
-import json
 import re
 import shutil
 import socket
-import subprocess
-import sys
 import tempfile
 from collections import Counter
 from pathlib import Path
@@ -26,12 +23,11 @@ pyigtl = pytest.importorskip("pyigtl", reason="OpenIGTLink comes with pyigtl: pi
 
 from playwright.sync_api import Page, sync_playwright  # noqa: E402
 
-from SlicerUSSim.Logic import PhasedProbe, TissueTable, Volume  # noqa: E402
+from SlicerUSSim.Logic import TissueTable, Volume  # noqa: E402
 from SlicerUSSim.Logic.base.errors import required  # noqa: E402
 from SlicerUSSim.Logic.base.volume import read_array  # noqa: E402
 from SlicerUSSim.Logic.mri.samples import head_mri  # noqa: E402
 from SlicerUSSim.Logic.probe.placement import pose_looking_at  # noqa: E402
-from SlicerUSSim.Logic.tissue.own_files import write_label_files  # noqa: E402
 from SlicerUSSim.Workstation.state import NAMES  # noqa: E402
 from tests.served import Served, refused, run_script  # noqa: E402
 from tests.test_label_maps import head  # noqa: E402
@@ -253,24 +249,11 @@ def eventually(page: Page, condition) -> None:
 
 def pressed_until(page: Page, selector: str, condition) -> None:
     """Press a button until a condition is true: of a busy server's page a press can be lost while an image comes."""
-
-    def press() -> None:
-        if page.locator(selector).is_enabled():
-            click(page, selector)
-
-    _done_until(page, press, condition, f"{selector} did nothing")
-
-
-def key_until(page: Page, key: str, condition) -> None:
-    """Press a key until a condition is true: as a press of a button, it can be lost on a busy machine."""
-    _done_until(page, lambda: page.keyboard.press(key), condition, f"the key {key} did nothing")
-
-
-def _done_until(page: Page, action, condition, complaint: str) -> None:
     end = monotonic() + PATIENCE_S
     while not condition():
-        assert monotonic() < end, complaint
-        action()
+        assert monotonic() < end, f"{selector} did nothing"
+        if page.locator(selector).is_enabled():
+            click(page, selector)
         for _ in range(100):
             if condition():
                 return
@@ -379,7 +362,7 @@ def shown_errors(page: Page) -> str:
 # ---- what one sees ---------------------------------------------------------------------------------------------------
 
 
-def test_the_page_shows_image_ruler_focus_marks_and_the_anatomy_around_the_probe(page):
+def test_the_page_shows_image_marks_anatomy_and_the_panel_of_a_fit(page):
     image = pixels(page)
     assert image.shape[0] == 512 and image.mean() > 15
     us = page.evaluate("window.ussim.image.ruler")
@@ -395,6 +378,8 @@ def test_the_page_shows_image_ruler_focus_marks_and_the_anatomy_around_the_probe
     drawn(page)
     for view in views(page):
         assert picture(page, view.bounding_box()).std() > 10
+    open_section(page, "Fit to real ultrasound")
+    assert page.locator("#fitButton").is_enabled() and page.locator("#applyFitButton").is_disabled()
 
 
 @pytest.mark.slow
@@ -417,42 +402,31 @@ def test_slice_views_show_the_field_outlined_and_the_image_blended_in(page):
     assert np.abs(np.diff(textures[1])).mean() > 2 * np.abs(np.diff(textures[0])).mean()  # speckle, not MRI
 
 
-def test_every_declared_parameter_that_is_shown_is_on_the_page_with_label_tip_unit_and_range(page):
+@pytest.mark.slow
+def test_every_shown_parameter_has_its_tip_unit_and_range(page):
     from SlicerUSSim.Logic.imaging.preset import preset_parameters
-    from SlicerUSSim.Logic.mrml.parameter_node import VALUE_PARAMETERS
     from SlicerUSSim.Widget.sections import panel_sections
     from SlicerUSSim.Workstation.page import NOT_SHOWN
 
-    known = {**preset_parameters(), **{f"scene.{name}": entry for name, entry in VALUE_PARAMETERS.items()}}
-    expected = {name for name, entry in known.items() if entry.shown}
-    controls = {control.value: control for section in panel_sections() for control in section.controls if control.value}
-    assert set(controls) == expected and len(expected) > 30
-    for section in panel_sections():
-        assert page.get_by_role("button", name=section.title, exact=True).count() == 1
-    for name, control in controls.items():
+    shown = {name: entry.shown for name, entry in preset_parameters().items() if entry.shown}
+    controls = {control.value: control for section in panel_sections() for control in section.controls}
+    assert set(shown) <= set(controls) and len(shown) > 30
+    for name, limits in shown.items():
+        control = controls[name]
         if control.widget in NOT_SHOWN:
             continue
-        entry = known[name]
         found = page.locator(f"#slider-{control.widget}" if control.kind == "slider" else f"#{control.widget}")
         assert found.count() == 1, name
         line = found.locator("xpath=ancestor-or-self::*[@title][1]")
-        assert line.get_attribute("title") == control.tip and entry.tip in control.tip, name
-        assert entry.label in line.text_content(), name
+        assert line.get_attribute("title") == control.tip and control.unit in line.text_content(), name
         if control.kind == "number":
-            assert f"{entry.label} [{control.unit}]" in line.text_content() or not control.unit
-            limits = [float(found.get_attribute(limit)) for limit in ("min", "max")]
-            assert limits == [entry.shown.low, entry.shown.high], name
-        elif control.kind == "slider":
-            assert control.unit in line.text_content()
-            thumb = line.locator("[role=slider]")
-            limits = [float(thumb.get_attribute(f"aria-value{limit}")) for limit in ("min", "max")]
-            assert limits == [entry.shown.low, entry.shown.high], name
+            assert [float(found.get_attribute(limit)) for limit in ("min", "max")] == [limits.low, limits.high], name
 
 
 # ---- moving the probe ------------------------------------------------------------------------------------------------
 
 
-def test_the_probe_slides_over_the_surface_where_the_mouse_drags_it_in_a_slice(page):
+def test_the_probe_slides_where_the_mouse_drags_it_in_a_slice(page):
     before, image = pose(page), pixels(page)
     drag(page, in_view(views(page)[1], 0.5, 0.15), (35, 5))
     after = pose(page)
@@ -488,17 +462,6 @@ def test_the_probes_body_is_taken_in_3d_and_slides_swings_or_rotates(page):
 
 
 @pytest.mark.slow
-def test_dragging_beside_the_probe_turns_the_camera_and_not_the_probe(page):
-    before, view = pose(page), views(page)[0]
-    drawn(page)
-    seen = picture(page, view.bounding_box())
-    drag(page, in_view(view, 0.6, 0.85), (40, 0))
-    drawn(page)
-    assert pose(page) == before
-    assert np.abs(picture(page, view.bounding_box()) - seen).mean() > 1
-    click(page, "#look")
-
-
 def test_a_double_click_aims_the_probe_at_a_structure(page):
     before = pose(page)
 
@@ -524,26 +487,18 @@ def test_keys_and_sliders_move_the_probe(page):
         after = pose(page)
         assert after[name] - before[name] == pytest.approx(change, abs=0.6), key
         before = after
-    page.keyboard.press("Home")
-    settled(page)
-    assert abs(pose(page)["rock_deg"]) < 0.1 and abs(pose(page)["tilt_deg"]) < 0.1
-    page.keyboard.press("ArrowUp")
-    settled(page)
-    assert pose(page)["front_deg"] != before["front_deg"]
     slider = page.locator("#slider-pose-lift_mm").locator("xpath=ancestor::*[contains(@class,'v-slider')]").first
     slider.scroll_into_view_if_needed()
     box = slider.bounding_box()
     with new_image(page):
         page.mouse.click(box["x"] + 0.5 * box["width"], box["y"] + 0.5 * box["height"])
     assert pose(page)["lift_mm"] == pytest.approx(10, abs=2)  # the middle of -10 to 30
-    page.keyboard.press("w")  # what is typed into a field is not a key for the probe
-    settled(page)
-    tilted = pose(page)
     page.locator("#fieldOfViewSpinBox").click()
-    page.keyboard.press("w")
+    before = pose(page)
+    page.keyboard.press("w")  # what is typed into a field is not a key for the probe
     page.locator("#fieldOfViewSpinBox").blur()
     settled(page)
-    assert pose(page) == tilted
+    assert pose(page) == before
 
 
 # ---- tissues, settings -----------------------------------------------------------------------------------------------
@@ -559,21 +514,17 @@ def test_segment_labels_the_mri_anew_and_says_what_it_cannot(page):
         # Without sulci it is another image, with them the same again.
         eventually(page, lambda on=on: np.array_equal(pixels(page), before) == on)
         assert not errors(page) and pixels(page).mean() > 5
+    page.evaluate("window.trame.trigger('set', ['classesSpinBox', 4])")
+    click(page, "#segmentButton")
+    assert "classes is 4, expected 3 for contrast t1" in shown_errors(page)
     classes = page.locator("#classesSpinBox")
-    assert classes.input_value() == "" and classes.get_attribute("placeholder") == "none"  # it was 2, out of its range
-    for count in ("4", "3"):
-        classes.fill(count)
-        classes.blur()
-        eventually(page, lambda count=count: shown(page, "classesSpinBox") == int(count))
-        if count == "4":
-            click(page, "#segmentButton")
-            assert "classes is 4, expected 3 for contrast t1" in shown_errors(page)
     classes.fill("")
     classes.blur()
     eventually(page, lambda: shown(page, "classesSpinBox") == 2)  # which stands for none
     assert classes.input_value() == ""
 
 
+@pytest.mark.slow
 def test_a_changed_tissue_changes_the_image_and_nonsense_is_refused(page):
     open_section(page, "Tissues")
     cell, before = page.get_by_label("white matter mu0"), pixels(page)
@@ -610,30 +561,16 @@ def test_gain_probe_and_depth_change_the_image(page):
     page.locator("#widthSpinBox").blur()
     assert "Width is -5 mm, expected a number between" in shown_errors(page)
     assert float(page.locator("#widthSpinBox").input_value()) > 0
-    preset = {"name": "a.json", "mimeType": "application/json", "buffer": _preset(page)}
     with new_image(page):
-        page.set_input_files("#open-file", preset)
-    assert shown(page, "kindComboBox") == "phased" and shown(page, "gainSlider") == 0
-
-
-def _preset(page: Page) -> bytes:
-    """The preset on the page, back to the sequence's probe and no gain."""
-    values = json.loads(download(page, "json").read_bytes())
-    values["probe"] = PhasedProbe(field_of_view_deg=75.0, depth_mm=70.0, scan_lines=96).to_dict()
-    values["display"]["gain_db"] = 0.0
-    return json.dumps(values).encode()
-
-
-def test_freezing_stops_the_images_and_live_goes_on(page):
-    click(page, "#live")
-    eventually(page, lambda: shown(page, "liveCheckBox") is False)
-    settled(page)
-    count, before = page.evaluate("window.ussim.images"), pose(page)
-    key_until(page, "a", lambda: pose(page) != before)
-    settled(page)
-    assert page.evaluate("window.ussim.images") == count
-    click(page, "#live")
-    page.wait_for_function("n => window.ussim.images > n", arg=count)
+        page.locator("#probePresetComboBox").select_option("custom")  # the sequence's
+    assert shown(page, "kindComboBox") == "phased"
+    with new_image(page):
+        page.evaluate("window.trame.trigger('set', ['depthSlider', 50])")
+    assert page.evaluate("window.ussim.image.ruler.h") == pytest.approx(50, rel=0.02)
+    with new_image(page):
+        page.evaluate("window.trame.trigger('set', ['depthSlider', 70])")
+        page.evaluate("window.trame.trigger('set', ['gainSlider', 0])")
+    assert np.array_equal(pixels(page), before)
 
 
 # ---- real images -----------------------------------------------------------------------------------------------------
@@ -660,6 +597,7 @@ def test_a_sequence_plays_beside_the_simulation_and_the_cost_follows(page):
     assert cost(page) > at_the_pose  # away from the recorded pose the cost is higher
 
 
+@pytest.mark.slow
 def test_real_and_simulated_blink_or_are_subtracted(page):
     page.evaluate("window.trame.trigger('show_number', [2])")
     click(page, "#compare-difference")
@@ -692,16 +630,20 @@ def fit(page: Page, evaluations: int) -> None:
 
 
 @pytest.mark.slow
-def test_a_fit_shows_its_costs_and_is_applied_and_reverted(page):
+def test_a_fit_outlives_its_page_and_is_applied_and_reverted(page, browser, url):
     page.evaluate("window.trame.trigger('show_number', [2])")
     settled(page)
     before = cost(page)
-    fit(page, 40)
+    other = opened(browser, url)
+    fit(other, 15)
+    eventually(other, lambda: len(state(other, NAMES.fit.curve)) > 1)
+    other.close()
+    open_section(page, "Fit to real ultrasound")
     page.locator("#cost-curve svg").wait_for()
     eventually(page, lambda: shown(page, "fitLabel").startswith("cost"))
     settled(page)
     curve = state(page, NAMES.fit.curve)
-    assert len(curve) > 10 and min(curve) < curve[0] and curve == sorted(curve, reverse=True)
+    assert len(curve) > 4 and min(curve) < curve[0] and curve == sorted(curve, reverse=True)
     # The last value may come after the label
     said = re.compile(r"→ ([0-9.]+) after")
     eventually(
@@ -724,28 +666,19 @@ def test_a_fit_is_cancelled_and_nothing_changes(page):
     summary, gain = shown(page, "fitLabel"), shown(page, "gainSlider")
     fit(page, 100_000)
     page.locator("#cancel").wait_for()
+    page.locator("#frozen").wait_for()
     eventually(page, lambda: len(state(page, NAMES.fit.curve)) > 1)
     click(page, "#cancel")
+    page.locator("#frozen").wait_for(state="hidden")
     eventually(page, lambda: not state(page, NAMES.messages.progress_title))
     assert shown(page, "fitLabel") == summary and shown(page, "gainSlider") == gain
     assert not errors(page)
 
 
-@pytest.mark.slow
-def test_a_fit_goes_on_when_the_browser_is_closed_and_its_result_is_there_after(page, browser, url):
-    other = opened(browser, url)
-    set_state(other, NAMES.panel.values, {**state(other, NAMES.panel.values), "fitLabel": ""})
-    fit(other, 60)
-    eventually(other, lambda: len(state(other, NAMES.fit.curve)) > 1)
-    other.close()
-    again = opened(browser, url)
-    eventually(again, lambda: shown(again, "fitLabel").startswith("cost"))
-    again.close()
-
-
 # ---- export ----------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_images_are_exported_as_they_are_seen_with_their_place(page):
     seen = pixels(page)
     png = np.asarray(Image.open(download(page, "png")))
@@ -764,13 +697,6 @@ def test_images_are_exported_as_they_are_seen_with_their_place(page):
     )
 
 
-@pytest.mark.slow
-def test_the_script_gives_the_same_image_pixel_by_pixel(page, files, tmp_path):
-    shutil.copy(files / "head.nii.gz", tmp_path)  # for the script, if the page has opened it
-    expected = np.asarray(Image.open(download(page, "png")))
-    assert np.array_equal(run_again(script_of(page), tmp_path), expected)
-
-
 def round_head(folder: Path) -> Volume:
     """A brain in skull and skin, whose labels are written to labels.nii.gz with their table."""
     axis = np.arange(-84.0, 85.0, 3.0)
@@ -783,67 +709,17 @@ def round_head(folder: Path) -> Volume:
     return labels
 
 
-@pytest.mark.parametrize("source", ["disc:50", "mask", "curve"])
 @pytest.mark.slow
-def test_the_workstation_begins_with_the_opening_of_its_option(browser, tmp_path, source):
-    labels, given = round_head(tmp_path), source
-    if source == "mask":
-        above = labels.with_array(np.zeros_like(labels.array))
-        above.array[36:, 20:37, 20:37] = 1
-        above.write(given := tmp_path / "mask.nii.gz")
-    elif source == "curve":
-        points = [{"position": [x, y, 78.0]} for x, y in ((-25, -25), (25, -25), (25, 25), (-25, 25))]
-        markup = {"type": "ClosedCurve", "coordinateSystem": "LPS", "coordinateUnits": "mm", "controlPoints": points}
-        (given := tmp_path / "curve.mrk.json").write_text(json.dumps({"markups": [markup]}))
-    with serving("--labels", str(tmp_path / "labels.nii.gz"), "--craniotomy", str(given)) as address:
-        page = opened(browser, address)
-        settled(page)
-        what = {"disc:50": "a disc of 50 mm", "mask": "mask.nii.gz", "curve": "curve.mrk.json"}[source]
-        assert not errors(page) and f"craniotomy: {what}" in shown(page, "notesLabel").replace("'", "").replace(
-            "LabelMapVolume ", "").replace("MarkupsClosedCurve ", "")  # fmt: skip
-        assert (shown(page, "craniotomySpinBox") == 50.0) == (source == "disc:50")
-        image = np.asarray(Image.open(download(page, "png")), float)
-        assert image[image.shape[0] // 2 :].mean() > 5.0  # the beam reaches the brain
-        page.close()
-
-
-@pytest.mark.slow
-def test_the_workstation_opens_over_the_lesion_that_is_added_as_the_command_does(browser, tmp_path):
-    labels, place = round_head(tmp_path), np.array([35.0, -20.0, 25.0])
-    at = np.stack(np.meshgrid(*[np.arange(57) * 3.0 - 84.0] * 3, indexing="ij"), axis=-1)[..., ::-1]
-    ball = np.linalg.norm(at - place, axis=-1) < 8.0
-    labels.with_array(ball.astype(np.uint8)).write(lesion := tmp_path / "lesion.nii.gz")
-    with serving(
-        "--labels", str(tmp_path / "labels.nii.gz"), "--add", f"tumour={lesion}", "--craniotomy", "auto"
-    ) as address:  # fmt: skip
-        page = opened(browser, address)
-        settled(page)
-        pose = np.array(page.evaluate("window.ussim.image.pose")).reshape(4, 4)
-        page.close()
-    off = (np.linalg.inv(pose) @ [*place, 1.0])[[0, 2]]
-    assert np.hypot(*off) < 3.0, pose
-
-
-@pytest.mark.parametrize("what", ["a craniotomy off the head", "an MRI called CT"])
-@pytest.mark.slow
-def test_bad_anatomy_is_one_line_in_the_page_which_goes_on(browser, files, tmp_path, what):
+def test_a_craniotomy_off_the_head_is_one_line_and_the_page_goes_on(browser, files, tmp_path):
     round_head(tmp_path)
-    arguments, words = [str(files / "head.nii.gz"), "--ct"], "expected Hounsfield units"
-    if what != "an MRI called CT":
-        arguments = ["--labels", str(tmp_path / "labels.nii.gz"), "--craniotomy", str(files / "far.nii.gz")]
-        words = "is empty, or lies outside of the patient"
+    arguments = ["--labels", str(tmp_path / "labels.nii.gz"), "--craniotomy", str(files / "far.nii.gz")]
     with serving(*arguments) as address:
-        page = browser.new_page()
-        page.set_default_timeout(1000 * PATIENCE_S)
-        page.goto(address)
-        page.wait_for_function("window.trame?.state?.get !== undefined")
+        page = opened(browser, address)
         eventually(page, lambda: bool(errors(page)))
         (line,) = errors(page)
-        assert words in line and "\n" not in line
-        if what == "a craniotomy off the head":
-            loaded(page)
-            settled(page)
-            assert page.locator("#closeCraniotomyButton").is_disabled()  # nothing was opened, and images are made
+        assert "is empty, or lies outside of the patient" in line and "\n" not in line
+        settled(page)
+        assert page.locator("#closeCraniotomyButton").is_disabled()  # nothing was opened
         page.close()
 
 
@@ -878,36 +754,9 @@ def test_a_craniotomy_is_opened_and_closed_in_the_page(browser, tmp_path):
         page.close()
 
 
-@pytest.mark.slow
-def test_the_page_places_the_probe_in_the_opening_so_that_it_looks_at_the_tumour(browser, tmp_path):
-    labels, place = round_head(tmp_path), np.array([12.0, 0.0, 33.0])
-    k, j, i = np.indices(labels.array.shape)
-    centres = np.stack([i, j, k], axis=-1) * 3.0 - 84.0
-    labels.with_array(np.where(np.linalg.norm(centres - place, axis=-1) < 9.0, 4, labels.array).astype(np.uint8)).write(
-        tmp_path / "labels.nii.gz"
-    )
-    TissueTable.brain(("grey matter", "skull", "skin", "tumour")).write(tmp_path / "labels.json")
-    hole = labels.with_array(np.zeros_like(labels.array))
-    hole.array[36:, 21:36, 21:36] = 1
-    hole.write(tmp_path / "hole.nii.gz")
-    with serving("--labels", str(tmp_path / "labels.nii.gz"), "--craniotomy", str(tmp_path / "hole.nii.gz")) as address:
-        page = opened(browser, address)
-        settled(page)
-        assert not errors(page)
-        assert re.search(
-            r"^probe: aimed at the tumour, 2\d degrees off the surface's normal$",
-            shown(page, "notesLabel"),
-            re.MULTILINE,
-        )
-        assert "the skull is closed" not in shown(page, "notesLabel")
-        image = np.asarray(Image.open(download(page, "png")), float)
-        assert image[image.shape[0] // 3 :].mean() > 5.0  # the beam reaches the brain
-        page.close()
-
-
 @needs_atlas
-@pytest.mark.slow
-def test_a_click_in_a_lesion_proposes_it_and_accept_lays_it_over_the_tissues(browser, tmp_path):
+@pytest.mark.long
+def test_a_click_proposes_a_lesion_and_accept_adds_it_to_the_tissues(browser, tmp_path):
     maps = with_low_grade_tumour(required(tissue_maps("mni152"), "no atlas"), CENTRE, 14.0).coarser(2)
     image = phantom(maps, "flair", noise=0.03, bias=0.0)
     image.mri.write(tmp_path / "flair.nii.gz")
@@ -947,7 +796,7 @@ def test_a_click_in_a_lesion_proposes_it_and_accept_lays_it_over_the_tissues(bro
         page.close()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_workstation_finds_sheets_and_its_script_has_them(browser, tmp_path):
     head_mri(2.0).write(tmp_path / "head.nii.gz")
     with serving(str(tmp_path / "head.nii.gz"), "--sheets", "auto", "--no-sheet", "ependyma") as address:
@@ -967,6 +816,7 @@ def test_the_workstation_finds_sheets_and_its_script_has_them(browser, tmp_path)
         page.close()
 
 
+@pytest.mark.slow
 def test_the_cine_is_a_gif_that_moves(page):
     for _ in range(4):
         with new_image(page):
@@ -978,7 +828,7 @@ def test_the_cine_is_a_gif_that_moves(page):
     assert (np.asarray(gif.convert("L")) != first).mean() > 0.05
 
 
-def test_the_scene_opens_again_with_everything_and_gives_the_same_image(page, tmp_path):
+def test_a_saved_scene_opens_again_with_the_same_image(page, tmp_path):
     from slicer import vtkSlicerSequencesLogic
     from trame_slicer.core import SlicerApp
 
@@ -991,19 +841,19 @@ def test_the_scene_opens_again_with_everything_and_gives_the_same_image(page, tm
     app = SlicerApp()  # Slicer's own scene and logic, without a window
     app.register_module_logic(vtkSlicerSequencesLogic())
     assert app.io_manager.load_scene(bundle)
-    scene = app.scene
-    logic = UltrasoundSceneLogic(scene)
+    logic = UltrasoundSceneLogic(app.scene)
     parameters = logic.parameters
     assert np.array_equal(read_volume(parameters.output).array[0], expected)
     logic.simulate(parameters.labels, parameters.probe_transform, parameters.output)
     assert np.abs(read_volume(parameters.output).array[0].astype(int) - expected).max() <= 1
     assert parameters.real.GetNumberOfDataNodes() == 6 and parameters.mri is not None
-    assert scene.GetFirstNodeByName("Probe body") is None  # what only this page shows stays here
+    assert app.scene.GetFirstNodeByName("Probe body") is None  # what only this page shows stays here
 
 
 # ---- tracker ---------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_tracker_moves_the_probe_and_gets_every_image_with_its_matrix(page, tracker):
     target = pose_looking_at([35.0, 0.0, 60.0], [0.0, 0.0, 0.0])
     tracker.send_message(pyigtl.TransformMessage(target, device_name="ProbeToReference"), wait=False)
@@ -1054,19 +904,12 @@ def test_a_reloaded_page_shows_what_there_was(page):
         assert picture(page, view.bounding_box()).std() > 10
 
 
-@pytest.mark.parametrize(
-    ("name", "content", "message"),
-    [
-        ("broken.nii.gz", b"this is no image", "broken.nii.gz: "),
-        ("settings.json", b'{"probe": {"kind": "square"}}', "kind"),
-        ("sweep.igs.mha", b"ObjectType = nonsense", "sweep.igs.mha: "),
-    ],
-)
-def test_a_file_that_cannot_be_read_is_said_and_changes_nothing(page, name, content, message):
+def test_a_file_that_cannot_be_read_is_said_and_changes_nothing(page):
     before = state(page, NAMES.title), shown(page, "kindComboBox"), shown(page, "mriSelector")
-    page.set_input_files("#open-file", {"name": name, "mimeType": "application/octet-stream", "buffer": content})
+    broken = {"name": "broken.nii.gz", "mimeType": "application/octet-stream", "buffer": b"this is no image"}
+    page.set_input_files("#open-file", broken)
     text = shown_errors(page)
-    assert message in text and "/tmp" not in text and "Traceback" not in text
+    assert "broken.nii.gz: " in text and "/tmp" not in text and "Traceback" not in text
     settled(page)
     assert (state(page, NAMES.title), shown(page, "kindComboBox"), shown(page, "mriSelector")) == before
     page.locator(".ussim-error button").first.click()
@@ -1074,7 +917,7 @@ def test_a_file_that_cannot_be_read_is_said_and_changes_nothing(page, name, cont
 
 
 @pytest.mark.slow
-def test_a_mask_opened_on_the_page_is_laid_over_the_tissues_as_what_the_user_says(page, files, tmp_path):
+def test_a_mask_is_laid_over_the_tissues_as_what_the_user_says(page, files, tmp_path):
     shutil.copy(files / "head.nii.gz", tmp_path)  # for the script, if the page has opened it
     mri = head_mri(2.0)
     index = np.indices(mri.array.shape)[::-1].reshape(3, -1)
@@ -1103,62 +946,6 @@ def test_a_mask_opened_on_the_page_is_laid_over_the_tissues_as_what_the_user_say
 
 
 @pytest.mark.slow
-def test_masks_whose_files_are_doubtful_are_added_with_what_to_check_in_the_notes(page, tmp_path):
-    distance = np.sqrt(((np.indices((40, 40, 40)) - 19.5) ** 2).sum(axis=0))
-    place = np.eye(4)
-    place[:3, 3] = [-30 - 19.5, 10 - 19.5, 40 - 19.5]
-    brats = Volume(np.select([distance < 5, distance < 8, distance < 12], [1, 3, 2], 0).astype(np.uint8), place)
-    brats.write(tmp_path / "brats3.nii.gz")
-    partial = (distance < 6).astype(np.float32)
-    partial[:, :, :3] = np.nan
-    Volume(partial, place).write(tmp_path / "partial.nii.gz")
-    page.select_option("#added-as", "tumour")
-    for name, line in (
-        ("brats3", "Check: brats3.nii.gz holds the labels 1, 2, 3; all of them are added as tumour ('labels by their "
-         "names, or a BraTS map' adds the tissues of a BraTS map)"),
-        ("partial", "Check: partial.nii.gz: 4800 of 64000 voxels, at the border of the volume, are NaN: they are read "
-         "as 0"),
-    ):  # fmt: skip
-        with new_image(page):
-            page.set_input_files("#add-file", tmp_path / f"{name}.nii.gz")
-        settled(page)
-        assert line in page.locator("#notesLabel").inner_text() and not errors(page)
-    assert "Check: brats3.nii.gz holds" in page.locator("#notesLabel").inner_text()  # its lesion is still there
-
-
-def test_latency_is_measured_on_request(page):
-    begun = monotonic()
-    click(page, "#show-latency")
-    page.wait_for_function("window.ussim.measuring")
-    drag(page, in_view(views(page)[1], 0.5, 0.15), (25, 5))
-    page.get_by_text("mouse to image").and_(page.get_by_text("95 % within")).wait_for()
-    times = page.evaluate("window.ussim.measured")
-    assert times and min(times) > 0 and max(times) < 1000 * (monotonic() - begun)
-    click(page, "#show-latency")
-
-
-@pytest.mark.slow
-def test_another_mri_takes_the_place_of_the_first(page, files, tmp_path):
-    content = (files / "head.nii.gz").read_bytes()
-    with new_image(page):
-        page.set_input_files("#open-file", {"name": "again.nii.gz", "mimeType": "application/gzip", "buffer": content})
-        answer_new_patient(page)
-    eventually(page, lambda: state(page, NAMES.title) == "again.nii.gz")
-    settled(page)
-    assert not errors(page) and shown(page, "liveCheckBox") and pixels(page).mean() > 5
-    assert page.locator("#mriSelector option:checked").inner_text().strip() == "again.nii.gz"
-    assert page.locator("#labelsSelector option:checked").inner_text().strip() == "again.nii.gz tissues"
-    assert shown(page, "lesionsSelector") is None  # of the patient before
-    elsewhere = Volume.read(files / "head.nii.gz")
-    Volume(elsewhere.array, elsewhere.ijk_to_ras + 400.0 * np.eye(4, k=3)).write(tmp_path / "elsewhere.nii.gz")
-    with new_image(page):
-        page.set_input_files("#open-file", tmp_path / "elsewhere.nii.gz")
-        answer_new_patient(page)
-    settled(page)
-    assert not errors(page) and pixels(page).mean() > 5  # the probe is placed on the patient in another frame
-
-
-@pytest.mark.slow
 def test_an_opened_patient_takes_the_place_of_title_notes_and_warnings(page, files, tmp_path):
     aseg = head()
     aseg.write(tmp_path / "aseg.nii.gz")
@@ -1173,115 +960,20 @@ def test_an_opened_patient_takes_the_place_of_title_notes_and_warnings(page, fil
         page.wait_for_function("title => document.title === title", arg=f"{path.name} - SlicerUSSim")
         return page.locator("#notesLabel").inner_text()
 
-    def as_shown() -> str:
-        return " ".join(page.locator("body").inner_text().split())
-
-    assert "share" in opened_as(files / "head.nii.gz")  # the table of the MRI
-    notes = opened_as(files / "labels.nii.gz", "Tissues of head.nii.gz")
-    assert "of the MRI head.nii.gz, which is shown: its intensities follow the labels" in notes
-    assert page.locator("#mriSelector option:checked").inner_text().strip() == "head.nii.gz"
-    notes = opened_as(tmp_path / "crop.nii.gz", "Tissues of labels.nii.gz")
+    notes = opened_as(tmp_path / "crop.nii.gz", "Tissues of head.nii.gz")
     assert "crop.nii.gz: FreeSurfer aseg: 8 labels to 3 tissues" in notes and "share" not in notes
     assert "Check: crop.nii.gz: a part of a brain of 1048 ml, cut off at the front" in notes
     assert "Check: the intensities of head.nii.gz do not follow the labels (of another patient?)" in notes
     assert errors(page) == [line.removeprefix("Check: ") for line in notes.splitlines() if "cut off" in line]
-    assert "/tmp" not in as_shown() and str(tmp_path) not in as_shown()
+    assert "/tmp" not in page.locator("body").inner_text()
     notes = opened_as(tmp_path / "aseg.nii.gz")
     assert "aseg.nii.gz: FreeSurfer aseg: 8 labels to 3 tissues" in notes
     assert not errors(page) and "crop" not in notes and shown(page, "mriSelector") is None
-    page.set_input_files("#open-file", files / "broken.nii.gz")  # changes nothing
-    assert "broken.nii.gz: " in shown_errors(page)
-    settled(page)
-    assert state(page, NAMES.title) == "aseg.nii.gz" and page.locator("#notesLabel").inner_text() == notes
     notes = opened_as(files / "head.nii.gz")
     assert "share" in notes and "aseg" not in notes and not errors(page)
 
 
-@pytest.mark.slow
-def test_a_label_map_is_opened_together_with_its_table(page, files, tmp_path):
-    labels = Volume.read(files / "labels.nii.gz")
-    names = TissueTable.read(files / "labels.json").names()[1:]
-    order = [names[2], names[1], names[0], *names[3:]]  # as of a T2
-    of_t2 = labels.with_array(np.array([0, 3, 2, 1, 4], np.uint8)[labels.array])
-    write_label_files(tmp_path / "rem.nii.gz", of_t2, TissueTable.brain().for_names(order))
-    page.set_input_files("#open-file", tmp_path / "rem.json")
-    assert "rem.json is the tissue table of a label map: open both files together" in shown_errors(page)
-    page.locator(".ussim-error button").first.click()
-    page.set_input_files("#open-file", tmp_path / "rem.nii.gz")
-    answer_new_patient(page)
-    assert "open it together with the .json file that was written beside it" in shown_errors(page)
-    page.locator(".ussim-error button").first.click()
-    with new_image(page):
-        page.set_input_files("#open-file", [tmp_path / "rem.nii.gz", tmp_path / "rem.json"])
-        answer_new_patient(page)
-    settled(page)
-    assert state(page, NAMES.title) == "rem.nii.gz" and not errors(page)
-    assert "4 labels by their numbers in the tissue table" in page.locator("#notesLabel").inner_text()
-    assert set(names) <= {row["name"] for row in state(page, NAMES.panel.tissues)}
-    # Its table says nothing about the next map, whose numbers mean something else: labels 4 and 5 were exchanged.
-    enhancing = of_t2.with_array(np.array([0, 1, 2, 3, 5, 4], np.uint8)[labels.array])
-    tissues = TissueTable.brain().for_names(["csf", "grey matter", "white matter", "enhancing", "leptomeninges"])
-    write_label_files(tmp_path / "gd.nii.gz", enhancing, tissues)
-    with new_image(page):
-        page.set_input_files("#open-file", [tmp_path / "gd.nii.gz", tmp_path / "gd.json"])
-        answer_new_patient(page)
-    settled(page)
-    assert state(page, NAMES.title) == "gd.nii.gz" and not errors(page)
-    page.set_input_files("#open-file", tmp_path / "rem.nii.gz")
-    answer_new_patient(page)
-    assert "open it together with the .json file that was written beside it" in shown_errors(page)
-    assert state(page, NAMES.title) == "gd.nii.gz"
-
-
 # ---- who may come in, and how it is started --------------------------------------------------------------------------
-
-
-@pytest.mark.slow
-def test_from_other_computers_only_the_token_opens_the_door(browser, files):
-    import urllib.error
-    import urllib.request
-
-    def status(address: str, **headers: str) -> int:
-        try:
-            return urllib.request.urlopen(urllib.request.Request(address, headers=headers), timeout=PATIENCE_S).status
-        except urllib.error.HTTPError as error:
-            return error.code
-
-    with serving("--labels", str(files / "labels.nii.gz"), "--host", "0.0.0.0") as address:
-        token = address.partition("?token=")[2]
-        assert len(token) >= 32
-        port = address.split(":")[2].split("/")[0]
-        base = f"http://127.0.0.1:{port}/"
-        assert (
-            status(base) == status(f"{base}?token=wrong") == status(f"{base}index.html") == status(f"{base}ws") == 403
-        )
-        with_cookies = urllib.request.build_opener(urllib.request.HTTPCookieProcessor())
-        with with_cookies.open(f"{base}?token={token}", timeout=PATIENCE_S) as answer:
-            assert answer.status == 200 and token not in answer.url  # nor in the history
-            assert answer.headers["X-Content-Type-Options"] == "nosniff"
-            assert "frame-ancestors 'none'" in answer.headers["Content-Security-Policy"]
-            assert answer.headers["Referrer-Policy"] == "no-referrer"
-        assert status(f"{base}ws?token={token}", Origin="http://elsewhere.example") == 403
-        stranger = browser.new_page()
-        stranger.goto(f"{base}?token=wrong")
-        assert "token is missing or wrong" in stranger.locator("#reason").inner_text()
-        stranger.close()
-        # Only the owner's page gets as far as an image; here it is of labels without an MRI.
-        page = opened(browser, f"{base}?token={token}")
-        settled(page)
-        assert pixels(page).mean() > 5 and not errors(page)
-        assert "token" not in page.url
-        page.close()
-
-
-def test_a_server_on_loopback_refuses_pages_of_other_sites(url):
-    import urllib.error
-    import urllib.request
-
-    for headers in ({"Origin": "http://elsewhere.example"}, {"Host": "elsewhere.example"}):
-        with pytest.raises(urllib.error.HTTPError) as caught:
-            urllib.request.urlopen(urllib.request.Request(url, headers=headers), timeout=PATIENCE_S)
-        assert caught.value.code == 403
 
 
 @pytest.mark.parametrize(
@@ -1291,28 +983,10 @@ def test_a_server_on_loopback_refuses_pages_of_other_sites(url):
         (["{broken}"], "broken.nii.gz: cannot be read"),
         (["--igtl", "nowhere"], "--igtl is 'nowhere', expected HOST:PORT"),
         (["--igtl", "listen:203.0.113.7:18944"], "cannot wait for a tracker at 203.0.113.7:18944"),
-        (["--sequence", "{broken}"], "broken.nii.gz"),
         (["--host", "203.0.113.7"], "cannot listen at 203.0.113.7"),
-        (["--device", "no such device"], "no such device"),
-        (["{head}", "--also", "t2"], "--also is 't2', expected CONTRAST=FILE"),
-        (["{head}", "--also", "t2={head}", "--also", "flair={head}"], "--also is given 2 times, expected one"),
-        (["{head}", "--add", "tumuor={head}"], "no tissue is called 'tumuor', expected tumour"),
         (["{head}", "--add", "tumour={far}"], "far.nii.gz: lies "),
         (["--labels", "{head}", "--contrast", "t2"], "head.nii.gz: is a label map, and --contrast is for an MRI"),
-        (["--labels", "{head}", "--ct"], "head.nii.gz: is a label map, and --ct is for a CT"),
-        (["{head}", "--map", "24=csf"], "--map is for a label map, expected --labels too"),
-        (["{head}", "--organs", "{head}"], "--organs is for a CT, expected --ct too"),
-        (["{head}", "--contrast", "flair", "--sheets", "auto"], "sheets are not found in contrast 'flair'"),
-        (["{head}", "--sheets", "{head}"], "head.nii.gz: expected a .vtp that `ussim segment --sheets` has written"),
         (["{head}", "--no-sheet", "falx"], "--no-sheet leaves out some of --sheets; give --sheets, too"),
-        (["{head}", "--craniotomy", "disc:30"], "--craniotomy is disc:30, and the image shows a brain without"),
-        (
-            ["--craniotomy", "auto"],
-            "--craniotomy is auto, and the demo is a brain without its skull, which has nothing",
-        ),
-        (["{head}", "--ct", "--craniotomy", "auto"], "which opens a head that was found in an MRI, and this is a CT"),
-        (["{head}", "--outside", "--craniotomy", "disc:3"], "--craniotomy is 'disc:3', expected disc: and a diameter"),
-        (["{head}", "--outside", "--craniotomy", "{head}"], "head.nii.gz: has "),
     ],
 )
 def test_what_cannot_be_served_is_said_in_one_line(files, arguments, message):
@@ -1323,8 +997,4 @@ def test_what_cannot_be_served_is_said_in_one_line(files, arguments, message):
 def test_a_port_that_is_taken_is_said():
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
-        done = subprocess.run(
-            [sys.executable, "-m", "SlicerUSSim.Command.cli", "serve", "--port", str(port)],
-            capture_output=True, text=True, timeout=PATIENCE_S,
-        )  # fmt: skip
-    assert done.returncode == 2 and f"127.0.0.1:{port}" in done.stderr
+        assert f"127.0.0.1:{port}" in refused("--port", port)
