@@ -7,18 +7,15 @@ import shutil
 
 import numpy as np
 import pytest
-from scipy import ndimage
 from scipy.spatial.transform import Rotation
 
 pytest.importorskip("trame_slicer", reason="the workstation comes with: pip install '.[serve]'")
 pytest.importorskip("playwright", reason="browser tests need playwright: pip install '.[test]'")
 
-from SlicerUSSim.Logic import Volume
-from SlicerUSSim.Logic.tracked.field import estimate_field
 from SlicerUSSim.Logic.tracked.pose_files import write_pose
 from SlicerUSSim.Logic.tracked.sequence import TrackedSequence
 from SlicerUSSim.Workstation.state import NAMES
-from tests.conftest import SHARED, needs_shared, rigid
+from tests.conftest import rigid
 from tests.test_workstation import (
     answer_new_patient,
     browser as browser,
@@ -109,7 +106,7 @@ def shown_pose(page, number: int) -> np.ndarray:
 
 
 @pytest.mark.slow
-def test_ultrasound_without_a_calibration_asks_for_it_and_is_compared_with_it(page, recording):
+def test_ultrasound_without_a_calibration_asks_for_it(page, recording):
     said = state(page, NAMES.opened)[0]
     assert said.endswith(
         "tracked ultrasound: 6 images of 624x512, transforms ProbeToTracker, ReferenceToTracker, StylusToTracker: its "
@@ -132,13 +129,8 @@ def test_ultrasound_without_a_calibration_asks_for_it_and_is_compared_with_it(pa
 
 @pytest.mark.slow
 def test_values_are_typed_and_wrong_ones_are_said_and_change_nothing(page, recording):
-    for typed, words in (
-        ("1 0 0", "Calibration has 3 numbers, expected 16 numbers, the 4x4 matrix by rows"),
-        ("1 0 0 x" + " 0" * 12, "Calibration has 'x', expected 16 numbers, the 4x4 matrix by rows"),
-        (text(np.diag([0.1, 0.1, 0.1, 2.0])), "Calibration has last row"),
-    ):
-        fill(page, "calibration", typed)
-        assert errors(page)[-1].startswith(words), errors(page)
+    fill(page, "calibration", "1 0 0")
+    assert errors(page)[-1] == "Calibration has 3 numbers, expected 16 numbers, the 4x4 matrix by rows"
     page.fill("#calibration-name", "Image")
     fill(page, "calibration", recording["calibration"])
     assert errors(page)[-1] == "Its name is 'Image', expected two frames joined by To, such as ImageToProbe"
@@ -172,17 +164,12 @@ def add(page, recording, number: int, pixel: tuple[float, float], off_mm=(0.0, 0
 def test_landmarks_register_and_what_remains_is_told(page, recording):
     page.set_input_files("#calibration-file", recording["folder"] / "plus.xml")
     settled(page)
-    for pixel, point, words in (
-        ("-50 10", "1 2 3", "Landmark in the image has column -50, expected 0 to 623, as the image has 624x512 pixels"),
-        ("10 9999", "1 2 3", "Landmark in the image has row 9999, expected 0 to 511, as the image has 624x512 pixels"),
-        ("10 10", "1e9 0 0", "Landmark in the patient has R 1e+09 mm, expected at most 100000 mm from the origin"),
-    ):
-        page.fill("#landmark-pixel", pixel)
-        page.fill("#landmark-point", point)
-        click(page, "#add-landmark")
-        settled(page)
-        assert errors(page)[-1] == words and not state(page, NAMES.registration.landmarks)
-        assert page.locator("#landmark-pixel").input_value() == pixel  # to be corrected
+    page.fill("#landmark-pixel", "-50 10")
+    page.fill("#landmark-point", "1 2 3")
+    click(page, "#add-landmark")
+    settled(page)
+    assert "column -50, expected 0 to 623" in errors(page)[-1] and not state(page, NAMES.registration.landmarks)
+    assert page.locator("#landmark-pixel").input_value() == "-50 10"  # to be corrected
     add(page, recording, 0, (200.0, 150.0))
     add(page, recording, 0, (420.0, 160.0))
     click(page, "#fit-landmarks")
@@ -258,26 +245,7 @@ def test_a_landmark_is_picked_in_the_real_image_and_in_a_slice(page, recording):
 
 
 @pytest.mark.slow
-def test_transforms_without_ultrasound_and_of_other_kinds_are_said(page, recording, files):
-    page.set_input_files("#calibration-file", files / "far.nii.gz")
-    settled(page)
-    assert (
-        errors(page)[-1].startswith("far.nii.gz is a mask")
-        and "expected the calibration of tracked" in errors(page)[-1]
-    )
-    click(page, "#close-patient")
-    settled(page)
-    assert state(page, NAMES.registration.recording) == ""
-    page.set_input_files("#registration-file", recording["folder"] / "registration.txt")
-    settled(page)
-    assert errors(page)[-1].startswith("registration.txt: a 4x4 matrix, expected tracked ultrasound first")
-
-
-@pytest.mark.slow
-def test_a_transform_without_ultrasound_is_asked_and_is_a_pose_or_of_the_ultrasound_that_comes_next(
-    browser, recording, files, tmp_path
-):
-    """It was refused."""
+def test_a_transform_is_a_pose_or_of_the_ultrasound_that_comes_next(browser, recording, files, tmp_path):
     with serving("--labels", str(files / "labels.nii.gz")) as address:
         page = opened(browser, address)
         settled(page)
@@ -303,96 +271,4 @@ def test_a_transform_without_ultrasound_is_asked_and_is_a_pose_or_of_the_ultraso
         assert page.locator("#registration-from").inner_text() == "Registration registration.txt"
         assert "plus.xml" in page.locator("#calibration-from").inner_text() and not errors(page)
         np.testing.assert_allclose(shown_pose(page, 3), recording["poses"][3], atol=0.5)
-        page.close()
-
-
-# ---- a real recording ------------------------------------------------------------------------------------------------
-
-#: From the transducer of a tracked Ultrasonix L14-5 to its sensor, as its maker calibrates it: in PlusLib's data,
-#: ConfigFiles/PlusDeviceSet_Server_Ultrasonix_L14-5_Ascension3DG_calibrated.xml
-TRANSDUCER = [
-    [0.0018, 0.9477, -0.0175, 14.8449],
-    [-1.0000, 0.0016, -0.0052, 15.0061],
-    [-0.0052, 0.0166, 0.9998, 0.1638],
-    [0, 0, 0, 1],
-]
-
-
-def labels_of(sequence: TrackedSequence, to_ras: np.ndarray) -> Volume:
-    """Tissue (1) where a recording shows something, and bone (2) where it is bright below the skin; of 1 mm voxels.
-
-    No CT of this phantom is at hand: this stands for one, in its place.
-    """
-    rows, columns = sequence.images.shape[1:]
-    matrices = [to_ras @ sequence.pose(n, "ImageToReference") for n in range(len(sequence))]
-    shown = np.argwhere(sequence.images.max(axis=0) > 0)
-    corners = np.array([shown.min(axis=0), shown.max(axis=0)])
-    ends = np.array([[x, y, 0, 1] for x in corners[:, 1] for y in corners[:, 0]], float)
-    points = np.concatenate([(ends @ matrix.T)[:, :3] for matrix in matrices])
-    low, high = points.min(axis=0) - 6, points.max(axis=0) + 6
-    counts = np.ceil(high - low).astype(int)
-    to_patient = np.eye(4)
-    to_patient[:3, 3] = low
-    index = np.indices(counts[::-1])[::-1].reshape(3, -1)
-    voxels = np.concatenate([index + low[:, None], np.ones((1, index.shape[1]))])
-    labels = np.ones(index.shape[1], np.uint8)
-    for matrix, image in zip(matrices, sequence.images, strict=True):
-        smooth = ndimage.gaussian_filter(image.astype(np.float32), 8.0)
-        x, y, z, _ = np.linalg.inv(matrix) @ voxels
-        near = (np.abs(z) < 1.2) & (x > 0) & (x < columns - 1) & (y > 130) & (y < rows - 1)
-        bright = smooth[y[near].round().astype(int), x[near].round().astype(int)] > 120
-        labels[np.flatnonzero(near)[bright]] = 2
-    return Volume(labels.reshape(counts[::-1]), to_patient)
-
-
-@pytest.fixture(scope="module")
-def phantom(tmp_path_factory) -> dict:
-    """The recording of a spine phantom, two files with its calibration, and a label map in another frame."""
-    folder = tmp_path_factory.mktemp("phantom")
-    sequence = TrackedSequence.read(SHARED / "SpinePhantomFreehand.igs.mha")
-    in_image = estimate_field(sequence.images, width_mm=38.0).image_to_probe  # L14-5: 38 mm wide
-    constant = {"ImageToTransducer": in_image, "TransducerToProbe": np.array(TRANSDUCER)}
-    numbers = " ".join(f"{value:g}" for value in np.ravel(TRANSDUCER))
-    (folder / "l14-5.xml").write_text(
-        f'<PlusConfiguration><Transform From="Transducer" To="Probe" Matrix="{numbers}"/></PlusConfiguration>'
-    )
-    calibrated = sequence.with_transforms(constant)
-    labels_of(calibrated, TO_RAS).write(folder / "spine.nii.gz")
-    (folder / "spine.json").write_text('{"1": "muscle", "2": "bone"}')
-    return {"folder": folder, "in_image": in_image, "sequence": calibrated}
-
-
-@needs_shared
-@pytest.mark.slow
-def test_a_real_recording_of_a_spine_phantom_is_calibrated_registered_and_compared(browser, phantom):
-    """SpinePhantomFreehand of Plus, whose file has no calibration and the frame of its tracker."""
-    folder, sequence = phantom["folder"], phantom["sequence"]
-    with serving("--labels", str(folder / "spine.nii.gz"), "--map", str(folder / "spine.json")) as address:
-        page = opened(browser, address)
-        page.set_input_files("#open-file", SHARED / "SpinePhantomFreehand.igs.mha")
-        settled(page)
-        assert "21 images of 820x616" in state(page, NAMES.opened)[0] and state(page, NAMES.sequence.length) == 0
-        page.fill("#calibration-name", "ImageToTransducer")
-        fill(page, "calibration", phantom["in_image"])
-        assert "no path from Image to Reference" in page.locator("#calibration-from").inner_text()
-        page.set_input_files("#calibration-file", folder / "l14-5.xml")
-        settled(page)
-        assert (
-            page.locator("#calibration-from").inner_text()
-            == "Calibration ImageToTransducer as typed; TransducerToProbe of l14-5.xml"
-        )
-        assert state(page, NAMES.sequence.length) == 21 and not errors(page)
-        known = {"image_to_ras": [TO_RAS @ sequence.pose(n, "ImageToReference") for n in range(21)]}
-        for number, pixel in ((0, (370, 180)), (10, (330, 230)), (10, (500, 260)), (20, (430, 240)), (4, (250, 150))):
-            add(page, known, number, pixel, (0.4, -0.3, 0.2) if number == 4 else (0.0, 0.0, 0.0))
-        off = state(page, NAMES.sequence.similarity)  # the probe is beside the phantom
-        click(page, "#fit-landmarks")
-        settled(page)
-        assert re.search(r"5 landmarks agree to 0\.\d+ mm", page.locator("#registration-from").inner_text())
-        shown_pose(page, 10)
-        assert off == "" and 0 < cost(page) < 0.9 and not errors(page)
-        assert state(page, NAMES.panel.values)["kindComboBox"] == "linear"
-        in_image = np.array(page.evaluate("window.ussim.image.pose"))
-        right = TO_RAS @ sequence.pose(10, "ImageToReference") @ np.linalg.inv(phantom["in_image"])
-        np.testing.assert_allclose(in_image[:3, 3], right[:3, 3], atol=1.0)
         page.close()
