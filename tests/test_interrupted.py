@@ -9,12 +9,10 @@ import sys
 import time
 from pathlib import Path
 
-import numpy as np
 import pytest
 
-from SlicerUSSim.Logic import PhasedProbe, TissueTable, TrackedSequence, Volume, segment_mri
+from SlicerUSSim.Logic import PhasedProbe, TissueTable, Volume, segment_mri
 from SlicerUSSim.Logic.base.files import read_json, write_json
-from SlicerUSSim.Logic.base.volume import read_array
 from SlicerUSSim.Logic.mri.samples import head_mri
 from SlicerUSSim.Logic.probe import craniotomy_pose
 from SlicerUSSim.Logic.tracked import write_pose
@@ -25,15 +23,6 @@ pytestmark = [pytest.mark.slow, pytest.mark.skipif(sys.platform == "win32", reas
 FIT = "labels.nii.gz --sequence tracked.igs.mha --probe probe.json --free gain_db --restarts 0"
 COMMANDS = {
     "segment": ("segment mri.nii.gz -o out.nii.gz", {"out.nii.gz": Volume.read}),
-    "simulate": ("simulate labels.nii.gz --pose pose.json -o out.mha", {"out.mha": read_array}),
-    "sweep": (
-        "sweep labels.nii.gz --sequence tracked.igs.mha --probe probe.json -o out.igs.mha",
-        {"out.igs.mha": TrackedSequence.read},
-    ),
-    "volume": (
-        "volume labels.nii.gz --pose pose.json --tilt 20 --frames 6 --spacing 1 -o out.nrrd",
-        {"out.nrrd": Volume.read},
-    ),
     "optimize": (f"optimize {FIT} --evaluations 60 -o out.json", {"out.json": read_json}),
 }
 
@@ -83,7 +72,7 @@ def test_a_command_that_is_interrupted_leaves_nothing_half_done(name, inputs, tm
     made = {path.name for path in tmp_path.iterdir()} - inputs.keys()
     assert made >= outputs.keys()
     interrupted = 0
-    for share in (0.3, 0.6, 0.8, 0.9, 0.97):
+    for share in (0.6, 0.9):
         for file in made:
             (tmp_path / file).unlink(missing_ok=True)
         process = start(tmp_path, command)
@@ -102,29 +91,6 @@ def test_a_command_that_is_interrupted_leaves_nothing_half_done(name, inputs, tm
     assert interrupted
     for file, content in inputs.items():
         assert (tmp_path / file).read_bytes() == content
-
-
-def test_a_fit_that_was_interrupted_goes_on_where_it_was(inputs, tmp_path):
-    for file, content in inputs.items():
-        (tmp_path / file).write_bytes(content)
-    command = f"optimize {FIT} --evaluations 40 --state state.json -o out.json"
-    process = start(tmp_path, command)
-    while process.poll() is None and not (tmp_path / "state.json").exists():
-        time.sleep(0.01)
-    process.send_signal(signal.SIGINT)
-    process.communicate()
-    assert process.returncode in (0, 130)
-    before = len(str(read_json(tmp_path / "state.json", 2**30)))
-    process = start(tmp_path, command)
-    _, said = process.communicate()
-    assert process.returncode == 0, said
-    assert len(str(read_json(tmp_path / "state.json", 2**30))) >= before
-    resumed = read_json(tmp_path / "out.json")
-    process = start(tmp_path, command.replace("--state state.json", "").replace("out.json", "whole.json"))
-    _, said = process.communicate()
-    assert process.returncode == 0, said
-    whole = read_json(tmp_path / "whole.json")
-    assert np.isclose(resumed["cost_after"], whole["cost_after"], rtol=1e-6)
 
 
 _IN_A_LIBRARY = """
@@ -147,7 +113,6 @@ cli.main(["compute"])
     ("number", "before"),
     [
         (signal.SIGINT, ""),
-        (signal.SIGTERM, ""),
         # As in the background of a shell script
         (signal.SIGTERM, "import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)"),
     ],
@@ -193,3 +158,47 @@ def test_a_signal_during_an_import_waits_for_its_end(number, tmp_path):
     )  # fmt: skip
     assert done.returncode == 128 + number and done.stdout == "imported\n"
     assert done.stderr == ("ussim: interrupted\n" if number == signal.SIGINT else "")
+
+
+_ENDS_DURING_A_CALL_BACK = """
+import threading, time, types
+import SimpleITK as sitk
+from SlicerUSSim.Command.serve import _run
+from SlicerUSSim.Workstation.tasks import Tasks
+
+begun, tasks = threading.Event(), Tasks(print)
+
+def compute():
+    smooth = sitk.CurvatureFlowImageFilter()
+    smooth.SetNumberOfIterations(10**8)
+    smooth.AddCommand(sitk.sitkProgressEvent, begun.set)  # from C++ back to Python, again and again
+    smooth.Execute(sitk.Image(16, 16, 16, sitk.sitkFloat32))
+
+class Slow:  # Python's end takes a while
+    def __del__(self):
+        time.sleep(0.5)
+
+time.slow = Slow()
+tasks._worker.submit(compute)
+handlers = types.SimpleNamespace(add=lambda function: None)
+_run(
+    types.SimpleNamespace(
+        server=types.SimpleNamespace(
+            controller=types.SimpleNamespace(on_server_bind=handlers, on_server_ready=handlers),
+            start=lambda **options: begun.wait(),
+        ),
+        take_token=lambda port: "token", end_session=lambda: print("session ended"),
+        is_computing=begun.wait() and tasks.are_computing,
+    ),
+    "127.0.0.1", 0, None,
+)
+"""
+
+
+def test_the_server_ends_without_a_word_while_a_library_calls_back():
+    """ "FATAL: exception not rethrown", or an abort."""
+    pytest.importorskip("trame_slicer", reason="the workstation comes with: pip install '.[serve]'")
+    ended = subprocess.run(
+        [sys.executable, "-c", _ENDS_DURING_A_CALL_BACK], capture_output=True, text=True, timeout=300
+    )
+    assert (ended.returncode, ended.stdout, ended.stderr) == (0, "session ended\n", "")

@@ -7,7 +7,6 @@ import re
 import shutil
 import zipfile
 from pathlib import Path
-from time import monotonic
 
 import numpy as np
 import pytest
@@ -21,23 +20,24 @@ from vtkmodules.vtkIOXML import vtkXMLImageDataReader
 
 from SlicerUSSim.Logic import Volume
 from SlicerUSSim.Logic.base.volume import read_array
-from SlicerUSSim.Logic.mri.samples import head_mri
 from SlicerUSSim.Logic.tracked.sequence import TrackedSequence
 from SlicerUSSim.Workstation.scene_files import read_scene
 from SlicerUSSim.Workstation.state import NAMES
 from tests.test_workstation import (
+    answer_new_patient,
     browser as browser,
     click,
     cost,
     dismiss_messages,
     download,
+    drawn,
     errors,
     eventually,
     first_page as first_page,
-    fit,
     new_image,
     open_head,
     open_new_patient,
+    picture,
     pixels,
     pose,
     pytestmark as pytestmark,
@@ -46,10 +46,10 @@ from tests.test_workstation import (
     serving,
     settled,
     shown,
+    shown_errors,
     state,
+    views,
 )
-from tests.test_workstation_sessions import sector_rows
-from tests.test_workstation_waiting import cancelled
 
 
 @pytest.fixture(scope="module")
@@ -186,24 +186,13 @@ def output_of_scene(bundle: Path, folder: Path):
 
 
 @pytest.mark.slow
-def test_a_live_image_is_saved_where_it_was_taken_and_follows_the_probe_after_that(page, tmp_path):
+def test_a_live_image_is_saved_where_it_was_taken(page, tmp_path):
     shutil.copy(download(page, "nrrd"), tmp_path / "live.nrrd")
     _, in_scene = output_of_scene(download(page, "mrb"), tmp_path)
     np.testing.assert_allclose(in_scene, read_array(tmp_path / "live.nrrd")[1], atol=1e-3)
     with new_image(page):
         page.keyboard.press("a")
     assert page.locator("#frozen").is_hidden()
-
-
-@pytest.mark.slow
-def test_while_a_fit_runs_the_image_is_marked_frozen(head_page):
-    page = head_page
-    fit(page, 100_000)
-    page.locator("#cancel").wait_for()
-    page.locator("#frozen").wait_for()
-    click(page, "#cancel")
-    page.locator("#frozen").wait_for(state="hidden")
-    settled(page)
 
 
 @pytest.mark.slow
@@ -223,7 +212,7 @@ def test_the_cost_is_blank_where_the_probe_sees_nothing(head_page):
 
 
 @pytest.mark.slow
-def test_a_new_patient_clears_image_ruler_and_cost_at_once_and_the_probe_is_placed_anew(head_page, files, tmp_path):
+def test_a_new_patient_clears_image_ruler_cost_and_pose_at_once(head_page, files, tmp_path):
     page = head_page
     for _ in range(6):
         page.keyboard.press("Shift+ArrowLeft")
@@ -283,23 +272,6 @@ def test_a_saved_scene_holds_this_patient_only_and_a_patient_can_be_closed(page,
 
 
 @pytest.mark.slow
-def test_the_last_segment_is_undone_on_the_page(page, files):
-    open_new_patient(page, files / "head.nii.gz")
-    notes, before = shown(page, "notesLabel"), np.asarray(Image.open(download(page, "png")))
-    thin = shown(page, "thinSulciCheckBox")
-    page.evaluate("on => window.trame.trigger('set', ['thinSulciCheckBox', on])", not thin)
-    with new_image(page):
-        click(page, "#segmentButton")
-        eventually(page, lambda: shown(page, "notesLabel") != notes)
-    assert not np.array_equal(np.asarray(Image.open(download(page, "png"))), before)
-    with new_image(page):
-        click(page, "#undoSegmentButton")
-    assert np.array_equal(np.asarray(Image.open(download(page, "png"))), before) and shown(page, "notesLabel") == notes
-    page.evaluate("on => window.trame.trigger('set', ['thinSulciCheckBox', on])", thin)
-    settled(page)
-
-
-@pytest.mark.slow
 def test_an_upload_shows_how_far_it_is_can_be_cancelled_and_images_go_on(page, files):
     """Of 216 MB nothing was shown for 49 s, and no image came meanwhile."""
     session = page.context.new_cdp_session(page)
@@ -316,7 +288,7 @@ def test_an_upload_shows_how_far_it_is_can_be_cancelled_and_images_go_on(page, f
         page.keyboard.press("a")
         page.wait_for_function("n => window.ussim.images > n && window.ussim.uploading", arg=count)
         click(page, "#upload-cancel")
-        page.wait_for_function("!window.ussim.uploading", timeout=1000)
+        page.wait_for_function("!window.ussim.uploading")
         assert page.locator("#upload").is_hidden()
     finally:
         session.send("Network.emulateNetworkConditions", {**slow, "uploadThroughput": -1})
@@ -324,30 +296,11 @@ def test_an_upload_shows_how_far_it_is_can_be_cancelled_and_images_go_on(page, f
     assert state(page, NAMES.title) == before and not errors(page)
 
 
-@pytest.mark.slow
-def test_cancel_ends_a_segmentation_within_a_second_and_images_go_on(page, tmp_path):
-    head_mri(1.0).write(tmp_path / "fine.nii.gz")
-    open_new_patient(page, tmp_path / "fine.nii.gz")
-    notes = shown(page, "notesLabel")
-    page.evaluate("window.trame.trigger('set', ['skullStripComboBox', 'atlas'])")
-    page.evaluate("window.trame.trigger('set', ['maskSelector', ''])")
-    settled(page)
-    click(page, "#segmentButton")
-    page.locator("#cancel").wait_for()
-    page.wait_for_timeout(300)
-    took = cancelled(page)
-    start = monotonic()
-    with new_image(page):
-        page.keyboard.press("a")
-    answered = monotonic() - start  # on a busy machine all takes longer
-    assert took < 1.0 + 3.0 * answered and shown(page, "notesLabel") == notes and not errors(page)
-
-
 # ---- images of a sequence --------------------------------------------------------------------------------------------
 
 
 @pytest.mark.slow
-def test_the_images_of_simulate_sequence_are_shown_and_played_where_they_were_taken(page, files, tmp_path):
+def test_simulated_sequences_are_shown_and_played_where_they_were_taken(page, files, tmp_path):
     """The page made images that it could not show."""
     open_new_patient(page, files / "head.nii.gz", files / "sweep.igs.mha")
     eventually(page, lambda: state(page, NAMES.sequence.length) == 6)
@@ -401,6 +354,14 @@ def test_the_images_of_simulate_sequence_are_shown_and_played_where_they_were_ta
     assert page.locator("#simulated-player").count() == 0 and not errors(page)
 
 
+def sector_rows(page) -> int:
+    """Rows that the outline of the imaged field covers in the slice view of the image plane."""
+    drawn(page)
+    red, green, blue = np.moveaxis(picture(page, views(page)[1].bounding_box()), -1, 0)
+    rows, _ = np.nonzero((red > 110) & (green > 80) & (blue < 0.6 * green))
+    return int(np.ptp(rows)) if rows.size else 0
+
+
 @pytest.mark.slow
 def test_slices_are_in_the_image_plane_right_after_a_file_was_opened(page, files):
     open_new_patient(page, files / "head.nii.gz")
@@ -410,3 +371,69 @@ def test_slices_are_in_the_image_plane_right_after_a_file_was_opened(page, files
 def probe_pose(page) -> np.ndarray:
     """(4, 4) of the probe, as the page shows it in numbers."""
     return np.array(state(page, NAMES.pose_matrix).split(), float).reshape(4, 4)
+
+
+# ---- work that takes long --------------------------------------------------------------------------------------------
+
+
+_AT_WORK = f"title => window.trame.state.get('{NAMES.messages.progress_title}') === title"
+
+
+def cancel(page) -> None:
+    """Press Cancel and wait until the page shows that nothing is under way."""
+    page.evaluate("document.getElementById('cancel').click()")  # playwright waits until a button stands still
+    page.wait_for_function(_AT_WORK, arg="")
+
+
+def image_during(page, title: str) -> None:
+    """Assert that the image follows the probe while something is under way."""
+    count = page.evaluate("window.ussim.images")
+    page.keyboard.press("a")
+    page.wait_for_function("n => window.ussim.images > n", arg=count)
+    assert page.evaluate(_AT_WORK, title)
+
+
+@pytest.mark.slow
+def test_a_surface_is_cancelled_or_late_and_images_go_on(page, files, tmp_path):
+    k, j, i = np.ogrid[-119.5:120, -119.5:120, -119.5:120]
+    away = k**2 + j**2 + i**2
+    ball = sum((away < radius**2).astype(np.uint8) for radius in (60.0, 90.0, 110.0))
+    Volume(ball, np.eye(4)).write(tmp_path / "ball.nii.gz")
+    shutil.copy(files / "labels.json", tmp_path / "ball.json")
+    ball = [tmp_path / "ball.nii.gz", tmp_path / "ball.json"]
+    page.set_input_files("#open-file", ball)
+    answer_new_patient(page)
+    page.wait_for_function(_AT_WORK, arg="Make the surface")
+    cancel(page)
+    settled(page)
+    assert state(page, NAMES.title) == "ball.nii.gz" and state(page, NAMES.pose) is None
+    assert state(page, NAMES.messages.status).startswith("no surface of the patient") and pixels(page).any()
+    click(page, "#look")
+    page.wait_for_function(_AT_WORK, arg="Make the surface")
+    image_during(page, "Make the surface")
+    settled(page)
+    assert abs(state(page, NAMES.pose)["lift_mm"]) < 5
+    page.set_input_files("#open-file", ball)
+    answer_new_patient(page)
+    page.wait_for_function(_AT_WORK, arg="Make the surface")
+    page.evaluate("window.trame.trigger('press', ['closePatient'])")
+    page.wait_for_function("window.ussim.image === null")
+    settled(page)
+    assert state(page, NAMES.title) == "" and state(page, NAMES.pose) is None
+    page.keyboard.press("ArrowRight")  # along no surface
+    settled(page)
+    assert state(page, NAMES.pose) is None and page.evaluate("window.ussim.image") is None
+
+
+@pytest.mark.slow
+def test_exports_are_for_whom_has_the_token(page, browser, url):
+    other = browser.new_context()
+    address = f"{url.split('?')[0]}exported?kind="
+    assert other.request.get(f"{address}json").status == 403
+    found = page.request.get(f"{address}json")
+    assert found.status == 200 and found.headers["cache-control"] == "no-store" and "probe" in found.json()
+    assert page.request.get(f"{address}../secret").status == 204
+    shown_errors(page)  # the message comes by the page's socket, after the answer
+    assert errors(page) == ["the export is '../secret', expected one of the menu"]
+    dismiss_messages(page)
+    other.close()
