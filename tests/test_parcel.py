@@ -24,7 +24,7 @@ Kind, Parcel = content.Kind, parcels.Parcel
 SEQUENCE = TrackedSequence(np.full((2, 8, 9), 3, np.uint8), ({"ImageToReference": np.eye(4)},) * 2, np.arange(2.0))
 
 
-@pytest.mark.parametrize("ending", [".nii.gz", ".nii", ".nrrd", ".mha", ".mnc", ".vti"])
+@pytest.mark.parametrize("ending", [".nii.gz", ".nrrd", ".mha", ".vti"])
 def test_a_format_is_known_by_its_content(tmp_path, ending):
     path = tmp_path / f"v{ending}"
     Volume(np.arange(60, dtype=np.float32).reshape(3, 4, 5), np.eye(4)).write(path)
@@ -36,12 +36,6 @@ def test_a_format_is_known_by_its_content(tmp_path, ending):
         parcel = Parcel(folder, {"scan.dat": data})
         assert parcel.renamed == {f"scan.dat{ending}": "scan.dat"}
         assert Volume.read(parcel.paths[0]).array.shape == (3, 4, 5)
-
-
-def test_a_text_that_is_called_a_scene_keeps_its_name():
-    """The error was about x.mrb.json, which the user does not have."""
-    assert formats.readable_name("x.mrb", b'{"a": 1}') == "x.mrb" == formats.readable_name("x.mrb", b"<xml>")
-    assert formats.readable_name("x.mrb", b"NRRD0004\n") == "x.mrb.nrrd"
 
 
 @pytest.mark.parametrize(
@@ -77,7 +71,7 @@ def test_files_of_one_name_in_several_folders_are_all_kept():
         uploads.require_whole_files({str(n): b"" for n in range(10_001)})
 
 
-@pytest.mark.parametrize("name", ["a.mha", "a.igs.mha", "a.seq.nrrd", "a.nrrd", "a.txt", "a"])
+@pytest.mark.parametrize("name", ["a.igs.mha", "a.nrrd", "a"])
 def test_tracked_ultrasound_is_one_under_any_name(tmp_path, name):
     SEQUENCE.write(tmp_path / (name if name.endswith((".mha", ".nrrd")) else "a.mha"))
     (data,) = [path.read_bytes() for path in tmp_path.iterdir()]
@@ -189,7 +183,7 @@ def test_a_damaged_image_beside_the_chosen_series_is_said(tmp_path):
 # ---- questions -------------------------------------------------------------------------------------------------------
 
 
-def test_a_question_waits_while_everything_else_goes_on_and_only_its_own_answers_count():
+def test_a_question_waits_for_its_own_answer_and_all_else_goes_on():
     import asyncio
 
     from trame_server.state import State

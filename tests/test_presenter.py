@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import inspect
-import subprocess
-import sys
 from contextlib import contextmanager
 from dataclasses import dataclass
 
@@ -25,9 +23,8 @@ from SlicerUSSim.Logic.mrml.own_labels import content_of  # noqa: E402
 from SlicerUSSim.Logic.mrml.share_nodes import read_shares  # noqa: E402
 from SlicerUSSim.Logic.mrml.taken_image import about_image, is_frozen, patient_of  # noqa: E402
 from SlicerUSSim.Logic.probe.arrays import PROBE_KINDS, PROBES, LinearProbe  # noqa: E402
-from SlicerUSSim.Logic.tissue.tissue import TISSUE_PARAMETERS  # noqa: E402
 from SlicerUSSim.Widget.controls import by_widget, part_of, shown_by, usable  # noqa: E402
-from SlicerUSSim.Widget.presenter import TISSUE_COLUMNS, PanelPresenter  # noqa: E402
+from SlicerUSSim.Widget.presenter import PanelPresenter  # noqa: E402
 from SlicerUSSim.Widget.sections import CUSTOM_PROBE, panel_sections  # noqa: E402
 
 pytestmark = pytest.mark.usefixtures("segmented_once")
@@ -66,19 +63,10 @@ class PlainView:
 def presenter():
     scene = slicer.vtkMRMLScene()
     node = scene.AddNewNodeByClass("vtkMRMLScalarVolumeNode", "Head")
-    write_volume(node, head_mri(3.0))
+    write_volume(node, head_mri(3.5))
     result = PanelPresenter(UltrasoundSceneLogic(scene), PlainView())
     result.chooseDefaultNodes()
     return result
-
-
-def test_it_needs_no_qt():
-    code = (
-        "import sys, SlicerUSSim.Widget.presenter; "
-        "print([name for name in sys.modules if name.split('.')[0] in ('qt', 'PySide6')])"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
-    assert done.returncode == 0 and done.stdout.strip() == "[]", done.stderr
 
 
 def test_from_mri_to_live_image(presenter):
@@ -128,12 +116,12 @@ def test_an_output_of_others_is_kept_and_a_new_one_selected(presenter):
     presenter.segment()
     presenter.setValue("probe.scan_lines", 48)
     scan = logic.scene.AddNewNodeByClass("vtkMRMLScalarVolumeNode", "CT")
-    write_volume(scan, head_mri(3.0))
+    write_volume(scan, head_mri(3.5))
     logic.parameters.output = scan
     presenter.simulate()
     assert not presenter.view.errors and logic.parameters.output.GetName() == "Ultrasound"
     assert "'CT' has data of others and is kept; the result is 'Ultrasound'" in presenter.notes()
-    np.testing.assert_array_equal(slicer.util.arrayFromVolume(scan), head_mri(3.0).array)
+    np.testing.assert_array_equal(slicer.util.arrayFromVolume(scan), head_mri(3.5).array)
     chosen = logic.parameters.output
     presenter.simulate()
     assert logic.parameters.output is chosen
@@ -158,14 +146,7 @@ def test_every_name_in_the_list_of_sections_is_one_of_the_presenter(presenter):
     assert len(controls) > 60
 
 
-def test_the_tissue_table_has_a_column_for_every_number_of_a_tissue(presenter):
-    assert [name for name, _, _ in TISSUE_COLUMNS] == [entry.name for entry in TISSUE_PARAMETERS]
-    for (_, heading, tip), entry in zip(TISSUE_COLUMNS, TISSUE_PARAMETERS, strict=True):
-        assert heading == entry.symbol and entry.tip in tip and entry.unit in tip
-    assert all(len(row.values) == len(TISSUE_COLUMNS) for row in presenter.tissues())
-
-
-def test_a_parameter_of_a_new_kind_of_probe_is_in_the_panel_by_its_declaration_alone(presenter):
+def test_a_parameter_of_a_new_probe_is_in_the_panel_by_its_declaration(presenter):
     @dataclass(frozen=True)
     class RingProbe(LinearProbe):
         kind = "ring"
@@ -210,19 +191,19 @@ def test_values_are_shown_in_the_unit_of_the_panel_and_meant_in_their_own(presen
     assert len(presenter.view.errors) == 4
 
 
-@pytest.mark.parametrize("name", PROBES)
-def test_every_probe_preset_is_offered_by_a_readable_name(presenter, name):
+def test_every_probe_preset_is_offered_by_a_readable_name(presenter):
     control = by_widget(panel_sections())["probePresetComboBox"]
-    shown = name.replace("_", " ")
-    assert shown in control.choices and len(control.choices) == len(PROBES) + 1
-    assert f"{shown} {PROBES[name].frequency_mhz:g} MHz" in control.tip
-    for spelling in (shown, name):  # scripts may use the name in PROBES
-        presenter.logic.preset = presenter.logic.preset.changed("probe", depth_mm=77.0)
-        assert presenter.probeName() == CUSTOM_PROBE
-        presenter.chooseProbe(spelling)
-        assert presenter.logic.preset.probe == PROBES[name] and presenter.probeName() == shown
-        presenter.chooseProbe(CUSTOM_PROBE)  # back to that of before
-        assert presenter.probeName() == CUSTOM_PROBE and presenter.logic.preset.probe.depth_mm == 77.0
+    assert len(control.choices) == len(PROBES) + 1
+    for name, probe in PROBES.items():
+        shown = name.replace("_", " ")
+        assert shown in control.choices and f"{shown} {probe.frequency_mhz:g} MHz" in control.tip
+        for spelling in (shown, name):  # scripts may use the name in PROBES
+            presenter.logic.preset = presenter.logic.preset.changed("probe", depth_mm=77.0)
+            assert presenter.probeName() == CUSTOM_PROBE
+            presenter.chooseProbe(spelling)
+            assert presenter.logic.preset.probe == probe and presenter.probeName() == shown
+            presenter.chooseProbe(CUSTOM_PROBE)  # back to that of before
+            assert presenter.probeName() == CUSTOM_PROBE and presenter.logic.preset.probe.depth_mm == 77.0
     assert not presenter.view.errors
 
 
@@ -238,14 +219,10 @@ def test_custom_without_a_custom_probe_says_how_to_make_one(presenter):
     ("act", "message"),
     [
         (lambda p: p.setValue("display.gain_db", 1000.0), "Gain is 1000 dB, expected a number between -"),
-        (lambda p: p.setValue("display.gain_db", "loud"), "Gain is 'loud', expected a number between -"),
-        (lambda p: p.setValue("probe.depth_mm", -5), "Depth is -5 mm, expected a number between "),
         (lambda p: p.chooseProbe("loud"), "no probe is called 'loud', expected one of phased"),
         (lambda p: p.setTissue("csf", "mu0", "nan"), "tissue 'csf': mu0 is 'nan', expected a number"),
-        (lambda p: p.setTissue("bone marrow", "mu0", "1"), "no tissue is called 'bone marrow'"),
         (lambda p: p.assignTissue("csf", "cheese"), "no tissue is called 'cheese'"),
         (lambda p: p.setLive(True), "no label map chosen; segment the MRI first"),
-        (lambda p: p.placeProbe(), "no label map chosen, expected one to put the probe on"),
         (lambda p: p.loadPreset("/nowhere.json"), "/nowhere.json: cannot be read"),
     ],
 )
@@ -264,7 +241,7 @@ def test_a_bug_of_ours_is_not_swallowed(presenter, monkeypatch):
     assert presenter.logic.scene.GetFirstNodeByName("Head tissues") is None and presenter.canSegment()[0]
 
 
-def test_values_of_another_transmission_are_not_offered_and_those_of_the_chosen_one_can_be_set(presenter):
+def test_only_values_of_the_chosen_transmission_are_offered(presenter):
     presenter.setValue("probe.transmit", "focus")
     assert presenter.value("probe.focal_zones") is None and presenter.value("probe.transmit_angles") is None
     presenter.setValue("probe.transmit", "zones")
@@ -273,7 +250,7 @@ def test_values_of_another_transmission_are_not_offered_and_those_of_the_chosen_
     assert not presenter.view.errors
 
 
-def test_the_notes_say_what_labels_were_recognised_as_and_are_those_of_the_shown_ones(presenter):
+def test_the_notes_say_what_the_shown_labels_were_recognised_as(presenter):
     """They stayed those of the segmentation before; what labels are was in the log alone."""
     from tests.test_label_places import kept, whole_head
 
@@ -358,7 +335,7 @@ def _labels_of(labels_node, logic):
     return found.labels, found.names
 
 
-def test_undo_of_the_first_segment_leaves_no_tissues_and_those_of_others_alone(presenter):
+def test_undo_of_the_first_segment_leaves_the_users_tissues_alone(presenter):
     parameters, scene = presenter.logic.parameters, presenter.logic.scene
     own = scene.AddNewNodeByClass("vtkMRMLSegmentationNode", "tumour of the user")
     head = read_volume(parameters.mri)

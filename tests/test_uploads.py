@@ -15,7 +15,6 @@ uploads = pytest.importorskip("SlicerUSSim.Workstation.uploads")
     ("name", "words"),
     [
         ("../mri.nii.gz", "is no plain file name"),
-        ("..", "is no plain file name"),
         ("/etc/cron.d/x", "is no plain file name"),
         ("a\\b.nii", "is no plain file name"),
         ("a\0.nii", "is no plain file name"),
@@ -39,7 +38,7 @@ def test_a_header_that_names_another_file_is_refused(suffix, tmp_path):
             uploads.require_whole_files({name: path.read_bytes()})
 
 
-@pytest.mark.parametrize("suffix", [".mha", ".nrrd", ".nii", ".nii.gz", ".vti"])
+@pytest.mark.parametrize("suffix", [".mha", ".nrrd", ".nii.gz"])
 def test_whole_files_are_taken(suffix, tmp_path):
     path = tmp_path / f"image{suffix}"
     Volume(np.ones((3, 4, 5), np.uint8), np.eye(4)).write(path)
