@@ -1,7 +1,7 @@
 """`ussim serve` as a process for tests of the page: a fork of a process that has imported everything.
 
 Imports are half of the time until a server answers. Tests of the start and the end of the command itself start it anew
-(test_workstation_access.py, test_workstation_waiting.py, ...).
+(test_workstation_access.py).
 """
 
 from __future__ import annotations

@@ -34,12 +34,11 @@ from SlicerUSSim.Logic.base.errors import Cancelled
 from SlicerUSSim.Logic.base.volume import Volume, read_array
 from SlicerUSSim.Logic.imaging.noise import seed_of_pose
 from SlicerUSSim.Logic.imaging.preset import Preset
-from SlicerUSSim.Logic.mri import add_tissues, craniotomy
 from SlicerUSSim.Logic.mri.samples import head_mri
 from SlicerUSSim.Logic.mri.segmentation import segment_mri
 from SlicerUSSim.Logic.probe.arrays import PROBES
 from SlicerUSSim.Logic.probe.image_grid import ImageGrid
-from SlicerUSSim.Logic.probe.placement import craniotomy_pose, pose_looking_at, tilt_sweep, turned
+from SlicerUSSim.Logic.probe.placement import craniotomy_pose, tilt_sweep, turned
 from SlicerUSSim.Logic.probe.shape import field_polydata, probe_polydata
 from SlicerUSSim.Logic.tissue.own_files import write_label_files
 from SlicerUSSim.Logic.tracked.sequence import TrackedSequence
@@ -78,7 +77,7 @@ from tests.served import run_script  # noqa: E402
 
 @pytest.fixture(scope="module")
 def head():
-    return segment_mri(head_mri(4.0), thin_sulci=True)
+    return segment_mri(head_mri(3.5), thin_sulci=True)
 
 
 # ---- tasks -----------------------------------------------------------------------------------------------------------
@@ -155,6 +154,70 @@ def test_errors_of_work_reach_the_task_and_those_of_tasks_are_told():
         return errors
 
     assert [type(error) for error in run_in_loop(scenario)] == [IndexError]
+
+
+@pytest.mark.slow
+def test_what_does_not_hear_of_its_cancellation_is_abandoned():
+    async def scenario():
+        goes_on, happened, renewed = threading.Event(), [], []
+        tasks = Tasks(happened.append)
+        begun = threading.Event()
+
+        def long() -> str:
+            begun.set()
+            assert goes_on.wait(150)
+            return "too late"
+
+        waiting = []
+
+        def task() -> None:
+            from greenlet import getcurrent
+
+            waiting.append(getcurrent())
+            try:
+                happened.append(tasks.do(long))
+            except Cancelled:
+                happened.append("cancelled")
+
+        tasks.start(task)
+        while not begun.is_set():
+            await asyncio.sleep(0.01)
+        tasks.start(lambda: happened.append(tasks.do(lambda: "an image")))  # behind it
+        await asyncio.sleep(0.05)
+        assert happened == []
+        waits = []  # seconds that the loop is asked to wait, whatever the machine makes of them
+        loop = asyncio.get_running_loop()
+        later = loop.call_later
+        loop.call_later = lambda delay, *rest, **more: (waits.append(delay), later(delay, *rest, **more))[1]
+        tasks.abandonSoon(waiting[0], lambda: True, lambda: renewed.append(1))
+        while not tasks.are_done:
+            await asyncio.sleep(0.01)
+        loop.call_later = later
+        is_blocked = not goes_on.is_set()
+        goes_on.set()
+        await asyncio.sleep(0.1)
+        return sorted(happened), renewed, sum(wait for wait in waits if wait > 0.05), is_blocked
+
+    happened, renewed, waited, is_blocked = run_in_loop(scenario)
+    assert happened == ["an image", "cancelled"] and renewed == [1] and is_blocked and 0.0 < waited < 1.0
+
+
+@pytest.mark.slow
+def test_images_do_not_wait_for_what_needs_no_device():
+    async def scenario():
+        goes_on, done = threading.Event(), []
+        tasks = Tasks(done.append)
+        tasks.start(lambda: done.append(tasks.doAside(lambda: goes_on.wait(150) and "a surface")))
+        tasks.start(lambda: done.append(tasks.do(lambda: "an image")))
+        while not done:
+            await asyncio.sleep(0.01)
+        first = list(done)
+        goes_on.set()
+        while not tasks.are_done:
+            await asyncio.sleep(0.01)
+        return first, done
+
+    assert run_in_loop(scenario) == (["an image"], ["an image", "a surface"])
 
 
 class _NoWaiting(selectors.DefaultSelector):
@@ -445,53 +508,6 @@ def test_the_script_of_an_mri_has_its_files_options_and_texture():
     script = python_script(source, replace(Preset(), tissues=tissues), np.eye(4))
     assert "others={'t2': Volume.read('t2.nii.gz')}" in script and "also=['my tissue']" in script
     assert source.missing == ("t2.nii.gz", "seg.nii.gz") and script.count("# Opened in a page") == 2
-
-
-@pytest.mark.slow
-def test_the_script_of_labels_with_lesions_gives_the_same_image(head, tmp_path):
-    """Of a mask that a page has sent, only the name is known."""
-    labels, mask = tmp_path / "labels.nii.gz", "it's a cyst.nii.gz"
-    head.labels.write(labels)
-    middle = [n // 2 for n in head.labels.array.shape]
-    lesion = np.zeros_like(head.labels.array)
-    lesion[middle[0] : middle[0] + 16, middle[1] - 8 : middle[1] + 8, middle[2] - 8 : middle[2] + 8] = 1
-    head.labels.with_array(lesion).write(tmp_path / mask)
-    added = add_tissues(head.labels, head.tissue_names, [("cyst", head.labels.with_array(lesion), mask)])
-    probe = PhasedProbe(60.0, 90.0, scan_lines=48)
-    preset = Preset(probe=probe, tissues=TissueTable.brain(added.tissue_names))
-    pose = craniotomy_pose(head.labels, probe)
-    source = LabelSource(str(labels), True, tissue_names=head.tissue_names, additions=(("cyst", mask),))
-    script = python_script(source, preset, pose)
-    assert f"# Opened in a page; give its path below, or run this beside it: {mask!r}" in script
-    frame = UltrasoundSimulator(added.labels, preset.tissues).simulate(
-        probe, pose, preset.display, noise_seed=seed_of_pose(pose)
-    )
-    assert np.array_equal(run_again(script, tmp_path), frame.image)
-    without = UltrasoundSimulator(head.labels, preset.tissues).simulate(
-        probe, pose, preset.display, noise_seed=seed_of_pose(pose)
-    )
-    assert not np.array_equal(without.image, frame.image)
-
-
-@pytest.mark.slow
-def test_the_script_of_an_opened_head_gives_the_same_image(tmp_path):
-    axis = np.arange(-60.0, 61.0, 2.0)
-    radius = np.sqrt(sum(place**2 for place in np.meshgrid(axis, axis, axis)))
-    matrix = np.diag([2.0, 2.0, 2.0, 1.0])
-    matrix[:3, 3] = axis[0]
-    names = ("grey matter", "skull", "skin")
-    labels = Volume(np.select([radius < 40, radius < 50, radius < 56], [1, 2, 3], 0).astype(np.uint8), matrix)
-    labels.write(tmp_path / "labels.nii.gz")
-    probe = PhasedProbe(60.0, 60.0, scan_lines=48)
-    preset, pose = Preset(probe=probe, tissues=TissueTable.brain(names)), pose_looking_at((0, 0, 42), (0, 0, 0))
-    source = LabelSource(str(tmp_path / "labels.nii.gz"), True, tissue_names=names, disc=(36.0, pose))
-    found, _ = craniotomy.opened(labels, names, craniotomy.disc_opening(labels, names, pose, 36.0))
-    images = [
-        UltrasoundSimulator(one, preset.tissues).simulate(probe, pose, preset.display, noise_seed=seed_of_pose(pose))
-        for one in (labels, found)
-    ]
-    assert np.array_equal(run_again(python_script(source, preset, pose), tmp_path), images[1].image)
-    assert not np.array_equal(images[0].image, images[1].image)
 
 
 # ---- sequences as nodes ----------------------------------------------------------------------------------------------

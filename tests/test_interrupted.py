@@ -9,7 +9,6 @@ import sys
 import time
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from SlicerUSSim.Logic import PhasedProbe, TissueTable, Volume, segment_mri
@@ -94,29 +93,6 @@ def test_a_command_that_is_interrupted_leaves_nothing_half_done(name, inputs, tm
         assert (tmp_path / file).read_bytes() == content
 
 
-def test_a_fit_that_was_interrupted_goes_on_where_it_was(inputs, tmp_path):
-    for file, content in inputs.items():
-        (tmp_path / file).write_bytes(content)
-    command = f"optimize {FIT} --evaluations 40 --state state.json -o out.json"
-    process = start(tmp_path, command)
-    while process.poll() is None and not (tmp_path / "state.json").exists():
-        time.sleep(0.01)
-    process.send_signal(signal.SIGINT)
-    process.communicate()
-    assert process.returncode in (0, 130)
-    before = len(str(read_json(tmp_path / "state.json", 2**30)))
-    process = start(tmp_path, command)
-    _, said = process.communicate()
-    assert process.returncode == 0, said
-    assert len(str(read_json(tmp_path / "state.json", 2**30))) >= before
-    resumed = read_json(tmp_path / "out.json")
-    process = start(tmp_path, command.replace("--state state.json", "").replace("out.json", "whole.json"))
-    _, said = process.communicate()
-    assert process.returncode == 0, said
-    whole = read_json(tmp_path / "whole.json")
-    assert np.isclose(resumed["cost_after"], whole["cost_after"], rtol=1e-6)
-
-
 _IN_A_LIBRARY = """
 import sqlite3, sys
 from SlicerUSSim.Command import cli
@@ -182,3 +158,47 @@ def test_a_signal_during_an_import_waits_for_its_end(number, tmp_path):
     )  # fmt: skip
     assert done.returncode == 128 + number and done.stdout == "imported\n"
     assert done.stderr == ("ussim: interrupted\n" if number == signal.SIGINT else "")
+
+
+_ENDS_DURING_A_CALL_BACK = """
+import threading, time, types
+import SimpleITK as sitk
+from SlicerUSSim.Command.serve import _run
+from SlicerUSSim.Workstation.tasks import Tasks
+
+begun, tasks = threading.Event(), Tasks(print)
+
+def compute():
+    smooth = sitk.CurvatureFlowImageFilter()
+    smooth.SetNumberOfIterations(10**8)
+    smooth.AddCommand(sitk.sitkProgressEvent, begun.set)  # from C++ back to Python, again and again
+    smooth.Execute(sitk.Image(16, 16, 16, sitk.sitkFloat32))
+
+class Slow:  # Python's end takes a while
+    def __del__(self):
+        time.sleep(0.5)
+
+time.slow = Slow()
+tasks._worker.submit(compute)
+handlers = types.SimpleNamespace(add=lambda function: None)
+_run(
+    types.SimpleNamespace(
+        server=types.SimpleNamespace(
+            controller=types.SimpleNamespace(on_server_bind=handlers, on_server_ready=handlers),
+            start=lambda **options: begun.wait(),
+        ),
+        take_token=lambda port: "token", end_session=lambda: print("session ended"),
+        is_computing=begun.wait() and tasks.are_computing,
+    ),
+    "127.0.0.1", 0, None,
+)
+"""
+
+
+def test_the_server_ends_without_a_word_while_a_library_calls_back():
+    """ "FATAL: exception not rethrown", or an abort."""
+    pytest.importorskip("trame_slicer", reason="the workstation comes with: pip install '.[serve]'")
+    ended = subprocess.run(
+        [sys.executable, "-c", _ENDS_DURING_A_CALL_BACK], capture_output=True, text=True, timeout=300
+    )
+    assert (ended.returncode, ended.stdout, ended.stderr) == (0, "session ended\n", "")

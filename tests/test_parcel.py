@@ -38,12 +38,6 @@ def test_a_format_is_known_by_its_content(tmp_path, ending):
         assert Volume.read(parcel.paths[0]).array.shape == (3, 4, 5)
 
 
-def test_a_text_that_is_called_a_scene_keeps_its_name():
-    """The error was about x.mrb.json, which the user does not have."""
-    assert formats.readable_name("x.mrb", b'{"a": 1}') == "x.mrb" == formats.readable_name("x.mrb", b"<xml>")
-    assert formats.readable_name("x.mrb", b"NRRD0004\n") == "x.mrb.nrrd"
-
-
 @pytest.mark.parametrize(
     ("text", "ending"),
     [

@@ -63,7 +63,7 @@ class PlainView:
 def presenter():
     scene = slicer.vtkMRMLScene()
     node = scene.AddNewNodeByClass("vtkMRMLScalarVolumeNode", "Head")
-    write_volume(node, head_mri(4.0))
+    write_volume(node, head_mri(3.5))
     result = PanelPresenter(UltrasoundSceneLogic(scene), PlainView())
     result.chooseDefaultNodes()
     return result
@@ -116,12 +116,12 @@ def test_an_output_of_others_is_kept_and_a_new_one_selected(presenter):
     presenter.segment()
     presenter.setValue("probe.scan_lines", 48)
     scan = logic.scene.AddNewNodeByClass("vtkMRMLScalarVolumeNode", "CT")
-    write_volume(scan, head_mri(4.0))
+    write_volume(scan, head_mri(3.5))
     logic.parameters.output = scan
     presenter.simulate()
     assert not presenter.view.errors and logic.parameters.output.GetName() == "Ultrasound"
     assert "'CT' has data of others and is kept; the result is 'Ultrasound'" in presenter.notes()
-    np.testing.assert_array_equal(slicer.util.arrayFromVolume(scan), head_mri(4.0).array)
+    np.testing.assert_array_equal(slicer.util.arrayFromVolume(scan), head_mri(3.5).array)
     chosen = logic.parameters.output
     presenter.simulate()
     assert logic.parameters.output is chosen

@@ -25,7 +25,6 @@ from SlicerUSSim.Logic.base.reading import write_values
 from SlicerUSSim.Logic.mri.samples import head_mri
 from SlicerUSSim.Logic.mrml.nodes import write_volume
 from SlicerUSSim.Workstation import session_store
-from SlicerUSSim.Workstation.access import proof
 from SlicerUSSim.Workstation.autosave import Autosave
 from SlicerUSSim.Workstation.export import Cine
 from SlicerUSSim.Workstation.session_store import OwnSession, SessionStore, sessions_folder
@@ -160,12 +159,6 @@ def test_the_token_of_a_killed_server_is_taken_once_and_at_its_port_only(tmp_pat
     own.keep_address(8080, TOKEN)
     own.end()  # as it should
     assert store.token_of(8080) is None and (own.folder / "state.json").exists()
-
-
-def test_a_proof_is_of_one_token_and_one_question():
-    assert proof(TOKEN, "00" * 8) == proof(TOKEN, "00" * 8)
-    assert len({proof(TOKEN, "00" * 8), proof(TOKEN, "01" * 8), proof("u" * 32, "00" * 8)}) == 3
-    assert TOKEN not in proof(TOKEN, "00" * 8)
 
 
 # ---- autosave --------------------------------------------------------------------------------------------------------

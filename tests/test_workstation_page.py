@@ -88,6 +88,9 @@ def test_keys_change_the_slider_that_has_them_and_else_move_the_probe(page):
     page.keyboard.press("ArrowUp")
     settled(page)
     assert pose(page)["front_deg"] != before["front_deg"]
+    page.keyboard.press("Home")
+    settled(page)
+    assert abs(pose(page)["rock_deg"]) < 0.1 and abs(pose(page)["tilt_deg"]) < 0.1
 
 
 # ---- poses -----------------------------------------------------------------------------------------------------------
@@ -245,19 +248,3 @@ def test_nothing_is_cut_off(page, size):
     for name in ("Gain", "Depth"):
         box = page.locator(f"[role=slider][aria-label='{name}']").bounding_box()
         assert box["y"] + box["height"] < height, f"{name} is below the fold"
-
-
-@pytest.mark.slow
-def test_a_focus_below_the_image_is_not_drawn_over_other_things(page):
-    focus, depth = shown(page, "focusSlider"), shown(page, "depthSlider")
-    page.evaluate("window.trame.trigger('set', ['focusSlider', 65])")
-    settled(page)
-    assert page.locator("#focus-mark").count() == 1
-    page.evaluate("window.trame.trigger('set', ['depthSlider', 40])")
-    settled(page)
-    assert page.evaluate("window.ussim.image.ruler.h") == pytest.approx(40, abs=3)
-    assert page.locator("#focus-mark").count() == 0
-    page.evaluate("depth => window.trame.trigger('set', ['depthSlider', depth])", depth)
-    page.evaluate("focus => window.trame.trigger('set', ['focusSlider', focus])", focus)
-    settled(page)
-    assert state(page, NAMES.messages.errors) == [] and page.locator("#focus-mark").count() == 1

@@ -24,6 +24,7 @@ from SlicerUSSim.Logic.tracked.sequence import TrackedSequence
 from SlicerUSSim.Workstation.scene_files import read_scene
 from SlicerUSSim.Workstation.state import NAMES
 from tests.test_workstation import (
+    answer_new_patient,
     browser as browser,
     click,
     cost,
@@ -45,6 +46,7 @@ from tests.test_workstation import (
     serving,
     settled,
     shown,
+    shown_errors,
     state,
     views,
 )
@@ -369,3 +371,69 @@ def test_slices_are_in_the_image_plane_right_after_a_file_was_opened(page, files
 def probe_pose(page) -> np.ndarray:
     """(4, 4) of the probe, as the page shows it in numbers."""
     return np.array(state(page, NAMES.pose_matrix).split(), float).reshape(4, 4)
+
+
+# ---- work that takes long --------------------------------------------------------------------------------------------
+
+
+_AT_WORK = f"title => window.trame.state.get('{NAMES.messages.progress_title}') === title"
+
+
+def cancel(page) -> None:
+    """Press Cancel and wait until the page shows that nothing is under way."""
+    page.evaluate("document.getElementById('cancel').click()")  # playwright waits until a button stands still
+    page.wait_for_function(_AT_WORK, arg="")
+
+
+def image_during(page, title: str) -> None:
+    """Assert that the image follows the probe while something is under way."""
+    count = page.evaluate("window.ussim.images")
+    page.keyboard.press("a")
+    page.wait_for_function("n => window.ussim.images > n", arg=count)
+    assert page.evaluate(_AT_WORK, title)
+
+
+@pytest.mark.slow
+def test_a_surface_is_cancelled_or_late_and_images_go_on(page, files, tmp_path):
+    k, j, i = np.ogrid[-119.5:120, -119.5:120, -119.5:120]
+    away = k**2 + j**2 + i**2
+    ball = sum((away < radius**2).astype(np.uint8) for radius in (60.0, 90.0, 110.0))
+    Volume(ball, np.eye(4)).write(tmp_path / "ball.nii.gz")
+    shutil.copy(files / "labels.json", tmp_path / "ball.json")
+    ball = [tmp_path / "ball.nii.gz", tmp_path / "ball.json"]
+    page.set_input_files("#open-file", ball)
+    answer_new_patient(page)
+    page.wait_for_function(_AT_WORK, arg="Make the surface")
+    cancel(page)
+    settled(page)
+    assert state(page, NAMES.title) == "ball.nii.gz" and state(page, NAMES.pose) is None
+    assert state(page, NAMES.messages.status).startswith("no surface of the patient") and pixels(page).any()
+    click(page, "#look")
+    page.wait_for_function(_AT_WORK, arg="Make the surface")
+    image_during(page, "Make the surface")
+    settled(page)
+    assert abs(state(page, NAMES.pose)["lift_mm"]) < 5
+    page.set_input_files("#open-file", ball)
+    answer_new_patient(page)
+    page.wait_for_function(_AT_WORK, arg="Make the surface")
+    page.evaluate("window.trame.trigger('press', ['closePatient'])")
+    page.wait_for_function("window.ussim.image === null")
+    settled(page)
+    assert state(page, NAMES.title) == "" and state(page, NAMES.pose) is None
+    page.keyboard.press("ArrowRight")  # along no surface
+    settled(page)
+    assert state(page, NAMES.pose) is None and page.evaluate("window.ussim.image") is None
+
+
+@pytest.mark.slow
+def test_exports_are_for_whom_has_the_token(page, browser, url):
+    other = browser.new_context()
+    address = f"{url.split('?')[0]}exported?kind="
+    assert other.request.get(f"{address}json").status == 403
+    found = page.request.get(f"{address}json")
+    assert found.status == 200 and found.headers["cache-control"] == "no-store" and "probe" in found.json()
+    assert page.request.get(f"{address}../secret").status == 204
+    shown_errors(page)  # the message comes by the page's socket, after the answer
+    assert errors(page) == ["the export is '../secret', expected one of the menu"]
+    dismiss_messages(page)
+    other.close()
