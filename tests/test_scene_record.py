@@ -9,7 +9,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from vtkmodules.vtkCommonTransforms import vtkTransform
 
 slicer = pytest.importorskip("slicer", reason="MRML nodes come with slicer-core: pip install '.[slicer]'")
 
@@ -20,15 +19,12 @@ from SlicerUSSim.Logic.base.vtk_data import vtk_matrix  # noqa: E402
 from SlicerUSSim.Logic.imaging.preset import Preset  # noqa: E402
 from SlicerUSSim.Logic.mri.samples import head_mri  # noqa: E402
 from SlicerUSSim.Logic.mri.settings import SegmentationSettings  # noqa: E402
-from SlicerUSSim.Logic.mri.sheets.polydata import as_polydata  # noqa: E402
-from SlicerUSSim.Logic.mri.sheets.surfels import Surfels  # noqa: E402
 from SlicerUSSim.Logic.mrml.known_field import KnownField, write_known_field  # noqa: E402
 from SlicerUSSim.Logic.mrml.label_nodes import write_labels  # noqa: E402
 from SlicerUSSim.Logic.mrml.landmark_nodes import Landmark, landmarks_of, write_landmarks  # noqa: E402
 from SlicerUSSim.Logic.mrml.lesion_nodes import add_lesion, read_lesions  # noqa: E402
 from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic  # noqa: E402
 from SlicerUSSim.Logic.mrml.nodes import node_to_world, write_volume  # noqa: E402
-from SlicerUSSim.Logic.mrml.parameter_node import SceneParameters  # noqa: E402
 from SlicerUSSim.Logic.mrml.scene_record import (  # noqa: E402
     NodeRecord,
     SceneRecord,
