@@ -2,10 +2,10 @@
 
     python -m tests.test_architecture [ROOT]
 
-prints rooms, levels and imports of the tree that holds SlicerUSSim/, to compare two states of it. A room is a package
-of Logic/ (or a single file there), Widget, Workstation, Command or the file that Slicer loads. Imports count at the top
-of a file, inside functions and for types alone; but not what a face re-exports, since an import of a name from a face
-counts as an import of the module that defines it.
+prints rooms with their lines, levels and imports of the tree that holds SlicerUSSim/, to compare two states of it. A
+room is a package of Logic/ (or a single file there), Widget, Workstation, Command or the file that Slicer loads.
+Imports count at the top of a file, inside functions and for types alone; but not what a face re-exports, since an
+import of a name from a face counts as an import of the module that defines it.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from __future__ import annotations
 import ast
 import re
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from graphlib import CycleError, TopologicalSorter
@@ -25,7 +25,8 @@ ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = "SlicerUSSim"
 #: The rooms in the order of the table in docs/architecture.md, each of which may import those before it. The module's
 #: file is not one of them, and may import all but the workstation and the command.
-_TABLE = re.findall(r"^\| \[(\w+)\]", (ROOT / "docs/architecture.md").read_text(encoding="utf-8"), re.MULTILINE)
+_PAGE = (ROOT / "docs/architecture.md").read_text(encoding="utf-8")
+_TABLE = re.findall(r"^\| \[(\w+)\]\(\.\./SlicerUSSim", _PAGE, re.MULTILINE)
 ORDER = [room for entry in _TABLE for room in (["module", entry] if entry == "Workstation" else [entry])]
 #: Libraries that take long to import, and the rooms whose files may do so at their top. Elsewhere it is left to the
 #: functions that need them, so that other uses do not wait for them.
@@ -38,6 +39,15 @@ HEAVY = {
     "nlopt": set(),
     "slicer": {"mrml", "module", "Widget", "Workstation"},
 }
+#: Lines of Python that a room, or a folder beside the product, may have. Raising one is a decision: the commit says what
+#: the users get for it.
+BUDGETS = {
+    "base": 3800, "opencl": 1300, "probe": 1500, "tissue": 3750, "tracked": 2150, "mri": 12300, "imaging": 4550,
+    "fitting": 4500, "vtk": 550, "mrml": 4550, "Widget": 2500, "Workstation": 8100, "Command": 3350, "module": 370,
+    "validation": 6000, "benchmarks": 3750, "tests": 32500, "tests/reference": 1500,
+}  # fmt: skip
+#: Lines of all of SlicerUSSim/, and of kernels/
+LARGEST_PRODUCT, LARGEST_KERNELS = 53_200, 5_600
 #: Packages of the checkout that use the product and are not installed with it
 CHECKOUT = {"validation", "benchmarks", "tests", "examples"}
 
@@ -149,6 +159,20 @@ def _module_name(path: Path, root: Path) -> str:
     return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
 
 
+def lines_of(paths: Iterable[Path]) -> int:
+    """Lines of some files, blank ones and comments included."""
+    return sum(len(path.read_text(encoding="utf-8").splitlines()) for path in paths)
+
+
+def lines_of_rooms(tree: Tree) -> dict[str, int]:
+    """{room: lines of its files, its face included}."""
+    found: dict[str, int] = {}
+    for name, path in tree.paths.items():
+        room = room_of(name)
+        found[room] = found.get(room, 0) + lines_of([path])
+    return found
+
+
 def room_of(module: str) -> str:
     """The room of a module: the package of Logic, or a file directly in it; the folder beside it; "module"."""
     parts = module.split(".")[1:]
@@ -238,6 +262,23 @@ def test_examples_and_benchmarks_know_no_workstation_and_no_panel(tree):
         assert not rooms & {"Workstation", "Widget", "Command"}, path.name
 
 
+def test_no_room_exceeds_its_budget_of_lines(tree):
+    rooms = lines_of_rooms(tree)
+    assert sum(rooms.values()) <= LARGEST_PRODUCT
+    rooms["module"] += rooms.pop("Logic")  # the face of all rooms
+    for folder in ("validation", "benchmarks", "tests", "tests/reference"):
+        rooms[folder] = lines_of((ROOT / folder).glob("*.py"))
+    assert set(rooms) == set(BUDGETS)
+    assert {room: lines for room, lines in rooms.items() if lines > BUDGETS[room]} == {}
+    assert lines_of((ROOT / "kernels").glob("*.cl*")) <= LARGEST_KERNELS
+
+
+def test_names_of_tests_are_short_sentences():
+    texts = [path.read_text(encoding="utf-8") for path in (ROOT / "tests").glob("test_*.py")]
+    names = [name for text in texts for name in re.findall(r"^def (test_\w+)", text, re.MULTILINE)]
+    assert [name for name in names if len(name) > 70] == []
+
+
 def test_slicer_and_qt_stay_where_they_belong(tree):
     logic = {name for name in tree.paths if name.startswith(f"{PACKAGE}.Logic")}
     assert {room_of(name) for name in tree.importers("slicer") & logic} == {"mrml"}
@@ -283,13 +324,15 @@ def main(root: Path) -> None:
     """Print rooms, levels and imports."""
     tree = Tree(root)
     edges = tree.room_edges
-    floor = levels(edges)
+    floor, lines = levels(edges), lines_of_rooms(tree)
     for room in sorted(edges, key=lambda name: (floor[name], name)):
-        print(f"{floor[room]:3d}  {room:16s} {', '.join(sorted(edges[room], key=lambda name: floor[name]))}")
+        imported = ", ".join(sorted(edges[room], key=lambda name: floor[name]))
+        print(f"{floor[room]:3d}  {room:16s} {lines[room]:6d} lines  {imported}")
     between = sum(room_of(a) != room_of(b) for a, b in tree.edges)
     print(
         f"{len(tree.paths) - len(tree.faces)} modules, {len(edges)} rooms, {max(floor.values())} levels, "
-        f"{sum(map(len, edges.values()))} imports between rooms, {between} between modules of different rooms"
+        f"{sum(map(len, edges.values()))} imports between rooms, {between} between modules of different rooms, "
+        f"{sum(lines.values())} lines"
     )
 
 
