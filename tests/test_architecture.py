@@ -39,8 +39,8 @@ HEAVY = {
     "nlopt": set(),
     "slicer": {"mrml", "module", "Widget", "Workstation"},
 }
-#: Lines of Python that a room, or a folder beside the product, may have. Raising one is a decision: the commit says what
-#: the users get for it.
+#: Lines of Python that a room, or a folder beside the product, may have. Raising one is a decision: the commit says
+#: what users get for it.
 BUDGETS = {
     "base": 3800, "opencl": 1300, "probe": 1500, "tissue": 3750, "tracked": 2150, "mri": 12300, "imaging": 4550,
     "fitting": 4500, "vtk": 550, "mrml": 4550, "Widget": 2500, "Workstation": 8100, "Command": 3350, "module": 370,
