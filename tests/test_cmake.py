@@ -38,18 +38,15 @@ def run_cmake(*arguments) -> str:
     return subprocess.run([CMAKE, *map(str, arguments)], check=True, capture_output=True, text=True).stdout
 
 
-def build_extension(source: Path, folder: Path) -> Path:
+@pytest.fixture(scope="module")
+def build(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("build")
     run_cmake(
-        *("-S", source, "-B", folder, "-G", "Ninja", f"-DCMAKE_MAKE_PROGRAM={NINJA}", "-DBUILD_TESTING=ON"),
+        *("-S", ROOT, "-B", folder, "-G", "Ninja", f"-DCMAKE_MAKE_PROGRAM={NINJA}", "-DBUILD_TESTING=ON"),
         *(f"-DSlicer_DIR={ROOT / 'tests/slicer_cmake'}", f"-DCMAKE_INSTALL_PREFIX={folder / 'installed'}"),
     )
     run_cmake("--build", folder)
     return folder
-
-
-@pytest.fixture(scope="module")
-def build(tmp_path_factory) -> Path:
-    return build_extension(ROOT, tmp_path_factory.mktemp("build"))
 
 
 @pytest.fixture(scope="module")
@@ -89,33 +86,13 @@ def test_the_module_its_resources_and_one_folder_are_installed(build, installed)
     wanted |= {f"SlicerUSSim/kernels/{path}" for path in files(ROOT / "kernels")}
     data = {"SlicerUSSim/Logic/fitting/report.html", "SlicerUSSim/Logic/py.typed", "Resources/Icons/USSim.png"}
     assert data <= wanted
+    # Resources of other extensions are in the same folders: a name such as Resources/UI/Settings.ui could conflict.
+    mine = files(package / "Resources")
+    assert all("USSim" in Path(path).parts or Path(path).stem == "USSim" for path in mine)
     assert files(build / MODULES) == wanted
     others = {"Resources/requirements.txt", "Resources/Icons/Other.png", "Logic/__init__.py"}
     assert files(installed) == wanted | others
     assert all((installed / name).read_text() == "another extension's\n" for name in others)
-
-
-@needs_cmake
-def test_every_installed_resource_bears_the_modules_name(installed):
-    """Resources of other extensions are in the same folders: a name such as Resources/UI/Settings.ui could conflict."""
-    mine = files(ROOT / "SlicerUSSim" / "Resources")
-    assert mine and all("USSim" in Path(path).parts or Path(path).stem == "USSim" for path in mine)
-
-
-@pytest.mark.slow
-@needs_cmake
-def test_a_new_file_is_built_without_a_list_to_add_it_to(tmp_path):
-    source = tmp_path / "source"
-    shutil.copytree(ROOT / "SlicerUSSim", source / "SlicerUSSim", ignore=shutil.ignore_patterns("__pycache__"))
-    for name in ("kernels", "CMakeLists.txt", "LICENSE", "README.md"):
-        copy = shutil.copytree if (ROOT / name).is_dir() else shutil.copy
-        copy(ROOT / name, source / name)
-    build = build_extension(source, tmp_path / "build")
-    new = {"SlicerUSSim/Logic/probe/new.py": "Logic/probe/new.py", "SlicerUSSim/kernels/new.cl": "../kernels/new.cl"}
-    for path in new.values():
-        (source / "SlicerUSSim" / path).write_text("")
-    run_cmake("--build", build)
-    assert set(new) <= files(build / MODULES)
 
 
 @needs_cmake

@@ -500,10 +500,3 @@ def test_a_kind_of_probe_is_taken_once(kinds):
     values = {"kind": "ring", "radius_mm": 10, "field_of_view_deg": 90, "depth_mm": 40}
     assert type(arrays.probe_from_dict(values)) is ring
     assert Preset().changed("probe", **values).probe.to_dict()["kind"] == "ring"
-
-
-@pytest.mark.parametrize("values", [{"display": None}, {"probe": "x"}, {"tissues": {}}, {"settings": {"seed": 3}}])
-def test_a_preset_checks_its_sections(values):
-    (name,) = values
-    with pytest.raises(SimulationError, match=f"preset: {name} is .*, expected a "):
-        Preset(**values)

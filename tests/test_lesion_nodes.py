@@ -10,7 +10,6 @@ import pytest
 slicer = pytest.importorskip("slicer", reason="MRML nodes come with slicer-core: pip install '.[slicer]'")
 
 from SlicerUSSim.Logic import SimulationError, Volume  # noqa: E402
-from SlicerUSSim.Logic.base.errors import Cancelled  # noqa: E402
 from SlicerUSSim.Logic.base.vtk_data import vtk_matrix  # noqa: E402
 from SlicerUSSim.Logic.mri import add_tissues  # noqa: E402
 from SlicerUSSim.Logic.mri.samples import head_mri  # noqa: E402
@@ -347,19 +346,3 @@ def test_the_panel_lays_lesions_over_a_copy_of_the_users_own_labels():
     own = parameters.labels
     presenter.addTissues()  # of its own making
     assert parameters.labels is own
-
-
-def test_a_cancelled_segmentation_leaves_nodes_and_notes_as_they_were():
-    bench = Scene()
-    presenter, parameters = bench.presenter(), bench.logic.parameters
-    presenter.segment()
-    edit(parameters.labels)
-    labels, notes, count = parameters.labels, presenter.notes(), bench.scene.GetNumberOfNodes()
-
-    def cancel(share):
-        raise Cancelled
-
-    presenter.view.shares = type("Cancels", (), {"append": staticmethod(cancel)})()
-    presenter.segment()
-    assert parameters.labels is labels and presenter.notes() == notes and not presenter.view.errors
-    assert bench.scene.GetNumberOfNodes() == count and presenter.canSegment()[0]

@@ -355,24 +355,6 @@ def test_segment_names_choose_tissues_and_those_nobody_knows_are_listed(bench):
     assert bench.logic.tissues(segmentation)[2].name == "speckle"
 
 
-def test_large_labels_as_freesurfer_has_them_are_told_by_their_colours(bench):
-    volume = cyst()
-    label_map = add(bench.scene, "LabelMapVolume", "aseg")
-    big = volume.with_array(np.where(volume.array == 2, 1035, 2).astype(np.int16))
-    write_volume(label_map, big)
-    with pytest.raises(SimulationError, match="label 1035"):
-        bench.logic.simulate(label_map, bench.probe, bench.image)
-    colours = add(bench.scene, "ColorTable", "FreeSurfer")
-    colours.SetTypeToUser()
-    colours.SetNumberOfColors(1036)
-    colours.SetColor(2, "Left-Cerebral-White-Matter", 1, 1, 1, 1)
-    colours.SetColor(1035, "ctx-lh-insula", 1, 1, 1, 1)
-    label_map.CreateDefaultDisplayNodes()
-    label_map.GetDisplayNode().SetAndObserveColorNodeID(colours.GetID())
-    table = bench.logic.tissues(label_map)
-    assert sorted(tissue.name for label, tissue in table.items() if label) == ["grey matter", "white matter"]
-
-
 def test_label_maps_of_other_programs_are_recognised_and_masks_refused(bench):
     bench.logic.preset = Preset()
     aseg, mask = add(bench.scene, "LabelMapVolume", "aseg"), add(bench.scene, "LabelMapVolume", "mask")
@@ -850,12 +832,11 @@ def test_parameters_have_the_form_of_slicers_parameter_node_wrapper(bench):
 
 
 def test_every_declared_setting_is_remembered_one_by_one_and_together(bench):
-    parameters, node = bench.logic.parameters, bench.logic.parameters.node
+    parameters = bench.logic.parameters
     assert parameters.segmentation == SegmentationSettings() and parameters.fit == FitSettings()
     settings = SegmentationSettings("flair", 4, thin_sulci=False, filter_radius=2, filter_epsilon=0.25)
     parameters.segmentation = settings
     assert parameters.segmentation == settings and (parameters.contrast, parameters.filter_epsilon) == ("flair", 0.25)
-    assert node.GetParameter("filter_epsilon") == "0.25" and node.GetParameter("thin_sulci") == "False"
     parameters.filter_epsilon = None
     assert parameters.segmentation == replace(settings, filter_epsilon=None)
     parameters.fit = FitSettings(frames="0,5", free="gain_db", register=True, restarts=0)

@@ -74,6 +74,19 @@ def segmented(kind: str = "LabelMapVolume") -> UltrasoundSceneLogic:
     return logic
 
 
+def simulated_sequence(logic: UltrasoundSceneLogic):
+    """The node with two images at the pose of the probe."""
+    scene, parameters = logic.scene, logic.parameters
+    transforms, images = add(scene, "Sequence", "sweep"), add(scene, "Sequence", "sweep ultrasound")
+    for number in range(2):
+        item = slicer.vtkMRMLLinearTransformNode()
+        item.SetMatrixTransformToParent(vtk_matrix(node_to_world(parameters.probe_transform)))
+        transforms.SetDataNodeAtValue(item, f"{0.1 * number:g}")
+    logic.simulateSequence(parameters.labels, transforms, images)
+    parameters.image_sequence = images
+    return images
+
+
 def image_of(logic: UltrasoundSceneLogic) -> np.ndarray:
     chosen = logic.parameters
     if chosen.output is None:
@@ -178,13 +191,7 @@ def test_a_file_of_values_calls_nothing():
 def test_images_of_a_sequence_and_a_proposal_there_and_back():
     logic = segmented()
     parameters, scene = logic.parameters, logic.scene
-    transforms, images = add(scene, "Sequence", "sweep"), add(scene, "Sequence", "sweep ultrasound")
-    for number in range(2):
-        item = slicer.vtkMRMLLinearTransformNode()
-        item.SetMatrixTransformToParent(vtk_matrix(node_to_world(parameters.probe_transform)))
-        transforms.SetDataNodeAtValue(item, f"{0.1 * number:g}")
-    logic.simulateSequence(parameters.labels, transforms, images)
-    parameters.image_sequence = images
+    images = simulated_sequence(logic)
     mri = head_mri(4.0)
     mask = np.zeros(mri.array.shape, np.uint8)
     mask[20:23, 20:25, 20:24] = 1
@@ -256,14 +263,7 @@ def test_a_restored_image_is_of_the_tissues_it_was_kept_with():
 def test_an_image_of_a_sequence_keeps_its_number_the_seed_of_its_noise():
     logic = segmented()
     parameters, scene = logic.parameters, logic.scene
-    transforms, images = add(scene, "Sequence", "sweep"), add(scene, "Sequence", "sweep ultrasound")
-    pose = node_to_world(parameters.probe_transform)
-    for number in range(2):
-        item = slicer.vtkMRMLLinearTransformNode()
-        item.SetMatrixTransformToParent(vtk_matrix(pose))
-        transforms.SetDataNodeAtValue(item, f"{number}")
-    logic.simulateSequence(parameters.labels, transforms, images)
-    parameters.image_sequence = images
+    images = simulated_sequence(logic)
     taken = logic.showSequenceImage(images, 1, parameters.output)
     assert logic.areOfTissues() == (True, True)
     record = required(written_and_read(record_scene(scene)).frozen, "no frozen image")
