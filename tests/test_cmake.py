@@ -38,18 +38,15 @@ def run_cmake(*arguments) -> str:
     return subprocess.run([CMAKE, *map(str, arguments)], check=True, capture_output=True, text=True).stdout
 
 
-def build_extension(source: Path, folder: Path) -> Path:
+@pytest.fixture(scope="module")
+def build(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("build")
     run_cmake(
-        *("-S", source, "-B", folder, "-G", "Ninja", f"-DCMAKE_MAKE_PROGRAM={NINJA}", "-DBUILD_TESTING=ON"),
+        *("-S", ROOT, "-B", folder, "-G", "Ninja", f"-DCMAKE_MAKE_PROGRAM={NINJA}", "-DBUILD_TESTING=ON"),
         *(f"-DSlicer_DIR={ROOT / 'tests/slicer_cmake'}", f"-DCMAKE_INSTALL_PREFIX={folder / 'installed'}"),
     )
     run_cmake("--build", folder)
     return folder
-
-
-@pytest.fixture(scope="module")
-def build(tmp_path_factory) -> Path:
-    return build_extension(ROOT, tmp_path_factory.mktemp("build"))
 
 
 @pytest.fixture(scope="module")
@@ -89,33 +86,13 @@ def test_the_module_its_resources_and_one_folder_are_installed(build, installed)
     wanted |= {f"SlicerUSSim/kernels/{path}" for path in files(ROOT / "kernels")}
     data = {"Logic/fitting/report.html", "Logic/imaging/golden/convex.png", "Logic/py.typed"}
     assert {f"SlicerUSSim/{path}" for path in data} | {"Resources/Icons/USSim.png"} <= wanted
+    # Resources of other extensions are in the same folders: a name such as Resources/UI/Settings.ui could conflict.
+    mine = files(package / "Resources")
+    assert all("USSim" in Path(path).parts or Path(path).stem == "USSim" for path in mine)
     assert files(build / MODULES) == wanted
     others = {"Resources/requirements.txt", "Resources/Icons/Other.png", "Logic/__init__.py"}
     assert files(installed) == wanted | others
     assert all((installed / name).read_text() == "another extension's\n" for name in others)
-
-
-@needs_cmake
-def test_every_installed_resource_bears_the_modules_name(installed):
-    """Resources of other extensions are in the same folders: a name such as Resources/UI/Settings.ui could conflict."""
-    mine = files(ROOT / "SlicerUSSim" / "Resources")
-    assert mine and all("USSim" in Path(path).parts or Path(path).stem == "USSim" for path in mine)
-
-
-@pytest.mark.slow
-@needs_cmake
-def test_a_new_file_is_built_without_a_list_to_add_it_to(tmp_path):
-    source = tmp_path / "source"
-    shutil.copytree(ROOT / "SlicerUSSim", source / "SlicerUSSim", ignore=shutil.ignore_patterns("__pycache__"))
-    for name in ("kernels", "CMakeLists.txt", "LICENSE", "README.md"):
-        copy = shutil.copytree if (ROOT / name).is_dir() else shutil.copy
-        copy(ROOT / name, source / name)
-    build = build_extension(source, tmp_path / "build")
-    new = {"SlicerUSSim/Logic/probe/new.py": "Logic/probe/new.py", "SlicerUSSim/kernels/new.cl": "../kernels/new.cl"}
-    for path in new.values():
-        (source / "SlicerUSSim" / path).write_text("")
-    run_cmake("--build", build)
-    assert set(new) <= files(build / MODULES)
 
 
 @needs_cmake
@@ -129,9 +106,7 @@ def test_slicer_is_asked_for_the_module_and_its_test(record):
 def test_the_installed_module_loads_beside_other_extensions(installed):
     """Another extension's Logic on sys.path is not affected."""
     package = installed / "SlicerUSSim"
-    result = load(installed, self_test=True)
-    assert_loaded_from(result, installed / "USSim.py", package, package / "kernels")
-    assert result["shown"][-1] == "Test passed"
+    assert_loaded_from(load(installed), installed / "USSim.py", package, package / "kernels")
 
 
 @needs_cmake
@@ -164,8 +139,8 @@ def test_the_entry_has_the_fields_of_the_schema_and_no_others():
     assert required <= set(values) <= set(kinds)
     assert all(type(value) is kinds[name] for name, value in values.items())
     assert values["scm_type"] == "git" and 1 <= values["tier"] <= 5 and values["build_dependencies"] == []
-    schemas = "https://raw.githubusercontent.com/Slicer/Slicer/main/Schemas/slicer-extension-catalog-entry-schema-"
-    assert re.fullmatch(re.escape(schemas) + r"v1\.0\.[12]\.json#", values["$schema"])
+    assert values["category"] == "Ultrasound"  # of ACCEPTED_EXTENSION_CATEGORIES
+    assert re.search(r"/slicer-extension-catalog-entry-schema-v1\.0\.[12]\.json#$", values["$schema"])
     assert b"\r" not in ENTRY_FILE.read_bytes()
 
 
@@ -177,12 +152,12 @@ def test_the_extension_is_called_as_the_index_wants():
     assert url.scheme in ("git", "https") and Path(url.path).stem == f"Slicer{name}"  # the repository's name
 
 
-@pytest.mark.parametrize(("variable", "at_least"), [("ICONURL", 1), ("SCREENSHOTURLS", 1)])
-def test_the_pictures_lie_where_their_addresses_say(variable, at_least):
+@pytest.mark.parametrize("variable", ["ICONURL", "SCREENSHOTURLS"])
+def test_the_pictures_lie_where_their_addresses_say(variable):
     """The Index reads them from CMakeLists.txt with these expressions, and loads them."""
     (text,) = re.findall(rf'set\s*\(EXTENSION_{variable}\s*"([^"]+)"[ ]*\)', CMAKE_TEXT, re.IGNORECASE)
     urls = text.split()
-    assert len(urls) >= at_least
+    assert urls
     for url in urls:
         base = "https://raw.githubusercontent.com/SlicerUSSim/SlicerUSSim/main/"
         assert url.startswith(base) and url.endswith(".png")

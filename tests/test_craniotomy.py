@@ -137,7 +137,7 @@ def test_an_opening_that_is_none_is_refused(call, message, head):
         call(head)
 
 
-def test_a_soft_mask_opens_where_it_is_one_and_one_far_from_the_brain_is_refused(head):
+def test_a_soft_mask_opens_where_it_is_one_and_not_far_from_the_brain(head):
     disc = disc_opening(head, NAMES, TOP, 30.0)
     np.testing.assert_array_equal(mask_opening(head, head.with_array(np.where(disc, 0.9, 1e-6)), "soft"), disc)
     bony = (places_of(head)[..., 0] > 70.0) & (head.array == 0)

@@ -175,11 +175,3 @@ def require_imports(code: str) -> None:
 def test_python_snippets_compile_and_import_what_there_is(code):
     compile(code, "snippet", "exec")
     require_imports(code)
-
-
-@pytest.mark.parametrize(
-    "script", sorted([*ROOT.glob("examples/*.py"), *ROOT.glob("benchmarks/*.py")]), ids=lambda script: script.name
-)
-def test_examples_and_benchmarks_import_what_there_is(script):
-    ours = [line for line in ast.parse(script.read_text(encoding="utf-8")).body if isinstance(line, ast.ImportFrom)]
-    require_imports("\n".join(map(ast.unparse, ours)))

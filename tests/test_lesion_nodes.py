@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 slicer = pytest.importorskip("slicer", reason="MRML nodes come with slicer-core: pip install '.[slicer]'")
 
 from SlicerUSSim.Logic import SimulationError, Volume  # noqa: E402
-from SlicerUSSim.Logic.base.errors import Cancelled  # noqa: E402
 from SlicerUSSim.Logic.base.vtk_data import vtk_matrix  # noqa: E402
 from SlicerUSSim.Logic.mri import add_tissues  # noqa: E402
 from SlicerUSSim.Logic.mri.samples import head_mri  # noqa: E402
@@ -32,6 +33,12 @@ KINDS = ["LabelMapVolume", "Segmentation"]
 def lesion(radius: float, centre=PLACE) -> Volume:
     """A ball on a grid of its own, finer than the head's and turned."""
     return ball(moved(empty((1.3, 1.3, 2.0), np.diag([-1.0, -1.0, 1.0]), 22), *PLACE), radius, centre)
+
+
+def brats(values: tuple[int, int, int]) -> Volume:
+    """Shells with these labels, from the inside."""
+    r = np.sqrt(((np.indices((20, 20, 20)) - 9.5) ** 2).sum(axis=0))
+    return Volume(np.select([r < 4, r < 6, r < 9], values, 0).astype(np.uint8), rigid(np.eye(3), PLACE - 9.5))
 
 
 class Scene:
@@ -151,10 +158,7 @@ def test_lesions_that_cannot_be_added_are_one_line_and_change_nothing(paint, mes
 
 def test_a_brats_map_is_three_segments_each_within_the_one_before():
     bench = Scene()
-    r = np.indices((20, 20, 20)).astype(float) - 9.5
-    r = np.sqrt((r**2).sum(axis=0))
-    values = np.select([r < 4, r < 6, r < 9], [1, 4, 2], 0).astype(np.uint8)
-    ids = add_lesion(bench.lesions, Volume(values, rigid(np.eye(3), PLACE - 9.5)), "brats", "map")
+    ids = add_lesion(bench.lesions, brats((1, 4, 2)), "brats", "map")
     segmentation = bench.lesions.GetSegmentation()
     assert [segmentation.GetSegment(name).GetName() for name in ids] == ["oedema", "necrosis", "enhancing"]
     bench.logic.segment(bench.mri, bench.labels, lesions_node=bench.lesions)
@@ -185,9 +189,7 @@ def test_each_lesion_is_told_once_however_often_masks_are_added():
 def test_doubts_about_a_file_of_lesions_are_told_every_time():
     """Of a BraTS map that was added as one tissue, in the words of the page, and not only when it was opened."""
     bench = Scene()
-    r = np.sqrt(((np.indices((20, 20, 20)) - 9.5) ** 2).sum(axis=0))
-    values = np.select([r < 4, r < 6, r < 9], [1, 3, 2], 0).astype(np.uint8)
-    whole = Volume(values, rigid(np.eye(3), PLACE - 9.5), doubts=("brats3.nii.gz: 7 voxels are NaN",))
+    whole = replace(brats((1, 3, 2)), doubts=("brats3.nii.gz: 7 voxels are NaN",))
     add_lesion(bench.lesions, whole, "tumour", "brats3.nii.gz", PAGE)
     bench.logic.segment(bench.mri, bench.labels, lesions_node=bench.lesions)
     told = (
@@ -200,7 +202,7 @@ def test_doubts_about_a_file_of_lesions_are_told_every_time():
     bench.logic.addTissues(bench.labels, bench.lesions)
     assert [bench.logic.warnings.count(line) for line in told] == [1, 1]
     with pytest.raises(SimulationError, match=r"what it is: 'tumour', or 'necrosis' if it is BraTS's label 1$"):
-        add_lesion(bench.lesions, whole.with_array((values == 1).astype(np.uint8)), "brats", "core", PAGE)
+        add_lesion(bench.lesions, whole.with_array((whole.array == 1).astype(np.uint8)), "brats", "core", PAGE)
 
 
 # ---- labels that stay as they are ------------------------------------------------------------------------------------
@@ -344,19 +346,3 @@ def test_the_panel_lays_lesions_over_a_copy_of_the_users_own_labels():
     own = parameters.labels
     presenter.addTissues()  # of its own making
     assert parameters.labels is own
-
-
-def test_a_cancelled_segmentation_leaves_nodes_and_notes_as_they_were():
-    bench = Scene()
-    presenter, parameters = bench.presenter(), bench.logic.parameters
-    presenter.segment()
-    edit(parameters.labels)
-    labels, notes, count = parameters.labels, presenter.notes(), bench.scene.GetNumberOfNodes()
-
-    def cancel(share):
-        raise Cancelled
-
-    presenter.view.shares = type("Cancels", (), {"append": staticmethod(cancel)})()
-    presenter.segment()
-    assert parameters.labels is labels and presenter.notes() == notes and not presenter.view.errors
-    assert bench.scene.GetNumberOfNodes() == count and presenter.canSegment()[0]

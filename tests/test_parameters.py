@@ -99,12 +99,9 @@ def test_no_noise_starts_at_the_lowest_level():
             "white matter.echogenicity_db is free together with white matter.mu0, expected one or the other",
         ),
         ({"gain_db": (3, -3)}, "bounds of gain_db are 3.0 to -3.0, expected two numbers, the smaller one first"),
-        ({"gain_db": (0, 0)}, "the smaller one first"),
         ({"gain_db": (0, float("nan"))}, "the smaller one first"),
         ({"gain_db": 5}, "bounds of gain_db are 5, expected two numbers"),
-        ({"gain_db": ("a", "b")}, "expected two numbers"),
         ({"dynamic_range_db": (-5, 60)}, "dynamic_range_db is -5.0"),
-        ({"white matter.mu1": (-30, 0)}, "mu1 is -30.0"),
     ],
 )
 def test_what_is_no_parameter_or_no_range_is_refused_in_one_line(free, message):

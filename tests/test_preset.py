@@ -9,7 +9,6 @@ from hypothesis import given, strategies as st
 from SlicerUSSim.Logic import ConvexProbe, LinearProbe, Preset, SimulationError, TissueTable
 from SlicerUSSim.Logic.base.transforms import pose_of_angles
 from SlicerUSSim.Logic.probe.arrays import PROBES
-from SlicerUSSim.Logic.tissue.names import tissue_named
 from SlicerUSSim.Logic.tracked.pose_files import read_pose
 
 
@@ -76,21 +75,6 @@ def test_changed_refuses_what_it_does_not_know():
         Preset().changed("probe", radius_mm=3)
     with pytest.raises(SimulationError, match="kind is 'sector'"):
         Preset().changed("probe", kind="sector")
-
-
-@pytest.mark.parametrize(
-    ("name", "tissue"),
-    [
-        ("Left-Cerebral-White-Matter", "white matter"),
-        ("ctx-lh-precuneus", "grey matter"),
-        ("3rd-Ventricle", "csf"),
-        ("Left-Thalamus-Proper", "grey matter"),
-        ("blood vessels", "blood"),
-        ("Gray_Matter", "grey matter"),
-    ],
-)
-def test_names_of_other_programs_find_their_tissue(name, tissue):
-    assert tissue_named(name).name == tissue
 
 
 def test_a_table_for_other_labels_keeps_edited_tissues():

@@ -5,9 +5,7 @@ from __future__ import annotations
 import importlib.util
 import re
 import sys
-from dataclasses import dataclass, field
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 
@@ -28,7 +26,7 @@ def module_of_docs(name: str):
 reference = module_of_docs("reference")
 
 
-def test_the_pages_of_rooms_describe_the_names_of_their_faces_and_no_others():
+def test_the_pages_of_rooms_describe_the_names_of_their_faces_alone():
     for room in reference.rooms():
         page = reference.room_page(room)
         described = re.findall(r"^\.\. (?:autoclass|autofunction|py:data):: (\w+)$", page, re.MULTILINE)
@@ -77,18 +75,6 @@ def test_parameters_become_a_definition_list():
         "    ``a``, ``b``", "        (rows, columns).", "",
         "Raises SimulationError for others.",
     ]  # fmt: skip
-
-
-def test_a_field_without_a_comment_has_what_its_declaration_says():
-    about = SimpleNamespace(tip="Depth of the image", unit="mm", bounds=(1, 400), note="Of the field", source="")
-
-    @dataclass
-    class Declared:
-        depth_mm: float = field(default=1.0, metadata={"parameter": about})
-        plain: float = 0.0
-
-    assert reference.declared_fields(Declared) == {"depth_mm": "Depth of the image (1 to 400 mm). Of the field."}
-    assert reference.declared_fields(int) == {}
 
 
 @pytest.mark.parametrize(

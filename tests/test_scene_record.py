@@ -53,7 +53,7 @@ def segmented(kind: str = "LabelMapVolume") -> UltrasoundSceneLogic:
     """A scene with a head, its tissues with a tumour on top, a probe and an image."""
     logic = UltrasoundSceneLogic(slicer.vtkMRMLScene())
     scene, parameters = logic.scene, logic.parameters
-    mri = head_mri(3.0)
+    mri = head_mri(4.0)
     node, labels, lesions = add(scene, "ScalarVolume", "head"), add(scene, kind, "tissues"), add(scene, "Segmentation")
     turned = np.array([[0, -1, 0, 5.0], [1, 0, 0, -3.0], [0, 0, 1, 7.0], [0, 0, 0, 1]])
     tilt = add(scene, "LinearTransform", "registration")
@@ -72,6 +72,19 @@ def segmented(kind: str = "LabelMapVolume") -> UltrasoundSceneLogic:
     logic.preset = Preset().changed("display", gain_db=4.0).changed("probe", depth_mm=60.0)
     parameters.segmentation = SegmentationSettings("t2")
     return logic
+
+
+def simulated_sequence(logic: UltrasoundSceneLogic):
+    """The node with two images at the pose of the probe."""
+    scene, parameters = logic.scene, logic.parameters
+    transforms, images = add(scene, "Sequence", "sweep"), add(scene, "Sequence", "sweep ultrasound")
+    for number in range(2):
+        item = slicer.vtkMRMLLinearTransformNode()
+        item.SetMatrixTransformToParent(vtk_matrix(node_to_world(parameters.probe_transform)))
+        transforms.SetDataNodeAtValue(item, f"{0.1 * number:g}")
+    logic.simulateSequence(parameters.labels, transforms, images)
+    parameters.image_sequence = images
+    return images
 
 
 def image_of(logic: UltrasoundSceneLogic) -> np.ndarray:
@@ -173,21 +186,13 @@ def test_a_file_of_values_calls_nothing():
 
     with pytest.raises(SimulationError, match="is damaged, or of another version"):
         read_values(io.BytesIO(pickle.dumps(Bad())))
-    with pytest.raises(SimulationError, match="is damaged, or of another version"):
-        read_values(io.BytesIO(b"x"))
 
 
 def test_images_of_a_sequence_and_a_proposal_there_and_back():
     logic = segmented()
     parameters, scene = logic.parameters, logic.scene
-    transforms, images = add(scene, "Sequence", "sweep"), add(scene, "Sequence", "sweep ultrasound")
-    for number in range(2):
-        item = slicer.vtkMRMLLinearTransformNode()
-        item.SetMatrixTransformToParent(vtk_matrix(node_to_world(parameters.probe_transform)))
-        transforms.SetDataNodeAtValue(item, f"{0.1 * number:g}")
-    logic.simulateSequence(parameters.labels, transforms, images)
-    parameters.image_sequence = images
-    mri = head_mri(3.0)
+    images = simulated_sequence(logic)
+    mri = head_mri(4.0)
     mask = np.zeros(mri.array.shape, np.uint8)
     mask[20:23, 20:25, 20:24] = 1
     proposal = add(scene, "Segmentation", "Lesion proposal")
@@ -195,11 +200,7 @@ def test_images_of_a_sequence_and_a_proposal_there_and_back():
     parameters.proposal = proposal
     before = record_scene(scene)
     assert before.simulated is not None and before.size > sum(image.nbytes for image in before.simulated.images)
-    buffer = io.BytesIO()
-    write_values(buffer, before)
-    buffer.seek(0)
-    record = read_values(buffer)
-
+    record = written_and_read(before)
     other = UltrasoundSceneLogic(slicer.vtkMRMLScene())
     made = put_nodes(other.scene, record)
     segmentation = made["proposal"].GetSegmentation()
@@ -211,15 +212,10 @@ def test_images_of_a_sequence_and_a_proposal_there_and_back():
         assert np.array_equal(old.probe_to_world, new.probe_to_world)
         assert sequence.GetNthIndexValue(number) == images.GetNthIndexValue(number)
         assert new.anatomy is None  # of which nobody knows whether it is the same still
-    # What does not go together is refused, and nothing of it stays
+    # What does not go together is refused, and nothing of it stays.
     count = other.scene.GetNumberOfNodesByClass("vtkMRMLSequenceNode")
-    for damaged in (
-        replace(record.simulated, about="{}"),
-        replace(record.simulated, images=(np.zeros((3, 3), np.uint8),) * 2),
-        replace(record.simulated, images=record.simulated.images[:1]),
-    ):
-        with pytest.raises(SimulationError, match=r"of a sequence is|images of"):
-            put_taken(other.scene, damaged)
+    with pytest.raises(SimulationError, match=r"of a sequence is|images of"):
+        put_taken(other.scene, replace(record.simulated, images=record.simulated.images[:1]))
     assert other.scene.GetNumberOfNodesByClass("vtkMRMLSequenceNode") == count
 
 
@@ -228,10 +224,9 @@ def live_update(logic: UltrasoundSceneLogic) -> None:
     logic.startLiveUpdate(chosen.labels, chosen.probe_transform, chosen.output)
 
 
-@pytest.mark.parametrize("kind", ["LabelMapVolume", "Segmentation"])
-def test_a_scene_tells_a_frozen_image_from_a_live_one(kind):
+def test_a_scene_tells_a_frozen_image_from_a_live_one():
     """Both are where the probe is if that has not moved, and the frozen one came back live."""
-    logic = segmented(kind)
+    logic = segmented()
     live_update(logic)
     output = logic.parameters.output
     with logic.imageHeld():
@@ -268,14 +263,7 @@ def test_a_restored_image_is_of_the_tissues_it_was_kept_with():
 def test_an_image_of_a_sequence_keeps_its_number_the_seed_of_its_noise():
     logic = segmented()
     parameters, scene = logic.parameters, logic.scene
-    transforms, images = add(scene, "Sequence", "sweep"), add(scene, "Sequence", "sweep ultrasound")
-    pose = node_to_world(parameters.probe_transform)
-    for number in range(2):
-        item = slicer.vtkMRMLLinearTransformNode()
-        item.SetMatrixTransformToParent(vtk_matrix(pose))
-        transforms.SetDataNodeAtValue(item, f"{number}")
-    logic.simulateSequence(parameters.labels, transforms, images)
-    parameters.image_sequence = images
+    images = simulated_sequence(logic)
     taken = logic.showSequenceImage(images, 1, parameters.output)
     assert logic.areOfTissues() == (True, True)
     record = required(written_and_read(record_scene(scene)).frozen, "no frozen image")
@@ -324,10 +312,9 @@ def test_real_images_keep_their_probe_and_registration():
     record = required(record_scene(logic.scene).sequence, "no sequence")
     assert record.field is None and record.to_ras is None
     np.testing.assert_allclose(TrackedImages.of(record.sequence).poses, tracked.poses, atol=1e-6)
-    for damaged in ("{", '{"probe": {}}', '{"probe": {"kind": "phased"}, "image_to_probe": [1], "to_ras": [2]}'):
-        node.SetAttribute("SlicerUSSim.field", damaged)
-        with pytest.raises(SimulationError, match=r"'sweep': its attribute SlicerUSSim\.field is damaged"):
-            record_scene(logic.scene)
+    node.SetAttribute("SlicerUSSim.field", '{"probe": {}}')
+    with pytest.raises(SimulationError, match=r"'sweep': its attribute SlicerUSSim\.field is damaged"):
+        record_scene(logic.scene)
 
 
 def test_what_is_left_of_landmarks_is_kept_with_them():

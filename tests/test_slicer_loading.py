@@ -180,15 +180,3 @@ def test_nothing_beside_the_module_is_taken_for_another():
 @pytest.mark.parametrize("dropped", [".", "SlicerUSSim", "SlicerUSSim/USSim.py"])
 def test_the_extension_wizard_and_drag_and_drop_find_the_module(dropped):
     assert found_by_wizard(ROOT / dropped) == [ROOT / "SlicerUSSim" / "USSim.py"]
-
-
-def test_the_rules_imitated_refuse_what_slicer_refuses(tmp_path):
-    """The former package: an __init__.py hides the module from the Wizard and causes a traceback at each start."""
-    shutil.copy(ROOT / "SlicerUSSim" / "USSim.py", tmp_path)
-    (tmp_path / "__init__.py").write_text("")
-    (tmp_path / "tool.py").write_text("#!/usr/bin/env python3\n")
-    (tmp_path / "old.pyc").write_bytes(b"")
-    assert found_by_wizard(tmp_path) == []
-    taken = {path.name for path in tmp_path.iterdir() if is_scripted_module(path)}
-    assert taken == {"USSim.py", "__init__.py", "old.pyc"}
-    assert [path.name for path in tmp_path.iterdir() if is_command_line_module(path)] == ["tool.py"]

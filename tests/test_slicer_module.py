@@ -248,30 +248,22 @@ def test_sample_data_is_registered_with_a_checksum_and_a_thumbnail(module, monke
     assert hashlib.sha256(brain.read_bytes()).hexdigest() == registered["checksums"].split(":")[1]
 
 
-def test_the_parameter_node_is_the_scenes(module):
-    wrapper = module.USSimParameterNode
-    hints = typing.get_type_hints(wrapper, include_extras=True)
-    parameters = importlib.import_module("SlicerUSSim.Logic.mrml.parameter_node")
-    values = {name: entry for name, entry in parameters.VALUE_PARAMETERS.items() if not entry.can_be_none}
-    assert set(hints) == set(wrapper.names) == {*parameters.NODE_PARAMETERS, *values} and len(values) > 10
+def test_slicer_and_module_read_what_the_other_wrote_in_the_parameter_node(session):
+    parameters, typed = session.parameters, session.widget.logic.getParameterNode()
+    declared = session.logic_module("mrml.parameter_node")
+    values = {name: entry for name, entry in declared.VALUE_PARAMETERS.items() if not entry.can_be_none}
+    assert set(typed.names) == {*declared.NODE_PARAMETERS, *values} and len(values) > 10
+    hints = typing.get_type_hints(session.module.USSimParameterNode, include_extras=True)
     for name, entry in values.items():
+        assert getattr(typed, name) == getattr(parameters, name) == entry.default, name
         kind, *notes = typing.get_args(hints[name]) or (hints[name],)
         assert kind is entry.type, name
         if entry.choices:
             assert notes[0].choices == list(entry.choices)
         elif entry.bounds:
             assert (notes[0].minimum, notes[0].maximum) == entry.bounds
-    for name, classes in parameters.NODE_PARAMETERS.items():
-        for kind in classes:
-            assert issubclass(getattr(slicer, kind), hints[name]), name
-
-
-def test_slicer_and_module_read_what_the_other_wrote_in_the_parameter_node(session):
-    parameters, typed = session.parameters, session.widget.logic.getParameterNode()
-    declared = importlib.import_module("SlicerUSSim.Logic.mrml.parameter_node").VALUE_PARAMETERS
-    for name in typed.names:
-        if name in declared:
-            assert getattr(typed, name) == getattr(parameters, name) == declared[name].default, name
+    for name, classes in declared.NODE_PARAMETERS.items():
+        assert all(issubclass(getattr(slicer, kind), hints[name]) for kind in classes), name
     typed.contrast, typed.fit_evaluations, typed.show_in_slice = "flair", 70, False
     assert (parameters.contrast, parameters.fit.evaluations, parameters.show_in_slice) == ("flair", 70, False)
     assert session.ui.contrastComboBox.currentText() == "flair" and not session.ui.showInSliceCheckBox.isChecked()
@@ -323,28 +315,6 @@ def test_every_node_selector_has_the_scene_and_the_classes_of_its_role(session):
     for control, widget in selectors:
         assert widget.property("nodeTypes") == list(roles[control.node]) and widget._scene is session.scene
         assert widget.property("addEnabled") == bool(control.new_node)
-
-
-@pytest.mark.slow
-def test_every_value_of_the_panel_accepts_both_ends_of_its_range(session):
-    preset_module = session.logic_module("imaging.preset")
-    presenter = session.panel.presenter
-    for probe in {probe.kind: probe for probe in session.logic_module("probe.arrays").PROBES.values()}.values():
-        session.logic.preset = preset_module.Preset(probe)
-        for name, (control, _) in controls_of(session).items():
-            shown = presenter.value(name)
-            if shown is None:
-                continue
-            if control.kind in ("slider", "number"):
-                assert control.range.low <= shown <= control.range.high, (name, probe)
-                for end in (control.range.low, control.range.high):
-                    presenter.setValue(name, float(end))  # as widgets hold whole numbers
-                    assert presenter.value(name) == pytest.approx(end) or control.range.none_at == end, name
-            else:
-                presenter.setValue(name, shown)
-                assert presenter.value(name) == shown
-            session.logic.preset = preset_module.Preset(probe)
-    assert not session.app.errors
 
 
 def test_whole_numbers_and_ticks_of_widgets_reach_the_declared_types(session):
@@ -663,9 +633,6 @@ def test_the_panel_fits_compares_applies_and_reverts(session):
     composite.SetForegroundOpacity(1.0)
     session.panel.presenter.fits.blink()
     assert composite.GetForegroundOpacity() == 0.0
-    # The cost is in the scene's plot.
-    assert session.scene.GetFirstNodeByClass("vtkMRMLPlotChartNode").GetNumberOfPlotSeriesNodes() == 2
-
     ui.applyFitButton.click()
     assert session.logic.preset.display.gain_db == pytest.approx(9.0, abs=1.5)
     assert ui.gainSlider.property("value") == pytest.approx(session.logic.preset.display.gain_db)
@@ -709,10 +676,12 @@ def test_closing_the_scene_and_leaving_the_module_is_survived(session):
     session.segmented()
     session.ui.liveCheckBox.setChecked(True)
     session.widget.exit()
+    session.ui.mriSelector.setCurrentNode(None)  # as selectors do while a scene is closed
     session.move(1)
     session.process()
-    assert session.logic.isLive  # in another module the image still follows
+    assert session.logic.isLive and session.parameters.mri is not None  # in another module the image still follows
     session.widget.enter()
+    assert session.ui.mriSelector.currentNode() is session.parameters.mri
     session.scene.Clear(0)
     session.process()
     assert not session.logic.isLive and session.parameters.labels is None
@@ -721,17 +690,6 @@ def test_closing_the_scene_and_leaving_the_module_is_survived(session):
     session.ui.segmentButton.click()
     assert not session.app.errors
     assert session.parameters.labels is not None
-
-
-def test_widgets_leave_the_scene_alone_while_another_module_is_open(session):
-    session.parameters.mri = session.head()
-    session.widget.exit()
-    session.ui.mriSelector.setCurrentNode(None)  # as selectors do while a scene is closed
-    session.ui.gainSlider.setValue(3.0)
-    assert session.parameters.mri is not None and session.logic.preset.display.gain_db == 0.0
-    session.widget.enter()
-    assert session.ui.mriSelector.currentNode() is session.parameters.mri
-    assert session.ui.gainSlider.property("value") == 0.0
 
 
 def test_reloading_the_module_brings_new_code(module):
@@ -747,30 +705,19 @@ def test_reloading_the_module_brings_new_code(module):
 
 
 @pytest.mark.slow
-def test_the_panel_looks_as_it_should(session, tmp_path):
-    """A figure of the panel with all sections open, in which every control is completely visible."""
+def test_every_control_of_the_open_panel_is_visible(session):
     session.segmented()
-    session.ui.simulateButton.click()
     for button in session.parent.findChildren(stand_in.CollapsibleButton):
         button.setCollapsed(False)
     session.parent.resize(520, 1500)
     session.parent.show()
     session.process()
-    picture = session.parent.grab().toImage()
-    file = tmp_path / "panel.png"
-    assert picture.save(str(file))
+    kinds = stand_in.QtWidgets.QAbstractButton | stand_in.SliderWidget | stand_in.NodeComboBox
     for widget in vars(session.ui).values():
-        if isinstance(widget, stand_in.QtWidgets.QAbstractButton | stand_in.SliderWidget | stand_in.NodeComboBox):
-            if widget.objectName() == "cancelButton":
-                continue
+        if isinstance(widget, kinds) and widget.objectName() != "cancelButton":
             assert widget.isVisible() and widget.width() > 40 and widget.height() >= 12, widget.objectName()
-    from PIL import Image
-
-    pixels = np.asarray(Image.open(file).convert("L"))
-    assert pixels.shape[0] >= 1400 and pixels.std() > 20
-    keep = os.environ.get("USSIM_PICTURES")
-    if keep:
-        picture.save(str(Path(keep) / "slicer-panel.png"))
+    if folder := os.environ.get("USSIM_PICTURES"):
+        session.parent.grab().toImage().save(str(Path(folder) / "slicer-panel.png"))
 
 
 def test_a_preset_beyond_the_sliders_is_shown_as_it_is(session, tmp_path):
@@ -851,9 +798,7 @@ def test_on_windows_without_a_device_intels_runtime_is_offered(bare_slicer, simu
     """Untested on Windows: this tests only the questions and actions of the module."""
     app = bare_slicer.app
     app.installed = ["pyopencl"]
-    devices = importlib.import_module("SlicerUSSim.Logic.opencl.devices")
-    found, absent = [], ["intel-opencl-rt"]
-    known = importlib.metadata.version
+    absent, known = ["intel-opencl-rt"], importlib.metadata.version
 
     def version(name: str) -> str:
         if name in absent:
@@ -861,7 +806,7 @@ def test_on_windows_without_a_device_intels_runtime_is_offered(bare_slicer, simu
         return known(name)
 
     monkeypatch.setattr(importlib.metadata, "version", version)
-    monkeypatch.setattr(devices, "list_devices", lambda: found)
+    monkeypatch.setattr(importlib.import_module("SlicerUSSim.Logic.opencl.devices"), "list_devices", list)
     bare_slicer.ensure()
     assert not app.questions  # not where Linux is
     monkeypatch.setattr(sys, "platform", "win32")
@@ -873,9 +818,7 @@ def test_on_windows_without_a_device_intels_runtime_is_offered(bare_slicer, simu
         bare_slicer.ensure()
     assert app.installed == ["pyopencl", "intel-opencl-rt"] and "numpy==2.0.2" in app.constraints
     app.questions.clear()
-    found.append("a device")
-    bare_slicer.ensure()
-    found.clear(), absent.clear()  # installed, and no device all the same
+    absent.clear()  # installed, and no device all the same
     bare_slicer.ensure()
     assert not app.questions
 
@@ -931,13 +874,6 @@ def test_selectors_offer_only_what_fits(session):
     assert offered(ui.outputSelector) == ["None", "Ultrasound", "empty"]
     assert offered(ui.outlineSelector) == ["None", "Ultrasound outline"]
     assert offered(ui.sheetsSelector) == ["None"]
-    sheets = session.add("Model", "sheets")
-    surfels = session.logic_module("mri.sheets.surfels").Surfels(
-        *np.float32([[[0, 0, 0]], [[0, 0, 1]]]), *np.float32([[1], [1], [1]]), kind=np.uint8([1])
-    )
-    sheets.SetAndObservePolyData(session.logic_module("mri.sheets.polydata").as_polydata(surfels))
-    session.panel.refresh()
-    assert offered(ui.sheetsSelector) == ["None", "sheets"] and "sheets" not in offered(ui.outlineSelector)
     assert offered(ui.probeTransformSelector) == ["None", "Probe"]
 
 

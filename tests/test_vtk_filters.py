@@ -101,7 +101,6 @@ def test_it_executes_when_something_changes_and_only_then():
         "tissues": lambda: algorithm.SetTissues(TISSUES.replace("speckle", mu0=0.5)),
         "transform": lambda: algorithm.SetProbeTransform(vtk_matrix(rigid(np.eye(3), [1, -15, 0]))),
         "labels": lambda: algorithm.SetInputData(cyst().to_vtk()),
-        "alpha": lambda: algorithm.SetFieldAlpha(True),
     }
     for name, change in changes.items():
         change()
@@ -109,6 +108,11 @@ def test_it_executes_when_something_changes_and_only_then():
         if name not in ("transform", "labels"):  # those are other objects each time
             change()
         assert not executes(algorithm), f"{name}, set to what it was"
+    image = algorithm.GetInputDataObject(0, 0)
+    vtk_to_numpy(image.GetPointData().GetScalars())[:] = 1  # in place
+    image.Modified()
+    before = image_of(algorithm)
+    assert executes(algorithm) and image_of(algorithm).mean() > before.mean()  # the cyst is gone
 
 
 def test_every_pose_has_noise_of_its_own_and_has_it_again():
@@ -143,19 +147,6 @@ def test_a_transform_deep_in_a_chain_moves_the_image():
     assert not executes(algorithm)
     assert algorithm.GetOutput().GetOrigin()[1] == pytest.approx(-10 + 30 / 96 / 2)
     np.testing.assert_allclose(algorithm.GetOutput(1).GetBounds(), (-10, 10, -10, 20, 0, 0), atol=1e-5)  # the outline
-
-
-def test_voxels_that_change_in_place_are_seen():
-    algorithm = simulation()
-    image = cyst().to_vtk()
-    algorithm.SetInputData(image)
-    algorithm.Update()
-    before = vtk_to_numpy(algorithm.GetOutput().GetPointData().GetScalars()).copy()
-    vtk_to_numpy(image.GetPointData().GetScalars())[:] = 1
-    image.Modified()
-    assert executes(algorithm)
-    after = vtk_to_numpy(algorithm.GetOutput().GetPointData().GetScalars())
-    assert after.astype(float).mean() > before.astype(float).mean()  # the cyst is gone
 
 
 @settings(max_examples=10)
@@ -212,25 +203,6 @@ def test_alpha_is_the_imaged_field():
     np.testing.assert_array_equal(both[..., 0], algorithm.GetFrame().image)
     outside = both[..., 1] == 0
     assert 0.2 < outside.mean() < 0.6 and not algorithm.GetFrame().image[outside].any()
-
-
-def test_labels_of_freesurfer_are_read_as_those_of_the_same_tissues():
-    array = np.zeros((40, 40, 40), np.int16)
-    for label, i in ((1003, 2), (2, 8), (4, 14), (43, 20), (41, 26), (2003, 32), (10, 17), (49, 23)):
-        array[:, :, i : i + 3] = label
-    numbers = {0: 0, 2: 1, 41: 1, 4: 2, 43: 2, 10: 3, 49: 3, 1003: 3, 2003: 3}
-    merged = np.vectorize(numbers.get)(array).astype(np.uint8)
-    images = []
-    for labels, tissues in (
-        (array, TissueTable.brain()), (merged, TissueTable.brain(["white matter", "csf", "grey matter"])),
-    ):  # fmt: skip
-        algorithm = simulation()
-        algorithm.SetInputData(Volume(labels, np.eye(4)).to_vtk())
-        algorithm.SetTissues(tissues)
-        algorithm.Update()
-        assert algorithm.GetErrorMessage() == ""
-        images.append(algorithm.GetFrame().image)
-    np.testing.assert_array_equal(*images)
 
 
 @pytest.mark.parametrize(
@@ -329,27 +301,15 @@ def test_segmentation_labels_as_the_function_does_and_names_travel():
     assert algorithm._simulator._simulator.medium.tissues[1].name == "white matter"
 
 
-@pytest.mark.slow
 def test_segmentation_has_the_declared_defaults_and_refuses_on_update():
     segmentation = SegmentationFilter()
     assert segmentation._values == asdict(SegmentationSettings())
     segmentation.SetInputData(head_mri(4.0).to_vtk())
-    errors = []
-    segmentation.AddObserver("ErrorEvent", lambda *_: errors.append(segmentation.GetErrorMessage()))
-    segmentation.GetExecutive().AddObserver("ErrorEvent", lambda *_: None)
-    for change, message in (
-        (lambda: segmentation.SetFilterEpsilon(-1.0), "segmentation: filter_epsilon is -1.0, expected a number"),
-        (lambda: segmentation.SetContrast("pd"), "segmentation: contrast is 'pd', expected one of t1, t1gd, t2"),
-    ):
-        time = segmentation.GetMTime()
-        change()
-        assert segmentation.GetMTime() > time and not errors
-        segmentation.Update()
-        assert errors.pop().startswith(message)
-    segmentation.SetContrast("t1")
-    segmentation.SetFilterEpsilon(None)
+    for heard in (segmentation, segmentation.GetExecutive()):
+        heard.AddObserver("ErrorEvent", lambda *_: None)
+    segmentation.SetContrast("pd")
     segmentation.Update()
-    assert not errors and segmentation.GetErrorMessage() == ""
+    assert segmentation.GetErrorMessage().startswith("segmentation: contrast is 'pd', expected one of t1, t1gd, t2")
 
 
 @pytest.mark.slow
