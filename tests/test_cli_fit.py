@@ -254,7 +254,7 @@ def test_mistakes_are_one_line_and_write_nothing(folder, options, message, monke
     assert sorted(path.name for path in folder.iterdir()) == before
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_example_writes_a_twin_that_optimize_reads(mni, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr("sys.argv", ["write_twin.py", str(tmp_path), "--seed", "4"])
     example("write_twin").main()

@@ -251,7 +251,7 @@ def test_an_interrupted_run_is_resumed_without_computing_again(twin):
         optimise(twin, ["gain_db"], resume={"hello": 1})
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_longer_run_goes_on_from_a_shorter_one_as_if_it_were_alone(twin):
     short = optimise(twin, ["display"], max_evaluations=40, restarts=1)
     whole = optimise(twin, ["display"], max_evaluations=60, restarts=2)

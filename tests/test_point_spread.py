@@ -71,7 +71,7 @@ def test_a_probe_whose_speckle_is_too_fine_gets_the_true_one_back():
     assert found.after.total < first.after.total and found.after.extrema <= first.after.extrema
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_what_is_wide_by_smoothing_is_not_taken_for_the_point_spread():
     """The true probe, whose images a scanner smooths: its widths would say another one."""
     tracked = replace(recorded(0.2), probe=TRUE)

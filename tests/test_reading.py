@@ -148,7 +148,7 @@ def written(folder: Path) -> list[tuple[Path, type | object]]:
     """A file of every kind, with what reads it."""
     volume = Volume(np.arange(60, dtype=np.int16).reshape(3, 4, 5), np.diag([2.0, 2.0, 2.0, 1.0]))
     found = []
-    for suffix in (".nii.gz", ".nrrd", ".mha", ".vti"):
+    for suffix in (".nii.gz", ".vti"):
         volume.write(folder / f"volume{suffix}")
         found.append((folder / f"volume{suffix}", Volume.read))
     images = np.arange(40, dtype=np.uint8).reshape(2, 4, 5)

@@ -127,7 +127,7 @@ def test_the_cost_found_is_that_of_images_at_the_corrected_poses():
     references = [seen.simulate(SMALL, pose, display, grid).image for pose in true]
     away = [rotation @ rigid_from([1.5, 1.0, -0.8, 2, 3, -3]) @ np.linalg.inv(rotation) @ pose for pose in true]
     found = register_poses(
-        seen, SMALL, away, references, display=display, grid=grid, range_mm=4, range_deg=6, max_evaluations=240
+        seen, SMALL, away, references, display=display, grid=grid, range_mm=4, range_deg=6, max_evaluations=140
     )
 
     def cost(poses):

@@ -79,7 +79,7 @@ def test_smoothing_and_texture_are_found_by_the_costs_of_texture(tracked):
 @pytest.mark.slow
 def test_fit_with_speckle_beats_the_fit_without(tracked):
     """Even tissues get the texture of their presets; the paper's cost is not worse for it."""
-    settings = {"free": ["gain_db", "dynamic_range_db"], "display": PLAIN, "max_evaluations": 80, "restarts": 0}
+    settings = {"free": ["gain_db", "dynamic_range_db"], "display": PLAIN, "max_evaluations": 40, "restarts": 0}
     plain = fit(simulator(even(TISSUES)), tracked[1], **settings)
     made = simulator(even(TISSUES))
     found = fit(made, tracked[1], speckle=True, **settings)
