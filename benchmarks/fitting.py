@@ -19,6 +19,7 @@ from time import perf_counter
 import numpy as np
 
 from benchmarks.measuring import measured, output_file
+from benchmarks.twins import TISSUE, Twin, make_twin
 from SlicerUSSim.Logic import DisplaySettings, TissueTable, Volume, optimize_appearance, segment_mri
 from SlicerUSSim.Logic.base import write_json
 from SlicerUSSim.Logic.fitting import AppearanceModel, FreeParameters, SimilaritySettings
@@ -31,7 +32,6 @@ from SlicerUSSim.Logic.imaging import TreeOverflowWarning
 from SlicerUSSim.Logic.mri import demo_mri
 from SlicerUSSim.Logic.probe import ImageGrid
 from SlicerUSSim.Logic.tracked import TrackedImages
-from validation.twins import TISSUE, Twin, make_twin
 
 #: Poor starting points of the search.
 FAR = {

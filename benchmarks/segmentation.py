@@ -27,7 +27,9 @@ import numpy as np
 from scipy import ndimage
 
 from benchmarks.brain_extraction import SHARED, measure_brains
+from benchmarks.labelled_brains import labelled_scan, maps_of_labels
 from benchmarks.measuring import output_file
+from benchmarks.segmentation_controls import atropos, plain_mixture, true_thresholds
 from SlicerUSSim.Logic import Volume, segment_mri
 from SlicerUSSim.Logic.base import write_json
 from SlicerUSSim.Logic.base.errors import SimulationError, require
@@ -42,8 +44,6 @@ from validation.brain_phantoms import (
     with_ring_tumour,
 )
 from validation.brain_scores import calibration, scores
-from validation.labelled_brains import labelled_scan, maps_of_labels
-from validation.segmentation_controls import atropos, plain_mixture, true_thresholds
 
 #: (noise, bias) of the phantoms
 QUALITIES = ((0.03, 0.0), (0.03, 0.2), (0.07, 0.2))

@@ -5,7 +5,7 @@
         -o FOLDER/result.json --report FOLDER/report.html
 
 The "real" images in tracked.igs.mha are simulated with the parameters in truth.json, other speckle and noise;
-labels.nii.gz is the same brain with a slightly wrong segmentation (validation/twins.py).
+labels.nii.gz is the same brain with a slightly wrong segmentation (benchmarks/twins.py).
 """
 
 from __future__ import annotations
@@ -15,10 +15,10 @@ import sys
 from dataclasses import asdict
 from pathlib import Path
 
+from benchmarks.twins import make_twin
 from SlicerUSSim.Logic import TissueTable, segment_mri
 from SlicerUSSim.Logic.base import write_json
 from SlicerUSSim.Logic.mri import demo_mri
-from validation.twins import make_twin
 
 
 def main() -> None:

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
+from benchmarks.segmentation_controls import NAMES, plain_mixture, true_thresholds
 from SlicerUSSim.Logic import SimulationError, segment_mri
 from validation.brain_phantoms import (
     MEANS,
@@ -21,7 +22,6 @@ from validation.brain_phantoms import (
     with_ring_tumour,
 )
 from validation.brain_scores import calibration, dice, scores
-from validation.segmentation_controls import NAMES, plain_mixture, true_thresholds
 
 
 @cache

@@ -10,6 +10,7 @@ import pytest
 from click.testing import CliRunner
 from PIL import Image
 
+from benchmarks.twins import make_twin
 from SlicerUSSim.Command.cli import main
 from SlicerUSSim.Logic import (
     PhasedProbe,
@@ -27,7 +28,6 @@ from SlicerUSSim.Logic.probe.placement import tilt_sweep
 from SlicerUSSim.Logic.tracked import TrackedImages, read_pose, write_pose
 from tests.conftest import SHARED, example, needs_shared
 from tests.test_label_maps import head_tissues
-from validation.twins import make_twin
 
 
 def ussim(*arguments):

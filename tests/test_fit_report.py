@@ -1,4 +1,4 @@
-"""What the report of a fit says of its controls (fitting/controls.py) and of the fit of the speckle."""
+"""What the report of a fit says of its controls (fitting/control_costs.py) and of the fit of the speckle."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from SlicerUSSim.Logic import (
     UltrasoundSimulator,
 )
 from SlicerUSSim.Logic.base.files import write_json
-from SlicerUSSim.Logic.fitting.controls import control_costs, mean_cost, neighbours_of
+from SlicerUSSim.Logic.fitting.control_costs import control_costs, mean_cost, neighbours_of
 from SlicerUSSim.Logic.fitting.point_spread import PointSpread
 from SlicerUSSim.Logic.fitting.search import Progress
 from SlicerUSSim.Logic.fitting.speckle_fit import SpeckleFit

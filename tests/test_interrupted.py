@@ -11,12 +11,12 @@ from pathlib import Path
 
 import pytest
 
+from benchmarks.twins import make_twin
 from SlicerUSSim.Logic import PhasedProbe, TissueTable, Volume, segment_mri
 from SlicerUSSim.Logic.base.files import read_json, write_json
 from SlicerUSSim.Logic.mri.samples import head_mri
 from SlicerUSSim.Logic.probe import craniotomy_pose
 from SlicerUSSim.Logic.tracked import write_pose
-from validation.twins import make_twin
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(sys.platform == "win32", reason="Windows has no SIGINT to send")]
 

@@ -9,6 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from benchmarks.twins import make_twin
 from SlicerUSSim.Logic import (
     DisplaySettings,
     LinearProbe,
@@ -37,7 +38,6 @@ from SlicerUSSim.Logic.probe.image_grid import ImageGrid
 from SlicerUSSim.Logic.tissue.tissue import Tissue
 from tests.conftest import few_slow_others_long
 from tests.test_label_maps import head_tissues
-from validation.twins import make_twin
 
 SMALL = PhasedProbe(70.0, 50.0, scan_lines=80)
 

@@ -10,6 +10,7 @@ from click.testing import CliRunner
 from scipy import ndimage
 from skimage.morphology import local_maxima
 
+from benchmarks.twins import make_twin
 from SlicerUSSim.Logic import (
     DisplaySettings,
     LinearProbe,
@@ -23,7 +24,7 @@ from SlicerUSSim.Logic import (
 )
 from SlicerUSSim.Logic.base.files import read_json, write_json
 from SlicerUSSim.Logic.fitting import TextureReference, neighbours_of, speckle_widths, texture_misfit
-from SlicerUSSim.Logic.fitting.controls import NEIGHBOURS, UNIFORM
+from SlicerUSSim.Logic.fitting.control_costs import NEIGHBOURS, UNIFORM
 from SlicerUSSim.Logic.fitting.speckle_width import log_speckle_correlation
 from SlicerUSSim.Logic.fitting.texture_costs import local_extrema
 from SlicerUSSim.Logic.probe import ImageGrid, probe_from_dict
@@ -31,7 +32,6 @@ from SlicerUSSim.Logic.tracked import TrackedImages
 from tests.conftest import SHARED, SPECKLE, block, needs_shared, rigid
 from tests.test_label_maps import head_tissues
 from validation.realism import BLURRED, LEVELLED, REAL, blurred, main, measure_realism
-from validation.twins import make_twin
 
 SPACING = 0.2, 0.2
 GRID = ImageGrid(300, 240, -24.0, 0.0, SPACING)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given, strategies as st
 
+from benchmarks.twins import make_twin
 from SlicerUSSim.Logic import (
     DisplaySettings,
     LinearProbe,
@@ -24,7 +25,6 @@ from SlicerUSSim.Logic.fitting.registration import Registration, register_poses,
 from SlicerUSSim.Logic.fitting.search import Evaluation
 from SlicerUSSim.Logic.probe.image_grid import ImageGrid
 from tests.conftest import FLUID, SPECKLE, block
-from validation.twins import make_twin
 
 PROBE = PhasedProbe(75.0, 60.0, scan_lines=96)
 

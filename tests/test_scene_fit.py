@@ -11,6 +11,7 @@ slicer = pytest.importorskip("slicer", reason="Slicer's MRML libraries: pip inst
 
 from vtkmodules.util.numpy_support import vtk_to_numpy  # noqa: E402
 
+from benchmarks.twins import make_twin  # noqa: E402
 from SlicerUSSim.Logic import PhasedProbe, Preset, SimulationError, TissueTable, Volume  # noqa: E402
 from SlicerUSSim.Logic.base.vtk_data import vtk_matrix  # noqa: E402
 from SlicerUSSim.Logic.fitting import tracked_fit  # noqa: E402
@@ -22,7 +23,6 @@ from SlicerUSSim.Logic.mrml.label_nodes import write_labels  # noqa: E402
 from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic  # noqa: E402
 from SlicerUSSim.Logic.mrml.nodes import ijk_to_ras, node_to_world, nodes_of_class, read_volume, write_volume  # noqa: E402
 from tests.remembered import segment_once  # noqa: E402
-from validation.twins import make_twin  # noqa: E402
 
 PROBE = PhasedProbe(70.0, 50.0, scan_lines=80)
 

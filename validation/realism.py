@@ -37,7 +37,7 @@ from SlicerUSSim.Logic.base.errors import SimulationError, require
 from SlicerUSSim.Logic.base.files import write_json, written_whole
 from SlicerUSSim.Logic.base.own_outputs import save_marked_png
 from SlicerUSSim.Logic.base.settings import DisplaySettings
-from SlicerUSSim.Logic.fitting.controls import (
+from SlicerUSSim.Logic.fitting.control_costs import (
     NEIGHBOURS,
     UNIFORM,
     Cost,

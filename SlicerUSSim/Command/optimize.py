@@ -71,7 +71,7 @@ def optimize(
     """Fit display and tissue parameters to tracked real ultrasound."""
     from SlicerUSSim.Logic.base.files import read_json, write_json
     from SlicerUSSim.Logic.base.own_outputs import write_own_json
-    from SlicerUSSim.Logic.fitting.controls import neighbours_of
+    from SlicerUSSim.Logic.fitting.control_costs import neighbours_of
     from SlicerUSSim.Logic.fitting.held_out import predict
     from SlicerUSSim.Logic.fitting.tracked_fit import fit
     from SlicerUSSim.Logic.imaging.figures import require_matplotlib
@@ -141,7 +141,7 @@ def _write_report(
     path: Path, found: Fit, tracked: TrackedExamination, patient: PatientOptions, recording: SequenceOptions
 ) -> None:
     """Write --report, with all inputs that are needed to repeat the fit."""
-    from SlicerUSSim.Logic.fitting.controls import control_costs, neighbours_of
+    from SlicerUSSim.Logic.fitting.control_costs import control_costs, neighbours_of
     from SlicerUSSim.Logic.fitting.report import write_report
 
     simulator = tracked.examination.simulator

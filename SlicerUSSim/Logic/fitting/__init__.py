@@ -9,7 +9,7 @@ from SlicerUSSim.Logic.base.lazy import lazy_exports
 
 if TYPE_CHECKING:
     from .appearance import AppearanceModel as AppearanceModel
-    from .controls import neighbours_of as neighbours_of
+    from .control_costs import neighbours_of as neighbours_of
     from .held_out import predict as predict
     from .image_similarity import (
         Similarity as Similarity,

@@ -10,7 +10,7 @@ import numpy as np
 
 from SlicerUSSim.Logic.base.errors import require
 from SlicerUSSim.Logic.base.settings import DisplaySettings
-from SlicerUSSim.Logic.fitting.controls import FITTED, NEIGHBOURS, UNIFORM, Cost, costs_against, uniform_tissues
+from SlicerUSSim.Logic.fitting.control_costs import FITTED, NEIGHBOURS, UNIFORM, Cost, costs_against, uniform_tissues
 from SlicerUSSim.Logic.fitting.image_similarity import SimilaritySettings
 from SlicerUSSim.Logic.fitting.parameters import DISPLAY_BOUNDS, GROUPS, TISSUES, Bounds
 from SlicerUSSim.Logic.fitting.prediction import Prediction
@@ -51,7 +51,7 @@ def predict(
     free, display, speckle, max_evaluations, restarts : as they were for the fit; the uniform tissue is fitted with the
         same, since a cost has several minima.
     neighbours, fitted_neighbours : per image of `others`, and of the fitted ones, real images near it
-        (controls.neighbours_of); without them there is no floor.
+        (control_costs.neighbours_of); without them there is no floor.
 
     Raises SimulationError for images that were fitted too, and if no tissue has scatterers.
     """

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from SlicerUSSim.Logic.fitting.controls import FITTED, UNIFORM, Cost, mean_cost
+from SlicerUSSim.Logic.fitting.control_costs import FITTED, UNIFORM, Cost, mean_cost
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,7 +15,7 @@ import numpy as np
 
 from SlicerUSSim.Logic.base.files import written_whole
 from SlicerUSSim.Logic.base.own_outputs import marked_html
-from SlicerUSSim.Logic.fitting.controls import FITTED, Cost, mean_cost
+from SlicerUSSim.Logic.fitting.control_costs import FITTED, Cost, mean_cost
 from SlicerUSSim.Logic.fitting.identifiability import Spread
 from SlicerUSSim.Logic.fitting.optimization import AGAIN, STAGES, AppearanceResult
 from SlicerUSSim.Logic.fitting.parameters import Parameter
