@@ -9,7 +9,6 @@ import sys
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
-from time import monotonic
 
 import hypothesis
 import numpy as np
@@ -70,24 +69,6 @@ def simulator(
     """A simulator for labels 1, 2, ... with `coupling` around them, without the probe's own ring-down."""
     table = TissueTable({0: coupling, **dict(enumerate(tissues, 1))}, membrane)
     return UltrasoundSimulator(labels, table, SimulationSettings(**{"ring_down": False, **settings}))
-
-
-def pytest_addoption(parser):
-    parser.addoption(
-        "--within",
-        type=float,
-        metavar="MINUTES",
-        help="leave out tests that would begin later than that (-ra lists them)",
-    )
-
-
-_BEGAN = monotonic()
-
-
-def pytest_runtest_setup(item):
-    minutes = item.config.getoption("--within")
-    if minutes is not None and monotonic() > _BEGAN + 60.0 * minutes:
-        pytest.skip(f"not begun within {minutes:g} minutes")
 
 
 @cache
