@@ -77,11 +77,6 @@ def coarse_chest() -> CtPhantom:
     return lower_chest((4.0, 4.0, 4.0))
 
 
-def few_slow_others_long(draws: int, few: int) -> list:
-    """Parameters 0 to `draws`: the first `few` in slow tests, the others in those that only a release waits for."""
-    return [pytest.param(n, marks=pytest.mark.slow if n < few else pytest.mark.long) for n in range(draws)]
-
-
 def example(name: str):
     """The module examples/`name`.py."""
     path = Path(__file__).parents[1] / "examples" / f"{name}.py"

@@ -36,7 +36,6 @@ from SlicerUSSim.Logic.probe import pose_looking_at
 from SlicerUSSim.Logic.probe.beam import FWHM_PER_SIGMA
 from SlicerUSSim.Logic.probe.image_grid import ImageGrid
 from SlicerUSSim.Logic.tissue.tissue import Tissue
-from tests.conftest import few_slow_others_long
 from tests.test_label_maps import head_tissues
 
 SMALL = PhasedProbe(70.0, 50.0, scan_lines=80)
@@ -111,7 +110,8 @@ def test_it_says_what_cannot_be_known(result):
     assert json.loads(json.dumps(result.to_dict()))["identifiability"]["cost_tolerance"] > 0
 
 
-@pytest.mark.parametrize("seed", few_slow_others_long(3, 0))
+@pytest.mark.long
+@pytest.mark.parametrize("seed", range(3))
 def test_restarts_reach_the_fit_and_its_interval_holds_the_truth(brain, seed):
     """Along the parameters restarts stopped in the valley of TGC and attenuation: 8 of 25 reached the fit's cost."""
     twin = make_twin(*brain, seed, probe=SMALL)
@@ -439,7 +439,8 @@ def real_brain(mni):
 PATIENTS = PhasedProbe(75.0, 60.0, scan_lines=128)
 
 
-@pytest.mark.parametrize("seed", few_slow_others_long(14, 0))
+@pytest.mark.long
+@pytest.mark.parametrize("seed", range(14))
 def test_fourteen_patients_with_a_known_display(real_brain, seed):
     twin = make_twin(*real_brain, seed, probe=PATIENTS, display_is_known=True)
     result = optimise(twin, ["white matter"], max_evaluations=150)
