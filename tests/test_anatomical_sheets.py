@@ -387,8 +387,7 @@ def wide_vertex(is_enhanced: bool) -> tuple[Head, np.ndarray]:
     return head, at[0, :, 0]
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("is_enhanced", [True, False])
+@pytest.mark.parametrize("is_enhanced", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_a_falx_in_wide_fluid_at_the_vertex_stays_off_the_gyri(is_enhanced):
     head, at = wide_vertex(is_enhanced)
     found = falx(head)

@@ -125,7 +125,7 @@ def test_a_brain_without_a_head_is_refused():
 
 @pytest.mark.slow
 def test_the_commands_label_what_is_outside_the_brain(tmp_path):
-    mri, brain, _ = round_head(COARSE_MM)
+    mri, brain, _ = round_head()
     mri.write(tmp_path / "head.nii.gz")
     mri.with_array(brain.astype(np.uint8)).write(tmp_path / "brain.nii.gz")
     image, mask, out = (str(tmp_path / name) for name in ("head.nii.gz", "brain.nii.gz", "labels.nii.gz"))

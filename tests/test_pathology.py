@@ -435,7 +435,7 @@ def test_segment_writes_added_tissues_and_says_what_it_added(files, tmp_path):
     assert "tumour: " in result.stderr and " ml, added over " in result.stderr and "over tumour 100 %" in result.stderr
     table, labels = TissueTable.read(tmp_path / "labels.json"), Volume.read(out)
     cyst = table.label_of("cyst")
-    assert table.names() == ["coupling", "csf", "grey matter", "white matter", "leptomeninges", "tumour", "cyst"]
+    assert table.names() == ["coupling", "csf", "grey matter", "white matter", "tumour", "cyst"]
     volume_ml = (labels.array == cyst).sum() * 0.064
     assert volume_ml == pytest.approx(4 / 3 * np.pi * 0.5**3, rel=0.2)
     edema = ussim("segment", files / "head.nii.gz", "-o", out, "--add", f"edema={files / 'cyst.nrrd'}")
