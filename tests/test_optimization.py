@@ -459,8 +459,9 @@ def net_fall(tissue: Tissue, display: DisplaySettings) -> float:
     return (loss_db - gained_db) / path - display.tgc_db_cm_mhz
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("seed", [0, *(pytest.param(n, marks=pytest.mark.long) for n in range(1, 14))])
+@pytest.mark.parametrize(
+    "seed", [pytest.param(n, marks=[pytest.mark.long if n else pytest.mark.slow]) for n in range(14)]
+)
 def test_fourteen_patients_with_everything_free(real_brain, seed):
     twin = make_twin(*real_brain, seed, probe=PATIENTS)
     result = optimise(twin, ["display", "white matter"], max_evaluations=600)  # the default number
