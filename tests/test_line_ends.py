@@ -21,7 +21,7 @@ PLAIN = {"beam": "ray", "side_lobes": False, "scatterers_per_mm3": 30.0, "wavefr
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["phased", "convex", "linear"])
+@pytest.mark.parametrize("name", ["phased", "convex", "linear", "neonatal", "cardiac", "linear_15", "matrix"])
 def test_the_last_samples_of_a_line_are_as_bright_as_those_before(name):
     """They were 2 to 3.6 dB darker: of half the pulse there were no echoes."""
     power = np.mean(

@@ -254,7 +254,7 @@ def nodes_of_scene(bundle: Path) -> list[str]:
 def test_a_saved_scene_holds_this_patient_only_and_a_patient_can_be_closed(page, files, tmp_path):
     """A scene held 21 files of three patients."""
     for name in ("second", "third"):
-        shutil.copy(files / "head.nii.gz", tmp_path / f"{name}.nii.gz")
+        shutil.copy(files / "labels.nii.gz", tmp_path / f"{name}.nii.gz")
         open_new_patient(page, tmp_path / f"{name}.nii.gz")
     held = nodes_of_scene(download(page, "mrb"))
     assert any("third.nii.gz" in name for name in held)
