@@ -151,6 +151,7 @@ def test_what_cannot_be_opened_changes_nothing(head):  # noqa: F811
     assert "has no opening, or the labels before it are gone" in bench.view.errors[-1]
 
 
+@pytest.mark.slow
 def test_the_probe_is_placed_at_the_chosen_view(head):  # noqa: F811
     bench = Bench(head)
     bench.presenter.setValue("scene.view", "temporal-left")
@@ -187,6 +188,7 @@ def test_the_labels_are_no_opening_and_edits_are_not_lost_unsaid(head):  # noqa:
     assert bench.labels is not first and "what was edited in LabelMapVolume" in bench.presenter.notes()
 
 
+@pytest.mark.slow
 def test_gel_is_between_skin_and_probe_unless_the_user_says_otherwise(head):  # noqa: F811
     bench = Bench(head)
     bench.move(pose_looking_at((0.0, 0.0, 88.0), (0.0, 0.0, 0.0)))  # 10 mm off the skin

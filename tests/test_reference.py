@@ -86,7 +86,6 @@ def test_parameters_become_a_definition_list():
         ("`Volume.read`", ":py:obj:`Volume.read <base.Volume.read>`"),
         ("Volume", "Volume"),  # an ordinary word, too
         ("a TissueTable.", "a :py:obj:`TissueTable <tissue.TissueTable>`."),
-        ("OpenSomething", "OpenSomething"),
         ("echo ~ |r|", r"echo ~ \|r\|"),
         ("see docs/physics.md#3-rays.", "see :doc:`docs/physics.md </docs/physics>`."),
     ],

@@ -115,21 +115,6 @@ def test_it_executes_when_something_changes_and_only_then():
     assert executes(algorithm) and image_of(algorithm).mean() > before.mean()  # the cyst is gone
 
 
-def test_every_pose_has_noise_of_its_own_and_has_it_again():
-    fluid = block(lambda x, y, z: np.full_like(x, 2), (12, 16, 8))
-    algorithm, matrix = simulation(fluid), vtkMatrix4x4()
-    algorithm.SetSettings(SimulationSettings(ring_down=False))  # which is the same everywhere
-    algorithm.SetDisplay(DisplaySettings(noise_db=-20.0, tgc_db_cm_mhz=0.0, image_size=(96, 64)))
-    algorithm.SetProbeTransform(matrix)
-    noise = []
-    for place in (-15.0, -14.0, -15.0):
-        matrix.SetElement(1, 3, place)
-        algorithm.Update()
-        noise.append(algorithm.GetFrame().envelope.ravel())
-    assert abs(np.corrcoef(noise[0], noise[1])[0, 1]) < 0.03 and noise[0].std() > 0
-    np.testing.assert_array_equal(noise[0], noise[2])
-
-
 def test_a_transform_deep_in_a_chain_moves_the_image():
     algorithm = simulation()
     matrix, inner, outer = vtkMatrix4x4(), vtkTransform(), vtkTransform()
