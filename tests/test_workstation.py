@@ -545,7 +545,7 @@ def test_a_changed_tissue_changes_the_image_and_nonsense_is_refused(page):
 
 
 def test_gain_probe_and_depth_change_the_image(page):
-    before = pixels(page)
+    before, depth = pixels(page), shown(page, "depthSlider")
     slider = page.locator("#slider-gainSlider").locator("xpath=ancestor::*[contains(@class,'v-slider')]").first
     slider.scroll_into_view_if_needed()
     box = slider.bounding_box()
@@ -568,7 +568,7 @@ def test_gain_probe_and_depth_change_the_image(page):
         page.evaluate("window.trame.trigger('set', ['depthSlider', 50])")
     assert page.evaluate("window.ussim.image.ruler.h") == pytest.approx(50, rel=0.02)
     with new_image(page):
-        page.evaluate("window.trame.trigger('set', ['depthSlider', 70])")
+        page.evaluate("depth => window.trame.trigger('set', ['depthSlider', depth])", depth)
         page.evaluate("window.trame.trigger('set', ['gainSlider', 0])")
     assert np.array_equal(pixels(page), before)
 
@@ -635,7 +635,7 @@ def test_a_fit_outlives_its_page_and_is_applied_and_reverted(page, browser, url)
     settled(page)
     before = cost(page)
     other = opened(browser, url)
-    fit(other, 15)
+    fit(other, 8)
     eventually(other, lambda: len(state(other, NAMES.fit.curve)) > 1)
     other.close()
     open_section(page, "Fit to real ultrasound")
@@ -643,7 +643,7 @@ def test_a_fit_outlives_its_page_and_is_applied_and_reverted(page, browser, url)
     eventually(page, lambda: shown(page, "fitLabel").startswith("cost"))
     settled(page)
     curve = state(page, NAMES.fit.curve)
-    assert len(curve) > 4 and min(curve) < curve[0] and curve == sorted(curve, reverse=True)
+    assert len(curve) > 2 and min(curve) < curve[0] and curve == sorted(curve, reverse=True)
     # The last value may come after the label
     said = re.compile(r"→ ([0-9.]+) after")
     eventually(
@@ -707,20 +707,6 @@ def round_head(folder: Path) -> Volume:
     labels.write(folder / "labels.nii.gz")
     TissueTable.brain(("grey matter", "skull", "skin")).write(folder / "labels.json")
     return labels
-
-
-@pytest.mark.slow
-def test_a_craniotomy_off_the_head_is_one_line_and_the_page_goes_on(browser, files, tmp_path):
-    round_head(tmp_path)
-    arguments = ["--labels", str(tmp_path / "labels.nii.gz"), "--craniotomy", str(files / "far.nii.gz")]
-    with serving(*arguments) as address:
-        page = opened(browser, address)
-        eventually(page, lambda: bool(errors(page)))
-        (line,) = errors(page)
-        assert "is empty, or lies outside of the patient" in line and "\n" not in line
-        settled(page)
-        assert page.locator("#closeCraniotomyButton").is_disabled()  # nothing was opened
-        page.close()
 
 
 @pytest.mark.slow
@@ -946,7 +932,7 @@ def test_a_mask_is_laid_over_the_tissues_as_what_the_user_says(page, files, tmp_
 
 
 @pytest.mark.slow
-def test_an_opened_patient_takes_the_place_of_title_notes_and_warnings(page, files, tmp_path):
+def test_an_opened_patient_takes_the_place_of_title_notes_and_warnings(page, tmp_path):
     aseg = head()
     aseg.write(tmp_path / "aseg.nii.gz")
     Volume(aseg.array[:, :35].copy(), aseg.ijk_to_ras).write(tmp_path / "crop.nii.gz")
@@ -969,8 +955,6 @@ def test_an_opened_patient_takes_the_place_of_title_notes_and_warnings(page, fil
     notes = opened_as(tmp_path / "aseg.nii.gz")
     assert "aseg.nii.gz: FreeSurfer aseg: 8 labels to 3 tissues" in notes
     assert not errors(page) and "crop" not in notes and shown(page, "mriSelector") is None
-    notes = opened_as(files / "head.nii.gz")
-    assert "share" in notes and "aseg" not in notes and not errors(page)
 
 
 # ---- who may come in, and how it is started --------------------------------------------------------------------------

@@ -174,7 +174,7 @@ def test_a_label_map_is_of_this_patient_or_of_a_new_one(page, files, tmp_path):
 
 @pytest.mark.slow
 def test_a_ct_is_recognised_and_segmented_as_one(page, tmp_path):
-    lumbar_spine((2.0, 2.0, 2.0)).ct.write(tmp_path / "spine.nrrd")
+    lumbar_spine((3.0, 3.0, 3.0)).ct.write(tmp_path / "spine.nrrd")
     with new_image(page):
         said = answered(page, tmp_path / "spine.nrrd", "New patient")
     assert "spine.nrrd: a CT by its numbers" in said and "segmented as ct (before: t1)" in said and not errors(page)

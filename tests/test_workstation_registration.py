@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import shutil
 
 import numpy as np
 import pytest
@@ -22,7 +21,6 @@ from tests.test_workstation import (
     click,
     cost,
     dismiss_messages,
-    download,
     drawn,
     errors,
     eventually,
@@ -227,15 +225,6 @@ def test_a_landmark_is_picked_in_the_real_image_and_in_a_slice(page, recording):
     shown_pose(page, 2)
     assert mark.count() == 0
     shown_pose(page, 1)
-    # A scene keeps it
-    shutil.copy(download(page, "mrb"), recording["folder"] / "marked.mrb")
-    page.set_input_files("#open-file", recording["folder"] / "marked.mrb")
-    answer_new_patient(page, "The patient of the scene")
-    eventually(page, lambda: state(page, NAMES.registration.recording) != "")
-    settled(page)
-    (again,) = state(page, NAMES.registration.landmarks)
-    assert (again["ultrasound"], again["patient"]) == (line["ultrasound"], line["patient"])
-    assert not any("landmarks" in item["title"] for item in state(page, NAMES.panel.nodes)["seedSelector"])
     click(page, "#pick-landmark")
     eventually(page, lambda: state(page, NAMES.registration.picking) == "ultrasound")
     page.mouse.move(600, 500)
