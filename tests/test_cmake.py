@@ -77,6 +77,7 @@ def files(folder: Path, pattern: str = "*") -> set[str]:
 # ---- build and install -----------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @needs_cmake
 def test_the_module_its_resources_and_one_folder_are_installed(build, installed):
     package = ROOT / "SlicerUSSim"
@@ -95,6 +96,7 @@ def test_the_module_its_resources_and_one_folder_are_installed(build, installed)
     assert all((installed / name).read_text() == "another extension's\n" for name in others)
 
 
+@pytest.mark.slow
 @needs_cmake
 def test_slicer_is_asked_for_the_module_and_its_test(record):
     assert record["NAME"] == ["USSim", "SlicerUSSim"] and record["TEST"] == ["USSim.py"]
@@ -164,6 +166,7 @@ def test_the_pictures_lie_where_their_addresses_say(variable):
         assert (ROOT / url.removeprefix(base)).read_bytes().startswith(b"\x89PNG"), url
 
 
+@pytest.mark.slow
 @needs_cmake
 def test_the_build_and_the_entry_say_the_same(record):
     for name in ("HOMEPAGE", "CATEGORY", "CONTRIBUTORS", "DESCRIPTION", "DEPENDS"):

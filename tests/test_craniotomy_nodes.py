@@ -235,6 +235,7 @@ def test_a_disc_opens_over_the_lesion_that_was_laid_over_the_labels(head, to_wor
         np.testing.assert_allclose(pose, same, atol=1e-3)
 
 
+@pytest.mark.slow
 def test_the_notes_say_that_no_part_of_the_face_touches_the_patient(head):  # noqa: F811
     nothing = "0% of the probe's face touches the patient (contact gap: 3 mm): the image is black"
     bench = Bench(head)

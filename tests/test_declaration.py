@@ -11,7 +11,7 @@ from dataclasses import MISSING, dataclass, fields, make_dataclass
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from hypothesis import given, strategies as st
+from hypothesis import given, settings as examples, strategies as st
 
 from SlicerUSSim.Command.cli import main
 from SlicerUSSim.Logic import DisplaySettings, Preset, SimulationError, SimulationSettings, Tissue
@@ -328,6 +328,7 @@ def _places(value, place=()) -> list[tuple]:
                       for way in _places(value[name], (*place, name))]  # fmt: skip
 
 
+@examples(max_examples=25)
 @given(place=st.sampled_from(_places(GOOD)), name=st.none() | st.text(max_size=8), value=JSON_VALUES)
 def test_any_value_anywhere_in_a_preset_is_taken_or_refused(tmp_path_factory, place, name, value):
     """Instead of what was there, or beside it under another name."""

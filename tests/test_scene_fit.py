@@ -24,12 +24,12 @@ from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic  # noqa: E402
 from SlicerUSSim.Logic.mrml.nodes import ijk_to_ras, node_to_world, nodes_of_class, read_volume, write_volume  # noqa: E402
 from tests.remembered import segment_once  # noqa: E402
 
-PROBE = PhasedProbe(70.0, 50.0, scan_lines=80)
+PROBE = PhasedProbe(70.0, 50.0, scan_lines=48)
 
 
 @pytest.fixture(scope="module")
 def brain():
-    segmentation = segment_once(head_mri(3.0))
+    segmentation = segment_once(head_mri(4.0))
     return segmentation, make_twin(
         segmentation.labels, TissueTable.brain(segmentation.tissue_names), 3, probe=PROBE, frames=3
     )
@@ -79,7 +79,7 @@ class Scene:
         self.calibration.SetAndObserveTransformNodeID(probe.GetID())
 
     def optimize(self, images=None, **options):
-        options = {"max_evaluations": 60, "restarts": 0, "free": ["display"], **options}
+        options = {"max_evaluations": 30, "restarts": 0, "free": ["display"], **options}
         return self.logic.optimize(self.labels, images or self.images, **options)
 
     def volume(self, name: str):
@@ -238,7 +238,7 @@ def test_geometry_can_be_estimated(scene):
             scene.optimize()
         found = scene.optimize(estimate_geometry=True, max_evaluations=20)
         assert found.tracked.probe.depth_mm == pytest.approx(50.0, abs=1.0)
-        assert found.tracked.probe.frequency_mhz == 4.0 and found.tracked.probe.scan_lines == 80
+        assert found.tracked.probe.frequency_mhz == 4.0 and found.tracked.probe.scan_lines == 48
     finally:
         scene.logic.preset = scene_preset
 

@@ -646,17 +646,13 @@ def test_the_panel_fits_compares_applies_and_reverts(session):
     assert not session.app.errors
 
 
-def test_cancel_stops_a_fit_and_changes_nothing(session):
+def test_a_cancelled_fit_changes_nothing_and_errors_are_one_line(session):
     with_real_image(session)
     before = session.logic.preset
     stand_in.QtCore.QTimer.singleShot(0, session.ui.cancelButton.click)
     session.ui.fitButton.click()
     assert session.logic.preset == before and not session.app.errors
     assert session.ui.fitLabel.text() == "" and session.ui.fitButton.isEnabled()
-
-
-def test_errors_of_a_fit_are_one_line(session):
-    with_real_image(session)
     session.panel.presenter.fits.setFree("gain_db", False)
     session.ui.fitButton.click()
     assert session.app.errors == ["nothing is free, tick at least one parameter"]
