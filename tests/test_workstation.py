@@ -504,7 +504,7 @@ def test_keys_and_sliders_move_the_probe(page):
 # ---- tissues, settings -----------------------------------------------------------------------------------------------
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_segment_labels_the_mri_anew_and_says_what_it_cannot(page):
     before = pixels(page)
     for on in (False, True):
@@ -634,6 +634,7 @@ def test_a_fit_outlives_its_page_and_is_applied_and_reverted(page, browser, url)
     page.evaluate("window.trame.trigger('show_number', [2])")
     settled(page)
     before = cost(page)
+    page.evaluate("window.trame.trigger('set', ['fitFramesLineEdit', '2'])")
     other = opened(browser, url)
     fit(other, 8)
     eventually(other, lambda: len(state(other, NAMES.fit.curve)) > 1)
@@ -659,6 +660,7 @@ def test_a_fit_outlives_its_page_and_is_applied_and_reverted(page, browser, url)
     with new_image(page):
         click(page, "#revertFitButton")
     assert cost(page) == pytest.approx(before, abs=0.02)
+    page.evaluate("window.trame.trigger('set', ['fitFramesLineEdit', ''])")
 
 
 @pytest.mark.slow
@@ -709,7 +711,7 @@ def round_head(folder: Path) -> Volume:
     return labels
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_craniotomy_is_opened_and_closed_in_the_page(browser, tmp_path):
     closed, misfit = "the skull is closed in front of the probe", "mm wide and does not fit the opening"
     round_head(tmp_path)
@@ -902,7 +904,7 @@ def test_a_file_that_cannot_be_read_is_said_and_changes_nothing(page):
     eventually(page, lambda: not errors(page))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_mask_is_laid_over_the_tissues_as_what_the_user_says(page, files, tmp_path):
     shutil.copy(files / "head.nii.gz", tmp_path)  # for the script, if the page has opened it
     mri = head_mri(2.0)
@@ -931,7 +933,7 @@ def test_a_mask_is_laid_over_the_tissues_as_what_the_user_says(page, files, tmp_
     assert np.array_equal(run_again(script_of(page), tmp_path), expected)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_an_opened_patient_takes_the_place_of_title_notes_and_warnings(page, tmp_path):
     aseg = head()
     aseg.write(tmp_path / "aseg.nii.gz")

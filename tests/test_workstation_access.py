@@ -125,7 +125,7 @@ def test_requests_that_no_browser_sends_leave_no_traceback(server):
 
 
 @needs_openssl
-@pytest.mark.slow
+@pytest.mark.long
 def test_with_a_certificate_page_and_images_come_over_tls(browser, files, certificate):
     cert, key = certificate
     server = Server("--labels", files / "labels.nii.gz", "--cert", cert, "--key", key)

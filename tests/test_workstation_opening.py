@@ -113,7 +113,7 @@ def ball(mri: Volume, radius_mm: float = 12.0) -> Volume:
     return mri.with_array(inside.astype(np.uint8))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_points_of_slicer_are_an_opening_or_the_point_of_a_lesion(page, tmp_path):
     points = [{"position": [x, y, 60.0]} for x, y in ((-10, -10), (10, -10), (10, 10))]
     for kind, name, selector, deed in (
@@ -152,7 +152,7 @@ def test_a_mask_is_a_tumour_or_a_brain_mask_as_the_user_says(page, files, tmp_pa
     assert shown(page, "lesionsSelector") is not None  # which stays
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_label_map_is_of_this_patient_or_of_a_new_one(page, files, tmp_path):
     shutil.copy(files / "labels.nii.gz", tmp_path / "own.nii.gz")
     ball(Volume.read(files / "head.nii.gz")).write(tmp_path / "mask.nii.gz")
@@ -172,7 +172,7 @@ def test_a_label_map_is_of_this_patient_or_of_a_new_one(page, files, tmp_path):
     assert shown(page, "lesionsSelector") is None
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_ct_is_recognised_and_segmented_as_one(page, tmp_path):
     lumbar_spine((3.0, 3.0, 3.0)).ct.write(tmp_path / "spine.nrrd")
     with new_image(page):
@@ -182,7 +182,7 @@ def test_a_ct_is_recognised_and_segmented_as_one(page, tmp_path):
     assert "bone" in {row["name"] for row in state(page, NAMES.panel.tissues)}
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_ultrasound_that_is_opened_before_any_patient_stays_for_him(page, files, tmp_path):
     sweep = TrackedSequence.read(files / "sweep.igs.mha")
     bare = tuple({"ProbeToReference": entry["ProbeToReference"]} for entry in sweep.transforms)
@@ -201,7 +201,7 @@ def test_ultrasound_that_is_opened_before_any_patient_stays_for_him(page, files,
     assert 0 < cost(page) < 1 and not errors(page)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_several_files_at_once_are_opened_in_their_order(page, files, tmp_path):
     preset = Preset()
     preset.write(tmp_path / "a.json")
@@ -236,7 +236,7 @@ def dicom(files, tmp_path_factory) -> Path:
     return folder
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_series_of_a_dicom_folder_is_asked_by_its_description(page, dicom):
     page.set_input_files("#open-folder", dicom)
     text = question(page)
@@ -269,7 +269,7 @@ DROP = """async ([files, from]) => {
 }"""
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_files_are_dropped_anywhere_on_the_page(page, files, dicom):
     paths = sorted((dicom / "IMAGES" / "A").iterdir())
     sent = [(path.name, base64.b64encode(path.read_bytes()).decode()) for path in paths]

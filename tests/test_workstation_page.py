@@ -61,7 +61,7 @@ def page(first_page):
 # ---- keys ------------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_keys_change_the_slider_that_has_them_and_else_move_the_probe(page):
     before, gain = pose(page), shown(page, "gainSlider")
     page.locator("#gainSlider, [aria-label='Gain']").first.focus()
@@ -106,7 +106,7 @@ def typed(page, field: str, text: str) -> None:
     settled(page)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_pose_is_typed_as_position_and_angles_or_as_a_matrix(page):
     open_section(page, "Probe")
     shown = [float(number) for number in page.locator("#pose-numbers").input_value().split()]
@@ -130,7 +130,7 @@ def test_a_pose_is_typed_as_position_and_angles_or_as_a_matrix(page):
     np.testing.assert_array_equal(where(page), before)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_pose_is_saved_and_opened_again(page, tmp_path):
     open_section(page, "Probe")
     with new_image(page):
@@ -155,7 +155,7 @@ def test_a_pose_is_saved_and_opened_again(page, tmp_path):
 # ---- names and contrast ----------------------------------------------------------------------------------------------
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_axe_finds_nothing_wrong(page):
     for title in ("Probe", "Tissues", "Rays", "Tracked ultrasound", "Fit to real ultrasound"):
         open_section(page, title)
@@ -173,7 +173,7 @@ def test_axe_finds_nothing_wrong(page):
     assert not wrong, "\n".join(map(str, wrong[:30]))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_question_is_asked_of_everyone(page, files):
     """Of screen readers and keyboards, too, within two sizes of the window."""
     sent = files / "head.nii.gz"
@@ -205,7 +205,7 @@ def test_a_question_is_asked_of_everyone(page, files):
 # ---- room ------------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("size", SIZES, ids=lambda size: f"{size[0]}x{size[1]}")
 def test_nothing_is_cut_off(page, size):
     width, height = size

@@ -103,7 +103,7 @@ def shown_pose(page, number: int) -> np.ndarray:
     return np.array(page.evaluate("window.ussim.image.pose"))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_ultrasound_without_a_calibration_asks_for_it(page, recording):
     said = state(page, NAMES.opened)[0]
     assert said.endswith(
@@ -125,7 +125,7 @@ def test_ultrasound_without_a_calibration_asks_for_it(page, recording):
     assert 0 < cost(page) < 0.5 and not errors(page)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_values_are_typed_and_wrong_ones_are_said_and_change_nothing(page, recording):
     fill(page, "calibration", "1 0 0")
     assert errors(page)[-1] == "Calibration has 3 numbers, expected 16 numbers, the 4x4 matrix by rows"
@@ -158,7 +158,7 @@ def add(page, recording, number: int, pixel: tuple[float, float], off_mm=(0.0, 0
     settled(page)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_landmarks_register_and_what_remains_is_told(page, recording):
     page.set_input_files("#calibration-file", recording["folder"] / "plus.xml")
     settled(page)
@@ -194,7 +194,7 @@ def test_landmarks_register_and_what_remains_is_told(page, recording):
     assert 0 < cost(page) < 0.5
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_landmark_is_picked_in_the_real_image_and_in_a_slice(page, recording):
     page.set_input_files("#calibration-file", recording["folder"] / "plus.xml")
     settled(page)
@@ -233,7 +233,7 @@ def test_a_landmark_is_picked_in_the_real_image_and_in_a_slice(page, recording):
     assert len(state(page, NAMES.registration.landmarks)) == 1 and not errors(page)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_transform_is_a_pose_or_of_the_ultrasound_that_comes_next(browser, recording, files, tmp_path):
     with serving("--labels", str(files / "labels.nii.gz")) as address:
         page = opened(browser, address)

@@ -191,7 +191,7 @@ def test_the_workstation_opens_the_scene_of_the_slicer_module(page, module_scene
     assert (np.asarray(Image.open(download(page, "png"))) != image).mean() < 0.001  # poses are saved as text
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_frozen_image_comes_back_with_its_scene(page, files, tmp_path):
     """A live image where the probe is was shown in its place, and said to be "as it was"; also with the probe there."""
     open_new_patient(page, files / "labels.nii.gz")
@@ -319,7 +319,7 @@ def test_real_images_that_cannot_be_used_close_no_patient(page, files, tmp_path)
     assert state(page, NAMES.title) == "labels.nii.gz" and np.array_equal(pixels(page), before)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_scene_that_this_module_was_not_used_in_is_opened_as_its_mri(page, tmp_path):
     app = app_of_slicer()
     write_volume(app.scene.AddNewNodeByClass("vtkMRMLScalarVolumeNode", "T1 of a study"), head_mri(3.0))
@@ -330,7 +330,7 @@ def test_a_scene_that_this_module_was_not_used_in_is_opened_as_its_mri(page, tmp
     assert not errors(page) and "other.mrb: a scene" in notes and "white matter" in notes
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_workstation_starts_with_a_scene(browser, module_scene):
     path, image, pose = module_scene
     with serving(str(path)) as address:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import socket
 import stat
 import zipfile
@@ -108,7 +109,7 @@ def crashed_and_restored(server: Server, page) -> None:
     restore(page)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_after_kill_9_the_page_reconnects_by_itself_and_restores_all(server, browser, files, tmp_path):
     own = server(str(files / "head.nii.gz"), "--sequence", str(files / "sweep.igs.mha"))
     problems: list[str] = []
@@ -232,6 +233,7 @@ def test_a_frozen_image_comes_back_frozen_where_it_was_taken(server, browser, fi
 
 @pytest.mark.slow
 def test_the_folder_is_for_the_user_alone_and_holds_this_patient_only(server, browser, files, tmp_path):
+    shutil.copy(files / "labels.nii.gz", tmp_path / "other.nii.gz")
     own = server("--labels", str(files / "labels.nii.gz"))
     page = opened(browser, own.url)
     settled(page)
@@ -243,17 +245,17 @@ def test_the_folder_is_for_the_user_alone_and_holds_this_patient_only(server, br
     assert parts == {"lock", "address.json", "state.json", "anatomy", "cine"}
     assert all(stat.S_IMODE(path.stat().st_mode) == 0o600 for path in session.iterdir())
     first = [path.name for path in session.glob("anatomy-*")]
-    open_new_patient(page, files / "head.nii.gz")
+    open_new_patient(page, tmp_path / "other.nii.gz")
     kept(page)
-    assert json.loads((session / "state.json").read_text())["patient"] == "head.nii.gz"
+    assert json.loads((session / "state.json").read_text())["patient"] == "other.nii.gz"
     assert len(list(session.glob("anatomy-*"))) == 1 and not (session / first[0]).exists()
     # A patient that is closed is not on the disk either, and neither is one who is not to be kept
     click(page, "#close-patient")
     settled(page)
     page.evaluate("window.trame.trigger('session_kept')")
     assert {path.name for path in session.iterdir()} == {"lock", "address.json"}
-    page.set_input_files("#open-file", files / "head.nii.gz")
-    page.wait_for_function("window.ussim.image?.patient === 'head.nii.gz'")
+    page.set_input_files("#open-file", tmp_path / "other.nii.gz")
+    page.wait_for_function("window.ussim.image?.patient === 'other.nii.gz'")
     settled(page)
     kept(page)
     page.locator("#keeps-session").uncheck()
@@ -287,7 +289,7 @@ def test_a_session_is_never_put_onto_another_patient(server, browser, files, tmp
     page.close()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_what_is_discarded_or_damaged_changes_nothing(server, browser, files):
     own = server("--labels", str(files / "labels.nii.gz"))
     page = opened(browser, own.url)
@@ -312,7 +314,7 @@ def test_what_is_discarded_or_damaged_changes_nothing(server, browser, files):
     page.close()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_new_server_with_another_token_is_said_and_not_trusted(server, browser, files):
     """After an end as it should be the token is a new one; the cookie is sent to no server that cannot prove itself."""
     own = server("--labels", str(files / "labels.nii.gz"))
@@ -331,7 +333,7 @@ def test_a_new_server_with_another_token_is_said_and_not_trusted(server, browser
     page.close()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_without_autosave_nothing_is_on_the_disk(server, browser, files, tmp_path):
     own = server("--labels", str(files / "labels.nii.gz"), "--no-autosave")
     page = opened(browser, own.url)
@@ -350,7 +352,7 @@ def bundled(page, folder: Path) -> np.ndarray:
     return read_array(folder / "image.nrrd")[0][0]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_scripts_of_uploads_run_also_of_files_with_one_name(server, browser, files, tmp_path):
     """They read files that nobody had any more."""
     own = server("--labels", str(files / "labels.nii.gz"))
@@ -383,7 +385,7 @@ def test_scripts_of_uploads_run_also_of_files_with_one_name(server, browser, fil
     page.close()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_dicom_series_and_calibrated_ultrasound_survive_a_crash(server, browser, files, dicom, recording, tmp_path):
     own = server("--labels", str(files / "labels.nii.gz"))
     page = opened(browser, own.url)

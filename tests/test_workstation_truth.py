@@ -268,7 +268,7 @@ def test_a_saved_scene_holds_this_patient_only_and_a_patient_can_be_closed(page,
     assert not errors(page)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_an_upload_shows_how_far_it_is_can_be_cancelled_and_images_go_on(page, files):
     """Of 216 MB nothing was shown for 49 s, and no image came meanwhile."""
     session = page.context.new_cdp_session(page)
@@ -296,7 +296,7 @@ def test_an_upload_shows_how_far_it_is_can_be_cancelled_and_images_go_on(page, f
 # ---- images of a sequence --------------------------------------------------------------------------------------------
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_simulated_sequences_are_shown_and_played_where_they_were_taken(head_page, files, tmp_path):
     """The page made images that it could not show."""
     page = head_page
