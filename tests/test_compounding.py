@@ -173,7 +173,7 @@ def test_a_simulated_volume_shows_a_cyst_where_it_is():
     quiet = simulator(labels, SPECKLE, coupling=SPECKLE.__class__("fluid", 1541.0, 1.607, 0.0))
     probe = LinearProbe(36, 45, scan_lines=96, focus_mm=25, elevation_focus_mm=25)
     pose = rigid(rotation, rotation.T @ centre + [0, -25, 0])
-    for poses in (slide_sweep(pose, 20, 14), tilt_sweep(pose, 45, 16)):
+    for poses in (slide_sweep(pose, 20, 26), tilt_sweep(pose, 45, 31)):
         done = []
         volume = quiet.volume(probe, poses, spacing_mm=0.8, progress=done.append)
         assert done == list(range(1, len(poses) + 1))
