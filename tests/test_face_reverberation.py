@@ -43,7 +43,7 @@ def test_a_plane_has_its_image_at_twice_the_depth(name, reflection):
     assert image - level == pytest.approx(20.0 * np.log10(REFLECTION * reflection), abs=1.5)
 
 
-def test_without_a_face_and_where_nothing_comes_back_to_it_there_is_no_image():
+def test_without_a_face_or_an_echo_to_it_there_is_no_image():
     probe, simulator = PROBES["linear"], plate()
     level = peak(simulator, probe, DEPTH_MM)[1]
     assert peak(simulator, replace(probe, face_reflection=0.0), 2.0 * DEPTH_MM)[1] < level - 100.0

@@ -27,7 +27,7 @@ def test_images_are_those_that_were_accepted():
     assert not changed, "\n".join([*changed, "look at them: python -m tests.golden_images --show DIR"])
 
 
-def test_every_accepted_image_exists_once_and_those_of_the_package_are_small():
+def test_accepted_images_exist_once_and_those_of_the_package_are_small():
     assert {path.stem for path in FOLDER.glob("*.png")} == set(PROBES) - set(FAMILIES)
     assert {path.stem for path in GOLDEN.iterdir()} == set(FAMILIES)
     assert sum(path.stat().st_size for path in GOLDEN.iterdir()) < 100_000

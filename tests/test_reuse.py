@@ -16,7 +16,7 @@ TABLE = TissueTable({0: FLUID, 1: SPECKLE})
 SETTINGS = SimulationSettings()
 
 
-def test_what_needs_no_other_voxels_keeps_the_simulator_and_is_what_it_has_then():
+def test_what_needs_no_other_voxels_keeps_the_simulator():
     reused = ReusedSimulator()
     first = reused.get(1, LABELS, TABLE, SETTINGS)
     assert reused.get(1, LABELS, TABLE, SETTINGS) is first

@@ -122,7 +122,7 @@ def test_the_imaged_field_is_where_its_outline_says(angles):
     assert wrong.mean() < 0.01
 
 
-def test_zones_are_spread_over_twice_the_focal_depth_and_the_narrowest_counts():
+def test_zones_lie_within_twice_the_focal_depth_and_the_narrowest_counts():
     probe = LinearProbe(38, 60, focus_mm=30.0, transmit="zones", focal_zones=3, receive_f_number=2.0)
     assert [focus for _, focus, _ in probe.transmit_zones()] == [10.0, 30.0, 50.0]
     at_foci = probe.lateral_sigmas_mm(np.array([10.0, 30.0, 50.0]))[0] * 2.3548
@@ -239,7 +239,7 @@ def test_a_parameter_of_another_kind_of_probe_is_named():
         replace(PROBES["phased"], width_mm=5.0)  # type: ignore[call-arg]
 
 
-def test_the_harmonic_has_twice_the_frequency_a_longer_pulse_and_weaker_side_lobes():
+def test_the_harmonic_has_twice_the_frequency_and_weaker_side_lobes():
     pulse = replace(PROBES["abdominal"], frequency_mhz=2.0, clutter_db=None)
     second = replace(pulse, harmonic=True)
     assert second.cycles_per_mm == 2.0 * pulse.cycles_per_mm
@@ -254,7 +254,7 @@ SOLID = block(lambda x, y, z: np.ones_like(x), half_mm=(15, 25, 6))
 
 
 @pytest.mark.parametrize("lines", [41, 201])
-def test_a_curved_phase_shortens_the_correlation_of_speckle_and_keeps_its_level(lines):
+def test_a_curved_phase_shortens_the_correlation_of_speckle_at_its_level(lines):
     probe = LinearProbe(20.0, 40.0, scan_lines=lines, focus_mm=30.0, elevation_focus_mm=25.0)
     pose, lag, found = rigid(np.eye(3), [0, -20, 0]), lines // 40, {}
     for curved in (False, True):
@@ -271,7 +271,7 @@ def test_a_curved_phase_shortens_the_correlation_of_speckle_and_keeps_its_level(
 
 
 @pytest.mark.parametrize("depth", [12.0, 38.0])
-def test_speckle_changes_across_the_image_plane_as_that_of_waves_away_from_the_focus_of_the_lens(depth):
+def test_speckle_changes_across_the_image_plane_as_that_of_waves(depth):
     """The half length of waves; the beam without its curved phase has a correlation of 0.9 and 0.8 there."""
     probe = LinearProbe(20.0, 44.0, scan_lines=81, focus_mm=25.0, elevation_focus_mm=25.0)
     lens = probe.elevation_aperture_mm, probe.elevation_focus_mm
