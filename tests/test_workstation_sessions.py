@@ -200,7 +200,7 @@ def test_after_kill_9_the_page_reconnects_by_itself_and_restores_all(server, bro
     page.close()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_frozen_image_comes_back_frozen_where_it_was_taken(server, browser, files, tmp_path):
     """A live image at the probe's pose was shown in its place, and then it had no script."""
     own = server("--labels", str(files / "labels.nii.gz"))
