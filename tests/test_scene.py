@@ -881,7 +881,7 @@ def test_slicers_own_slice_view_shows_the_image_upright_and_not_mirrored(bench):
     assert top.mean() > 0 and to_pixel[1, 1] < 0 < to_pixel[0, 0]  # depth runs down, left is left
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_example_builds_a_scene_and_saves_it_so_that_it_opens(mni, tmp_path, capsys):
     slicer_scene = example("slicer_scene")
     slicer_scene.main(tmp_path / "brain.mrb")

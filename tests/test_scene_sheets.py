@@ -10,6 +10,7 @@ slicer = pytest.importorskip("slicer", reason="MRML nodes come with slicer-core:
 from SlicerUSSim.Logic import TissueTable, UltrasoundSimulator, Volume  # noqa: E402
 from SlicerUSSim.Logic.base.vtk_data import vtk_matrix  # noqa: E402
 from SlicerUSSim.Logic.imaging.noise import seed_of_pose  # noqa: E402
+from SlicerUSSim.Logic.mri.samples import head_mri  # noqa: E402
 from SlicerUSSim.Logic.mri.sheets import KINDS, Surfels, find_sheets  # noqa: E402
 from SlicerUSSim.Logic.mrml.label_nodes import read_labels, write_labels  # noqa: E402
 from SlicerUSSim.Logic.mrml.nodes import node_to_world, write_volume  # noqa: E402
@@ -17,7 +18,7 @@ from SlicerUSSim.Logic.mrml.sheet_nodes import read_sheets, sheets_version, writ
 from tests.conftest import coarse_chest  # noqa: E402
 from tests.remembered import segment_once  # noqa: E402
 from tests.test_craniotomy_nodes import TURN  # noqa: E402
-from tests.test_lesion_nodes import HEAD, Scene  # noqa: E402
+from tests.test_lesion_nodes import Scene  # noqa: E402
 from tests.test_lesion_proposals import CENTRE, brain, needs_atlas  # noqa: E402
 
 pytestmark = pytest.mark.usefixtures("segmented_once")
@@ -76,6 +77,8 @@ def test_segment_finds_sheets_and_images_show_them(monkeypatch):
 
     monkeypatch.setattr("SlicerUSSim.Logic.mrml.logic.find_sheets", find)
     bench, presenter = bench_with_probe()
+    mri = head_mri(5.0)
+    write_volume(bench.mri, mri)
     parent = bench.add("LinearTransform", "to world")
     parent.SetMatrixTransformToParent(vtk_matrix(TURN))
     bench.mri.SetAndObserveTransformNodeID(parent.GetID())
@@ -93,7 +96,7 @@ def test_segment_finds_sheets_and_images_show_them(monkeypatch):
     presenter.simulate()
     shown = bench.logic.lastFrame.image
 
-    result = segment_once(HEAD, classes=None, thin_sulci=False)
+    result = segment_once(mri, classes=None, thin_sulci=False)
     preset, pose = bench.logic.preset, np.linalg.inv(TURN) @ node_to_world(parameters.probe_transform)
     simulator = UltrasoundSimulator(
         result.labels, TissueTable.brain(result.tissue_names), preset.settings, texture=result.texture(),
@@ -228,17 +231,3 @@ def test_a_point_in_a_view_proposes_a_lesion_that_is_laid_on_when_accepted():
     laid = bench.voxels("tumour", parameters.labels)
     assert 0.6 * true.sum() < laid < 1.4 * true.sum()
     assert list(parameters.lesions.GetSegmentation().GetSegmentIDs())
-
-
-@pytest.mark.slow
-@needs_atlas
-def test_a_point_in_no_lesion_is_one_line_and_proposes_nothing():
-    bench, presenter, _ = proposing()
-    bench.logic.proposals.segmented(bench.mri, brain("healthy")[0])
-    bench.logic.parameters.seed = bench.add("MarkupsFiducial", "point")
-    bench.logic.parameters.seed.AddControlPointWorld(28.0, -22.0, 28.0)
-    presenter.proposeAtPoint()
-    (line,) = presenter.view.errors
-    assert "white matter that looks healthy" in line and "\n" not in line
-    presenter.proposeLesions()
-    assert bench.logic.parameters.proposal is None and "proposal: no lesion proposed" in presenter.notes()

@@ -497,7 +497,7 @@ def test_cancel_stops_the_segmentation_and_leaves_nothing(session):
     assert session.ui.segmentButton.isEnabled() and not session.ui.progressWidget.isVisibleTo(session.parent)
 
 
-@pytest.mark.slow  # the extraction of a brain
+@pytest.mark.long  # the extraction of a brain
 @needs_shared
 def test_the_brain_of_a_whole_head_is_a_mask_node_and_can_be_cancelled(session, monkeypatch):
     """ReMIND-022's T1 with the skull, at 4 mm (../shared/data)."""
