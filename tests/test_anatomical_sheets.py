@@ -485,7 +485,7 @@ def test_a_file_of_others_is_not_replaced_and_vessels_are_not_invented(tmp_path)
     assert not sheets.masks() and not len(sheets.surfels)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_command_writes_sheets_and_lays_structures_over_the_labels(tmp_path):
     from click.testing import CliRunner
 
@@ -508,7 +508,7 @@ def test_the_command_writes_sheets_and_lays_structures_over_the_labels(tmp_path)
     assert "is not as this program wrote it" in refused.output
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_sheets_of_colin27_are_where_its_image_and_aal_show_them():
     if not (COLIN27 / "ch2bet.nii.gz").exists():
         pytest.skip("mricron-data is not installed")

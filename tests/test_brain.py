@@ -176,7 +176,7 @@ def test_a_border_as_bright_as_tissue_is_named(head, value, message):
         find_brain(Volume(array, matrix))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @needs_nilearn
 def test_voxels_without_data_are_left_out_with_a_warning(head, found):
     (mri, _), value = head, -3.0
@@ -635,7 +635,7 @@ def test_a_mask_that_cuts_the_vertex_is_reported_and_a_whole_one_is_not(head, fo
 
 
 @needs_nilearn
-@pytest.mark.slow
+@pytest.mark.long
 def test_masks_that_take_in_skull_or_lie_below_the_cortex_are_reported(head):
     mri, brain = head
     distance = refinement.signed_distance(brain, mri.spacing_mm, 25.0)
@@ -654,7 +654,7 @@ def test_masks_that_take_in_skull_or_lie_below_the_cortex_are_reported(head):
 
 
 @needs_nilearn
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_shifted_or_turned_mask_is_called_so(head):
     mri, brain = head
     step = round(20.0 / mri.spacing_mm[0])

@@ -385,7 +385,7 @@ def test_a_tracked_sweep_given_as_an_mri_is_called_what_it_is(tmp_path):
     assert result.exit_code == 2 and "is a sequence of tracked ultrasound images, expected an MRI" in result.stderr
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_demo_replaces_only_files_that_it_wrote_itself(head, tmp_path):
     pytest.importorskip("matplotlib", reason="pictures need matplotlib: pip install '.[demo]'")
     out = tmp_path / "out"

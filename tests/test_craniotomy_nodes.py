@@ -287,11 +287,11 @@ def test_a_view_is_placed_in_an_opening_or_said_to_be_elsewhere(head):  # noqa: 
     bench.presenter.openCraniotomy()
     bench.presenter.placeAtView()
     assert radius() == pytest.approx(60.0, abs=2.0) and not bench.view.errors
-    assert "; the view fontanelle is seen through the opening" in bench.presenter.notes()
+    assert "the view fontanelle is seen through the opening" in bench.presenter.notes()
     bench.presenter.setValue("scene.view", "temporal")
     bench.presenter.placeAtView()
     assert radius() == pytest.approx(78.0, abs=2.0) and bench.presenter.notes().count("view: ") == 1
-    assert "; the opening is not where the view temporal is seen from: the probe stands on the skin" in (
+    assert "the opening is not where the view temporal is seen from: the probe stands on the skin" in (
         bench.presenter.notes()
     )
 

@@ -181,7 +181,7 @@ def test_organs_of_another_patient_are_refused_by_the_numbers_of_the_ct():
     assert not any("of this CT" in line for line in segment_ct(chest.ct, organs=in_chest).warnings)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_few_organs_are_read_by_totalsegmentators_numbers():
     chest, spine = lower_chest((2.0, 2.0, 2.0)), lumbar_spine((2.0, 2.0, 2.0))
     organs = read_label_map(chest.organs, of_ct=True)

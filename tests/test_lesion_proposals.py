@@ -114,7 +114,7 @@ def test_one_seed_grows_the_lesion_and_not_what_is_outside(kind):
 
 
 @needs_atlas
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_point_in_a_ventricle_beside_what_enhances_is_refused():
     """A seed in a cistern does not give the veins beside it as a tumour."""
     maps = tissue_maps("mni152")
@@ -191,7 +191,7 @@ def test_proposals_are_files_that_are_not_replaced_once_edited(tmp_path, capsys)
 
 
 @needs_atlas
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_lesion_grows_also_under_a_name_that_fits_its_look():
     ring, _ = brain("ring")
     rim = (CENTRE[0] + 13.0, *CENTRE[1:])
@@ -226,7 +226,7 @@ def test_only_lesions_are_grown(name):
 
 
 @needs_atlas
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_refused_seed_costs_neither_the_labels_nor_the_other_seeds(tmp_path):
     maps = tissue_maps("mni152")
     assert maps is not None

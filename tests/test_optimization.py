@@ -459,9 +459,8 @@ def net_fall(tissue: Tissue, display: DisplaySettings) -> float:
     return (loss_db - gained_db) / path - display.tgc_db_cm_mhz
 
 
-@pytest.mark.parametrize(
-    "seed", [pytest.param(n, marks=[pytest.mark.long if n else pytest.mark.slow]) for n in range(14)]
-)
+@pytest.mark.long
+@pytest.mark.parametrize("seed", range(14))
 def test_fourteen_patients_with_everything_free(real_brain, seed):
     twin = make_twin(*real_brain, seed, probe=PATIENTS)
     result = optimise(twin, ["display", "white matter"], max_evaluations=600)  # the default number

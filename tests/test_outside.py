@@ -77,7 +77,7 @@ def test_a_head_that_the_image_cuts_is_reported():
     assert find_outside(Volume(mri.array[5:].copy(), mri.ijk_to_ras), brain[5:]).warnings == ()  # the neck
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_wide_csf_around_a_shrunken_brain_is_csf_with_a_t2_only():
     mri, _, radius = round_head()
     brain, csf = radius <= 53.0, (radius > 54.5) & (radius <= 61.5)
@@ -123,7 +123,7 @@ def test_a_brain_without_a_head_is_refused():
         find_outside(mri, np.zeros_like(brain))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_commands_label_what_is_outside_the_brain(tmp_path):
     mri, brain, _ = round_head()
     mri.write(tmp_path / "head.nii.gz")

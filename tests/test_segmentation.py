@@ -360,7 +360,7 @@ def test_a_label_map_is_refused_as_second_mri(mni2):
         segment_mri(mni2, contrast="t1", others={"t2": mni2.with_array(parts.astype(np.uint8))})
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_map_of_one_tissue_is_refused_as_second_mri(mni2):
     grey = mni2.with_array(np.clip(1.0 - np.abs(mni2.array - 60.0) / 30.0, 0.0, 1.0).astype(np.float32))
     with pytest.raises(SimulationError, match=r"t2: is 0 in \d+% of the brain, as the map of one tissue is"):

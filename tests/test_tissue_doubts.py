@@ -111,7 +111,7 @@ def test_grey_and_white_matter_that_noise_hides_are_reported():
     assert faint(classes_of([10, 160, 220]), noise=10.0) == []
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_an_mri_as_z_scores_gets_the_labels_of_the_mri():
     """The usual preparation for neural networks; a field multiplies."""
     maps = brain()

@@ -881,7 +881,7 @@ def test_two_tabs_show_and_drive_the_same_workstation(page, browser, url):
     assert pose(page)["rock_deg"] - before["rock_deg"] == pytest.approx(12, abs=0.9)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_reloaded_page_shows_what_there_was(page):
     image = pixels(page)
     page.reload()

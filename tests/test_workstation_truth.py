@@ -139,7 +139,7 @@ def test_ruler_and_image_change_together(page):
         assert of_image == of_ruler and ratio == pytest.approx(of_pixels, rel=0.02)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_frozen_image_stays_where_it_was_taken_in_every_export(head_page, files, tmp_path):
     page = head_page
     shutil.copy(files / "head.nii.gz", tmp_path)  # for the script, if the page has opened it
