@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.measuring import Machine, frame_work, measured, output_file, summary
-from SlicerUSSim.Logic.base.errors import require_between
+from SlicerUSSim.Logic.base.errors import SimulationError, require_between
 from SlicerUSSim.Logic.base.files import write_json
 from SlicerUSSim.Logic.base.settings import DisplaySettings
 from SlicerUSSim.Logic.base.version import __version__
@@ -197,7 +197,10 @@ def main() -> None:
     parser.add_argument("--device", help="number or part of the name of a device; default: all")
     arguments = parser.parse_args()
     repeat = min(arguments.repeat, 5) if arguments.brief else arguments.repeat
-    result = run_benchmark(devices_to_measure(arguments.device), repeat=repeat, brief=arguments.brief)
+    try:
+        result = run_benchmark(devices_to_measure(arguments.device), repeat=repeat, brief=arguments.brief)
+    except SimulationError as error:
+        parser.error(str(error))
     print(table_of(result))
     if arguments.json:
         write_json(arguments.json, result)

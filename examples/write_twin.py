@@ -5,7 +5,8 @@
         -o FOLDER/result.json --report FOLDER/report.html
 
 The "real" images in tracked.igs.mha are simulated with the parameters in truth.json, other speckle and noise;
-labels.nii.gz is the same brain with a slightly wrong segmentation (benchmarks/twins.py).
+labels.nii.gz is the same brain with a slightly wrong segmentation (benchmarks/twins.py, in a checkout that was
+installed with pip install -e).
 """
 
 from __future__ import annotations

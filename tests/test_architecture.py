@@ -269,7 +269,9 @@ def test_no_room_exceeds_its_budget_of_lines(tree):
     for folder in ("validation", "benchmarks", "tests", "tests/reference"):
         rooms[folder] = lines_of((ROOT / folder).glob("*.py"))
     assert set(rooms) == set(BUDGETS)
-    assert {room: lines for room, lines in rooms.items() if lines > BUDGETS[room]} == {}
+    for room, lines in rooms.items():
+        advice = "remove something, or raise BUDGETS in a commit with its reason"
+        assert lines <= BUDGETS[room], f"{room} has {lines} lines, budget {BUDGETS[room]}: {advice}"
     assert lines_of((ROOT / "kernels").glob("*.cl*")) <= LARGEST_KERNELS
 
 
@@ -327,7 +329,7 @@ def main(root: Path) -> None:
     floor, lines = levels(edges), lines_of_rooms(tree)
     for room in sorted(edges, key=lambda name: (floor[name], name)):
         imported = ", ".join(sorted(edges[room], key=lambda name: floor[name]))
-        print(f"{floor[room]:3d}  {room:16s} {lines[room]:6d} lines  {imported}")
+        print(f"{floor[room]:3d}  {room:12s} {lines[room]:6d} of {BUDGETS.get(room, 0):5d} lines  {imported}")
     between = sum(room_of(a) != room_of(b) for a, b in tree.edges)
     print(
         f"{len(tree.paths) - len(tree.faces)} modules, {len(edges)} rooms, {max(floor.values())} levels, "

@@ -39,6 +39,9 @@ _NO_MORE = {errno.ENOSPC, errno.EDQUOT, errno.EIO, errno.EBADF}
 _LEAST_ADDRESS_SPACE = 500_000_000
 
 
+_HELP = {"help_option_names": ["-h", "--help"]}
+
+
 class _OneLineErrors(click.Command):
     """Reports errors caused by the user, and warnings, as one line on stderr; the exit status of errors is 2."""
 
@@ -72,14 +75,18 @@ class _OneLineErrors(click.Command):
 
 
 class ToolCommand(_OneLineErrors):
-    """A command of a checkout, beside `ussim`."""
+    """A command of a checkout, with the options of every subcommand of `ussim`."""
+
+    def __init__(self, *args: Any, **extra: Any) -> None:
+        super().__init__(*args, **extra, context_settings=_HELP)
+        untrusted_option(verbose_option(self))
 
 
 class _Commands(_OneLineErrors, click.Group):
     """The subcommands of `ussim`."""
 
 
-@click.group(cls=_Commands, context_settings={"help_option_names": ["-h", "--help"]})
+@click.group(cls=_Commands, context_settings=_HELP)
 @click.version_option(__version__, prog_name="ussim")
 def main() -> None:
     """B-mode ultrasound simulated from a patient's MRI."""

@@ -15,7 +15,7 @@ import numpy as np
 
 from SlicerUSSim.Logic.base.files import written_whole
 from SlicerUSSim.Logic.base.own_outputs import marked_html
-from SlicerUSSim.Logic.fitting.control_costs import FITTED, Cost, mean_cost
+from SlicerUSSim.Logic.fitting.control_costs import FITTED, UNIFORM, Cost, mean_cost
 from SlicerUSSim.Logic.fitting.identifiability import Spread
 from SlicerUSSim.Logic.fitting.optimization import AGAIN, STAGES, AppearanceResult
 from SlicerUSSim.Logic.fitting.parameters import Parameter
@@ -156,7 +156,10 @@ def _predicted(prediction: Prediction, reference: str) -> str:
     heads = [
         "images", f"fitted ({listed[0]}): cost", "with texture", f"predicted ({listed[1]}): cost", "with texture"
     ]  # fmt: skip
-    rows = [[_named(source, reference), *map(_number, values)] for source, *values in prediction.rows()]
+    rows = [
+        [_named(source, reference) + (", fitted" if source == UNIFORM else ""), *map(_number, values)]
+        for source, *values in prediction.rows()
+    ]
     return f"""<h2>Images that were not fitted</h2>
 {_table(heads, rows)}
 <p class="dim">The predicted images cost {prediction.of_uniform:.2f} of what one uniform tissue without anatomy, fitted

@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from .noise import seed_of_pose as seed_of_pose
     from .preset import Preset as Preset
     from .reuse import ReusedSimulator as ReusedSimulator
+    from .self_check import SelfCheck as SelfCheck, check_devices as check_devices
     from .simulator import (
         EmptyViewWarning as EmptyViewWarning,
         SlowScatterersWarning as SlowScatterersWarning,

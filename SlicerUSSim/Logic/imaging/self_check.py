@@ -95,15 +95,17 @@ class SelfCheck:
 
     @property
     def lines(self) -> list[str]:
-        """Aligned lines per device, then all that is wrong, or that nothing is."""
-        found = [
-            line
-            for device in self.devices
-            for line in (str(device.info), *(f"  {found.name:14s}  {found.text}" for found in device.findings))
-        ]
+        """Aligned lines per device, then which devices compute wrongly and what to do, or that none does."""
+        found = []
+        for device in self.devices:
+            found.append(str(device.info))
+            found += [f"  {one.name:14s}  {'WRONG: ' if one.is_wrong else ''}{one.text}" for one in device.findings]
+        bad = [f"{device.info.index} {device.info.name}" for device in self.devices if device.wrong]
+        if bad:
+            advice = "Choose another device (--device, USSIM_DEVICE) or update the driver, and report this."
+            return [*found, f"{len(bad)} of {len(self.devices)} devices compute wrongly: {', '.join(bad)}. {advice}"]
         count = len(self.devices)
-        good = "The device computes correctly." if count == 1 else f"All {count} devices compute correctly."
-        return [*found, *(self.wrong or [good])]
+        return [*found, "The device computes correctly." if count == 1 else f"All {count} devices compute correctly."]
 
 
 def check_devices(device: str | None = None, progress: Callable[[float], None] | None = None) -> SelfCheck:
