@@ -1,4 +1,4 @@
-// Memory bandwidth and arithmetic throughput of the device (benchmarks/measuring.py), for the lower bounds of stage times.
+// Memory bandwidth and arithmetic throughput of the device (benchmarks/measuring.py): lower bounds of stage times.
 
 #include "common.clh"
 
