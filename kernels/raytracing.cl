@@ -26,20 +26,16 @@
 inline void trace_ray(Line *line, Ray ray) {
   __constant const Acquisition *acquisition = line->acquisition;
   while (line->count <= line->room) {
-    March to = march_from(line, &ray, line->tissues[ray.label], line->on_axis);
-    float decay;
-    while (1) {
-      decay = decay_in(acquisition, to.here);
-      march(line, &ray, &to, decay, 1e9f);
-      write_segments(line, &ray, &to, decay, to.ends);
-      if (to.ends) break;
-      enter_next_tissue(&ray, &to);
-    }
+    March to = march_from(line, &ray, 0);
+    do {
+      march(line, &ray, &to, 1e9f);
+      write_segments(line, &ray, &to, to.ends);
+    } while (!to.ends);
     if (to.border < 0.0f) {
       if (to.is_silenced) line->cut += ray.weight;
       return;
     }
-    const Crossing at = cross_border(line, &ray, &to, decay, 0.0f);
+    const Crossing at = cross_border(line, &ray, &to, 0.0f);
     if (ray.depth >= acquisition->traced_mm) return;  // without the overshoot, the border lies beyond the field
     write_hit(line, &ray, &at);
     if (at.is_strong) {
@@ -83,7 +79,7 @@ __kernel void trace(__constant const Acquisition *acquisition, __global const us
   ray.label = label_at(&line, course_at(acquisition, &course, 0.0f));
   // Where the face stands in bone, what other parts of the aperture see goes beside the ray through it.
   const int is_in_bone =
-      is_beam && is_covered(speed_to_beams(acquisition, tissues[0]), speed_to_beams(acquisition, tissues[ray.label]));
+      is_beam && is_covered(speed_to_beams(acquisition, tissues), speed_to_beams(acquisition, tissues + ray.label));
   if (is_in_bone) {
     beam.strong = UNDER;
     beam.front_weight = 1.0f;
