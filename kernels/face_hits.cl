@@ -7,6 +7,7 @@
 //
 // Buffers: quantiles, segments, segment_counts, hits, hit_counts as in raytracing.cl.
 
+#include "common.clh"
 #include "hits.clh"
 
 // Length along a ray in the probe frame at which it meets the surface of the face from in front; -1 if it does not.

@@ -8,6 +8,7 @@
 // Buffers: planes uint2 [k][j][i] (sheets.clh); quantiles, segments, segment_counts, hits, hit_counts as in
 // raytracing.cl.
 
+#include "common.clh"
 #include "hits.clh"
 #include "sheets.clh"
 
