@@ -652,10 +652,12 @@ inline void scatter_piece(const Patient *patient, const Piece *piece, float low,
   const float3 box_high = (fmax(near_end, far_end) + reach) * inverse_cell;
   const int v_low = (int)floor(box_low.y), v_high = (int)floor(box_high.y);
   const int w_low = (int)floor(box_low.z), w_high = (int)floor(box_high.z);
-  // A scatterer is at most half a cell from the centre of its cell along each axis.
-  const float slack_d = 0.5f * cell * (fabs(d.x) + fabs(d.y) + fabs(d.z));
-  const float limit_l = radius_l + 0.5f * cell * (fabs(l.x) + fabs(l.y) + fabs(l.z));
-  const float limit_e = radius_e + 0.5f * cell * (fabs(e.x) + fabs(e.y) + fabs(e.z));
+  // A scatterer is at most half a cell from the centre of its cell along each axis. The rest is for rounding, and for
+  // axes nearly at right angles to u, whose slope along it is at least 1e-5.
+  const float half_cell = 0.5f * cell, rest = 1e-3f;
+  const float slack_d = half_cell * (fabs(d.x) + fabs(d.y) + fabs(d.z)) + rest;
+  const float limit_l = radius_l + half_cell * (fabs(l.x) + fabs(l.y) + fabs(l.z)) + rest;
+  const float limit_e = radius_e + half_cell * (fabs(e.x) + fabs(e.y) + fabs(e.z)) + rest;
   const float per_d = inverse_cell / (fabs(d.x) < 1e-5f ? 1e-5f : d.x);
   const float per_l = inverse_cell / (fabs(l.x) < 1e-5f ? 1e-5f : l.x);
   const float per_e = inverse_cell / (fabs(e.x) < 1e-5f ? 1e-5f : e.x);
