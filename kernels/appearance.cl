@@ -40,13 +40,8 @@ __kernel void mix_bases(__global const float *bases, __constant const float *wei
   floatn low = 0.0f, high = 0.0f;  // real and imaginary parts side by side
   for (int n = 0; n < count; n++) {
     __global const float *from = bases + 2 * (n * values + here);
-#if LANES == 1
-    low += weights[n] * from[0];
-    high += weights[n] * from[1];
-#else
     low += weights[n] * LOAD_LANES(from);
     high += weights[n] * LOAD_LANES(from + LANES);
-#endif
   }
   floatn exponent = 0.0f;
   for (int t = 0; t < tissues; t++) exponent += decays[t] * LOAD_LANES(paths + t * values + here);

@@ -74,12 +74,8 @@ typedef struct {
   __global const ushort *voxels;
   __global const uint *planes, *texture;
   __global const float *sites;
-#ifdef VARIED
-  __global const int *part_of;
-#endif
-#ifdef LOBES
-  __global const float *lobes;
-#endif
+  __global const int *part_of;  // with VARIED
+  __global const float *lobes;  // with LOBES
 } Patient;
 
 // The strips that a work-item computes: `lines` of them from `left` on, along the path of one in the middle, whose
@@ -159,7 +155,6 @@ inline float row_of_depth(__constant const Acquisition *acquisition, float path,
   return place - *row;
 }
 
-#ifndef LOBES
 // By how many cycles the phase of the elevational beam, of this sigma, is behind that on its axis, per squared
 // millimetre from there. With it, speckle has the height that it has at the aperture's beam (diffraction.py).
 inline float elevational_cycles(__constant const Acquisition *acquisition, float path, float frequency, float sigma) {
@@ -170,9 +165,6 @@ inline float elevational_cycles(__constant const Acquisition *acquisition, float
   if (height <= 0.0f || height >= sigma) return 0.0f;
   return sqrt(1.0f / (height * height) - 1.0f / (sigma * sigma)) / (sigma * 2.0f * TWO_PI);
 }
-#endif
-
-#ifdef LOBES
 
 // The distance from the axis at which lobes are cut off.
 inline float reach_of_lobes(__constant const Acquisition *acquisition, __global const float *lobes, float path) {
@@ -194,6 +186,7 @@ inline float lobe_at(__constant const Acquisition *acquisition, __global const f
   return blend(blend(near[0], near[1], at - column), blend(far[0], far[1], at - column), deeper);
 }
 
+#ifdef LOBES
 // Adds an echo of this amplitude to the two edges of its strip. Work-items add to disjoint samples.
 inline void add_echo(Echoes *to, int part, int bin, float between, float right, float strength, float re, float im) {
   const float place = right * to->lines;
@@ -221,13 +214,8 @@ inline void add_echo(Echoes *sum, int part, int bin, float between, float right,
 #endif
 
 // Of a label by drawn_label
-#ifdef FOUND
 #define TISSUE_OF(label) ((label) & LABEL_MASK)
 #define IS_ON_MEMBRANE(label) ((label) == MEMBRANE_LABEL || ((label) & ON_SHEET))
-#else
-#define TISSUE_OF(label) (label)
-#define IS_ON_MEMBRANE(label) ((label) == MEMBRANE_LABEL)
-#endif
 
 inline __global const uint *planes_at(const Patient *patient, int voxel) {
   return patient->planes + (patient->acquisition->sheet_label < 0 ? 0 : PLANE_WORDS * voxel);
@@ -236,10 +224,7 @@ inline __global const uint *planes_at(const Patient *patient, int voxel) {
 // The sheet (sheets.clh) at the voxel nearest to a scatterer at fraction `at` of a cell, its plane 0 for none; and the
 // offset from it
 typedef struct {
-  uint plane;
-#ifdef FOUND
-  uint look;
-#endif
+  uint plane, look;  // no look without FOUND
 } Sheet;
 
 inline Sheet nearest_sheet(__constant const Acquisition *acquisition, __global const uint *planes, float3 at,
@@ -247,11 +232,7 @@ inline Sheet nearest_sheet(__constant const Acquisition *acquisition, __global c
   const int x = at.x > 0.5f, y = at.y > 0.5f, z = at.z > 0.5f;
   *offset = at - (float3)(x, y, z);
   __global const uint *words = planes + PLANE_WORDS * (x + acquisition->dims[0] * (y + acquisition->dims[1] * z));
-  Sheet sheet;
-  sheet.plane = words[0];
-#ifdef FOUND
-  sheet.look = words[1];
-#endif
+  const Sheet sheet = {words[0], PLANE_WORDS == 2 ? words[1] : 0u};
   return sheet;
 }
 
@@ -259,12 +240,8 @@ inline Sheet nearest_sheet(__constant const Acquisition *acquisition, __global c
 inline int is_in_sheet(__constant const Acquisition *acquisition, const Piece *piece, Sheet sheet, float3 offset,
                        float3 *normal) {
   const float3 gradient = gradient_of_sheet(sheet.plane);
-#ifdef FOUND
   const float distance = sheet.look ? distance_of_look(sheet.look) : distance_of_sheet(sheet.plane);
   const float reach = sheet.look ? half_of_look(sheet.look) : acquisition->sheet_reach_mm;
-#else
-  const float distance = distance_of_sheet(sheet.plane), reach = acquisition->sheet_reach_mm;
-#endif
   const float away = fabs(dot3(gradient, offset) - length3(gradient) * distance);
   // A gradient's length in millimetres is at most 1 / voxel_mm of that in voxels; this is seldom true.
   if (away * acquisition->voxel_mm >= reach) return 0;
@@ -300,10 +277,8 @@ inline int drawn_label(const Patient *patient, const Piece *piece, int here, flo
     // Voxels are thicker than the sheet.
     const uint drawn_plane = planes[PLANE_WORDS * drawn];
     if (label == acquisition->sheet_label && drawn_plane) label = label_beside_sheet(drawn_plane);
-#ifdef FOUND
     if (sheet.look && !is_membrane) return label;
-    if (is_dura(sheet.look)) tissue = acquisition->dura_label | ON_SHEET;
-#endif
+    if (sheet.look && is_dura(sheet.look)) tissue = acquisition->dura_label | ON_SHEET;
   }
   if (!is_membrane) {
     const float near_z = blend(blend((float)(corner[0] >> 8), (float)(corner[1] >> 8), at.x),
@@ -327,8 +302,7 @@ inline float gain_on_membrane(const Patient *patient, const Piece *piece, int he
   float3 normal, offset;
   float level = acquisition->membrane_gain;
   int of_dura = 0;
-  Sheet sheet;
-  sheet.plane = 0u;
+  Sheet sheet = {0u, 0u};
   if (acquisition->sheet_label >= 0) sheet = nearest_sheet(acquisition, planes_at(patient, here), at, &offset);
   if (!sheet.plane || !is_in_sheet(acquisition, piece, sheet, offset, &normal)) {
     const int nx = acquisition->dims[0], nxy = nx * acquisition->dims[1];
@@ -339,11 +313,9 @@ inline float gain_on_membrane(const Patient *patient, const Piece *piece, int he
     const float gy = blend(lines.y - lines.x, lines.w - lines.z, at.z);
     const float gz = blend(lines.z, lines.w, at.y) - blend(lines.x, lines.y, at.y);
     normal = gx * piece->row_i + gy * piece->row_j + gz * piece->row_k;
-#ifdef FOUND
   } else if (sheet.look) {
     level *= level_of_look(sheet.look);
     of_dura = is_dura(sheet.look);
-#endif
   }
   const float cosine = fabs(dot3(normal, piece->direction)) / fmax(length3(normal), 1e-6f);
   if (of_dura) {
@@ -353,7 +325,6 @@ inline float gain_on_membrane(const Patient *patient, const Piece *piece, int he
   return level * exp2_scalar(max(acquisition->membrane_exponent * log2_scalar(fmax(cosine, 1e-6f)), -100.0f));
 }
 
-#ifdef UNEVEN
 // By how much tissue varies at LANES places in the patient, as factors of amplitudes. `words` are those of the tissue
 // at each place.
 inline floatn unevenness(uint seed, const floatn *words, int has_specks, floatn x, floatn y, floatn z) {
@@ -386,16 +357,13 @@ inline floatn unevenness(uint seed, const floatn *words, int has_specks, floatn 
   }
   return exp2_fast(clamp(level, (floatn)(-30.0f), (floatn)(30.0f)));
 }
-#endif
 
 // Where scatterers are re a piece, for LANES of them at places u, v, w from the segment's start.
 typedef struct {
   floatn t, right, depth;  // part of the piece, of the strip's width, displayed depth
   floatn aside2;           // squared distance from the axis in elevation
   intn counts;             // whether it belongs to this piece and strip
-#ifdef LOBES
-  floatn along, away;
-#endif
+  floatn along, away;      // length along the piece, distance from the axis in elevation
 } Beside;
 
 inline Beside beside_piece(const Piece *piece, floatn pu, floatn pv, floatn pw) {
@@ -409,10 +377,8 @@ inline Beside beside_piece(const Piece *piece, floatn pu, floatn pv, floatn pw) 
   const floatn range = fma(aside_l, aside_l * piece->bend, along);
   at.depth = line_lanes(range, piece->depth0, piece->slope);
   at.counts = (at.right >= 0.0f) & (at.right < 1.0f) & (along >= piece->from_mm) & (along < piece->to_mm);
-#ifdef LOBES
   at.along = along;
   at.away = fabs(aside_e);
-#endif
   return at;
 }
 
@@ -609,7 +575,6 @@ inline void scatter_batch(const Patient *patient, const Piece *piece, const Cell
   add_echoes(patient, piece, &batch, sum);
 }
 
-#ifdef LOBES
 // From where to where along a piece there is dark tissue in the middle or near the edges of its strip, a step farther
 // to both sides; (high, low) if there is none.
 inline float2 dark_part(const Patient *patient, const Piece *piece, float low, float high) {
@@ -634,7 +599,6 @@ inline float2 dark_part(const Patient *patient, const Piece *piece, float low, f
   if (last < 0) return (float2)(high, low);
   return (float2)(fmax(low, low + (first - 1) * step), fmin(high, low + (last + 2) * step));
 }
-#endif
 
 // The scatterers of one piece between two lengths along it: finds the lattice cells beside it and computes them in
 // batches.
