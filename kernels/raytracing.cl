@@ -24,7 +24,7 @@
 // exponentially). What is left of it then, and children that are not followed, is added to `cut`: leaves and cuts
 // sum to one. Through soft borders, with the aperture's beams, it goes straight on.
 inline void trace_ray(Line *line, Ray ray) {
-  __constant const Acquisition *acquisition = line->acquisition;
+  Frame frame = line->frame;
   while (line->count <= line->room) {
     March to = march_from(line, &ray, 0);
     do {
@@ -36,7 +36,7 @@ inline void trace_ray(Line *line, Ray ray) {
       return;
     }
     const Crossing at = cross_border(line, &ray, &to, 0.0f);
-    if (ray.depth >= acquisition->traced_mm) return;  // without the overshoot, the border lies beyond the field
+    if (ray.depth >= frame->traced_mm) return;  // without the overshoot, the border lies beyond the field
     write_hit(line, &ray, &at);
     if (at.is_strong) {
       push_reflected(line, &ray, &at);
@@ -49,15 +49,15 @@ inline void trace_ray(Line *line, Ray ray) {
 }
 
 ONE_BY_ONE
-__kernel void trace(__constant const Acquisition *acquisition, __global const ushort *voxels,
-                    __global const uchar *groups, __global const ushort *smooth, __constant const Tissue *tissues,
-                    __global const float *roots, __global const float *quantiles, __global const float *beams,
-                    __global Segment *segments, __global int *segment_counts, __global Hit *hits,
-                    __global int *hit_counts, __global float *cut, __global int *overflown) {
-  const int number = get_global_id(0), ray_of_line = get_global_id(1), rays = acquisition->elevational_rays;
-  const int on_axis = ray_of_line == 0, slot = number * rays + ray_of_line - 1, depths = 1 + acquisition->screen_depths;
+__kernel void trace(Frame frame, __global const ushort *voxels, __global const uchar *groups,
+                    __global const ushort *smooth, __constant const Tissue *tissues, __global const float *roots,
+                    __global const float *quantiles, __global const float *beams, __global Segment *segments,
+                    __global int *segment_counts, __global Hit *hits, __global int *hit_counts, __global float *cut,
+                    __global int *overflown) {
+  const int number = get_global_id(0), ray_of_line = get_global_id(1), rays = frame->elevational_rays;
+  const int on_axis = ray_of_line == 0, slot = number * rays + ray_of_line - 1, depths = 1 + frame->screen_depths;
   Ray stack[MAX_STACK + 1];  // one of them for the ray that is followed next
-  Line line = {acquisition,
+  Line line = {frame,
                tissues,
                voxels,
                groups,
@@ -71,15 +71,15 @@ __kernel void trace(__constant const Acquisition *acquisition, __global const us
                on_axis ? MAX_SEGMENTS : MAX_HITS,
                0,
                0};
-  Ray ray = root_of(acquisition, vload4(number, roots), traced_start(acquisition, (float)number));
-  Beam beam = {beams + 4 * number * depths, beams + 4 * (acquisition->traced_lines + number) * depths, ray};
-  int is_beam = acquisition->aperture_beams;
+  Ray ray = root_of(frame, vload4(number, roots), traced_start(frame, (float)number));
+  Beam beam = {beams + 4 * number * depths, beams + 4 * (frame->traced_lines + number) * depths, ray};
+  int is_beam = frame->aperture_beams;
   if (is_beam) start_piece(&line, 0, &ray, &beam);
   const Course course = course_of(&line, &ray);
-  ray.label = label_at(&line, course_at(acquisition, &course, 0.0f));
+  ray.label = label_at(&line, course_at(frame, &course, 0.0f));
   // Where the face stands in bone, what other parts of the aperture see goes beside the ray through it.
   const int is_in_bone =
-      is_beam && is_covered(speed_to_beams(acquisition, tissues), speed_to_beams(acquisition, tissues + ray.label));
+      is_beam && is_covered(speed_to_beams(frame, tissues), speed_to_beams(frame, tissues + ray.label));
   if (is_in_bone) {
     beam.strong = UNDER;
     beam.front_weight = 1.0f;

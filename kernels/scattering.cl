@@ -42,8 +42,10 @@
 
 #ifdef VARIED
 #define VARIED_PARAMETERS , __global const int *part_of
+#define PART_OF part_of
 #else
 #define VARIED_PARAMETERS
+#define PART_OF 0
 #undef PARTS
 #define PARTS 1
 #endif
@@ -54,9 +56,11 @@
 #ifdef LOBES
 #define PIECE_BLOCK (4 * BLOCK)  // samples over which gains are assumed linear
 #define LOBE_PARAMETERS , __global const float *lobes, int together
+#define LOBE_TABLE lobes
 #else
 #define PIECE_BLOCK BLOCK
 #define LOBE_PARAMETERS
+#define LOBE_TABLE 0
 #endif
 
 #ifdef FOUND
@@ -70,7 +74,7 @@
 
 // What scatters, see above
 typedef struct {
-  __constant const Acquisition *acquisition;
+  Frame frame;
   __global const ushort *voxels;
   __global const uint *planes, *texture;
   __global const float *sites;
@@ -149,38 +153,37 @@ inline floatn line_lanes(floatn t, float a, float slope) { return fma(t, (floatn
 inline uint axis_step(int axis) { return axis == 0 ? 0x9E3779B1u : axis == 1 ? 0x85EBCA77u : 0xC2B2AE3Du; }
 
 // The depth of tables for a path length: its row, and the part by which it is deeper.
-inline float row_of_depth(__constant const Acquisition *acquisition, float path, int *row) {
-  const float place = clamp(path / acquisition->depth_mm * (LOBE_DEPTHS - 1), 0.0f, LOBE_DEPTHS - 1.001f);
+inline float row_of_depth(Frame frame, float path, int *row) {
+  const float place = clamp(path / frame->depth_mm * (LOBE_DEPTHS - 1), 0.0f, LOBE_DEPTHS - 1.001f);
   *row = (int)place;
   return place - *row;
 }
 
 // By how many cycles the phase of the elevational beam, of this sigma, is behind that on its axis, per squared
 // millimetre from there. With it, speckle has the height that it has at the aperture's beam (diffraction.py).
-inline float elevational_cycles(__constant const Acquisition *acquisition, float path, float frequency, float sigma) {
+inline float elevational_cycles(Frame frame, float path, float frequency, float sigma) {
   int row;
-  const float deeper = row_of_depth(acquisition, path, &row);
-  __constant const float *heights = acquisition->speckle_height_mm + row;
+  const float deeper = row_of_depth(frame, path, &row);
+  __constant const float *heights = frame->speckle_height_mm + row;
   const float height = blend(heights[0], heights[1], deeper) / frequency;
   if (height <= 0.0f || height >= sigma) return 0.0f;
   return sqrt(1.0f / (height * height) - 1.0f / (sigma * sigma)) / (sigma * 2.0f * TWO_PI);
 }
 
 // The distance from the axis at which lobes are cut off.
-inline float reach_of_lobes(__constant const Acquisition *acquisition, __global const float *lobes, float path) {
+inline float reach_of_lobes(Frame frame, __global const float *lobes, float path) {
   int row;
-  const float deeper = row_of_depth(acquisition, path, &row);
+  const float deeper = row_of_depth(frame, path, &row);
   __global const float *ends = lobes + LOBE_DEPTHS * LOBE_DISTANCES + row;
   return blend(ends[0], ends[1], deeper);
 }
 
 // The square root of their power per millimetre at a distance from the axis.
-inline float lobe_at(__constant const Acquisition *acquisition, __global const float *lobes, float path,
-                     float distance) {
-  const float at = distance / reach_of_lobes(acquisition, lobes, path) * (LOBE_DISTANCES - 1);
+inline float lobe_at(Frame frame, __global const float *lobes, float path, float distance) {
+  const float at = distance / reach_of_lobes(frame, lobes, path) * (LOBE_DISTANCES - 1);
   if (at >= LOBE_DISTANCES - 1) return 0.0f;
   int row;
-  const float deeper = row_of_depth(acquisition, path, &row);
+  const float deeper = row_of_depth(frame, path, &row);
   const int column = (int)at;
   __global const float *near = lobes + row * LOBE_DISTANCES + column, *far = near + LOBE_DISTANCES;
   return blend(blend(near[0], near[1], at - column), blend(far[0], far[1], at - column), deeper);
@@ -218,7 +221,7 @@ inline void add_echo(Echoes *sum, int part, int bin, float between, float right,
 #define IS_ON_MEMBRANE(label) ((label) == MEMBRANE_LABEL || ((label) & ON_SHEET))
 
 inline __global const uint *planes_at(const Patient *patient, int voxel) {
-  return patient->planes + (patient->acquisition->sheet_label < 0 ? 0 : PLANE_WORDS * voxel);
+  return patient->planes + (patient->frame->sheet_label < 0 ? 0 : PLANE_WORDS * voxel);
 }
 
 // The sheet (sheets.clh) at the voxel nearest to a scatterer at fraction `at` of a cell, its plane 0 for none; and the
@@ -227,24 +230,22 @@ typedef struct {
   uint plane, look;  // no look without FOUND
 } Sheet;
 
-inline Sheet nearest_sheet(__constant const Acquisition *acquisition, __global const uint *planes, float3 at,
-                           float3 *offset) {
+inline Sheet nearest_sheet(Frame frame, __global const uint *planes, float3 at, float3 *offset) {
   const int x = at.x > 0.5f, y = at.y > 0.5f, z = at.z > 0.5f;
   *offset = at - (float3)(x, y, z);
-  __global const uint *words = planes + PLANE_WORDS * (x + acquisition->dims[0] * (y + acquisition->dims[1] * z));
+  __global const uint *words = planes + PLANE_WORDS * (x + frame->dims[0] * (y + frame->dims[1] * z));
   const Sheet sheet = {words[0], PLANE_WORDS == 2 ? words[1] : 0u};
   return sheet;
 }
 
 // Whether a scatterer is in a sheet, at this offset from its voxel; and the normal, of the length of a gradient
-inline int is_in_sheet(__constant const Acquisition *acquisition, const Piece *piece, Sheet sheet, float3 offset,
-                       float3 *normal) {
+inline int is_in_sheet(Frame frame, const Piece *piece, Sheet sheet, float3 offset, float3 *normal) {
   const float3 gradient = gradient_of_sheet(sheet.plane);
   const float distance = sheet.look ? distance_of_look(sheet.look) : distance_of_sheet(sheet.plane);
-  const float reach = sheet.look ? half_of_look(sheet.look) : acquisition->sheet_reach_mm;
+  const float reach = sheet.look ? half_of_look(sheet.look) : frame->sheet_reach_mm;
   const float away = fabs(dot3(gradient, offset) - length3(gradient) * distance);
   // A gradient's length in millimetres is at most 1 / voxel_mm of that in voxels; this is seldom true.
-  if (away * acquisition->voxel_mm >= reach) return 0;
+  if (away * frame->voxel_mm >= reach) return 0;
   *normal = gradient.x * piece->row_i + gradient.y * piece->row_j + gradient.z * piece->row_k;
   return away < reach * length3(*normal);
 }
@@ -253,10 +254,10 @@ inline int is_in_sheet(__constant const Acquisition *acquisition, const Piece *p
 // membrane; with ON_SHEET if it is in a sheet of the dura's own tissue. `random` are random bits of the scatterer. With
 // TEXTURE, also its gain.
 inline int drawn_label(const Patient *patient, const Piece *piece, int here, float3 at, uint random, float *gain) {
-  __constant const Acquisition *acquisition = patient->acquisition;
+  Frame frame = patient->frame;
   __global const ushort *corner = patient->voxels + here;
   __global const uint *planes = planes_at(patient, here);
-  const int nx = acquisition->dims[0], nxy = nx * acquisition->dims[1];
+  const int nx = frame->dims[0], nxy = nx * frame->dims[1];
   // Partial volume without blending: the scatterer takes the label of one corner, drawn with that corner's trilinear
   // weight. The border is soft on average and fixed in the patient.
   const int dx = at.x * 32.0f > (random & 31u) + 0.5f, dy = at.y * 32.0f > ((random >> 5) & 31u) + 0.5f,
@@ -270,15 +271,15 @@ inline int drawn_label(const Patient *patient, const Piece *piece, int here, flo
 #endif
   if (corner[0] & NO_MEMBRANE) return label;
   int is_membrane = 0, tissue = MEMBRANE_LABEL;
-  if (acquisition->sheet_label >= 0) {
+  if (frame->sheet_label >= 0) {
     float3 offset, normal;
-    const Sheet sheet = nearest_sheet(acquisition, planes, at, &offset);
-    is_membrane = sheet.plane && is_in_sheet(acquisition, piece, sheet, offset, &normal);
+    const Sheet sheet = nearest_sheet(frame, planes, at, &offset);
+    is_membrane = sheet.plane && is_in_sheet(frame, piece, sheet, offset, &normal);
     // Voxels are thicker than the sheet.
     const uint drawn_plane = planes[PLANE_WORDS * drawn];
-    if (label == acquisition->sheet_label && drawn_plane) label = label_beside_sheet(drawn_plane);
+    if (label == frame->sheet_label && drawn_plane) label = label_beside_sheet(drawn_plane);
     if (sheet.look && !is_membrane) return label;
-    if (sheet.look && is_dura(sheet.look)) tissue = acquisition->dura_label | ON_SHEET;
+    if (sheet.look && is_dura(sheet.look)) tissue = frame->dura_label | ON_SHEET;
   }
   if (!is_membrane) {
     const float near_z = blend(blend((float)(corner[0] >> 8), (float)(corner[1] >> 8), at.x),
@@ -286,7 +287,7 @@ inline int drawn_label(const Patient *patient, const Piece *piece, int here, flo
     corner += nxy;
     const float far_z = blend(blend((float)(corner[0] >> 8), (float)(corner[1] >> 8), at.x),
                               blend((float)(corner[nx] >> 8), (float)(corner[nx + 1] >> 8), at.x), at.y);
-    if (fabs(blend(near_z, far_z, at.z) - 127.5f) >= acquisition->membrane_reach) return label;
+    if (fabs(blend(near_z, far_z, at.z) - 127.5f) >= frame->membrane_reach) return label;
   }
   *gain = 1.0f;
   return tissue;
@@ -297,15 +298,15 @@ inline int drawn_label(const Patient *patient, const Piece *piece, int here, flo
 // fitted plane, or the gradient of the fluid distance: from lines of two voxels along i, first those of the near plane,
 // then of the far.
 inline float gain_on_membrane(const Patient *patient, const Piece *piece, int here, float3 at) {
-  __constant const Acquisition *acquisition = patient->acquisition;
+  Frame frame = patient->frame;
   __global const ushort *corner = patient->voxels + here;
   float3 normal, offset;
-  float level = acquisition->membrane_gain;
+  float level = frame->membrane_gain;
   int of_dura = 0;
   Sheet sheet = {0u, 0u};
-  if (acquisition->sheet_label >= 0) sheet = nearest_sheet(acquisition, planes_at(patient, here), at, &offset);
-  if (!sheet.plane || !is_in_sheet(acquisition, piece, sheet, offset, &normal)) {
-    const int nx = acquisition->dims[0], nxy = nx * acquisition->dims[1];
+  if (frame->sheet_label >= 0) sheet = nearest_sheet(frame, planes_at(patient, here), at, &offset);
+  if (!sheet.plane || !is_in_sheet(frame, piece, sheet, offset, &normal)) {
+    const int nx = frame->dims[0], nxy = nx * frame->dims[1];
     const float4 from = (float4)(corner[0] >> 8, corner[nx] >> 8, corner[nxy] >> 8, corner[nxy + nx] >> 8);
     const float4 to = (float4)(corner[1] >> 8, corner[nx + 1] >> 8, corner[nxy + 1] >> 8, corner[nxy + nx + 1] >> 8);
     const float4 lines = from + at.x * (to - from), rise = to - from;
@@ -319,10 +320,10 @@ inline float gain_on_membrane(const Patient *patient, const Piece *piece, int he
   }
   const float cosine = fabs(dot3(normal, piece->direction)) / fmax(length3(normal), 1e-6f);
   if (of_dura) {
-    const float isotropic = acquisition->dura_isotropic;
+    const float isotropic = frame->dura_isotropic;
     return level * sqrt(isotropic + (1.0f - isotropic) * cosine * cosine);
   }
-  return level * exp2_scalar(max(acquisition->membrane_exponent * log2_scalar(fmax(cosine, 1e-6f)), -100.0f));
+  return level * exp2_scalar(max(frame->membrane_exponent * log2_scalar(fmax(cosine, 1e-6f)), -100.0f));
 }
 
 // By how much tissue varies at LANES places in the patient, as factors of amplitudes. `words` are those of the tissue
@@ -383,20 +384,17 @@ inline Beside beside_piece(const Piece *piece, floatn pu, floatn pv, floatn pw) 
 }
 
 // Where the scatterers of cells are, and which contribute, often a quarter of them: those are put side by side.
-inline void place_scatterers(__constant const Acquisition *acquisition, const Piece *piece, const Cells *cells,
-                             int count, Batch *batch) {
-  const float cell = acquisition->cell_mm, grain = cell / GRAINS, first_u = 0.5f * grain - piece->start.x;
-#ifndef LOBES
-  const float cutoff2 = 0.5f * LOG2_E * acquisition->beam_cutoff * acquisition->beam_cutoff;
-#endif
-  const float inverse_sample = 1.0f / acquisition->sample_mm;
+inline void place_scatterers(Frame frame, const Piece *piece, const Cells *cells, int count, Batch *batch) {
+  const float cell = frame->cell_mm, grain = cell / GRAINS, first_u = 0.5f * grain - piece->start.x;
+  const float cutoff2 = 0.5f * LOG2_E * frame->beam_cutoff * frame->beam_cutoff;
+  const float inverse_sample = 1.0f / frame->sample_mm;
   const int u = piece->u, v = piece->v, w = piece->w;
   const uint step_u = axis_step(u);
   ushort chosen[BATCH + 1];
   int n = 0;
   for (int begin = 0; begin < count; begin += LANES) {
     const intn cell_u = LOAD_LANES(cells->u + begin);
-    const uintn key = hash_mixn((LOAD_LANES(cells->key + begin) + TO_UINTN(cell_u) * step_u) ^ acquisition->seed);
+    const uintn key = hash_mixn((LOAD_LANES(cells->key + begin) + TO_UINTN(cell_u) * step_u) ^ frame->seed);
     // (The seed is not added to the index: seeds would then give the same scatterers, shifted by cells.)
     // Jitter is defined by lattice axis: u, v, w use the bits of the axis they represent.
     const uintn bits_u = (key >> (10 * u)) & 0x3ffu, bits_v = (key >> (10 * v)) & 0x3ffu,
@@ -433,10 +431,10 @@ inline void place_scatterers(__constant const Acquisition *acquisition, const Pi
 }
 
 // The echoes of scatterers of unit amplitude, where they are among samples and strips, and among voxels.
-inline void compute_echoes(__constant const Acquisition *acquisition, const Piece *piece, Batch *batch) {
-  const int nx = acquisition->dims[0], ny = acquisition->dims[1];
-  const float3 voxel_top = (float3)(nx - 1.001f, ny - 1.001f, acquisition->dims[2] - 1.001f);
-  const float inverse_sample = 1.0f / acquisition->sample_mm;
+inline void compute_echoes(Frame frame, const Piece *piece, Batch *batch) {
+  const int nx = frame->dims[0], ny = frame->dims[1];
+  const float3 voxel_top = (float3)(nx - 1.001f, ny - 1.001f, frame->dims[2] - 1.001f);
+  const float inverse_sample = 1.0f / frame->sample_mm;
   for (int begin = 0; begin < batch->count; begin += LANES) {
     const floatn pu = LOAD_LANES(batch->u + begin), pv = LOAD_LANES(batch->v + begin),
                  pw = LOAD_LANES(batch->w + begin);
@@ -457,7 +455,7 @@ inline void compute_echoes(__constant const Acquisition *acquisition, const Piec
         exp2_fast(clamp(line_lanes(beside.t, piece->gain0, piece->gain1) - r2, (floatn)(-100.0f), (floatn)(100.0f)));
     const floatn echo = amplitude * (1.0f - TO_FLOATN((random >> 14) & 2u));
     floatn cosine, sine;
-    turn(fma(beside.depth, (floatn)(acquisition->cycles_per_mm), curved), &cosine, &sine);
+    turn(fma(beside.depth, (floatn)(frame->cycles_per_mm), curved), &cosine, &sine);
     const float3 at = piece->at_start, ri = piece->row_i, rj = piece->row_j, rk = piece->row_k;
     const floatn vx = clamp(at.x + dot_lanes(pu, pv, pw, ri), (floatn)(0.0f), (floatn)(voxel_top.x));
     const floatn vy = clamp(at.y + dot_lanes(pu, pv, pw, rj), (floatn)(0.0f), (floatn)(voxel_top.y));
@@ -495,10 +493,8 @@ inline void label_scatterers(const Patient *patient, const Piece *piece, Batch *
     float gain = 1.0f;
     const float3 at = (float3)(batch->fx[i], batch->fy[i], batch->fz[i]);
     batch->label[i] = drawn_label(patient, piece, here, at, batch->random[i], &gain);
-#ifdef TEXTURE
     batch->re[i] *= gain;
     batch->im[i] *= gain;
-#endif
   }
 }
 
@@ -533,7 +529,7 @@ inline void vary_scatterers(const Patient *patient, const Piece *piece, Batch *b
     const floatn x = u == 0 ? along_u : v == 0 ? along_v : along_w;  // along the axes of the patient
     const floatn y = u == 1 ? along_u : v == 1 ? along_v : along_w;
     const floatn z = u == 2 ? along_u : v == 2 ? along_v : along_w;
-    STORE_LANES(unevenness(patient->acquisition->seed, words, has_specks, x, y, z), batch->uneven + i);
+    STORE_LANES(unevenness(patient->frame->seed, words, has_specks, x, y, z), batch->uneven + i);
   }
 }
 #endif
@@ -545,7 +541,7 @@ inline void add_echoes(const Patient *patient, const Piece *piece, const Batch *
     float strength = (batch->random[i] >> 16) + 0.5f < site.x ? site.y : 0.0f;
 #ifdef LOBES
     if (strength == 0.0f) continue;
-    strength *= lobe_at(patient->acquisition, patient->lobes, batch->path[i], batch->away[i]);
+    strength *= lobe_at(patient->frame, patient->lobes, batch->path[i], batch->away[i]);
 #endif
     if (IS_ON_MEMBRANE(batch->label[i])) {
       const float3 at = (float3)(batch->fx[i], batch->fy[i], batch->fz[i]);
@@ -566,8 +562,8 @@ inline void add_echoes(const Patient *patient, const Piece *piece, const Batch *
 // The scatterers of cells in stages, each without unpredictable branches.
 inline void scatter_batch(const Patient *patient, const Piece *piece, const Cells *cells, int count, Echoes *sum) {
   Batch batch;
-  place_scatterers(patient->acquisition, piece, cells, count, &batch);
-  compute_echoes(patient->acquisition, piece, &batch);
+  place_scatterers(patient->frame, piece, cells, count, &batch);
+  compute_echoes(patient->frame, piece, &batch);
   label_scatterers(patient, piece, &batch);
 #ifdef UNEVEN
   vary_scatterers(patient, piece, &batch);
@@ -578,10 +574,10 @@ inline void scatter_batch(const Patient *patient, const Piece *piece, const Cell
 // From where to where along a piece there is dark tissue in the middle or near the edges of its strip, a step farther
 // to both sides; (high, low) if there is none.
 inline float2 dark_part(const Patient *patient, const Piece *piece, float low, float high) {
-  __constant const Acquisition *acquisition = patient->acquisition;
+  Frame frame = patient->frame;
   __global const float *is_dark = patient->sites + 2 * MAX_TISSUES;
-  const int nx = acquisition->dims[0], ny = acquisition->dims[1], steps = max(1, (int)ceil(high - low));
-  const float3 most = (float3)(nx - 1, ny - 1, acquisition->dims[2] - 1);
+  const int nx = frame->dims[0], ny = frame->dims[1], steps = max(1, (int)ceil(high - low));
+  const float3 most = (float3)(nx - 1, ny - 1, frame->dims[2] - 1);
   const float step = (high - low) / steps;
   int first = steps, last = -1;
   for (int n = 0; n < steps; n++) {
@@ -603,9 +599,9 @@ inline float2 dark_part(const Patient *patient, const Piece *piece, float low, f
 // The scatterers of one piece between two lengths along it: finds the lattice cells beside it and computes them in
 // batches.
 inline void scatter_piece(const Patient *patient, const Piece *piece, float low, float high, Echoes *sum) {
-  __constant const Acquisition *acquisition = patient->acquisition;
+  Frame frame = patient->frame;
   Cells cells;
-  const float cell = acquisition->cell_mm, inverse_cell = 1.0f / cell;
+  const float cell = frame->cell_mm, inverse_cell = 1.0f / cell;
   const float3 start = piece->start, d = piece->direction, l = piece->lateral, e = piece->elevational;
   const float radius_l = piece->reach_l, radius_e = piece->reach_e;
 
@@ -686,10 +682,9 @@ inline void scatter_piece(const Patient *patient, const Piece *piece, float low,
 
 // The axes of a segment in the order u, v, w of lattice axes: u is closest to the elevation direction, in which the
 // beam is widest and whose cells fill the lanes, and v is closest to depth.
-inline void set_axes(__constant const Acquisition *acquisition, __global const Segment *segment, Piece *piece) {
-  float wide[3];
-  for (int a = 0; a < 3; a++) wide[a] = fabs(segment->elevational[a]);
-  const int u = wide[0] >= wide[1] ? (wide[0] >= wide[2] ? 0 : 2) : (wide[1] >= wide[2] ? 1 : 2);
+inline void set_axes(Frame frame, __global const Segment *segment, Piece *piece) {
+  const float3 wide = fabs(vload3(0, segment->elevational));
+  const int u = wide.x >= wide.y ? (wide.x >= wide.z ? 0 : 2) : (wide.y >= wide.z ? 1 : 2);
   const int next = u == 2 ? 0 : u + 1, after = next == 2 ? 0 : next + 1;
   const int is_deep = fabs(segment->direction[next]) >= fabs(segment->direction[after]);
   const int v = is_deep ? next : after, w = is_deep ? after : next;
@@ -697,7 +692,7 @@ inline void set_axes(__constant const Acquisition *acquisition, __global const S
   piece->direction = (float3)(segment->direction[u], segment->direction[v], segment->direction[w]);
   piece->lateral = (float3)(segment->lateral[u], segment->lateral[v], segment->lateral[w]);
   piece->elevational = (float3)(segment->elevational[u], segment->elevational[v], segment->elevational[w]);
-  __constant const float *m = acquisition->ras_to_voxel;
+  __constant const float *m = frame->ras_to_voxel;
   piece->u = u, piece->v = v, piece->w = w;
   piece->at_start = affine_point(m, (float3)(segment->start[0], segment->start[1], segment->start[2]));
   piece->row_i = (float3)(m[u], m[v], m[w]);
@@ -708,94 +703,86 @@ inline void set_axes(__constant const Acquisition *acquisition, __global const S
 // The widths and gains of a piece of a segment between two lengths along it, linear between those at the ends.
 inline void set_ends(const Patient *patient, __global const Segment *segment, const Strips *strips, float low,
                      float high, float to_apex, Piece *piece) {
-  __constant const Acquisition *acquisition = patient->acquisition;
+  Frame frame = patient->frame;
   const float path_low = segment->path_mm + low, path_high = segment->path_mm + high;
   const float loss_low = segment->loss + segment->loss_per_mm * low;
   const float loss_high = segment->loss + segment->loss_per_mm * high;
   float band_low, band_high;
-  const float frequency_low = band_after(acquisition, loss_low, &band_low);
-  const float frequency_high = band_after(acquisition, loss_high, &band_high);
-  const float apart_low = line_distance(acquisition, path_low + strips->begins);
-  const float apart_high = line_distance(acquisition, path_high + strips->begins);
+  const float frequency_low = band_after(frame, loss_low, &band_low);
+  const float frequency_high = band_after(frame, loss_high, &band_high);
+  const float apart_low = line_distance(frame, path_low + strips->begins);
+  const float apart_high = line_distance(frame, path_high + strips->begins);
   // beam.cl knows the displayed depth alone, which differs from the path where sound is slower or faster.
   const float shown_low = fmax(piece->depth0 + piece->slope * low, strips->begins);
   const float shown_high = fmax(piece->depth0 + piece->slope * high, strips->begins);
-  const float wide_low = lateral_sigma_at(acquisition, shown_low - strips->begins, 1.0f / frequency_low);
-  const float wide_high = lateral_sigma_at(acquisition, shown_high - strips->begins, 1.0f / frequency_high);
+  const float wide_low = lateral_sigma_at(frame, shown_low - strips->begins, 1.0f / frequency_low);
+  const float wide_high = lateral_sigma_at(frame, shown_high - strips->begins, 1.0f / frequency_high);
   piece->low = low;
   piece->path0 = path_low;
   piece->span = 1.0f / fmax(high - low, 1e-6f);
-  piece->bend = acquisition->linear ? 0.0f : 0.5f / fmax(to_apex + low, 1.0f);
+  piece->bend = frame->linear ? 0.0f : 0.5f / fmax(to_apex + low, 1.0f);
   piece->edge = (strips->line - strips->left + 0.5f) / strips->lines;
   piece->line0 = 1.0f / (strips->lines * apart_low);
   piece->line1 = 1.0f / (strips->lines * apart_high) - piece->line0;
 #ifdef LOBES
   // The table has the square root of the power per millimetre, where the main beam has 1 / (sqrt(pi) sigma_e).
   const float tall_low = 0.56418958f, tall_high = tall_low;
-  piece->reach_e = fmax(reach_of_lobes(acquisition, patient->lobes, path_low),
-                        reach_of_lobes(acquisition, patient->lobes, path_high));
+  piece->reach_e =
+      fmax(reach_of_lobes(frame, patient->lobes, path_low), reach_of_lobes(frame, patient->lobes, path_high));
 #else
-  const float tall_low = elevation_sigma_at(acquisition, path_low, 1.0f / frequency_low);
-  const float tall_high = elevation_sigma_at(acquisition, path_high, 1.0f / frequency_high);
-  piece->reach_e = acquisition->beam_cutoff * fmax(tall_low, tall_high);
+  const float tall_low = elevation_sigma_at(frame, path_low, 1.0f / frequency_low);
+  const float tall_high = elevation_sigma_at(frame, path_high, 1.0f / frequency_high);
+  piece->reach_e = frame->beam_cutoff * fmax(tall_low, tall_high);
   piece->narrow0 = 0.5f * LOG2_E / (tall_low * tall_low);
   piece->narrow1 = 0.5f * LOG2_E / (tall_high * tall_high) - piece->narrow0;
-  piece->curved0 = elevational_cycles(acquisition, path_low, frequency_low, tall_low);
-  piece->curved1 = elevational_cycles(acquisition, path_high, frequency_high, tall_high) - piece->curved0;
+  piece->curved0 = elevational_cycles(frame, path_low, frequency_low, tall_low);
+  piece->curved1 = elevational_cycles(frame, path_high, frequency_high, tall_high) - piece->curved0;
 #endif
   // Unit energy of the point spread function for all widths: sqrt(1 / (sigma_l sigma_e)) times the scale. The
   // weights of beam.cl have unit sum, that is apart / (sqrt(2 pi) sigma_l) at the peak, so that a strip of width
   // `apart` has the power apart / sigma_l of both at the displayed depth. A pulse covers 1 / slope of its length.
-  const float gain = log2_scalar(segment->weight * segment->attenuation * acquisition->speckle_scale * 2.50662827f);
+  const float gain = log2_scalar(segment->weight * segment->attenuation * frame->speckle_scale * 2.50662827f);
   const float decay = LOG2_E * segment->decay_per_mm;
   // Behind a curved mirror the same power is spread over a wider tube.
   const float4 tube_low = tube_after(vload4(0, segment->tube), low);
   const float4 tube_high = tube_after(vload4(0, segment->tube), high);
-  piece->gain0 =
-      gain + LOG2_E * band_low - decay * low +
-      0.5f * log2_scalar(piece->slope * wide_low /
-                         (tall_low * tube_low.x * tube_low.z * apart_low * line_distance(acquisition, shown_low)));
+  piece->gain0 = gain + LOG2_E * band_low - decay * low +
+                 0.5f * log2_scalar(piece->slope * wide_low /
+                                    (tall_low * tube_low.x * tube_low.z * apart_low * line_distance(frame, shown_low)));
   piece->gain1 =
       gain + LOG2_E * band_high - decay * high +
-      0.5f *
-          log2_scalar(piece->slope * wide_high /
-                      (tall_high * tube_high.x * tube_high.z * apart_high * line_distance(acquisition, shown_high))) -
+      0.5f * log2_scalar(piece->slope * wide_high /
+                         (tall_high * tube_high.x * tube_high.z * apart_high * line_distance(frame, shown_high))) -
       piece->gain0;
   const float lines_aside = max(strips->line - strips->left, strips->left + strips->lines - 1 - strips->line) + 0.5f;
   piece->reach_l = lines_aside * fmax(apart_low, apart_high);
 }
 
 ONE_BY_ONE
-__kernel void scatter(__constant const Acquisition *acquisition, __global const ushort *voxels,
-                      __global const uint *planes, __global const uint *texture, __global const float *sites,
-                      __global const Segment *segments, __global const int *segment_counts, __global float *re,
-                      __global float *im, int stride VARIED_PARAMETERS LOBE_PARAMETERS) {
+__kernel void scatter(Frame frame, __global const ushort *voxels, __global const uint *planes,
+                      __global const uint *texture, __global const float *sites, __global const Segment *segments,
+                      __global const int *segment_counts, __global float *re, __global float *im,
+                      int stride VARIED_PARAMETERS LOBE_PARAMETERS) {
   const int chunk = get_global_id(0), first = chunk * CHUNK;
 #ifdef LOBES
-  const int left = get_global_id(1) * together, lines = min(together, acquisition->traced_lines - left);
+  const int left = get_global_id(1) * together, lines = min(together, frame->traced_lines - left);
   const int line = left + lines / 2;
-  Echoes echoes = {re, im, stride, left, acquisition->traced_lines, lines, first, 0};
-  echoes.last = min(CHUNK, acquisition->samples - first);
+  Echoes echoes = {re, im, stride, left, frame->traced_lines, lines, first, 0};
+  echoes.last = min(CHUNK, frame->samples - first);
   Echoes *sum = &echoes;
 #else
   const int line = get_global_id(1), left = line, lines = 1;
   Echoes sum[PARTS * PART];
   for (int i = 0; i < PARTS * PART; i++) sum[i] = (float4)(0.0f);
 #endif
-  const float depth_low = (first - 1) * acquisition->sample_mm, depth_high = (first + CHUNK) * acquisition->sample_mm;
+  const float depth_low = (first - 1) * frame->sample_mm, depth_high = (first + CHUNK) * frame->sample_mm;
   // Widths and gains are assumed linear over a block, of which CHUNK is a part, so that the image does not depend on
   // the split of the work.
   const int block = first / PIECE_BLOCK * PIECE_BLOCK;
-  const float block_low = (block - 1) * acquisition->sample_mm;
-  const float block_high = (block + PIECE_BLOCK) * acquisition->sample_mm;
-  const Strips strips = {line, left, lines, traced_start(acquisition, (float)line)};
-  Patient patient = {acquisition, voxels, planes, texture, sites};
-#ifdef VARIED
-  patient.part_of = part_of;
-#endif
-#ifdef LOBES
-  patient.lobes = lobes;
-#endif
+  const float block_low = (block - 1) * frame->sample_mm;
+  const float block_high = (block + PIECE_BLOCK) * frame->sample_mm;
+  const Strips strips = {line, left, lines, traced_start(frame, (float)line)};
+  const Patient patient = {frame, voxels, planes, texture, sites, PART_OF, LOBE_TABLE};
 
   int count = min(segment_counts[line], MAX_SEGMENTS);
   for (int index = 0; index < count; index++) {
@@ -810,16 +797,16 @@ __kernel void scatter(__constant const Acquisition *acquisition, __global const 
     const float chunk_high = (depth_high - piece.depth0) / piece.slope;
     if (fmax(segment_low, chunk_low) >= fmin(segment_high, chunk_high)) continue;
 
-    set_axes(acquisition, segment, &piece);
+    set_axes(frame, segment, &piece);
     // Widths and gains are assumed linear between the two ends of a piece, so it must be short compared with the beam's
     // waist, and end at most twice as far from the apex as it begins: lines are apart in proportion to that distance.
 #ifdef LOBES
-    const float longest = acquisition->transmit_waist;
+    const float longest = frame->transmit_waist;
 #else
-    const float longest = 0.4f * fmin(acquisition->transmit_waist, acquisition->elevation_rayleigh);
+    const float longest = 0.4f * fmin(frame->transmit_waist, frame->elevation_rayleigh);
 #endif
     const int pieces = max(1, (int)ceil((segment_high - segment_low) / longest));
-    const float to_apex = segment->path_mm + (acquisition->linear ? 1e6f : acquisition->apex_radius_mm + strips.begins);
+    const float to_apex = segment->path_mm + (frame->linear ? 1e6f : frame->apex_radius_mm + strips.begins);
     float high = segment_low;
     for (int n = 0; n < pieces;) {
       const float low = high, next_high = blend(segment_low, segment_high, (float)(n + 1) / pieces);
