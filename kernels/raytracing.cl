@@ -97,10 +97,6 @@ __kernel void trace(Frame frame, __global const ushort *voxels, __global const u
   }
 
   cut[number * (rays + 1) + ray_of_line] = line.cut;
-  if (!on_axis) {
-    hit_counts[slot] = line.count;
-    return;
-  }
-  segment_counts[number] = line.count;
-  if (line.count > MAX_SEGMENTS) atomic_inc(overflown);
+  *(on_axis ? segment_counts + number : hit_counts + slot) = line.count;
+  if (on_axis && line.count > MAX_SEGMENTS) atomic_inc(overflown);
 }

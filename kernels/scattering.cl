@@ -65,8 +65,12 @@
 
 #ifdef FOUND
 #define PLANE_WORDS 2
+#define TISSUE_OF(label) ((label) & LABEL_MASK)  // of a label by drawn_label
+#define IS_ON_MEMBRANE(label) ((label) == MEMBRANE_LABEL || ((label) & ON_SHEET))
 #else
 #define PLANE_WORDS 1
+#define TISSUE_OF(label) (label)
+#define IS_ON_MEMBRANE(label) ((label) == MEMBRANE_LABEL)
 #endif
 
 #define GRAINS 1024.0f      // places of a scatterer along each axis of its cell, in the middle of as many parts
@@ -216,10 +220,6 @@ inline void add_echo(Echoes *sum, int part, int bin, float between, float right,
 }
 #endif
 
-// Of a label by drawn_label
-#define TISSUE_OF(label) ((label) & LABEL_MASK)
-#define IS_ON_MEMBRANE(label) ((label) == MEMBRANE_LABEL || ((label) & ON_SHEET))
-
 inline __global const uint *planes_at(const Patient *patient, int voxel) {
   return patient->planes + (patient->frame->sheet_label < 0 ? 0 : PLANE_WORDS * voxel);
 }
@@ -278,8 +278,10 @@ inline int drawn_label(const Patient *patient, const Piece *piece, int here, flo
     // Voxels are thicker than the sheet.
     const uint drawn_plane = planes[PLANE_WORDS * drawn];
     if (label == frame->sheet_label && drawn_plane) label = label_beside_sheet(drawn_plane);
+#ifdef FOUND
     if (sheet.look && !is_membrane) return label;
     if (sheet.look && is_dura(sheet.look)) tissue = frame->dura_label | ON_SHEET;
+#endif
   }
   if (!is_membrane) {
     const float near_z = blend(blend((float)(corner[0] >> 8), (float)(corner[1] >> 8), at.x),
@@ -314,9 +316,11 @@ inline float gain_on_membrane(const Patient *patient, const Piece *piece, int he
     const float gy = blend(lines.y - lines.x, lines.w - lines.z, at.z);
     const float gz = blend(lines.z, lines.w, at.y) - blend(lines.x, lines.y, at.y);
     normal = gx * piece->row_i + gy * piece->row_j + gz * piece->row_k;
+#ifdef FOUND
   } else if (sheet.look) {
     level *= level_of_look(sheet.look);
     of_dura = is_dura(sheet.look);
+#endif
   }
   const float cosine = fabs(dot3(normal, piece->direction)) / fmax(length3(normal), 1e-6f);
   if (of_dura) {
@@ -364,7 +368,9 @@ typedef struct {
   floatn t, right, depth;  // part of the piece, of the strip's width, displayed depth
   floatn aside2;           // squared distance from the axis in elevation
   intn counts;             // whether it belongs to this piece and strip
-  floatn along, away;      // length along the piece, distance from the axis in elevation
+#ifdef LOBES
+  floatn along, away;  // length along the segment, distance from the axis in elevation
+#endif
 } Beside;
 
 inline Beside beside_piece(const Piece *piece, floatn pu, floatn pv, floatn pw) {
@@ -378,8 +384,10 @@ inline Beside beside_piece(const Piece *piece, floatn pu, floatn pv, floatn pw) 
   const floatn range = fma(aside_l, aside_l * piece->bend, along);
   at.depth = line_lanes(range, piece->depth0, piece->slope);
   at.counts = (at.right >= 0.0f) & (at.right < 1.0f) & (along >= piece->from_mm) & (along < piece->to_mm);
+#ifdef LOBES
   at.along = along;
   at.away = fabs(aside_e);
+#endif
   return at;
 }
 
@@ -389,12 +397,11 @@ inline void place_scatterers(Frame frame, const Piece *piece, const Cells *cells
   const float cutoff2 = 0.5f * LOG2_E * frame->beam_cutoff * frame->beam_cutoff;
   const float inverse_sample = 1.0f / frame->sample_mm;
   const int u = piece->u, v = piece->v, w = piece->w;
-  const uint step_u = axis_step(u);
   ushort chosen[BATCH + 1];
   int n = 0;
   for (int begin = 0; begin < count; begin += LANES) {
     const intn cell_u = LOAD_LANES(cells->u + begin);
-    const uintn key = hash_mixn((LOAD_LANES(cells->key + begin) + TO_UINTN(cell_u) * step_u) ^ frame->seed);
+    const uintn key = hash_mixn((LOAD_LANES(cells->key + begin) + TO_UINTN(cell_u) * axis_step(u)) ^ frame->seed);
     // (The seed is not added to the index: seeds would then give the same scatterers, shifted by cells.)
     // Jitter is defined by lattice axis: u, v, w use the bits of the axis they represent.
     const uintn bits_u = (key >> (10 * u)) & 0x3ffu, bits_v = (key >> (10 * v)) & 0x3ffu,
@@ -493,8 +500,10 @@ inline void label_scatterers(const Patient *patient, const Piece *piece, Batch *
     float gain = 1.0f;
     const float3 at = (float3)(batch->fx[i], batch->fy[i], batch->fz[i]);
     batch->label[i] = drawn_label(patient, piece, here, at, batch->random[i], &gain);
+#ifdef TEXTURE
     batch->re[i] *= gain;
     batch->im[i] *= gain;
+#endif
   }
 }
 
