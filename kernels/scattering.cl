@@ -65,10 +65,12 @@
 
 #ifdef FOUND
 #define PLANE_WORDS 2
+#define LOOK(sheet) ((sheet).look)
 #define TISSUE_OF(label) ((label) & LABEL_MASK)  // of a label by drawn_label
 #define IS_ON_MEMBRANE(label) ((label) == MEMBRANE_LABEL || ((label) & ON_SHEET))
 #else
 #define PLANE_WORDS 1
+#define LOOK(sheet) 0u
 #define TISSUE_OF(label) (label)
 #define IS_ON_MEMBRANE(label) ((label) == MEMBRANE_LABEL)
 #endif
@@ -227,7 +229,7 @@ inline __global const uint *planes_at(const Patient *patient, int voxel) {
 // The sheet (sheets.clh) at the voxel nearest to a scatterer at fraction `at` of a cell, its plane 0 for none; and the
 // offset from it
 typedef struct {
-  uint plane, look;  // no look without FOUND
+  uint plane, look;  // LOOK(sheet); none without FOUND
 } Sheet;
 
 inline Sheet nearest_sheet(Frame frame, __global const uint *planes, float3 at, float3 *offset) {
@@ -241,8 +243,8 @@ inline Sheet nearest_sheet(Frame frame, __global const uint *planes, float3 at, 
 // Whether a scatterer is in a sheet, at this offset from its voxel; and the normal, of the length of a gradient
 inline int is_in_sheet(Frame frame, const Piece *piece, Sheet sheet, float3 offset, float3 *normal) {
   const float3 gradient = gradient_of_sheet(sheet.plane);
-  const float distance = sheet.look ? distance_of_look(sheet.look) : distance_of_sheet(sheet.plane);
-  const float reach = sheet.look ? half_of_look(sheet.look) : frame->sheet_reach_mm;
+  const float distance = LOOK(sheet) ? distance_of_look(LOOK(sheet)) : distance_of_sheet(sheet.plane);
+  const float reach = LOOK(sheet) ? half_of_look(LOOK(sheet)) : frame->sheet_reach_mm;
   const float away = fabs(dot3(gradient, offset) - length3(gradient) * distance);
   // A gradient's length in millimetres is at most 1 / voxel_mm of that in voxels; this is seldom true.
   if (away * frame->voxel_mm >= reach) return 0;
@@ -278,10 +280,8 @@ inline int drawn_label(const Patient *patient, const Piece *piece, int here, flo
     // Voxels are thicker than the sheet.
     const uint drawn_plane = planes[PLANE_WORDS * drawn];
     if (label == frame->sheet_label && drawn_plane) label = label_beside_sheet(drawn_plane);
-#ifdef FOUND
-    if (sheet.look && !is_membrane) return label;
-    if (sheet.look && is_dura(sheet.look)) tissue = frame->dura_label | ON_SHEET;
-#endif
+    if (LOOK(sheet) && !is_membrane) return label;
+    if (is_dura(LOOK(sheet))) tissue = frame->dura_label | ON_SHEET;
   }
   if (!is_membrane) {
     const float near_z = blend(blend((float)(corner[0] >> 8), (float)(corner[1] >> 8), at.x),
@@ -316,11 +316,9 @@ inline float gain_on_membrane(const Patient *patient, const Piece *piece, int he
     const float gy = blend(lines.y - lines.x, lines.w - lines.z, at.z);
     const float gz = blend(lines.z, lines.w, at.y) - blend(lines.x, lines.y, at.y);
     normal = gx * piece->row_i + gy * piece->row_j + gz * piece->row_k;
-#ifdef FOUND
-  } else if (sheet.look) {
-    level *= level_of_look(sheet.look);
-    of_dura = is_dura(sheet.look);
-#endif
+  } else if (LOOK(sheet)) {
+    level *= level_of_look(LOOK(sheet));
+    of_dura = is_dura(LOOK(sheet));
   }
   const float cosine = fabs(dot3(normal, piece->direction)) / fmax(length3(normal), 1e-6f);
   if (of_dura) {
@@ -397,11 +395,12 @@ inline void place_scatterers(Frame frame, const Piece *piece, const Cells *cells
   const float cutoff2 = 0.5f * LOG2_E * frame->beam_cutoff * frame->beam_cutoff;
   const float inverse_sample = 1.0f / frame->sample_mm;
   const int u = piece->u, v = piece->v, w = piece->w;
+  const uint step_u = axis_step(u);
   ushort chosen[BATCH + 1];
   int n = 0;
   for (int begin = 0; begin < count; begin += LANES) {
     const intn cell_u = LOAD_LANES(cells->u + begin);
-    const uintn key = hash_mixn((LOAD_LANES(cells->key + begin) + TO_UINTN(cell_u) * axis_step(u)) ^ frame->seed);
+    const uintn key = hash_mixn((LOAD_LANES(cells->key + begin) + TO_UINTN(cell_u) * step_u) ^ frame->seed);
     // (The seed is not added to the index: seeds would then give the same scatterers, shifted by cells.)
     // Jitter is defined by lattice axis: u, v, w use the bits of the axis they represent.
     const uintn bits_u = (key >> (10 * u)) & 0x3ffu, bits_v = (key >> (10 * v)) & 0x3ffu,
