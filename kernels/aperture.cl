@@ -45,14 +45,11 @@ DEFINE_ELEVATION(float8, elevation_sigma8)
 #define MOST_UNEVEN 0.7f    // ... and up to which that belongs to the width of the beam
 
 // Position along the face (mm) and angle of the normal of a point of the array.
-inline float point_angle(__constant const Acquisition *acquisition, float along) {
-  return acquisition->flat_face ? 0.0f : along / acquisition->apex_radius_mm;
-}
+inline float point_angle(Frame frame, float along) { return frame->flat_face ? 0.0f : along / frame->apex_radius_mm; }
 
-inline float2 point_on_face(__constant const Acquisition *acquisition, float along) {
-  const float angle = point_angle(acquisition, along);
-  return angle == 0.0f ? (float2)(along, 0.0f)
-                       : acquisition->apex_radius_mm * (float2)(sin_of(angle), cos_of(angle) - 1.0f);
+inline float2 point_on_face(Frame frame, float along) {
+  const float angle = point_angle(frame, along);
+  return angle == 0.0f ? (float2)(along, 0.0f) : frame->apex_radius_mm * (float2)(sin_of(angle), cos_of(angle) - 1.0f);
 }
 
 // Extra path and nepers per mm of tissue beside `soft`, of which strong tissue has the attenuation, and also the extra
@@ -90,27 +87,26 @@ inline float border_nepers(float impedance, float other_impedance) {
 // steps of a voxel are smooth. Strong tissue counts as what lies in front of it, with what it takes more recorded: by
 // its borders, its attenuation, and by refraction. With `all_soft`, no tissues have a strong border.
 ONE_BY_ONE
-__kernel void fans(__constant const Acquisition *acquisition, __global const ushort *voxels,
-                   __global const float4 *acoustics, int all_soft, __global float *sums) {
+__kernel void fans(Frame frame, __global const ushort *voxels, __global const float4 *acoustics, int all_soft,
+                   __global float *sums) {
   const int ray = get_global_id(0), point = get_global_id(1), row = get_global_id(2);
-  const int depths = acquisition->fan_depths;
-  const int nx = acquisition->dims[0], ny = acquisition->dims[1], nxy = nx * ny;
-  const float3 top = (float3)(nx - 1.001f, ny - 1.001f, acquisition->dims[2] - 1.001f);
-  __global float *to = sums + ((row * acquisition->fan_points + point) * acquisition->fan_angles + ray) * depths * 4;
+  const int depths = frame->fan_depths;
+  const int nx = frame->dims[0], ny = frame->dims[1], nxy = nx * ny;
+  const float3 top = (float3)(nx - 1.001f, ny - 1.001f, frame->dims[2] - 1.001f);
+  __global float *to = sums + ((row * frame->fan_points + point) * frame->fan_angles + ray) * depths * 4;
 
-  const float along = acquisition->fan_first + point * acquisition->fan_pitch;
-  const float2 origin = point_on_face(acquisition, along);
-  const float own = acquisition->fan_first_angle + ray * acquisition->fan_angle_step;
-  const float angle = own + point_angle(acquisition, along);
-  const float3 start = affine_point(acquisition->ras_to_voxel,
-                                    affine_point(acquisition->probe_to_ras, (float3)(origin.x, origin.y, 0.0f)));
-  const float3 step =
-      affine_vector(acquisition->ras_to_voxel,
-                    affine_vector(acquisition->probe_to_ras, (float3)(sin_of(angle), cos_of(angle), 0.0f)));
+  const float along = frame->fan_first + point * frame->fan_pitch;
+  const float2 origin = point_on_face(frame, along);
+  const float own = frame->fan_first_angle + ray * frame->fan_angle_step;
+  const float angle = own + point_angle(frame, along);
+  const float3 start =
+      affine_point(frame->ras_to_voxel, affine_point(frame->probe_to_ras, (float3)(origin.x, origin.y, 0.0f)));
+  const float3 step = affine_vector(frame->ras_to_voxel,
+                                    affine_vector(frame->probe_to_ras, (float3)(sin_of(angle), cos_of(angle), 0.0f)));
   const float3 aside =
-      affine_vector(acquisition->ras_to_voxel, affine_vector(acquisition->probe_to_ras, (float3)(0.0f, 0.0f, 1.0f))) *
+      affine_vector(frame->ras_to_voxel, affine_vector(frame->probe_to_ras, (float3)(0.0f, 0.0f, 1.0f))) *
       (ROW_SIGMA * (row - 1));
-  const float length = acquisition->fan_step;
+  const float length = frame->fan_step;
 
   float covered = 0.0f;           // the largest part of a cell that was bone
   int label = 0, was_strong = 0;  // of the last soft tissue, first the coupling medium; whether strong tissue is behind
@@ -123,7 +119,7 @@ __kernel void fans(__constant const Acquisition *acquisition, __global const ush
   for (int depth = 1; depth < depths; depth += 8) {
     // Eight look-ups at once, which are nearly always in one tissue.
     const float8 path = (depth - 0.5f + (float8)(0, 1, 2, 3, 4, 5, 6, 7)) * length;
-    const float8 sigma = elevation_sigma8(acquisition, path);
+    const float8 sigma = elevation_sigma8(frame, path);
     const float8 x = clamp(start.x + path * step.x + sigma * aside.x, (float8)(0.0f), (float8)(top.x));
     const float8 y = clamp(start.y + path * step.y + sigma * aside.y, (float8)(0.0f), (float8)(top.y));
     const float8 z = clamp(start.z + path * step.z + sigma * aside.z, (float8)(0.0f), (float8)(top.z));
@@ -214,12 +210,11 @@ inline float passed_strong(float nepers) { return nepers == 0.0f ? 1.0f : exp_fa
 // The sums of a point's fan in the direction `place` (in rays) at distance `far` (in stored depths); of strong tissue
 // the amplitude that passes it. Between a ray in bone and one beside it that is half, where the mean of the nepers is
 // dark.
-inline float4 sums_at(__constant const Acquisition *acquisition, __global const float *sums, int row, int point,
-                      float place, float far) {
-  const int ray = (int)place, depth = (int)far, depths = acquisition->fan_depths;
+inline float4 sums_at(Frame frame, __global const float *sums, int row, int point, float place, float far) {
+  const int ray = (int)place, depth = (int)far, depths = frame->fan_depths;
   const float t = place - ray, u = far - depth;
   __global const float *near =
-      sums + (((row * acquisition->fan_points + point) * acquisition->fan_angles + ray) * depths + depth) * 4;
+      sums + (((row * frame->fan_points + point) * frame->fan_angles + ray) * depths + depth) * 4;
   __global const float *next = near + depths * 4;
   const float4 a = vload4(0, near) + u * (vload4(1, near) - vload4(0, near));
   const float4 b = vload4(0, next) + u * (vload4(1, next) - vload4(0, next));
@@ -248,13 +243,12 @@ inline float overlap(const float2 *first, const float2 *second, int count) {
 
 // Where the line from a point of the face to a target lies in its fan: direction in rays, distance in stored depths,
 // and in mm.
-inline float3 place_in_fan(__constant const Acquisition *acquisition, float along, float2 target) {
-  const float2 towards = target - point_on_face(acquisition, along);
+inline float3 place_in_fan(Frame frame, float along, float2 target) {
+  const float2 towards = target - point_on_face(frame, along);
   const float away = sqrt(towards.x * towards.x + towards.y * towards.y);
-  const float turned = direction_of(towards.x, towards.y) - point_angle(acquisition, along);
-  return (float3)(clamp((turned - acquisition->fan_first_angle) / acquisition->fan_angle_step, 0.0f,
-                        acquisition->fan_angles - 1.001f),
-                  clamp(away / acquisition->fan_step, 0.0f, acquisition->fan_depths - 1.001f), away);
+  const float turned = direction_of(towards.x, towards.y) - point_angle(frame, along);
+  return (float3)(clamp((turned - frame->fan_first_angle) / frame->fan_angle_step, 0.0f, frame->fan_angles - 1.001f),
+                  clamp(away / frame->fan_step, 0.0f, frame->fan_depths - 1.001f), away);
 }
 
 // The axis of a screen line: where it leaves the face, its direction, and its place along the face.
@@ -263,18 +257,17 @@ typedef struct {
   float centre;
 } Axis;
 
-inline Axis axis_of(__constant const Acquisition *acquisition, int line) {
-  const float traced = (float)line * (acquisition->traced_lines - 1) / (acquisition->screen_lines - 1);
-  const float position = acquisition->first_line +
-                         acquisition->line_spacing * (traced - acquisition->guard_lines) / acquisition->lateral_rays;
-  const float radius = acquisition->apex_radius_mm;
+inline Axis axis_of(Frame frame, int line) {
+  const float traced = (float)line * (frame->traced_lines - 1) / (frame->screen_lines - 1);
+  const float position = frame->first_line + frame->line_spacing * (traced - frame->guard_lines) / frame->lateral_rays;
+  const float radius = frame->apex_radius_mm;
   Axis axis;
-  axis.direction = acquisition->linear ? (float2)(acquisition->steering_sin, acquisition->steering_cos)
-                                       : (float2)(sin_of(position), cos_of(position));
-  axis.centre = acquisition->linear ? position / acquisition->steering_cos : radius * position;
-  if (acquisition->steered && !acquisition->linear) axis.centre = radius * axis.direction.x / axis.direction.y;
-  axis.origin = acquisition->flat_face ? (float2)(axis.centre, 0.0f)
-                                       : radius * (float2)(axis.direction.x, axis.direction.y - 1.0f);
+  axis.direction =
+      frame->linear ? (float2)(frame->steering_sin, frame->steering_cos) : (float2)(sin_of(position), cos_of(position));
+  axis.centre = frame->linear ? position / frame->steering_cos : radius * position;
+  if (frame->steered && !frame->linear) axis.centre = radius * axis.direction.x / axis.direction.y;
+  axis.origin =
+      frame->flat_face ? (float2)(axis.centre, 0.0f) : radius * (float2)(axis.direction.x, axis.direction.y - 1.0f);
   return axis;
 }
 
@@ -285,16 +278,15 @@ typedef struct {
   float part, places[2];
 } Beside;
 
-inline Beside rays_beside(__constant const Acquisition *acquisition, Axis axis, float path) {
-  const float place =
-      clamp((axis.centre - acquisition->fan_first) / acquisition->fan_pitch, 0.0f, acquisition->fan_points - 1.0f);
+inline Beside rays_beside(Frame frame, Axis axis, float path) {
+  const float place = clamp((axis.centre - frame->fan_first) / frame->fan_pitch, 0.0f, frame->fan_points - 1.0f);
   Beside beside;
   beside.before = (int)place;
   beside.part = place - beside.before;
   for (int n = 0; n < 2; n++) {
-    const int point = min(beside.before + n, acquisition->fan_points - 1);
-    const float3 at = place_in_fan(acquisition, acquisition->fan_first + point * acquisition->fan_pitch,
-                                   axis.origin + path * axis.direction);
+    const int point = min(beside.before + n, frame->fan_points - 1);
+    const float3 at =
+        place_in_fan(frame, frame->fan_first + point * frame->fan_pitch, axis.origin + path * axis.direction);
     beside.places[n] = at.x;
     beside.depth = (int)at.y;
   }
@@ -302,17 +294,15 @@ inline Beside rays_beside(__constant const Acquisition *acquisition, Axis axis, 
 }
 
 // How much of the axis is in strong tissue in the step behind the stored depth `depth`: of the rays beside it.
-inline float share_strong(__constant const Acquisition *acquisition, __global const float *sums, const Beside *beside,
-                          int depth) {
+inline float share_strong(Frame frame, __global const float *sums, const Beside *beside, int depth) {
   float strong = 0.0f;
   for (int n = 0; n < 2; n++) {
-    const int point = min(beside->before + n, acquisition->fan_points - 1), ray = (int)beside->places[n];
+    const int point = min(beside->before + n, frame->fan_points - 1), ray = (int)beside->places[n];
     const float aside = beside->places[n] - ray;
     for (int m = 0; m < 2; m++) {
       const float share = (n ? beside->part : 1.0f - beside->part) * (m ? aside : 1.0f - aside);
-      __global const float *at = sums + 4 * (((acquisition->fan_points + point) * acquisition->fan_angles + ray + m) *
-                                                 acquisition->fan_depths +
-                                             depth);
+      __global const float *at =
+          sums + 4 * (((frame->fan_points + point) * frame->fan_angles + ray + m) * frame->fan_depths + depth);
       if (as_uint(at[6]) & 1u) strong += share;
     }
   }
@@ -321,58 +311,53 @@ inline float share_strong(__constant const Acquisition *acquisition, __global co
 
 // The path on an axis of which the step behind the stored depth `depth` is the last in strong tissue, or has its
 // border: half a step behind it, where all lines have left it.
-inline float path_behind(__constant const Acquisition *acquisition, int depth) {
-  return (depth + 1.5f) * acquisition->fan_step;
-}
+inline float path_behind(Frame frame, int depth) { return (depth + 1.5f) * frame->fan_step; }
 
 // The depth on the axis at which a beam is as at `path`: there, unless it is in strong tissue or a step before it; then
 // the last depth before that, and behind it, if it ends in this step or its border is in the next one. (Of a ray that
 // is still in it, raytracing.cl takes what it had before.)
-inline float depth_outside(__constant const Acquisition *acquisition, __global const float *sums, float path,
-                           Axis axis) {
-  const Beside beside = rays_beside(acquisition, axis, path);
+inline float depth_outside(Frame frame, __global const float *sums, float path, Axis axis) {
+  const Beside beside = rays_beside(frame, axis, path);
   // Lines are interpolated between rays, and labels found at the middle of a step: they seem to enter strong tissue up
   // to four steps before the axis does.
-  int own = clamp(beside.depth, 2, acquisition->fan_depths - 6);
-  const float own_share = share_strong(acquisition, sums, &beside, own);
+  int own = clamp(beside.depth, 2, frame->fan_depths - 6);
+  const float own_share = share_strong(frame, sums, &beside, own);
   float in_front = 0.0f, beyond = own_share, most = own_share;
   int ends = 0;  // the last step in strong tissue, from this one on
   for (int n = 1; n <= 4; n++) {
-    const float share = share_strong(acquisition, sums, &beside, own + n);
+    const float share = share_strong(frame, sums, &beside, own + n);
     beyond += share;
     most = fmax(most, share);
     if (share <= 0.5f && n <= 2 && own_share > 0.5f && ends == 0) ends = own + n - 1;
-    if (n <= 2) in_front += share_strong(acquisition, sums, &beside, own - n);
+    if (n <= 2) in_front += share_strong(frame, sums, &beside, own - n);
   }
   // Not in it, nor before it: beside it, or behind it
   if (most <= 0.5f || (own_share <= 0.5f && beyond <= 2.0f * in_front)) return path;
-  if (ends > 0) return fmax(path, path_behind(acquisition, ends));
+  if (ends > 0) return fmax(path, path_behind(frame, ends));
   float share = own_share;
   for (int last = own; last > 4 && share > 0.0f; last--) {
-    const float before = share_strong(acquisition, sums, &beside, last - 1);
+    const float before = share_strong(frame, sums, &beside, last - 1);
     // It has come out of other strong tissue, which lies in front of this one.
-    if (share <= 0.5f && before > share) return fmin(last * acquisition->fan_step, path);
+    if (share <= 0.5f && before > share) return fmin(last * frame->fan_step, path);
     share = before;
     own = last - 1;
   }
-  return fmin(fmax(own - 3.0f, 1.0f) * acquisition->fan_step, path);
+  return fmin(fmax(own - 3.0f, 1.0f) * frame->fan_step, path);
 }
 
 // The path on the axis behind the last step between `start` and `end` in which strong tissue ends; 0 if there is none.
-inline float exit_between(__constant const Acquisition *acquisition, __global const float *sums, float start, float end,
-                          Axis axis) {
-  const Beside beside = rays_beside(acquisition, axis, end);
-  const int last = min(beside.depth + 1, acquisition->fan_depths - 3);  // as in depth_outside
-  const int first = max(beside.depth - (int)ceil((end - start) / acquisition->fan_step) - 1, 0);
+inline float exit_between(Frame frame, __global const float *sums, float start, float end, Axis axis) {
+  const Beside beside = rays_beside(frame, axis, end);
+  const int last = min(beside.depth + 1, frame->fan_depths - 3);  // as in depth_outside
+  const int first = max(beside.depth - (int)ceil((end - start) / frame->fan_step) - 1, 0);
   __global const float *on_axis =
-      sums +
-      4 * ((acquisition->fan_points + beside.before) * acquisition->fan_angles + (int)(beside.places[0] + 0.5f)) *
-          acquisition->fan_depths;
+      sums + 4 * ((frame->fan_points + beside.before) * frame->fan_angles + (int)(beside.places[0] + 0.5f)) *
+                 frame->fan_depths;
   if (on_axis[4 * last + 6] == on_axis[4 * first + 2]) return 0.0f;
-  float behind = share_strong(acquisition, sums, &beside, last + 1);
+  float behind = share_strong(frame, sums, &beside, last + 1);
   for (int depth = last; depth >= first; depth--) {
-    const float share = share_strong(acquisition, sums, &beside, depth);
-    if (share > 0.5f && behind <= 0.5f) return path_behind(acquisition, depth);
+    const float share = share_strong(frame, sums, &beside, depth);
+    if (share > 0.5f && behind <= 0.5f) return path_behind(frame, depth);
     behind = share;
   }
   return 0.0f;
@@ -391,23 +376,22 @@ typedef struct {
 } Lines;
 
 // The lines to the depth `path` of an axis.
-inline void find_lines(__constant const Acquisition *acquisition, __global const float *sums, float path, Axis axis,
-                       Lines *lines) {
-  const float pitch = acquisition->fan_pitch, centre = axis.centre;
+inline void find_lines(Frame frame, __global const float *sums, float path, Axis axis, Lines *lines) {
+  const float pitch = frame->fan_pitch, centre = axis.centre;
   const float2 origin = axis.origin, direction = axis.direction;
-  const float reach = 0.5f * fmin(acquisition->aperture_mm, path / acquisition->receive_f_number);
-  const int low = max((int)ceil((centre - reach - 0.5f * pitch - acquisition->fan_first) / pitch), 0);
-  const int high = (int)floor((centre + reach + 0.5f * pitch - acquisition->fan_first) / pitch);
-  lines->count = clamp(high - low + 1, 1, min(MOST_POINTS, acquisition->fan_points - low));
+  const float reach = 0.5f * fmin(frame->aperture_mm, path / frame->receive_f_number);
+  const int low = max((int)ceil((centre - reach - 0.5f * pitch - frame->fan_first) / pitch), 0);
+  const int high = (int)floor((centre + reach + 0.5f * pitch - frame->fan_first) / pitch);
+  lines->count = clamp(high - low + 1, 1, min(MOST_POINTS, frame->fan_points - low));
   float least = 1e30f, most = 0.0f;
   for (int i = 0; i < lines->count; i++) {
-    const float along = acquisition->fan_first + (low + i) * pitch;
-    const float2 point = point_on_face(acquisition, along);
-    const float3 at = place_in_fan(acquisition, along, origin + path * direction);
+    const float along = frame->fan_first + (low + i) * pitch;
+    const float2 point = point_on_face(frame, along);
+    const float3 at = place_in_fan(frame, along, origin + path * direction);
     lines->x[i] = (point.x - origin.x) * direction.y - (point.y - origin.y) * direction.x;
     lines->weight[i] = clamp((reach - fabs(along - centre)) / pitch + 0.5f, 0.0f, 1.0f);
     for (int row = 0; row < ROWS; row++) {
-      const float4 found = sums_at(acquisition, sums, row, low + i, at.x, at.y);
+      const float4 found = sums_at(frame, sums, row, low + i, at.x, at.y);
       const float ratio = path / at.z;  // per length of the axis: a homogeneous medium changes nothing but the mean
       lines->delay[row][i] = ratio * found.x;
       lines->loss[row][i] = ratio * found.y;
@@ -447,12 +431,12 @@ typedef struct {
 } Waves;
 
 // The transmit focus of the zone that is used at the depth `path`; `path` itself where all depths are in focus.
-inline float transmit_focus_at(__constant const Acquisition *acquisition, float path) {
+inline float transmit_focus_at(Frame frame, float path) {
   float focus = path, least = 1e30f;
-  for (int zone = 0; zone < acquisition->transmit_zones; zone++) {
-    const float a = (path - acquisition->transmit_focus[zone]) / acquisition->transmit_rayleigh[zone];
-    const float width = acquisition->transmit_sigma[zone] * sqrt(1.0f + a * a);
-    if (width < least) focus = acquisition->transmit_focus[zone];
+  for (int zone = 0; zone < frame->transmit_zones; zone++) {
+    const float a = (path - frame->transmit_focus[zone]) / frame->transmit_rayleigh[zone];
+    const float width = frame->transmit_sigma[zone] * sqrt(1.0f + a * a);
+    if (width < least) focus = frame->transmit_focus[zone];
     least = fmin(least, width);
   }
   return focus;
@@ -464,10 +448,9 @@ typedef struct {
   float2 turned[ROWS][MOST_POINTS], focus[MOST_POINTS];
 } Phases;
 
-inline void find_phases(__constant const Acquisition *acquisition, const Lines *lines, float path, float mean_delay,
-                        Phases *phases) {
-  const float cycles = 0.5f * acquisition->cycles_per_mm;  // per millimetre of path, one way
-  const float focusing = 0.5f * cycles * (1.0f / path - 1.0f / transmit_focus_at(acquisition, path));  // turns per mm^2
+inline void find_phases(Frame frame, const Lines *lines, float path, float mean_delay, Phases *phases) {
+  const float cycles = 0.5f * frame->cycles_per_mm;  // per millimetre of path, one way
+  const float focusing = 0.5f * cycles * (1.0f / path - 1.0f / transmit_focus_at(frame, path));  // turns per mm^2
   float c, s;
   for (int i = 0; i < lines->count; i++) {
     turn(focusing * lines->x[i] * lines->x[i], &c, &s);
@@ -515,12 +498,11 @@ inline float width_of(const Waves *waves, int count) {
 // the phases and the uneven losses of soft tissue, nepers lost to strong tissue, width, and the nepers lost to strong
 // tissue right in front, which is the mean power over the lines). The power of speckle is the integral over the beam of
 // the transmitted times the received intensity. A shift of both beams changes nothing.
-inline float4 level_and_spread(__constant const Acquisition *acquisition, const Lines *lines, float path,
-                               float mean_delay, float loss) {
+inline float4 level_and_spread(Frame frame, const Lines *lines, float path, float mean_delay, float loss) {
   const int count = lines->count;
   Phases phases;
   Waves waves;
-  find_phases(acquisition, lines, path, mean_delay, &phases);
+  find_phases(frame, lines, path, mean_delay, &phases);
   find_waves(lines, &phases, UNDISTURBED, &waves);
   const float still = overlap(waves.received, waves.transmitted, count), own_width = width_of(&waves, count);
   // Strong and very lossy tissue takes parts of the aperture away. That is in the level; the line's neighbours are
@@ -566,8 +548,8 @@ typedef struct {
   float x, delay, loss, slope, rise;
 } Means;
 
-inline Means means_over(__constant const Acquisition *acquisition, const Lines *lines, float path) {
-  const float pitch = acquisition->fan_pitch;
+inline Means means_over(Frame frame, const Lines *lines, float path) {
+  const float pitch = frame->fan_pitch;
   float all = 0.0f, first = 0.0f, second = 0.0f, delays = 0.0f, moments = 0.0f, arriving = 0.0f, losses = 0.0f;
   float row_lift[ROWS];
   for (int row = 0; row < ROWS; row++) {
@@ -605,48 +587,48 @@ inline Means means_over(__constant const Acquisition *acquisition, const Lines *
 
 // One work-item computes one depth of one screen line. Global size (screen lines, depths): at one depth all lines have
 // about as many points, and compilers that make vectors of neighbouring work-items need alike ones.
-__kernel void screens(__constant const Acquisition *acquisition, __global const float *sums, int with_level,
-                      int all_soft, __global float *screens_, __global float *shades, __global float *spreads) {
-  const int line = get_global_id(0), node = get_global_id(1), nodes = acquisition->screen_depths;
-  const float path = (node + 1) * acquisition->screen_step;
-  const Axis axis = axis_of(acquisition, line);
+__kernel void screens(Frame frame, __global const float *sums, int with_level, int all_soft, __global float *screens_,
+                      __global float *shades, __global float *spreads) {
+  const int line = get_global_id(0), node = get_global_id(1), nodes = frame->screen_depths;
+  const float path = (node + 1) * frame->screen_step;
+  const Axis axis = axis_of(frame, line);
   Lines lines;
-  find_lines(acquisition, sums, path, axis, &lines);
+  find_lines(frame, sums, path, axis, &lines);
 
-  const Means means = means_over(acquisition, &lines, path);
+  const Means means = means_over(frame, &lines, path);
   float slope = means.slope, rise = means.rise;
   float4 found = (float4)(0.0f, 0.0f, 1.0f, 0.0f);
   float exit_shade = 0.0f, away = NO_END;
   int is_inside = 0;  // strong tissue
   if (with_level) {
     // In strong tissue, a beam has the level that it has before it: what this tissue takes is a matter of its ray.
-    const float depth = all_soft ? path : depth_outside(acquisition, sums, path, axis);
+    const float depth = all_soft ? path : depth_outside(frame, sums, path, axis);
     is_inside = depth < path;
-    if (depth != path) find_lines(acquisition, sums, depth, axis, &lines);
+    if (depth != path) find_lines(frame, sums, depth, axis, &lines);
     if (is_inside) {  // and goes on as before it: within bone, the lines that are left say nothing of a direction
-      const Means before = means_over(acquisition, &lines, depth);
+      const Means before = means_over(frame, &lines, depth);
       slope = before.slope;
       rise = before.rise * path / depth;
     }
     const float loss = depth != path ? mean_loss(&lines) : means.loss;
-    found = level_and_spread(acquisition, &lines, depth, means.delay, loss);
+    found = level_and_spread(frame, &lines, depth, means.delay, loss);
     exit_shade = found.y;
     // Behind the last end of strong tissue on this axis, or on one beside it, between which lines may meet it
     float behind = 0.0f;
     for (int n = 0; n < 3 && behind == 0.0f && !all_soft; n++) {
       const int beside = line + (n == 1 ? -1 : n == 2 ? 1 : 0);
-      if (beside >= 0 && beside < acquisition->screen_lines)
-        behind = exit_between(acquisition, sums, path - acquisition->screen_step, path, axis_of(acquisition, beside));
+      if (beside >= 0 && beside < frame->screen_lines)
+        behind = exit_between(frame, sums, path - frame->screen_step, path, axis_of(frame, beside));
     }
     if (behind != 0.0f) {
-      find_lines(acquisition, sums, behind, axis, &lines);
-      exit_shade = level_and_spread(acquisition, &lines, behind, means.delay, loss).w;
+      find_lines(frame, sums, behind, axis, &lines);
+      exit_shade = level_and_spread(frame, &lines, behind, means.delay, loss).w;
       // The part u of an aperture leaves u^3 of the power of speckle, in a beam 1 / u times as wide; but the edge of a
       // plate right in front of a point cuts a beam that is in focus: u. A beam is made of the visible aperture from
       // the distance on at which the cone of its lines is wider than a Fresnel zone, 4 F^2 wavelengths.
       away = fmax(path - behind, 0.0f);
-      const float zone = 8.0f * acquisition->receive_f_number * acquisition->receive_f_number;
-      const float far = fmin(away * acquisition->cycles_per_mm / zone, 1.0f);
+      const float zone = 8.0f * frame->receive_f_number * frame->receive_f_number;
+      const float far = fmin(away * frame->cycles_per_mm / zone, 1.0f);
       found.y = blend(found.w, found.y, far);
     }
   }
@@ -659,9 +641,8 @@ __kernel void screens(__constant const Acquisition *acquisition, __global const 
 
 // Mean power over a beam of standard deviation `sigma`, in screen lines, of what the lines at one depth let through,
 // relative to its own line. The power of the beam has sigma / sqrt 2; a Gauss-Hermite rule of three points.
-inline float mean_passed(__constant const Acquisition *acquisition, __global const float *screens_, int node, int line,
-                         float sigma) {
-  const int nodes = acquisition->screen_depths, lines = acquisition->screen_lines;
+inline float mean_passed(Frame frame, __global const float *screens_, int node, int line, float sigma) {
+  const int nodes = frame->screen_depths, lines = frame->screen_lines;
   const float own = screens_[4 * (line * nodes + node)];
   float sum = 0.6666667f;
   for (int side = -1; side <= 1; side += 2) {
@@ -676,25 +657,23 @@ inline float mean_passed(__constant const Acquisition *acquisition, __global con
 // An echo has the level of the line that its scatterer is on, but should have that of the line whose beam receives it.
 // Over the width of an undisturbed beam the two hardly differ. For a wider one this is the factor that leaves a line
 // the mean power that it had. One work-item computes one depth of one screen line. Global size (depths, screen lines).
-__kernel void keep_levels(__constant const Acquisition *acquisition, __global const float *screens_,
-                          __global float *spreads) {
-  const int node = get_global_id(0), line = get_global_id(1), at = line * acquisition->screen_depths + node;
-  const float path = (node + 1) * acquisition->screen_step, spread = spreads[2 * at];
-  const float traced_lines = (float)(acquisition->traced_lines - 1) / (acquisition->screen_lines - 1);
-  const float apart = line_distance(acquisition, path + traced_start(acquisition, line * traced_lines));
-  const float sigma = lateral_sigma(acquisition, path) / (apart * traced_lines);
-  spreads[2 * at + 1] = sqrt(mean_passed(acquisition, screens_, node, line, sigma) /
-                             mean_passed(acquisition, screens_, node, line, sigma * spread));
+__kernel void keep_levels(Frame frame, __global const float *screens_, __global float *spreads) {
+  const int node = get_global_id(0), line = get_global_id(1), at = line * frame->screen_depths + node;
+  const float path = (node + 1) * frame->screen_step, spread = spreads[2 * at];
+  const float traced_lines = (float)(frame->traced_lines - 1) / (frame->screen_lines - 1);
+  const float apart = line_distance(frame, path + traced_start(frame, line * traced_lines));
+  const float sigma = lateral_sigma(frame, path) / (apart * traced_lines);
+  spreads[2 * at + 1] =
+      sqrt(mean_passed(frame, screens_, node, line, sigma) / mean_passed(frame, screens_, node, line, sigma * spread));
 }
 
 // The factor by which the power of speckle would change where the axes of neighbouring lines come together to the part
 // `ratio` of their distance: a scatterer is then in the strips of several lines, which add up with phases that differ
 // by `turns` from one to the next (docs/physics.md#beams-from-an-aperture).
-inline float gathered_power(__constant const Acquisition *acquisition, float path, float apart_mm, float ratio,
-                            float turns) {
-  const float apart = 0.5f * apart_mm / lateral_sigma(acquisition, path);
+inline float gathered_power(Frame frame, float path, float apart_mm, float ratio, float turns) {
+  const float apart = 0.5f * apart_mm / lateral_sigma(frame, path);
   // Their depths differ, too, by a part of the pulse. Its deviation is 2.3548 / (2 pi bandwidth) cycles.
-  const float later = 1.3341168f * acquisition->fractional_bandwidth * turns;
+  const float later = 1.3341168f * frame->fractional_bandwidth * turns;
   const float decay = apart * apart + later * later;
   float sum = 1.0f;
   for (int n = 1; n < MOST_GATHERED; n++) {
@@ -710,9 +689,9 @@ inline float gathered_power(__constant const Acquisition *acquisition, float pat
 // The lines of an aperture seem to meet in a point on the axis, but out of its focus the transmitted beam is wide, and
 // a part of it passes beside strong tissue that is right in front of this point: the variance of its intensity, in
 // mm^2, by which it is wider than the received one. (Over the width of that, images average by the lateral beam.)
-inline float extra_variance(__constant const Acquisition *acquisition, float path) {
-  const float receive = fmax(path * acquisition->receive_sigma_slope, acquisition->receive_sigma_min);
-  return 0.5f * fmax(transmit_variance(acquisition, path, 1.0f) - receive * receive, 0.0f);
+inline float extra_variance(Frame frame, float path) {
+  const float receive = fmax(path * frame->receive_sigma_slope, frame->receive_sigma_min);
+  return 0.5f * fmax(transmit_variance(frame, path, 1.0f) - receive * receive, 0.0f);
 }
 
 // A place between two screen lines
@@ -721,9 +700,9 @@ typedef struct {
   float part;
 } Between;
 
-inline Between between_lines(__constant const Acquisition *acquisition, float place) {
+inline Between between_lines(Frame frame, float place) {
   Between between;
-  const float inside = clamp(place, 0.0f, acquisition->screen_lines - 1.001f);
+  const float inside = clamp(place, 0.0f, frame->screen_lines - 1.001f);
   between.left = (int)inside;
   between.part = inside - between.left;
   return between;
@@ -733,10 +712,9 @@ inline Between between_lines(__constant const Acquisition *acquisition, float pl
 // two `kinds` of shades. In shadows it is the mean over a deviation `sigma` in screen lines, by a Gauss-Hermite rule of
 // three points; from where the beam passes beside, nothing is taken. In strong tissue shades are those before it, and
 // light from there does not reach what is behind: its lines count as the line itself.
-inline float mean_lit(__constant const Acquisition *acquisition, __global const float *shades, int kind, int node,
-                      float place, float sigma) {
-  const int nodes = acquisition->screen_depths;
-  const Between middle = between_lines(acquisition, place);
+inline float mean_lit(Frame frame, __global const float *shades, int kind, int node, float place, float sigma) {
+  const int nodes = frame->screen_depths;
+  const Between middle = between_lines(frame, place);
   __global const float *left = shades + 4 * (middle.left * nodes + node), *right = left + 4 * nodes;
   // Between a line that is in strong tissue and one that is not, a ray which has left it is as the latter; between two
   // that are, as the darker one: the other may not have come out since the face.
@@ -746,7 +724,7 @@ inline float mean_lit(__constant const Acquisition *acquisition, __global const 
   const float own = left_inside && right_inside ? fmin(on_left, on_right) : blend(on_left, on_right, part);
   float sum = 0.6666667f * own;
   for (int side = -1; side <= 1; side += 2) {
-    const Between at = between_lines(acquisition, place + side * 1.7320508f * sigma);
+    const Between at = between_lines(frame, place + side * 1.7320508f * sigma);
     float lit[2];
     for (int n = 0; n < 2; n++) {
       __global const float *shade = shades + 4 * ((at.left + n) * nodes + node);
@@ -759,55 +737,55 @@ inline float mean_lit(__constant const Acquisition *acquisition, __global const 
 }
 
 // The nepers that strong tissue takes at a depth, and behind its last end before.
-inline float2 mean_shades(__constant const Acquisition *acquisition, __global const float *shades, int node,
-                          float place, float path, float lines_per_mm) {
-  const int nodes = acquisition->screen_depths;
-  const float extra = extra_variance(acquisition, path);
+inline float2 mean_shades(Frame frame, __global const float *shades, int node, float place, float path,
+                          float lines_per_mm) {
+  const int nodes = frame->screen_depths;
+  const float extra = extra_variance(frame, path);
   const float reach = sqrt(extra) * lines_per_mm;
   float away = NO_END;
   for (int side = -1; side <= 1; side++) {
-    const Between at = between_lines(acquisition, place + side * 1.7320508f * reach);
+    const Between at = between_lines(frame, place + side * 1.7320508f * reach);
     away = fmin(away, fmin(fabs(shades[4 * (at.left * nodes + node) + 3]),
                            fabs(shades[4 * ((at.left + 1) * nodes + node) + 3])));
   }
   if (away == NO_END) {
-    const float lit = mean_lit(acquisition, shades, 0, node, place, 0.0f);
+    const float lit = mean_lit(frame, shades, 0, node, place, 0.0f);
     return (float2)(-log_fast(lit), -log_fast(lit));
   }
   // The lines come together from a distance in a cone, over whose width they average themselves.
-  const float cone = away / acquisition->receive_f_number;
+  const float cone = away / frame->receive_f_number;
   const float sigma = sqrt(fmax(extra - cone * cone / 12.0f, 0.0f)) * lines_per_mm;
-  const float end_sigma = sqrt(extra_variance(acquisition, path - away)) * lines_per_mm;
-  return (float2)(-log_fast(mean_lit(acquisition, shades, 0, node, place, sigma)),
-                  -log_fast(mean_lit(acquisition, shades, 1, node, place, end_sigma)));
+  const float end_sigma = sqrt(extra_variance(frame, path - away)) * lines_per_mm;
+  return (float2)(-log_fast(mean_lit(frame, shades, 0, node, place, sigma)),
+                  -log_fast(mean_lit(frame, shades, 1, node, place, end_sigma)));
 }
 
 // The beams of traced lines, interpolated between screens; 0 at the face. Axes that come together must not create
 // energy. One work-item computes one depth of one traced line. Global size (1 + depths, traced lines).
-__kernel void beams(__constant const Acquisition *acquisition, __global const float *screens_,
-                    __global const float *shades, int all_soft, __global float *beams_) {
-  const int number = get_global_id(0), line = get_global_id(1), depths = acquisition->screen_depths;
+__kernel void beams(Frame frame, __global const float *screens_, __global const float *shades, int all_soft,
+                    __global float *beams_) {
+  const int number = get_global_id(0), line = get_global_id(1), depths = frame->screen_depths;
   const int to = line * (1 + depths) + number;
-  __global float *shade = beams_ + 4 * acquisition->traced_lines * (1 + depths);
+  __global float *shade = beams_ + 4 * frame->traced_lines * (1 + depths);
   if (number == 0) {
     vstore4((float4)(0.0f), to, beams_);
     vstore4((float4)(0.0f), to, shade);
     return;
   }
-  const float per_line = (acquisition->screen_lines - 1.0f) / (acquisition->traced_lines - 1);
+  const float per_line = (frame->screen_lines - 1.0f) / (frame->traced_lines - 1);
   const float place = line * per_line;
-  const int before = min((int)place, acquisition->screen_lines - 2);
+  const int before = min((int)place, frame->screen_lines - 2);
   const float4 left = vload4(before * depths + number - 1, screens_);
   const float4 right = vload4((before + 1) * depths + number - 1, screens_);
   float4 beam = left + (place - before) * (right - left);
   const float4 left_shade = vload4(before * depths + number - 1, shades);
   const float4 right_shade = vload4((before + 1) * depths + number - 1, shades);
   float4 own = left_shade + (place - before) * (right_shade - left_shade);
-  const float path = number * acquisition->screen_step;
-  const float apart = line_distance(acquisition, path + traced_start(acquisition, (float)line));
+  const float path = number * frame->screen_step;
+  const float apart = line_distance(frame, path + traced_start(frame, (float)line));
   if (!all_soft) {
     const float lines_per_mm = per_line / apart;
-    const float2 mean = mean_shades(acquisition, shades, number - 1, place, path, lines_per_mm);
+    const float2 mean = mean_shades(frame, shades, number - 1, place, path, lines_per_mm);
     beam.x += mean.x - own.x;
     own.xy = mean;
   }
@@ -817,7 +795,7 @@ __kernel void beams(__constant const Acquisition *acquisition, __global const fl
   vstore4(own, to, shade);
   const float4 per_strip = (right - left) * per_line;  // from line to line
   const float tilt = beam.z / path;
-  const float turns = acquisition->cycles_per_mm * (per_strip.y - (apart + per_strip.z) * tilt);
-  beam.x += 0.5f * log_fast(gathered_power(acquisition, path, apart, 1.0f + per_strip.z / apart, turns));
+  const float turns = frame->cycles_per_mm * (per_strip.y - (apart + per_strip.z) * tilt);
+  beam.x += 0.5f * log_fast(gathered_power(frame, path, apart, 1.0f + per_strip.z / apart, turns));
   vstore4(beam, to, beams_);
 }

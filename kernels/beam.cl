@@ -25,14 +25,14 @@
 
 // Writes the width of the beam of a traced line at path lengths `s` and the factor of its echoes, both re an
 // undisturbed one, linear between the screens.
-inline void find_spread(__constant const Acquisition *acquisition, __global const float *spreads, int traced, floatn s,
-                        floatn *width, floatn *factor) {
+inline void find_spread(Frame frame, __global const float *spreads, int traced, floatn s, floatn *width,
+                        floatn *factor) {
   *width = *factor = (floatn)(1.0f);
-  if (!acquisition->aperture_beams) return;
-  const int depths = acquisition->screen_depths;
-  const float line = (float)traced * (acquisition->screen_lines - 1) / (acquisition->traced_lines - 1);
-  const int left = min((int)line, acquisition->screen_lines - 2);
-  const floatn far = s / acquisition->screen_step - 1.0f;
+  if (!frame->aperture_beams) return;
+  const int depths = frame->screen_depths;
+  const float line = (float)traced * (frame->screen_lines - 1) / (frame->traced_lines - 1);
+  const int left = min((int)line, frame->screen_lines - 2);
+  const floatn far = s / frame->screen_step - 1.0f;
   SPREAD(float, far_, far);
   const int near = clamp((int)far_[0], 0, depths - 2);  // for all lanes, which are much closer than screens
   const floatn t = clamp(far - (float)near, (floatn)(0.0f), (floatn)(1.0f));
@@ -52,36 +52,36 @@ __kernel void join_edges(__global const float *from_re, __global const float *fr
   STORE_LANES(LOAD_LANES(from_im + before) + LOAD_LANES(from_im + behind), edge_im + to);
 }
 
-__kernel void lateral_beam(__constant const Acquisition *acquisition, __global const float *edge_re,
-                           __global const float *edge_im, __global const float *spreads, __global const float *losses,
-                           __global float *to_re, __global float *to_im, int stride) {
+__kernel void lateral_beam(Frame frame, __global const float *edge_re, __global const float *edge_im,
+                           __global const float *spreads, __global const float *losses, __global float *to_re,
+                           __global float *to_im, int stride) {
   int sample = get_global_id(0) * LANES, line = get_global_id(1);
-  int centre = acquisition->guard_lines + line * acquisition->lateral_rays;
+  int centre = frame->guard_lines + line * frame->lateral_rays;
   // One width per lane: near a tight focus the width changes from sample to sample.
-  const float start = line_start(acquisition, (float)line);
-  const floatn s = fmax((TO_FLOATN(LANE_INDEX) + sample) * acquisition->sample_mm - start, (floatn)(0.0f));
+  const float start = line_start(frame, (float)line);
+  const floatn s = fmax((TO_FLOATN(LANE_INDEX) + sample) * frame->sample_mm - start, (floatn)(0.0f));
   floatn spread, factor;
-  find_spread(acquisition, spreads, centre, s, &spread, &factor);
-  __global const float *of_line = losses + LOSS_WORDS * line * (acquisition->samples / LOSS_STEP + 1);
+  find_spread(frame, spreads, centre, s, &spread, &factor);
+  __global const float *of_line = losses + LOSS_WORDS * line * (frame->samples / LOSS_STEP + 1);
   const floatn stretch = 1.0f / frequency_at(of_line, sample);
-  const floatn apart = line_distance_lanes(acquisition, s + start);
-  const floatn sigma = spread * lateral_sigma_lanes_at(acquisition, s, stretch);
+  const floatn apart = line_distance_lanes(frame, s + start);
+  const floatn sigma = spread * lateral_sigma_lanes_at(frame, s, stretch);
   floatn step = apart / sigma;  // between traced lines, in sigmas
   floatn step2 = step * step;
   floatn narrow2 = fmax(1.0f - step2 / 6.0f, 0.25f);  // (sigma of these weights / sigma of the beam)^2
   const floatn apart2 = step2 / narrow2;              // squared distance of traced lines in sigmas of these weights
-  const floatn reach = ceil(acquisition->beam_cutoff * sigma / apart);
-  const int last = min((int)largest(reach), max(centre, acquisition->traced_lines - 1 - centre));
+  const floatn reach = ceil(frame->beam_cutoff * sigma / apart);
+  const int last = min((int)largest(reach), max(centre, frame->traced_lines - 1 - centre));
   // Up to here both edges of a pair are there, for all lanes.
-  const int whole = min((int)smallest(reach), min(centre - 1, acquisition->traced_lines - 2 - centre));
+  const int whole = min((int)smallest(reach), min(centre - 1, frame->traced_lines - 2 - centre));
   // By how much the phase turns at one step from the axis; at the middle between stored frequencies.
   const int node = sample / LOSS_STEP;
-  const float middle = fmax((node + 0.5f) * LOSS_STEP * acquisition->sample_mm - start, 0.0f);
+  const float middle = fmax((node + 0.5f) * LOSS_STEP * frame->sample_mm - start, 0.0f);
   __global const float *stored = of_line + LOSS_WORDS * node + 2;
   const float frequency = 0.5f * (stored[0] + stored[LOSS_WORDS]);
   SPREAD(float, spread_, spread);
-  const float across = line_distance(acquisition, middle + start) / spread_[0];
-  const float curved = lateral_curvature(acquisition, middle, 1.0f / frequency) * across * across;
+  const float across = line_distance(frame, middle + start) / spread_[0];
+  const float curved = lateral_curvature(frame, middle, 1.0f / frequency) * across * across;
   const float turns = curved / (2.0f * TWO_PI);
   // Edge `edge` is half a step before traced line `edge`. Edges come in pairs, n + 1/2 lines to either side. Their
   // weights w are a Gaussian by recurrence: w(n + 1) = w(n) ratio(n).
@@ -100,7 +100,7 @@ __kernel void lateral_beam(__constant const Acquisition *acquisition, __global c
       floatn pair_re = 0.0f, pair_im = 0.0f;
       const int edges[2] = {centre - n, centre + n + 1};
       for (int side = 0; side < 2; side++) {
-        if (n > whole && (edges[side] < 1 || edges[side] >= acquisition->traced_lines)) continue;
+        if (n > whole && (edges[side] < 1 || edges[side] >= frame->traced_lines)) continue;
         pair_re += LOAD_LANES(edge_re + edges[side] * stride + here);
         pair_im += LOAD_LANES(edge_im + edges[side] * stride + here);
       }

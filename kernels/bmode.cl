@@ -2,16 +2,15 @@
 // Global size (samples / LANES, scan lines).
 //
 // Buffers: re, im float [scan line][stride], LINE_PAD zeros on either side of the samples; losses as in downshift.cl;
-// pulse float [2 reach + 1];
-// iq float2 (real, imaginary), envelope float and grey uchar [scan line][samples].
+// pulse float [2 reach + 1]; iq float2 (real, imaginary), envelope float and grey uchar [scan line][samples].
 
 #include "display.clh"
 
 // The axial part of the point spread function. The pulse is exp(-x^2 / 2 sx^2) cos(2 pi f x). Baseband impulses contain
 // the phase of the carrier, so only the Gaussian envelope remains, and the magnitude needs no Hilbert transform.
 __kernel void convolve_pulse(__global const float *re, __global const float *im, int stride,
-                             __constant const float *pulse, int reach, __constant const Acquisition *acquisition,
-                             __global const float *losses, __global float *iq, int samples) {
+                             __constant const float *pulse, int reach, Frame frame, __global const float *losses,
+                             __global float *iq, int samples) {
   int sample = get_global_id(0) * LANES, line = get_global_id(1);
   __global const float *from_re = re + line * stride + LINE_PAD + sample - reach;
   __global const float *from_im = im + line * stride + LINE_PAD + sample - reach;
@@ -21,9 +20,9 @@ __kernel void convolve_pulse(__global const float *re, __global const float *im,
     sum_re = fma(tap, LOAD_LANES(from_re + k), sum_re);
     sum_im = fma(tap, LOAD_LANES(from_im + k), sum_im);
   }
-  if (acquisition->downshift > 0.0f) {  // back to the carrier of the transmitted pulse
+  if (frame->downshift > 0.0f) {  // back to the carrier of the transmitted pulse
     floatn c, s;
-    turn(turns_at(acquisition, losses + LOSS_WORDS * line * (samples / LOSS_STEP + 1), sample), &c, &s);
+    turn(turns_at(frame, losses + LOSS_WORDS * line * (samples / LOSS_STEP + 1), sample), &c, &s);
     const floatn x = sum_re;
     sum_re = x * c + sum_im * s;
     sum_im = sum_im * c - x * s;
@@ -34,15 +33,14 @@ __kernel void convolve_pulse(__global const float *re, __global const float *im,
 // Amplifier noise, time gain compensation, envelope, log compression, eight bits. TGC is `tgc` [sample], in dB, and
 // `line_gains` [scan line] are added to it. `ringing`, float2 [sample], is added to every line: the reverberation at
 // the face. Both count from where the line leaves it.
-__kernel void compress(__constant const Acquisition *acquisition, __global const float *iq, int samples,
-                       __global const float *ringing, float noise, uint noise_seed, __global const float *tgc,
-                       __global const float *line_gains, float level_of_white_db, Display display,
-                       __global float *envelope, __global uchar *grey) {
+__kernel void compress(Frame frame, __global const float *iq, int samples, __global const float *ringing, float noise,
+                       uint noise_seed, __global const float *tgc, __global const float *line_gains,
+                       float level_of_white_db, Display display, __global float *envelope, __global uchar *grey) {
   int sample = get_global_id(0) * LANES, line = get_global_id(1);
   int here = line * samples + sample;
   floatn re, im;
   LOAD_PAIRS(re, im, iq + 2 * here);
-  const int start = (int)(line_start(acquisition, (float)line) / acquisition->sample_mm + 0.5f);
+  const int start = (int)(line_start(frame, (float)line) / frame->sample_mm + 0.5f);
   floatn ring_re, ring_im, tgc_db;
   if (start == 0) {
     LOAD_PAIRS(ring_re, ring_im, ringing + 2 * sample);

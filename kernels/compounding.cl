@@ -26,8 +26,7 @@ __kernel void mean_in_field(__global const uchar *image, __global const uchar *f
 //
 // `to_image` is the affine map from voxels to (column, row, distance from the plane in millimetres), three rows of
 // four. `axes` are (first other axis, second other axis, axis of the columns), `dims` the voxels along i, j, k,
-// `pixels` the (columns, rows) of the image.
-// Buffers: mean, field as above; sum, weight float [k][j][i].
+// `pixels` the (columns, rows) of the image. Buffers: mean, field as above; sum, weight float [k][j][i].
 __kernel void add_image(__global const float *mean, __global const uchar *field, int2 pixels,
                         __constant const float *to_image, int4 axes, int4 low, int4 dims, float reach,
                         __global float *sum, __global float *weight) {

@@ -12,11 +12,11 @@
 #include "common.clh"
 
 // One work-item computes one scan line. Global size (scan lines).
-__kernel void losses(__constant const Acquisition *acquisition, __global const Segment *segments,
-                     __global const int *segment_counts, __global float *losses_) {
-  const int scan_line = get_global_id(0), nodes = acquisition->samples / LOSS_STEP + 1;
-  const int line = acquisition->guard_lines + scan_line * acquisition->lateral_rays;
-  const float step = LOSS_STEP * acquisition->sample_mm;
+__kernel void losses(Frame frame, __global const Segment *segments, __global const int *segment_counts,
+                     __global float *losses_) {
+  const int scan_line = get_global_id(0), nodes = frame->samples / LOSS_STEP + 1;
+  const int line = frame->guard_lines + scan_line * frame->lateral_rays;
+  const float step = LOSS_STEP * frame->sample_mm;
   __global float *to = losses_ + LOSS_WORDS * scan_line * nodes;
   const int count = min(segment_counts[line], MAX_SEGMENTS);
   for (int node = 0; node < nodes; node++) vstore3((float3)(0.0f, -1.0f, 1.0f), node, to);
@@ -34,8 +34,8 @@ __kernel void losses(__constant const Acquisition *acquisition, __global const S
   float loss = 0.0f, lower = 0.0f, turns = 0.0f;
   for (int node = 0; node < nodes; node++) {
     if (to[LOSS_WORDS * node + 1] >= 0.0f) loss = to[LOSS_WORDS * node];  // otherwise nothing is there: it goes on
-    const float frequency = frequency_after(acquisition, loss), missing = 1.0f - frequency;
-    if (node > 0) turns += 0.5f * (lower + missing) * step * acquisition->cycles_per_mm;
+    const float frequency = frequency_after(frame, loss), missing = 1.0f - frequency;
+    if (node > 0) turns += 0.5f * (lower + missing) * step * frame->cycles_per_mm;
     lower = missing;
     vstore3((float3)(loss, turns, frequency), node, to);
   }
@@ -44,14 +44,14 @@ __kernel void losses(__constant const Acquisition *acquisition, __global const S
 // The carrier of every echo becomes that of its depth, for a pulse without a carrier to be convolved with. Echoes lie
 // between two samples, with one phase in both. Turned by an angle from one sample to the next, they have (2 + cos) / 3
 // of their power on average, which is given back. Global size (samples / LANES, scan lines).
-__kernel void shift_frequency(__constant const Acquisition *acquisition, __global const float *losses_,
-                              __global float *re, __global float *im, int stride) {
+__kernel void shift_frequency(Frame frame, __global const float *losses_, __global float *re, __global float *im,
+                              int stride) {
   const int sample = get_global_id(0) * LANES, line = get_global_id(1);
   const int here = line * stride + LINE_PAD + sample;
-  __global const float *of_line = losses_ + LOSS_WORDS * line * (acquisition->samples / LOSS_STEP + 1);
+  __global const float *of_line = losses_ + LOSS_WORDS * line * (frame->samples / LOSS_STEP + 1);
   floatn c, s;
-  turn(turns_at(acquisition, of_line, sample), &c, &s);
-  const float cycles = acquisition->sample_mm * acquisition->cycles_per_mm;
+  turn(turns_at(frame, of_line, sample), &c, &s);
+  const float cycles = frame->sample_mm * frame->cycles_per_mm;
   floatn step_c, step_s;
   turn((1.0f - frequency_at(of_line, sample)) * cycles, &step_c, &step_s);
   const floatn kept = 1.0f / sqrt((2.0f + step_c) / 3.0f);

@@ -7,6 +7,7 @@
 //
 // Buffers: quantiles, segments, segment_counts, hits, hit_counts as in raytracing.cl.
 
+#include "common.clh"
 #include "hits.clh"
 
 // Length along a ray in the probe frame at which it meets the surface of the face from in front; -1 if it does not.
@@ -19,13 +20,12 @@ inline float length_to_face(float3 start, float3 direction, float radius) {
   return b < 0.0f && root >= 0.0f && a > 1e-6f ? -(b + sqrt(root)) / a : -1.0f;
 }
 
-__kernel void face_hits(__constant const Acquisition *acquisition, __global const float *quantiles,
-                        __global const Segment *segments, __global const int *segment_counts, __global Hit *hits,
-                        __global int *hit_counts) {
-  const int line = get_global_id(0), ray = get_global_id(1), slot = line * acquisition->elevational_rays + ray;
+__kernel void face_hits(Frame frame, __global const float *quantiles, __global const Segment *segments,
+                        __global const int *segment_counts, __global Hit *hits, __global int *hit_counts) {
+  const int line = get_global_id(0), ray = get_global_id(1), slot = line * frame->elevational_rays + ray;
   const float quantile = quantiles[slot];
-  const float radius = acquisition->flat_face ? 0.0f : acquisition->apex_radius_mm;
-  __constant const float *m = acquisition->probe_to_ras;
+  const float radius = frame->flat_face ? 0.0f : frame->apex_radius_mm;
+  __constant const float *m = frame->probe_to_ras;
   const float3 origin = (float3)(m[3], m[7], m[11]);
   const int segments_of_line = min(segment_counts[line], MAX_SEGMENTS);
   int count = hit_counts[slot];
@@ -38,17 +38,17 @@ __kernel void face_hits(__constant const Acquisition *acquisition, __global cons
     float along = length_to_face(start, direction, radius);
     float3 aside = (float3)(0.0f);
     for (int n = 0; n < 2 && along >= 0.0f; n++) {  // the ray's offset changes slowly along the segment
-      aside = quantile * elevation_sigma(acquisition, segment->path_mm + along) * elevational;
+      aside = quantile * elevation_sigma(frame, segment->path_mm + along) * elevational;
       along = length_to_face(start + aside, direction, radius);
     }
     if (along < 0.0f || along > segment->length_mm) continue;
     const float3 at = start + aside + along * direction;
-    if (fabs(at.x) > acquisition->face_half_mm || fabs(at.z) > acquisition->face_half_height_mm) continue;
+    if (fabs(at.x) > frame->face_half_mm || fabs(at.z) > frame->face_half_height_mm) continue;
     const float3 normal =
         radius == 0.0f ? (float3)(0.0f, 1.0f, 0.0f) : (float3)(at.x / radius, (at.y + radius) / radius, 0.0f);
     if (count < MAX_HITS)
       hits[slot * MAX_HITS + count] =
-          hit_on_segment(acquisition, segment, along, quantile, affine_vector(m, normal), acquisition->face_reflection);
+          hit_on_segment(frame, segment, along, quantile, affine_vector(m, normal), frame->face_reflection);
     count++;
   }
   hit_counts[slot] = count;

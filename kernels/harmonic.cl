@@ -6,11 +6,11 @@
 
 #include "common.clh"
 
-__kernel void apply_level(__constant const Acquisition *acquisition, __global const float *levels,
-                          __global const float *contact, __global float *re, __global float *im, int stride) {
+__kernel void apply_level(Frame frame, __global const float *levels, __global const float *contact, __global float *re,
+                          __global float *im, int stride) {
   const int sample = get_global_id(0) * LANES, line = get_global_id(1);
   const int here = line * stride + LINE_PAD + sample;
-  const int start = (int)(line_start(acquisition, (float)line) / acquisition->sample_mm + 0.5f);
+  const int start = (int)(line_start(frame, (float)line) / frame->sample_mm + 0.5f);
   float level_[LANES];
   for (int lane = 0; lane < LANES; lane++) level_[lane] = levels[max(sample + lane - start, 0)] * contact[line];
   const floatn level = LOAD_LANES(level_);

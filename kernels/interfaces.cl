@@ -60,13 +60,13 @@ inline float part_carried(float least, float phase, float most, float flat) {
 }
 
 // One work-item computes the walls of one traced line.
-__kernel void find_walls(__constant const Acquisition *acquisition, __global const Hit *hits,
-                         __global const int *hit_counts, __global const float *centres, __global Wall *walls,
-                         __global int *wall_counts, __global int *wall_reach) {
-  const int line = get_global_id(0), rays = acquisition->elevational_rays;
-  const float pulse = acquisition->fractional_bandwidth * 0.42466090f;  // 1 / (2 sqrt(2 ln 2))
-  const float per_mm = TWO_PI * acquisition->cycles_per_mm;
-  const float start = traced_start(acquisition, (float)line);
+__kernel void find_walls(Frame frame, __global const Hit *hits, __global const int *hit_counts,
+                         __global const float *centres, __global Wall *walls, __global int *wall_counts,
+                         __global int *wall_reach) {
+  const int line = get_global_id(0), rays = frame->elevational_rays;
+  const float pulse = frame->fractional_bandwidth * 0.42466090f;  // 1 / (2 sqrt(2 ln 2))
+  const float per_mm = TWO_PI * frame->cycles_per_mm;
+  const float start = traced_start(frame, (float)line);
   __global Wall *my_walls = walls + line * rays * MAX_HITS;
   int walls_found = 0;
   float farthest = 0.0f;
@@ -74,9 +74,9 @@ __kernel void find_walls(__constant const Acquisition *acquisition, __global con
     const int slot = line * rays + ray, count = min(hit_counts[slot], MAX_HITS);
     for (int h = 0; h < count; h++) {
       __global const Hit *hit = hits + slot * MAX_HITS + h;
-      const float2 sigma = beam_sigma(acquisition, hit->path_mm);
+      const float2 sigma = beam_sigma(frame, hit->path_mm);
       // Near the apex of a phased array all lines are within the beam, and every second, fourth ... is enough.
-      float step = line_distance(acquisition, hit->path_mm + start);
+      float step = line_distance(frame, hit->path_mm + start);
       int every = 1;
       for (; 8.0f * step < sigma.x && every < 64; every *= 2) step *= 2.0f;
       if (line % every) continue;
@@ -97,11 +97,11 @@ __kernel void find_walls(__constant const Acquisition *acquisition, __global con
       // shifted ones differs from the integral, the more so in steep walls.
       const float centre = hit->elevational_mm + flat_aside * (centres[ray] * sigma.y - hit->elevational_mm);
       Wall wall;
-      wall.echo = hit->echo * exp_fast(gain_of_band(acquisition, hit->loss));
+      wall.echo = hit->echo * exp_fast(gain_of_band(frame, hit->loss));
       wall.depth_mm = hit->depth_mm - hit->elevational_slope * (hit->elevational_mm - (1.0f - carried_aside) * centre);
       // In a fan of lines a plane is bent: the depth along it grows to both sides.
-      const float apart = line_distance(acquisition, hit->path_mm);
-      const float fan = (2.0f * stretch - 1.0f) * (line_distance(acquisition, hit->path_mm + 1.0f) / apart - 1.0f);
+      const float apart = line_distance(frame, hit->path_mm);
+      const float fan = (2.0f * stretch - 1.0f) * (line_distance(frame, hit->path_mm + 1.0f) / apart - 1.0f);
       const float inside2 =
           bent_patch(per_mm, hit->lateral_slope, bend + fan, inside * sigma2, &wall.depth_mm) +
           bent_patch(per_mm, hit->elevational_slope, bend, inside_aside * sigma.y * sigma.y, &wall.depth_mm);
@@ -116,7 +116,7 @@ __kernel void find_walls(__constant const Acquisition *acquisition, __global con
       wall.echo *= share * 0.39894228f * lines;  // 1 / sqrt(2 pi): unit sum over the lines
       wall.fall = -0.5f * LOG2_E * per_line * per_line;
       // Walls are far brighter than speckle: cut off as early as that they would visibly end.
-      wall.reach = 1.35f * acquisition->beam_cutoff / per_line;
+      wall.reach = 1.35f * frame->beam_cutoff / per_line;
       farthest = fmax(farthest, wall.reach);
       my_walls[walls_found++] = wall;
     }
@@ -126,15 +126,14 @@ __kernel void find_walls(__constant const Acquisition *acquisition, __global con
 }
 
 // One work-item computes the samples of one slice of one scan line; global size (slices, scan lines).
-__kernel void interface_echoes(__constant const Acquisition *acquisition, __global const Wall *walls,
-                               __global const int *wall_counts, __global const int *wall_reach, __global float *re,
-                               __global float *im, int stride) {
+__kernel void interface_echoes(Frame frame, __global const Wall *walls, __global const int *wall_counts,
+                               __global const int *wall_reach, __global float *re, __global float *im, int stride) {
   const int slice = get_global_id(0), slices = get_global_size(0), line = get_global_id(1);
-  const int first = slice * acquisition->samples / slices, last = (slice + 1) * acquisition->samples / slices;
-  const int centre = acquisition->guard_lines + line * acquisition->lateral_rays;
-  const int most = acquisition->elevational_rays * MAX_HITS;
+  const int first = slice * frame->samples / slices, last = (slice + 1) * frame->samples / slices;
+  const int centre = frame->guard_lines + line * frame->lateral_rays;
+  const int most = frame->elevational_rays * MAX_HITS;
   __global float *my_re = re + line * stride + LINE_PAD, *my_im = im + line * stride + LINE_PAD;
-  for (int from = 0; from < acquisition->traced_lines; from++) {
+  for (int from = 0; from < frame->traced_lines; from++) {
     const int away = centre - from;
     if (abs(away) > wall_reach[from]) continue;
     __global const Wall *its_walls = walls + from * most;
@@ -142,13 +141,13 @@ __kernel void interface_echoes(__constant const Acquisition *acquisition, __glob
     for (int w = 0; w < count; w++) {
       if (fabs((float)away) > its_walls[w].reach) continue;
       const float depth = its_walls[w].depth_mm + away * its_walls[w].depth_per_line;
-      const float place = depth / acquisition->sample_mm;
+      const float place = depth / frame->sample_mm;
       const int bin = (int)floor(place);
-      if (bin < first - 1 || bin >= last || bin < 0 || bin + 1 >= acquisition->samples) continue;
+      if (bin < first - 1 || bin >= last || bin < 0 || bin + 1 >= frame->samples) continue;
       const float part = place - bin;
       const float echo = its_walls[w].echo * exp2_scalar(fmax(its_walls[w].fall * away * away, -100.0f));
       float c, s;
-      turn(depth * acquisition->cycles_per_mm, &c, &s);
+      turn(depth * frame->cycles_per_mm, &c, &s);
       c *= echo, s *= -echo;
       if (bin >= first) {
         my_re[bin] += c * (1.0f - part);

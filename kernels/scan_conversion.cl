@@ -18,23 +18,22 @@ inline floatn angle_of(floatn x, floatn y) {
   return x < 0.0f ? -a : a;
 }
 
-__kernel void scan_convert(__constant const Acquisition *acquisition, __global const uchar *grey, float left, float top,
-                           float pixel_x, float pixel_y, int columns, __global uchar *image) {
+__kernel void scan_convert(Frame frame, __global const uchar *grey, float left, float top, float pixel_x, float pixel_y,
+                           int columns, __global uchar *image) {
   const int column = get_global_id(0) * LANES, row = get_global_id(1);
-  const int scan_lines = acquisition->scan_lines, samples = acquisition->samples;
+  const int scan_lines = frame->scan_lines, samples = frame->samples;
   const floatn x = left + (TO_FLOATN(column + LANE_INDEX) + 0.5f) * pixel_x;
   const floatn y = (floatn)(top + (row + 0.5f) * pixel_y);
-  floatn lateral = x * acquisition->steering_cos - y * acquisition->steering_sin;
-  floatn depth = x * acquisition->steering_sin + y * acquisition->steering_cos + acquisition->start_mm;
-  if (!acquisition->linear) {
-    const floatn from_apex = y + acquisition->apex_radius_mm;
-    depth = sqrt(x * x + from_apex * from_apex) - acquisition->apex_radius_mm;
+  floatn lateral = x * frame->steering_cos - y * frame->steering_sin;
+  floatn depth = x * frame->steering_sin + y * frame->steering_cos + frame->start_mm;
+  if (!frame->linear) {
+    const floatn from_apex = y + frame->apex_radius_mm;
+    depth = sqrt(x * x + from_apex * from_apex) - frame->apex_radius_mm;
     lateral = from_apex > 0.0f ? angle_of(x, from_apex) : (floatn)(1e9f);  // the field opens to less than 180 degrees
   }
-  const floatn place = (lateral - acquisition->first_line) / acquisition->line_spacing,
-               sample = depth / acquisition->sample_mm;
-  const intn inside = (place >= -0.5f) & (place <= scan_lines - 0.5f) & (depth >= 0.0f) &
-                      (depth < acquisition->depth_mm) & (y >= acquisition->top_mm) & (y < acquisition->bottom_mm);
+  const floatn place = (lateral - frame->first_line) / frame->line_spacing, sample = depth / frame->sample_mm;
+  const intn inside = (place >= -0.5f) & (place <= scan_lines - 0.5f) & (depth >= 0.0f) & (depth < frame->depth_mm) &
+                      (y >= frame->top_mm) & (y < frame->bottom_mm);
   if (!ANY_LANE(inside)) {
     for (int j = 0; j < min(LANES, columns - column); j++) image[row * columns + column + j] = 0;
     return;

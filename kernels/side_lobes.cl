@@ -24,16 +24,15 @@
 // movement less than rounding turn all signs. Rows of (2 -1 2; 2 2 -1; -1 2 2) / 3 are its axes.
 //
 // Random bits of the cell of the patient in which a scan line is at a displayed depth.
-inline uint bits_at(__constant const Acquisition *acquisition, __global const float *roots, int line, float depth_mm,
-                    float inverse_cell) {
-  const float4 root = vload4(acquisition->guard_lines + line * acquisition->lateral_rays, roots);
-  const float along = fmax(depth_mm - line_start(acquisition, (float)line), 0.0f);
+inline uint bits_at(Frame frame, __global const float *roots, int line, float depth_mm, float inverse_cell) {
+  const float4 root = vload4(frame->guard_lines + line * frame->lateral_rays, roots);
+  const float along = fmax(depth_mm - line_start(frame, (float)line), 0.0f);
   const float3 place = (float3)(root.x + along * root.z, root.y + along * root.w, 0.0f);
-  const float3 p = affine_point(acquisition->probe_to_ras, place) * (inverse_cell / 3.0f);
+  const float3 p = affine_point(frame->probe_to_ras, place) * (inverse_cell / 3.0f);
   const float3 turned = 2.0f * (p.xxy + p.zyz) - p.yzx;
   const float3 cell = floor(turned + 0.37f);
   const uint key = (uint)(int)cell.x * 0x9E3779B1u + (uint)(int)cell.y * 0x85EBCA77u + (uint)(int)cell.z * 0xC2B2AE3Du;
-  return hash_mix(key ^ acquisition->seed);
+  return hash_mix(key ^ frame->seed);
 }
 
 // A weight with a random sign: the parity of the bits that both have.
@@ -61,30 +60,29 @@ inline void at_node(const floatn *re, const floatn *im, const uint *places, cons
 }
 
 // `unit_least` and `unit_slope` give the wavelength times the f-number of the receive aperture, in millimetres.
-__kernel void side_lobes(__constant const Acquisition *acquisition, __global const float *lobes,
-                         __global const float *roots, __global float *re, __global float *im, int stride,
-                         float unit_least, float unit_slope) {
-  const int sample = get_global_id(0) * LANES, here = LINE_PAD + sample, lines = acquisition->scan_lines;
+__kernel void side_lobes(Frame frame, __global const float *lobes, __global const float *roots, __global float *re,
+                         __global float *im, int stride, float unit_least, float unit_slope) {
+  const int sample = get_global_id(0) * LANES, here = LINE_PAD + sample, lines = frame->scan_lines;
   // One path length for all lines and LANES: with steered lines that of the middle line, from where it leaves the face.
   // (At one displayed depth all lines are equally far apart.)
-  const float depth_mm = (sample / LOSS_STEP * LOSS_STEP + 0.5f * LOSS_STEP) * acquisition->sample_mm;
-  const float s = fmax(depth_mm - line_start(acquisition, 0.5f * (lines - 1)), 0.0f);
-  const float apart = line_distance(acquisition, depth_mm) * acquisition->lateral_rays;
-  const float unit = fmax(unit_least, unit_slope * s), main_beam = lateral_sigma(acquisition, s);
+  const float depth_mm = (sample / LOSS_STEP * LOSS_STEP + 0.5f * LOSS_STEP) * frame->sample_mm;
+  const float s = fmax(depth_mm - line_start(frame, 0.5f * (lines - 1)), 0.0f);
+  const float apart = line_distance(frame, depth_mm) * frame->lateral_rays;
+  const float unit = fmax(unit_least, unit_slope * s), main_beam = lateral_sigma(frame, s);
   const int dense = (lines + LOBE_NODES - 1) / LOBE_NODES;
   const int step = clamp((int)(NODE_DISTANCE * unit / apart), dense, lines), nodes = (lines + step - 1) / step;
 
   // The mean of lines whose speckle has the correlation exp(-distance^2 / 4 sigma^2) has this part of their power; with
   // a curved phase k y^2 / 2 the exponent is 1 + k^2 sigma^4 times as large. (Signs are random, so that the correlation
   // of different nodes does not matter.)
-  const float bent = lateral_curvature(acquisition, s, 1.0f) * main_beam * main_beam;
+  const float bent = lateral_curvature(frame, s, 1.0f) * main_beam * main_beam;
   const float fall = 0.25f * LOG2_E * (apart / main_beam) * (apart / main_beam) * (1.0f + bent * bent);
   float mean_power = 1.0f;
   for (int n = 1; n < step; n++)
     mean_power += 2.0f * (1.0f - (float)n / step) * exp2_scalar(fmax(-fall * n * n, -100.0f));
   mean_power /= step;
   const float per_node = step * apart / unit, scale = sqrt(per_node / mean_power);
-  const float place = fmin(s / acquisition->depth_mm, 1.0f) * (LOBE_DEPTHS - 1);
+  const float place = fmin(s / frame->depth_mm, 1.0f) * (LOBE_DEPTHS - 1);
   const int depth = min((int)place, LOBE_DEPTHS - 2);
   const float deeper = place - depth;
   __global const float *row = lobes + depth * LOBE_DISTANCES;
@@ -114,7 +112,7 @@ __kernel void side_lobes(__constant const Acquisition *acquisition, __global con
     }
     node_re[node] = sum_re / (float)step;
     node_im[node] = sum_im / (float)step;
-    places[node] = bits_at(acquisition, roots, min(node * step + step / 2, lines - 1), depth_mm, inverse_cell);
+    places[node] = bits_at(frame, roots, min(node * step + step / 2, lines - 1), depth_mm, inverse_cell);
   }
 
   floatn before_re, before_im;
