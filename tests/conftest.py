@@ -15,7 +15,6 @@ import numpy as np
 import pytest
 
 from SlicerUSSim.Logic import (
-    LinearProbe,
     PhasedProbe,
     SimulationSettings,
     Tissue,
@@ -113,11 +112,6 @@ def segmented_once():
         for module in ("Logic.mri.modality", "Command.whole_line"):
             patch.setattr(f"SlicerUSSim.{module}.segment_mri", segment_once)
         yield
-
-
-@pytest.fixture(scope="session")
-def small_probe() -> LinearProbe:
-    return LinearProbe(20, 30, scan_lines=64, focus_mm=15, elevation_focus_mm=15)
 
 
 @pytest.fixture(scope="session")

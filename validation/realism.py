@@ -34,8 +34,8 @@ from SlicerUSSim.Command.patient_options import PatientOptions
 from SlicerUSSim.Command.progress import note
 from SlicerUSSim.Command.sequence_options import SequenceOptions, open_tracked
 from SlicerUSSim.Logic.base.errors import SimulationError, require
-from SlicerUSSim.Logic.base.files import write_json, written_whole
-from SlicerUSSim.Logic.base.own_outputs import save_marked_png
+from SlicerUSSim.Logic.base.files import written_whole
+from SlicerUSSim.Logic.base.own_outputs import save_marked_png, write_own_json
 from SlicerUSSim.Logic.base.settings import DisplaySettings
 from SlicerUSSim.Logic.fitting.control_costs import (
     NEIGHBOURS,
@@ -301,7 +301,7 @@ def main(patient: PatientOptions, recording: SequenceOptions, out: Path | None, 
         real, {"simulated": images}, simulator, neighbours=neighbours_of(tracked.sequence, real), display=display
     )
     if out:
-        write_json(out, found.to_dict())
+        write_own_json(out, found.to_dict())
     if picture:
         draw_sources(picture, found)
     for title, heads, rows in found.tables():
