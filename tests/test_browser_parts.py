@@ -733,7 +733,7 @@ def test_a_frozen_image_stays_where_it_was_taken_in_3d_and_in_the_slices():
         app = SlicerApp()
         views = AnatomyViews(app, get_server("views of a test", client_type="vue3"), lambda *ignored: None)
         logic = UltrasoundSceneLogic(app.scene)
-        segmentation = segment_mri(head_mri(3.0))
+        segmentation = segment_mri(head_mri(3.0), thin_sulci=False)
         labels, probe, output = (
             app.scene.AddNewNodeByClass(f"vtkMRML{kind}Node")
             for kind in ("LabelMapVolume", "LinearTransform", "ScalarVolume")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import gc
-import json
 import weakref
 from dataclasses import replace
 from datetime import datetime, timezone
@@ -546,7 +545,7 @@ def test_live_update_ends_when_images_take_too_long_and_says_why(bench, monkeypa
         return simulate(*arguments, **options)
 
     monkeypatch.setattr("SlicerUSSim.Logic.mrml.live.perf_counter", lambda: now[0])
-    monkeypatch.setattr(bench.logic, "simulate", slow)
+    monkeypatch.setattr(bench.logic.images, "simulate", slow)
     bench.live(schedule=loop, report=reports.append, stopped=lambda: ended.append(1))
     loop.run()
     for shift in (1, 2, 3):
@@ -574,7 +573,7 @@ def test_live_update_ends_cleanly_with_its_nodes_its_scene_or_its_logic(bench, w
     elif what == "stop":
         bench.logic.stopLiveUpdate()
     elif what == "logic":
-        live = weakref.ref(bench.logic._live)
+        live = weakref.ref(bench.logic.live._update)
         bench.logic = None
         loop.waiting.clear()
         gc.collect()
@@ -756,7 +755,7 @@ def test_the_mri_is_never_the_output_and_other_wrong_content_is_refused(bench):
     write_labels(hollow, cyst().with_array(np.zeros_like(cyst().array)), ("speckle",), bench.grid())
     with pytest.raises(SimulationError, match="'hollow' is empty, expected a segment with voxels"):
         bench.logic.simulate(hollow, bench.probe, bench.image)
-    bench.logic.parameters.preset = "{gain: 3}"
+    bench.logic.parameters.node.SetParameter("preset", "{gain: 3}")
     with pytest.raises(SimulationError, match="the scene's preset is not JSON"):
         bench.simulate()
 
@@ -809,7 +808,7 @@ def test_parameters_have_the_form_of_slicers_parameter_node_wrapper(bench):
     assert node is parameters.node and node.GetAttribute("ModuleName") == "USSim"
     assert node.GetNodeReference("labels") is bench.labels and node.HasParameter("labels")
     assert node.GetParameter("thin_sulci") == "False" and node.GetParameter("classes") == "4"
-    assert json.loads(node.GetParameter("preset"))["display"]["image_size"] == [96, 64]
+    assert node.GetParameter("display.image_size") == "96, 64"
     parameters.labels = None
     assert parameters.labels is None
     with pytest.raises(SimulationError, match="no 'label'"):
@@ -964,7 +963,7 @@ def test_a_simulation_that_fails_leaves_no_old_image(bench, is_live, monkeypatch
 
 def test_a_patient_is_forgotten(bench):
     bench.simulate()
-    kept = weakref.ref(bench.logic._simulators._simulator)
+    kept = weakref.ref(bench.logic.patients._simulators._simulator)
     bench.logic.clearImage(bench.image)
     bench.logic.forgetPatient()
     gc.collect()

@@ -75,7 +75,7 @@ def test_segment_finds_sheets_and_images_show_them(monkeypatch):
         found.append(find_sheets(*arguments, **options))
         return found[-1]
 
-    monkeypatch.setattr("SlicerUSSim.Logic.mrml.logic.find_sheets", find)
+    monkeypatch.setattr("SlicerUSSim.Logic.mrml.segment_logic.find_sheets", find)
     bench, presenter = bench_with_probe()
     mri = head_mri(5.0)
     write_volume(bench.mri, mri)

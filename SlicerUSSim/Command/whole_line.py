@@ -66,7 +66,7 @@ def run_whole_line(
     additions = additions or Additions()
     additions.require_addable(mri, options.get("mask"), options.get("skull_strip", SegmentationSettings.skull_strip))
     with about_file(mri.name):
-        segmentation = segment_mri(mri, thin_sulci=True, device=device, **options)
+        segmentation = segment_mri(mri, device=device, **options)
     timings["segmentation"] = (perf_counter() - start) * 1e3
 
     progress("build the acoustic medium")

@@ -10,7 +10,7 @@ import math
 import os
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -326,10 +326,9 @@ class PanelPresenter:
                 self._replaceable(f"{mri.GetName()} tissues", mri) as labels,
             ):
                 result = self.logic.segment(
-                    mri, labels, mask_node=parameters.mask, others=others, organs_node=parameters.organs,
+                    mri, labels, settings, mask_node=parameters.mask, others=others, organs_node=parameters.organs,
                     lesions_node=parameters.lesions, sheets=kinds, sheets_node=sheets,
                     keep_mask_at=self.maskFile(mri), keep_sheets_at=self.sheetsFile(mri), progress=progress,
-                    **asdict(settings),
                 )  # fmt: skip
             told += self._take_sheets(sheets)
             self._notes_of, self._checks = mri.GetID(), _checks(result.warnings)

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import json
 import logging
 import os
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 from SlicerUSSim.Logic.base.declaration import Parameter, built, kind_of, parameter_of, parameters_of, short
-from SlicerUSSim.Logic.base.errors import require
+from SlicerUSSim.Logic.base.errors import SimulationError, require
 from SlicerUSSim.Logic.base.files import read_json, write_json
 from SlicerUSSim.Logic.base.own_outputs import MARK
 from SlicerUSSim.Logic.base.reading import reader
@@ -27,6 +29,7 @@ SECTIONS: dict[str, type[DisplaySettings] | type[SimulationSettings]] = {
 }
 #: Name of the pose, as in files of poses
 _POSE = "probe_to_ras"
+_KIND = "probe.kind"
 #: Tissues of segment_mri with thin sulci.
 _BRAIN = ("csf", "grey matter", "white matter", "leptomeninges")
 
@@ -116,6 +119,41 @@ class Preset:
             _log.info("%s: has no %s; the defaults are used", source, ", ".join(missing))
         return cls(**sections)
 
+    def to_texts(self) -> dict[str, str]:
+        """{name: text} of the values that differ from Preset(), or from PROBES for another kind of probe.
+
+        Names are those of preset_parameters ("display.gain_db"), "tissues.2" for the tissue of a label, "membrane.fluids"
+        for a value of the membrane, and "probe_to_ras". These others are JSON, null for what this preset lacks.
+        """
+        values, default, declared = _flat(self), _flat_default(self.probe.kind), preset_parameters()
+        return {
+            name: declared[name].to_text(values[name]) if name in declared else json.dumps(values.get(name))
+            for name in {**default, **values}
+            if values.get(name) != default.get(name)
+        }
+
+    @classmethod
+    def from_texts(cls, texts: Mapping[str, str], source: str = "preset") -> Preset:
+        """The inverse of to_texts. Raises SimulationError that names `source` and the invalid value."""
+        declared = {name: replace(entry, name=name) for name, entry in preset_parameters().items()}
+        kind = declared[_KIND].from_text(source, texts.get(_KIND, probe_kind().default))
+        values = _flat_default(kind)
+        for name, text in texts.items():
+            values[name] = (
+                declared[name].from_text(source, text) if name in declared else _from_json(name, text, source)
+            )
+        nested: dict[str, Any] = {"tissues": {}}
+        for name, value in values.items():
+            section, _, entry = name.partition(".")
+            if value is None and name not in declared:
+                continue
+            if entry:
+                nested.setdefault(section, {})[entry] = value
+            else:
+                nested[section] = value
+        nested["probe"]["kind"] = kind
+        return cls.from_dict(nested, source)
+
     @classmethod
     @reader
     def read(cls, path: str | os.PathLike) -> Preset:
@@ -135,6 +173,26 @@ def preset_parameters() -> dict[str, Parameter]:
     for section, owner in SECTIONS.items():
         found |= {f"{section}.{entry.name}": entry for entry in parameters_of(owner)}
     return found
+
+
+def _flat(preset: Preset) -> dict[str, Any]:
+    """{"section.name": value} of to_dict."""
+    found: dict[str, Any] = {}
+    for section, values in preset.to_dict().items():
+        is_nested = isinstance(values, dict)
+        found |= {f"{section}.{name}": value for name, value in values.items()} if is_nested else {section: values}
+    return found
+
+
+def _flat_default(kind: str) -> dict[str, Any]:
+    return {**_flat(Preset(PROBES[kind])), _KIND: probe_kind().default}
+
+
+def _from_json(name: str, text: str, source: str) -> Any:
+    try:
+        return json.loads(text)
+    except ValueError as error:
+        raise SimulationError(f"{source}: {name} is {short(text)}, which is not JSON ({error})") from None
 
 
 def _check_section(section: str) -> None:

@@ -7,12 +7,15 @@ Scenes can therefore be exchanged between scripts and the module. Values are tho
 
 from __future__ import annotations
 
+import json
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Generic, TypeVar, overload
 
 from SlicerUSSim.Logic.base.declaration import Declared, Parameter, Shown, parameter, parameters_of
 from SlicerUSSim.Logic.base.errors import SimulationError, require
 from SlicerUSSim.Logic.fitting.settings import FitSettings
+from SlicerUSSim.Logic.imaging.preset import Preset
 from SlicerUSSim.Logic.mri.lesions.seeded import LESION_TISSUES
 from SlicerUSSim.Logic.mri.settings import MRI_CONTRASTS, SegmentationSettings, SheetSettings
 from SlicerUSSim.Logic.mri.views import VIEWS
@@ -20,7 +23,10 @@ from SlicerUSSim.Logic.mri.views import VIEWS
 MODULE_NAME = "USSim"
 #: Choice of PanelSettings.lesion_as
 BY_LOOK = "by its look"
-_OWNER = "scene"
+_OWNER, _SOURCE = "scene", "the scene's preset"
+#: Sections of a preset in the names of its parameters; and the parameter in which scenes of before have it as JSON
+_AS_ONE = "preset"
+_PRESET_SECTIONS = ("probe", "display", "settings", "tissues", "membrane", "probe_to_ras", _AS_ONE)
 S = TypeVar("S", bound=Declared)
 
 
@@ -57,7 +63,6 @@ class PanelSettings(Declared):
         False, "Pose in presets", "Save preset saves the pose of the probe, too; a preset with a pose moves the probe "
         "there when it is loaded", shown=True,
     )  # fmt: skip
-    preset: str = parameter("", "Preset", "The JSON text of a Preset; empty: the default")
 
     def _owner(self) -> str:
         return "panel"
@@ -136,6 +141,49 @@ class SettingsParameter(Generic[S]):
         node.EndModify(was_modifying)
 
 
+def preset_texts(texts: Mapping[str, str]) -> dict[str, str]:
+    """Those of a scene's {name: text} that are of its preset."""
+    return {name: text for name, text in texts.items() if text and name.split(".")[0] in _PRESET_SECTIONS}
+
+
+def preset_of(texts: Mapping[str, str]) -> Preset:
+    """The preset of a scene's {name: text}. Raises SimulationError that names an invalid value."""
+    texts = preset_texts(texts)
+    try:
+        return (
+            Preset.from_dict(json.loads(texts[_AS_ONE]), _SOURCE)
+            if _AS_ONE in texts
+            else Preset.from_texts(texts, _SOURCE)
+        )
+    except ValueError as error:
+        raise SimulationError(f"{_SOURCE} is not JSON ({error})") from None
+
+
+class PresetParameter:
+    """Probe, display, settings and tissues; each value that is not the default is a parameter, see Preset.to_texts."""
+
+    def __get__(self, parameters: SceneParameters, owner: type | None = None) -> Preset:
+        """Raises SimulationError that names an invalid value. What scenes of before have is replaced."""
+        texts = preset_texts(parameters.texts)
+        known, preset = vars(parameters).get("_preset", (None, None))
+        if known != texts:
+            preset = preset_of(texts)
+            if _AS_ONE in texts:
+                self.__set__(parameters, preset)
+            else:
+                vars(parameters)["_preset"] = texts, preset
+        return preset
+
+    def __set__(self, parameters: SceneParameters, preset: Preset) -> None:
+        texts = preset.to_texts()
+        parameters.put_preset(texts)
+        vars(parameters)["_preset"] = texts, preset
+
+
+#: What SceneParameters has
+_PARAMETERS = NodeParameter | ValueParameter | SettingsParameter | PresetParameter
+
+
 class SceneParameters:
     """The parameters of one scene as attributes: parameters.mri, parameters.contrast = "t2", parameters.fit.register.
 
@@ -171,6 +219,7 @@ class SceneParameters:
     sheet = SettingsParameter(SheetSettings, "sheet_")
     fit = SettingsParameter(FitSettings, "fit_")
     panel = SettingsParameter(PanelSettings)
+    preset = PresetParameter()
 
     def __init__(self, scene) -> None:
         object.__setattr__(self, "scene", scene)
@@ -189,15 +238,29 @@ class SceneParameters:
         node.SetAttribute("ModuleName", MODULE_NAME)  # closing a scene may remove it
         return node
 
-    if TYPE_CHECKING:  # type checkers use the names declared above
-        preset: str
-    else:
+    @property
+    def texts(self) -> dict[str, str]:
+        """{name: text} of all that the node has."""
+        node = self.node
+        return {name: node.GetParameter(name) for name in node.GetParameterNames()}
+
+    def put_preset(self, texts: Mapping[str, str]) -> None:
+        """Set the texts of a preset as they are; one change of the node, or none."""
+        node, texts = self.node, preset_texts(texts)
+        was_modifying = node.StartModify()
+        for name in preset_texts(self.texts).keys() - texts:
+            node.UnsetParameter(name)
+        for name, text in texts.items():
+            node.SetParameter(name, text)
+        node.EndModify(was_modifying)
+
+    if not TYPE_CHECKING:  # type checkers use the names declared above
 
         def __getattr__(self, name: str):
             raise SimulationError(f"scene parameters have no {name!r}")
 
         def __setattr__(self, name: str, value) -> None:
-            if not isinstance(vars(type(self)).get(name), NodeParameter | ValueParameter | SettingsParameter):
+            if not isinstance(vars(type(self)).get(name), _PARAMETERS):
                 raise SimulationError(f"scene parameters have no {name!r}")
             object.__setattr__(self, name, value)
 

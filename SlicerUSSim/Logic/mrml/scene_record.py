@@ -38,7 +38,7 @@ from SlicerUSSim.Logic.mrml.nodes import (
     write_volume,
 )
 from SlicerUSSim.Logic.mrml.ownership import OWN, claim, is_claimed
-from SlicerUSSim.Logic.mrml.parameter_node import VALUE_PARAMETERS, SceneParameters
+from SlicerUSSim.Logic.mrml.parameter_node import VALUE_PARAMETERS, SceneParameters, preset_texts
 from SlicerUSSim.Logic.mrml.share_nodes import set_shares_node, shares_node
 from SlicerUSSim.Logic.mrml.taken_image import was_live
 from SlicerUSSim.Logic.mrml.taken_sequence import FrozenRecord, SimulatedRecord, record_frozen, record_taken
@@ -185,9 +185,9 @@ def nodes_version(parameters: SceneParameters, roles: Iterable[str] = ROLES) -> 
 
 
 def recorded_values(parameters: SceneParameters) -> dict[str, str]:
-    """{name: text} of the scene's values that are not the default."""
-    node = parameters.node
-    return {name: node.GetParameter(name) for name in VALUE_PARAMETERS if node.GetParameter(name)}
+    """{name: text} of the scene's values and preset that are not the default."""
+    texts = parameters.texts
+    return {**{name: texts[name] for name in VALUE_PARAMETERS if texts.get(name)}, **preset_texts(texts)}
 
 
 def record_scene(scene) -> SceneRecord:
@@ -369,7 +369,10 @@ def put_nodes(scene, record: SceneRecord) -> dict[str, Any]:
 
 
 def put_values(parameters: SceneParameters, values: Mapping[str, str]) -> list[str]:
-    """Set the scene's values from their texts; returns lines about those that this version does not take."""
+    """Set the scene's values and preset from their texts; returns lines about values that this version does not take.
+
+    A preset is taken as it is, and checked when it is used.
+    """
     node, refused = parameters.node, []
     was_modifying = node.StartModify()
     for name, declared in VALUE_PARAMETERS.items():
@@ -379,6 +382,7 @@ def put_values(parameters: SceneParameters, values: Mapping[str, str]) -> list[s
             setattr(parameters, name, value)
         except SimulationError as error:
             refused.append(str(error).replace(f"scene: {name} is ", f"{declared.label or name} in the scene is ", 1))
+    parameters.put_preset(values)
     node.EndModify(was_modifying)
     return refused
 
