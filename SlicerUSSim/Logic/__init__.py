@@ -1,6 +1,6 @@
 """The public interface: `from SlicerUSSim.Logic import UltrasoundSimulator`.
 
-One room per subject, each with a face of its own: base, opencl, probe, tissue, mri, imaging, tracked, fitting, mrml,
+One room per subject, each with a face of its own: base, opencl, probe, tissue, mri, placement, imaging, tracked, fitting, mrml,
 vtk. Names are imported when they are first used, so that importing this package costs nothing.
 """
 

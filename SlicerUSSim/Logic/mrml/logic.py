@@ -19,9 +19,9 @@ from SlicerUSSim.Logic.base.transforms import check_rigid
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.base.vtk_data import matrix_array
 from SlicerUSSim.Logic.fitting.adopted import taken_back, with_fit
+from SlicerUSSim.Logic.fitting.fit_settings import FitSettings
 from SlicerUSSim.Logic.fitting.held_out import predict
 from SlicerUSSim.Logic.fitting.search import Progress
-from SlicerUSSim.Logic.fitting.settings import FitSettings
 from SlicerUSSim.Logic.fitting.tracked_fit import Fit, fit
 from SlicerUSSim.Logic.imaging.contact import about_contact
 from SlicerUSSim.Logic.imaging.found_sheets import with_their_tissue
@@ -31,17 +31,12 @@ from SlicerUSSim.Logic.imaging.preset import Preset
 from SlicerUSSim.Logic.imaging.reuse import ReusedSimulator
 from SlicerUSSim.Logic.imaging.simulator import EmptyViewWarning, UltrasoundSimulator
 from SlicerUSSim.Logic.mri.addable import require_addable
-from SlicerUSSim.Logic.mri.aiming import opening_pose
-from SlicerUSSim.Logic.mri.bone_before_probe import SCENE, about_bone
-from SlicerUSSim.Logic.mri.craniotomy import default_pose, disc_diameter_mm, disc_opening, opened
 from SlicerUSSim.Logic.mri.ct import CtSegmentation
 from SlicerUSSim.Logic.mri.modality import has_brain_mask, segment_image
 from SlicerUSSim.Logic.mri.pathology import Added, add_tissues, texture_below
 from SlicerUSSim.Logic.mri.segmentation import Segmentation
-from SlicerUSSim.Logic.mri.settings import CT, GEL_MM, SegmentationSettings
+from SlicerUSSim.Logic.mri.segmentation_settings import CT, GEL_MM, SegmentationSettings
 from SlicerUSSim.Logic.mri.sheets.finding import find_sheets, require_findable
-from SlicerUSSim.Logic.mri.sheets.surfels import Surfels
-from SlicerUSSim.Logic.mri.views import opened_view_pose, view_pose
 from SlicerUSSim.Logic.mrml.craniotomy_nodes import (
     closed_labels,
     flap_centre,
@@ -103,8 +98,13 @@ from SlicerUSSim.Logic.mrml.taken_image import (
     write_about,
 )
 from SlicerUSSim.Logic.mrml.taken_sequence import FrozenRecord, in_node, read_taken, taken_of, write_taken
-from SlicerUSSim.Logic.probe.placement import pose_in_slice
+from SlicerUSSim.Logic.placement.aiming import opening_pose
+from SlicerUSSim.Logic.placement.bone_before_probe import SCENE, about_bone
+from SlicerUSSim.Logic.placement.craniotomy import default_pose, disc_diameter_mm, disc_opening, opened
+from SlicerUSSim.Logic.placement.views import opened_view_pose, view_pose
+from SlicerUSSim.Logic.probe.poses import pose_in_slice
 from SlicerUSSim.Logic.tissue.label_maps import LabelledTissues
+from SlicerUSSim.Logic.tissue.surfels import Surfels
 from SlicerUSSim.Logic.tissue.table import TissueTable
 from SlicerUSSim.Logic.tissue.texture import Texture
 
