@@ -27,7 +27,7 @@ from SlicerUSSim.Logic import (
     segment_ct,
 )
 from SlicerUSSim.Logic.probe import pose_looking_at
-from SlicerUSSim.Logic.probe.placement import slice_under_probe
+from SlicerUSSim.Logic.probe.poses import slice_under_probe
 from SlicerUSSim.Logic.tissue import LabelMapping, read_label_map
 from SlicerUSSim.Logic.tissue.presets import colour_of
 from validation.ct_phantoms import BY_NUMBER, NAMES, CtPhantom, lower_chest, lumbar_spine

@@ -31,7 +31,7 @@ from SlicerUSSim.Logic.mri.segmentation import Segmentation, segment_mri
 from SlicerUSSim.Logic.opencl.device import Device
 from SlicerUSSim.Logic.opencl.devices import DeviceInfo, devices_to_measure
 from SlicerUSSim.Logic.probe.arrays import ConvexProbe, PhasedProbe
-from SlicerUSSim.Logic.probe.placement import craniotomy_pose, tilt_sweep
+from SlicerUSSim.Logic.probe.poses import craniotomy_pose, tilt_sweep
 from SlicerUSSim.Logic.tissue.table import TissueTable
 
 FRAMES = {"A": PhasedProbe(75, 73, scan_lines=196), "B": ConvexProbe(60, 70, 120, scan_lines=192)}

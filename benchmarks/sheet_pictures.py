@@ -22,9 +22,10 @@ from SlicerUSSim.Logic import Segmentation, TissueTable, UltrasoundSimulator, Vo
 from SlicerUSSim.Logic.base.own_outputs import save_marked_png
 from SlicerUSSim.Logic.mri import demo_mri
 from SlicerUSSim.Logic.mri.pathology import add_tissues
-from SlicerUSSim.Logic.mri.sheets import KINDS, STRUCTURES, Sheets, find_sheets
+from SlicerUSSim.Logic.mri.sheets import STRUCTURES, Sheets, find_sheets
 from SlicerUSSim.Logic.mri.sheets.head import Head
 from SlicerUSSim.Logic.probe import PROBES, craniotomy_pose
+from SlicerUSSim.Logic.tissue import KINDS
 from validation.brain_phantoms import COLIN27
 
 #: Axis of MNI152 (0 is x) and place in mm of every plane

@@ -18,14 +18,15 @@ from scipy.spatial import KDTree
 
 from benchmarks.brain_extraction import SHARED
 from SlicerUSSim.Logic import Segmentation, Volume, segment_mri
+from SlicerUSSim.Logic.base.neighbourhood import distance_to
 from SlicerUSSim.Logic.mri import demo_mri
 from SlicerUSSim.Logic.mri.coregistration import aligned
-from SlicerUSSim.Logic.mri.distances import distance_to
-from SlicerUSSim.Logic.mri.sheets import STRUCTURES, Sheets, Surfels, find_sheets
+from SlicerUSSim.Logic.mri.sheets import STRUCTURES, Sheets, find_sheets
 from SlicerUSSim.Logic.mri.sheets.falx import FREE_EDGE, falx
 from SlicerUSSim.Logic.mri.sheets.head import Head
 from SlicerUSSim.Logic.mri.sheets.regions import hindbrain, in_tentorium, tentorium_height, ventricles
 from SlicerUSSim.Logic.mri.sheets.ridges import Ridges, large_parts, ridges
+from SlicerUSSim.Logic.tissue import Surfels
 from validation.brain_phantoms import COLIN27
 
 _RNG = np.random.default_rng(0)

@@ -30,8 +30,8 @@ from SlicerUSSim.Logic import (
     UltrasoundSimulator,
     Volume,
 )
-from SlicerUSSim.Logic.mri.sheets import Surfels
 from SlicerUSSim.Logic.probe import Probe
+from SlicerUSSim.Logic.tissue import Surfels
 from SlicerUSSim.Logic.tissue.tissue import Membrane
 
 _FLUID = Tissue("fluid", 1520.0, 1.52, 0.0)

@@ -24,10 +24,10 @@ from SlicerUSSim.Logic import (
     grow_lesion,
     segment_mri,
 )
-from SlicerUSSim.Logic.mri.craniotomy import disc_opening, opened, without_outside
 from SlicerUSSim.Logic.mri.pathology import add_tissues
+from SlicerUSSim.Logic.placement.craniotomy import disc_opening, opened, without_outside
 from SlicerUSSim.Logic.probe import PROBES, pose_looking_at
-from SlicerUSSim.Logic.probe.placement import slice_under_probe, surface_point
+from SlicerUSSim.Logic.probe.poses import slice_under_probe, surface_point
 
 #: From the tumour to the opening: left-right, front-back, up
 _OPENINGS = {"from above": (0.35, 0.0, 0.95), "from the side": (0.95, 0.0, 0.35), "from the front": (0.45, 0.6, 0.65)}

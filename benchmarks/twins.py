@@ -18,7 +18,7 @@ from SlicerUSSim.Logic.imaging.simulator import UltrasoundSimulator
 from SlicerUSSim.Logic.opencl.device import DeviceChoice
 from SlicerUSSim.Logic.probe.arrays import PhasedProbe, Probe
 from SlicerUSSim.Logic.probe.image_grid import ImageGrid
-from SlicerUSSim.Logic.probe.placement import craniotomy_pose, pose_looking_at, sample, surface_point, tilt_sweep
+from SlicerUSSim.Logic.probe.poses import craniotomy_pose, pose_looking_at, sample, surface_point, tilt_sweep
 from SlicerUSSim.Logic.tissue.table import TissueTable
 from SlicerUSSim.Logic.tissue.tissue import Tissue
 from SlicerUSSim.Logic.tracked.sequence import SIMULATED, TrackedSequence

@@ -25,7 +25,7 @@ from SlicerUSSim.Logic import (
 )
 from SlicerUSSim.Logic.mri.samples import head_mri
 from SlicerUSSim.Logic.probe.image_grid import ImageGrid
-from SlicerUSSim.Logic.probe.placement import craniotomy_pose, tilt_sweep
+from SlicerUSSim.Logic.probe.poses import craniotomy_pose, tilt_sweep
 from SlicerUSSim.Logic.tissue.presets import TISSUES
 from SlicerUSSim.Logic.tracked.sequence import TrackedSequence
 from tests.remembered import segment_once

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from SlicerUSSim.Logic import Volume
-from SlicerUSSim.Logic.mri.aiming import FARTHEST_DEG, opening_pose
-from SlicerUSSim.Logic.mri.bone_before_probe import CLOSED_DB, SCENE, about_bone
-from SlicerUSSim.Logic.mri.craniotomy import default_pose, disc_opening, middle_of, opened, without_outside
 from SlicerUSSim.Logic.mri.pathology import add_tissues
-from SlicerUSSim.Logic.mri.views import view_pose
+from SlicerUSSim.Logic.placement.aiming import FARTHEST_DEG, opening_pose
+from SlicerUSSim.Logic.placement.bone_before_probe import CLOSED_DB, SCENE, about_bone
+from SlicerUSSim.Logic.placement.craniotomy import default_pose, disc_opening, middle_of, opened, without_outside
+from SlicerUSSim.Logic.placement.views import view_pose
 from SlicerUSSim.Logic.probe import PROBES, ConvexProbe, LinearProbe, Probe
-from SlicerUSSim.Logic.probe.placement import pose_looking_at, turned
+from SlicerUSSim.Logic.probe.poses import pose_looking_at, turned
 from SlicerUSSim.Logic.tissue.presets import TISSUES
 from tests.test_craniotomy import NAMES, TOP, head, places_of  # noqa: F401
 

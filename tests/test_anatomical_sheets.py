@@ -13,12 +13,13 @@ from scipy import ndimage
 from scipy.spatial import KDTree
 
 from SlicerUSSim.Logic import Segmentation, SimulationError, TissueTable, UltrasoundSimulator, Volume, segment_mri
+from SlicerUSSim.Logic.imaging.sheet_voxels import on_voxels
 from SlicerUSSim.Logic.mri import demo_mri, head_mri
 from SlicerUSSim.Logic.mri.atlas import mni152
 from SlicerUSSim.Logic.mri.atlas_registration import AtlasFit
-from SlicerUSSim.Logic.mri.sheets import KINDS, Surfels, find_sheets, on_voxels
-from SlicerUSSim.Logic.mri.sheets.ependyma import ependyma
+from SlicerUSSim.Logic.mri.sheets import find_sheets
 from SlicerUSSim.Logic.mri.sheets.falx import falx
+from SlicerUSSim.Logic.mri.sheets.finding import ependyma
 from SlicerUSSim.Logic.mri.sheets.head import Head
 from SlicerUSSim.Logic.mri.sheets.heights import settled
 from SlicerUSSim.Logic.mri.sheets.kept import key_of, read_kept_sheets
@@ -26,6 +27,7 @@ from SlicerUSSim.Logic.mri.sheets.polydata import as_polydata, read_surfels, req
 from SlicerUSSim.Logic.mri.sheets.regions import tentorium_height
 from SlicerUSSim.Logic.mri.sheets.ridges import ridges
 from SlicerUSSim.Logic.mri.sheets.sulcal import sulci
+from SlicerUSSim.Logic.tissue import KINDS, Surfels
 from validation.brain_phantoms import COLIN27
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from SlicerUSSim.Logic import SimulationError, Volume
-from SlicerUSSim.Logic.mri.craniotomy import file_opening, opened
+from SlicerUSSim.Logic.placement.craniotomy import file_opening, opened
 from tests.conftest import block
 
 

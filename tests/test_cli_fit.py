@@ -24,7 +24,7 @@ from SlicerUSSim.Logic.base.files import write_json
 from SlicerUSSim.Logic.fitting import tracked_fit
 from SlicerUSSim.Logic.fitting.registration import rigid_from
 from SlicerUSSim.Logic.fitting.tracked_fit import fit
-from SlicerUSSim.Logic.probe.placement import tilt_sweep
+from SlicerUSSim.Logic.probe.poses import tilt_sweep
 from SlicerUSSim.Logic.tracked import TrackedImages, read_pose, write_pose
 from tests.conftest import SHARED, example, needs_shared
 from tests.test_label_maps import head_tissues

@@ -13,7 +13,7 @@ from SlicerUSSim.Logic import ConvexProbe, LinearProbe, SimulationError, Volume
 from SlicerUSSim.Logic.imaging.compounding import Compounder, sweep_grid
 from SlicerUSSim.Logic.imaging.frame import Frame
 from SlicerUSSim.Logic.probe.image_grid import ImageGrid
-from SlicerUSSim.Logic.probe.placement import slide_sweep, tilt_sweep
+from SlicerUSSim.Logic.probe.poses import slide_sweep, tilt_sweep
 from tests.conftest import SPECKLE, block, rigid, simulator
 from validation.beams import freehand_sweep
 

@@ -189,7 +189,7 @@ def test_the_grey_maps_of_two_scanners_are_those_found_by_trial():
     """A brain, and a spine phantom as the control: another scanner, another map."""
     greys = (15, 30, 45, 60, 80, 100, 160, 200)
     sequence = TrackedSequence.read(SHARED / "SpinePhantomFreehand.igs.mha")
-    from SlicerUSSim.Logic.tracked.field import estimate_field
+    from SlicerUSSim.Logic.tracked.imaged_field import estimate_field
 
     field = estimate_field(sequence.images, (0.1, 0.1))
     images = [np.ascontiguousarray(image[field.window]) for image in sequence.images[::4]]

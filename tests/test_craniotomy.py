@@ -15,7 +15,9 @@ from SlicerUSSim.Command.cli import main
 from SlicerUSSim.Command.proposals import split_seeds
 from SlicerUSSim.Command.serve import _require_opening
 from SlicerUSSim.Logic import SimulationError, Volume
-from SlicerUSSim.Logic.mri.craniotomy import (
+from SlicerUSSim.Logic.mri.outside import OUTSIDE
+from SlicerUSSim.Logic.mri.samples import head_mri
+from SlicerUSSim.Logic.placement.craniotomy import (
     disc_opening,
     file_opening,
     mask_opening,
@@ -23,10 +25,8 @@ from SlicerUSSim.Logic.mri.craniotomy import (
     polygon_opening,
     without_outside,
 )
-from SlicerUSSim.Logic.mri.outside import OUTSIDE
-from SlicerUSSim.Logic.mri.samples import head_mri
-from SlicerUSSim.Logic.mri.views import view_pose
-from SlicerUSSim.Logic.probe.placement import pose_looking_at
+from SlicerUSSim.Logic.placement.views import view_pose
+from SlicerUSSim.Logic.probe.poses import pose_looking_at
 from SlicerUSSim.Logic.tissue.own_files import write_label_files
 from SlicerUSSim.Logic.tissue.table import TissueTable
 

@@ -15,7 +15,6 @@ from vtkmodules.vtkCommonCore import vtkPoints  # noqa: E402
 from SlicerUSSim.Logic import SimulationError, Volume  # noqa: E402
 from SlicerUSSim.Logic.base.reading import read_values, write_values  # noqa: E402
 from SlicerUSSim.Logic.base.vtk_data import vtk_matrix  # noqa: E402
-from SlicerUSSim.Logic.mri.craniotomy import default_pose, disc_opening, opened  # noqa: E402
 from SlicerUSSim.Logic.mri.pathology import add_tissues  # noqa: E402
 from SlicerUSSim.Logic.mrml.label_nodes import read_labels, write_labels  # noqa: E402
 from SlicerUSSim.Logic.mrml.lesion_nodes import add_lesion  # noqa: E402
@@ -23,7 +22,8 @@ from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic  # noqa: E402
 from SlicerUSSim.Logic.mrml.nodes import node_to_world, nodes_of_class, set_node_to_world, write_volume  # noqa: E402
 from SlicerUSSim.Logic.mrml.own_labels import mark_as_made  # noqa: E402
 from SlicerUSSim.Logic.mrml.scene_record import put_nodes, record_scene  # noqa: E402
-from SlicerUSSim.Logic.probe.placement import pose_looking_at  # noqa: E402
+from SlicerUSSim.Logic.placement.craniotomy import default_pose, disc_opening, opened  # noqa: E402
+from SlicerUSSim.Logic.probe.poses import pose_looking_at  # noqa: E402
 from SlicerUSSim.Widget.presenter import PanelPresenter  # noqa: E402
 from tests.test_aiming import with_ball  # noqa: E402
 from tests.test_craniotomy import NAMES, TOP, head  # noqa: E402, F401

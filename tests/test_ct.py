@@ -25,7 +25,7 @@ from SlicerUSSim.Logic.base.errors import Cancelled
 from SlicerUSSim.Logic.base.neighbourhood import largest_around
 from SlicerUSSim.Logic.mri import head_mri
 from SlicerUSSim.Logic.mri.ct_unit import hounsfield_offset, looks_like_ct
-from SlicerUSSim.Logic.probe.placement import pose_looking_at
+from SlicerUSSim.Logic.probe.poses import pose_looking_at
 from SlicerUSSim.Logic.tissue import LabelledTissues, LabelMapping, read_label_map
 from validation.ct_phantoms import BY_NUMBER, NAMES, CtPhantom, lower_chest, lumbar_spine
 

@@ -25,7 +25,7 @@ from SlicerUSSim.Logic.base.declaration import (
     parameters_of,
 )
 from SlicerUSSim.Logic.imaging.preset import preset_parameters
-from SlicerUSSim.Logic.mri.settings import SegmentationSettings
+from SlicerUSSim.Logic.mri.segmentation_settings import SegmentationSettings
 from SlicerUSSim.Logic.probe import arrays
 from SlicerUSSim.Logic.probe.arrays import PROBES, ConvexProbe, probe_kind
 from SlicerUSSim.Logic.tissue.presets import TISSUES

@@ -19,8 +19,8 @@ from SlicerUSSim.Logic import (
 )
 from SlicerUSSim.Logic.fitting import fit
 from SlicerUSSim.Logic.fitting.deformation import Deformation, basis, deformed, find_deformation, gradients
-from SlicerUSSim.Logic.mri.sheets.surfels import Surfels
 from SlicerUSSim.Logic.probe import ImageGrid, tilt_sweep
+from SlicerUSSim.Logic.tissue.surfels import Surfels
 from SlicerUSSim.Logic.tissue.texture import Texture
 from SlicerUSSim.Logic.tracked import TrackedImages
 from tests.conftest import block, rigid

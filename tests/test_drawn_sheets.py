@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from SlicerUSSim.Command.sheets import DrawnSheets
+from SlicerUSSim.Command.sheet_options import DrawnSheets
 from SlicerUSSim.Logic import SimulationError, TissueTable, UltrasoundSimulator, Volume
-from SlicerUSSim.Logic.mri.sheets import Surfels
 from SlicerUSSim.Logic.mri.sheets.polydata import write_surfels
+from SlicerUSSim.Logic.tissue import Surfels
 from SlicerUSSim.Logic.tissue.presets import TISSUES
 from SlicerUSSim.Logic.tissue.sheet_looks import looks_of, with_dura
 from tests.conftest import block

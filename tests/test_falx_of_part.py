@@ -12,10 +12,11 @@ from scipy.spatial.transform import Rotation
 
 from SlicerUSSim.Logic import Segmentation, SimulationError, Volume, segment_mri
 from SlicerUSSim.Logic.mri.lesions.seeded import grow_lesion
-from SlicerUSSim.Logic.mri.sheets import Surfels, find_sheets
+from SlicerUSSim.Logic.mri.sheets import find_sheets
 from SlicerUSSim.Logic.mri.sheets.falx_of_part import falx_of_part
 from SlicerUSSim.Logic.mri.sheets.head import Head
 from SlicerUSSim.Logic.mri.sheets.sulcal import sulci
+from SlicerUSSim.Logic.tissue import Surfels
 from validation.brain_phantoms import COLIN27, cut_to, part_box
 
 FLUID, GREY, WHITE, NOISE = 20.0, 100.0, 140.0, 4.0

@@ -13,7 +13,7 @@ from scipy import ndimage
 
 from SlicerUSSim.Logic import ConvexProbe, LinearProbe, PhasedProbe, SimulationError, TrackedSequence
 from SlicerUSSim.Logic.probe.image_grid import ImageGrid
-from SlicerUSSim.Logic.tracked.field import ImagedField, draw_field, estimate_field
+from SlicerUSSim.Logic.tracked.imaged_field import ImagedField, draw_field, estimate_field
 from SlicerUSSim.Logic.tracked.images import TrackedImages
 from tests.conftest import SHARED, needs_shared
 

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, strategies as st
 
 from SlicerUSSim.Logic import ConvexProbe, DisplaySettings, LinearProbe
-from SlicerUSSim.Logic.fitting.fingerprint import fingerprint
+from SlicerUSSim.Logic.fitting.optimization import fingerprint
 
 plain = st.none() | st.booleans() | st.integers(-9, 9) | st.floats(-9, 9) | st.text("a1", max_size=3)
 values = st.recursive(plain, lambda inner: st.lists(inner, max_size=4).map(tuple), max_leaves=8)

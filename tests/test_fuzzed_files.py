@@ -23,8 +23,8 @@ from hypothesis import HealthCheck, given, settings, strategies as st
 from SlicerUSSim.Logic import SimulationError, TissueTable, Volume
 from SlicerUSSim.Logic.base.volume import read_array
 from SlicerUSSim.Logic.imaging.preset import Preset
-from SlicerUSSim.Logic.mri.sheets import Surfels
 from SlicerUSSim.Logic.mri.sheets.polydata import read_surfels, write_surfels
+from SlicerUSSim.Logic.tissue import Surfels
 from SlicerUSSim.Logic.tissue.label_files import read_names
 from SlicerUSSim.Logic.tracked.pose_files import read_matrix, read_pose, read_tags, read_transform, write_pose
 from SlicerUSSim.Logic.tracked.sequence import TrackedSequence, read_coordinate_definitions

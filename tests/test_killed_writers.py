@@ -18,7 +18,7 @@ from SlicerUSSim.Logic import Volume
 from SlicerUSSim.Logic.base.errors import SimulationError
 from SlicerUSSim.Logic.tracked.sequence import TrackedSequence
 from SlicerUSSim.Logic.base.files import write_json
-from SlicerUSSim.Logic.mri.sheets import Surfels
+from SlicerUSSim.Logic.tissue import Surfels
 from SlicerUSSim.Logic.mri.sheets.polydata import read_surfels, write_surfels
 from SlicerUSSim.Logic.tracked.pose_files import read_pose, write_pose
 import SimpleITK, nrrd

@@ -18,7 +18,7 @@ from SlicerUSSim.Logic.mri.samples import head_mri
 from SlicerUSSim.Logic.opencl import device as devices
 from SlicerUSSim.Logic.opencl.device import Device
 from SlicerUSSim.Logic.probe.image_grid import ImageGrid
-from SlicerUSSim.Logic.probe.placement import craniotomy_pose, tilt_sweep
+from SlicerUSSim.Logic.probe.poses import craniotomy_pose, tilt_sweep
 from SlicerUSSim.Logic.tracked.images import TrackedImages
 from SlicerUSSim.Logic.tracked.sequence import TrackedSequence
 from tests.test_label_maps import head_tissues

@@ -7,7 +7,7 @@ import pytest
 
 from SlicerUSSim.Logic import PhasedProbe, SimulationSettings, TissueTable, UltrasoundSimulator, Volume, segment_mri
 from SlicerUSSim.Logic.base.errors import SimulationError
-from SlicerUSSim.Logic.probe.placement import craniotomy_pose, pose_looking_at, sample, slice_under_probe, surface_point
+from SlicerUSSim.Logic.probe.poses import craniotomy_pose, pose_looking_at, sample, slice_under_probe, surface_point
 
 
 @pytest.fixture(scope="module")

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from SlicerUSSim.Logic import DisplaySettings, LinearProbe, SimulationError, seed_of_pose
 from SlicerUSSim.Logic.fitting.appearance import AppearanceModel
 from SlicerUSSim.Logic.imaging.compounding import Compounder, sweep_grid
-from SlicerUSSim.Logic.probe.placement import slide_sweep
+from SlicerUSSim.Logic.probe.poses import slide_sweep
 from tests.conftest import FLUID, block, rigid, simulator
 
 PROBE = LinearProbe(40, 50, scan_lines=161)

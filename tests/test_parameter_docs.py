@@ -14,9 +14,9 @@ from typing import get_args, get_origin
 
 from SlicerUSSim.Logic.base.declaration import Declared, Parameter, parameters_of
 from SlicerUSSim.Logic.base.settings import DisplaySettings, SimulationSettings
+from SlicerUSSim.Logic.fitting.fit_settings import FitSettings
 from SlicerUSSim.Logic.fitting.image_similarity import SimilaritySettings
-from SlicerUSSim.Logic.fitting.settings import FitSettings
-from SlicerUSSim.Logic.mri.settings import SegmentationSettings, SheetSettings
+from SlicerUSSim.Logic.mri.segmentation_settings import SegmentationSettings, SheetSettings
 from SlicerUSSim.Logic.mrml.parameter_node import PanelSettings
 from SlicerUSSim.Logic.probe.arrays import PROBE_KINDS, Probe, probe_kind
 from SlicerUSSim.Logic.probe.beam import Beam

@@ -8,7 +8,7 @@ import pytest
 from SlicerUSSim.Logic import LinearProbe
 from SlicerUSSim.Logic.fitting.report import grey_levels_per_tissue
 from SlicerUSSim.Logic.probe.image_grid import ImageGrid
-from SlicerUSSim.Logic.tracked.field import ImagedField
+from SlicerUSSim.Logic.tracked.imaged_field import ImagedField
 from SlicerUSSim.Logic.tracked.images import TrackedImages
 from tests.conftest import FLUID, SPECKLE, block, rigid, simulator
 

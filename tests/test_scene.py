@@ -30,9 +30,9 @@ from SlicerUSSim.Logic import (  # noqa: E402
 )
 from SlicerUSSim.Logic.base.errors import Cancelled  # noqa: E402
 from SlicerUSSim.Logic.base.vtk_data import vtk_matrix  # noqa: E402
-from SlicerUSSim.Logic.fitting.settings import FitSettings  # noqa: E402
+from SlicerUSSim.Logic.fitting.fit_settings import FitSettings  # noqa: E402
 from SlicerUSSim.Logic.mri.samples import head_mri  # noqa: E402
-from SlicerUSSim.Logic.mri.settings import SegmentationSettings  # noqa: E402
+from SlicerUSSim.Logic.mri.segmentation_settings import SegmentationSettings  # noqa: E402
 from SlicerUSSim.Logic.mrml.label_nodes import write_labels  # noqa: E402
 from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic  # noqa: E402
 from SlicerUSSim.Logic.mrml.nodes import ijk_to_ras, node_to_world, pose_in_labels, set_node_to_world, write_volume  # noqa: E402

@@ -18,7 +18,7 @@ from SlicerUSSim.Logic.base.reading import read_values, write_values  # noqa: E4
 from SlicerUSSim.Logic.base.vtk_data import vtk_matrix  # noqa: E402
 from SlicerUSSim.Logic.imaging.preset import Preset  # noqa: E402
 from SlicerUSSim.Logic.mri.samples import head_mri  # noqa: E402
-from SlicerUSSim.Logic.mri.settings import SegmentationSettings  # noqa: E402
+from SlicerUSSim.Logic.mri.segmentation_settings import SegmentationSettings  # noqa: E402
 from SlicerUSSim.Logic.mrml.known_field import KnownField, write_known_field  # noqa: E402
 from SlicerUSSim.Logic.mrml.label_nodes import write_labels  # noqa: E402
 from SlicerUSSim.Logic.mrml.landmark_nodes import Landmark, landmarks_of, write_landmarks  # noqa: E402

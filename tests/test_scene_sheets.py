@@ -11,10 +11,11 @@ from SlicerUSSim.Logic import TissueTable, UltrasoundSimulator, Volume  # noqa: 
 from SlicerUSSim.Logic.base.vtk_data import vtk_matrix  # noqa: E402
 from SlicerUSSim.Logic.imaging.noise import seed_of_pose  # noqa: E402
 from SlicerUSSim.Logic.mri.samples import head_mri  # noqa: E402
-from SlicerUSSim.Logic.mri.sheets import KINDS, Surfels, find_sheets  # noqa: E402
+from SlicerUSSim.Logic.mri.sheets import find_sheets  # noqa: E402
 from SlicerUSSim.Logic.mrml.label_nodes import read_labels, write_labels  # noqa: E402
 from SlicerUSSim.Logic.mrml.nodes import node_to_world, write_volume  # noqa: E402
 from SlicerUSSim.Logic.mrml.sheet_nodes import read_sheets, sheets_version, write_sheets  # noqa: E402
+from SlicerUSSim.Logic.tissue import KINDS, Surfels  # noqa: E402
 from tests.conftest import coarse_chest  # noqa: E402
 from tests.remembered import segment_once  # noqa: E402
 from tests.test_craniotomy_nodes import TURN  # noqa: E402

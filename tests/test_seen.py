@@ -10,8 +10,8 @@ import pytest
 
 from SlicerUSSim.Logic import TissueTable, UltrasoundSimulator, Volume
 from SlicerUSSim.Logic.fitting.seen import parameters_seen, shares
-from SlicerUSSim.Logic.mri.sheets import Surfels
 from SlicerUSSim.Logic.probe import PROBES, ImageGrid
+from SlicerUSSim.Logic.tissue import Surfels
 from tests.conftest import rigid
 
 PROBE = replace(PROBES["linear"], width_mm=30.0, depth_mm=40.0)

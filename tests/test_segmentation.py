@@ -13,15 +13,14 @@ from scipy.spatial.transform import Rotation
 from SlicerUSSim.Logic import SimulationError, Volume, segment_mri
 from SlicerUSSim.Logic.mri.atlas import mni152
 from SlicerUSSim.Logic.mri.atlas_registration import register_atlas
+from SlicerUSSim.Logic.mri.bias import anatomy, estimate_field
 from SlicerUSSim.Logic.mri.classification import class_names, classify
 from SlicerUSSim.Logic.mri.coregistration import aligned
-from SlicerUSSim.Logic.mri.field import anatomy, estimate_field
 from SlicerUSSim.Logic.mri.filtering import guided_filter
 from SlicerUSSim.Logic.mri.histogram import Histogram
 from SlicerUSSim.Logic.mri.mixture import fit_mixture
-from SlicerUSSim.Logic.mri.neighbours import less_sure
 from SlicerUSSim.Logic.mri.samples import head_mri
-from SlicerUSSim.Logic.mri.segmentation import estimate_noise
+from SlicerUSSim.Logic.mri.segmentation import estimate_noise, less_sure
 from tests.conftest import rigid
 from tests.remembered import segment_once
 from validation.brain_phantoms import part_of, phantom, tissue_maps

@@ -17,7 +17,7 @@ from SlicerUSSim.Logic import (
     UltrasoundSimulator,
     Volume,
 )
-from SlicerUSSim.Logic.imaging.sheets import sheet_planes
+from SlicerUSSim.Logic.imaging.labelled_sheets import sheet_planes
 from SlicerUSSim.Logic.opencl.device import Device
 from SlicerUSSim.Logic.tissue.presets import TISSUES
 from tests.conftest import block, rigid

@@ -13,8 +13,7 @@ from benchmarks.measuring import Machine
 from SlicerUSSim.Logic import DisplaySettings, LinearProbe
 from SlicerUSSim.Logic.fitting.appearance import AppearanceModel
 from SlicerUSSim.Logic.imaging import stages
-from SlicerUSSim.Logic.imaging.bmode import Compressor
-from SlicerUSSim.Logic.imaging.scan_conversion import ScanConverter
+from SlicerUSSim.Logic.imaging.bmode import Compressor, ScanConverter
 from SlicerUSSim.Logic.imaging.scattering import LateralBeam
 from SlicerUSSim.Logic.imaging.stage import Stage, Work
 from SlicerUSSim.Logic.opencl import device as opencl_device

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from SlicerUSSim.Logic import SimulationError, Volume
 from SlicerUSSim.Logic.base.errors import Cancelled
 from SlicerUSSim.Logic.mri.samples import head_mri
-from SlicerUSSim.Logic.probe.placement import aimed_at, angles_to_surface, carried, turned
+from SlicerUSSim.Logic.probe.poses import aimed_at, angles_to_surface, carried, turned
 from SlicerUSSim.Logic.probe.surface import PatientSurface
 from tests.conftest import block
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from SlicerUSSim.Logic import SimulationError, Volume
-from SlicerUSSim.Logic.probe.placement import turned
+from SlicerUSSim.Logic.probe.poses import turned
 
 pyigtl = pytest.importorskip("pyigtl", reason="OpenIGTLink comes with pyigtl: pip install '.[serve]'")
 

@@ -7,7 +7,7 @@ import pytest
 
 from SlicerUSSim.Command.patient_options import STANDARD_VIEWS
 from SlicerUSSim.Logic import SimulationError
-from SlicerUSSim.Logic.mri.views import VIEWS, view_pose
+from SlicerUSSim.Logic.placement.views import VIEWS, view_pose
 from tests.test_craniotomy import NAMES, head  # noqa: F401
 
 

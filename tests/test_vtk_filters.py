@@ -38,7 +38,7 @@ from SlicerUSSim.Logic import (
 )
 from SlicerUSSim.Logic.base.vtk_data import vtk_matrix
 from SlicerUSSim.Logic.mri.samples import head_mri
-from SlicerUSSim.Logic.mri.settings import SegmentationSettings
+from SlicerUSSim.Logic.mri.segmentation_settings import SegmentationSettings
 from SlicerUSSim.Logic.mri.sheets.polydata import as_polydata
 from SlicerUSSim.Logic.probe.shape import outline_polydata
 from SlicerUSSim.Logic.vtk.filters import SegmentationFilter, UltrasoundSimulationFilter

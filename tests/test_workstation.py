@@ -27,7 +27,7 @@ from SlicerUSSim.Logic import TissueTable, Volume  # noqa: E402
 from SlicerUSSim.Logic.base.errors import required  # noqa: E402
 from SlicerUSSim.Logic.base.volume import read_array  # noqa: E402
 from SlicerUSSim.Logic.mri.samples import head_mri  # noqa: E402
-from SlicerUSSim.Logic.probe.placement import pose_looking_at  # noqa: E402
+from SlicerUSSim.Logic.probe.poses import pose_looking_at  # noqa: E402
 from SlicerUSSim.Workstation.state import NAMES  # noqa: E402
 from tests.served import Served, refused, run_script  # noqa: E402
 from tests.test_label_maps import head  # noqa: E402

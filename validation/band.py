@@ -12,7 +12,7 @@ from SlicerUSSim.Logic.base.settings import DisplaySettings, SimulationSettings
 from SlicerUSSim.Logic.imaging.frame import Frame
 from SlicerUSSim.Logic.imaging.simulator import UltrasoundSimulator
 from SlicerUSSim.Logic.probe.arrays import PROBES, ConvexProbe, LinearProbe, PhasedProbe, Probe
-from SlicerUSSim.Logic.probe.placement import elevational_motion
+from SlicerUSSim.Logic.probe.poses import elevational_motion
 from validation.checks import Check, Outcome, Row
 from validation.measurement import correlation, depth_window, level_db
 from validation.phantoms import BACKGROUND, band_power, uniform_speckle

@@ -14,7 +14,7 @@ from SlicerUSSim.Logic.base.settings import DisplaySettings, SimulationSettings
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.imaging.simulator import UltrasoundSimulator
 from SlicerUSSim.Logic.probe.beam import FWHM_PER_SIGMA
-from SlicerUSSim.Logic.probe.placement import elevational_motion, sample, slide_sweep, tilt_sweep
+from SlicerUSSim.Logic.probe.poses import elevational_motion, sample, slide_sweep, tilt_sweep
 from validation.checks import PROBES, Check, Outcome, Row
 from validation.measurement import depth_window, echo_near, full_width
 from validation.phantoms import (

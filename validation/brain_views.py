@@ -10,7 +10,7 @@ from scipy import ndimage
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.mri.samples import demo_mri
 from SlicerUSSim.Logic.mri.segmentation import segment_mri
-from SlicerUSSim.Logic.probe.placement import pose_looking_at, surface_point
+from SlicerUSSim.Logic.probe.poses import pose_looking_at, surface_point
 from SlicerUSSim.Logic.tissue.table import TissueTable
 from validation.brain_phantoms import COLIN27
 

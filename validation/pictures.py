@@ -11,7 +11,7 @@ from SlicerUSSim.Logic.base.files import written_whole
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.imaging.frame import Frame
 from SlicerUSSim.Logic.probe.arrays import Probe
-from SlicerUSSim.Logic.probe.placement import sample, slice_under_probe
+from SlicerUSSim.Logic.probe.poses import sample, slice_under_probe
 from validation.measurement import RayleighFit
 from validation.phantoms import Echo, LevelChange, Phantom
 

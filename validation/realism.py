@@ -51,7 +51,7 @@ from SlicerUSSim.Logic.fitting.tracked_fit import simulated
 from SlicerUSSim.Logic.imaging.grey_map import EstimatedMap, estimate_grey_map
 from SlicerUSSim.Logic.imaging.medium import Medium
 from SlicerUSSim.Logic.imaging.simulator import UltrasoundSimulator
-from SlicerUSSim.Logic.probe.placement import slice_under_probe
+from SlicerUSSim.Logic.probe.poses import slice_under_probe
 from SlicerUSSim.Logic.tracked.images import TrackedImages
 from validation.grey_statistics import (
     TissueGrey,

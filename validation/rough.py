@@ -11,8 +11,8 @@ from scipy import ndimage, special
 from SlicerUSSim.Logic.base.settings import SimulationSettings
 from SlicerUSSim.Logic.imaging.frame import Frame
 from SlicerUSSim.Logic.imaging.simulator import UltrasoundSimulator
-from SlicerUSSim.Logic.mri.sheets import Surfels
 from SlicerUSSim.Logic.probe.arrays import PROBES, LinearProbe, Probe
+from SlicerUSSim.Logic.tissue import Surfels
 from SlicerUSSim.Logic.tissue.presets import TISSUES
 from SlicerUSSim.Logic.tissue.table import TissueTable
 from SlicerUSSim.Logic.tissue.tissue import Membrane

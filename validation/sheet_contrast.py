@@ -13,9 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import ndimage
 
-from SlicerUSSim.Logic.mri.sheets.surfels import Surfels
 from SlicerUSSim.Logic.probe.arrays import Probe
 from SlicerUSSim.Logic.probe.image_grid import ImageGrid
+from SlicerUSSim.Logic.tissue.surfels import Surfels
 
 #: Angles between the normal of a line and the beam, degrees: from squarely on to along it
 ANGLES_DEG = ((0, 30), (30, 60), (60, 90))

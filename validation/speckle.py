@@ -14,7 +14,7 @@ from SlicerUSSim.Logic.imaging.frame import Frame
 from SlicerUSSim.Logic.imaging.scattering import PAPER_SITES_PER_MM3, sites_per_mm3
 from SlicerUSSim.Logic.imaging.simulator import UltrasoundSimulator
 from SlicerUSSim.Logic.probe.arrays import PROBES as SHIPPED, LinearProbe, Probe
-from SlicerUSSim.Logic.probe.placement import elevational_motion
+from SlicerUSSim.Logic.probe.poses import elevational_motion
 from SlicerUSSim.Logic.tissue.table import TissueTable
 from SlicerUSSim.Logic.tissue.tissue import Tissue
 from validation.checks import PROBES, Check, Outcome, Row

@@ -15,7 +15,7 @@ def run() -> None:
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         signal.signal(signal.SIGINT, press)
     from SlicerUSSim.Command.cli import main
-    from SlicerUSSim.Command.signals import end_at_once
+    from SlicerUSSim.Command.interrupts import end_at_once
 
     if pressed:
         print("ussim: interrupted", file=sys.stderr)

@@ -16,18 +16,14 @@ from typing import Any
 
 import click
 
-from SlicerUSSim.Command.check import check
 from SlicerUSSim.Command.demo import demo
-from SlicerUSSim.Command.devices import devices
+from SlicerUSSim.Command.interrupts import end_at_signals
 from SlicerUSSim.Command.optimize import optimize
-from SlicerUSSim.Command.options import untrusted_option, verbose_option
-from SlicerUSSim.Command.progress import note
+from SlicerUSSim.Command.options import device_option, untrusted_option, verbose_option
+from SlicerUSSim.Command.progress import Share, note
 from SlicerUSSim.Command.segment import segment
 from SlicerUSSim.Command.serve import serve
-from SlicerUSSim.Command.signals import end_at_signals
-from SlicerUSSim.Command.simulate import simulate
-from SlicerUSSim.Command.sweep import sweep
-from SlicerUSSim.Command.volume import volume
+from SlicerUSSim.Command.simulate import simulate, sweep, volume
 from SlicerUSSim.Logic.base.errors import SimulationError, is_our_warning, user_message
 from SlicerUSSim.Logic.base.version import __version__
 from SlicerUSSim.Logic.opencl.limits import address_space, doubt_of_address_space, lack_of_address_space
@@ -100,6 +96,39 @@ def _show_warning(message: Warning | str, category: type[Warning], *_: Any, **__
     """Show warnings of this package as one line, and none of other libraries."""
     if is_our_warning(category):
         note(f"ussim: warning: {message}")
+
+
+@click.command()
+@device_option
+def devices(device: str | None) -> None:
+    """List the OpenCL devices, the one that is used with the reason, and how to install a faster one."""
+    from SlicerUSSim.Logic.opencl.devices import choose_device, faster_hint, list_devices
+
+    chosen, reason = choose_device(device)
+    for info in list_devices():
+        click.echo(f"{'*' if info == chosen else ' '} {info}, {info.memory_mb} MB")
+    click.echo(f"used: {chosen.index}, {reason}")
+    hint = faster_hint(chosen)
+    if hint:
+        click.echo(f"faster on this computer: {hint}")
+
+
+@click.command()
+@device_option
+@click.pass_context
+def check(ctx: click.Context, device: str | None) -> None:
+    """Test that every OpenCL device computes correctly, in some seconds each.
+
+    Compares small images with those of the release and speed of sound, attenuation and speckle with theory, and
+    measures the time per frame. The exit status is 1 if a device computes wrongly or fails.
+    """
+    from SlicerUSSim.Logic.imaging.self_check import check_devices
+
+    with Share("check") as progress:
+        result = check_devices(device, progress)
+    for line in result.lines:
+        click.echo(line)
+    ctx.exit(1 if result.wrong else 0)
 
 
 for command in (check, demo, devices, optimize, segment, serve, simulate, sweep, volume):

@@ -14,7 +14,7 @@ from SlicerUSSim.Command.mri_options import also_option, read_also, read_mri
 from SlicerUSSim.Command.options import device_option, mask_option, parameter_option
 from SlicerUSSim.Command.progress import Steps, note
 from SlicerUSSim.Logic.base.settings import DisplaySettings, SimulationSettings
-from SlicerUSSim.Logic.mri.settings import SegmentationSettings
+from SlicerUSSim.Logic.mri.segmentation_settings import SegmentationSettings
 
 if TYPE_CHECKING:
     from SlicerUSSim.Logic.mri import Segmentation

@@ -11,7 +11,7 @@ import click
 from SlicerUSSim.Command.options import require_no_options_beside_ct
 from SlicerUSSim.Command.progress import Share, note
 from SlicerUSSim.Logic.base.errors import SimulationError, require
-from SlicerUSSim.Logic.mri.settings import CT, MRI_CONTRASTS, SegmentationSettings
+from SlicerUSSim.Logic.mri.segmentation_settings import CT, MRI_CONTRASTS, SegmentationSettings
 
 if TYPE_CHECKING:
     from SlicerUSSim.Command.additions import Additions

@@ -15,7 +15,7 @@ from SlicerUSSim.Command.progress import Curve, note
 from SlicerUSSim.Command.sequence_options import SequenceOptions, TrackedExamination, open_tracked
 from SlicerUSSim.Logic.base.errors import SimulationError, require
 from SlicerUSSim.Logic.base.version import __version__
-from SlicerUSSim.Logic.fitting.settings import FitSettings
+from SlicerUSSim.Logic.fitting.fit_settings import FitSettings
 
 if TYPE_CHECKING:
     from SlicerUSSim.Logic.fitting import Fit

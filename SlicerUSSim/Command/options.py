@@ -5,6 +5,7 @@ Name, help, default and checks of a parameter's option are derived from its decl
 
 from __future__ import annotations
 
+import logging
 import os
 from collections.abc import Callable, Iterable
 from dataclasses import Field, field, fields
@@ -16,10 +17,11 @@ import click
 from click.core import ParameterSource
 from click.shell_completion import CompletionItem
 
+from SlicerUSSim.Command.progress import note
 from SlicerUSSim.Logic.base.declaration import Declared, Parameter, parameter_of, parameters_of
 from SlicerUSSim.Logic.base.errors import require
 from SlicerUSSim.Logic.base.reading import UNTRUSTED
-from SlicerUSSim.Logic.mri.settings import CT, SegmentationSettings
+from SlicerUSSim.Logic.mri.segmentation_settings import CT, SegmentationSettings
 
 Command = Callable[..., None]
 Decorator = Callable[[Command], Command]
@@ -58,7 +60,6 @@ def _set_verbosity(ctx: click.Context, _: click.Parameter, count: int) -> None:
     ctx.meta[_VERBOSITY] = ctx.meta.get(_VERBOSITY, 0) + count
     if isinstance(ctx.command, click.Group):
         return  # the subcommand has the same option, adds its count and shows the log
-    from SlicerUSSim.Command.log import show_log  # imported here to keep --help fast
 
     show_log(ctx, ctx.meta[_VERBOSITY])
 
@@ -288,3 +289,43 @@ def check_places(*outputs: Path | None) -> None:
         if out is not None:
             require_place(out)
     require_no_input(*outputs)
+
+
+# ---- the package's log on stderr: `ussim: LEVEL: MESSAGE` ------------------------------------------------------------
+
+#: Level by the number of --verbose options
+_LEVELS = (logging.WARNING, logging.INFO, logging.DEBUG)
+
+
+class _Handler(logging.Handler):
+    """Writes to the current stderr, above a progress bar."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        try:
+            note(f"ussim: {record.levelname.lower()}: {self.format(record)}")
+        except Exception:
+            self.handleError(record)
+
+
+def show_log(ctx: click.Context, verbosity: int) -> None:
+    """Show the package's warnings until `ctx` ends; with `verbosity` 1 also INFO, with 2 also DEBUG.
+
+    Of other packages, only errors without another handler are shown.
+    """
+    ours, last = logging.getLogger("SlicerUSSim"), logging.lastResort
+    handler = _Handler()
+    before = ours.level, ours.propagate, None if last is None else last.level
+    ours.addHandler(handler)
+    ours.setLevel(_LEVELS[min(verbosity, len(_LEVELS) - 1)])
+    ours.propagate = False  # a library that adds a handler to the root logger would duplicate each line
+    if last is not None:
+        last.setLevel(logging.ERROR)
+
+    def restore() -> None:
+        ours.removeHandler(handler)
+        ours.setLevel(before[0])
+        ours.propagate = before[1]
+        if last is not None and before[2] is not None:
+            last.setLevel(before[2])
+
+    ctx.find_root().call_on_close(restore)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from SlicerUSSim.Command.additions import Additions, add_option
-from SlicerUSSim.Command.craniotomy import GEL_MM, Craniotomy, craniotomy_option
+from SlicerUSSim.Command.craniotomy_options import GEL_MM, Craniotomy, craniotomy_option
 from SlicerUSSim.Command.mri_options import (
     also_option,
     organs_option,
@@ -30,10 +30,10 @@ from SlicerUSSim.Command.options import (
 )
 from SlicerUSSim.Command.progress import note
 from SlicerUSSim.Command.set_option import Changes, set_option
-from SlicerUSSim.Command.sheets import DrawnSheets, drawn_sheets_option, no_sheet_option
+from SlicerUSSim.Command.sheet_options import DrawnSheets, drawn_sheets_option, no_sheet_option
 from SlicerUSSim.Logic.base.errors import SimulationError, require, required
 from SlicerUSSim.Logic.base.settings import DisplaySettings, SimulationSettings
-from SlicerUSSim.Logic.mri.settings import CT, SegmentationSettings
+from SlicerUSSim.Logic.mri.segmentation_settings import CT, SegmentationSettings
 
 if TYPE_CHECKING:
     import numpy as np
@@ -289,9 +289,9 @@ def _placed(
     pose: np.ndarray | str | None,
 ) -> _Placed:  # fmt: skip
     """The probe at its pose on a patient; `before` are the labels without what --add laid over them."""
-    from SlicerUSSim.Logic.mri.aiming import opening_pose
-    from SlicerUSSim.Logic.mri.craniotomy import default_pose, middle_of
-    from SlicerUSSim.Logic.mri.views import opened_view_pose, view_pose
+    from SlicerUSSim.Logic.placement.aiming import opening_pose
+    from SlicerUSSim.Logic.placement.craniotomy import default_pose, middle_of
+    from SlicerUSSim.Logic.placement.views import opened_view_pose, view_pose
     from SlicerUSSim.Logic.tissue.brain_orders import BRAIN_TISSUES
 
     labels, names, settings = added.labels, added.tissue_names, preset.settings
@@ -327,7 +327,7 @@ def _placed(
 
 def _say_bone(placed: _Placed, added: Added, tissues: TissueTable, preset: Preset, craniotomy: Craniotomy) -> None:
     """Say that the skull before the probe is closed, or that its face does not fit the opening."""
-    from SlicerUSSim.Logic.mri.bone_before_probe import COMMAND, about_bone
+    from SlicerUSSim.Logic.placement.bone_before_probe import COMMAND, about_bone
 
     if placed.probe_to_ras is not None:
         for line in about_bone(

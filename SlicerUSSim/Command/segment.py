@@ -22,9 +22,9 @@ from SlicerUSSim.Command.proposals import (
     split_seeds,
     write_proposals,
 )
-from SlicerUSSim.Command.sheets import require_sheets, sheet_kind_option, sheets_option, write_sheets
+from SlicerUSSim.Command.sheet_options import require_sheets, sheet_kind_option, sheets_option, write_sheets
 from SlicerUSSim.Logic.base.errors import require
-from SlicerUSSim.Logic.mri.settings import CT, SegmentationSettings
+from SlicerUSSim.Logic.mri.segmentation_settings import CT, SegmentationSettings
 
 
 @click.command()

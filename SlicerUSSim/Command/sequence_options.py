@@ -106,7 +106,7 @@ def open_tracked(
     import numpy as np
 
     from SlicerUSSim.Logic.base.files import require_place
-    from SlicerUSSim.Logic.tracked.field import draw_field
+    from SlicerUSSim.Logic.tracked.imaged_field import draw_field
     from SlicerUSSim.Logic.tracked.images import TrackedImages
     from SlicerUSSim.Logic.tracked.sequence import checked_apart, frame_numbers
 
@@ -184,7 +184,7 @@ class _Cuts:
 def _read_cuts(pose_file: str, recording: SequenceOptions) -> _Cuts:
     """The volume of --sequence, with the pose of --cut and neighbouring poses."""
     from SlicerUSSim.Logic.base.volume import Volume
-    from SlicerUSSim.Logic.probe.placement import slide_sweep, tilt_sweep
+    from SlicerUSSim.Logic.probe.poses import slide_sweep, tilt_sweep
     from SlicerUSSim.Logic.tracked.pose_files import read_pose
 
     if recording.cut_tilt is not None and recording.cut_slide is not None:

@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from SlicerUSSim.Command.additions import Additions, add_option, split_additions
-from SlicerUSSim.Command.craniotomy import Craniotomy, craniotomy_option
+from SlicerUSSim.Command.craniotomy_options import Craniotomy, craniotomy_option
+from SlicerUSSim.Command.interrupts import end_at_once
 from SlicerUSSim.Command.mri_options import also_option, organs_option, read_mri, require_other_files, split_also
 from SlicerUSSim.Command.options import ct_option, device_option, mask_option, parameter_option, require_no_mri_options
 from SlicerUSSim.Command.patient_options import map_option
@@ -23,10 +24,9 @@ from SlicerUSSim.Command.sequence_options import (
     to_mri_option,
     transform_option,
 )
-from SlicerUSSim.Command.sheets import AUTO, NONE, DrawnSheets, drawn_sheets_option, no_sheet_option
-from SlicerUSSim.Command.signals import end_at_once
+from SlicerUSSim.Command.sheet_options import AUTO, NONE, DrawnSheets, drawn_sheets_option, no_sheet_option
 from SlicerUSSim.Logic.base.errors import SimulationError, require
-from SlicerUSSim.Logic.mri.settings import CT, SegmentationSettings
+from SlicerUSSim.Logic.mri.segmentation_settings import CT, SegmentationSettings
 
 if TYPE_CHECKING:
     import ssl
@@ -208,7 +208,7 @@ def serve(
     to_ras = read_to_mri(to_mri) if to_mri else None
 
     _prepare_libraries()
-    from SlicerUSSim.Logic.mri.settings import SheetSettings
+    from SlicerUSSim.Logic.mri.segmentation_settings import SheetSettings
     from SlicerUSSim.Workstation.opener import Files
     from SlicerUSSim.Workstation.session_store import SessionStore, sessions_folder
     from SlicerUSSim.Workstation.workstation import Workstation
@@ -264,9 +264,9 @@ def _opened_first(path: str, options: list[str]) -> tuple[tuple[SceneRecord, str
 
 def _require_opening(path: str) -> None:
     """Raise SimulationError for a file of --craniotomy that is neither a mask nor a polygon."""
-    from SlicerUSSim.Logic.mri.craniotomy import is_open, polygon_of_file
     from SlicerUSSim.Logic.mri.markups import is_markup_name
     from SlicerUSSim.Logic.mri.masks import read_mask
+    from SlicerUSSim.Logic.placement.craniotomy import is_open, polygon_of_file
 
     if is_markup_name(path):
         polygon_of_file(path)

@@ -1,15 +1,18 @@
-"""`ussim simulate`."""
+"""`ussim simulate`, `ussim sweep` and `ussim volume`."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import click
 
-from SlicerUSSim.Command.options import check_output, gathered
+from SlicerUSSim.Command.options import check_output, check_outputs, gathered
 from SlicerUSSim.Command.patient_options import PatientOptions, open_examination_at, pose_option, say_contact
-from SlicerUSSim.Command.progress import note
-from SlicerUSSim.Logic.mri.settings import CT
+from SlicerUSSim.Command.progress import Share, note
+from SlicerUSSim.Command.sequence_options import SequenceOptions, open_tracked
+from SlicerUSSim.Logic.base.errors import SimulationError
+from SlicerUSSim.Logic.mri.segmentation_settings import CT
 
 
 @click.command()
@@ -33,3 +36,77 @@ def simulate(patient: PatientOptions, pose: str, out: Path) -> None:
         write_own_volume(out, frame.to_volume())
     kind = "labels" if examination.is_labels else "CT" if patient.segmentation.contrast == CT else "MRI"
     note(f"wrote {out} ({frame.image.shape[1]}x{frame.image.shape[0]}, from {kind})")
+
+
+@click.command()
+@gathered(patient=PatientOptions, recording=SequenceOptions)
+@click.option(
+    "-o", "--out", type=click.Path(path_type=Path), required=True, help="Sequence: .igs.mha .seq.mha .mhd or .nrrd"
+)
+def sweep(patient: PatientOptions, recording: SequenceOptions, out: Path) -> None:
+    """Simulate the images of a tracked sequence, at its poses and on its pixels."""
+    import numpy as np
+
+    from SlicerUSSim.Logic.base.own_outputs import mark_of
+    from SlicerUSSim.Logic.base.volume import MADE_BY
+    from SlicerUSSim.Logic.tracked.sequence import require_sequence_name
+
+    require_sequence_name(out)
+    check_outputs(out, recording.field)
+    # The real images are not compared: what is drawn over them is seen in the figure of --field alone
+    tracked = open_tracked(patient, recording, finds_marks=recording.field is not None)
+    simulator, display = tracked.examination.simulator, tracked.examination.display
+    real = tracked.images
+    rows, columns = real.field.mask.shape
+    simulated = np.zeros((len(real.poses), rows, columns), np.uint8)
+    with Share("sweep") as progress:
+        for place, (number, pose) in enumerate(zip(real.numbers, real.poses, strict=True)):
+            frame = simulator.simulate(real.probe, pose, display, real.grid, noise_seed=number)
+            simulated[place][real.field.window] = frame.image
+            progress((place + 1) / len(real.poses))
+    sequence = tracked.sequence.with_images(real.numbers, simulated)
+    replace(sequence, fields={**sequence.fields, MADE_BY: mark_of(simulated)}).write(out)
+    figure = f", {recording.field}" if recording.field else ""
+    note(f"wrote {out} ({len(simulated)} images of {columns}x{rows}){figure}")
+
+
+@click.command()
+@gathered(patient=PatientOptions)
+@pose_option
+@click.option("-o", "--out", type=click.Path(path_type=Path), required=True, help="Volume: .nrrd .nii.gz .mha or .vti")
+@click.option("--tilt", type=float, help="Tilt the image plane about the probe face over this total angle in degrees.")
+@click.option(
+    "--slide", type=float, help="Slide the probe across its image plane over this total distance in millimetres."
+)
+@click.option(
+    "--frames", type=click.IntRange(1, 10_000), default=61, show_default=True, help="Number of images in the sweep."
+)
+@click.option("--spacing", type=float, default=0.5, show_default=True, help="Voxel size [mm].")
+@click.option("--like", type=click.Path(), help="Use the voxel grid of this volume, such as the MRI.")
+def volume(
+    patient: PatientOptions, pose: str, out: Path, tilt: float | None, slide: float | None, frames: int,
+    spacing: float, like: str | None,
+) -> None:  # fmt: skip
+    """Simulate a 3D ultrasound volume: a sweep of images around a pose, compounded in patient space."""
+    from SlicerUSSim.Logic.base.own_outputs import write_own_volume
+    from SlicerUSSim.Logic.base.volume import Volume
+    from SlicerUSSim.Logic.probe.poses import slide_sweep, tilt_sweep
+
+    check_output(out)
+    if tilt is not None and slide is None:
+        poses_around, extent = tilt_sweep, tilt
+    elif slide is not None and tilt is None:
+        poses_around, extent = slide_sweep, slide
+    else:
+        raise SimulationError("expected exactly one of --tilt DEGREES and --slide MILLIMETRES")
+    grid = Volume.read(like) if like else None
+    examination, middle = open_examination_at(patient, pose)
+    poses = poses_around(middle, extent, frames)
+    say_contact(examination, examination.probe, poses)
+    with Share("sweep") as progress:
+        result = examination.simulator.volume(
+            examination.probe, poses, examination.display, spacing_mm=spacing, like=grid,
+            progress=lambda done: progress(done / frames),
+        )  # fmt: skip
+    write_own_volume(out, result)
+    note(f"wrote {out} ({result.size_text} voxels from {frames} images)")

@@ -20,9 +20,9 @@ from SlicerUSSim.Logic.imaging.figures import draw_views, require_matplotlib, wr
 from SlicerUSSim.Logic.imaging.preset import Preset
 from SlicerUSSim.Logic.imaging.simulator import UltrasoundSimulator
 from SlicerUSSim.Logic.mri.segmentation import Segmentation, segment_mri
-from SlicerUSSim.Logic.mri.settings import SegmentationSettings
+from SlicerUSSim.Logic.mri.segmentation_settings import SegmentationSettings
 from SlicerUSSim.Logic.probe.arrays import Probe
-from SlicerUSSim.Logic.probe.placement import craniotomy_pose, slice_under_probe
+from SlicerUSSim.Logic.probe.poses import craniotomy_pose, slice_under_probe
 from SlicerUSSim.Logic.tissue.own_files import write_label_files
 from SlicerUSSim.Logic.tissue.table import TissueTable
 from SlicerUSSim.Logic.tracked.pose_files import write_pose

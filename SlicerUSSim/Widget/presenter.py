@@ -20,7 +20,7 @@ import numpy as np
 from SlicerUSSim.Logic.base.errors import Cancelled, SimulationError, require, required, user_message
 from SlicerUSSim.Logic.imaging.preset import Preset
 from SlicerUSSim.Logic.mri.segmentation import Segmentation
-from SlicerUSSim.Logic.mri.settings import GEL_MM, SegmentationSettings
+from SlicerUSSim.Logic.mri.segmentation_settings import GEL_MM, SegmentationSettings
 from SlicerUSSim.Logic.mrml.fitting_nodes import fits
 from SlicerUSSim.Logic.mrml.labels_before import LabelsBefore
 from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic

@@ -13,7 +13,7 @@ from SlicerUSSim.Logic.base.errors import SimulationError
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.fitting.image_similarity import Similarity, similarity
 from SlicerUSSim.Logic.probe.image_grid import ImageGrid
-from SlicerUSSim.Logic.probe.placement import slice_under_probe
+from SlicerUSSim.Logic.probe.poses import slice_under_probe
 from SlicerUSSim.Logic.tracked.images import TrackedImages
 from SlicerUSSim.Workstation.state import ComparisonMode, SharedState
 from SlicerUSSim.Workstation.streams import ImageStream

@@ -21,12 +21,12 @@ from vtkmodules.vtkCommonCore import vtkOutputWindow
 
 from SlicerUSSim.Logic.base.errors import SimulationError, require, required
 from SlicerUSSim.Logic.imaging.preset import Preset
-from SlicerUSSim.Logic.mri.sheets.surfels import KINDS
 from SlicerUSSim.Logic.mrml.label_nodes import read_labels
 from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic
 from SlicerUSSim.Logic.mrml.nodes import nodes_of_class, pose_in_labels
 from SlicerUSSim.Logic.mrml.taken_image import TakenImage
 from SlicerUSSim.Logic.tissue.sheet_looks import with_dura
+from SlicerUSSim.Logic.tissue.surfels import KINDS
 from SlicerUSSim.Workstation.opener import FILE, Opener
 from SlicerUSSim.Workstation.script import LabelSource, python_script
 from SlicerUSSim.Workstation.tasks import Tasks

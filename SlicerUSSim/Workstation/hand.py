@@ -15,7 +15,7 @@ from vtkmodules.vtkCommonDataModel import vtkStaticCellLocator
 from SlicerUSSim.Logic.base.errors import SimulationError
 from SlicerUSSim.Logic.base.vtk_data import matrix_array
 from SlicerUSSim.Logic.probe.arrays import Probe
-from SlicerUSSim.Logic.probe.placement import aimed_at, carried, turned
+from SlicerUSSim.Logic.probe.poses import aimed_at, carried, turned
 from SlicerUSSim.Logic.probe.shape import probe_polydata
 from SlicerUSSim.Logic.probe.surface import PatientSurface
 

@@ -13,13 +13,13 @@ from trame_slicer.core import SlicerApp
 
 from SlicerUSSim.Logic.base.errors import SimulationError, require
 from SlicerUSSim.Logic.base.volume import Volume
-from SlicerUSSim.Logic.mri.craniotomy import disc_diameter_mm
 from SlicerUSSim.Logic.mri.given_mask import checked_mask
-from SlicerUSSim.Logic.mri.label_agreement import follows
+from SlicerUSSim.Logic.mri.mask_check import follows
 from SlicerUSSim.Logic.mrml.label_nodes import labels_version
 from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic
 from SlicerUSSim.Logic.mrml.nodes import pose_in_labels, probe_pose, read_volume
 from SlicerUSSim.Logic.mrml.taken_sequence import FrozenRecord
+from SlicerUSSim.Logic.placement.craniotomy import disc_diameter_mm
 from SlicerUSSim.Logic.tissue.label_maps import LabelledTissues, as_whole
 from SlicerUSSim.Widget.presenter import PanelPresenter
 from SlicerUSSim.Workstation.anatomy import AnatomyViews

@@ -18,12 +18,11 @@ from SlicerUSSim.Logic.base.files import read_json
 from SlicerUSSim.Logic.base.reading import untrusted_folder
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.imaging.preset import Preset
-from SlicerUSSim.Logic.mri.craniotomy import is_open, polygon_of_file
 from SlicerUSSim.Logic.mri.kept_mask import mask_beside
 from SlicerUSSim.Logic.mri.markups import is_markup_name
 from SlicerUSSim.Logic.mri.masks import with_label_names
 from SlicerUSSim.Logic.mri.samples import demo_mri
-from SlicerUSSim.Logic.mri.settings import SheetSettings
+from SlicerUSSim.Logic.mri.segmentation_settings import SheetSettings
 from SlicerUSSim.Logic.mri.sheets.kept import sheets_beside
 from SlicerUSSim.Logic.mri.sheets.polydata import as_polydata, read_surfels
 from SlicerUSSim.Logic.mrml.known_field import KnownField, write_known_field
@@ -34,6 +33,7 @@ from SlicerUSSim.Logic.mrml.nodes import display_of, write_volume
 from SlicerUSSim.Logic.mrml.scene_record import SceneRecord, SequenceRecord
 from SlicerUSSim.Logic.mrml.sequence_nodes import add_sequence
 from SlicerUSSim.Logic.mrml.taken_image import PATIENT, patient_of
+from SlicerUSSim.Logic.placement.craniotomy import is_open, polygon_of_file
 from SlicerUSSim.Logic.probe.arrays import Probe
 from SlicerUSSim.Logic.tissue.label_advice import ORGANS_PAGE, PAGE
 from SlicerUSSim.Logic.tissue.label_mapping import LabelMapping

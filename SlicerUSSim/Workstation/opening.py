@@ -9,12 +9,12 @@ from typing import Any
 from SlicerUSSim.Logic.base.dicom import FoundSeries
 from SlicerUSSim.Logic.base.errors import Cancelled, SimulationError, require
 from SlicerUSSim.Logic.imaging.preset import Preset
-from SlicerUSSim.Logic.mri.craniotomy import POLYGONS
 from SlicerUSSim.Logic.mri.markups import markup_points
 from SlicerUSSim.Logic.mri.modality import has_brain_mask
 from SlicerUSSim.Logic.mri.pathology import LESIONS
-from SlicerUSSim.Logic.mri.settings import CT, MRI_CONTRASTS
+from SlicerUSSim.Logic.mri.segmentation_settings import CT, MRI_CONTRASTS
 from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic
+from SlicerUSSim.Logic.placement.craniotomy import POLYGONS
 from SlicerUSSim.Logic.tracked.pose_files import read_pose
 from SlicerUSSim.Widget.presenter import PanelPresenter
 from SlicerUSSim.Workstation.content import Kind

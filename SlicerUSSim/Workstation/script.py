@@ -14,7 +14,7 @@ import numpy as np
 
 from SlicerUSSim.Logic.imaging.preset import Preset
 from SlicerUSSim.Logic.mri.masks import SEVERAL
-from SlicerUSSim.Logic.mri.settings import CT
+from SlicerUSSim.Logic.mri.segmentation_settings import CT
 from SlicerUSSim.Logic.tissue.presets import TISSUES
 
 _TEMPLATE = '''"""Reproduces an image of a SlicerUSSim workstation."""
@@ -164,7 +164,7 @@ def python_script(
         lines += [f"added = add_tissues(labels, {names}, [{masks}]{more_options})", "labels = added.labels"]
         names = "added.tissue_names"
     if source.disc is not None:
-        more += "from SlicerUSSim.Logic.mri.craniotomy import disc_opening, opened\n"
+        more += "from SlicerUSSim.Logic.placement.craniotomy import disc_opening, opened\n"
         diameter, pose = source.disc
         lines += [
             f"opening = disc_opening(labels, {names}, np.array({_array(pose)}), {diameter!r})",

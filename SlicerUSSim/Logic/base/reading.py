@@ -49,8 +49,6 @@ _SAFE = {
     ("numpy", "ndarray"),
     ("numpy", "dtype"),
     ("SimpleITK.SimpleITK", "Image"),
-    ("SlicerUSSim.Logic.tissue.table", "TissueTable"),
-    ("SlicerUSSim.Logic.fitting.parameters", "FreeParameters"),
     ("builtins", "set"),
     ("builtins", "frozenset"),
     ("builtins", "slice"),
@@ -59,6 +57,10 @@ _SAFE = {
     ("builtins", "object"),
     *(("pathlib", name) for name in ("PosixPath", "WindowsPath", "PurePosixPath", "PureWindowsPath")),
 }
+
+
+class PlainValue:
+    """Base of a class that is not a dataclass, but whose objects are plain values, and may come back from a child."""
 
 
 @dataclass(frozen=True)
@@ -239,7 +241,8 @@ class _Safe(pickle.Unpickler):
             return super().find_class(module, name)
         if module.startswith("SlicerUSSim.Logic."):
             found = super().find_class(module, name)
-            if isinstance(found, type) and (is_dataclass(found) or issubclass(found, Enum | Warning | SimulationError)):
+            is_value = isinstance(found, type) and issubclass(found, PlainValue | Enum | Warning | SimulationError)
+            if is_value or (isinstance(found, type) and is_dataclass(found)):
                 return found
         raise pickle.UnpicklingError(f"{module}.{name} is no value that is read from files")
 

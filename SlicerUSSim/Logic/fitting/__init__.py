@@ -10,6 +10,7 @@ from SlicerUSSim.Logic.base.lazy import lazy_exports
 if TYPE_CHECKING:
     from .appearance import AppearanceModel as AppearanceModel
     from .control_costs import neighbours_of as neighbours_of
+    from .fit_settings import FitSettings as FitSettings
     from .held_out import predict as predict
     from .image_similarity import (
         Similarity as Similarity,
@@ -22,7 +23,6 @@ if TYPE_CHECKING:
     from .registration import Registration as Registration, register_poses as register_poses
     from .report import write_report as write_report
     from .search import Progress as Progress
-    from .settings import FitSettings as FitSettings
     from .speckle_fit import SpeckleFit as SpeckleFit, fit_speckle as fit_speckle
     from .speckle_width import SpeckleWidth as SpeckleWidth, speckle_widths as speckle_widths
     from .texture_costs import (

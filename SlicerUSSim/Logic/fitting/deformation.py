@@ -25,7 +25,7 @@ from SlicerUSSim.Logic.fitting.registration import coarser, middle_frame
 from SlicerUSSim.Logic.fitting.search import Progress, Search
 from SlicerUSSim.Logic.fitting.targets import mean_cost, target_comparisons
 from SlicerUSSim.Logic.imaging.simulator import UltrasoundSimulator
-from SlicerUSSim.Logic.mri.sheets.surfels import Surfels
+from SlicerUSSim.Logic.tissue.surfels import Surfels
 from SlicerUSSim.Logic.tissue.texture import Texture
 from SlicerUSSim.Logic.tracked.images import TrackedImages
 

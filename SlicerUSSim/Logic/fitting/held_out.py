@@ -11,11 +11,11 @@ import numpy as np
 from SlicerUSSim.Logic.base.errors import require
 from SlicerUSSim.Logic.base.settings import DisplaySettings
 from SlicerUSSim.Logic.fitting.control_costs import FITTED, NEIGHBOURS, UNIFORM, Cost, costs_against, uniform_tissues
+from SlicerUSSim.Logic.fitting.fit_settings import FitSettings
 from SlicerUSSim.Logic.fitting.image_similarity import SimilaritySettings
 from SlicerUSSim.Logic.fitting.parameters import DISPLAY_BOUNDS, GROUPS, TISSUES, Bounds
 from SlicerUSSim.Logic.fitting.prediction import Prediction
 from SlicerUSSim.Logic.fitting.search import Progress
-from SlicerUSSim.Logic.fitting.settings import FitSettings
 from SlicerUSSim.Logic.fitting.tracked_fit import Fit, fit as fit_images, simulated
 from SlicerUSSim.Logic.imaging.simulator import UltrasoundSimulator
 from SlicerUSSim.Logic.tracked.images import TrackedImages

@@ -8,9 +8,10 @@ the same result, and an interrupted run is resumed by replaying its evaluations.
 
 from __future__ import annotations
 
+import hashlib
 import logging
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, is_dataclass, replace
 from time import perf_counter
 
 import numpy as np
@@ -19,7 +20,7 @@ from SlicerUSSim.Logic.base.errors import require_between
 from SlicerUSSim.Logic.base.settings import DisplaySettings
 from SlicerUSSim.Logic.base.version import __version__
 from SlicerUSSim.Logic.fitting.appearance import AppearanceModel
-from SlicerUSSim.Logic.fitting.fingerprint import fingerprint
+from SlicerUSSim.Logic.fitting.fit_settings import FitSettings
 from SlicerUSSim.Logic.fitting.identifiability import (
     Identifiability,
     State,
@@ -38,7 +39,6 @@ from SlicerUSSim.Logic.fitting.search import (
     history_from,
 )
 from SlicerUSSim.Logic.fitting.sensitivity import FIRST_STEP, patch_statistics, search_axes
-from SlicerUSSim.Logic.fitting.settings import FitSettings
 from SlicerUSSim.Logic.fitting.targets import mean_cost, target_comparisons
 from SlicerUSSim.Logic.imaging.medium import as_labels
 from SlicerUSSim.Logic.imaging.simulator import UltrasoundSimulator
@@ -501,3 +501,43 @@ def _problem(
         "version": __version__,
     } | ({} if begin is None else {"where the search begins": begin})
     return {name: fingerprint(part) for name, part in parts.items()}
+
+
+# ---- a hash that is equal only for equal values ----------------------------------------------------------------------
+
+
+def fingerprint(value: object) -> str:
+    """SHA-256 of plain values, arrays, dataclasses (fields that are compared), and sequences and mappings of these.
+
+    Types and shapes of arrays and lengths of sequences are included, so that different values with the same bytes have
+    different hashes. Raises TypeError for other values.
+    """
+    digest = hashlib.sha256()
+    _feed(digest, value)
+    return digest.hexdigest()
+
+
+def _feed(digest, value: object) -> None:
+    if value is None or isinstance(value, str):
+        _feed_bytes(digest, type(value).__name__, repr(value).encode())
+    elif isinstance(value, bool | int | float | np.generic):
+        whole = float(value).is_integer()  # 1 equals 1.0, but 2**53 does not equal 2**53 + 1
+        _feed_bytes(digest, "number", repr(int(value) if whole else float(value)).encode())
+    elif isinstance(value, np.ndarray) and not value.dtype.hasobject:
+        _feed_bytes(digest, f"array {value.dtype.str} {value.shape}", np.ascontiguousarray(value).data)
+    elif isinstance(value, Mapping):
+        _feed(digest, [*value.items()])
+    elif isinstance(value, list | tuple):
+        _feed_bytes(digest, f"sequence of {len(value)}", b"")
+        for item in value:
+            _feed(digest, item)
+    elif is_dataclass(value):
+        compared = {field.name: getattr(value, field.name) for field in fields(value) if field.compare}
+        _feed(digest, [type(value).__name__, compared])
+    else:
+        raise TypeError(f"no fingerprint of a {type(value).__name__}")
+
+
+def _feed_bytes(digest, kind: str, content) -> None:
+    digest.update(f"{kind}, {memoryview(content).nbytes} bytes:".encode())
+    digest.update(content)

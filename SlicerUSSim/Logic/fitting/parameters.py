@@ -20,6 +20,7 @@ import numpy as np
 
 from SlicerUSSim.Logic.base.declaration import Fit, Parameter as Declaration, parameters_of
 from SlicerUSSim.Logic.base.errors import SimulationError, require
+from SlicerUSSim.Logic.base.reading import PlainValue
 from SlicerUSSim.Logic.base.settings import DisplaySettings
 from SlicerUSSim.Logic.tissue.names import same_name
 from SlicerUSSim.Logic.tissue.table import TissueTable
@@ -105,7 +106,7 @@ class Parameter:
         return (value - self.low) / (self.high - self.low)
 
 
-class FreeParameters(tuple):
+class FreeParameters(PlainValue, tuple):
     """The free parameters of one optimisation, in their order."""
 
     @classmethod

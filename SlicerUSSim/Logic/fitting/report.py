@@ -24,9 +24,9 @@ from SlicerUSSim.Logic.fitting.speckle_fit import SpeckleFit
 from SlicerUSSim.Logic.fitting.texture_costs import TextureReference
 from SlicerUSSim.Logic.imaging.figures import require_matplotlib
 from SlicerUSSim.Logic.imaging.simulator import UltrasoundSimulator
-from SlicerUSSim.Logic.probe.placement import slice_under_probe
+from SlicerUSSim.Logic.probe.poses import slice_under_probe
 from SlicerUSSim.Logic.tissue.presets import colour_of
-from SlicerUSSim.Logic.tracked.field import draw_field
+from SlicerUSSim.Logic.tracked.imaged_field import draw_field
 from SlicerUSSim.Logic.tracked.images import TrackedImages
 
 _TEMPLATE = Path(__file__).parent / "report.html"

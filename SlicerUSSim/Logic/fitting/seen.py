@@ -10,7 +10,7 @@ import numpy as np
 from SlicerUSSim.Logic.base.settings import DisplaySettings
 from SlicerUSSim.Logic.fitting.parameters import ATTENUATION, TISSUES, Bounds, FreeParameters
 from SlicerUSSim.Logic.imaging.simulator import UltrasoundSimulator
-from SlicerUSSim.Logic.probe.placement import slice_under_probe
+from SlicerUSSim.Logic.probe.poses import slice_under_probe
 from SlicerUSSim.Logic.tissue.sheet_looks import DURA, DURA_KINDS, dura_label
 from SlicerUSSim.Logic.tracked.images import TrackedImages
 

@@ -12,13 +12,13 @@ import numpy as np
 
 from SlicerUSSim.Logic.base.settings import DisplaySettings
 from SlicerUSSim.Logic.fitting.deformation import Deformation, find_deformation
+from SlicerUSSim.Logic.fitting.fit_settings import FitSettings
 from SlicerUSSim.Logic.fitting.image_similarity import Similarity, SimilaritySettings, similarity
 from SlicerUSSim.Logic.fitting.optimization import AppearanceResult, optimize_appearance
 from SlicerUSSim.Logic.fitting.parameters import Bounds
 from SlicerUSSim.Logic.fitting.registration import Registration, register_poses
 from SlicerUSSim.Logic.fitting.search import Progress
 from SlicerUSSim.Logic.fitting.seen import parameters_seen
-from SlicerUSSim.Logic.fitting.settings import FitSettings
 from SlicerUSSim.Logic.fitting.speckle_fit import (
     SpeckleFit,
     fit_speckle,

@@ -1,4 +1,5 @@
-"""Host side of kernels/bmode.cl: pulse, noise, time-gain compensation, envelope, log compression, eight bits."""
+"""Host side of kernels/bmode.cl: pulse, noise, time-gain compensation, envelope, log compression, eight bits;
+and of kernels/scan_conversion.cl: from scan lines to pixels."""
 
 from __future__ import annotations
 
@@ -233,3 +234,53 @@ def pulse_taps(sigma: float) -> np.ndarray:
     assert reach <= CONSTANTS["LINE_PAD"], "the bounds of Probe and SimulationSettings keep every pulse within the pad"
     taps = np.exp(-0.5 * (np.arange(-reach, reach + 1) / narrowed) ** 2)
     return (taps * sigma / narrowed).astype(np.float32)
+
+
+# ---- from scan lines to pixels (kernels/scan_conversion.cl) ----------------------------------------------------------
+
+_PER_PIXEL = 80  # operations
+
+
+class ScanConverter(Stage):
+    """Interpolates the grey levels of the scan lines at the pixels of an ImageGrid."""
+
+    name = "scan conversion"
+
+    def __init__(self, device: Device) -> None:
+        super().__init__(device)
+        self.average = device.kernels("bmode.cl", device.lanes)["average_depth"]
+        self.convert = device.kernels("scan_conversion.cl", device.lanes)["scan_convert"]
+        self.workspace = Workspace(device)
+
+    def run(self, frame: DeviceFrame) -> None:
+        """Enqueue the conversion of one frame: its `image`."""
+        grid, (lines, samples) = frame.grid, frame.line_shape
+        sample_mm = float(frame.acquisition["sample_mm"])
+        frame.image = self.workspace.get("image", grid.rows * grid.columns)
+        smooth = self.workspace.get("smooth", lines * samples)
+        self.device.run(
+            self.average,
+            (samples // self.device.lanes, lines),
+            frame.grey,
+            smooth,
+            np.int32(samples),
+            np.int32(np.ceil(float(frame.acquisition["depth_mm"]) / sample_mm)),
+            np.int32(max(round(grid.pixel_spacing_mm[1] / sample_mm), 1)),
+        )
+        self.device.run(
+            self.convert,
+            (-(-grid.columns // self.device.lanes), grid.rows),
+            frame.acquisition_buffer,
+            smooth,
+            np.float32(grid.left_mm),
+            np.float32(grid.top_mm),
+            np.float32(grid.pixel_spacing_mm[0]),
+            np.float32(grid.pixel_spacing_mm[1]),
+            np.int32(grid.columns),
+            frame.image,
+        )
+
+    def work(self, frame: DeviceFrame, tree: RayTree) -> Work:
+        grid, (lines, samples) = frame.grid, frame.line_shape
+        pixels, averaged = grid.rows * grid.columns, grid.pixel_spacing_mm[1] / float(frame.acquisition["sample_mm"])
+        return Work(2 * lines * samples + 9 * pixels, averaged * lines * samples + _PER_PIXEL * pixels)

@@ -13,7 +13,7 @@ import numpy as np
 
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.probe.arrays import Probe
-from SlicerUSSim.Logic.probe.placement import sample
+from SlicerUSSim.Logic.probe.poses import sample
 
 #: Places along the face per aperture, and across it; steps through the gap in voxels
 _ALONG, _ACROSS, _STEP = 25, 5, 0.5

@@ -11,10 +11,10 @@ import numpy as np
 
 from SlicerUSSim.Logic.base.errors import require
 from SlicerUSSim.Logic.base.volume import Volume
-from SlicerUSSim.Logic.mri.sheets.surfels import KINDS, Surfels
-from SlicerUSSim.Logic.mri.sheets.voxels import on_voxels
+from SlicerUSSim.Logic.imaging.sheet_voxels import on_voxels
 from SlicerUSSim.Logic.opencl.layout import CONSTANTS
 from SlicerUSSim.Logic.tissue.sheet_looks import SheetLook, looks_of, with_dura
+from SlicerUSSim.Logic.tissue.surfels import KINDS, Surfels
 from SlicerUSSim.Logic.tissue.table import TissueTable
 
 #: Fluid around a sheet, along its normal, is a gap as narrow as a sheet up to here on either side; from here on it is

@@ -22,11 +22,11 @@ from SlicerUSSim.Logic.base.errors import SimulationError, require
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.imaging.borders import smoothed_indicators, smoothed_members
 from SlicerUSSim.Logic.imaging.found_sheets import FoundSheets, cells_around, found_sheets, with_their_tissue
-from SlicerUSSim.Logic.imaging.sheets import sheet_planes
-from SlicerUSSim.Logic.mri.sheets.surfels import Surfels
+from SlicerUSSim.Logic.imaging.labelled_sheets import sheet_planes
 from SlicerUSSim.Logic.opencl.device import Device, divisible
 from SlicerUSSim.Logic.opencl.layout import CONSTANTS, TISSUE
 from SlicerUSSim.Logic.tissue.sheet_looks import looks_of
+from SlicerUSSim.Logic.tissue.surfels import Surfels
 from SlicerUSSim.Logic.tissue.table import MAX_LABEL, TissueTable
 from SlicerUSSim.Logic.tissue.tissue import Membrane
 

@@ -8,8 +8,8 @@ from collections.abc import Hashable
 from SlicerUSSim.Logic.base.settings import SimulationSettings
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.imaging.simulator import UltrasoundSimulator
-from SlicerUSSim.Logic.mri.sheets.surfels import Surfels
 from SlicerUSSim.Logic.opencl.device import DeviceChoice
+from SlicerUSSim.Logic.tissue.surfels import Surfels
 from SlicerUSSim.Logic.tissue.table import TissueTable
 from SlicerUSSim.Logic.tissue.texture import Texture
 

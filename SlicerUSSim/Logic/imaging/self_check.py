@@ -22,7 +22,7 @@ from SlicerUSSim.Logic.imaging.simulator import UltrasoundSimulator
 from SlicerUSSim.Logic.opencl.device import Device
 from SlicerUSSim.Logic.opencl.devices import DeviceInfo, devices_to_measure
 from SlicerUSSim.Logic.probe.arrays import PROBES, Probe
-from SlicerUSSim.Logic.probe.placement import pose_looking_at
+from SlicerUSSim.Logic.probe.poses import pose_looking_at
 from SlicerUSSim.Logic.tissue.table import TissueTable
 from SlicerUSSim.Logic.tissue.tissue import Tissue
 

@@ -31,13 +31,13 @@ from SlicerUSSim.Logic.imaging.raytracing import RayTracer
 from SlicerUSSim.Logic.imaging.scattering import cells_in_view, sites_per_mm3
 from SlicerUSSim.Logic.imaging.signals import RayTree
 from SlicerUSSim.Logic.imaging.stage import DeviceFrame, Stage
-from SlicerUSSim.Logic.mri.sheets.surfels import Surfels
 from SlicerUSSim.Logic.opencl.device import Device, DeviceChoice
 from SlicerUSSim.Logic.opencl.layout import ACQUISITION, CONSTANTS
 from SlicerUSSim.Logic.probe.arrays import Probe
 from SlicerUSSim.Logic.probe.beam import CURVED, NOMINAL_SPEED_M_S
 from SlicerUSSim.Logic.probe.image_grid import ImageGrid
 from SlicerUSSim.Logic.tissue.sheet_looks import DURA_ISOTROPIC, dura_label
+from SlicerUSSim.Logic.tissue.surfels import Surfels
 from SlicerUSSim.Logic.tissue.table import TissueTable
 from SlicerUSSim.Logic.tissue.texture import Texture
 

@@ -6,10 +6,9 @@ How to add one is in docs/architecture.md#adding-a-stage.
 from __future__ import annotations
 
 from SlicerUSSim.Logic.imaging.aperture import Aperture
-from SlicerUSSim.Logic.imaging.bmode import Compressor, PulseFilter
+from SlicerUSSim.Logic.imaging.bmode import Compressor, PulseFilter, ScanConverter
 from SlicerUSSim.Logic.imaging.console import EdgeEnhancement, EnvelopeSmoothing, GreyMapping
 from SlicerUSSim.Logic.imaging.raytracing import RayTracer
-from SlicerUSSim.Logic.imaging.scan_conversion import ScanConverter
 from SlicerUSSim.Logic.imaging.scattering import InterfaceEchoes, LateralBeam, Scatterers
 from SlicerUSSim.Logic.imaging.side_lobes import SideLobes
 from SlicerUSSim.Logic.imaging.stage import Stage

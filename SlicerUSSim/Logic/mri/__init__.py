@@ -18,6 +18,6 @@ if TYPE_CHECKING:
     from .pathology import Added as Added, add_tissue as add_tissue, add_tissues as add_tissues
     from .samples import demo_mri as demo_mri, head_mri as head_mri
     from .segmentation import Segmentation as Segmentation, segment_mri as segment_mri
-    from .settings import SegmentationSettings as SegmentationSettings
+    from .segmentation_settings import SegmentationSettings as SegmentationSettings
 
 lazy_exports(globals())

@@ -32,7 +32,7 @@ from SlicerUSSim.Logic.mri.recognition import (
     stripped_brain,
 )
 from SlicerUSSim.Logic.mri.refinement import on_grid, refined, signed_distance
-from SlicerUSSim.Logic.mri.settings import SegmentationSettings
+from SlicerUSSim.Logic.mri.segmentation_settings import SegmentationSettings
 
 _log = logging.getLogger(__name__)
 

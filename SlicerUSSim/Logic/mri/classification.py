@@ -11,7 +11,7 @@ from SlicerUSSim.Logic.base.declaration import parameter_of
 from SlicerUSSim.Logic.base.errors import require
 from SlicerUSSim.Logic.mri.histogram import Histogram
 from SlicerUSSim.Logic.mri.mixture import ANY, TISSUES, Points, TissueMixture, fit_mixture
-from SlicerUSSim.Logic.mri.settings import CT, SegmentationSettings
+from SlicerUSSim.Logic.mri.segmentation_settings import CT, SegmentationSettings
 
 #: Tissues (indices in mixture.TISSUES) from dark to bright
 ORDERS = {"t1": (0, 1, 2), "t1gd": (0, 1, 2), "t2": (2, 1, 0), "flair": (0, 2, 1)}

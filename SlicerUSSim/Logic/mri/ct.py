@@ -15,12 +15,11 @@ from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.mri.ct_body import axis_of_slices, cells, extend_into, find_body, pooled
 from SlicerUSSim.Logic.mri.ct_classes import BLOOD, NAMES, SKIN_MM, classified, sharpened
 from SlicerUSSim.Logic.mri.ct_organs import laid_over, organs_of_ct
-from SlicerUSSim.Logic.mri.ct_shares import border_shares
 from SlicerUSSim.Logic.mri.ct_unit import hounsfield_offset, padding_of
 from SlicerUSSim.Logic.mri.filtering import estimate_noise, guided_filter
 from SlicerUSSim.Logic.mri.recognition import check_finite
+from SlicerUSSim.Logic.mri.segmentation_settings import SegmentationSettings
 from SlicerUSSim.Logic.mri.segmentation_steps import StepTimes
-from SlicerUSSim.Logic.mri.settings import SegmentationSettings
 from SlicerUSSim.Logic.opencl.device import DeviceChoice
 from SlicerUSSim.Logic.tissue.label_maps import LabelledTissues
 from SlicerUSSim.Logic.tissue.label_sources import not_intensities
@@ -299,3 +298,40 @@ def _moments(hu: np.ndarray, labels: np.ndarray, count: int) -> tuple[np.ndarray
         second += np.bincount(label, value**2, count + 1)
     mean = first / np.maximum(numbers, 1)
     return mean[1:], np.sqrt(np.maximum(second / np.maximum(numbers, 1) - mean**2, 0.0))[1:]
+
+
+# ---- partial volumes: the part of a voxel on a border that the tissue beside it fills --------------------------------
+
+#: The part of the range between two tissues in which a number tells a share, as in texture.volume_shares; a step is
+#: clear from this many deviations of the noise on
+_INNER_RANGE, _CLEAR = 0.7, 5.0
+
+
+def border_shares(
+    labels: np.ndarray, filtered: np.ndarray, sharp: np.ndarray, noise: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """((k, j, i) uint8 label of the other tissue in every voxel, float32 part that it fills, 0 to 1/2).
+
+    A voxel beside another label, whose filtered number lies between the numbers that both have beyond the border (the
+    sharpened ones), is filled in that proportion. Of several neighbours the one across the largest step counts.
+    """
+    second, share = np.zeros(labels.shape, np.uint8), np.zeros(labels.shape, np.float32)
+    step = np.zeros(labels.shape, np.int16)
+    for axis in range(3):
+        for towards in (1, -1):
+            here, there = (_side(axis, towards * sign) for sign in (1, -1))
+            differs = labels[here] != labels[there]
+            rise = sharp[there] - sharp[here]
+            larger = differs & (np.abs(rise) > np.abs(step[here])) & (np.abs(rise) > _CLEAR * noise)
+            np.copyto(step[here], rise, where=larger)
+            np.copyto(second[here], labels[there], where=larger)
+    on_border = step != 0
+    part = (filtered[on_border].astype(np.float32) - sharp[on_border]) / step[on_border]
+    share[on_border] = np.clip((part - 0.5) / _INNER_RANGE + 0.5, 0.0, 0.5)
+    return second, share
+
+
+def _side(axis: int, sign: int) -> tuple[slice, ...]:
+    parts = [slice(None)] * 3
+    parts[axis] = slice(None, -1) if sign > 0 else slice(1, None)
+    return tuple(parts)

@@ -10,7 +10,7 @@ from SlicerUSSim.Logic.base.errors import require
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.mri.ct import CtSegmentation, segment_ct
 from SlicerUSSim.Logic.mri.segmentation import Segmentation, segment_mri
-from SlicerUSSim.Logic.mri.settings import CT, SegmentationSettings
+from SlicerUSSim.Logic.mri.segmentation_settings import CT, SegmentationSettings
 from SlicerUSSim.Logic.opencl.device import DeviceChoice
 from SlicerUSSim.Logic.tissue.label_maps import LabelledTissues
 

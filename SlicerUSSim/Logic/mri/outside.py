@@ -15,9 +15,9 @@ import numpy as np
 from scipy import ndimage
 
 from SlicerUSSim.Logic.base.errors import require
+from SlicerUSSim.Logic.base.neighbourhood import distance_to
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.mri.coarse import largest_component
-from SlicerUSSim.Logic.mri.distances import distance_to
 from SlicerUSSim.Logic.mri.skull_surface import thickness_of_skull
 
 #: Contrasts in which bone is known to be found

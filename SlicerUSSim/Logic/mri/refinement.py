@@ -7,9 +7,9 @@ from typing import cast
 import numpy as np
 from scipy import ndimage
 
+from SlicerUSSim.Logic.base.neighbourhood import distance_to
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.mri.coarse import resampled_to_ras, widened
-from SlicerUSSim.Logic.mri.distances import distance_to
 
 _SPACING_MM = 1.2
 #: Brightness, relative to the brain nearby, between tissue and the skull or CSF of a T1

@@ -13,7 +13,7 @@ from scipy import ndimage
 from scipy.sparse import coo_array, csr_array
 from scipy.spatial import KDTree
 
-from SlicerUSSim.Logic.mri.distances import distance_to
+from SlicerUSSim.Logic.base.neighbourhood import distance_to
 
 #: Places over the brain, mm apart, and thicknesses that are tried, mm
 _PLACES_MM, _STEP_MM = 4.0, 0.5

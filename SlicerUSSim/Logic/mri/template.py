@@ -9,10 +9,10 @@ import numpy as np
 from scipy import ndimage
 
 from SlicerUSSim.Logic.base.errors import required
+from SlicerUSSim.Logic.base.neighbourhood import distance_to
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.mri.atlas import mni152
 from SlicerUSSim.Logic.mri.coarse import CoarseImage
-from SlicerUSSim.Logic.mri.distances import distance_to
 
 #: Voxel size of the template in the search and width of its dark ring, mm
 TEMPLATE_MM, _RING_MM = 5, 6.0

@@ -9,10 +9,10 @@ from vtkmodules.vtkFiltersCore import vtkFlyingEdges3D, vtkWindowedSincPolyDataF
 
 from SlicerUSSim.Logic.base.errors import require
 from SlicerUSSim.Logic.base.volume import Volume
-from SlicerUSSim.Logic.mri.craniotomy import mask_opening, middle_of, polygon_opening
 from SlicerUSSim.Logic.mrml.label_nodes import LABEL_CLASSES, hidden_segments, node_labels
 from SlicerUSSim.Logic.mrml.nodes import control_points, display_of, named, node_to_world, require_node
 from SlicerUSSim.Logic.mrml.own_results import FLAP, mark_as_result, may_replace_result
+from SlicerUSSim.Logic.placement.craniotomy import mask_opening, middle_of, polygon_opening
 
 #: Nodes that describe an opening
 OPENING_CLASSES = ("vtkMRMLMarkupsNode", *LABEL_CLASSES)

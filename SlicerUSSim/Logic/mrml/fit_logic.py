@@ -10,9 +10,9 @@ import numpy as np
 
 from SlicerUSSim.Logic.base.errors import required
 from SlicerUSSim.Logic.fitting.adopted import taken_back, with_fit
+from SlicerUSSim.Logic.fitting.fit_settings import FitSettings
 from SlicerUSSim.Logic.fitting.held_out import predict
 from SlicerUSSim.Logic.fitting.search import Progress
-from SlicerUSSim.Logic.fitting.settings import FitSettings
 from SlicerUSSim.Logic.fitting.tracked_fit import Fit, fit
 from SlicerUSSim.Logic.imaging.preset import Preset
 from SlicerUSSim.Logic.mrml.fit_nodes import CostPlot, neighbours_in, tracked_images, write_compared

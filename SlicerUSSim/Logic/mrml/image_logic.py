@@ -14,10 +14,6 @@ from SlicerUSSim.Logic.imaging.contact import about_contact
 from SlicerUSSim.Logic.imaging.frame import Frame
 from SlicerUSSim.Logic.imaging.noise import seed_of_pose
 from SlicerUSSim.Logic.imaging.simulator import EmptyViewWarning
-from SlicerUSSim.Logic.mri.aiming import opening_pose
-from SlicerUSSim.Logic.mri.bone_before_probe import SCENE, about_bone
-from SlicerUSSim.Logic.mri.craniotomy import default_pose
-from SlicerUSSim.Logic.mri.views import opened_view_pose, view_pose
 from SlicerUSSim.Logic.mrml.craniotomy_nodes import flap_centre, is_opened
 from SlicerUSSim.Logic.mrml.label_nodes import labels_version
 from SlicerUSSim.Logic.mrml.nodes import (
@@ -33,7 +29,11 @@ from SlicerUSSim.Logic.mrml.nodes import (
 from SlicerUSSim.Logic.mrml.own_results import IMAGE, OUTLINE, mark_as_result, may_replace_result, require_result
 from SlicerUSSim.Logic.mrml.patient_logic import PatientLogic
 from SlicerUSSim.Logic.mrml.taken_image import TakenImage, freeze, patient_of, remove_image, write_about
-from SlicerUSSim.Logic.probe.placement import pose_in_slice
+from SlicerUSSim.Logic.placement.aiming import opening_pose
+from SlicerUSSim.Logic.placement.bone_before_probe import SCENE, about_bone
+from SlicerUSSim.Logic.placement.craniotomy import default_pose
+from SlicerUSSim.Logic.placement.views import opened_view_pose, view_pose
+from SlicerUSSim.Logic.probe.poses import pose_in_slice
 
 
 class ImageLogic:

@@ -12,7 +12,7 @@ from SlicerUSSim.Logic.base.errors import SimulationError
 from SlicerUSSim.Logic.base.transforms import check_affine, check_rigid
 from SlicerUSSim.Logic.mrml.nodes import named
 from SlicerUSSim.Logic.probe.arrays import probe_from_dict
-from SlicerUSSim.Logic.tracked.field import ImagedField
+from SlicerUSSim.Logic.tracked.imaged_field import ImagedField
 
 #: Attribute of a sequence node with real images: probe, its place in the images and registration, as JSON
 _KNOWN = "SlicerUSSim.field"

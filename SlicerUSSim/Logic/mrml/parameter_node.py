@@ -14,11 +14,11 @@ from typing import TYPE_CHECKING, Any, Generic, TypeVar, overload
 
 from SlicerUSSim.Logic.base.declaration import Declared, Parameter, Shown, parameter, parameters_of
 from SlicerUSSim.Logic.base.errors import SimulationError, require
-from SlicerUSSim.Logic.fitting.settings import FitSettings
+from SlicerUSSim.Logic.fitting.fit_settings import FitSettings
 from SlicerUSSim.Logic.imaging.preset import Preset
 from SlicerUSSim.Logic.mri.lesions.seeded import LESION_TISSUES
-from SlicerUSSim.Logic.mri.settings import MRI_CONTRASTS, SegmentationSettings, SheetSettings
-from SlicerUSSim.Logic.mri.views import VIEWS
+from SlicerUSSim.Logic.mri.segmentation_settings import MRI_CONTRASTS, SegmentationSettings, SheetSettings
+from SlicerUSSim.Logic.placement.views import VIEWS
 
 MODULE_NAME = "USSim"
 #: Choice of PanelSettings.lesion_as

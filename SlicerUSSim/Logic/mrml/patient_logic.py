@@ -15,14 +15,14 @@ from SlicerUSSim.Logic.imaging.found_sheets import with_their_tissue
 from SlicerUSSim.Logic.imaging.preset import Preset
 from SlicerUSSim.Logic.imaging.reuse import ReusedSimulator
 from SlicerUSSim.Logic.imaging.simulator import UltrasoundSimulator
-from SlicerUSSim.Logic.mri.settings import GEL_MM
-from SlicerUSSim.Logic.mri.sheets.surfels import Surfels
+from SlicerUSSim.Logic.mri.segmentation_settings import GEL_MM
 from SlicerUSSim.Logic.mrml.craniotomy_nodes import is_opened
 from SlicerUSSim.Logic.mrml.label_nodes import LABEL_CLASSES, Patient, PatientReader, labels_version
 from SlicerUSSim.Logic.mrml.nodes import pose_in_labels, require_node
 from SlicerUSSim.Logic.mrml.parameter_node import SceneParameters
 from SlicerUSSim.Logic.mrml.share_nodes import read_shares, shares_version
 from SlicerUSSim.Logic.mrml.sheet_nodes import read_sheets, sheets_version
+from SlicerUSSim.Logic.tissue.surfels import Surfels
 from SlicerUSSim.Logic.tissue.table import TissueTable
 from SlicerUSSim.Logic.tissue.texture import Texture
 

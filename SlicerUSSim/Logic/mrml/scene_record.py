@@ -20,7 +20,6 @@ from SlicerUSSim.Logic.base.errors import SimulationError, require
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.base.vtk_data import matrix_array, vtk_matrix
 from SlicerUSSim.Logic.mri.sheets.polydata import as_polydata, surfels_of
-from SlicerUSSim.Logic.mri.sheets.surfels import Surfels
 from SlicerUSSim.Logic.mrml.craniotomy_nodes import closed_labels, set_closed_labels, show_flap
 from SlicerUSSim.Logic.mrml.fit_nodes import sequence_of
 from SlicerUSSim.Logic.mrml.known_field import known_field
@@ -42,7 +41,8 @@ from SlicerUSSim.Logic.mrml.parameter_node import VALUE_PARAMETERS, SceneParamet
 from SlicerUSSim.Logic.mrml.share_nodes import set_shares_node, shares_node
 from SlicerUSSim.Logic.mrml.taken_image import was_live
 from SlicerUSSim.Logic.mrml.taken_sequence import FrozenRecord, SimulatedRecord, record_frozen, record_taken
-from SlicerUSSim.Logic.tracked.field import ImagedField
+from SlicerUSSim.Logic.tissue.surfels import Surfels
+from SlicerUSSim.Logic.tracked.imaged_field import ImagedField
 from SlicerUSSim.Logic.tracked.images import TrackedImages
 from SlicerUSSim.Logic.tracked.sequence import TrackedSequence
 

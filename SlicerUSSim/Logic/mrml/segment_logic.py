@@ -12,12 +12,11 @@ import numpy as np
 from SlicerUSSim.Logic.base.errors import require
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.mri.addable import require_addable
-from SlicerUSSim.Logic.mri.craniotomy import disc_diameter_mm, disc_opening, opened
 from SlicerUSSim.Logic.mri.ct import CtSegmentation
 from SlicerUSSim.Logic.mri.modality import has_brain_mask, segment_image
 from SlicerUSSim.Logic.mri.pathology import Added, add_tissues, texture_below
 from SlicerUSSim.Logic.mri.segmentation import Segmentation
-from SlicerUSSim.Logic.mri.settings import CT, SegmentationSettings
+from SlicerUSSim.Logic.mri.segmentation_settings import CT, SegmentationSettings
 from SlicerUSSim.Logic.mri.sheets.finding import find_sheets, require_findable
 from SlicerUSSim.Logic.mrml.craniotomy_nodes import (
     closed_labels,
@@ -54,6 +53,7 @@ from SlicerUSSim.Logic.mrml.proposal_nodes import LesionProposals
 from SlicerUSSim.Logic.mrml.share_nodes import read_shares, write_shares
 from SlicerUSSim.Logic.mrml.sheet_nodes import write_sheets
 from SlicerUSSim.Logic.mrml.taken_image import PATIENT, patient_of
+from SlicerUSSim.Logic.placement.craniotomy import disc_diameter_mm, disc_opening, opened
 from SlicerUSSim.Logic.tissue.label_maps import LabelledTissues
 from SlicerUSSim.Logic.tissue.texture import Texture
 

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 from SlicerUSSim.Logic.mri.sheets.polydata import as_polydata, surfels_of, surfels_of_squares
-from SlicerUSSim.Logic.mri.sheets.surfels import KINDS, Surfels
 from SlicerUSSim.Logic.mrml.nodes import display_of, named, node_to_world, require_node
 from SlicerUSSim.Logic.mrml.own_results import SHEETS, mark_as_result
+from SlicerUSSim.Logic.tissue.surfels import KINDS, Surfels
 
 
 def write_sheets(model_node, surfels: Surfels, mri_node) -> None:

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
         probe_from_dict as probe_from_dict,
     )
     from .image_grid import ImageGrid as ImageGrid
-    from .placement import (
+    from .poses import (
         aimed_at as aimed_at,
         carried as carried,
         craniotomy_pose as craniotomy_pose,

@@ -19,7 +19,7 @@ from vtkmodules.vtkFiltersGeneral import vtkTransformPolyDataFilter
 from SlicerUSSim.Logic.base.errors import require
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.base.vtk_data import vtk_matrix
-from SlicerUSSim.Logic.probe.placement import angles_to_surface, carried, turned
+from SlicerUSSim.Logic.probe.poses import angles_to_surface, carried, turned
 
 #: Voxel size of the surface, mm: a compromise between accuracy and the time to compute it.
 _VOXEL_MM = 2.0

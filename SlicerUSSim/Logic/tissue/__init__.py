@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from .label_sources import read_label_file as read_label_file
     from .names import same_name as same_name, tissue_named as tissue_named
     from .presets import TISSUES as TISSUES, colour_of as colour_of
+    from .surfels import KINDS as KINDS, Surfels as Surfels
     from .table import TissueTable as TissueTable
     from .texture import Texture as Texture
     from .tissue import Membrane as Membrane, Tissue as Tissue

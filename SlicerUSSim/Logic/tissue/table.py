@@ -13,7 +13,7 @@ import numpy as np
 from SlicerUSSim.Logic.base.declaration import built, kind_of, parameters_of, short
 from SlicerUSSim.Logic.base.errors import SimulationError, require, require_kind
 from SlicerUSSim.Logic.base.files import read_json, write_json
-from SlicerUSSim.Logic.base.reading import reader
+from SlicerUSSim.Logic.base.reading import PlainValue, reader
 from SlicerUSSim.Logic.tissue.names import plain_name, tissue_named
 from SlicerUSSim.Logic.tissue.presets import TISSUES
 from SlicerUSSim.Logic.tissue.tissue import Membrane, Tissue
@@ -23,7 +23,7 @@ _log = logging.getLogger(__name__)
 MAX_LABEL = 62  # six bits in the device's label volume, and 63 is the membrane
 
 
-class TissueTable(Mapping[int, Tissue]):
+class TissueTable(PlainValue, Mapping[int, Tissue]):
     """The tissues of a label map: a read-only mapping {label: Tissue}, and the membrane, if any.
 
     Label 0 is the coupling medium around the patient and is added when it is not given.

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from SlicerUSSim.Logic.base.lazy import lazy_exports
 
 if TYPE_CHECKING:
-    from .field import ImagedField as ImagedField, draw_field as draw_field, estimate_field as estimate_field
+    from .imaged_field import ImagedField as ImagedField, draw_field as draw_field, estimate_field as estimate_field
     from .images import TrackedImages as TrackedImages
     from .openigtlink import TrackerLink as TrackerLink
     from .pose_files import (

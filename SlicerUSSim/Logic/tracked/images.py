@@ -12,8 +12,8 @@ from SlicerUSSim.Logic.base.errors import SimulationError, require
 from SlicerUSSim.Logic.base.transforms import check_rigid, nearest_rotation
 from SlicerUSSim.Logic.probe.arrays import Probe
 from SlicerUSSim.Logic.probe.image_grid import ImageGrid
-from SlicerUSSim.Logic.tracked.field import ImagedField, bright_region, estimate_field, place_field
 from SlicerUSSim.Logic.tracked.hidden import look_inverted, spread_images, visible_part
+from SlicerUSSim.Logic.tracked.imaged_field import ImagedField, bright_region, estimate_field, place_field
 from SlicerUSSim.Logic.tracked.sequence import TrackedSequence
 
 _log = logging.getLogger(__name__)

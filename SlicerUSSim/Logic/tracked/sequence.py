@@ -289,7 +289,7 @@ class TrackedSequence:
         """
         from SlicerUSSim.Logic.base.transforms import check_rigid
         from SlicerUSSim.Logic.probe.image_grid import ImageGrid
-        from SlicerUSSim.Logic.probe.placement import slice_under_probe
+        from SlicerUSSim.Logic.probe.poses import slice_under_probe
 
         grid = ImageGrid.for_probe(probe, image_size)
         inside = grid.field(probe)

@@ -41,15 +41,15 @@ from SlicerUSSim.Logic.mri.ct import CtSegmentation
 from SlicerUSSim.Logic.mri.modality import has_brain_mask, segment_image
 from SlicerUSSim.Logic.mri.pathology import add_tissues
 from SlicerUSSim.Logic.mri.segmentation import Segmentation
-from SlicerUSSim.Logic.mri.settings import SegmentationSettings
+from SlicerUSSim.Logic.mri.segmentation_settings import SegmentationSettings
 from SlicerUSSim.Logic.mri.sheets.polydata import placed_surfels
-from SlicerUSSim.Logic.mri.sheets.surfels import KINDS, Surfels
 from SlicerUSSim.Logic.probe.arrays import Probe
 from SlicerUSSim.Logic.probe.image_grid import ImageGrid
 from SlicerUSSim.Logic.probe.shape import outline_polydata
 from SlicerUSSim.Logic.tissue.label_advice import MRI_SCRIPT, SCRIPT
 from SlicerUSSim.Logic.tissue.label_findings import NoPatientError
 from SlicerUSSim.Logic.tissue.label_maps import read_label_map
+from SlicerUSSim.Logic.tissue.surfels import KINDS, Surfels
 from SlicerUSSim.Logic.tissue.table import MAX_LABEL, TissueTable
 from SlicerUSSim.Logic.tissue.texture import Texture
 

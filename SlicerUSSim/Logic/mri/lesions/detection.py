@@ -14,8 +14,8 @@ import numpy as np
 from scipy import ndimage
 
 from SlicerUSSim.Logic.base.errors import require
+from SlicerUSSim.Logic.mri.evidence import Evidence
 from SlicerUSSim.Logic.mri.lesions.doubts import beside_no_tissue, why_no_lesion
-from SlicerUSSim.Logic.mri.lesions.evidence import Evidence
 from SlicerUSSim.Logic.mri.lesions.growth import smoothed
 from SlicerUSSim.Logic.mri.lesions.looks import (
     brighter_than_white,

@@ -7,7 +7,7 @@ from typing import cast
 import numpy as np
 from scipy import ndimage
 
-from SlicerUSSim.Logic.mri.lesions.evidence import Evidence
+from SlicerUSSim.Logic.mri.evidence import Evidence
 from SlicerUSSim.Logic.mri.lesions.growth import Region, smoothed
 from SlicerUSSim.Logic.mri.lesions.looks import Look, Window, brighter_than_white
 

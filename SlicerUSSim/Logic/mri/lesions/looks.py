@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from SlicerUSSim.Logic.mri.lesions.evidence import Evidence
+from SlicerUSSim.Logic.mri.evidence import Evidence
 from SlicerUSSim.Logic.mri.lesions.growth import distance_from, smoothed
 
 Window = tuple[slice, slice, slice]

@@ -6,7 +6,5 @@ from SlicerUSSim.Logic.base.lazy import lazy_exports
 
 if TYPE_CHECKING:
     from .finding import ALL_KINDS as ALL_KINDS, STRUCTURES as STRUCTURES, Sheets as Sheets, find_sheets as find_sheets
-    from .surfels import KINDS as KINDS, Surfels as Surfels
-    from .voxels import SheetVoxels as SheetVoxels, on_voxels as on_voxels
 
 lazy_exports(globals())

@@ -8,9 +8,9 @@ from functools import cache
 import numpy as np
 from scipy import ndimage
 
+from SlicerUSSim.Logic.base.neighbourhood import distance_to
 from SlicerUSSim.Logic.mri.atlas import Atlas
 from SlicerUSSim.Logic.mri.coarse import largest_component
-from SlicerUSSim.Logic.mri.distances import distance_to
 from SlicerUSSim.Logic.mri.sheets.head import Head
 
 #: y and z of MNI152 between which it is, and how far it is followed to the sides, mm

@@ -10,11 +10,11 @@ from collections.abc import Callable
 import numpy as np
 from scipy import ndimage
 
+from SlicerUSSim.Logic.base.neighbourhood import distance_to
 from SlicerUSSim.Logic.mri.coarse import largest_component
-from SlicerUSSim.Logic.mri.distances import distance_to
 from SlicerUSSim.Logic.mri.sheets.head import Head
 from SlicerUSSim.Logic.mri.sheets.heights import centred, patches, settled
-from SlicerUSSim.Logic.mri.sheets.surfels import Surfels
+from SlicerUSSim.Logic.tissue.surfels import Surfels
 
 #: y and z of MNI152 in which the falx is looked for, how far from the midsagittal plane, and steps; mm
 _Y_MM, _Z_MM, _X_MM, _STEP_MM = (-112.0, 78.0), (-30.0, 90.0), 16.0, 1.0

@@ -19,7 +19,7 @@ from SlicerUSSim.Logic.mri.sheets.head import Head
 from SlicerUSSim.Logic.mri.sheets.heights import patches
 from SlicerUSSim.Logic.mri.sheets.regions import ventricles
 from SlicerUSSim.Logic.mri.sheets.sulcal import sulci
-from SlicerUSSim.Logic.mri.sheets.surfels import Surfels
+from SlicerUSSim.Logic.tissue.surfels import Surfels
 
 #: The plane's normal is this near to left and right, and to the axial plane: heads are turned in scanners. Those of the
 #: leaves of the tentorium are steeper

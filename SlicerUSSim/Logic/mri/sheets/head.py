@@ -10,10 +10,10 @@ import numpy as np
 from scipy import ndimage
 
 from SlicerUSSim.Logic.base.errors import require, required
+from SlicerUSSim.Logic.base.neighbourhood import distance_to
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.mri.atlas_registration import AtlasFit
 from SlicerUSSim.Logic.mri.coarse import largest_component, widened
-from SlicerUSSim.Logic.mri.distances import distance_to
 from SlicerUSSim.Logic.mri.refinement import closed, on_grid
 from SlicerUSSim.Logic.mri.segmentation import Segmentation
 

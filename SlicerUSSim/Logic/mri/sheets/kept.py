@@ -17,7 +17,7 @@ from SlicerUSSim.Logic.base.version import __version__
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.mri.kept_mask import cache_folder, fingerprint_of, named_beside
 from SlicerUSSim.Logic.mri.segmentation import Segmentation
-from SlicerUSSim.Logic.mri.sheets.surfels import Surfels
+from SlicerUSSim.Logic.tissue.surfels import Surfels
 
 _log = logging.getLogger(__name__)
 #: Raised where other sheets are found from the same image

@@ -13,7 +13,7 @@ from SlicerUSSim.Logic.base.errors import require
 from SlicerUSSim.Logic.base.files import messages_withheld, written_whole
 from SlicerUSSim.Logic.base.own_outputs import mark_of, require_known
 from SlicerUSSim.Logic.base.reading import in_child
-from SlicerUSSim.Logic.mri.sheets.surfels import KINDS, Surfels
+from SlicerUSSim.Logic.tissue.surfels import KINDS, Surfels
 
 if TYPE_CHECKING:
     from vtkmodules.vtkCommonDataModel import vtkPolyData

@@ -6,10 +6,10 @@ from functools import cache
 
 import numpy as np
 
+from SlicerUSSim.Logic.base.neighbourhood import distance_to
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.mri.atlas import Atlas
 from SlicerUSSim.Logic.mri.coarse import components
-from SlicerUSSim.Logic.mri.distances import distance_to
 from SlicerUSSim.Logic.mri.sheets.head import Head
 
 #: Corners of a box of the template that holds the lateral ventricles, and a place in each, in MNI152 millimetres

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import KDTree
 
-from SlicerUSSim.Logic.mri.distances import distance_to
+from SlicerUSSim.Logic.base.neighbourhood import distance_to
 from SlicerUSSim.Logic.mri.sheets.head import Head
 from SlicerUSSim.Logic.mri.sheets.regions import hindbrain
 from SlicerUSSim.Logic.mri.sheets.ridges import Ridges, large_parts, ridges
-from SlicerUSSim.Logic.mri.sheets.surfels import Surfels
+from SlicerUSSim.Logic.tissue.surfels import Surfels
 
 #: The distance counts up to this, and darkness as much as this distance, mm
 _FARTHEST_MM, _DARK_MM = 7.0, 4.0

@@ -9,7 +9,7 @@ from SlicerUSSim.Logic.mri.sheets.falx import FREE_EDGE
 from SlicerUSSim.Logic.mri.sheets.head import Head
 from SlicerUSSim.Logic.mri.sheets.heights import patches, settled
 from SlicerUSSim.Logic.mri.sheets.regions import in_tentorium, tentorium_height
-from SlicerUSSim.Logic.mri.sheets.surfels import Surfels
+from SlicerUSSim.Logic.tissue.surfels import Surfels
 
 #: x and y of MNI152 and how far along the normal it is looked for, mm
 _X_MM, _Y_MM, _REACH_MM, _STEP_MM = 66.0, (-104.0, -12.0), 6.0, 0.5

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 from scipy import ndimage
 
+from SlicerUSSim.Logic.base.neighbourhood import distance_to
 from SlicerUSSim.Logic.mri.coarse import components
-from SlicerUSSim.Logic.mri.distances import distance_to
 from SlicerUSSim.Logic.mri.refinement import closed
 from SlicerUSSim.Logic.mri.sheets.head import Head
 from SlicerUSSim.Logic.mri.sheets.regions import lateral_ventricles_of_atlas
-from SlicerUSSim.Logic.mri.sheets.surfels import Surfels
+from SlicerUSSim.Logic.tissue.surfels import Surfels
 
 #: Radii of vessels, mm; their objectness counts from this percentile of the brain's
 _SIGMAS_MM, _PERCENTILE = (0.7, 1.0, 1.5), 93.0

@@ -14,7 +14,7 @@ from SlicerUSSim.Logic.base.errors import require
 if TYPE_CHECKING:
     from SlicerUSSim.Logic.base import Volume
     from SlicerUSSim.Logic.mri import Segmentation
-    from SlicerUSSim.Logic.mri.sheets import Surfels
+    from SlicerUSSim.Logic.tissue import Surfels
 
 sheets_option = click.option(
     "--sheets", type=click.Path(path_type=Path), metavar="FILE",
@@ -59,7 +59,7 @@ class DrawnSheets:
             return cls(source, ())
         from SlicerUSSim.Logic.mri.sheets.finding import ALL_KINDS, require_findable
         from SlicerUSSim.Logic.mri.sheets.polydata import read_surfels
-        from SlicerUSSim.Logic.mri.sheets.surfels import KINDS
+        from SlicerUSSim.Logic.tissue.surfels import KINDS
 
         for kind in without:
             require(kind in ALL_KINDS, f"--no-sheet is {kind!r}, expected one of: {', '.join(ALL_KINDS)}")
@@ -88,7 +88,7 @@ class DrawnSheets:
         from SlicerUSSim.Logic.mri.pathology import add_tissues
         from SlicerUSSim.Logic.mri.sheets.finding import ALL_KINDS, STRUCTURES, find_sheets
         from SlicerUSSim.Logic.mri.sheets.kept import sheets_beside
-        from SlicerUSSim.Logic.mri.sheets.surfels import KINDS
+        from SlicerUSSim.Logic.tissue.surfels import KINDS
 
         with Share("sheets") as progress, about_file(mri_path):
             sheets = find_sheets(

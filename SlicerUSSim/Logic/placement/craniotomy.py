@@ -13,13 +13,13 @@ import numpy as np
 from scipy import ndimage
 
 from SlicerUSSim.Logic.base.errors import require
+from SlicerUSSim.Logic.base.neighbourhood import distance_to
 from SlicerUSSim.Logic.base.volume import Volume
-from SlicerUSSim.Logic.mri.distances import distance_to
 from SlicerUSSim.Logic.mri.markups import is_markup_name, markup_points
 from SlicerUSSim.Logic.mri.masks import read_mask, several_segments
 from SlicerUSSim.Logic.mri.outside import OUTSIDE
 from SlicerUSSim.Logic.probe.arrays import Probe
-from SlicerUSSim.Logic.probe.placement import craniotomy_pose, sample
+from SlicerUSSim.Logic.probe.poses import craniotomy_pose, sample
 from SlicerUSSim.Logic.probe.surface import PatientSurface
 from SlicerUSSim.Logic.tissue.names import labels_of
 

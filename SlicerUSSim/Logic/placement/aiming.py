@@ -8,10 +8,10 @@ import numpy as np
 from scipy import ndimage
 
 from SlicerUSSim.Logic.base.volume import Volume
-from SlicerUSSim.Logic.mri.craniotomy import face_width_mm, without_outside
 from SlicerUSSim.Logic.mri.pathology import ENHANCING, LESION_GROUPS, innermost_ras
+from SlicerUSSim.Logic.placement.craniotomy import face_width_mm, without_outside
 from SlicerUSSim.Logic.probe.arrays import Probe
-from SlicerUSSim.Logic.probe.placement import aimed_at, craniotomy_pose, sample
+from SlicerUSSim.Logic.probe.poses import aimed_at, craniotomy_pose, sample
 from SlicerUSSim.Logic.probe.surface import PatientSurface
 from SlicerUSSim.Logic.tissue.names import labels_of
 

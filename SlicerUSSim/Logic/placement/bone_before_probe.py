@@ -10,7 +10,7 @@ import numpy as np
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.mri.outside import OUTSIDE
 from SlicerUSSim.Logic.probe.arrays import Probe
-from SlicerUSSim.Logic.probe.placement import sample
+from SlicerUSSim.Logic.probe.poses import sample
 from SlicerUSSim.Logic.tissue.tissue import Tissue
 
 #: Tissues of the skull, which an opening removes

@@ -11,7 +11,7 @@ from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.mri.atlas import Atlas, mni152
 from SlicerUSSim.Logic.mri.atlas_registration import AtlasFit, register_atlas
 from SlicerUSSim.Logic.mri.plausibility import is_whole_brain
-from SlicerUSSim.Logic.probe.placement import sample
+from SlicerUSSim.Logic.probe.poses import sample
 
 #: Brightness in a T1, by which the atlas is registered to labels; what is not named here is as grey matter
 _BRIGHTNESS = {"csf": 0.2, "ventricle": 0.2, "resection cavity": 0.2, "white matter": 1.0, "corpus callosum": 1.0}

@@ -8,9 +8,9 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from SlicerUSSim.Logic.base.errors import require
+from SlicerUSSim.Logic.base.neighbourhood import distance_to
 from SlicerUSSim.Logic.base.volume import Volume
-from SlicerUSSim.Logic.mri.distances import distance_to
-from SlicerUSSim.Logic.mri.sheets.surfels import Surfels
+from SlicerUSSim.Logic.tissue.surfels import Surfels
 
 #: Bits of an entry: distance, normal (two coordinates of its octahedron), thickness, confidence
 _DISTANCE_BITS, _NORMAL_BITS, _THICKNESS_BITS, _CONFIDENCE_BITS = 12, 10, 8, 6

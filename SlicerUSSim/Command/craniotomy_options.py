@@ -11,7 +11,7 @@ import click
 
 from SlicerUSSim.Command.progress import note
 from SlicerUSSim.Logic.base.errors import SimulationError, require
-from SlicerUSSim.Logic.mri.settings import CT, GEL_MM as GEL_MM
+from SlicerUSSim.Logic.mri.segmentation_settings import CT, GEL_MM as GEL_MM
 
 if TYPE_CHECKING:
     import numpy as np
@@ -114,7 +114,7 @@ class Craniotomy:
         """
         if not self.is_wanted:
             return labels
-        from SlicerUSSim.Logic.mri.craniotomy import (
+        from SlicerUSSim.Logic.placement.craniotomy import (
             disc_diameter_mm,
             disc_opening,
             file_opening,

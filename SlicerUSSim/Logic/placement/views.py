@@ -9,9 +9,9 @@ import numpy as np
 
 from SlicerUSSim.Logic.base.errors import require
 from SlicerUSSim.Logic.base.volume import Volume
-from SlicerUSSim.Logic.mri.craniotomy import require_brain, without_outside
-from SlicerUSSim.Logic.mri.head_axes import head_axes
-from SlicerUSSim.Logic.probe.placement import pose_looking_at, sample
+from SlicerUSSim.Logic.placement.craniotomy import require_brain, without_outside
+from SlicerUSSim.Logic.placement.head_axes import head_axes
+from SlicerUSSim.Logic.probe.poses import pose_looking_at, sample
 from SlicerUSSim.Logic.probe.surface import PatientSurface
 from SlicerUSSim.Logic.tissue.names import labels_of
 
