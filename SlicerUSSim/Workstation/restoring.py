@@ -19,7 +19,7 @@ from SlicerUSSim.Logic.imaging.preset import Preset
 from SlicerUSSim.Logic.mrml.landmark_nodes import Landmark
 from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic
 from SlicerUSSim.Logic.mrml.nodes import display_of, set_node_to_world
-from SlicerUSSim.Logic.mrml.parameter_node import preset_of
+from SlicerUSSim.Logic.mrml.parameter_node import preset_texts
 from SlicerUSSim.Logic.mrml.scene_record import ROLES, SceneRecord, SequenceRecord, put_nodes, put_values
 from SlicerUSSim.Logic.mrml.taken_sequence import (
     FrozenRecord,
@@ -215,7 +215,7 @@ class Restoring:
 
     def _checked(self, record: SceneRecord, kept: Mapping[str, Any]) -> SceneRecord:
         """A record with its real images prepared. Raises SimulationError for what cannot be shown; nothing changes."""
-        preset = preset_of(kept.get("values", {}))
+        preset = Preset.from_texts(preset_texts(kept.get("values", {})), "the scene's preset")
         if record.frozen is not None:
             taken_of(record.frozen, None)
         found = record.sequence

@@ -30,6 +30,8 @@ SECTIONS: dict[str, type[DisplaySettings] | type[SimulationSettings]] = {
 #: Name of the pose, as in files of poses
 _POSE = "probe_to_ras"
 _KIND = "probe.kind"
+#: Name in Preset.from_texts of the whole as JSON, as scenes had it
+AS_ONE = "preset"
 #: Tissues of segment_mri with thin sulci.
 _BRAIN = ("csf", "grey matter", "white matter", "leptomeninges")
 
@@ -122,8 +124,8 @@ class Preset:
     def to_texts(self) -> dict[str, str]:
         """{name: text} of the values that differ from Preset(), or from PROBES for another kind of probe.
 
-        Names are those of preset_parameters ("display.gain_db"), "tissues.2" for the tissue of a label, "membrane.fluids"
-        for a value of the membrane, and "probe_to_ras". These others are JSON, null for what this preset lacks.
+        Names are those of preset_parameters, and "tissues.2" for label 2 or "membrane.fluids", whose values are JSON:
+        null for what this preset lacks. The pose is left out.
         """
         values, default, declared = _flat(self), _flat_default(self.probe.kind), preset_parameters()
         return {
@@ -134,24 +136,23 @@ class Preset:
 
     @classmethod
     def from_texts(cls, texts: Mapping[str, str], source: str = "preset") -> Preset:
-        """The inverse of to_texts. Raises SimulationError that names `source` and the invalid value."""
+        """The inverse of to_texts. Raises SimulationError that names `source` and the invalid value.
+
+        With AS_ONE, the whole as one JSON text, other names are ignored.
+        """
+        if AS_ONE in texts:
+            return cls.from_dict(_from_json(AS_ONE, texts[AS_ONE], source), source)
         declared = {name: replace(entry, name=name) for name, entry in preset_parameters().items()}
         kind = declared[_KIND].from_text(source, texts.get(_KIND, probe_kind().default))
-        values = _flat_default(kind)
+        values, nested = _flat_default(kind), {"tissues": {}}
         for name, text in texts.items():
             values[name] = (
                 declared[name].from_text(source, text) if name in declared else _from_json(name, text, source)
             )
-        nested: dict[str, Any] = {"tissues": {}}
-        for name, value in values.items():
+        for name, value in {**values, _KIND: kind}.items():
             section, _, entry = name.partition(".")
-            if value is None and name not in declared:
-                continue
-            if entry:
+            if value is not None or name in declared:
                 nested.setdefault(section, {})[entry] = value
-            else:
-                nested[section] = value
-        nested["probe"]["kind"] = kind
         return cls.from_dict(nested, source)
 
     @classmethod
@@ -176,12 +177,8 @@ def preset_parameters() -> dict[str, Parameter]:
 
 
 def _flat(preset: Preset) -> dict[str, Any]:
-    """{"section.name": value} of to_dict."""
-    found: dict[str, Any] = {}
-    for section, values in preset.to_dict().items():
-        is_nested = isinstance(values, dict)
-        found |= {f"{section}.{name}": value for name, value in values.items()} if is_nested else {section: values}
-    return found
+    sections = {**preset.to_dict(), _POSE: {}}
+    return {f"{section}.{name}": value for section, values in sections.items() for name, value in values.items()}
 
 
 def _flat_default(kind: str) -> dict[str, Any]:

@@ -67,9 +67,8 @@ def show_flap(labels_node: Any, removed: Volume) -> Any:
     scene = labels_node.GetScene()
     model = labels_node.GetNodeReference(_FLAP)
     if model is None or not may_replace_result(model):
-        model = scene.AddNewNodeByClass(
-            "vtkMRMLModelNode", scene.GenerateUniqueName(f"{labels_node.GetName()} removed")
-        )
+        name = scene.GenerateUniqueName(f"{labels_node.GetName()} removed")
+        model = scene.AddNewNodeByClass("vtkMRMLModelNode", name)
         labels_node.SetNodeReferenceID(_FLAP, model.GetID())
     model.SetAndObservePolyData(_surface(removed))
     mark_as_result(model, FLAP)

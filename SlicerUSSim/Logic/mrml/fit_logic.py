@@ -28,23 +28,13 @@ class FitLogic:
         self._patient, self._parameters = patient, patient.parameters
 
     def optimize(
-        self,
-        labels_node,
-        images_node,
-        *,
-        probe_transform_node=None,
-        frames: Sequence[int] | None = None,
+        self, labels_node, images_node, *, probe_transform_node=None, frames: Sequence[int] | None = None,
         validate: Sequence[int] = (),
         free: Iterable[str] | Mapping[str, tuple[float, float] | None] = ("display", "tissues"),
-        register: bool = False,
-        deform: bool = False,
-        speckle: bool = False,
-        estimate_geometry: bool = False,
-        max_evaluations: int = FitSettings.evaluations,
-        restarts: int = FitSettings.restarts,
-        plot: CostPlot | None = None,
-        progress: Callable[[Progress], None] | None = None,
-    ) -> Fit:
+        register: bool = False, deform: bool = False, speckle: bool = False, estimate_geometry: bool = False,
+        max_evaluations: int = FitSettings.evaluations, restarts: int = FitSettings.restarts,
+        plot: CostPlot | None = None, progress: Callable[[Progress], None] | None = None,
+    ) -> Fit:  # fmt: skip
         """Fit display and tissue parameters, with `register` the poses, with `deform` the tissues' place and
         with `speckle` the speckle, to real images. See fitting.fit.
 

@@ -21,10 +21,7 @@ from SlicerUSSim.Logic.mrml.sheet_nodes import holds_sheets
 #: Of transforms and models that Slicer keeps for its slice views; they are hidden from editors only as a rule
 _OF_SLICE_VIEWS = ("Volume Slice", "Slice Transform", "Volume Slice Transform")
 #: {role: roles of which a node cannot have one at the same time}
-_OTHERS = {
-    "second_mri": ("mri",),
-    "real": ("mri", "second_mri"),
-}
+_OTHERS = {"second_mri": ("mri",), "real": ("mri", "second_mri")}
 #: Attribute of nodes that only views show, which are nobody's data
 _DRAWN = "SlicerUSSim.drawn"
 

@@ -26,6 +26,7 @@ _CLAIMED = vtkCommand.UserEvent + 7301
 _SLOWEST_S, _SLOW_IMAGES = 10.0, 2
 #: Priority of an observer that is called before others, whose is 0
 _FIRST = 1000.0
+_Schedule = Callable[[Callable[[], None]], None]
 
 
 class LiveNodes(NamedTuple):
@@ -44,14 +45,9 @@ class LiveUpdate:
     running = False
 
     def __init__(
-        self,
-        patient: PatientLogic,
-        images: ImageLogic,
-        nodes: LiveNodes,
-        schedule: Callable[[Callable[[], None]], None] | None,
-        report: Callable[[str], None] | None,
-        stopped: Callable[[], None] | None,
-    ) -> None:
+        self, patient: PatientLogic, images: ImageLogic, nodes: LiveNodes, schedule: _Schedule | None,
+        report: Callable[[str], None] | None, stopped: Callable[[], None] | None,
+    ) -> None:  # fmt: skip
         self._parameters, self._images = patient.parameters, images
         self._nodes: LiveNodes | None = nodes
         labels_node, transform_node, output_node = nodes.labels, nodes.probe_transform, nodes.output
@@ -75,12 +71,8 @@ class LiveUpdate:
         self._observe(labels_node, labels_node.TransformModifiedEvent, self.request)
         if labels_node.IsA("vtkMRMLSegmentationNode"):
             segmentation, events = labels_node.GetSegmentation(), slicer.vtkSegmentation
-            for event in (
-                events.SourceRepresentationModified,
-                events.SegmentAdded,
-                events.SegmentRemoved,
-                events.SegmentModified,
-            ):
+            segments = events.SegmentAdded, events.SegmentRemoved, events.SegmentModified
+            for event in (events.SourceRepresentationModified, *segments):
                 self._observe(segmentation, event, self.request)
         else:
             self._observe(labels_node, labels_node.ImageDataModifiedEvent, self.request)
@@ -199,17 +191,10 @@ class LiveLogic:
         return self._update is not None and self._update.running
 
     def startLiveUpdate(
-        self,
-        labels_node,
-        probe_transform_node,
-        output_node,
-        outline_node=None,
-        slice_node=None,
-        *,
-        schedule: Callable[[Callable[[], None]], None] | None = None,
-        report: Callable[[str], None] | None = None,
+        self, labels_node, probe_transform_node, output_node, outline_node=None, slice_node=None, *,
+        schedule: _Schedule | None = None, report: Callable[[str], None] | None = None,
         stopped: Callable[[], None] | None = None,
-    ) -> None:
+    ) -> None:  # fmt: skip
         """Simulate now, and again whenever the transform or its parents, the labels or the preset change.
 
         `outline_node` is a model for the outline of the imaged field, `slice_node` a slice view that follows its plane.

@@ -142,9 +142,6 @@ def write_volume(volume_node, volume: Volume) -> None:
     volume_node.SetAndObserveImageData(Volume(volume.array, np.eye(4)).to_vtk())
 
 
-# ---- labels ----------------------------------------------------------------------------------------------------------
-
-
 # ---- simulated images -----------------------------------------------------------------------------------------------
 
 

@@ -7,7 +7,6 @@ Scenes can therefore be exchanged between scripts and the module. Values are tho
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Generic, TypeVar, overload
@@ -15,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Generic, TypeVar, overload
 from SlicerUSSim.Logic.base.declaration import Declared, Parameter, Shown, parameter, parameters_of
 from SlicerUSSim.Logic.base.errors import SimulationError, require
 from SlicerUSSim.Logic.fitting.fit_settings import FitSettings
-from SlicerUSSim.Logic.imaging.preset import Preset
+from SlicerUSSim.Logic.imaging.preset import AS_ONE, Preset
 from SlicerUSSim.Logic.mri.lesions.seeded import LESION_TISSUES
 from SlicerUSSim.Logic.mri.segmentation_settings import MRI_CONTRASTS, SegmentationSettings, SheetSettings
 from SlicerUSSim.Logic.placement.views import VIEWS
@@ -23,10 +22,7 @@ from SlicerUSSim.Logic.placement.views import VIEWS
 MODULE_NAME = "USSim"
 #: Choice of PanelSettings.lesion_as
 BY_LOOK = "by its look"
-_OWNER, _SOURCE = "scene", "the scene's preset"
-#: Sections of a preset in the names of its parameters; and the parameter in which scenes of before have it as JSON
-_AS_ONE = "preset"
-_PRESET_SECTIONS = ("probe", "display", "settings", "tissues", "membrane", "probe_to_ras", _AS_ONE)
+_OWNER = "scene"
 S = TypeVar("S", bound=Declared)
 
 
@@ -78,7 +74,7 @@ class NodeParameter:
         self.name = name
 
     def __get__(self, parameters: SceneParameters, owner: type | None = None) -> Any:
-        return self if parameters is None else parameters.node.GetNodeReference(self.name)
+        return parameters.node.GetNodeReference(self.name)
 
     def __set__(self, parameters: SceneParameters, value) -> None:
         require(
@@ -99,8 +95,6 @@ class ValueParameter:
         self.declared = declared
 
     def __get__(self, parameters: SceneParameters, owner: type | None = None) -> Any:
-        if parameters is None:
-            return self
         text = parameters.node.GetParameter(self.declared.name)
         return self.declared.default if text == "" else self.declared.from_text(_OWNER, text)
 
@@ -142,42 +136,27 @@ class SettingsParameter(Generic[S]):
 
 
 def preset_texts(texts: Mapping[str, str]) -> dict[str, str]:
-    """Those of a scene's {name: text} that are of its preset."""
-    return {name: text for name, text in texts.items() if text and name.split(".")[0] in _PRESET_SECTIONS}
-
-
-def preset_of(texts: Mapping[str, str]) -> Preset:
-    """The preset of a scene's {name: text}. Raises SimulationError that names an invalid value."""
-    texts = preset_texts(texts)
-    try:
-        return (
-            Preset.from_dict(json.loads(texts[_AS_ONE]), _SOURCE)
-            if _AS_ONE in texts
-            else Preset.from_texts(texts, _SOURCE)
-        )
-    except ValueError as error:
-        raise SimulationError(f"{_SOURCE} is not JSON ({error})") from None
+    """Those of a scene's {name: text} that are of its preset, see Preset.to_texts."""
+    sections = ("probe", "display", "settings", "tissues", "membrane", AS_ONE)
+    return {name: text for name, text in texts.items() if text and name.split(".")[0] in sections}
 
 
 class PresetParameter:
-    """Probe, display, settings and tissues; each value that is not the default is a parameter, see Preset.to_texts."""
+    """Probe, display, settings and tissues; each value that is not the default is a parameter, see Preset.to_texts.
+
+    A pose is not kept. What scenes of before have, AS_ONE, is replaced when it is read.
+    """
 
     def __get__(self, parameters: SceneParameters, owner: type | None = None) -> Preset:
-        """Raises SimulationError that names an invalid value. What scenes of before have is replaced."""
         texts = preset_texts(parameters.texts)
-        known, preset = vars(parameters).get("_preset", (None, None))
-        if known != texts:
-            preset = preset_of(texts)
-            if _AS_ONE in texts:
-                self.__set__(parameters, preset)
-            else:
-                vars(parameters)["_preset"] = texts, preset
-        return preset
+        if vars(parameters).get("_preset", (None, None))[0] != texts:
+            self.__set__(parameters, Preset.from_texts(texts, "the scene's preset"))
+        return vars(parameters)["_preset"][1]
 
     def __set__(self, parameters: SceneParameters, preset: Preset) -> None:
         texts = preset.to_texts()
         parameters.put_preset(texts)
-        vars(parameters)["_preset"] = texts, preset
+        vars(parameters)["_preset"] = texts, replace(preset, probe_to_ras=None)
 
 
 #: What SceneParameters has

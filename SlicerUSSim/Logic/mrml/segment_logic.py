@@ -85,23 +85,11 @@ class SegmentLogic:
         self.warnings: tuple[str, ...] = ()
 
     def segment(
-        self,
-        mri_node,
-        labels_node,
-        settings: SegmentationSettings | None = None,
-        *,
-        mask_node=None,
-        others: Mapping[str, Any] | None = None,
-        organs_node=None,
-        lesions_node=None,
-        sheets: Iterable[str] = (),
-        sheets_node=None,
-        overwrite: bool = False,
-        keep_mask_at: Path | None = None,
-        keep_sheets_at: Path | None = None,
-        progress: Callable[[float], None] | None = None,
-        **values: Any,
-    ) -> Segmentation | CtSegmentation:
+        self, mri_node, labels_node, settings: SegmentationSettings | None = None, *, mask_node=None,
+        others: Mapping[str, Any] | None = None, organs_node=None, lesions_node=None, sheets: Iterable[str] = (),
+        sheets_node=None, overwrite: bool = False, keep_mask_at: Path | None = None,
+        keep_sheets_at: Path | None = None, progress: Callable[[float], None] | None = None, **values: Any,
+    ) -> Segmentation | CtSegmentation:  # fmt: skip
         """Label the tissues of a scalar volume into a label map or segmentation node, with names and colours.
 
         See segmentation.segment_mri, and ct.segment_ct for the contrast "ct"; `values` change single ones of the

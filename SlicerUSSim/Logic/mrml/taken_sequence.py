@@ -35,14 +35,9 @@ def write_taken(images_node, index: SequenceIndex, taken: Sequence[TakenImage]) 
         preset = about.pop("preset")
         if preset not in presets:  # one for all, as a rule
             presets.append(preset)  # type: ignore[arg-type]
-        lines.append(
-            {
-                **about,
-                "preset": presets.index(preset),  # type: ignore[arg-type]
-                "probe_to_ras": image.probe_to_world.tolist(),  # all digits: scripts make the same pixels again
-                "is_empty": image.is_empty,
-            }
-        )
+        pose = image.probe_to_world.tolist()  # all digits: scripts make the same pixels again
+        is_of = {"preset": presets.index(preset), "probe_to_ras": pose, "is_empty": image.is_empty}  # type: ignore[arg-type]
+        lines.append({**about, **is_of})
     images_node.SetAttribute(_ABOUT, json.dumps({"presets": presets, "images": lines}))
     mark_as_result(images_node, SEQUENCE)
 
@@ -57,13 +52,12 @@ def read_taken(images_node, number: int, anatomy: Hashable = None) -> TakenImage
     node = images_node.GetNthDataNode(number)
     try:
         image = Volume.from_vtk(node.GetImageData(), ijk_to_ras(node)).array[0].copy()
-        taken = _taken(images_node.GetAttribute(_ABOUT) or "{}", number, image, anatomy, node)
+        return _taken(images_node.GetAttribute(_ABOUT) or "{}", number, image, anatomy, node)
     except (ValueError, LookupError, TypeError, AttributeError):
         raise SimulationError(
             f"{named(images_node)} does not say what its images are of, expected those of Simulate sequence; make them "
             "again"
         ) from None
-    return taken
 
 
 def _taken(about: str, number: int, image: np.ndarray, anatomy: Hashable, node: Any) -> TakenImage:
