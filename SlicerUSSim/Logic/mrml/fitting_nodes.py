@@ -10,11 +10,11 @@ from SlicerUSSim.Logic.mrml.own_results import (
     IMAGE,
     OUTLINE,
     SEQUENCE,
+    is_claimed,
     is_empty,
     kind_of_result,
     may_replace_result,
 )
-from SlicerUSSim.Logic.mrml.ownership import is_claimed
 from SlicerUSSim.Logic.mrml.parameter_node import NODE_PARAMETERS, SceneParameters
 from SlicerUSSim.Logic.mrml.sheet_nodes import holds_sheets
 

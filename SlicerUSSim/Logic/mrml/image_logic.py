@@ -23,12 +23,11 @@ from SlicerUSSim.Logic.mrml.nodes import (
     require_node,
     set_node_to_world,
     show_in_slice,
-    write_image,
     write_outline,
 )
-from SlicerUSSim.Logic.mrml.own_results import IMAGE, OUTLINE, mark_as_result, may_replace_result, require_result
+from SlicerUSSim.Logic.mrml.own_results import OUTLINE, mark_as_result, may_replace_result, require_result
 from SlicerUSSim.Logic.mrml.patient_logic import PatientLogic
-from SlicerUSSim.Logic.mrml.taken_image import TakenImage, freeze, patient_of, remove_image, write_about
+from SlicerUSSim.Logic.mrml.taken_image import TakenImage, freeze, patient_of, remove_image, write_image
 from SlicerUSSim.Logic.placement.aiming import opening_pose
 from SlicerUSSim.Logic.placement.bone_before_probe import SCENE, about_bone
 from SlicerUSSim.Logic.placement.craniotomy import default_pose
@@ -65,13 +64,8 @@ class ImageLogic:
             self.clearImage(output_node)  # an image of before would be taken for that of this pose
             raise
         self.taken = taken
-        was_modifying = output_node.StartModify()
-        write_about(taken)
-        frame = required(taken.frame, "the image has no frame")
-        write_image(output_node, frame, probe_transform_node)
-        mark_as_result(output_node, IMAGE)
-        output_node.EndModify(was_modifying)
-        return frame
+        write_image(taken, probe_transform_node)
+        return required(taken.frame, "the image has no frame")
 
     def take(
         self, labels_node, probe_to_world: np.ndarray, output_node, warned: Callable[[Warning], None],

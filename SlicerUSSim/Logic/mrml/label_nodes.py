@@ -123,12 +123,8 @@ def labels_version(labels_node) -> Hashable:
             parts.append((segment_id, segment.GetName(), None if source is None else source.GetMTime()))
         return tuple(parts)
     image, colours = labels_node.GetImageData(), _colour_node(labels_node)
-    return (
-        labels_node.GetID(),
-        None if image is None else image.GetMTime(),
-        ijk_to_ras(labels_node).tobytes(),
-        None if colours is None else colours.GetMTime(),
-    )
+    times = tuple(None if one is None else one.GetMTime() for one in (image, colours))
+    return labels_node.GetID(), times, ijk_to_ras(labels_node).tobytes()
 
 
 def read_labels(labels_node, tissues: TissueTable, *, of_ct: bool = False) -> LabelledTissues:
@@ -163,12 +159,10 @@ def read_labels(labels_node, tissues: TissueTable, *, of_ct: bool = False) -> La
 def hidden_segments(segmentation_node) -> dict[str, str]:
     """{ID: name} of the segments of a segmentation that its display hides one by one."""
     display, segmentation = segmentation_node.GetDisplayNode(), segmentation_node.GetSegmentation()
-    ids = (
-        []
-        if display is None
-        else [name for name in segmentation.GetSegmentIDs() if not display.GetSegmentVisibility(name)]
-    )
-    return {segment_id: segmentation.GetSegment(segment_id).GetName() for segment_id in ids}
+    if display is None:
+        return {}
+    hidden = (name for name in segmentation.GetSegmentIDs() if not display.GetSegmentVisibility(name))
+    return {segment_id: segmentation.GetSegment(segment_id).GetName() for segment_id in hidden}
 
 
 def node_labels(labels_node, without: Collection[str] = ()) -> tuple[Volume, dict[int, str]]:

@@ -31,7 +31,7 @@ class UltrasoundSceneLogic:
     """
 
     def __init__(self, scene, device: str | None = None, work: AtOnce | None = None) -> None:
-        self.scene = scene
+        self.scene, self.device = scene, device
         self.patients = patients = PatientLogic(scene, device, work or AtOnce())
         self.images = images = ImageLogic(patients)
         self.live = live = LiveLogic(patients, images)
@@ -73,11 +73,6 @@ class UltrasoundSceneLogic:
     @preset.setter
     def preset(self, preset: Preset) -> None:
         self.parameters.preset = preset
-
-    @property
-    def device(self) -> str | None:
-        """As it was given."""
-        return self.patients.device
 
     @property
     def proposals(self) -> LesionProposals:

@@ -10,7 +10,7 @@ from scipy import ndimage
 from SlicerUSSim.Logic.base.errors import SimulationError
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.mrml.label_nodes import node_labels, overlapping_segments
-from SlicerUSSim.Logic.mrml.ownership import claim, is_claimed
+from SlicerUSSim.Logic.mrml.own_results import claim, is_claimed, is_empty
 
 #: Attribute of a node, saved with the scene: a hash of voxels, place and names as Segment wrote them.
 _MADE = "SlicerUSSim.made"
@@ -31,17 +31,10 @@ def may_replace(labels_node) -> bool:
     """Whether a node is new, or has labels that this program made, and nobody has edited since.
 
     A new one has neither segments nor voxels; segments without voxels are somebody's plan. A copy of labels is of whom
-    copied them, see ownership.
+    copied them, see own_results.
     """
     made = content_as_made(labels_node)
-    return _is_new(labels_node) or (made is not None and content_of(labels_node) == made)
-
-
-def _is_new(labels_node) -> bool:
-    if labels_node.IsA("vtkMRMLSegmentationNode"):
-        return labels_node.GetSegmentation().GetNumberOfSegments() == 0
-    image = labels_node.GetImageData()
-    return image is None or image.GetNumberOfPoints() == 0
+    return is_empty(labels_node) or (made is not None and content_of(labels_node) == made)
 
 
 def content_of(labels_node) -> str:

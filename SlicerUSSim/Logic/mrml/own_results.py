@@ -1,15 +1,21 @@
 """Marks of nodes that hold results of this module, so that it never overwrites what others made.
 
 A result is this module's own as long as three things hold: its node has the kind of the result as an attribute, refers
-to itself (ownership: a copy does not), and has the data that this module wrote, by a hash that is an attribute, too.
+to itself (claim), and has the data that this module wrote, by a hash that is an attribute, too.
 All are saved with the scene, and formats that keep voxels, points and matrices as they are (NRRD, VTK, HDF5) keep the
 hash: results that were saved and loaded are replaced again. Data that the user put in their place, or edited, are the
 user's.
+
+Attributes are copied with a node, and the number in a node's ID may change when a scene is imported into another one.
+A reference to the node itself does right in both: a copy (clone) refers to the node that it was copied from, and scenes
+put references right when they give nodes other IDs, on import as on loading. Nodes of scenes that were saved by
+versions without this reference are taken for their users', and kept.
 """
 
 from __future__ import annotations
 
 import hashlib
+from typing import Any
 
 import numpy as np
 from vtkmodules.util.numpy_support import vtk_to_numpy
@@ -17,14 +23,26 @@ from vtkmodules.util.numpy_support import vtk_to_numpy
 from SlicerUSSim.Logic.base.errors import require
 from SlicerUSSim.Logic.base.vtk_data import matrix_array
 from SlicerUSSim.Logic.mrml.nodes import named, nodes_of_class
-from SlicerUSSim.Logic.mrml.ownership import claim, is_claimed
 
+#: Role of the reference of a node to itself; saved with the scene
+OWN = "SlicerUSSim.own"
 #: Attributes of a node, saved with the scene: kind of result ("1" by earlier versions), and a hash of its data
 _RESULT, _DATA = "SlicerUSSim.result", "SlicerUSSim.resultData"
 #: Kinds of results
 IMAGE, OUTLINE, SEQUENCE, SHEETS, FLAP, COMPARED, REGISTRATION = (
     "image", "outline", "sequence", "sheets", "flap", "compared", "registration"
 )  # fmt: skip
+
+
+def claim(node: Any) -> None:
+    """Record that this module filled a node; one outside a scene, as an item of a sequence, has no ID and stays."""
+    if node.GetScene() is not None and not is_claimed(node):
+        node.SetNodeReferenceID(OWN, node.GetID())
+
+
+def is_claimed(node: Any) -> bool:
+    """Whether this module filled this very node, and not one that it is a copy of."""
+    return node.GetID() is not None and node.GetNodeReferenceID(OWN) == node.GetID()
 
 
 def mark_as_result(node, kind: str) -> None:
@@ -77,11 +95,15 @@ def result_called(scene, kind: str, name: str):
 
 
 def is_empty(node) -> bool:
-    """Whether a volume, model, sequence or linear transform node has no data."""
+    """Whether a volume, model, sequence, linear transform, segmentation or markups node has no data."""
     if node.IsA("vtkMRMLSequenceNode"):
         return node.GetNumberOfDataNodes() == 0
     if node.IsA("vtkMRMLLinearTransformNode"):
         return bool(np.array_equal(matrix_array(node.GetMatrixTransformToParent()), np.eye(4)))
+    if node.IsA("vtkMRMLSegmentationNode"):
+        return node.GetSegmentation().GetNumberOfSegments() == 0
+    if node.IsA("vtkMRMLMarkupsNode"):
+        return node.GetNumberOfControlPoints() == 0
     data = node.GetPolyData() if node.IsA("vtkMRMLModelNode") else node.GetImageData()
     return data is None or data.GetNumberOfPoints() == 0
 

@@ -36,7 +36,7 @@ from SlicerUSSim.Logic.mrml.nodes import (
     probe_pose,
     write_volume,
 )
-from SlicerUSSim.Logic.mrml.ownership import OWN, claim, is_claimed
+from SlicerUSSim.Logic.mrml.own_results import OWN, claim, is_claimed, is_empty
 from SlicerUSSim.Logic.mrml.parameter_node import VALUE_PARAMETERS, SceneParameters, preset_texts
 from SlicerUSSim.Logic.mrml.share_nodes import set_shares_node, shares_node
 from SlicerUSSim.Logic.mrml.taken_image import was_live
@@ -159,7 +159,7 @@ def record_nodes(parameters: SceneParameters, roles: Iterable[str] = ROLES) -> d
     found: dict[str, NodeRecord] = {}
     for role in roles:
         node: Any = getattr(parameters, role)
-        if node is None or node.IsA("vtkMRMLSequenceNode") or _is_empty(node):
+        if node is None or node.IsA("vtkMRMLSequenceNode") or is_empty(node):
             continue
         if role == "labels":
             closed = closed_labels(node)
@@ -231,7 +231,7 @@ def _choose_missing(scene, parameters: SceneParameters) -> None:
     if parameters.mri is not None or parameters.labels is not None:
         return
     for node in nodes_of_class(scene, _VOLUME):
-        if node.GetClassName() == _VOLUME and not node.GetHideFromEditors() and not _is_empty(node):
+        if node.GetClassName() == _VOLUME and not node.GetHideFromEditors() and not is_empty(node):
             parameters.mri = node
             return
 
@@ -248,17 +248,6 @@ def _others(scene, parameters: SceneParameters) -> Iterable[str]:
             is_own = is_own or (node.GetName() or "").endswith("Volume Slice")
             if node.GetID() not in chosen and not is_own and node.GetSaveWithScene():
                 yield node.GetName() or node.GetID()
-
-
-def _is_empty(node) -> bool:
-    if node.IsA("vtkMRMLVolumeNode"):
-        image = node.GetImageData()
-        return image is None or image.GetNumberOfPoints() == 0
-    if node.IsA(_SEGMENTS):
-        return node.GetSegmentation().GetNumberOfSegments() == 0
-    if node.IsA(_MODEL):
-        return node.GetPolyData() is None or node.GetPolyData().GetNumberOfCells() == 0
-    return node.GetNumberOfControlPoints() == 0
 
 
 def _version(node) -> Hashable:

@@ -28,9 +28,7 @@ from SlicerUSSim.Logic.mrml.craniotomy_nodes import (
 )
 from SlicerUSSim.Logic.mrml.label_nodes import (
     LABEL_CLASSES,
-    hidden_segments,
     labels_version,
-    node_labels,
     read_labels,
     read_mask,
     write_labels,
@@ -245,38 +243,32 @@ class SegmentLogic:
             opening_node is None or opening_node not in (closed, labels_node, output_node),
             f"opening is {named(opening_node)}, the labels themselves, expected a node with the opening alone",
         )
-        is_left_out = closed is not labels_node and not may_replace(labels_node)
+        was_edited = closed is not labels_node and not may_replace(labels_node)
         self._require_replaceable(output_node, by="this module")
         was = self._known(closed)
         labels, names = was.labels, was.names
         world_to_labels, scaling = pose_in_labels(closed, np.eye(4))
         placed = Volume(labels.array, scaling @ labels.ijk_to_ras)
-        hidden: dict[str, str] = {}
+        left_out: tuple[str, ...] = ()
         if opening_node is not None:
-            opening = self._work.do(lambda: opening_of(opening_node, placed, names, world_to_labels))
-            what = named(opening_node)
-            if opening_node.IsA("vtkMRMLSegmentationNode"):
-                hidden = hidden_segments(opening_node)
-                what += f" with {', '.join(node_labels(opening_node, hidden)[1].values())}"
+            found = self._work.do(lambda: opening_of(opening_node, placed, names, world_to_labels))
+            opening, what, left_out = found
         else:
             pose, probe = world_to_labels @ probe_pose(probe_transform_node), self._patient.parameters.preset.probe
             diameter = disc_diameter_mm(probe) if diameter_mm is None else diameter_mm
             opening = self._work.do(lambda: disc_opening(placed, names, pose, diameter))
             what = f"a disc of {diameter:.0f} mm under the probe"
         result, millilitres = self._work.do(lambda: opened(placed, names, opening))
-        found = labels.with_array(result.array)
-        self._write(output_node, Added(found, names), closed, self._texture_of(was, found))
+        with_opening = labels.with_array(result.array)
+        self._write(output_node, Added(with_opening, names), closed, self._texture_of(was, with_opening))
         set_closed_labels(output_node, closed)
-        show_flap(output_node, labels.with_array(found.array != labels.array))
+        show_flap(output_node, labels.with_array(result.array != labels.array))
         self.notes = (
             f"craniotomy: {what}; {millilitres:.1f} ml of skin, scalp and skull are replaced by the coupling medium in "
             f"{named(output_node)}, and {named(closed)} stays as it is",
         )
-        self.warnings = ()
-        if hidden:
-            names_hidden = ", ".join(hidden.values())
-            self.warnings = (f"of {named(opening_node)} what is hidden is not opened: {names_hidden}",)
-        if is_left_out:
+        self.warnings = left_out
+        if was_edited:
             self.warnings += (
                 f"what was edited in {named(labels_node)} is not in {named(output_node)}, which is {named(closed)} "
                 "with the opening",

@@ -10,15 +10,14 @@ import numpy as np
 
 from SlicerUSSim.Logic.base.errors import require, required, warn_again
 from SlicerUSSim.Logic.base.transforms import check_rigid
-from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.mrml.image_logic import ImageLogic
 from SlicerUSSim.Logic.mrml.live import LiveLogic
-from SlicerUSSim.Logic.mrml.nodes import named, node_to_world, require_node, write_slice
-from SlicerUSSim.Logic.mrml.own_results import IMAGE, mark_as_result, require_result
+from SlicerUSSim.Logic.mrml.nodes import named, node_to_world, require_node
+from SlicerUSSim.Logic.mrml.own_results import require_result
 from SlicerUSSim.Logic.mrml.patient_logic import PatientLogic
 from SlicerUSSim.Logic.mrml.sequence_nodes import SequenceIndex
-from SlicerUSSim.Logic.mrml.taken_image import TakenImage, follow, freeze, write_about
-from SlicerUSSim.Logic.mrml.taken_sequence import FrozenRecord, in_node, read_taken, taken_of, write_taken
+from SlicerUSSim.Logic.mrml.taken_image import TakenImage, follow, freeze, write_image
+from SlicerUSSim.Logic.mrml.taken_sequence import FrozenRecord, read_taken, taken_of, write_taken
 
 
 class SequenceLogic:
@@ -66,7 +65,7 @@ class SequenceLogic:
             image = self._patient.scene.CreateNodeByClass("vtkMRMLScalarVolumeNode")
             image.UnRegister(None)
             taken = self._images.take(labels_node, pose, image, warn_again, number)
-            _write(taken)
+            write_image(taken)  # the browser's node for the shown image is a copy of it
             images.append(replace(taken, frame=None))  # whose signals are many times larger
             if progress is not None:
                 progress((number + 1) / count)
@@ -98,7 +97,7 @@ class SequenceLogic:
         Ends live update, whose next image would take its place. Raises SimulationError for an output with data that
         this module did not make.
         """
-        return self._show_frozen(lambda: in_node(self.sequenceImage(images_node, number), output_node), output_node)
+        return self._show_frozen(lambda: self.sequenceImage(images_node, number), output_node)
 
     def showFrozen(self, record: FrozenRecord, output_node) -> TakenImage:
         """Write an image of a scene that was saved into a scalar volume node, where it was taken; it stays there.
@@ -106,18 +105,18 @@ class SequenceLogic:
         The chosen labels and sheets are those of the scene, if the record is of them. Ends live update.
         Raises SimulationError for a damaged record, and for an output that this module did not make.
         """
-        labels = self._patient.parameters.labels
-        anatomy = self._patient.anatomyOf(labels) if record.is_of_tissues and labels is not None else None
+        labels = self._patient.parameters.labels if record.is_of_tissues else None
+        anatomy = None if labels is None else self._patient.anatomyOf(labels)
         return self._show_frozen(lambda: replace(taken_of(record, output_node), anatomy=anatomy), output_node)
 
     def _show_frozen(self, read: Callable[[], TakenImage], output_node) -> TakenImage:
         require_node(output_node, "vtkMRMLScalarVolumeNode", use="output")
         require_result(output_node, "output")
-        taken = read()
+        taken = replace(read(), node=output_node)
         self._live.stopLiveUpdate()
         self._images.taken = taken
         was_modifying = output_node.StartModify()
-        _write(taken)
+        write_image(taken)
         freeze(taken)
         output_node.EndModify(was_modifying)
         return taken
@@ -158,10 +157,3 @@ class SequenceLogic:
         """Take the images of a sequence for those of the chosen labels and sheets, with which it was restored."""
         labels = required(self._patient.parameters.labels, "no label map is chosen, expected that of the images")
         self._last = images_node.GetID(), self._patient.anatomyOf(labels)
-
-
-def _write(taken: TakenImage) -> None:
-    """Write an image into its node, in the probe frame; the browser's node for the shown image is a copy of that."""
-    write_about(taken)
-    write_slice(taken.node, Volume(taken.image[None], taken.grid.slice_to_probe))
-    mark_as_result(taken.node, IMAGE)

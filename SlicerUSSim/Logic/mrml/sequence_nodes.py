@@ -55,13 +55,9 @@ class SequenceIndex:
     def of_node(cls, sequence_node) -> SequenceIndex:
         """Index of a vtkMRMLSequenceNode."""
         count = sequence_node.GetNumberOfDataNodes()
-        return cls(
-            tuple(sequence_node.GetNthIndexValue(number) for number in range(count)),
-            sequence_node.GetIndexName(),
-            sequence_node.GetIndexUnit(),
-            sequence_node.GetIndexType() == sequence_node.TextIndex,
-            sequence_node.GetNumericIndexValueTolerance(),
-        )
+        values, name = map(sequence_node.GetNthIndexValue, range(count)), sequence_node.GetIndexName()
+        unit, is_text = sequence_node.GetIndexUnit(), sequence_node.GetIndexType() == sequence_node.TextIndex
+        return cls(tuple(values), name, unit, is_text, sequence_node.GetNumericIndexValueTolerance())
 
     def fill(self, sequence_node, items: Iterable) -> None:
         """Replace the content of a vtkMRMLSequenceNode by `items`, a data node for each value."""
@@ -106,14 +102,9 @@ def number_in(text: str) -> float:
 
 
 def add_sequence(
-    scene,
-    sequence: TrackedSequence,
-    name: str,
-    path: str = "ImageToReference",
-    to_ras: np.ndarray | None = None,
-    poses: Sequence[np.ndarray] = (),
-    probe_transform_node=None,
-):
+    scene, sequence: TrackedSequence, name: str, path: str = "ImageToReference", to_ras: np.ndarray | None = None,
+    poses: Sequence[np.ndarray] = (), probe_transform_node=None,
+):  # fmt: skip
     """(browser, images): a vtkMRMLSequenceBrowserNode and the vtkMRMLSequenceNode of the images in `scene`.
 
     The images are in pixels, under the recorded transforms to the world (RAS); `path` and `to_ras` (4, 4) are those of
