@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import json
 import os
 import pickle
 from dataclasses import replace
@@ -166,7 +167,10 @@ def test_values_of_other_versions_are_told_and_have_their_default():
     again = UltrasoundSceneLogic(slicer.vtkMRMLScene())
     lines = put_values(again.parameters, values)
     assert len(lines) == 1 and lines[0].startswith("Contrast in the scene is 't9', expected one of t1")
-    assert again.parameters.segmentation.contrast == "t1"
+    assert again.parameters.segmentation.contrast == "t1" and again.preset == logic.preset
+    old = Preset().changed("display", gain_db=-4.0).changed("probe", kind="convex")
+    assert put_values(again.parameters, {"preset": json.dumps(old.to_dict())}) == [] and again.preset == old
+    assert put_values(again.parameters, {}) == [] and again.preset == Preset()
 
 
 def test_what_does_not_fit_together_leaves_nothing_in_the_scene():
