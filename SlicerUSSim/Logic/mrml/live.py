@@ -14,7 +14,7 @@ from vtkmodules.vtkCommonCore import VTK_OBJECT, vtkCommand
 from SlicerUSSim.Logic.base.errors import user_message
 from SlicerUSSim.Logic.mrml.image_logic import ImageLogic
 from SlicerUSSim.Logic.mrml.label_nodes import labels_version
-from SlicerUSSim.Logic.mrml.nodes import node_to_world
+from SlicerUSSim.Logic.mrml.nodes import node_to_world, show_in_slice
 from SlicerUSSim.Logic.mrml.patient_logic import PatientLogic
 
 _log = logging.getLogger(__name__)
@@ -150,8 +150,8 @@ class LiveUpdate:
             if nodes.outline is not None and probe != self._outlined:
                 images.showOutline(nodes.outline, nodes.probe_transform)
                 self._outlined = probe
-            if nodes.slice_view is not None:
-                images.showInSlice(nodes.slice_view, nodes.output, nodes.probe_transform, fit=False)
+            if nodes.slice_view is not None and images.taken is not None:
+                show_in_slice(nodes.slice_view, nodes.output, images.taken.probe_to_world, probe, fit=False)
             message = "; ".join(map(str, caught))
         except Exception as error:
             message = user_message(error)

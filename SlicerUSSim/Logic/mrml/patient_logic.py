@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, TypeVar
@@ -17,15 +18,17 @@ from SlicerUSSim.Logic.imaging.reuse import ReusedSimulator
 from SlicerUSSim.Logic.imaging.simulator import UltrasoundSimulator
 from SlicerUSSim.Logic.mri.segmentation_settings import GEL_MM
 from SlicerUSSim.Logic.mrml.craniotomy_nodes import is_opened
-from SlicerUSSim.Logic.mrml.label_nodes import LABEL_CLASSES, Patient, PatientReader, labels_version
-from SlicerUSSim.Logic.mrml.nodes import pose_in_labels, require_node
+from SlicerUSSim.Logic.mrml.label_nodes import LABEL_CLASSES, labels_version, read_labels
+from SlicerUSSim.Logic.mrml.nodes import named, pose_in_labels, require_node
 from SlicerUSSim.Logic.mrml.parameter_node import SceneParameters
 from SlicerUSSim.Logic.mrml.share_nodes import read_shares, shares_version
 from SlicerUSSim.Logic.mrml.sheet_nodes import read_sheets, sheets_version
+from SlicerUSSim.Logic.tissue.label_maps import LabelledTissues
 from SlicerUSSim.Logic.tissue.surfels import Surfels
 from SlicerUSSim.Logic.tissue.table import TissueTable
 from SlicerUSSim.Logic.tissue.texture import Texture
 
+_log = logging.getLogger(__name__)
 T = TypeVar("T")
 
 
@@ -44,6 +47,28 @@ class AtOnce:
     def tell(self, function: Callable[[], None]) -> None:
         """From within do(): call `function`, which accesses nodes, as soon as possible."""
         function()
+
+
+@dataclass(frozen=True, eq=False)
+class Patient:
+    """A copy of all data of a label node for the simulator; the node is not accessed again."""
+
+    #: Description of the node in messages
+    name: str
+    #: uint8 labels, one per tissue, in a frame with a rigid transform to the world
+    labels: Volume
+    #: Name of the tissue of label 1, 2, ...
+    names: tuple[str, ...]
+    #: (4, 4) rigid, from the world (RAS) to the frame of `labels`
+    world_to_patient: np.ndarray
+    #: Version of the node's voxels and names, see labels_version; and of the inputs of simulators, which also include
+    #: the tissues of the names and a scaling transform
+    node_version: Hashable
+    version: Hashable
+
+    def pose(self, probe_to_world: np.ndarray) -> np.ndarray:
+        """(4, 4) of a probe in the frame of `labels`."""
+        return self.world_to_patient @ probe_to_world
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,7 +118,7 @@ class PatientLogic:
     def forget(self) -> None:
         """Release what is kept in memory of the last patient."""
         self._simulators.forget()
-        self._patients = PatientReader()
+        self._read: tuple[Hashable, LabelledTissues] | None = None  # with its version
         #: Labels that Segment wrote last
         self.segmented: KnownLabels | None = None
         #: (labels_version, (3,) mm in their frame) of the largest lesion that was laid over labels
@@ -106,12 +131,23 @@ class PatientLogic:
         self._simulators = ReusedSimulator()
 
     def patient(self, labels_node) -> Patient:
-        """The labels of a node with the tissues of the preset."""
-        return self._patients.read(labels_node, self.parameters.preset.tissues)
+        """The content and position of a label map or segmentation, read again if node or tissues have changed."""
+        require_node(labels_node, *LABEL_CLASSES, use="label map")
+        node_version, tissues = labels_version(labels_node), self.parameters.preset.tissues
+        # Names are not sufficient: a label map without names takes those of `tissues` by label.
+        version = (node_version, tuple((label, tissue.name) for label, tissue in tissues.items()))
+        if self._read is None or self._read[0] != version:
+            self._read = (version, read_labels(labels_node, tissues))
+            _log.debug("%s: labels read from the node", named(labels_node))
+        found = self._read[1]
+        world_to_patient, scaling = pose_in_labels(labels_node, np.eye(4))
+        labels = Volume(found.labels.array, scaling @ found.labels.ijk_to_ras)
+        of_simulator = (version, scaling.tobytes())
+        return Patient(named(labels_node), labels, found.names, world_to_patient, node_version, of_simulator)
 
     def recognised(self) -> tuple[str, tuple[str, ...]]:
         """(what the labels of the last image were recognised as, warnings about them): "FreeSurfer aseg: ..."."""
-        return self._patients.recognised
+        return ("", ()) if self._read is None else (self._read[1].message, self._read[1].warnings)
 
     def tissues(self, labels_node) -> TissueTable:
         """The tissues of a label map or segmentation by name, from the preset's table or else the tissue presets.

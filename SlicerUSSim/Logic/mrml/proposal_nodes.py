@@ -51,22 +51,18 @@ class LesionProposals:
             mri_node.GetID(), _version(mri_node),
         )  # fmt: skip
 
-    def grow(self, mri_node, seed_world_mm: Sequence[float], tissue: str | None = None):
-        """The segmentation node with the lesion around a point in world RAS mm; see seeded.grow_lesion.
-
-        Raises SimulationError, and changes nothing, if the MRI was not segmented or has changed since, and for a point
-        in what is no lesion.
-        """
-        result = self._segmentation_of(mri_node)
-        seed = np.linalg.inv(node_to_world(mri_node)) @ [*np.asarray(seed_world_mm, float), 1.0]
-        return self._written([self._work(lambda: grow_lesion(result, seed[:3].tolist(), tissue))], mri_node)
-
     def growFrom(self, mri_node, points_node, tissue: str | None = None):
-        """As grow, from the last control point of a markups node that is placed."""
+        """The segmentation node with the lesion around the last control point of a markups node that is placed.
+
+        See seeded.grow_lesion. Raises SimulationError, and changes nothing, if the MRI was not segmented or has changed
+        since, and for a point in what is no lesion.
+        """
         require_node(points_node, "vtkMRMLMarkupsFiducialNode", use="point in the lesion")
         placed = control_points(points_node)
         require(len(placed) > 0, f"{named(points_node)} has no point, expected one in the lesion; click it in a slice")
-        return self.grow(mri_node, placed[-1].tolist(), tissue)
+        result = self._segmentation_of(mri_node)
+        seed = np.linalg.inv(node_to_world(mri_node)) @ [*placed[-1], 1.0]
+        return self._written([self._work(lambda: grow_lesion(result, seed[:3].tolist(), tissue))], mri_node)
 
     def propose(self, mri_node):
         """The segmentation node with what looks like lesions, without a point; None if nothing does."""

@@ -53,6 +53,7 @@ from SlicerUSSim.Logic.mrml.sheet_nodes import write_sheets
 from SlicerUSSim.Logic.mrml.taken_image import PATIENT, patient_of
 from SlicerUSSim.Logic.placement.craniotomy import disc_diameter_mm, disc_opening, opened
 from SlicerUSSim.Logic.tissue.label_maps import LabelledTissues
+from SlicerUSSim.Logic.tissue.table import TissueTable
 from SlicerUSSim.Logic.tissue.texture import Texture
 
 #: Attribute of a mask node: the ID of the MRI node from which it was extracted
@@ -112,7 +113,7 @@ class SegmentLogic:
         if not overwrite:
             self._require_replaceable(labels_node)
         volumes = {contrast: _in_frame_of(node, mri_node) for contrast, node in (others or {}).items()}
-        lesions, skipped = ([], []) if lesions_node is None else self._lesions(lesions_node, mri_node)
+        lesions, skipped = ([], []) if lesions_node is None else read_lesions(lesions_node, mri_node, self._tissues)
         wanted = tuple(sheets)
         if wanted:
             require_findable(wanted, contrast)
@@ -202,7 +203,7 @@ class SegmentLogic:
         self._require_replaceable(output)
         require(lesions_node is not output, f"lesions and output are both {named(output)}, expected different nodes")
         was = self._known(labels_node)
-        lesions, skipped = self._lesions(lesions_node, labels_node)
+        lesions, skipped = read_lesions(lesions_node, labels_node, self._tissues)
         labels = was.labels
         if labels_node.IsA("vtkMRMLSegmentationNode"):
             labels = padded_for(lesions, labels)  # it is cropped to what it holds
@@ -286,15 +287,19 @@ class SegmentLogic:
             f"{named(labels_node)} was not made by {by}, or edited since, and is not replaced; choose another node",
         )
 
+    @property
+    def _tissues(self) -> TissueTable:
+        return self._patient.parameters.preset.tissues
+
     def _own_tissues(self) -> list[str]:
-        return [tissue.name for tissue in self._patient.parameters.preset.tissues.all_tissues()]
+        return [tissue.name for tissue in self._tissues.all_tissues()]
 
     def _known(self, labels_node) -> KnownLabels:
         """What Segment wrote into a node last, or what is read from it."""
         segmented, version = self._patient.segmented, labels_version(labels_node)
         if segmented is not None and segmented.version == version:
             return segmented
-        found = read_labels(labels_node, self._patient.parameters.preset.tissues)
+        found = read_labels(labels_node, self._tissues)
         labels, names = found.labels, found.names
         without_mri = labels.with_array(np.zeros(labels.array.shape, np.float32))
         return KnownLabels(version, labels, names, read_shares(labels_node, labels, names), without_mri, False)
@@ -305,9 +310,6 @@ class SegmentLogic:
         return None if texture is None else self._work.do(
             lambda: texture_below(texture, known.mri, known.labels, labels)
         )  # fmt: skip
-
-    def _lesions(self, lesions_node, to_frame_of) -> tuple[list[_Lesion], list[str]]:
-        return read_lesions(lesions_node, to_frame_of, self._patient.parameters.preset.tissues)
 
     def _organs(self, organs_node, mri_node, contrast: str) -> LabelledTissues:
         """The organs of a CT in its own frame. Raises SimulationError beside an MRI."""
@@ -322,7 +324,7 @@ class SegmentLogic:
             labels = Volume(found.labels.array, to_mri @ found.labels.ijk_to_ras)
             return replace(found, labels=labels, others=tuple(map(in_frame_of_mri, found.others)))
 
-        return in_frame_of_mri(read_labels(organs_node, self._patient.parameters.preset.tissues, of_ct=True))
+        return in_frame_of_mri(read_labels(organs_node, self._tissues, of_ct=True))
 
     def _with_lesions(
         self, labels: Volume, names: Sequence[str], lesions: list[_Lesion], before: _Told | None = None, *,
