@@ -20,7 +20,7 @@ from SlicerUSSim.Logic.mrml.label_nodes import read_labels, write_labels  # noqa
 from SlicerUSSim.Logic.mrml.lesion_nodes import add_lesion  # noqa: E402
 from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic  # noqa: E402
 from SlicerUSSim.Logic.mrml.nodes import node_to_world, nodes_of_class, set_node_to_world, write_volume  # noqa: E402
-from SlicerUSSim.Logic.mrml.own_labels import mark_as_made  # noqa: E402
+from SlicerUSSim.Logic.mrml.own_results import mark_as_made  # noqa: E402
 from SlicerUSSim.Logic.mrml.scene_record import put_nodes, record_scene  # noqa: E402
 from SlicerUSSim.Logic.placement.craniotomy import default_pose, disc_opening, opened  # noqa: E402
 from SlicerUSSim.Logic.probe.poses import pose_looking_at  # noqa: E402

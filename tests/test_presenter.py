@@ -19,7 +19,7 @@ from SlicerUSSim.Logic.mrml.label_nodes import read_labels, write_labels  # noqa
 from SlicerUSSim.Logic.mrml.lesion_nodes import add_lesion  # noqa: E402
 from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic  # noqa: E402
 from SlicerUSSim.Logic.mrml.nodes import probe_pose, read_volume, set_node_to_world, write_volume  # noqa: E402
-from SlicerUSSim.Logic.mrml.own_labels import content_of  # noqa: E402
+from SlicerUSSim.Logic.mrml.own_results import content_of  # noqa: E402
 from SlicerUSSim.Logic.mrml.share_nodes import read_shares  # noqa: E402
 from SlicerUSSim.Logic.mrml.taken_image import about_image, is_frozen, patient_of  # noqa: E402
 from SlicerUSSim.Logic.probe.arrays import PROBE_KINDS, PROBES, LinearProbe  # noqa: E402

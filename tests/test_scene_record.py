@@ -20,7 +20,6 @@ from SlicerUSSim.Logic.base.vtk_data import vtk_matrix  # noqa: E402
 from SlicerUSSim.Logic.imaging.preset import Preset  # noqa: E402
 from SlicerUSSim.Logic.mri.samples import head_mri  # noqa: E402
 from SlicerUSSim.Logic.mri.segmentation_settings import SegmentationSettings  # noqa: E402
-from SlicerUSSim.Logic.mrml.known_field import KnownField, write_known_field  # noqa: E402
 from SlicerUSSim.Logic.mrml.label_nodes import write_labels  # noqa: E402
 from SlicerUSSim.Logic.mrml.landmark_nodes import Landmark, landmarks_of, write_landmarks  # noqa: E402
 from SlicerUSSim.Logic.mrml.lesion_nodes import add_lesion, read_lesions  # noqa: E402
@@ -36,7 +35,11 @@ from SlicerUSSim.Logic.mrml.scene_record import (  # noqa: E402
     record_scene,
     recorded_values,
 )
-from SlicerUSSim.Logic.mrml.sequence_nodes import add_sequence  # noqa: E402
+from SlicerUSSim.Logic.mrml.sequence_nodes import (  # noqa: E402
+    KnownField,
+    add_sequence,
+    write_known_field,
+)
 from SlicerUSSim.Logic.mrml.taken_image import is_frozen  # noqa: E402
 from SlicerUSSim.Logic.mrml.taken_sequence import put_taken, record_frozen, taken_of  # noqa: E402
 from SlicerUSSim.Logic.probe.image_grid import ImageGrid  # noqa: E402

@@ -25,8 +25,7 @@ from SlicerUSSim.Logic.mrml.fitting_nodes import fits
 from SlicerUSSim.Logic.mrml.labels_before import LabelsBefore
 from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic
 from SlicerUSSim.Logic.mrml.nodes import display_of, nodes_of_class, probe_pose, set_node_to_world
-from SlicerUSSim.Logic.mrml.own_labels import content_as_made
-from SlicerUSSim.Logic.mrml.own_results import SHEETS, mark_as_result
+from SlicerUSSim.Logic.mrml.own_results import SHEETS, content_as_made, mark_as_result
 from SlicerUSSim.Logic.mrml.parameter_node import BY_LOOK
 from SlicerUSSim.Logic.mrml.sequence_nodes import MADE_FROM
 from SlicerUSSim.Logic.mrml.taken_sequence import FrozenRecord
@@ -88,7 +87,7 @@ class _LastSegment:
 
     before: _BeforeSegment
     labels: Any
-    #: Of the labels, see own_labels.content_as_made
+    #: Of the labels, see own_results.content_as_made
     content: str | None
     #: {role: chosen node}
     nodes: dict[str, Any]
@@ -118,7 +117,7 @@ class PanelPresenter:
         self.sheetsFile: Callable[[Any], Path | None] = lambda mri_node: None
         self._busy = False
         self._last_segment: _LastSegment | None = None
-        #: {content of labels, see own_labels.content_of: settings by which Segment made them}
+        #: {content of labels, see own_results.content_of: settings by which Segment made them}
         self._made_by: dict[str | None, SegmentationSettings] = {}
         self._custom_probe: Probe | None = None  # the last one that was none of PROBES
         self._last_image: float | None = None

@@ -8,7 +8,7 @@ from typing import Any
 from SlicerUSSim.Logic.base.errors import SimulationError
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.mrml.label_nodes import empty, read_labels, write_labels
-from SlicerUSSim.Logic.mrml.own_labels import content_of, mark_as_made
+from SlicerUSSim.Logic.mrml.own_results import content_of, mark_as_made
 from SlicerUSSim.Logic.mrml.share_nodes import read_shares, write_shares
 from SlicerUSSim.Logic.mrml.taken_image import PATIENT
 from SlicerUSSim.Logic.tissue.table import TissueTable

@@ -15,7 +15,7 @@ from SlicerUSSim.Logic.mri.lesions.seeded import grow_lesion
 from SlicerUSSim.Logic.mri.segmentation import Segmentation
 from SlicerUSSim.Logic.mrml.lesion_nodes import add_lesion
 from SlicerUSSim.Logic.mrml.nodes import control_points, named, node_to_world, nodes_of_class, require_node
-from SlicerUSSim.Logic.mrml.own_labels import mark_as_made, may_replace
+from SlicerUSSim.Logic.mrml.own_results import mark_as_made, may_replace
 
 #: Name of the node with a proposal
 NAME = "Lesion proposal"

@@ -22,7 +22,6 @@ from SlicerUSSim.Logic.base.vtk_data import matrix_array, vtk_matrix
 from SlicerUSSim.Logic.mri.sheets.polydata import as_polydata, surfels_of
 from SlicerUSSim.Logic.mrml.craniotomy_nodes import closed_labels, set_closed_labels, show_flap
 from SlicerUSSim.Logic.mrml.fit_nodes import sequence_of
-from SlicerUSSim.Logic.mrml.known_field import known_field
 from SlicerUSSim.Logic.mrml.label_nodes import colour_table, node_labels, read_mask, set_colour_table
 from SlicerUSSim.Logic.mrml.landmark_nodes import Landmark, landmarks_of
 from SlicerUSSim.Logic.mrml.lesion_nodes import tag_of
@@ -38,6 +37,7 @@ from SlicerUSSim.Logic.mrml.nodes import (
 )
 from SlicerUSSim.Logic.mrml.own_results import OWN, claim, is_claimed, is_empty
 from SlicerUSSim.Logic.mrml.parameter_node import VALUE_PARAMETERS, SceneParameters, preset_texts
+from SlicerUSSim.Logic.mrml.sequence_nodes import known_field
 from SlicerUSSim.Logic.mrml.share_nodes import set_shares_node, shares_node
 from SlicerUSSim.Logic.mrml.taken_image import was_live
 from SlicerUSSim.Logic.mrml.taken_sequence import FrozenRecord, SimulatedRecord, record_frozen, record_taken

@@ -44,8 +44,7 @@ from SlicerUSSim.Logic.mrml.nodes import (
     read_volume,
     require_node,
 )
-from SlicerUSSim.Logic.mrml.own_labels import mark_as_made, may_replace
-from SlicerUSSim.Logic.mrml.own_results import require_result
+from SlicerUSSim.Logic.mrml.own_results import mark_as_made, may_replace, require_result
 from SlicerUSSim.Logic.mrml.patient_logic import KnownLabels, PatientLogic
 from SlicerUSSim.Logic.mrml.proposal_nodes import LesionProposals
 from SlicerUSSim.Logic.mrml.share_nodes import read_shares, write_shares
