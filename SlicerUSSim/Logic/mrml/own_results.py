@@ -82,6 +82,15 @@ def may_replace_result(node) -> bool:
     )
 
 
+def is_own(node, kind: str) -> bool:
+    """Whether a node is empty, or holds a result of this kind that may be replaced."""
+    if is_empty(node):
+        return kind_of_result(node) in (None, kind, "1")
+    # Items of a sequence are compared when it is replaced
+    may_be = is_claimed if node.IsA("vtkMRMLSequenceNode") else may_replace_result
+    return kind_of_result(node) == kind and may_be(node)
+
+
 def require_result(node, use: str) -> None:
     """Raise SimulationError for a node with data that this module did not make; `use` is what the node is for."""
     require(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -18,22 +18,9 @@ from SlicerUSSim.Logic.mri.pathology import Added, add_tissues, texture_below
 from SlicerUSSim.Logic.mri.segmentation import Segmentation
 from SlicerUSSim.Logic.mri.segmentation_settings import CT, SegmentationSettings
 from SlicerUSSim.Logic.mri.sheets.finding import find_sheets, require_findable
-from SlicerUSSim.Logic.mrml.craniotomy_nodes import (
-    closed_labels,
-    hide_flap,
-    is_opened,
-    opening_of,
-    set_closed_labels,
-    show_flap,
-)
-from SlicerUSSim.Logic.mrml.label_nodes import (
-    LABEL_CLASSES,
-    labels_version,
-    read_labels,
-    read_mask,
-    write_labels,
-)
-from SlicerUSSim.Logic.mrml.lesion_nodes import padded_for, place_of, read_lesions
+from SlicerUSSim.Logic.mrml.craniotomy_nodes import closed_labels, is_opened, opening_of, set_closed_labels, show_flap
+from SlicerUSSim.Logic.mrml.label_nodes import LABEL_CLASSES, labels_version, read_labels, read_mask, write_labels
+from SlicerUSSim.Logic.mrml.lesion_nodes import Told, padded_for, read_lesions, with_lesions
 from SlicerUSSim.Logic.mrml.live import LiveLogic
 from SlicerUSSim.Logic.mrml.nodes import (
     named,
@@ -59,10 +46,6 @@ from SlicerUSSim.Logic.tissue.texture import Texture
 _BRAIN_OF = "SlicerUSSim.brainOf"
 #: Share of the time in which tissues are segmented, if sheets are looked for after that
 _SEGMENTED = 0.4
-#: (tissue, mask, name in messages)
-_Lesion = tuple[str, Volume, str]
-#: {lesion, see lesion_nodes.place_of: (messages, warnings) when it was laid over labels that did not have it}
-_Told = dict[Hashable, tuple[tuple[str, ...], tuple[str, ...]]]
 
 
 class SegmentLogic:
@@ -75,7 +58,7 @@ class SegmentLogic:
     def forget(self) -> None:
         """Release what is kept in memory of the last patient."""
         #: Version of the labels over which lesions were laid last, and what was told about each of them
-        self._laid: tuple[Hashable, _Told] = (None, {})
+        self._laid: tuple[Hashable, Told] = (None, {})
         #: Lesions proposed from the MRI that was segmented last
         self.proposals = LesionProposals(self._patient.scene, self._work.do)
         #: What the last segment(), addTissues() or openCraniotomy() did, and what to check, one line each
@@ -142,7 +125,9 @@ class SegmentLogic:
             if masks:
                 laid = self._work.do(lambda: add_tissues(labels, names, masks, has_brain_mask=True))
                 labels, names = laid.labels, laid.tissue_names
-        added, told = self._with_lesions(labels, names, lesions, has_brain_mask=is_of_brain)
+        added, told = self._work.do(
+            lambda: with_lesions(labels, names, lesions, also=own, before={}, has_brain_mask=is_of_brain)
+        )
         shares = self._work.do(lambda: texture_below(result.texture(), mri, result.labels, added.labels))
         require_node(labels_node, *LABEL_CLASSES, use="output of Segment")
         self._write(labels_node, added, mri_node, shares)
@@ -207,7 +192,10 @@ class SegmentLogic:
         if labels_node.IsA("vtkMRMLSegmentationNode"):
             labels = padded_for(lesions, labels)  # it is cropped to what it holds
         before = self._laid[1] if self._laid[0] == was.version else {}
-        added, told = self._with_lesions(labels, was.names, lesions, before, has_brain_mask=was.is_of_brain)
+        own, is_of_brain = self._own_tissues(), was.is_of_brain
+        added, told = self._work.do(
+            lambda: with_lesions(labels, was.names, lesions, also=own, before=before, has_brain_mask=is_of_brain)
+        )
         stays = is_opened(output)
         texture = self._texture_of(was, added.labels) if labels is was.labels else None
         self._write(output, added, labels_node, texture)
@@ -251,8 +239,7 @@ class SegmentLogic:
         placed = Volume(labels.array, scaling @ labels.ijk_to_ras)
         left_out: tuple[str, ...] = ()
         if opening_node is not None:
-            found = self._work.do(lambda: opening_of(opening_node, placed, names, world_to_labels))
-            opening, what, left_out = found
+            opening, what, left_out = self._work.do(lambda: opening_of(opening_node, placed, names, world_to_labels))
         else:
             pose, probe = world_to_labels @ probe_pose(probe_transform_node), self._patient.parameters.preset.probe
             diameter = disc_diameter_mm(probe) if diameter_mm is None else diameter_mm
@@ -306,9 +293,9 @@ class SegmentLogic:
     def _texture_of(self, known: KnownLabels, labels: Volume) -> Texture | None:
         """The texture below other labels on the same grid; None where there is none."""
         texture = known.texture
-        return None if texture is None else self._work.do(
-            lambda: texture_below(texture, known.mri, known.labels, labels)
-        )  # fmt: skip
+        if texture is None:
+            return None
+        return self._work.do(lambda: texture_below(texture, known.mri, known.labels, labels))
 
     def _organs(self, organs_node, mri_node, contrast: str) -> LabelledTissues:
         """The organs of a CT in its own frame. Raises SimulationError beside an MRI."""
@@ -325,38 +312,17 @@ class SegmentLogic:
 
         return in_frame_of_mri(read_labels(organs_node, self._tissues, of_ct=True))
 
-    def _with_lesions(
-        self, labels: Volume, names: Sequence[str], lesions: list[_Lesion], before: _Told | None = None, *,
-        has_brain_mask: bool,
-    ) -> tuple[Added, _Told]:  # fmt: skip
-        """(labels with lesions, what is told about each); `before` is that about those which the labels have."""
-        own = self._own_tissues()
-
-        def lay() -> tuple[Added, _Told]:
-            added, told = Added(labels, tuple(names)), {}
-            for tissue, mask, source in lesions:
-                added = add_tissues(
-                    added.labels, added.tissue_names, [(tissue, mask, source)], also=own, has_brain_mask=has_brain_mask
-                )
-                place = (tissue, source, *place_of(mask))
-                told[place] = (before or {}).get(place, (added.messages, added.warnings))
-            lines = [tuple(line for one in told.values() for line in one[kind]) for kind in (0, 1)]
-            return Added(added.labels, added.tissue_names, *lines), told
-
-        return self._work.do(lay)
-
     def _write(self, labels_node, added: Added, like_node, texture: Texture | None) -> None:
         """Write labels and what is known of their shares."""
         write_labels(labels_node, added.labels, added.tissue_names, like_node)
         mark_as_made(labels_node)
         labels_node.SetAttribute(PATIENT, patient_of(like_node))
         set_closed_labels(labels_node, None)
-        hide_flap(labels_node)
         if texture is not None:
             write_shares(labels_node, added.labels, added.tissue_names, texture)
             self._live.request()  # it may have seen the labels without them
 
-    def _note_laid(self, labels_node, added: Added, told: _Told, before: Volume) -> None:
+    def _note_laid(self, labels_node, added: Added, told: Told, before: Volume) -> None:
         version = labels_version(labels_node)
         self._laid, self._patient.lesion_place = (version, told), (version, added.centre_ras(before))
 
