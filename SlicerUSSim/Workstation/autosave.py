@@ -182,7 +182,7 @@ class Autosave:
         seen = (
             anatomy, tuple(self._opener.sent_files.files.items()), parameters.node.GetMTime(),
             None if pose is None else pose.tobytes(), fit is not None, sequence is not None, simulated, frozen, cine,
-            repr(page), self._presenter.noteLines, tuple(map(id, self._landmarks())), of_tissues,
+            repr(page), self._presenter.notes.lines, tuple(map(id, self._landmarks())), of_tissues,
         )  # fmt: skip
         if seen == self._seen and not is_new_fit and not is_new_sequence:
             return
@@ -199,7 +199,7 @@ class Autosave:
             "pose": None if pose is None or labels is None else pose.tolist(),
             "values": recorded_values(parameters),
             "page": page,
-            "notes": list(self._presenter.noteLines),
+            "notes": list(self._presenter.notes.lines),
             "curve": list(self._shared.now.fit.curve),
             "costs": self._shared.now.fit.costs,
             "source": None if source is None else source.to_dict(),

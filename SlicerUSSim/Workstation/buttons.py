@@ -55,4 +55,4 @@ class Buttons:
         panel = self._shared.now.panel
         with self._presenter.shown():
             require(bool(panel.chosen_tissue), "no tissue chosen, click on its line in the table")
-            self._presenter.assignTissue(panel.chosen_tissue, str(panel.values["tissuePresetComboBox"]))
+            self._presenter.tissues.assignTissue(panel.chosen_tissue, str(panel.values["tissuePresetComboBox"]))

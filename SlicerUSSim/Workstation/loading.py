@@ -101,7 +101,7 @@ class Loading:
                 recording = Recording(files.sequence, files.sequence_name, files.transform)
                 self._registration.take(recording, files.to_ras)
             elif files.preset is not None and files.preset.probe_to_ras is not None:
-                self._presenter.takePreset(files.preset)
+                self._presenter.values.takePreset(files.preset)
 
     @property
     def has_users_patient(self) -> bool:
@@ -169,7 +169,7 @@ class Loading:
                 )
             elif mri is not None:
                 checks.append(_of_mri(mri))
-            self._presenter.setNotes(f"{node.GetName()}: {found.message}", *checks)
+            self._presenter.notes.set(f"{node.GetName()}: {found.message}", *checks)
             for warning in found.warnings:
                 self._presenter.view.showError(warning)
             self.show_title()
@@ -254,7 +254,7 @@ class Loading:
         lesions, organs = parameters.lesions, parameters.organs
         kinds = parameters.sheet.kinds if parameters.sheet.find else ()
         before = self._opener.known_source(parameters.labels)
-        if not self._changed(self._presenter.segment):
+        if not self._changed(self._presenter.segmenting.segment):
             return False
         self._source_before = before
         self._opener.segmented(parameters.labels, *inputs, others, lesions, kinds, organs)
@@ -264,7 +264,7 @@ class Loading:
     def undo_segment(self) -> None:
         """Go back to the tissues from before the last Segment; others that were chosen since stay as they are."""
         chosen = self._logic.parameters.labels
-        is_changed = self._changed(self._presenter.undoSegment)
+        is_changed = self._changed(self._presenter.segmenting.undoSegment)
         labels: Any = self._logic.parameters.labels
         if chosen is not None and labels is None:
             self._logic.clearImage(self._logic.parameters.output)
@@ -278,13 +278,13 @@ class Loading:
     def add_tissues(self) -> None:
         """Lay the lesions over the tissues."""
         source, patient = self._opener.known_source(self._logic.parameters.labels), self._opener.patient()
-        if self._changed(self._presenter.addTissues):
+        if self._changed(self._presenter.lesions.addTissues):
             self._laid(source, patient)
 
     def accept_proposal(self) -> None:
         """Move what is proposed to the lesions, and lay them over the tissues."""
         source, patient = self._opener.known_source(self._logic.parameters.labels), self._opener.patient()
-        if self._changed(self._presenter.acceptProposal):
+        if self._changed(self._presenter.lesions.acceptProposal):
             self._laid(source, patient)
 
     def open_craniotomy(self) -> None:
@@ -292,7 +292,7 @@ class Loading:
         parameters: Any = self._logic.parameters
         labels, patient = parameters.labels, self._opener.patient()
         source = None if labels is None else self._opener.known_source(self._logic.closedLabels(labels))
-        if self._changed(self._presenter.openCraniotomy):
+        if self._changed(self._presenter.placing.openCraniotomy):
             disc = None
             if parameters.opening is None:
                 pose, _ = pose_in_labels(parameters.labels, probe_pose(parameters.probe_transform))
@@ -317,17 +317,17 @@ class Loading:
 
     def close_craniotomy(self) -> None:
         """Go back to the labels without the opening."""
-        if self._changed(self._presenter.closeCraniotomy):
+        if self._changed(self._presenter.placing.closeCraniotomy):
             self.labels_ready()
 
     def place_probe(self) -> None:
         """Place the probe at a typical craniotomy."""
-        self._presenter.placeProbe()
+        self._presenter.placing.placeProbe()
         self._probe.look()
 
     def place_at_view(self) -> None:
         """Place the probe where the chosen standard view is seen from."""
-        self._presenter.placeAtView()
+        self._presenter.placing.placeAtView()
         self._probe.look()
 
     def show_title(self) -> None:
@@ -349,7 +349,7 @@ class Loading:
         parameters.lesions = node
         try:
             if parameters.labels is not None:
-                self._presenter.layLesions()
+                self._presenter.lesions.layLesions()
         except SimulationError:
             undo()
             parameters.lesions = before
@@ -396,7 +396,7 @@ class Loading:
             parameters.mri = mris[0]
         self._views.show_volume(node if parameters.mri is None else parameters.mri)
         parameters.labels = node
-        self._presenter.setNotes(f"{node.GetName()}: {found.message}", *checks)
+        self._presenter.notes.set(f"{node.GetName()}: {found.message}", *checks)
         self.show_title()
         self.labels_ready()
 
@@ -416,7 +416,7 @@ class Loading:
         """Choose the label map of organs of a CT, which Segment uses."""
         self._logic.parameters.organs = node
         lines = [f"{node.GetName()}: {found.message}; Segment uses it with the contrast ct", found.taken_for]
-        self._presenter.setNotes("\n".join(filter(None, lines)))
+        self._presenter.notes.set("\n".join(filter(None, lines)))
 
     def close_patient(self) -> None:
         """Close the patient: nothing of him stays on the page, in the scene or in memory; settings stay."""
@@ -424,7 +424,7 @@ class Loading:
         self._messages.clear()
         self.forget_patient()
         parameters.mri = parameters.labels = parameters.mask = parameters.second_mri = None
-        self._presenter.setNotes()
+        self._presenter.notes.set()
         self.show_title()
 
     def forget_patient(self, *new: Any) -> None:
@@ -460,7 +460,7 @@ class Loading:
         parameters = self._logic.parameters
         self.forget_patient(node)
         parameters.mri = node
-        self._presenter.setNotes()
+        self._presenter.notes.set()
         self.show_title()
         self._views.show_volume(node)
 
@@ -491,13 +491,13 @@ class Loading:
         The probe `is_placed`, or is placed now if they are of a new patient.
         """
         if self._logic.parameters.probe_transform is None or (self._is_new and not is_placed):
-            self._presenter.placeProbe()
+            self._presenter.placing.placeProbe()
         self._is_new = False
         self.show_title()
         if frozen is not None:
-            self._presenter.showFrozen(frozen)
+            self._presenter.images.showFrozen(frozen)
         elif not self._logic.isLive:
-            self._presenter.setLive(True)
+            self._presenter.images.setLive(True)
         self._probe.update_surface()  # after the start of live images, which do not need it
         self._probe.look()
 

@@ -308,7 +308,7 @@ class Opening:
     def _preset(self, upload: Upload, beside: list[Upload]) -> tuple[str, Callable[[], object]]:
         preset = self._tasks.doAside(lambda: Preset.read(upload.path))
         moves = "" if preset.probe_to_ras is None else "; the probe is moved to its pose"
-        return f"in place of the settings of before{moves}", lambda: self._presenter.takePreset(preset)
+        return f"in place of the settings of before{moves}", lambda: self._presenter.values.takePreset(preset)
 
     def _pose(self, upload: Upload, beside: list[Upload]) -> tuple[str, Callable[[], object]]:
         pose = self._tasks.doAside(lambda: read_pose(upload.path))

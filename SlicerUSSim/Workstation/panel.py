@@ -137,7 +137,7 @@ class BrowserPanel:
             panel.nodes = {
                 name: self._nodes_for(control) for name, control in self._controls.items() if control.kind == "node"
             }
-            panel.tissues = [_line(row) for row in presenter.tissues()]
+            panel.tissues = [_line(row) for row in presenter.tissues.rows()]
             panel.can = {name: is_usable for name, (is_usable, _) in can.items()}
             panel.tips = {name: tip for name, (_, tip) in can.items()}
             now.fit.free = [FreeParameter(name, on) for name, on in presenter.fits.freeParameters()]
@@ -193,7 +193,7 @@ class BrowserPanel:
         if value == self._shown_value(control):
             return
         if control.value:
-            presenter.setValue(control.value, value)
+            presenter.values.setValue(control.value, value)
         elif control.node:
             with presenter.shown():
                 setattr(parameters, control.node, self._logic.scene.GetNodeByID(value) if value else None)
@@ -222,7 +222,7 @@ class BrowserPanel:
 
     def _shown_value(self, control: Control) -> object:
         if control.value:
-            return self.presenter.value(control.value)
+            return self.presenter.values.value(control.value)
         if control.node:
             node = getattr(self._logic.parameters, control.node)
             return None if node is None else node.GetID()

@@ -142,11 +142,11 @@ class Restoring:
             lines.append(f"left out, since the simulator does not use them: {', '.join(record.left_out)}")
         if parameters.labels is None:
             self._loading.segment()
-            self._presenter.addNotes(*lines)
+            self._presenter.notes.add(*lines)
         else:
             message, warnings = self._logic.recognised()
             checks = [f"Check: {warning}" for warning in warnings]
-            self._presenter.setNotes(*lines, f"{parameters.labels.GetName()}: {message}", *checks)
+            self._presenter.notes.set(*lines, f"{parameters.labels.GetName()}: {message}", *checks)
 
     def _take(
         self,
@@ -200,7 +200,7 @@ class Restoring:
             with self._shared.changing() as now:
                 now.fit.curve, now.fit.costs = [float(cost) for cost in kept["curve"]], str(kept["costs"])
         self._cine.restore(images, self._now())
-        self._presenter.setNotes(*map(str, kept.get("notes", ())), *refused)
+        self._presenter.notes.set(*map(str, kept.get("notes", ())), *refused)
         frozen = record.frozen
         if frozen is not None and refused:  # such as kinds of sheets, which the image shows
             frozen = replace(frozen, is_of_tissues=False)

@@ -61,7 +61,7 @@ class SimulatedSequence:
         output = required(parameters.output, "no image is shown yet, expected a patient and a probe first")
         number = int(np.clip(number, 0, max(images.GetNumberOfDataNodes() - 1, 0)))
         pose = self._logic.sequenceImage(images, number).probe_to_world
-        self._presenter.setLive(False)
+        self._presenter.images.setLive(False)
         if not self._comparison.show_at(pose):
             self._move(pose)
         self._logic.showSequenceImage(images, number, output)
@@ -74,7 +74,7 @@ class SimulatedSequence:
             self.stop()
             return
         self._comparison.stop()
-        self._presenter.setLive(False)
+        self._presenter.images.setLive(False)
         self._playing = get_event_loop().create_task(self._play_on())
         self._tell()
 

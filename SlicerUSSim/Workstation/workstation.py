@@ -88,9 +88,9 @@ class Workstation:
         self._simulated = SimulatedSequence(shared, logic, presenter, self._comparison, self._probe.move)
         self._panel.refreshed = self._refreshed
         opener = Opener(app.scene, logic, tasks, files)
-        presenter.maskFile, presenter.sheetsFile = opener.mask_file, opener.sheets_file
+        presenter.segmenting.maskFile, presenter.segmenting.sheetsFile = opener.mask_file, opener.sheets_file
         self._panel.pick = self._probe.hand.pick
-        self._exports = Exports(app, logic, tasks, opener, cine, presenter.presetToSave, self._panel.progress)
+        self._exports = Exports(app, logic, tasks, opener, cine, presenter.values.presetToSave, self._panel.progress)
         self._registration = Registration(
             shared, logic, tasks, opener, presenter, self._comparison, self._probe.hand
         )  # fmt: skip
@@ -180,7 +180,7 @@ class Workstation:
         triggers: dict[str, Callable[..., object]] = {
             "set": self._panel.set,
             "press": buttons.press,
-            "set_tissue": self._in_task(self._presenter.setTissue),
+            "set_tissue": self._in_task(self._presenter.tissues.setTissue),
             "set_free": self._in_task(self._presenter.fits.setFree),
             "set_pose": probe.set_pose,
             "type_pose": self._in_task(self._poses.type),
