@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 from SlicerUSSim.Logic.base.errors import require, required
 from SlicerUSSim.Logic.mri.segmentation import Segmentation
@@ -234,9 +234,9 @@ class SegmentPresenter:
 
     def _closed_again(self) -> list[str]:
         """Choose the labels before the opening, into which Segment writes; a line about it."""
-        logic, chosen = self._panel.logic, cast(Any, self._panel.parameters.labels)
-        closed = chosen if chosen is None else logic.closedLabels(chosen)
-        if closed is chosen:
+        logic, chosen = self._panel.logic, self._panel.parameters.labels
+        closed = None if chosen is None else logic.closedLabels(chosen)
+        if chosen is None or closed is chosen:
             return []
         logic.hideOpening(chosen)
         self._panel.parameters.labels = closed

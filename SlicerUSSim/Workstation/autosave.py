@@ -23,7 +23,6 @@ from trame_server.utils.asynchronous import get_event_loop
 from SlicerUSSim.Logic.base.errors import SimulationError
 from SlicerUSSim.Logic.base.reading import write_values
 from SlicerUSSim.Logic.mrml.landmark_nodes import Landmark
-from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic
 from SlicerUSSim.Logic.mrml.scene_record import (
     SceneRecord,
     SequenceRecord,
@@ -39,11 +38,10 @@ from SlicerUSSim.Logic.mrml.taken_sequence import (
     version_frozen,
     version_taken,
 )
-from SlicerUSSim.Widget.presenter import PanelPresenter
+from SlicerUSSim.Workstation.browser_panel import BrowserPanel
 from SlicerUSSim.Workstation.export import MOST_IMAGES, Cine, CineImage
 from SlicerUSSim.Workstation.opener import Opener
 from SlicerUSSim.Workstation.session_store import OwnSession
-from SlicerUSSim.Workstation.state import SharedState
 
 _log = logging.getLogger(__name__)
 
@@ -89,26 +87,15 @@ class Autosave:
     session : where; None: nothing is kept.
     pose : (4, 4) of the probe, or None.
     landmarks : of the registration.
-    told : called with a line if it cannot be kept, once.
-    in_loop : calls a function in the event loop, from any thread.
     """
 
     def __init__(
-        self,
-        session: OwnSession | None,
-        shared: SharedState,
-        logic: UltrasoundSceneLogic,
-        presenter: PanelPresenter,
-        opener: Opener,
-        cine: Cine,
-        pose: Callable[[], np.ndarray | None],
-        landmarks: Callable[[], Sequence[Landmark]],
-        told: Callable[[str], None],
-        in_loop: Callable[[Callable[[], None]], None],
-    ) -> None:
-        self._session, self._shared, self._logic, self._presenter = session, shared, logic, presenter
-        self._opener, self._cine, self._pose = opener, cine, pose
-        self._landmarks, self._told, self._in_loop = landmarks, told, in_loop
+        self, session: OwnSession | None, panel: BrowserPanel, opener: Opener, cine: Cine,
+        pose: Callable[[], np.ndarray | None], landmarks: Callable[[], Sequence[Landmark]],
+    ) -> None:  # fmt: skip
+        self._session, self._shared, self._logic = session, panel.shared, panel.logic
+        self._presenter, self._told, self._in_loop = panel.presenter, panel.showError, panel.tasks.tell
+        self._opener, self._cine, self._pose, self._landmarks = opener, cine, pose, landmarks
         self._is_told = False
         self._is_ended = False
         self._not_before = 0.0  # time, s

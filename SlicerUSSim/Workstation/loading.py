@@ -2,42 +2,43 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Callable, Hashable, Iterable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from trame_slicer.core import SlicerApp
 
 from SlicerUSSim.Logic.base.errors import SimulationError, require
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.mri.given_mask import checked_mask
 from SlicerUSSim.Logic.mri.mask_check import follows
 from SlicerUSSim.Logic.mrml.label_nodes import labels_version
-from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic
-from SlicerUSSim.Logic.mrml.nodes import pose_in_labels, probe_pose, read_volume
+from SlicerUSSim.Logic.mrml.nodes import nodes_of_class, pose_in_labels, probe_pose, read_volume
 from SlicerUSSim.Logic.mrml.taken_sequence import FrozenRecord
 from SlicerUSSim.Logic.placement.craniotomy import disc_diameter_mm
 from SlicerUSSim.Logic.tissue.label_maps import LabelledTissues, as_whole
-from SlicerUSSim.Widget.presenter import PanelPresenter
 from SlicerUSSim.Workstation.anatomy import AnatomyViews
+from SlicerUSSim.Workstation.browser_panel import BrowserPanel
 from SlicerUSSim.Workstation.comparison import Comparison
 from SlicerUSSim.Workstation.content import Kind
-from SlicerUSSim.Workstation.messages import Messages
 from SlicerUSSim.Workstation.opener import FILE, Files, LabelTable, Opener
-from SlicerUSSim.Workstation.patient_nodes import remove_patient_nodes
+from SlicerUSSim.Workstation.pose_registration import Recording, Registration
 from SlicerUSSim.Workstation.probe_control import ProbeControl
-from SlicerUSSim.Workstation.registration import Recording, Registration
 from SlicerUSSim.Workstation.script import LabelSource
-from SlicerUSSim.Workstation.state import ORGANS, SharedState
-from SlicerUSSim.Workstation.tasks import Tasks
+from SlicerUSSim.Workstation.state import ORGANS
 
 #: Roles of nodes of a patient
 _OF_PATIENT = (
     "mri", "labels", "mask", "second_mri", "lesions", "organs", "sheets", "seed", "proposal", "opening", "real",
     "transform_sequence", "image_sequence",
+)  # fmt: skip
+#: What is of a patient: images, labels, surfaces, points, recordings, the costs of a fit
+_PATIENT_CLASSES = (
+    "vtkMRMLSequenceBrowserNode", "vtkMRMLSequenceNode", "vtkMRMLVolumeNode", "vtkMRMLSegmentationNode",
+    "vtkMRMLModelNode", "vtkMRMLMarkupsNode", "vtkMRMLTransformNode", "vtkMRMLPlotChartNode", "vtkMRMLPlotSeriesNode",
+    "vtkMRMLTableNode",
 )  # fmt: skip
 
 
@@ -45,21 +46,11 @@ class Loading:
     """Replaces the patient, or adds data of the same patient. All methods run in a task."""
 
     def __init__(
-        self,
-        shared: SharedState,
-        app: SlicerApp,
-        logic: UltrasoundSceneLogic,
-        tasks: Tasks,
-        opener: Opener,
-        presenter: PanelPresenter,
-        messages: Messages,
-        views: AnatomyViews,
-        probe: ProbeControl,
-        comparison: Comparison,
+        self, panel: BrowserPanel, opener: Opener, views: AnatomyViews, probe: ProbeControl, comparison: Comparison,
         registration: Registration,
-    ) -> None:
-        self._shared, self._scene, self._logic, self._tasks = shared, app.scene, logic, tasks
-        self._opener, self._presenter, self._messages = opener, presenter, messages
+    ) -> None:  # fmt: skip
+        self._shared, self._logic, self._scene, self._tasks = panel.shared, panel.logic, panel.logic.scene, panel.tasks
+        self._panel, self._presenter, self._opener = panel, panel.presenter, opener
         self._views, self._probe, self._comparison = views, probe, comparison
         self._registration = registration
         self._is_new = False  # a patient was opened, on whom the probe is not yet
@@ -121,7 +112,7 @@ class Loading:
 
         def take() -> str | None:
             parameters = self._logic.parameters
-            self._messages.clear()
+            self._panel.clearErrors()
             self._take_mri(mri)
             if parameters.segmentation.contrast != contrast:
                 parameters.segmentation = replace(parameters.segmentation, contrast=contrast)
@@ -176,7 +167,7 @@ class Loading:
             self.labels_ready()
 
         def take() -> None:
-            self._messages.clear()
+            self._panel.clearErrors()
             self.forget_patient(node, *kept)
             if are_of_patient is False:
                 self._dropped = ""  # the user said that it is another patient's
@@ -421,11 +412,12 @@ class Loading:
     def close_patient(self) -> None:
         """Close the patient: nothing of him stays on the page, in the scene or in memory; settings stay."""
         parameters = self._logic.parameters
-        self._messages.clear()
-        self.forget_patient()
-        parameters.mri = parameters.labels = parameters.mask = parameters.second_mri = None
-        self._presenter.notes.set()
-        self.show_title()
+        with self._presenter.acting():
+            self._panel.clearErrors()
+            self.forget_patient()
+            parameters.mri = parameters.labels = parameters.mask = parameters.second_mri = None
+            self._presenter.notes.set()
+            self.show_title()
 
     def forget_patient(self, *new: Any) -> None:
         """Show, choose and keep nothing of the patient before, when another one is opened; `new` are nodes of his."""
@@ -447,7 +439,7 @@ class Loading:
             node: Any = getattr(parameters, role)
             if node not in kept:
                 setattr(parameters, role, None)
-        remove_patient_nodes(self._scene, kept)
+        _remove_patient_nodes(self._scene, kept)
         with self._shared.changing() as now:
             now.fit.curve, now.fit.costs = [], ""
         self._is_new = True
@@ -466,7 +458,7 @@ class Loading:
 
     def begin_patient(self, *nodes: Any) -> None:
         """Close the patient before, also the ultrasound that was opened before him; `nodes` are all of the next one."""
-        self._messages.clear()
+        self._panel.clearErrors()
         self._forget_ultrasound()
         self.forget_patient(*nodes)
 
@@ -504,3 +496,38 @@ class Loading:
 
 def _of_mri(mri_node: Any) -> str:
     return f"of the MRI {mri_node.GetName()}, which is shown: its intensities follow the labels"
+
+
+def _remove_patient_nodes(scene, kept: Iterable[Any]) -> None:
+    """Remove all nodes of these classes, with what displays and stores them, except those that are kept.
+
+    Nodes that are not saved with the scene belong to the views and stay. The scene is the workstation's own: nobody
+    else puts nodes into it.
+    """
+    ids = {node.GetID() for node in kept if node is not None}
+    for name in _PATIENT_CLASSES:
+        for node in nodes_of_class(scene, name):
+            # One may be gone together with another one before
+            if node.GetSaveWithScene() and node.GetScene() is not None and node.GetID() not in ids and _is_data(node):
+                for helper in _helpers(node):
+                    scene.RemoveNode(helper)
+                scene.RemoveNode(node)
+
+
+def _is_data(node) -> bool:
+    """Not a model of a slice view, which Slicer makes and needs."""
+    return (not (node.GetName() or "").endswith("Volume Slice") and not node.GetHideFromEditors()) or _is_shares(node)
+
+
+def _is_shares(node) -> bool:
+    return node.GetAttribute("SlicerUSSim.sharesOf") is not None
+
+
+def _helpers(node) -> list[Any]:
+    """Display and storage nodes, and the colours of labels."""
+    displays = range(node.GetNumberOfDisplayNodes()) if node.IsA("vtkMRMLDisplayableNode") else ()
+    stores = range(node.GetNumberOfStorageNodes()) if node.IsA("vtkMRMLStorableNode") else ()
+    found = [node.GetNthDisplayNode(number) for number in displays]
+    found += [node.GetNthStorageNode(number) for number in stores]
+    found.append(node.GetNodeReference("tissueColors"))
+    return [helper for helper in found if helper is not None]

@@ -13,19 +13,17 @@ from SlicerUSSim.Logic.mri.markups import markup_points
 from SlicerUSSim.Logic.mri.modality import has_brain_mask
 from SlicerUSSim.Logic.mri.pathology import LESIONS
 from SlicerUSSim.Logic.mri.segmentation_settings import CT, MRI_CONTRASTS
-from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic
 from SlicerUSSim.Logic.placement.craniotomy import POLYGONS
 from SlicerUSSim.Logic.tracked.pose_files import read_pose
-from SlicerUSSim.Widget.presenter import PanelPresenter
+from SlicerUSSim.Workstation.browser_panel import BrowserPanel
 from SlicerUSSim.Workstation.content import Kind
 from SlicerUSSim.Workstation.loading import Loading
 from SlicerUSSim.Workstation.opener import Opener, Upload
 from SlicerUSSim.Workstation.parcel import Parcel
 from SlicerUSSim.Workstation.pose_entry import PoseEntry
+from SlicerUSSim.Workstation.pose_registration import Registration
 from SlicerUSSim.Workstation.questions import Questions
-from SlicerUSSim.Workstation.registration import Registration
-from SlicerUSSim.Workstation.state import Choice, SharedState
-from SlicerUSSim.Workstation.tasks import Tasks
+from SlicerUSSim.Workstation.state import Choice
 from SlicerUSSim.Workstation.uploads import listed
 
 #: Keys of choices
@@ -40,19 +38,11 @@ class Opening:
     """Opens what a page has sent. All methods run in a task."""
 
     def __init__(
-        self,
-        shared: SharedState,
-        logic: UltrasoundSceneLogic,
-        tasks: Tasks,
-        opener: Opener,
-        presenter: PanelPresenter,
-        loading: Loading,
-        registration: Registration,
-        questions: Questions,
+        self, panel: BrowserPanel, opener: Opener, loading: Loading, registration: Registration, questions: Questions,
         poses: PoseEntry,
-    ) -> None:
-        self._shared, self._logic, self._tasks = shared, logic, tasks
-        self._opener, self._presenter, self._loading = opener, presenter, loading
+    ) -> None:  # fmt: skip
+        self._shared, self._logic, self._tasks = panel.shared, panel.logic, panel.tasks
+        self._presenter, self._opener, self._loading = panel.presenter, opener, loading
         self._registration, self._questions, self._poses = registration, questions, poses
         #: Opens a scene (.mrb) by its path, in place of the patient, and returns what was done
         self.open_scene: Callable[[str], str] | None = None

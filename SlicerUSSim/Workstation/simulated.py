@@ -10,11 +10,9 @@ import numpy as np
 from trame_server.utils.asynchronous import get_event_loop
 
 from SlicerUSSim.Logic.base.errors import required
-from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic
 from SlicerUSSim.Logic.mrml.taken_sequence import count_taken
-from SlicerUSSim.Widget.presenter import PanelPresenter
+from SlicerUSSim.Workstation.browser_panel import BrowserPanel
 from SlicerUSSim.Workstation.comparison import Comparison
-from SlicerUSSim.Workstation.state import SharedState
 
 #: Seconds between two images while they are played
 _PLAY_EVERY_S = 0.1
@@ -28,15 +26,8 @@ class SimulatedSequence:
     move : called with the pose (4, 4) of an image.
     """
 
-    def __init__(
-        self,
-        shared: SharedState,
-        logic: UltrasoundSceneLogic,
-        presenter: PanelPresenter,
-        comparison: Comparison,
-        move: Callable[[np.ndarray], None],
-    ) -> None:
-        self._shared, self._logic, self._presenter = shared, logic, presenter
+    def __init__(self, panel: BrowserPanel, comparison: Comparison, move: Callable[[np.ndarray], None]) -> None:
+        self._shared, self._logic, self._presenter = panel.shared, panel.logic, panel.presenter
         self._comparison, self._move = comparison, move
         self._playing: asyncio.Task | None = None
 
