@@ -11,7 +11,6 @@ from SlicerUSSim.Logic.imaging.preset import Preset
 from SlicerUSSim.Logic.mrml.fit_nodes import COMPARED, CostPlot
 from SlicerUSSim.Logic.mrml.nodes import composite_of, require_node
 from SlicerUSSim.Logic.mrml.own_results import result_called
-from SlicerUSSim.Logic.mrml.parameter_node import SceneParameters
 from SlicerUSSim.Logic.tracked.sequence import checked_apart, frame_numbers
 from SlicerUSSim.Widget.interface import PanelHost
 from SlicerUSSim.Widget.tissue_presenter import TissuePresenter
@@ -76,13 +75,13 @@ class FitPresenter:
     def canFit(self) -> tuple[bool, str]:
         """(whether Fit is enabled, the reason if not)"""
         can, why_not = self._panel.canSimulate()
-        if can and self._parameters.real is None:
+        if can and self._panel.parameters.real is None:
             return False, "Choose real images first"
         return can, why_not
 
     def fit(self) -> None:
         """Fit to the chosen real images; the preset does not change until apply()."""
-        panel, parameters = self._panel, self._parameters
+        panel, parameters = self._panel, self._panel.parameters
         with panel.acting(), panel.working("Fit") as progress:
             require(parameters.real is not None, "no real images chosen, expected a sequence or a volume")
             free = list(self._groups())  # "tissues" as such: the fit looks which the images show
@@ -107,13 +106,13 @@ class FitPresenter:
             self._show("after", found.tracked.numbers[0])
 
     def _frames(self) -> list[int] | None:
-        text, real = self._parameters.fit.frames.strip(), self._parameters.real
+        text, real = self._panel.parameters.fit.frames.strip(), self._panel.parameters.real
         if not text or not real.IsA("vtkMRMLSequenceNode"):
             return None
         return frame_numbers(text, real.GetNumberOfDataNodes())
 
     def _predicted(self) -> list[int]:
-        text, real = self._parameters.fit.validate, self._parameters.real
+        text, real = self._panel.parameters.fit.validate, self._panel.parameters.real
         if not text.strip():
             return []
         require(real.IsA("vtkMRMLSequenceNode"), "a single image leaves none to predict, expected a sequence")
@@ -180,10 +179,6 @@ class FitPresenter:
         view = self._panel.view.sliceNode()
         if view is not None:
             logic.showFitInSlice(view, found, labels, nodes[kind], nodes["real"], number)
-
-    @property
-    def _parameters(self) -> SceneParameters:
-        return self._panel.logic.parameters
 
 
 def _in_words(found: Fit) -> str:

@@ -108,12 +108,9 @@ class ImagePresenter:
             if images_node is not None and images_node.GetNodeReferenceID(MADE_FROM) not in own:
                 images_node = None  # those of other transforms stay
             with panel.made(images_node, "Sequence", f"{transforms_node.GetName()} ultrasound") as images:
+                browser = self._browser_of(transforms_node)
                 count = panel.logic.simulateSequence(
-                    parameters.labels,
-                    transforms_node,
-                    images,
-                    browser_node=self._browser_of(transforms_node),
-                    progress=progress,
+                    parameters.labels, transforms_node, images, browser_node=browser, progress=progress
                 )
             images.SetNodeReferenceID(MADE_FROM, transforms_node.GetID())
             parameters.image_sequence = images  # in place of which the next ones come

@@ -25,6 +25,10 @@ _WIDGETS: dict[Kind, str] = {
 }  # fmt: skip
 
 
+#: Whether a control can be used, or (whether it can, the reason if not)
+Can: TypeAlias = Callable[[], bool | tuple[bool, str]]
+
+
 @dataclass(frozen=True)
 class Control:
     """One element of the panel, which displays or sets a value or runs an action."""
@@ -47,8 +51,8 @@ class Control:
     sets: Callable[[Any], object] | None = None
     #: Called when a button is pressed, unless the view has an action of its own in place of it
     action: Callable[..., object] | None = None
-    #: Whether it can be used, as a bool or as (bool, the reason if not). None: always, and without additional packages
-    enabled: Callable[[], bool | tuple[bool, str]] | None = None
+    #: Whether it can be used; None: always, and without additional packages
+    enabled: Can | None = None
     #: Values, and sections of the preset, on which what it shows depends, besides chosen nodes and actions
     depends: tuple[str, ...] = ()
 

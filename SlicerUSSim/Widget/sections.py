@@ -18,7 +18,7 @@ from SlicerUSSim.Logic.mrml.parameter_node import SceneParameters, SettingsParam
 from SlicerUSSim.Logic.probe.arrays import PROBES, Probe
 from SlicerUSSim.Logic.tissue.presets import TISSUES
 from SlicerUSSim.Logic.tissue.tissue import TISSUE_PARAMETERS
-from SlicerUSSim.Widget.interface import Control, Kind, Row, Section
+from SlicerUSSim.Widget.interface import Can, Control, Kind, Row, Section
 from SlicerUSSim.Widget.presenter import PanelPresenter
 from SlicerUSSim.Widget.value_presenter import CUSTOM_PROBE, OPTIONAL, SCENE, SHOWN_PROBES, value_parameter
 
@@ -47,38 +47,32 @@ def _inputs(panel: PanelPresenter) -> tuple[Row, ...]:
     return (
         node("mri", "MRI", "MRI of a whole head, or of a skull-stripped brain"),
         node(
-            "mask", "Mask",
-            "Brain mask: a segmentation, or a label map on the MRI's grid; none: Segment extracts the brain from a "
-            "whole head, and keeps its mask here",
+            "mask", "Mask", "Brain mask: a segmentation, or a label map on the MRI's grid; none: Segment extracts the "
+            "brain from a whole head, and keeps its mask here",
         ),
         node(
-            "second_mri", "Second MRI",
-            "Another MRI of the same patient, on any grid, such as T2 or FLAIR: registered to the first and classified "
-            "together with it",
+            "second_mri", "Second MRI", "Another MRI of the same patient, on any grid, such as T2 or FLAIR: "
+            "registered to the first and classified together with it",
         ),
         value("scene.second_contrast"),
         *_of_scene(SceneParameters.segmentation),
         node(
-            "organs", "Organs of a CT",
-            "Label map or segmentation of organs of a CT (contrast ct), such as TotalSegmentator's, on any grid: its "
-            "soft tissues replace muscle and blood",
+            "organs", "Organs of a CT", "Label map or segmentation of organs of a CT (contrast ct), such as "
+            "TotalSegmentator's, on any grid: its soft tissues replace muscle and blood",
         ),
         node(
-            "labels", "Tissues",
-            "Segmentation or label map of the tissues: the output of Segment, or your own with names of tissues "
-            "(csf, grey matter, white matter, tumour, blood, skull, ...)", new_node="Tissues",
+            "labels", "Tissues", "Segmentation or label map of the tissues: the output of Segment, or your own with "
+            "names of tissues (csf, grey matter, white matter, tumour, blood, skull, ...)", new_node="Tissues",
         ),
         node(
-            "lesions", "Lesions",
-            "Segmentation whose segments are called tumour, oedema, necrosis, cyst, haematoma, cavity or as another "
-            "tissue, on any grid; Segment and Add to tissues lay them over the tissues, the last on top",
-            new_node="Lesions",
+            "lesions", "Lesions", "Segmentation whose segments are called tumour, oedema, necrosis, cyst, haematoma, "
+            "cavity or as another tissue, on any grid; Segment and Add to tissues lay them over the tissues, the last "
+            "on top", new_node="Lesions",
         ),
         (
             button(
-                "segment", "Segment",
-                "Segment the tissues of the MRI (some seconds), and lay the lesions over them; tissues that were not "
-                "made by Segment, or edited since, are kept: the result is then a new node",
+                "segment", "Segment", "Segment the tissues of the MRI (some seconds), and lay the lesions over them; "
+                "tissues that were not made by Segment, or edited since, are kept: the result is then a new node",
                 panel.segmenting.segment, panel.segmenting.canSegment,
             ),
             button(
@@ -103,18 +97,15 @@ def _sheets() -> tuple[Row, ...]:
     return (
         *_of_scene(SceneParameters.sheet),
         node(
-            "sheets", "Sheets",
-            "Model of the thin sheets that images show: those that Segment found, or a .vtp of ussim segment --sheets; "
-            "none: the lines of the labels",
+            "sheets", "Sheets", "Model of the thin sheets that images show: those that Segment found, or a .vtp of "
+            "ussim segment --sheets; none: the lines of the labels",
         ),
     )  # fmt: skip
 
 
 def _lesions(panel: PanelPresenter) -> tuple[Row, ...]:
     return (
-        node(
-            "seed", "Point", "Markups whose last point lies in the lesion", new_node="Lesion",
-        ),
+        node("seed", "Point", "Markups whose last point lies in the lesion", new_node="Lesion"),
         value("scene.lesion_as"),
         (
             button(
@@ -158,9 +149,8 @@ def _probe(panel: PanelPresenter) -> tuple[Row, ...]:
         ),
         *values(*(name for name in _probe_values() if name not in _CONSOLE)),
         node(
-            "probe_transform", "Transform",
-            "Linear transform of the probe [mm]: x to the right of the image, y along its depth, origin in the "
-            "middle of the probe face", new_node="Probe",
+            "probe_transform", "Transform", "Linear transform of the probe [mm]: x to the right of the image, y along "
+            "its depth, origin in the middle of the probe face", new_node="Probe",
         ),
         (
             button(
@@ -187,15 +177,13 @@ def _craniotomy(panel: PanelPresenter) -> tuple[Row, ...]:
     return (
         value("scene.craniotomy_mm"),
         node(
-            "opening", "Opening",
-            "What is opened instead of a disc under the probe: a closed curve or other markups, whose points are a "
-            "polygon over the skin, or a label map or segmentation",
+            "opening", "Opening", "What is opened instead of a disc under the probe: a closed curve or other markups, "
+            "whose points are a polygon over the skin, or a label map or segmentation",
         ),
         (
             button(
-                "openCraniotomy", "Open skull",
-                "Replace skin, scalp and skull in the opening by the coupling medium, in new labels; the tissues need "
-                "them, as Segment makes them with Label what is outside the brain",
+                "openCraniotomy", "Open skull", "Replace skin, scalp and skull in the opening by the coupling medium, "
+                "in new labels; the tissues need them, as Segment makes them with Label what is outside the brain",
                 panel.placing.openCraniotomy, panel.placing.canOpenCraniotomy,
             ),
             button(
@@ -215,10 +203,7 @@ def _tissues(panel: PanelPresenter) -> tuple[Row, ...]:
             "the tool tip of a value is its source", depends=("tissues",),
         ),
         (
-            Control(
-                "tissuePreset", "choice", tip="Tissue to copy to the selected line",
-                choices=tuple(TISSUES),
-            ),
+            Control("tissuePreset", "choice", tip="Tissue to copy to the selected line", choices=tuple(TISSUES)),
             button(
                 "assignTissue", "Use for selected line",
                 "Copy the parameters of the tissue on the left to the selected line", panel.tissues.assignTissue,
@@ -231,10 +216,7 @@ def _tissues(panel: PanelPresenter) -> tuple[Row, ...]:
 def _sequence(panel: PanelPresenter) -> tuple[Row, ...]:
     return (
         node("transform_sequence", "Transforms", "Recorded sequence of probe transforms"),
-        node(
-            "image_sequence", "Images", "Sequence for the simulated images; none: a new one",
-            new_node="Ultrasound",
-        ),
+        node("image_sequence", "Images", "Sequence for the simulated images; none: a new one", new_node="Ultrasound"),
         button(
             "simulateSequence", "Simulate sequence",
             "Simulate one image for each transform; the same sequence browser plays them",
@@ -246,9 +228,8 @@ def _sequence(panel: PanelPresenter) -> tuple[Row, ...]:
 def _fit(panel: PanelPresenter) -> tuple[Row, ...]:
     return (
         node(
-            "real", "Real images",
-            "Real ultrasound: a sequence of tracked images with its browser, a volume of one slice, or a 3D volume, "
-            "which is resliced in the image plane",
+            "real", "Real images", "Real ultrasound: a sequence of tracked images with its browser, a volume of one "
+            "slice, or a 3D volume, which is resliced in the image plane",
         ),
         *_of_scene(SceneParameters.fit),
         Control(
@@ -272,9 +253,8 @@ def _fit(panel: PanelPresenter) -> tuple[Row, ...]:
         ),
         Control("fit", "words", tip="Result of the last fit", shows=lambda: panel.fits.summary),
         Control(
-            "compare", "choice", "Show",
-            "Image of the fit in the slice view: real, simulated, or their difference (grey: zero); the real image is "
-            "in the background, and the view's opacity slider blends the two",
+            "compare", "choice", "Show", "Image of the fit in the slice view: real, simulated, or their difference "
+            "(grey: zero); the real image is in the background, and the view's opacity slider blends the two",
             choices=tuple(COMPARED), enabled=panel.fits.canCompare,
         ),
         Control(
@@ -291,13 +271,10 @@ def _fit(panel: PanelPresenter) -> tuple[Row, ...]:
 def _output(panel: PanelPresenter) -> tuple[Row, ...]:
     return (
         node(
-            "output", "Ultrasound",
-            "Volume for the image, placed under the probe's transform; none: a new one",
+            "output", "Ultrasound", "Volume for the image, placed under the probe's transform; none: a new one",
             new_node="Ultrasound",
         ),
-        node(
-            "outline", "Outline", "Model for the imaged field; none: a new one", new_node="Ultrasound outline"
-        ),
+        node("outline", "Outline", "Model for the imaged field; none: a new one", new_node="Ultrasound outline"),
         (
             button(
                 "simulate", "Simulate", "Simulate one image at the pose of the probe",
@@ -374,13 +351,7 @@ def node(role: str, label: str, tip: str, new_node: str = "") -> Control:
     return Control(_camel_case(role), "node", label, tip, node=role, new_node=new_node)
 
 
-def button(
-    name: str,
-    label: str,
-    tip: str,
-    action: Callable[..., object],
-    enabled: Callable[[], bool | tuple[bool, str]] | None = None,
-) -> Control:
+def button(name: str, label: str, tip: str, action: Callable[..., object], enabled: Can | None = None) -> Control:
     """A button."""
     return Control(name, "button", label, tip, action=action, enabled=enabled)
 

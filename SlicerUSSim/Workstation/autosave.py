@@ -62,16 +62,13 @@ class _Taken:
     #: Without its sequence
     anatomy: SceneRecord | None
     sequence: SequenceRecord | None
-    #: Whether there is one at all
-    has_sequence: bool
     #: Images of Simulate sequence
     simulated: SimulatedRecord | None
-    has_simulated: bool
     #: The image that stays where it was taken
     frozen: FrozenRecord | None
-    has_frozen: bool
     fit: tuple | None
-    has_fit: bool
+    #: Names of those of these four that there are not at all
+    missing: tuple[str, ...]
     #: Images that are new, and whether they begin a loop
     cine: list[CineImage]
     is_new_loop: bool
@@ -195,12 +192,11 @@ class Autosave:
             "landmarks": [mark.to_list() for mark in self._landmarks()],
         }
         is_new_loop = self._cine.loop != self._cine_seen[0]
+        parts = {"sequence": sequence, "simulated": simulated, "frozen": frozen, "fit": fit}
         taken = _Taken(
-            self._opener.patient(), state, record,
-            sequence if is_new_sequence else None, sequence is not None, made, simulated is not None,
-            image, frozen is not None,
+            self._opener.patient(), state, record, sequence if is_new_sequence else None, made, image,
             (replace(fit[0], simulator=None), fit[1]) if fit is not None and is_new_fit else None,
-            fit is not None, self._cine.since(0 if is_new_loop else self._cine_seen[1]), is_new_loop,
+            tuple(name for name, part in parts.items() if part is None), self._cine.since(0 if is_new_loop else self._cine_seen[1]), is_new_loop,
             dict(self._opener.sent_files.files),
         )  # fmt: skip
         self._seen, self._anatomy_seen, self._sequence_seen, self._fit_seen = seen, anatomy, sequence, fit
@@ -264,33 +260,20 @@ class Autosave:
         if size > room:
             session.clear()
             raise SimulationError(f"{taken.patient} has {size / 2**30:.1f} GB, expected at most {room / 2**30:.1f} GB")
-        if taken.anatomy is not None:
-            self._put("anatomy", taken.anatomy)
-        if taken.sequence is not None:
-            self._put("sequence", taken.sequence)
-        if taken.simulated is not None:
-            self._put("simulated", taken.simulated)
-        if taken.frozen is not None:
-            self._put("frozen", taken.frozen)
-        if taken.fit is not None:
-            self._put("fit", taken.fit)
+        for part in ("anatomy", "sequence", "simulated", "frozen", "fit"):
+            if getattr(taken, part) is not None:
+                self._put(part, getattr(taken, part))
         # By their places: another patient may have a file of the same name
         sent = {name: self._sent.get(path) or self._copied(path) for name, path in taken.sent.items()}
         self._files["sent"] = {name: file for name, file in sent.items() if file is not None}
-        for part, is_there in (
-            ("sequence", taken.has_sequence), ("simulated", taken.has_simulated), ("frozen", taken.has_frozen),
-            ("fit", taken.has_fit),
-        ):  # fmt: skip
-            if not is_there:
-                self._files.pop(part, None)
+        for part in taken.missing:
+            self._files.pop(part, None)
         if taken.is_new_loop:
             self._chunks = []
         if taken.cine:
             self._number += 1
-            name, images = (
-                f"cine-{self._number}",
-                [(seconds, _jpeg(image), about) for seconds, image, about in taken.cine],
-            )
+            name = f"cine-{self._number}"
+            images = [(seconds, _jpeg(image), about) for seconds, image, about in taken.cine]
             session.write(name, lambda file: write_values(file, images))
             self._chunks.append((name, len(images)))
         while self._chunks and sum(count for _, count in self._chunks[1:]) >= MOST_IMAGES:

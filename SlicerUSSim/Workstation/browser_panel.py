@@ -170,14 +170,14 @@ class BrowserPanel:
         stale = {name: control for name, control in self._controls.items() if control.depends_on(changed)}
         can = {name: control.usable() for name, control in stale.items() if control.enabled}
         nodes = {name: self._nodes_for(control) for name, control in stale.items() if control.node}
-        self.shared.show_values(
-            {name: self._shown_value(control) for name, control in stale.items() if _has_value(control)}
-        )
+        shown = {name for name, control in stale.items() if control.value or control.node or control.shows}
+        self.shared.show_values({name: self._shown_value(stale[name]) for name in shown})
         with self.shared.changing() as now:
             panel = now.panel
-            panel.nodes = {**panel.nodes, **nodes}
-            panel.can = {**panel.can, **{name: is_usable for name, (is_usable, _) in can.items()}}
-            panel.tips = {**panel.tips, **{name: tip for name, (_, tip) in can.items()}}
+            if nodes or can:
+                panel.nodes = {**panel.nodes, **nodes}
+                panel.can = {**panel.can, **{name: is_usable for name, (is_usable, _) in can.items()}}
+                panel.tips = {**panel.tips, **{name: tip for name, (_, tip) in can.items()}}
             if any(control.kind == "table" for control in stale.values()):
                 panel.tissues = [_line(row) for row in self.presenter.tissues.rows()]
             if any(control.kind == "list" for control in stale.values()):
@@ -329,10 +329,6 @@ class BrowserPanel:
             function()
         else:
             self.tasks.tell(function)
-
-
-def _has_value(control: Control) -> bool:
-    return bool(control.value or control.node or control.shows)
 
 
 def _line(row: TissueRow) -> TissueLine:

@@ -84,7 +84,7 @@ class Loading:
                 node, found = self._opener.labels(files.labels)
                 self._take_labels(node, found, self._mri_of(found.labels))
                 if files.additions:
-                    self.add_tissues()
+                    self.lay(self._presenter.lesions.addTissues)
             else:
                 self.segment()
             self._open_at_start(files)
@@ -266,16 +266,10 @@ class Loading:
             self.labels_ready()
         self.show_title()
 
-    def add_tissues(self) -> None:
-        """Lay the lesions over the tissues."""
+    def lay(self, action: Callable[[], None]) -> None:
+        """Run an action that lays the lesions over the tissues."""
         source, patient = self._opener.known_source(self._logic.parameters.labels), self._opener.patient()
-        if self._changed(self._presenter.lesions.addTissues):
-            self._laid(source, patient)
-
-    def accept_proposal(self) -> None:
-        """Move what is proposed to the lesions, and lay them over the tissues."""
-        source, patient = self._opener.known_source(self._logic.parameters.labels), self._opener.patient()
-        if self._changed(self._presenter.lesions.acceptProposal):
+        if self._changed(action):
             self._laid(source, patient)
 
     def open_craniotomy(self) -> None:
@@ -301,7 +295,7 @@ class Loading:
         if files.craniotomy not in ("auto", "disc:"):
             parameters.opening = self._opener.opening(files.craniotomy)
             self.open_craniotomy()
-            self.place_probe()
+            self.place(self._presenter.placing.placeProbe)
             return
         self._logic.placeProbe(parameters.labels, parameters.probe_transform, will_open=True)
         self.open_craniotomy()
@@ -311,14 +305,9 @@ class Loading:
         if self._changed(self._presenter.placing.closeCraniotomy):
             self.labels_ready()
 
-    def place_probe(self) -> None:
-        """Place the probe at a typical craniotomy."""
-        self._presenter.placing.placeProbe()
-        self._probe.look()
-
-    def place_at_view(self) -> None:
-        """Place the probe where the chosen standard view is seen from."""
-        self._presenter.placing.placeAtView()
+    def place(self, action: Callable[[], None]) -> None:
+        """Run an action that places the probe, and look at it."""
+        action()
         self._probe.look()
 
     def show_title(self) -> None:

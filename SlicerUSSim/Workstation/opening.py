@@ -47,19 +47,11 @@ class Opening:
         #: Opens a scene (.mrb) by its path, in place of the patient, and returns what was done
         self.open_scene: Callable[[str], str] | None = None
         self._took: dict[Kind, Callable[[Upload, list[Upload]], tuple[str, Callable[[], object]]]] = {
-            Kind.MRI: self._mri,
-            Kind.CT: self._mri,
-            Kind.LABELS: self._labels,
-            Kind.MASK: self._mask,
-            Kind.LESIONS: self._mask,
-            Kind.SEQUENCE: self._sequence,
-            Kind.SHEETS: self._sheets,
-            Kind.SCENE: self._scene,
-            Kind.PRESET: self._preset,
-            Kind.TRANSFORM: self._transform,
-            Kind.POSE: self._pose,
+            Kind.MRI: self._mri, Kind.CT: self._mri, Kind.LABELS: self._labels, Kind.MASK: self._mask,
+            Kind.LESIONS: self._mask, Kind.SEQUENCE: self._sequence, Kind.SHEETS: self._sheets, Kind.SCENE: self._scene,
+            Kind.PRESET: self._preset, Kind.TRANSFORM: self._transform, Kind.POSE: self._pose,
             Kind.POINTS: self._points,
-        }
+        }  # fmt: skip
 
     def open(self, files: Mapping[str, bytes], meant: str = "") -> None:
         """Open what a page has sent, {name: content}: any files of a patient, his ultrasound, and settings.
@@ -278,15 +270,12 @@ class Opening:
             return False
         return True
 
-    def _require_recording(self, upload: Upload) -> None:
-        require(
-            self._registration.recording is not None,
-            f"{upload.name}: {upload.content.what}, expected tracked ultrasound first, to which it belongs",
-        )
-
     def _transform_as(self, upload: Upload, key: str) -> tuple[str, Callable[[], object]]:
         registration = self._registration
-        self._require_recording(upload)
+        require(
+            registration.recording is not None,
+            f"{upload.name}: {upload.content.what}, expected tracked ultrasound first, to which it belongs",
+        )
         if key == _CALIBRATION:
             return "calibration of the tracked ultrasound", registration.reading_calibration(upload.path)
         return "registration of the tracked ultrasound", registration.reading_registration(upload.path)

@@ -80,16 +80,11 @@ POSE_SLIDERS = (
     PoseSlider("tilt_deg", "Tilt", "Out of the image plane (keys W, S; Shift and drag)", -75, 75, 0.5, "°"),
     PoseSlider("lift_mm", "Lift", "Off the surface; negative: pressed in (keys +, -)", -10, 30, 0.5, "mm"),
 )
-_EXPORTS = (
-    ("png", "Image (PNG)"),
-    (".nrrd", "Image with geometry (NRRD)"),
-    (".mha", "Image with geometry (MHA)"),
-    (".vti", "Image with geometry (VTI)"),
-    ("gif", "Cine of the last images (GIF)"),
-    ("mrb", "Scene for 3D Slicer (MRB)"),
-    ("json", "Settings (JSON)"),
-    ("zip", "Python script with its files (ZIP)"),
-)
+_EXPORTS = {
+    "png": "Image (PNG)", ".nrrd": "Image with geometry (NRRD)", ".mha": "Image with geometry (MHA)",
+    ".vti": "Image with geometry (VTI)", "gif": "Cine of the last images (GIF)", "mrb": "Scene for 3D Slicer (MRB)",
+    "json": "Settings (JSON)", "zip": "Python script with its files (ZIP)",
+}  # fmt: skip
 
 #: In the browser's tab
 _PROGRAM = "SlicerUSSim"
@@ -377,7 +372,7 @@ def _tools() -> None:
             with v3.Template(v_slot_activator="{ props }"):
                 v3.VBtn("Export", size="small", v_bind="props", prepend_icon="mdi-download", id="export")
             with v3.VList(density="compact"):
-                for kind, words in _EXPORTS:
+                for kind, words in _EXPORTS.items():
                     v3.VListItem(title=words, click=f"window.ussim.save('{kind}')", id=f"export-{kind.strip('.')}")
                 v3.VListItem(title="Copy as Python", click="trigger('script')", id="export-python")
 

@@ -6,6 +6,7 @@ import asyncio
 import secrets
 from collections.abc import Callable
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from time import perf_counter
 from typing import Any, cast
@@ -100,19 +101,23 @@ class Workstation:
         self._image_node = Observed("ImageDataModifiedEvent", self._images.image_changed)
         self._parameter_node = Observed("ModifiedEvent", self._parameters_changed)
         self._parameter_node.watch(logic.parameters.node)
+        segmenting, lesions, placing = presenter.segmenting, presenter.lesions, presenter.placing
         panel.own_actions |= {
-            presenter.segmenting.segment: loading.segment,
-            presenter.segmenting.undoSegment: loading.undo_segment,
-            presenter.lesions.addTissues: loading.add_tissues,
-            presenter.lesions.acceptProposal: loading.accept_proposal,
-            presenter.placing.openCraniotomy: loading.open_craniotomy,
-            presenter.placing.closeCraniotomy: loading.close_craniotomy,
-            presenter.placing.placeProbe: loading.place_probe,
-            presenter.placing.placeAtView: loading.place_at_view,
+            segmenting.segment: loading.segment,
+            segmenting.undoSegment: loading.undo_segment,
+            lesions.addTissues: partial(loading.lay, lesions.addTissues),
+            lesions.acceptProposal: partial(loading.lay, lesions.acceptProposal),
+            placing.openCraniotomy: loading.open_craniotomy,
+            placing.closeCraniotomy: loading.close_craniotomy,
+            placing.placeProbe: partial(loading.place, placing.placeProbe),
+            placing.placeAtView: partial(loading.place, placing.placeAtView),
         }
         self._answer_pages(stamps)
         self._follow_pages()
-        receiver = Receiver(self._open_files, self._add_file, panel.showError, self._open_pose)
+        opened, added = partial(self._then_refresh, self._opening.open), partial(self._then_refresh, loading.add)
+        receiver = Receiver(
+            self._in_task(opened), self._in_task(added), panel.showError, self._in_task(self._poses.open)
+        )  # fmt: skip
         self.server.controller.on_server_bind.add(lambda wslink: receiver.serve(wslink.app))
         self.server.controller.on_server_bind.add(lambda wslink: Sender(self._export).serve(wslink.app))
         self.server.controller.on_server_ready.add(self._ready)
@@ -195,7 +200,7 @@ class Workstation:
             "cancel": self._panel.cancel,
             "dismiss": self._panel.dismiss,
             "script": self._show_script,
-            "restore_session": self._in_task(lambda: self._then_refresh(self._restoring.restore)),
+            "restore_session": self._in_task(partial(self._then_refresh, self._restoring.restore)),
             "discard_session": self._in_task(self._restoring.discard),
             "session_kept": self._session_kept,
             "stamp": stamps.receive,
@@ -214,15 +219,6 @@ class Workstation:
 
     def _in_task(self, method: Callable[..., None]) -> Callable[..., None]:
         return lambda *arguments: self._tasks.start(lambda: method(*arguments))
-
-    def _open_files(self, files: dict[str, bytes], meant: str) -> None:
-        self._tasks.start(lambda: self._then_refresh(self._opening.open, files, meant))
-
-    def _add_file(self, name: str, content: bytes, tissue: str) -> None:
-        self._tasks.start(lambda: self._then_refresh(self._loading.add, name, content, tissue))
-
-    def _open_pose(self, name: str, content: bytes) -> None:
-        self._tasks.start(lambda: self._poses.open(name, content))
 
     def _then_refresh(self, method: Callable[..., None], *arguments: object) -> None:
         method(*arguments)
