@@ -196,7 +196,8 @@ class Autosave:
         taken = _Taken(
             self._opener.patient(), state, record, sequence if is_new_sequence else None, made, image,
             (replace(fit[0], simulator=None), fit[1]) if fit is not None and is_new_fit else None,
-            tuple(name for name, part in parts.items() if part is None), self._cine.since(0 if is_new_loop else self._cine_seen[1]), is_new_loop,
+            tuple(name for name, part in parts.items() if part is None),
+            self._cine.since(0 if is_new_loop else self._cine_seen[1]), is_new_loop,
             dict(self._opener.sent_files.files),
         )  # fmt: skip
         self._seen, self._anatomy_seen, self._sequence_seen, self._fit_seen = seen, anatomy, sequence, fit
