@@ -54,11 +54,6 @@ _NOT_GIVEN = (None, False, ())
 _TEXTS = (".json", ".vtp", ".tfm", ".h5", ".hdf5", ".mat", ".xfm", ".xml", ".tag", ".txt")
 
 
-def _contrast_option(command: Any) -> Any:
-    """--contrast, and --ct for one of its values."""
-    return parameter_option(SegmentationSettings, "contrast")(ct_option(command))
-
-
 def _option(*names: str, **about: Any) -> Any:
     return declared(click.option(*names, **about))
 
@@ -79,7 +74,7 @@ class ServeOptions:
     calibration: str | None = declared(calibration_option)
     to_mri: str | None = declared(to_mri_option)
     preset: str | None = _option("--preset", type=click.Path(), help="Probe, display, settings and tissues as JSON.")
-    contrast: str = declared(_contrast_option)
+    contrast: str = declared(lambda command: parameter_option(SegmentationSettings, "contrast")(ct_option(command)))
     skull_strip: str = declared(parameter_option(SegmentationSettings, "skull_strip"))
     outside: bool = declared(parameter_option(SegmentationSettings, "outside"))
     mask: str | None = declared(mask_option)

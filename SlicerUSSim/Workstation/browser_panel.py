@@ -89,11 +89,7 @@ class BrowserPanel:
     """
 
     def __init__(
-        self,
-        shared: SharedState,
-        logic: UltrasoundSceneLogic,
-        tasks: Tasks,
-        about_to_compute: Callable[[], None],
+        self, shared: SharedState, logic: UltrasoundSceneLogic, tasks: Tasks, about_to_compute: Callable[[], None]
     ) -> None:
         self.shared, self.logic, self.tasks = shared, logic, tasks
         self._about_to_compute = about_to_compute
