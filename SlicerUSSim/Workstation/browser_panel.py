@@ -20,6 +20,7 @@ from SlicerUSSim.Logic.base.errors import Cancelled, SimulationError, require, r
 from SlicerUSSim.Logic.mrml.fitting_nodes import offered
 from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic
 from SlicerUSSim.Logic.mrml.nodes import nodes_of_class
+from SlicerUSSim.Logic.mrml.taken_sequence import count_taken
 from SlicerUSSim.Widget.interface import Control, by_widget
 from SlicerUSSim.Widget.presenter import PanelPresenter
 from SlicerUSSim.Widget.sections import panel_sections
@@ -96,8 +97,6 @@ class BrowserPanel:
         self._thread = threading.get_ident()
         #: Calls a function with the point (3,), in the world, of the next click in a slice view, or None
         self.pick: Callable[[Callable[[np.ndarray | None], None]], None] = lambda clicked: None
-        #: Called after every change, such as when live images have ended, or begun to wait for other work
-        self.refreshed: Callable[[], None] = lambda: None
         #: The work under way: its title, whether it is cancelled, and the task that does it. The last is shown
         self._under_way: list[_Work] = []
         self._status, self._status_until = "", 0.0
@@ -178,7 +177,15 @@ class BrowserPanel:
                 panel.tissues = [_line(row) for row in self.presenter.tissues.rows()]
             if any(control.kind == "list" for control in stale.values()):
                 now.fit.free = [FreeParameter(name, on) for name, on in self.presenter.fits.freeParameters()]
-        self.refreshed()
+            length = count_taken(self.logic.parameters.image_sequence)
+            if now.simulated.length != length:
+                now.simulated.length, now.simulated.number = length, 0
+        self.tellFrozen()
+
+    def tellFrozen(self) -> None:
+        """Mark an image that does not follow the probe, since live images ended or wait for other work."""
+        with self.shared.changing() as now:
+            now.is_frozen = self.logic.taken is not None and (not self.logic.isLive or self.presenter.isBusy)
 
     @contextmanager
     def progress(self, title: str) -> Iterator[Callable[[float], None]]:

@@ -33,7 +33,7 @@ class ImageFlow:
         self, panel: BrowserPanel, views: AnatomyViews, comparison: Comparison, cine: Cine, tracker: Tracker,
         stamps: LatencyStamps,
     ) -> None:  # fmt: skip
-        self._shared, self._logic, self._presenter, self._views = panel.shared, panel.logic, panel.presenter, views
+        self._panel, self._logic, self._views = panel, panel.logic, views
         self._comparison, self._cine, self._tracker, self._stamps = comparison, cine, tracker, stamps
         self._simulated = ImageStream("simulated")
         self._field: tuple[tuple[ImageGrid, Probe], np.ndarray] | None = None
@@ -64,7 +64,7 @@ class ImageFlow:
             self._comparison.sees_nothing(taken.grid)
         else:
             self._comparison.compare(taken.image, taken.grid)
-        self.tell_frozen()
+        self._panel.tellFrozen()
 
     def clear(self) -> None:
         """Show no image anywhere, since that of before is not of this patient or pose."""
@@ -72,14 +72,7 @@ class ImageFlow:
         self._cine.clear()
         self._views.hide_image()
         self._comparison.sees_nothing(None)
-        self.tell_frozen()
-
-    def tell_frozen(self) -> None:
-        """Mark an image that does not follow the probe, since live images ended or wait for other work."""
-        is_frozen = self._logic.taken is not None and (not self._logic.isLive or self._presenter.isBusy)
-        if self._shared.now.is_frozen != is_frozen:
-            with self._shared.changing() as now:
-                now.is_frozen = is_frozen
+        self._panel.tellFrozen()
 
     def show_again(self) -> None:
         """Send the current images again, for a page that has just opened."""

@@ -10,7 +10,6 @@ import numpy as np
 from trame_server.utils.asynchronous import get_event_loop
 
 from SlicerUSSim.Logic.base.errors import required
-from SlicerUSSim.Logic.mrml.taken_sequence import count_taken
 from SlicerUSSim.Workstation.browser_panel import BrowserPanel
 from SlicerUSSim.Workstation.comparison import Comparison
 
@@ -30,16 +29,6 @@ class SimulatedSequence:
         self._shared, self._logic, self._presenter = panel.shared, panel.logic, panel.presenter
         self._comparison, self._move = comparison, move
         self._playing: asyncio.Task | None = None
-
-    def look(self) -> None:
-        """Tell the pages how many images the chosen sequence has."""
-        length = count_taken(self._logic.parameters.image_sequence)
-        if length == 0:
-            self.stop()
-        simulated = self._shared.now.simulated
-        if simulated.length != length:
-            with self._shared.changing() as now:
-                now.simulated.length, now.simulated.number = length, 0
 
     def show(self, number: int) -> None:
         """Show the image with this index where it was taken, with the probe there, and the real image of that pose."""

@@ -52,7 +52,7 @@ class NodeItem:
 
 @dataclass(frozen=True)
 class TissueLine:
-    """A line of the tissue table, in the order of presenter.TISSUE_COLUMNS."""
+    """A line of the tissue table, in the order of tissue_presenter.TISSUE_COLUMNS."""
 
     name: str
     values: list[str]

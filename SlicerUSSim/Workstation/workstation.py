@@ -78,7 +78,6 @@ class Workstation:
         self._tracker = Tracker(shared, tasks, probe.move)
         self._images = ImageFlow(panel, self._views, comparison, cine, self._tracker, stamps)
         self._simulated = SimulatedSequence(panel, comparison, probe.move)
-        panel.refreshed = self._refreshed
         opener = Opener(app.scene, logic, tasks, files)
         presenter.segmenting.maskFile, presenter.segmenting.sheetsFile = opener.mask_file, opener.sheets_file
         panel.pick = probe.hand.pick
@@ -243,10 +242,6 @@ class Workstation:
         self._tasks.start(export)
         return await exported
 
-    def _refreshed(self) -> None:
-        self._images.tell_frozen()
-        self._simulated.look()
-
     def _play(self) -> None:
         self._simulated.stop()
         self._comparison.play()
@@ -317,7 +312,7 @@ class Workstation:
         if self._image_node.watch(parameters.output) and taken is not None and taken.node is parameters.output:
             self._images.image_changed()  # it is in there already, as the frozen one of a scene at the start
         self._probe.draw()
-        self._images.tell_frozen()
+        self._panel.tellFrozen()
         if self._logic.isLive:
             with self._presenter.shown():
                 self._probe.update_surface()
