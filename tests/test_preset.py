@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import fields
+
 import numpy as np
 import pytest
 from hypothesis import given, strategies as st
@@ -98,9 +100,9 @@ PRESETS = [
 
 
 @pytest.mark.parametrize("preset", PRESETS)
-def test_a_preset_as_texts_has_what_is_not_the_default(preset):
+def test_a_preset_as_texts_has_every_value(preset):
     texts = preset.to_texts()
     assert Preset.from_texts(texts) == preset and Preset.from_texts(texts).tissues == preset.tissues
-    assert (texts == {}) == (preset == Preset())
+    assert {f"display.{entry.name}" for entry in fields(preset.display)} <= texts.keys()
     sources = [tissue.sources for tissue in preset.tissues.all_tissues()]
     assert [tissue.sources for tissue in Preset.from_texts(texts).tissues.all_tissues()] == sources

@@ -835,7 +835,6 @@ def test_a_changed_value_of_a_preset_is_one_changed_parameter(bench):
     parameters, logic = bench.logic.parameters, bench.logic
     logic.preset = Preset()
     before, events = parameters.texts, []
-    assert not any(name.startswith(("probe.", "display.", "settings.", "tissues.", "membrane.")) for name in before)
     tag = parameters.node.AddObserver(vtkCommand.ModifiedEvent, lambda *_: events.append(1))
     logic.preset = logic.preset.changed("display", gain_db=3.0, image_size=(64, 48))
     assert parameters.texts == {**before, "display.gain_db": "3.0", "display.image_size": "64, 48"} and len(events) == 1

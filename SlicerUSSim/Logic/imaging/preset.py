@@ -122,16 +122,15 @@ class Preset:
         return cls(**sections)
 
     def to_texts(self) -> dict[str, str]:
-        """{name: text} of the values that differ from Preset(), or from PROBES for another kind of probe.
+        """{name: text} of all values, so that what is kept does not change with the defaults of a later version.
 
         Names are those of preset_parameters, and "tissues.2" for label 2 or "membrane.fluids", whose values are JSON:
         null for what this preset lacks. The pose is left out.
         """
-        values, default, declared = _flat(self), _flat_default(self.probe.kind), preset_parameters()
+        values, declared = _flat(self), preset_parameters()
         return {
             name: declared[name].to_text(values[name]) if name in declared else json.dumps(values.get(name))
-            for name in {**default, **values}
-            if values.get(name) != default.get(name)
+            for name in {**_flat_default(self.probe.kind), **values}
         }
 
     @classmethod

@@ -142,15 +142,17 @@ def preset_texts(texts: Mapping[str, str]) -> dict[str, str]:
 
 
 class PresetParameter:
-    """Probe, display, settings and tissues; each value that is not the default is a parameter, see Preset.to_texts.
+    """Probe, display, settings and tissues; each value is a parameter, see Preset.to_texts.
 
-    A pose is not kept. What scenes of before have, AS_ONE, is replaced when it is read.
+    A pose is not kept. The text AS_ONE of older scenes is replaced when it is read.
     """
 
     def __get__(self, parameters: SceneParameters, owner: type | None = None) -> Preset:
         texts = preset_texts(parameters.texts)
         if vars(parameters).get("_preset", (None, None))[0] != texts:
-            self.__set__(parameters, Preset.from_texts(texts, "the scene's preset"))
+            vars(parameters)["_preset"] = texts, Preset.from_texts(texts, "the scene's preset")
+            if AS_ONE in texts:
+                self.__set__(parameters, vars(parameters)["_preset"][1])
         return vars(parameters)["_preset"][1]
 
     def __set__(self, parameters: SceneParameters, preset: Preset) -> None:
