@@ -25,7 +25,7 @@ from SlicerUSSim.Logic.mri.sheets import STRUCTURES, Sheets, find_sheets
 from SlicerUSSim.Logic.mri.sheets.falx import FREE_EDGE, falx
 from SlicerUSSim.Logic.mri.sheets.head import Head
 from SlicerUSSim.Logic.mri.sheets.regions import hindbrain, in_tentorium, tentorium_height, ventricles
-from SlicerUSSim.Logic.mri.sheets.ridges import Ridges, large_parts, ridges
+from SlicerUSSim.Logic.mri.sheets.sulcal import Ridges, large_parts, ridges
 from SlicerUSSim.Logic.tissue import Surfels
 from validation.brain_phantoms import COLIN27
 

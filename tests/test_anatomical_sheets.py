@@ -25,8 +25,7 @@ from SlicerUSSim.Logic.mri.sheets.heights import settled
 from SlicerUSSim.Logic.mri.sheets.kept import key_of, read_kept_sheets
 from SlicerUSSim.Logic.mri.sheets.polydata import as_polydata, read_surfels, require_own_surface, write_surfels
 from SlicerUSSim.Logic.mri.sheets.regions import tentorium_height
-from SlicerUSSim.Logic.mri.sheets.ridges import ridges
-from SlicerUSSim.Logic.mri.sheets.sulcal import sulci
+from SlicerUSSim.Logic.mri.sheets.sulcal import ridges, sulci
 from SlicerUSSim.Logic.tissue import KINDS, Surfels
 from validation.brain_phantoms import COLIN27
 
