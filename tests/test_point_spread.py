@@ -1,4 +1,4 @@
-"""Point spread function by the width of the speckle (fitting/point_spread.py): a start, taken only with T2."""
+"""Point spread function by the width of the speckle (fitting/speckle_fit.py): a start, taken only with T2."""
 
 from __future__ import annotations
 

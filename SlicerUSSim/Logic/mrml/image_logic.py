@@ -157,8 +157,8 @@ class ImageLogic:
         `target_ras` (default: the middle of the view). Without one it is a coronal view through a parasagittal
         craniotomy: on a brain, upright on the skin of a whole head, or on the brain in the middle of an opening, aimed
         at a lesion below it (aiming.opening_pose).
-        `view` is one of mri.views.VIEWS instead, as "temporal". With `will_open` it is on the brain of a closed head,
-        where openCraniotomy opens a disc under it: over the lesion that was laid over the labels, if there is one.
+        `view` is one of placement.views.VIEWS instead, as "temporal". With `will_open` it is on the brain of a closed
+        head, where openCraniotomy opens a disc under it: over the lesion that was laid over the labels, if there is one.
         Returns a line about what was done in labels with an opening, or about how the head lies for a view, or "".
         """
         require_node(probe_transform_node, "vtkMRMLLinearTransformNode", use="probe transform")

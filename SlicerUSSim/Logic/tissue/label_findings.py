@@ -13,7 +13,6 @@ import numpy as np
 
 from SlicerUSSim.Logic.base.errors import SimulationError, either
 from SlicerUSSim.Logic.base.volume import SIDES, Volume
-from SlicerUSSim.Logic.tissue import label_findings as cut_brain
 from SlicerUSSim.Logic.tissue.freesurfer import missing_structures
 from SlicerUSSim.Logic.tissue.interpolated_labels import are_interpolated_numbers
 from SlicerUSSim.Logic.tissue.label_advice import Advice
@@ -198,11 +197,7 @@ class Findings:
     def cut_sides(self) -> list[str]:
         """At which sides a brain was cut off: of left, right, back, front, bottom, top."""
         brain = self._brain()
-        return (
-            cut_brain.cut_sides(self.labels, {label: self.names[label] for label in brain}, self.counts)
-            if brain
-            else []
-        )
+        return cut_sides(self.labels, {label: self.names[label] for label in brain}, self.counts) if brain else []
 
     @cached_property
     def is_part_of_brain(self) -> bool:
@@ -210,8 +205,8 @@ class Findings:
         brain = self._brain()
         if not brain or self.cut_sides:
             return bool(self.cut_sides)
-        is_small = cut_brain.LEAST_ML <= self._millilitres(brain) < cut_brain.WHOLE_ML
-        return is_small and cut_brain.is_solid(self.labels, {label: self.names[label] for label in brain}, self.counts)
+        is_small = LEAST_ML <= self._millilitres(brain) < WHOLE_ML
+        return is_small and is_solid(self.labels, {label: self.names[label] for label in brain}, self.counts)
 
     def _brain_that_was_cut(self) -> list[str]:
         if not self.is_part_of_brain:

@@ -353,7 +353,7 @@ _LEAST_VESSEL_MM3 = 2.0
 #: sheets; mm
 _SINUS_MM, _SINUS_RIM_MM, _SURFACE_MM, _DURA_MM = 5.0, 2.0, 1.0, 1.5
 #: Choroid plexus: gaps that it leaves in the fluid, how far it may stick out of it, mm; brightness, and least volume
-_CLOSED_MM_VESSELS, _OUTSIDE_MM_VESSELS, _CHOROID_LEAST, _LEAST_CHOROID_MM3 = 3.6, 1.5, 2.0, 15.0
+_CHOROID_CLOSED_MM, _CHOROID_OUTSIDE_MM, _CHOROID_LEAST, _LEAST_CHOROID_MM3 = 3.6, 1.5, 2.0, 15.0
 #: Internal cerebral veins are nearer to the midline
 _MIDLINE_MM = 5.0
 
@@ -364,8 +364,8 @@ def choroid_plexus(head: Head, ventricles: np.ndarray) -> np.ndarray:
         return np.zeros(ventricles.shape, bool)
     mm = float(head.spacing.mean())
     # The plexus fills the atria, where no fluid tells of them.
-    region = closed(ventricles | lateral_ventricles_of_atlas(head), _CLOSED_MM_VESSELS / mm)
-    region = distance_to(region, head.image.spacing_mm) <= _OUTSIDE_MM_VESSELS
+    region = closed(ventricles | lateral_ventricles_of_atlas(head), _CHOROID_CLOSED_MM / mm)
+    region = distance_to(region, head.image.spacing_mm) <= _CHOROID_OUTSIDE_MM
     bright = region & (head.image.array > head.white + _CHOROID_LEAST * head.noise)
     bright &= np.abs(head.in_atlas[0]) > _MIDLINE_MM
     return _large(bright, _LEAST_CHOROID_MM3 / head.voxel_mm3)
