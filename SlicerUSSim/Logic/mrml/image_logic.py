@@ -158,7 +158,7 @@ class ImageLogic:
         craniotomy: on a brain, upright on the skin of a whole head, or on the brain in the middle of an opening, aimed
         at a lesion below it (aiming.opening_pose).
         `view` is one of placement.views.VIEWS instead, as "temporal". With `will_open` it is on the brain of a closed
-        head, where openCraniotomy opens a disc under it: over the lesion that was laid over the labels, if there is one.
+        head, where openCraniotomy opens a disc under it: over the lesion that was laid over the labels, if any.
         Returns a line about what was done in labels with an opening, or about how the head lies for a view, or "".
         """
         require_node(probe_transform_node, "vtkMRMLLinearTransformNode", use="probe transform")

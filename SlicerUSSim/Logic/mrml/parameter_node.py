@@ -148,17 +148,25 @@ class PresetParameter:
     """
 
     def __get__(self, parameters: SceneParameters, owner: type | None = None) -> Preset:
-        texts = preset_texts(parameters.texts)
-        if vars(parameters).get("_preset", (None, None))[0] != texts:
-            vars(parameters)["_preset"] = texts, Preset.from_texts(texts, "the scene's preset")
+        known, version = vars(parameters).get("_preset"), _version(parameters.node)
+        if known is None or known[0] != version:  # all texts are read only then: images need the preset often
+            texts = preset_texts(parameters.texts)
+            is_same = known is not None and known[1] == texts
+            preset = known[2] if is_same else Preset.from_texts(texts, "the scene's preset")
+            vars(parameters)["_preset"] = version, texts, preset
             if AS_ONE in texts:
-                self.__set__(parameters, vars(parameters)["_preset"][1])
-        return vars(parameters)["_preset"][1]
+                self.__set__(parameters, preset)
+        return vars(parameters)["_preset"][2]
 
     def __set__(self, parameters: SceneParameters, preset: Preset) -> None:
         texts = preset.to_texts()
         parameters.put_preset(texts)
-        vars(parameters)["_preset"] = texts, replace(preset, probe_to_ras=None)
+        vars(parameters)["_preset"] = _version(parameters.node), texts, replace(preset, probe_to_ras=None)
+
+
+def _version(node: Any) -> tuple[int, int]:
+    """Changes with a node, also while its events are held back."""
+    return node.GetMTime(), node.GetModifiedEventPending()
 
 
 #: What SceneParameters has
