@@ -151,8 +151,7 @@ class PresetParameter:
         known, version = vars(parameters).get("_preset"), _version(parameters.node)
         if known is None or known[0] != version:  # all texts are read only then: images need the preset often
             texts = preset_texts(parameters.texts)
-            is_same = known is not None and known[1] == texts
-            preset = known[2] if is_same else Preset.from_texts(texts, "the scene's preset")
+            preset = known[2] if known and known[1] == texts else Preset.from_texts(texts, "the scene's preset")
             vars(parameters)["_preset"] = version, texts, preset
             if AS_ONE in texts:
                 self.__set__(parameters, preset)
