@@ -554,6 +554,13 @@ inline void add_echoes(const Patient *patient, const Piece *piece, const Batch *
     if (IS_ON_MEMBRANE(batch->label[i])) {
       const float3 at = (float3)(batch->fx[i], batch->fy[i], batch->fz[i]);
       strength *= gain_on_membrane(patient, piece, batch->voxel[i], at);
+      if (patient->frame->membrane_octaves != 0.0f) {
+        const int u = piece->u, v = piece->v;
+        const float along[3] = {batch->u[i] + piece->start.x, batch->v[i] + piece->start.y, batch->w[i] + piece->start.z};
+        const float3 place = (float3)(along[u == 0 ? 0 : v == 0 ? 1 : 2], along[u == 1 ? 0 : v == 1 ? 1 : 2],
+                                      along[u == 2 ? 0 : v == 2 ? 1 : 2]);
+        strength *= exp2_scalar(patient->frame->membrane_octaves * (patch_at(patient->frame, place) - 0.35f * patient->frame->membrane_octaves));
+      }
     }
 #ifdef UNEVEN
     strength *= batch->uneven[i];

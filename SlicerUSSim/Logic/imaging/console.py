@@ -8,9 +8,11 @@ import numpy as np
 
 from SlicerUSSim.Logic.base.settings import FULL_SCALE_DB, DisplaySettings
 from SlicerUSSim.Logic.imaging.grey_map import TABLE_SIZE, grey_table, is_linear
+from SlicerUSSim.Logic.imaging.look import look_of
 from SlicerUSSim.Logic.imaging.signals import RayTree
 from SlicerUSSim.Logic.imaging.stage import DeviceFrame, Stage, Work
 from SlicerUSSim.Logic.opencl.device import Device, Workspace
+from SlicerUSSim.Logic.probe.arrays import Probe
 
 if TYPE_CHECKING:
     from pyopencl import Buffer
@@ -143,8 +145,10 @@ def smoothing_sigmas(frame: DeviceFrame) -> tuple[float, float]:
     seen from the depth of the focus.
     """
     display, probe = frame.display, frame.probe
-    along = display.smoothing_axial_mm / float(frame.acquisition["sample_mm"])
-    angle = float(np.deg2rad(display.smoothing_lateral_deg))
+    look = look_of(display, probe)
+    own_mm = look.smoothing_wavelengths / float(frame.acquisition["cycles_per_mm"])
+    along = float(np.hypot(display.smoothing_axial_mm, own_mm)) / float(frame.acquisition["sample_mm"])
+    angle = float(np.deg2rad(np.hypot(display.smoothing_lateral_deg, look.smoothing_deg)))
     if probe.is_linear and probe.focus_mm is not None:
         angle *= probe.focus_mm
     return along if along >= 0.2 else 0.0, across if (across := angle / probe.line_spacing) >= 0.1 else 0.0
@@ -157,18 +161,21 @@ def gaussian_taps(sigma: float) -> np.ndarray:
     return (taps / taps.sum()).astype(np.float32)
 
 
-def gains_along(display: DisplaySettings, depth_mm: np.ndarray, image_depth_mm: float) -> np.ndarray:
-    """(samples,) dB of the eight sliders of the gain by depth, straight between their middles, and of the near gain."""
+def gains_along(display: DisplaySettings, probe: Probe, depth_mm: np.ndarray) -> np.ndarray:
+    """(samples,) dB of the eight sliders of the gain by depth, straight between their middles, near gain and look."""
     sliders = [getattr(display, f"depth_gain_{n}_db") for n in range(1, 9)]
-    places = (np.arange(8) + 0.5) / 8.0 * image_depth_mm
+    places = (np.arange(8) + 0.5) / 8.0 * probe.depth_mm
     near = display.near_gain_db * np.exp(-np.maximum(depth_mm, 0.0) / _NEAR_GAIN_MM)
-    return np.interp(depth_mm, places, sliders) + near
+    return np.interp(depth_mm, places, sliders) + near + look_of(display, probe).along(depth_mm, probe.received_mhz)
 
 
-def gains_across(display: DisplaySettings, lines: int) -> np.ndarray:
-    """(lines,) float32 dB of the gain by line, from the first to the last, straight between five knots."""
+def gains_across(display: DisplaySettings, probe: Probe, lines: int) -> np.ndarray:
+    """(lines,) float32 dB of the gain by line, from the first to the last, straight between five knots, and of the look.
+
+    """
     knots = [getattr(display, f"line_gain_{n}_db") for n in range(1, 6)]
-    return np.interp(np.linspace(0.0, 1.0, lines), np.linspace(0.0, 1.0, 5), knots).astype(np.float32)
+    own = np.interp(np.linspace(0.0, 1.0, lines), np.linspace(0.0, 1.0, 5), knots)
+    return (own + look_of(display, probe).across(lines)).astype(np.float32)
 
 
 def _maps(frame: DeviceFrame) -> bool:
