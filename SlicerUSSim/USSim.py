@@ -244,6 +244,8 @@ class USSimWidget(ScriptedLoadableModuleWidget, VTKObservationMixin):
         if self._parameterNode is not None:
             self.addObserver(self._parameterNode, vtk.vtkCommand.ModifiedEvent, self.onParametersModified)
             self.onParametersModified()
+            if self.panel is not None:
+                self.panel.refresh()  # the nodes of the scene may be others
 
     def onParametersModified(self, caller=None, event=None) -> None:
         """Show the current parameters."""

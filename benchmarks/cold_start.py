@@ -36,7 +36,7 @@ def main() -> None:
     if arguments.first_frame:
         return first_frame(arguments.first_frame, arguments.labels)
     results = {}
-    segmentation = segment_mri(demo_mri()[0])
+    segmentation = segment_mri(demo_mri()[0], thin_sulci=False)
     with tempfile.TemporaryDirectory() as folder:
         labels = Path(folder) / "labels.nii.gz"
         segmentation.labels.write(labels)
@@ -64,7 +64,7 @@ def first_frame(device: str, label_file: Path | None) -> None:
     if label_file:
         labels, names = Volume.read(label_file), NAMES
     else:
-        segmentation = segment_mri(demo_mri()[0], device=device)
+        segmentation = segment_mri(demo_mri()[0], device=device, thin_sulci=False)
         labels, names = segmentation.labels, segmentation.tissue_names
     simulator = UltrasoundSimulator(labels, TissueTable.brain(names), device=device)
     simulator.simulate(FRAMES["A"], craniotomy_pose(labels, FRAMES["A"]))

@@ -39,14 +39,14 @@ _MARGIN = 8
 
 
 def compare(name: str, mri: Volume, contrast: str) -> None:
-    whole = segment_mri(mri, contrast=contrast)
+    whole = segment_mri(mri, contrast=contrast, thin_sulci=False)
     mask = whole.brain.mask
     truth = find_sheets(mri, whole, contrast=contrast, kinds=["falx"]).surfels
     for title, part in PARTS.items():
         box = part_box(mask, part, _MARGIN)
         image, inside = cut_to(mri, box), cut_to(mask, box)
         try:
-            segmentation = segment_mri(image, mask=inside, contrast=contrast)
+            segmentation = segment_mri(image, mask=inside, contrast=contrast, thin_sulci=False)
         except SimulationError as error:
             print(f"{name}, {title}: {error}")
             continue

@@ -59,7 +59,7 @@ def main() -> None:
     parser.add_argument("--json", type=output_file)
     arguments = parser.parse_args()
     warnings.simplefilter("ignore", TreeOverflowWarning)
-    segmentation = segment_mri(demo_mri()[0], device=arguments.device)
+    segmentation = segment_mri(demo_mri()[0], device=arguments.device, thin_sulci=False)
     tissues = TissueTable.brain(segmentation.tissue_names)
     run = {
         "twins": twins, "algorithms": algorithms, "ablation": ablation, "registration": registration,

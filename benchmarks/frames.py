@@ -100,7 +100,7 @@ class _DeviceBenchmark:
         self.progress(f"{self.info.index} {what}")
 
     def _segment(self) -> None:
-        self.segmentation = segment_mri(self.mri, device=self.device)
+        self.segmentation = segment_mri(self.mri, device=self.device, thin_sulci=False)
 
     def _frame(self, name: str, machine: Machine) -> dict:
         probe, pose, simulator = FRAMES[name], self.poses[name], self.simulator

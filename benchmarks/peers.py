@@ -43,7 +43,7 @@ def main() -> None:
     parser.add_argument("--json", type=output_file)
     arguments = parser.parse_args()
     devices = devices_to_measure(arguments.device)
-    segmentation = segment_mri(demo_mri()[0], device=devices[0])
+    segmentation = segment_mri(demo_mri()[0], device=devices[0], thin_sulci=False)
     tissues, pose = TissueTable.brain(segmentation.tissue_names), craniotomy_pose(segmentation.labels, PROBE)
     rows: dict[str, dict] = {}
     for info in devices:

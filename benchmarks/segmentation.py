@@ -88,7 +88,7 @@ def cases(arguments: argparse.Namespace) -> Iterator[tuple[str, Callable[[], tup
 
 def ours(case: BrainPhantom, contrast: str, **changes):
     """segment_mri with its defaults."""
-    found = segment_mri(case.mri, contrast=contrast, mask=case.mask, **changes)
+    found = segment_mri(case.mri, contrast=contrast, mask=case.mask, **changes, thin_sulci=False)
     return found.labels.array, dict(enumerate(found.tissue_names, start=1)), found.posteriors
 
 
@@ -97,7 +97,9 @@ def ours_smoothed(case: BrainPhantom, contrast: str):
     inside = (case.mask.array > 0).astype(np.float32)
     share = np.maximum(ndimage.gaussian_filter(inside, 0.6), 1e-3)
     smooth = np.where(inside > 0, ndimage.gaussian_filter(case.mri.array * inside, 0.6) / share, 0.0)
-    found = segment_mri(case.mri.with_array(smooth), contrast=contrast, mask=case.mask, filter_radius=0)
+    found = segment_mri(
+        case.mri.with_array(smooth), contrast=contrast, mask=case.mask, filter_radius=0, thin_sulci=False
+    )
     return found.labels.array, dict(enumerate(found.tissue_names, start=1)), found.posteriors
 
 
@@ -215,7 +217,7 @@ def measure_parts(arguments: argparse.Namespace) -> list[dict]:
                 ("N4", n4, False),
                 ("segment_mri", case.mri, None),
             ):
-                found = segment_mri(mri, contrast="t1", mask=case.mask, bias_correction=wanted)
+                found = segment_mri(mri, contrast="t1", mask=case.mask, bias_correction=wanted, thin_sulci=False)
                 names = dict(enumerate(found.tissue_names, start=1))
                 row[method] = scores(found.labels.array, names, case)["grey and white"]
             rows.append(row)
@@ -247,7 +249,7 @@ def measure_patients(arguments: argparse.Namespace) -> list[dict]:
         more: dict[str, Any] = {"others": others} if others else {}
         start = perf_counter()
         try:
-            found = segment_mri(mri, contrast=contrast, keep_mask_at=keep_at, **more)
+            found = segment_mri(mri, contrast=contrast, keep_mask_at=keep_at, **more, thin_sulci=False)
         except (SimulationError, TypeError) as error:
             print(f"| {name} | {error} |", flush=True)
             continue

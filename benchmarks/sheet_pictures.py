@@ -123,7 +123,7 @@ def main() -> None:
         options: dict[str, Any] = {}
         if arguments.keep:
             options["keep_mask_at"] = arguments.keep / f"{name}-mask.nrrd"
-        found = segment_mri(mri, contrast=contrast, **options)
+        found = segment_mri(mri, contrast=contrast, **options, thin_sulci=False)
         sheets = find_sheets(mri, found, contrast=contrast)
         for line in sheets.notes:
             print(f"{name}: {line}")

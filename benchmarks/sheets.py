@@ -25,7 +25,7 @@ from SlicerUSSim.Logic.mri.sheets import STRUCTURES, Sheets, find_sheets
 from SlicerUSSim.Logic.mri.sheets.falx import FREE_EDGE, falx
 from SlicerUSSim.Logic.mri.sheets.head import Head
 from SlicerUSSim.Logic.mri.sheets.regions import hindbrain, in_tentorium, tentorium_height, ventricles
-from SlicerUSSim.Logic.mri.sheets.ridges import Ridges, large_parts, ridges
+from SlicerUSSim.Logic.mri.sheets.sulcal import Ridges, large_parts, ridges
 from SlicerUSSim.Logic.tissue import Surfels
 from validation.brain_phantoms import COLIN27
 
@@ -184,7 +184,7 @@ def sheet_errors(name: str, head: Head, truth: np.ndarray, sheets: dict[str, Sur
 
 def segmented(arguments, name: str, mri: Volume, **options) -> Segmentation:
     keep_at = arguments.keep / f"{name}-mask.nrrd" if arguments.keep else None
-    return segment_mri(mri, keep_mask_at=keep_at, **options)
+    return segment_mri(mri, keep_mask_at=keep_at, **options, thin_sulci=False)
 
 
 def dura(head: Head, surfels: Surfels) -> None:
@@ -221,7 +221,7 @@ def remind(arguments) -> None:
     t2_confirms(head, sulci, other)
     dura(head, sheets.surfels)
     # The same walls and sulci from the T2 alone
-    by_t2 = segment_mri(other, contrast="t2", mask=found.brain.mask)
+    by_t2 = segment_mri(other, contrast="t2", mask=found.brain.mask, thin_sulci=False)
     again = timed("ReMIND-022's T2", other, by_t2, "t2", kinds=["sulcus", "ependyma"]).surfels
     for kind in ("ependyma", "sulcus"):
         one, two = sheets.surfels.of_kind(kind), again.of_kind(kind)
@@ -262,7 +262,9 @@ def turned(arguments) -> None:
     image = ndimage.map_coordinates(t1.array.astype(np.float32), index, order=3)
     image = np.maximum(image + _RNG.normal(0.0, found.noise, shape), 0.0).astype(np.float32)
     mask = ndimage.map_coordinates(found.brain.mask.array.astype(np.float32), index, order=1) > 0.5
-    again = segment_mri(Volume(image, matrix), contrast="t1gd", mask=Volume(mask.astype(np.uint8), matrix))
+    again = segment_mri(
+        Volume(image, matrix), contrast="t1gd", mask=Volume(mask.astype(np.uint8), matrix), thin_sulci=False
+    )
     second = find_sheets(Volume(image, matrix), again, contrast="t1gd").surfels
     back = replace(
         second,
@@ -306,7 +308,7 @@ def shifted(arguments) -> None:
     index = np.moveaxis(index[..., ::-1], -1, 0)
     image = t1.with_array(ndimage.map_coordinates(t1.array.astype(np.float32), index, order=1))
     mask = ndimage.map_coordinates(found.brain.mask.array.astype(np.float32), index, order=1) > 0.5
-    again = segment_mri(image, contrast="t1gd", mask=t1.with_array(mask.astype(np.uint8)))
+    again = segment_mri(image, contrast="t1gd", mask=t1.with_array(mask.astype(np.uint8)), thin_sulci=False)
     bent = Head.of(image, again, "t1gd")
     here = falx(bent)
     flat = bent.to_atlas(here.place) * [0, 1, 1]
@@ -359,7 +361,7 @@ def colin(arguments) -> None:
 def other(file: Path, contrast: str) -> None:
     """Another head: its visible CSF, and with contrast agent its falx and tentorium."""
     mri = Volume.read(file)
-    found = segment_mri(mri, contrast=contrast)
+    found = segment_mri(mri, contrast=contrast, thin_sulci=False)
     sheets = timed(file.name, mri, found, contrast)
     head = Head.of(mri, found, contrast)
     coverage(file.name, head, sheets.surfels.of_kind("sulcus", "falx", "tentorium"))
@@ -369,7 +371,7 @@ def other(file: Path, contrast: str) -> None:
 
 def mni(arguments) -> None:
     mri = demo_mri()[0]
-    found = segment_mri(mri)
+    found = segment_mri(mri, thin_sulci=False)
     sheets = timed("MNI152", mri, found, "t1")
     head = Head.of(mri, found, "t1")
     coverage("MNI152", head, sheets.surfels.of_kind("sulcus", "falx", "tentorium"))

@@ -42,7 +42,14 @@ def main() -> None:
     folder = SHARED / "remind022"
     mri, truth = Volume.read(folder / "t1_contrast.nii.gz"), Volume.read(folder / "glioma.nii.gz")
     mask = None if arguments.mask is None else Volume.read(arguments.mask)
-    found = segment_mri(mri, contrast="t1gd", others={"t2": Volume.read(folder / "t2.nii.gz")}, mask=mask, outside=True)
+    found = segment_mri(
+        mri,
+        contrast="t1gd",
+        others={"t2": Volume.read(folder / "t2.nii.gz")},
+        mask=mask,
+        outside=True,
+        thin_sulci=False,
+    )
     middle = truth.ijk_to_ras[:3] @ np.append(np.argwhere(truth.array > 0).mean(axis=0)[::-1], 1.0)
     proposal = grow_lesion(found, middle.tolist())
     print(proposal.message)

@@ -28,11 +28,11 @@
 // With FOUND defined, planes have two words: some are of sheets that were found in the MRI (sheets.clh). Beside these
 // nothing else is membrane.
 //
-// With UNEVEN defined, some tissues have an echogenicity that varies within them (unevenness.py).
+// With UNEVEN defined, some tissues have an echogenicity that varies within them (imaging/scattering.py).
 //
 // Buffers: voxels, segments as in raytracing.cl; planes uint [k][j][i] of sheets.cl (one element without sheets);
 // texture uint [k][j][i] (one element without TEXTURE); sites float2 [label], the share of cells with a scatterer, in
-// 1/65536, and its amplitude, behind them whether it is dark (with LOBES), behind that UNEVEN_WORDS of unevenness.py;
+// 1/65536, and its amplitude, behind them whether it is dark (with LOBES), behind that UNEVEN_WORDS of imaging/scattering.py;
 // re, im float [2 traced line + side][stride]; with VARIED also [part] before these, and part_of int [label], -1 for a
 // tissue in none; with LOBES lobes float [LOBE_DEPTHS][LOBE_DISTANCES], and behind them the distance of the last column
 // [LOBE_DEPTHS].

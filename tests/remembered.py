@@ -39,12 +39,12 @@ def once(segment: Callable[..., Segmentation]) -> Callable[..., Segmentation]:
     """
     results: OrderedDict[bytes, tuple[Segmentation, list[float], list[logging.LogRecord]]] = OrderedDict()
 
-    def segment_once(mri, *, progress=None, device=None, keep_mask_at=None, **arguments) -> Segmentation:
+    def segment_once(mri, settings=None, *, progress=None, device=None, keep_mask_at=None, **arguments):
         told = progress or (lambda share: None)
         if device is not None or (keep_mask_at is not None and keep_mask_at.exists()):
-            return segment(mri, progress=progress, device=device, keep_mask_at=keep_mask_at, **arguments)
+            return segment(mri, settings, progress=progress, device=device, keep_mask_at=keep_mask_at, **arguments)
         level = logging.getLogger(_LOGGER).getEffectiveLevel()  # which lines there are to remember
-        given = inspect.signature(segment).bind(mri, **arguments)
+        given = inspect.signature(segment).bind(mri, settings, **arguments)
         given.apply_defaults()
         key = hashlib.sha256(pickle.dumps((sorted(given.arguments.items()), level))).digest()
         if key in results:
@@ -66,7 +66,7 @@ def once(segment: Callable[..., Segmentation]) -> Callable[..., Segmentation]:
         logger = logging.getLogger(_LOGGER)
         logger.addHandler(log)
         try:
-            result = segment(mri, progress=report, keep_mask_at=keep_mask_at, **arguments)
+            result = segment(mri, settings, progress=report, keep_mask_at=keep_mask_at, **arguments)
         finally:
             logger.removeHandler(log)
         if keep_mask_at is None or result.brain.method in ("given", "stripped", "none"):  # of those no mask is kept
@@ -85,6 +85,6 @@ def _shared() -> Callable[..., Segmentation]:
     return once(segment_mri)
 
 
-def segment_once(mri, **options) -> Segmentation:
+def segment_once(mri, settings=None, **options) -> Segmentation:
     """segment_mri, as tests that are not about segmentation call it."""
-    return _shared()(mri, **options)
+    return _shared()(mri, settings, **options)

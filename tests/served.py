@@ -122,9 +122,9 @@ def _serve(arguments: list[str], state: str, out: Any, errors: str, segmented: s
     os.dup2(out.fileno(), 1)
     out.close()
     sys.stdout = open(1, "w", buffering=1, closefd=False)  # noqa: SIM115
-    from SlicerUSSim.Logic.mrml import logic
+    from SlicerUSSim.Logic.mrml import segment_logic
 
-    logic.segment_image = _remembered(logic.segment_image, Path(segmented))
+    segment_logic.segment_image = _remembered(segment_logic.segment_image, Path(segmented))
     try:
         main(["serve", *arguments], prog_name="ussim")
     finally:

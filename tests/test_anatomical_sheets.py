@@ -25,8 +25,7 @@ from SlicerUSSim.Logic.mri.sheets.heights import settled
 from SlicerUSSim.Logic.mri.sheets.kept import key_of, read_kept_sheets
 from SlicerUSSim.Logic.mri.sheets.polydata import as_polydata, read_surfels, require_own_surface, write_surfels
 from SlicerUSSim.Logic.mri.sheets.regions import tentorium_height
-from SlicerUSSim.Logic.mri.sheets.ridges import ridges
-from SlicerUSSim.Logic.mri.sheets.sulcal import sulci
+from SlicerUSSim.Logic.mri.sheets.sulcal import ridges, sulci
 from SlicerUSSim.Logic.tissue import KINDS, Surfels
 from validation.brain_phantoms import COLIN27
 
@@ -410,7 +409,7 @@ def test_a_falx_in_wide_fluid_at_the_vertex_stays_off_the_gyri(is_enhanced):
 @pytest.mark.slow
 def test_what_cannot_be_found_is_reported_before_the_search():
     mri = head_mri(spacing_mm=4.0)
-    found = segment_mri(mri)
+    found = segment_mri(mri, thin_sulci=False)
     with pytest.raises(SimulationError, match="'dura'"):
         find_sheets(mri, found, contrast="t1", kinds=["dura"])
     with pytest.raises(SimulationError, match="contrast 'flair'"):
@@ -434,7 +433,7 @@ def template_head() -> tuple[Volume, Segmentation]:
         pytest.skip("nilearn is not installed")
     step = slice(None, None, 2)
     coarse = Volume(mri.array[step, step, step].astype(np.float32), mri.ijk_to_ras @ np.diag([2.0, 2.0, 2.0, 1.0]))
-    return coarse, segment_mri(coarse)
+    return coarse, segment_mri(coarse, thin_sulci=False)
 
 
 @pytest.mark.slow
@@ -515,7 +514,7 @@ def test_sheets_of_colin27_are_where_its_image_and_aal_show_them():
     if not (COLIN27 / "ch2bet.nii.gz").exists():
         pytest.skip("mricron-data is not installed")
     mri = Volume.read(COLIN27 / "ch2bet.nii.gz")
-    found = segment_mri(mri)
+    found = segment_mri(mri, thin_sulci=False)
     sheets = find_sheets(mri, found, contrast="t1")
     head = Head.of(mri, found, "t1")
     # Fluid of sulci near a sheet, and near a sheet displaced

@@ -130,7 +130,7 @@ def test_scores_are_1_for_the_truth_and_fall_where_labels_are_exchanged():
 
 
 def found_by_product(case: BrainPhantom, contrast: str = "t1") -> dict[str, float]:
-    found = segment_mri(case.mri, contrast=contrast, mask=case.mask)
+    found = segment_mri(case.mri, contrast=contrast, mask=case.mask, thin_sulci=False)
     return scores(found.labels.array, dict(enumerate(found.tissue_names, start=1)), case)
 
 
@@ -164,7 +164,7 @@ IN_CI = (("mni152", 0.03, 0.2, "full"), ("colin27", 0.07, 0.2, "tight"))
 )
 def test_segmentation_at_1_mm_is_as_good_as_the_documentation_says(name, noise, bias, mask):
     case = phantom(fine(name), noise=noise, bias=bias, mask=mask)
-    found = segment_mri(case.mri, mask=case.mask)
+    found = segment_mri(case.mri, mask=case.mask, thin_sulci=False)
     names = dict(enumerate(found.tissue_names, start=1))
     assert scores(found.labels.array, names, case)["grey and white"] >= LEAST[name, noise, bias]
     for stated, right, voxels in calibration(found.posteriors, names, case):

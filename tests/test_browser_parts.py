@@ -57,19 +57,18 @@ from SlicerUSSim.Logic.mrml.logic import AtOnce, UltrasoundSceneLogic  # noqa: E
 from SlicerUSSim.Logic.mrml.nodes import node_to_world, probe_pose, read_volume, set_node_to_world, write_volume  # noqa: E402
 from SlicerUSSim.Logic.mrml.sequence_nodes import TIME, SequenceIndex, add_sequence  # noqa: E402
 from SlicerUSSim.Logic.tracked.images import TrackedImages  # noqa: E402
-from SlicerUSSim.Widget.sections import panel_sections  # noqa: E402
+from SlicerUSSim.Workstation.browser_panel import BrowserPanel  # noqa: E402
 from SlicerUSSim.Workstation.comparison import Comparison, RealImages  # noqa: E402
 from SlicerUSSim.Workstation.content import Kind  # noqa: E402
 from SlicerUSSim.Workstation.export import Cine, gif  # noqa: E402
-from SlicerUSSim.Workstation.messages import Messages  # noqa: E402
 from SlicerUSSim.Workstation.opener import Files, Opener  # noqa: E402
-from SlicerUSSim.Workstation.panel import BrowserPanel  # noqa: E402
 from SlicerUSSim.Workstation.state import (  # noqa: E402
     NAMES,
     ComparisonMode,
     NodeItem,
     SharedState,
     TissueLine,
+    value_of,
 )
 from SlicerUSSim.Workstation.tasks import AtMost, Tasks  # noqa: E402
 from tests.served import run_script  # noqa: E402
@@ -410,7 +409,7 @@ def test_of_tasks_at_once_the_last_is_shown_and_each_can_be_cancelled():
     shared = SharedState(State(ready=True))
     tasks = SimpleNamespace(abandonSoon=lambda *ignored: None)
     logic = UltrasoundSceneLogic(slicer.vtkMRMLScene())
-    panel = BrowserPanel(shared, Messages(shared), logic, tasks, panel_sections(), lambda: None)
+    panel = BrowserPanel(shared, logic, tasks, lambda: None)
     messages = shared.now.messages
     first, second = panel.progress("First"), panel.progress("Second")
     report_first, report_second = first.__enter__(), second.__enter__()
@@ -426,6 +425,32 @@ def test_of_tasks_at_once_the_last_is_shown_and_each_can_be_cancelled():
     second.__exit__(None, None, None)
     assert messages.progress_title == ""
     panel.cancel()  # nothing
+
+
+def test_a_changed_value_brings_the_page_no_other_values(monkeypatch):
+    """Nor node lists, tissues and what can be done; a node brings all."""
+    read, sent = [], {}
+    shared, tasks = SharedState(State(ready=True, commit_fn=sent.update)), SimpleNamespace(start=lambda act: act())
+    panel = BrowserPanel(shared, UltrasoundSceneLogic(slicer.vtkMRMLScene()), tasks, lambda: None)
+    presenter = panel.presenter
+    panel.refresh()
+    presenter.parametersChanged()
+    sent.clear()
+    value = presenter.values.value
+    monkeypatch.setattr(presenter.values, "value", lambda name: (read.append(name), value(name))[1])
+    monkeypatch.setattr(presenter.tissues, "rows", lambda: 1 / 0)
+    panel.set("gainSlider", 7.0)
+    presenter.parametersChanged()  # as for every change of the scene's parameters
+    assert set(read) == {"display.gain_db"} and sent == {value_of("gainSlider"): 7.0}
+    read.clear(), sent.clear()
+    panel.set("transmitComboBox", "zones")
+    presenter.parametersChanged()
+    assert all(name.startswith("probe.") for name in read) and "probe.focal_zones" in read
+    assert sent[value_of("transmitComboBox")] == "zones" and value_of("gainSlider") not in sent
+    monkeypatch.undo()
+    presenter.logic.scene.AddNewNodeByClass("vtkMRMLScalarVolumeNode", "head")
+    presenter.parametersChanged()
+    assert "head" in [item.title for item in panel.shared.now.panel.nodes["mriSelector"]]
 
 
 #: What breaks text that is pasted between quotes.
@@ -733,7 +758,7 @@ def test_a_frozen_image_stays_where_it_was_taken_in_3d_and_in_the_slices():
         app = SlicerApp()
         views = AnatomyViews(app, get_server("views of a test", client_type="vue3"), lambda *ignored: None)
         logic = UltrasoundSceneLogic(app.scene)
-        segmentation = segment_mri(head_mri(3.0))
+        segmentation = segment_mri(head_mri(3.0), thin_sulci=False)
         labels, probe, output = (
             app.scene.AddNewNodeByClass(f"vtkMRML{kind}Node")
             for kind in ("LabelMapVolume", "LinearTransform", "ScalarVolume")

@@ -20,7 +20,7 @@ from SlicerUSSim.Logic.mrml.label_nodes import read_labels, write_labels  # noqa
 from SlicerUSSim.Logic.mrml.lesion_nodes import add_lesion  # noqa: E402
 from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic  # noqa: E402
 from SlicerUSSim.Logic.mrml.nodes import node_to_world, nodes_of_class, set_node_to_world, write_volume  # noqa: E402
-from SlicerUSSim.Logic.mrml.own_labels import mark_as_made  # noqa: E402
+from SlicerUSSim.Logic.mrml.own_results import mark_as_made  # noqa: E402
 from SlicerUSSim.Logic.mrml.scene_record import put_nodes, record_scene  # noqa: E402
 from SlicerUSSim.Logic.placement.craniotomy import default_pose, disc_opening, opened  # noqa: E402
 from SlicerUSSim.Logic.probe.poses import pose_looking_at  # noqa: E402
@@ -77,24 +77,26 @@ def expected(labels: Volume, pose: np.ndarray, diameter_mm: float) -> float:
 def test_a_disc_is_opened_in_labels_of_its_own_and_closed_again(head):  # noqa: F811
     bench = Bench(head)
     before = bench.tissues(bench.whole)
-    assert bench.presenter.canOpenCraniotomy()[0] and not bench.presenter.canCloseCraniotomy()[0]
-    bench.presenter.setValue("scene.craniotomy_mm", 30.0)
-    bench.presenter.openCraniotomy()
+    assert bench.presenter.placing.canOpenCraniotomy()[0] and not bench.presenter.placing.canCloseCraniotomy()[0]
+    bench.presenter.values.setValue("scene.craniotomy_mm", 30.0)
+    bench.presenter.placing.openCraniotomy()
     assert not bench.view.errors and bench.labels is not bench.whole
     np.testing.assert_array_equal(bench.tissues(bench.whole), before)
     after = bench.tissues(bench.labels)
     gone = (after != before) & (before == 2)
     assert not after[after != before].any() and (after == 1).sum() == (before == 1).sum()
     assert gone.sum() * head.voxel_ml == pytest.approx(expected(head, TOP, 30.0), rel=1e-6)
-    assert "craniotomy: a disc of 30 mm under the probe; " in bench.presenter.notes()
+    assert "craniotomy: a disc of 30 mm under the probe; " in bench.presenter.notes.text()
     node = bench.labels
     bench.move(pose_looking_at((0.0, 80.0, 0.0), (0.0, 0.0, 0.0)))
-    bench.presenter.openCraniotomy()  # there, and closed again where it was
+    bench.presenter.placing.openCraniotomy()  # there, and closed again where it was
     assert bench.labels is node and len(nodes_of_class(bench.scene, "vtkMRMLModelNode")) == 1
-    assert (bench.tissues(bench.labels)[gone] == 2).mean() > 0.9 and bench.presenter.notes().count("craniotomy: ") == 1
-    bench.presenter.closeCraniotomy()
-    assert bench.labels is bench.whole and "craniotomy: " not in bench.presenter.notes()
-    assert not bench.presenter.canCloseCraniotomy()[0] and not bench.view.errors
+    assert (bench.tissues(bench.labels)[gone] == 2).mean() > 0.9 and bench.presenter.notes.text().count(
+        "craniotomy: "
+    ) == 1
+    bench.presenter.placing.closeCraniotomy()
+    assert bench.labels is bench.whole and "craniotomy: " not in bench.presenter.notes.text()
+    assert not bench.presenter.placing.canCloseCraniotomy()[0] and not bench.view.errors
 
 
 def test_the_model_shows_what_was_removed_where_it_was(head):  # noqa: F811
@@ -118,10 +120,10 @@ def test_markups_and_masks_are_opened(head):  # noqa: F811
     for x, y in ((-20, -10), (20, -10), (20, 10), (-20, 10)):
         points.InsertNextPoint((TURN @ [x, y, 78.0, 1.0])[:3])
     bench.logic.parameters.opening = curve
-    bench.presenter.openCraniotomy()
+    bench.presenter.placing.openCraniotomy()
     assert "'curve' has 0 points, expected three or more" in bench.view.errors[-1] and bench.labels is bench.whole
     curve.SetControlPointPositionsWorld(points)
-    bench.presenter.openCraniotomy()
+    bench.presenter.placing.openCraniotomy()
     before = bench.tissues(bench.whole)
     gone = np.argwhere(bench.tissues(bench.labels) != before)
     along = 2.0 * gone - 84.0
@@ -130,7 +132,7 @@ def test_markups_and_masks_are_opened(head):  # noqa: F811
     above = head.with_array(((head.array > 2) & (np.arange(head.array.shape[0])[:, None, None] > 75)).astype(np.uint8))
     write_labels(mask, above, ("opening",), bench.whole)
     bench.logic.parameters.opening = mask
-    bench.presenter.openCraniotomy()
+    bench.presenter.placing.openCraniotomy()
     gone = (bench.tissues(bench.labels) != before) & (before == 2)
     assert len(bench.view.errors) == 1
     np.testing.assert_array_equal(gone, above.array > 0)
@@ -140,22 +142,22 @@ def test_what_cannot_be_opened_changes_nothing(head):  # noqa: F811
     bench = Bench(head)
     bench.move(pose_looking_at((300.0, 0.0, 0.0), (300.0, 100.0, 0.0)))
     names = [node.GetName() for node in nodes_of_class(bench.scene, "vtkMRMLVolumeNode")]
-    bench.presenter.openCraniotomy()
+    bench.presenter.placing.openCraniotomy()
     assert "there is no brain under the craniotomy" in bench.view.errors[-1] and bench.labels is bench.whole
     assert [node.GetName() for node in nodes_of_class(bench.scene, "vtkMRMLVolumeNode")] == names
     mine = bench.add("LabelMapVolume", "mine")
     write_labels(mine, head, NAMES, bench.whole)
     with pytest.raises(SimulationError, match="was not made by this module, or edited since, and is not replaced"):
         bench.logic.openCraniotomy(bench.whole, mine, probe_transform_node=bench.probe)
-    bench.presenter.closeCraniotomy()
+    bench.presenter.placing.closeCraniotomy()
     assert "has no opening, or the labels before it are gone" in bench.view.errors[-1]
 
 
 @pytest.mark.slow
 def test_the_probe_is_placed_at_the_chosen_view(head):  # noqa: F811
     bench = Bench(head)
-    bench.presenter.setValue("scene.view", "temporal-left")
-    bench.presenter.placeAtView()
+    bench.presenter.values.setValue("scene.view", "temporal-left")
+    bench.presenter.placing.placeAtView()
     place = (np.linalg.inv(TURN) @ node_to_world(bench.probe))[:3, 3]
     world = node_to_world(bench.probe)[:3, 3] - TURN[:3, 3]
     assert np.linalg.norm(place) == pytest.approx(78.0, abs=2.0) and world[0] < -70 and not bench.view.errors
@@ -163,7 +165,7 @@ def test_the_probe_is_placed_at_the_chosen_view(head):  # noqa: F811
 
 def test_place_follows_the_labels_and_takes_the_largest_piece(head):  # noqa: F811
     bench = Bench(head)
-    bench.presenter.openCraniotomy()
+    bench.presenter.placing.openCraniotomy()
     moved = bench.add("LinearTransform", "moved")
     moved.SetMatrixTransformToParent(vtk_matrix(np.array([[1.0, 0, 0, 100], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])))
     bench.labels.SetAndObserveTransformNodeID(moved.GetID())
@@ -177,15 +179,15 @@ def test_place_follows_the_labels_and_takes_the_largest_piece(head):  # noqa: F8
 def test_the_labels_are_no_opening_and_edits_are_not_lost_unsaid(head):  # noqa: F811
     bench = Bench(head)
     bench.logic.parameters.opening = bench.whole
-    bench.presenter.openCraniotomy()
+    bench.presenter.placing.openCraniotomy()
     assert "the labels themselves, expected a node with the opening alone" in bench.view.errors[-1]
     bench.logic.parameters.opening = None
-    bench.presenter.openCraniotomy()
+    bench.presenter.placing.openCraniotomy()
     first = bench.labels
     first.GetImageData().SetScalarComponentFromDouble(42, 42, 42, 0, 2.0)
     first.GetImageData().Modified()
-    bench.presenter.openCraniotomy()
-    assert bench.labels is not first and "what was edited in LabelMapVolume" in bench.presenter.notes()
+    bench.presenter.placing.openCraniotomy()
+    assert bench.labels is not first and "what was edited in LabelMapVolume" in bench.presenter.notes.text()
 
 
 @pytest.mark.slow
@@ -194,21 +196,21 @@ def test_gel_is_between_skin_and_probe_unless_the_user_says_otherwise(head):  # 
     bench.move(pose_looking_at((0.0, 0.0, 88.0), (0.0, 0.0, 0.0)))  # 10 mm off the skin
     image = bench.add("ScalarVolume", "image")
     gel = bench.logic.simulate(bench.whole, bench.probe, image).image.copy()
-    assert "gel fills gaps of up to 3 mm between skin and probe" in bench.presenter.notes()
+    assert "gel fills gaps of up to 3 mm between skin and probe" in bench.presenter.notes.text()
     plain = bench.logic.preset
     bench.logic.preset = plain.changed("settings", contact_gap_mm=3.0)
     np.testing.assert_array_equal(bench.logic.simulate(bench.whole, bench.probe, image).image, gel)
     bench.logic.preset = plain.changed("settings", contact_gap_mm=1.0)
-    assert bench.logic.settings(bench.whole).contact_gap_mm == 1.0 and "gel " not in bench.presenter.notes()
+    assert bench.logic.settings(bench.whole).contact_gap_mm == 1.0 and "gel " not in bench.presenter.notes.text()
     bench.logic.preset = plain
-    bench.presenter.setValue("scene.gel", False)
+    bench.presenter.values.setValue("scene.gel", False)
     immersed = bench.logic.simulate(bench.whole, bench.probe, image).image
     assert gel.mean() < 0.5 * immersed.mean() and immersed.max() > gel.max() + 50
-    assert "gel " not in bench.presenter.notes()
-    bench.presenter.setValue("scene.gel", True)
-    bench.presenter.openCraniotomy()  # filled with saline
-    assert bench.logic.settings(bench.labels).contact_gap_mm is None and "gel " not in bench.presenter.notes()
-    bench.presenter.closeCraniotomy()
+    assert "gel " not in bench.presenter.notes.text()
+    bench.presenter.values.setValue("scene.gel", True)
+    bench.presenter.placing.openCraniotomy()  # filled with saline
+    assert bench.logic.settings(bench.labels).contact_gap_mm is None and "gel " not in bench.presenter.notes.text()
+    bench.presenter.placing.closeCraniotomy()
     assert bench.logic.settings(bench.labels).contact_gap_mm == 3.0
     brain = Bench(head.with_array(np.where(head.array == 2, 2, 0).astype(np.uint8)))
     assert brain.logic.settings(brain.whole).contact_gap_mm is None
@@ -239,39 +241,41 @@ def test_a_disc_opens_over_the_lesion_that_was_laid_over_the_labels(head, to_wor
 def test_the_notes_say_that_no_part_of_the_face_touches_the_patient(head):  # noqa: F811
     nothing = "0% of the probe's face touches the patient (contact gap: 3 mm): the image is black"
     bench = Bench(head)
-    bench.presenter.placeProbe()
-    assert "face touches" not in bench.presenter.notes()
-    bench.presenter.setLive(True)
+    bench.presenter.placing.placeProbe()
+    assert "face touches" not in bench.presenter.notes.text()
+    bench.presenter.images.setLive(True)
     refreshed = bench.view.refreshed
     bench.move(pose_looking_at((0.0, 0.0, 88.0), (0.0, 0.0, 0.0)))
     bench.view.waiting.pop()()
-    assert bench.view.refreshed == refreshed + 1 and bench.presenter.notes().count(nothing) == 1
-    bench.presenter.setLive(False)
+    assert bench.view.refreshed == refreshed + 1 and bench.presenter.notes.text().count(nothing) == 1
+    bench.presenter.images.setLive(False)
     bench.logic.parameters.panel = replace(bench.logic.parameters.panel, gel=False)  # it lies in the coupling medium
-    assert "face touches" not in bench.presenter.notes() and not bench.view.errors
+    assert "face touches" not in bench.presenter.notes.text() and not bench.view.errors
 
 
 @pytest.mark.slow
 def test_the_notes_follow_the_probe_over_bone_and_openings(head):  # noqa: F811
     closed, misfit = "the skull is closed in front of the probe", "does not fit the opening"
     bench = Bench(head)
-    bench.presenter.placeProbe()
-    assert bench.presenter.notes().count(closed) == 1 and "Open skull in Craniotomy" in bench.presenter.notes()
-    bench.presenter.openCraniotomy()
-    bench.presenter.placeProbe()
-    assert closed not in bench.presenter.notes() and misfit not in bench.presenter.notes()
+    bench.presenter.placing.placeProbe()
+    assert (
+        bench.presenter.notes.text().count(closed) == 1 and "Open skull in Craniotomy" in bench.presenter.notes.text()
+    )
+    bench.presenter.placing.openCraniotomy()
+    bench.presenter.placing.placeProbe()
+    assert closed not in bench.presenter.notes.text() and misfit not in bench.presenter.notes.text()
     bench.logic.preset = bench.logic.preset.changed("probe", aperture_mm=40.0)
-    assert "is 40 mm wide and does not fit the opening" in bench.presenter.notes()
+    assert "is 40 mm wide and does not fit the opening" in bench.presenter.notes.text()
     bench.logic.preset = bench.logic.preset.changed("probe", aperture_mm=12.0)
-    bench.presenter.setLive(True)
-    assert misfit not in bench.presenter.notes() and not bench.view.errors
+    bench.presenter.images.setLive(True)
+    assert misfit not in bench.presenter.notes.text() and not bench.view.errors
     refreshed = bench.view.refreshed
     bench.move(pose_looking_at((78.5, 0.0, 0.0), (0.0, 0.0, 0.0), (0.0, 1.0, 0.0)))
     bench.view.waiting.pop()()  # the image there
     assert bench.view.refreshed == refreshed + 1  # so that the notes are shown anew
-    assert closed in bench.presenter.notes() and "the opening is elsewhere" in bench.presenter.notes()
-    bench.presenter.setLive(False)
-    assert not [line for line in bench.presenter.noteLines if closed in line]
+    assert closed in bench.presenter.notes.text() and "the opening is elsewhere" in bench.presenter.notes.text()
+    bench.presenter.images.setLive(False)
+    assert not [line for line in bench.presenter.notes.lines if closed in line]
 
 
 @pytest.mark.slow
@@ -281,18 +285,18 @@ def test_a_view_is_placed_in_an_opening_or_said_to_be_elsewhere(head):  # noqa: 
     def radius() -> float:
         return float(np.linalg.norm((np.linalg.inv(TURN) @ node_to_world(bench.probe))[:3, 3]))
 
-    bench.presenter.setValue("scene.view", "fontanelle")
-    bench.presenter.placeAtView()
+    bench.presenter.values.setValue("scene.view", "fontanelle")
+    bench.presenter.placing.placeAtView()
     assert radius() == pytest.approx(78.0, abs=2.0)
-    bench.presenter.openCraniotomy()
-    bench.presenter.placeAtView()
+    bench.presenter.placing.openCraniotomy()
+    bench.presenter.placing.placeAtView()
     assert radius() == pytest.approx(60.0, abs=2.0) and not bench.view.errors
-    assert "the view fontanelle is seen through the opening" in bench.presenter.notes()
-    bench.presenter.setValue("scene.view", "temporal")
-    bench.presenter.placeAtView()
-    assert radius() == pytest.approx(78.0, abs=2.0) and bench.presenter.notes().count("view: ") == 1
+    assert "the view fontanelle is seen through the opening" in bench.presenter.notes.text()
+    bench.presenter.values.setValue("scene.view", "temporal")
+    bench.presenter.placing.placeAtView()
+    assert radius() == pytest.approx(78.0, abs=2.0) and bench.presenter.notes.text().count("view: ") == 1
     assert "the opening is not where the view temporal is seen from: the probe stands on the skin" in (
-        bench.presenter.notes()
+        bench.presenter.notes.text()
     )
 
 
@@ -307,22 +311,22 @@ def test_hidden_segments_of_an_opening_stay_closed_and_are_said_to(head):  # noq
     first, second = opening.GetSegmentation().GetSegmentIDs()
     bench.logic.parameters.opening = opening
     opening.GetDisplayNode().SetSegmentVisibility(second, False)
-    bench.presenter.openCraniotomy()
+    bench.presenter.placing.openCraniotomy()
     assert not bench.view.errors
     before, after = bench.tissues(bench.whole), bench.tissues(bench.labels)
     np.testing.assert_array_equal((after != before) & (before == 2), both.array == 1)
-    notes = bench.presenter.notes()
+    notes = bench.presenter.notes.text()
     assert "with left; " in notes and "what is hidden is not opened: right" in notes
     opening.GetDisplayNode().SetSegmentVisibility(first, False)
-    bench.presenter.openCraniotomy()
+    bench.presenter.placing.openCraniotomy()
     assert "all its segments are hidden, expected a visible one to open" in bench.view.errors[-1]
 
 
 def test_an_opening_is_kept_with_the_scene_and_can_then_be_closed(head):  # noqa: F811
     bench = Bench(head, "Segmentation")
-    bench.presenter.openCraniotomy()
+    bench.presenter.placing.openCraniotomy()
     assert not bench.view.errors
-    bench.presenter.simulate()
+    bench.presenter.images.simulate()
     image, whole = bench.logic.lastFrame.image, bench.tissues(bench.whole)
     file = io.BytesIO()
     write_values(file, record_scene(bench.scene))
@@ -334,10 +338,10 @@ def test_an_opening_is_kept_with_the_scene_and_can_then_be_closed(head):  # noqa
     nodes = put_nodes(again.scene, record)
     again.logic.parameters.labels = nodes["labels"]
     set_node_to_world(again.probe, record.pose)
-    again.presenter.simulate()
+    again.presenter.images.simulate()
     assert not again.view.errors and np.array_equal(again.logic.lastFrame.image, image)
     flaps = [node for node in nodes_of_class(again.scene, "vtkMRMLModelNode") if "removed" in node.GetName()]
     assert len(flaps) == 1 and flaps[0].GetPolyData().GetNumberOfPoints() > 20
-    again.presenter.closeCraniotomy()
+    again.presenter.placing.closeCraniotomy()
     assert not again.view.errors and again.labels is nodes["closed"]
     assert np.array_equal(np.unique(again.tissues(again.labels)), np.unique(whole))

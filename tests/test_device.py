@@ -343,22 +343,6 @@ def test_too_small_an_address_space_is_named(after):
     assert re.search(r"refused: .*limited to 400 MB \(ulimit -v\), expected at least \d+ MB", done.stdout), done.stdout
 
 
-@pytest.mark.skipif(sys.platform != "linux", reason="limits of a process")
-def test_a_command_without_room_for_numpy_says_so_at_once():
-    """numpy's libraries wait for memory for ever while they are imported, and no signal but SIGKILL ends that."""
-    program = (
-        "import resource, sys\n"
-        "resource.setrlimit(resource.RLIMIT_AS, (300 * 10**6, resource.RLIM_INFINITY))\n"
-        "from SlicerUSSim.Command.cli import main\n"
-        "sys.argv = ['ussim', 'simulate', 'labels.nii.gz', '--pose', 'auto', '-o', 'image.png']\n"
-        "main()\n"
-    )
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
-    assert done.returncode == 2 and done.stderr.splitlines() == [
-        "ussim: the address space of this process is limited to 300 MB (ulimit -v), expected at least 1000 MB"
-    ]
-
-
 def test_a_full_disk_for_programs_is_named_unless_they_are_built(tmp_path, monkeypatch):
     """The compiler ends the process."""
     monkeypatch.setattr("shutil.disk_usage", lambda path: SimpleNamespace(free=10**5))

@@ -103,7 +103,7 @@ def test_images_that_are_too_thin_are_refused():
 def test_find_sheets_has_the_falx_of_a_part_and_not_twice():
     image, brain = slab()
     mask = image.with_array(brain.astype(np.uint8))
-    segmentation = segment_mri(image, mask=mask)
+    segmentation = segment_mri(image, mask=mask, thin_sulci=False)
     assert segmentation.atlas is None
     found = find_sheets(image, segmentation, contrast="t1", kinds=("sulcus", "falx"))
     falx, others = found.surfels.of_kind("falx"), found.surfels.of_kind("sulcus")
@@ -117,7 +117,9 @@ def test_find_sheets_has_the_falx_of_a_part_and_not_twice():
 def test_a_seed_does_not_grow_across_the_fissure():
     image, brain = slab(tumour=True)
     mask = image.with_array(brain.astype(np.uint8))
-    proposal = grow_lesion(segment_mri(image, mask=mask, bias_correction=False), (10.0, 0.0, 36.0), "tumour")
+    proposal = grow_lesion(
+        segment_mri(image, mask=mask, bias_correction=False, thin_sulci=False), (10.0, 0.0, 36.0), "tumour"
+    )
     inside = proposal.labels.array > 0
     ras = np.argwhere(inside)[:, ::-1] + image.ijk_to_ras[:3, 3]
     across = ras[:, 0] < midline(ras[:, 1], ras[:, 2]) - 1.5
@@ -129,7 +131,7 @@ def colin27() -> tuple[Volume, Segmentation]:
     if not (COLIN27 / "ch2bet.nii.gz").exists():
         pytest.skip("mricron-data is not installed")
     mri = Volume.read(COLIN27 / "ch2bet.nii.gz")
-    return mri, segment_mri(mri)
+    return mri, segment_mri(mri, thin_sulci=False)
 
 
 @pytest.mark.slow
@@ -147,7 +149,7 @@ def test_the_falx_of_a_part_is_that_of_the_whole_head(part, is_there):
     mask = whole.brain.mask
     box = part_box(mask, part)
     image, inside = cut_to(mri, box), cut_to(mask, box)
-    segmentation = segment_mri(image, mask=inside)
+    segmentation = segment_mri(image, mask=inside, thin_sulci=False)
     assert segmentation.atlas is None
     found = find_sheets(image, segmentation, contrast="t1", kinds=("falx",)).surfels
     assert (len(found) > 0) == is_there

@@ -23,9 +23,8 @@ from SlicerUSSim.Logic import (
 )
 from SlicerUSSim.Logic.base.files import write_json
 from SlicerUSSim.Logic.fitting.control_costs import control_costs, mean_cost, neighbours_of
-from SlicerUSSim.Logic.fitting.point_spread import PointSpread
 from SlicerUSSim.Logic.fitting.search import Progress
-from SlicerUSSim.Logic.fitting.speckle_fit import SpeckleFit
+from SlicerUSSim.Logic.fitting.speckle_fit import PointSpread, SpeckleFit
 from SlicerUSSim.Logic.fitting.texture_costs import TextureMisfit
 from SlicerUSSim.Logic.fitting.tracked_fit import simulated
 from SlicerUSSim.Logic.probe import ImageGrid, tilt_sweep

@@ -8,8 +8,7 @@ from scipy import ndimage
 from scipy.spatial.transform import Rotation
 
 from SlicerUSSim.Logic import Volume
-from SlicerUSSim.Logic.placement.head_axes import head_axes
-from SlicerUSSim.Logic.placement.views import VIEWS, view_pose
+from SlicerUSSim.Logic.placement.views import VIEWS, head_axes, view_pose
 
 NAMES = ("csf", "grey matter", "white matter")
 

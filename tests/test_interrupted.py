@@ -26,7 +26,7 @@ def heard():
 
 
 def test_an_interrupted_fit_leaves_its_state_and_nothing_half_done(tmp_path):
-    segmentation = segment_mri(head_mri(3.5))
+    segmentation = segment_mri(head_mri(3.5), thin_sulci=False)
     probe = PhasedProbe(70.0, 50.0, scan_lines=80)
     twin = make_twin(segmentation.labels, TissueTable.brain(segmentation.tissue_names), 3, probe=probe)
     twin.simulator.medium.labels.write(tmp_path / "labels.nii.gz")

@@ -285,13 +285,13 @@ def test_tissues_keep_the_colours_that_a_user_gave_them(kind):
 def test_notes_say_whose_they_are_and_do_not_stay_for_another_patient():
     bench = Scene()
     presenter, parameters = bench.presenter(), bench.logic.parameters
-    presenter.segment()
-    assert presenter.notes().splitlines()[0] == "Head:" and "white matter" in presenter.notes()
+    presenter.segmenting.segment()
+    assert presenter.notes.text().splitlines()[0] == "Head:" and "white matter" in presenter.notes.text()
     other = bench.add("ScalarVolume", "Zeros")
     write_volume(other, HEAD.with_array(np.zeros(HEAD.array.shape, np.float32)))
     parameters.mri = other
-    presenter.segment()
-    assert len(presenter.view.errors) == 1 and presenter.notes() == ""
+    presenter.segmenting.segment()
+    assert len(presenter.view.errors) == 1 and presenter.notes.text() == ""
 
 
 def test_a_segmentation_that_was_saved_and_loaded_is_still_segments_own(tmp_path):
@@ -313,16 +313,16 @@ def test_a_segmentation_that_was_saved_and_loaded_is_still_segments_own(tmp_path
 def test_tissues_that_must_stay_are_kept_and_the_new_node_is_named(label_maps):
     bench = Scene()
     presenter, parameters = bench.presenter(label_maps=label_maps), bench.logic.parameters
-    presenter.segment()
+    presenter.segmenting.segment()
     first = parameters.labels
     assert first.IsA("vtkMRMLLabelMapVolumeNode" if label_maps else "vtkMRMLSegmentationNode")
-    presenter.segment()
-    assert parameters.labels is first and "is kept" not in presenter.notes()
+    presenter.segmenting.segment()
+    assert parameters.labels is first and "is kept" not in presenter.notes.text()
     edit(first)
     before = node_labels(first)[0].array.copy()
-    presenter.segment()
+    presenter.segmenting.segment()
     assert parameters.labels is not first and not presenter.view.errors
-    line = presenter.notes().splitlines()[-1]
+    line = presenter.notes.text().splitlines()[-1]
     assert line.startswith("'Head tissues' was not made by Segment, or edited since, and is kept; the result is ")
     assert line.endswith(repr(parameters.labels.GetName()))
     np.testing.assert_array_equal(node_labels(first)[0].array, before)
@@ -335,13 +335,16 @@ def test_the_panel_lays_lesions_over_a_copy_of_the_users_own_labels():
     edit(bench.labels)
     presenter, parameters = bench.presenter(), bench.logic.parameters
     parameters.labels = bench.labels
-    assert presenter.canAddTissues() == (False, "Choose a segmentation with segments called tumour, oedema, ...")
+    assert presenter.lesions.canAddTissues() == (
+        False,
+        "Choose a segmentation with segments called tumour, oedema, ...",
+    )
     parameters.lesions = bench.lesions
-    assert presenter.canAddTissues()[0]
-    presenter.addTissues()
+    assert presenter.lesions.canAddTissues()[0]
+    presenter.lesions.addTissues()
     assert parameters.labels.GetName() == "tissues with lesions" and bench.voxels("tumour", parameters.labels) > 50
-    assert "'tissues' was not made by Segment" in presenter.notes() and "tumour: " in presenter.notes()
+    assert "'tissues' was not made by Segment" in presenter.notes.text() and "tumour: " in presenter.notes.text()
     assert "tumour" not in node_labels(bench.labels)[1].values()
     own = parameters.labels
-    presenter.addTissues()  # of its own making
+    presenter.lesions.addTissues()  # of its own making
     assert parameters.labels is own

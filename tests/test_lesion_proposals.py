@@ -91,7 +91,7 @@ def brain(kind: str) -> tuple[Segmentation, np.ndarray]:
         contrast, parts = "t1", ()
     image = phantom(maps, contrast, noise=0.03, bias=0.0)
     true = sum((maps.shares[part] for part in parts), np.zeros(maps.mask.shape)) > 0.5
-    return segment_mri(image.mri, contrast=contrast, mask=image.mask), true
+    return segment_mri(image.mri, contrast=contrast, mask=image.mask, thin_sulci=False), true
 
 
 def core(proposal: Proposal) -> np.ndarray:
@@ -122,7 +122,7 @@ def test_a_point_in_a_ventricle_beside_what_enhances_is_refused():
     centre = (18.0, 8.0, 18.0)  # beside the frontal horn
     maps = with_ring_tumour(maps, centre, 9.0).coarser(2)
     image = phantom(maps, "t1gd", noise=0.03, bias=0.0)
-    segmentation = segment_mri(image.mri, contrast="t1gd", mask=image.mask)
+    segmentation = segment_mri(image.mri, contrast="t1gd", mask=image.mask, thin_sulci=False)
     assert "necrosis" in grow_lesion(segmentation, centre).tissues
     apart = np.asarray(ndimage.distance_transform_edt(maps.shares[3] + maps.shares[4] < 0.5, sampling=2.0))
     fluid = np.where((apart > 2.5) & (apart < 5.0), ndimage.uniform_filter(maps.shares[0], 3), 0.0)

@@ -42,7 +42,7 @@ def bright_nuclei() -> tuple[TissueMaps, np.ndarray, np.ndarray]:
 
 
 def grey_share(case: BrainPhantom, where: np.ndarray, contrast: str) -> float:
-    found = segment_mri(case.mri, contrast=contrast, mask=case.mask)
+    found = segment_mri(case.mri, contrast=contrast, mask=case.mask, thin_sulci=False)
     return float((found.labels.array[where] == found.tissue_names.index("grey matter") + 1).mean())
 
 
@@ -60,7 +60,7 @@ def test_nuclei_nearly_as_bright_as_white_matter_are_grey():
 def test_white_matter_beside_a_nucleus_stays_white():
     maps, nuclei, ball = bright_nuclei()
     case = phantom(maps, noise=0.03, bias=0.0)
-    found = segment_mri(case.mri, mask=case.mask)
+    found = segment_mri(case.mri, mask=case.mask, thin_sulci=False)
     capsule = (maps.white > 0.7) & ~nuclei & ~ball & (sum_around(nuclei) > 0)
     assert capsule.sum() > 150
     assert (found.labels.array[capsule] == 3).mean() > 0.9
@@ -76,7 +76,7 @@ def test_putamen_and_thalamus_of_colin27_are_grey_where_aal_draws_them():
     if not (COLIN27 / "aal.nii.gz").exists():
         pytest.skip("mricron-data is not installed")
     brain, drawn = (Volume.read(COLIN27 / name) for name in ("ch2bet.nii.gz", "aal.nii.gz"))
-    found = segment_mri(brain)
+    found = segment_mri(brain, thin_sulci=False)
     assert drawn.array.shape == brain.array.shape
     for labels in _AAL.values():
         inside = np.isin(drawn.array, labels) & (found.labels.array > 1)  # AAL's thalamus reaches into the ventricle

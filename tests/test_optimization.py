@@ -432,7 +432,7 @@ def test_bad_input_is_one_clear_line(twin):
 
 @pytest.fixture(scope="module")
 def real_brain(mni):
-    segmentation = segment_mri(mni[0])
+    segmentation = segment_mri(mni[0], thin_sulci=False)
     return segmentation.labels, TissueTable.brain(segmentation.tissue_names)
 
 

@@ -167,7 +167,9 @@ def test_a_brain_without_a_head_is_refused_before_it_is_segmented(tmp_path):
 def test_the_segmentation_has_what_is_outside_after_its_own_labels():
     mri, brain, _ = round_head(COARSE_MM)
     mask = mri.with_array(brain.astype(np.uint8))
-    plain, whole = (segment_mri(mri, mask=mask, bias_correction=False, outside=on) for on in (False, True))
+    plain, whole = (
+        segment_mri(mri, mask=mask, bias_correction=False, outside=on, thin_sulci=False) for on in (False, True)
+    )
     assert whole.tissue_names == (*plain.tissue_names, *OUTSIDE) and whole.brain_names == plain.tissue_names
     np.testing.assert_array_equal(np.where(brain, whole.labels.array, 0), plain.labels.array)
     found = find_outside(mri, brain).over(plain.labels, plain.tissue_names)

@@ -15,8 +15,16 @@ from SlicerUSSim.Logic.mrml import UltrasoundSceneLogic
 from SlicerUSSim.Logic.mrml.fitting_nodes import fits
 from SlicerUSSim.Logic.mrml.label_nodes import node_labels, write_labels
 from SlicerUSSim.Logic.mrml.nodes import write_volume
-from SlicerUSSim.Logic.mrml.own_labels import content_of, mark_as_made
-from SlicerUSSim.Logic.mrml.own_results import IMAGE, OUTLINE, REGISTRATION, SEQUENCE, kind_of_result, mark_as_result
+from SlicerUSSim.Logic.mrml.own_results import (
+    IMAGE,
+    OUTLINE,
+    REGISTRATION,
+    SEQUENCE,
+    content_of,
+    kind_of_result,
+    mark_as_made,
+    mark_as_result,
+)
 from SlicerUSSim.Logic.mrml.scene_record import SceneRecord, put_nodes, record_nodes
 from tests.conftest import rigid
 from tests.test_scene import Bench, add, cyst, pixels, put, save_scene

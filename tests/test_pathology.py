@@ -399,7 +399,7 @@ def test_a_lesion_has_a_preset_with_sources_and_a_colour_of_its_own(name):
 @pytest.mark.slow
 def test_the_texture_of_the_mri_is_certain_in_a_lesion():
     mri = head_mri(3.0)
-    segmentation = segment_mri(mri)
+    segmentation = segment_mri(mri, thin_sulci=False)
     result = added(ball(mri, 12.0, [30, 0, 30]), "tumour", segmentation.labels, segmentation.tissue_names)
     lesion = result.labels.array == 4
     before = segmentation.texture()

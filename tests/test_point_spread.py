@@ -17,8 +17,7 @@ from SlicerUSSim.Logic import (
     UltrasoundSimulator,
 )
 from SlicerUSSim.Logic.fitting import fit_speckle
-from SlicerUSSim.Logic.fitting.point_spread import BAND_SIGMA, PointSpread, point_spread
-from SlicerUSSim.Logic.fitting.speckle_fit import with_point_spread
+from SlicerUSSim.Logic.fitting.speckle_fit import BAND_SIGMA, PointSpread, point_spread, with_point_spread
 from SlicerUSSim.Logic.fitting.speckle_width import SpeckleWidth
 from SlicerUSSim.Logic.probe import ImageGrid, tilt_sweep
 from SlicerUSSim.Logic.tracked import TrackedImages

@@ -19,13 +19,14 @@ from SlicerUSSim.Logic.mrml.label_nodes import read_labels, write_labels  # noqa
 from SlicerUSSim.Logic.mrml.lesion_nodes import add_lesion  # noqa: E402
 from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic  # noqa: E402
 from SlicerUSSim.Logic.mrml.nodes import probe_pose, read_volume, set_node_to_world, write_volume  # noqa: E402
-from SlicerUSSim.Logic.mrml.own_labels import content_of  # noqa: E402
+from SlicerUSSim.Logic.mrml.own_results import content_of  # noqa: E402
 from SlicerUSSim.Logic.mrml.share_nodes import read_shares  # noqa: E402
 from SlicerUSSim.Logic.mrml.taken_image import about_image, is_frozen, patient_of  # noqa: E402
 from SlicerUSSim.Logic.probe.arrays import PROBE_KINDS, PROBES, LinearProbe  # noqa: E402
-from SlicerUSSim.Widget.controls import by_widget, part_of, shown_by, usable  # noqa: E402
+from SlicerUSSim.Widget.interface import by_widget  # noqa: E402
 from SlicerUSSim.Widget.presenter import PanelPresenter  # noqa: E402
-from SlicerUSSim.Widget.sections import CUSTOM_PROBE, panel_sections  # noqa: E402
+from SlicerUSSim.Widget.sections import panel_sections  # noqa: E402
+from SlicerUSSim.Widget.value_presenter import CUSTOM_PROBE  # noqa: E402
 
 pytestmark = pytest.mark.usefixtures("segmented_once")
 
@@ -42,8 +43,9 @@ class PlainView:
     def showStatus(self, message: str) -> None:
         self.status.append(message)
 
-    def refresh(self) -> None:
+    def refresh(self, changed=None) -> None:
         self.refreshed += 1
+        self.changed = changed
 
     @contextmanager
     def progress(self, title: str):
@@ -71,77 +73,75 @@ def presenter():
 
 def test_from_mri_to_live_image(presenter):
     view = presenter.view
-    assert presenter.canSegment()[0] and not presenter.canSimulate()[0]
-    presenter.segment()
+    assert presenter.segmenting.canSegment()[0] and not presenter.canSimulate()[0]
+    presenter.segmenting.segment()
     assert presenter.canSimulate()[0] and view.shares[-1] == 1.0
-    presenter.setValue("probe.scan_lines", 48)
-    presenter.setLive(True)
-    assert presenter.isLive() and not view.errors
+    presenter.values.setValue("probe.scan_lines", 48)
+    presenter.images.setLive(True)
+    assert presenter.images.isLive() and not view.errors
     before = slicer.util.arrayFromVolume(presenter.logic.parameters.output).copy()
-    presenter.setValue("display.gain_db", 10.0)
-    assert presenter.value("display.gain_db") == 10.0 and len(view.waiting) == 1
+    presenter.values.setValue("display.gain_db", 10.0)
+    assert presenter.values.value("display.gain_db") == 10.0 and len(view.waiting) == 1
     view.waiting.pop()()
     after = slicer.util.arrayFromVolume(presenter.logic.parameters.output)
     assert after.astype(float).mean() > before.astype(float).mean() + 10
-    presenter.setLive(False)
-    assert not presenter.isLive()
+    presenter.images.setLive(False)
+    assert not presenter.images.isLive()
 
 
 def test_presets_carry_the_pose_if_it_is_wanted(presenter, tmp_path):
     view, parameters = presenter.view, presenter.logic.parameters
-    presenter.setValue("scene.preset_pose", True)
-    presenter.savePreset(tmp_path / "none.json")
+    presenter.values.setValue("scene.preset_pose", True)
+    presenter.values.savePreset(tmp_path / "none.json")
     assert "Pose in presets is ticked, and there is no probe" in view.errors.pop() and not list(tmp_path.iterdir())
-    presenter.segment()
-    presenter.placeProbe()
+    presenter.segmenting.segment()
+    presenter.placing.placeProbe()
     pose = probe_pose(parameters.probe_transform) @ pose_of_angles([3.0, 0, 5.0], [0, 10.0, 20.0])
     set_node_to_world(parameters.probe_transform, pose)
-    presenter.savePreset(tmp_path / "with.json")
-    presenter.setValue("scene.preset_pose", False)
-    presenter.savePreset(tmp_path / "without.json")
-    presenter.placeProbe()
+    presenter.values.savePreset(tmp_path / "with.json")
+    presenter.values.setValue("scene.preset_pose", False)
+    presenter.values.savePreset(tmp_path / "without.json")
+    presenter.placing.placeProbe()
     placed = probe_pose(parameters.probe_transform)
-    presenter.loadPreset(tmp_path / "without.json")
+    presenter.values.loadPreset(tmp_path / "without.json")
     np.testing.assert_array_equal(probe_pose(parameters.probe_transform), placed)
-    presenter.loadPreset(tmp_path / "with.json")
+    presenter.values.loadPreset(tmp_path / "with.json")
     np.testing.assert_allclose(probe_pose(parameters.probe_transform), pose, atol=1e-9)
     assert not view.errors and presenter.logic.preset.probe_to_ras is None  # the probe's node has it
     parameters.labels = None
-    presenter.loadPreset(tmp_path / "with.json")
+    presenter.values.loadPreset(tmp_path / "with.json")
     assert "the pose of the preset is not used, since there are no tissues" in view.errors.pop()
 
 
 def test_an_output_of_others_is_kept_and_a_new_one_selected(presenter):
     logic = presenter.logic
-    presenter.segment()
-    presenter.setValue("probe.scan_lines", 48)
+    presenter.segmenting.segment()
+    presenter.values.setValue("probe.scan_lines", 48)
     scan = logic.scene.AddNewNodeByClass("vtkMRMLScalarVolumeNode", "CT")
     write_volume(scan, head_mri(3.5))
     logic.parameters.output = scan
-    presenter.simulate()
+    presenter.images.simulate()
     assert not presenter.view.errors and logic.parameters.output.GetName() == "Ultrasound"
-    assert "'CT' has data of others and is kept; the result is 'Ultrasound'" in presenter.notes()
+    assert "'CT' has data of others and is kept; the result is 'Ultrasound'" in presenter.notes.text()
     np.testing.assert_array_equal(slicer.util.arrayFromVolume(scan), head_mri(3.5).array)
     chosen = logic.parameters.output
-    presenter.simulate()
+    presenter.images.simulate()
     assert logic.parameters.output is chosen
 
 
-def test_every_name_in_the_list_of_sections_is_one_of_the_presenter(presenter):
-    controls = by_widget(panel_sections())
+def test_every_control_shows_something_and_says_whether_it_can_be_used(presenter):
+    controls = by_widget(panel_sections(presenter))
     own = {"loadPreset", "savePreset", "assignTissue"}  # with what the view has chosen
     for control in controls.values():
-        if control.shows:
-            shown_by(presenter, control.shows)
-        if control.action:
-            assert callable(part_of(presenter, control.action)), control.name
-            needs = [
-                parameter
-                for parameter in inspect.signature(part_of(presenter, control.action)).parameters.values()
-                if parameter.default is parameter.empty
-            ]
-            assert control.name in own or len(needs) == (control.kind != "button"), control.name
-        can, tip = usable(presenter, control)
+        assert control.shows is None or control.shows() is not None, control.name
+        assert (control.action is not None) == (control.kind == "button"), control.name
+        for method, given in ((control.action, control.name in own), (control.sets, True)):
+            if method is not None:
+                needs = [
+                    entry for entry in inspect.signature(method).parameters.values() if entry.default is entry.empty
+                ]
+                assert bool(needs) == given, control.name
+        can, tip = control.usable()
         assert isinstance(can, bool) and tip
     assert len(controls) > 60
 
@@ -155,75 +155,77 @@ def test_a_parameter_of_a_new_probe_is_in_the_panel_by_its_declaration(presenter
         )
 
     try:
-        control = by_widget(panel_sections())["turnSpinBox"]
+        control = by_widget(panel_sections(presenter))["turnSpinBox"]
         assert control.tip == "About its axis (-90 to 90°)" and control.suffix == "°" and control.decimals == 1
-        assert presenter.value("probe.turn_deg") is None  # the probe in use has none
+        assert presenter.values.value("probe.turn_deg") is None  # the probe in use has none
     finally:
         del PROBE_KINDS["ring"]
 
 
-def test_widgets_are_called_after_what_they_show_without_its_unit():
-    names = {control.value: control.widget for control in by_widget(panel_sections()).values() if control.value}
+def test_widgets_are_called_after_what_they_show_without_its_unit(presenter):
+    names = {
+        control.value: control.widget for control in by_widget(panel_sections(presenter)).values() if control.value
+    }
     assert names["display.tgc_db_cm_mhz"] == "tgcSlider" and names["probe.field_of_view_deg"] == "fieldOfViewSpinBox"
     assert names["settings.reference_speed_m_s"] == "referenceSpeedSpinBox" and names["probe.kind"] == "kindComboBox"
     assert names["scene.fit_frames"] == "fitFramesLineEdit" and names["scene.thin_sulci"] == "thinSulciCheckBox"
-    section = panel_sections()[0]
+    section = panel_sections(presenter)[0]
     with pytest.raises(ValueError, match="two controls of one name"):
         by_widget((section, section))
 
 
 def test_values_are_shown_in_the_unit_of_the_panel_and_meant_in_their_own(presenter):
-    presenter.setValue("settings.intensity_threshold", -100.0)
+    presenter.values.setValue("settings.intensity_threshold", -100.0)
     assert presenter.logic.preset.settings.intensity_threshold == pytest.approx(1e-5)
-    assert presenter.value("settings.intensity_threshold") == pytest.approx(-100.0)
-    presenter.setValue("display.noise_db", -150.0)
-    assert presenter.logic.preset.display.noise_db is None and presenter.value("display.noise_db") == -150.0
-    presenter.setValue("probe.focus_mm", 0.0)
-    assert presenter.value("probe.focus_mm") == 54.0  # where it is by default
-    presenter.setValue("probe.scan_lines", 64.0)
+    assert presenter.values.value("settings.intensity_threshold") == pytest.approx(-100.0)
+    presenter.values.setValue("display.noise_db", -150.0)
+    assert presenter.logic.preset.display.noise_db is None and presenter.values.value("display.noise_db") == -150.0
+    presenter.values.setValue("probe.focus_mm", 0.0)
+    assert presenter.values.value("probe.focus_mm") == 54.0  # where it is by default
+    presenter.values.setValue("probe.scan_lines", 64.0)
     assert type(presenter.logic.preset.probe.scan_lines) is int
-    assert presenter.value("probe.width_mm") is None
-    presenter.setValue("scene.fit_evaluations", 70.0)
+    assert presenter.values.value("probe.width_mm") is None
+    presenter.values.setValue("scene.fit_evaluations", 70.0)
     assert presenter.logic.parameters.fit.evaluations == 70 and not presenter.view.errors
     for wrong in (float("nan"), "many", True, None):
-        presenter.setValue("scene.fit_evaluations", wrong)
-        assert "Evaluations is " in presenter.view.errors[-1] and presenter.value("scene.fit_evaluations") == 70
+        presenter.values.setValue("scene.fit_evaluations", wrong)
+        assert "Evaluations is " in presenter.view.errors[-1] and presenter.values.value("scene.fit_evaluations") == 70
     assert len(presenter.view.errors) == 4
 
 
 def test_every_probe_preset_is_offered_by_a_readable_name(presenter):
-    control = by_widget(panel_sections())["probePresetComboBox"]
+    control = by_widget(panel_sections(presenter))["probePresetComboBox"]
     assert len(control.choices) == len(PROBES) + 1
     for name, probe in PROBES.items():
         shown = name.replace("_", " ")
         assert shown in control.choices and f"{shown} {probe.frequency_mhz:g} MHz" in control.tip
         for spelling in (shown, name):  # scripts may use the name in PROBES
             presenter.logic.preset = presenter.logic.preset.changed("probe", depth_mm=77.0)
-            assert presenter.probeName() == CUSTOM_PROBE
-            presenter.chooseProbe(spelling)
-            assert presenter.logic.preset.probe == probe and presenter.probeName() == shown
-            presenter.chooseProbe(CUSTOM_PROBE)  # back to that of before
-            assert presenter.probeName() == CUSTOM_PROBE and presenter.logic.preset.probe.depth_mm == 77.0
+            assert presenter.values.probeName() == CUSTOM_PROBE
+            presenter.values.chooseProbe(spelling)
+            assert presenter.logic.preset.probe == probe and presenter.values.probeName() == shown
+            presenter.values.chooseProbe(CUSTOM_PROBE)  # back to that of before
+            assert presenter.values.probeName() == CUSTOM_PROBE and presenter.logic.preset.probe.depth_mm == 77.0
     assert not presenter.view.errors
 
 
 def test_custom_without_a_custom_probe_says_how_to_make_one(presenter):
-    presenter.chooseProbe("linear")
-    presenter._custom_probe = None
-    presenter.chooseProbe(CUSTOM_PROBE)
-    assert presenter.probeName() == "linear"
+    presenter.values.chooseProbe("linear")
+    presenter.values._custom_probe = None
+    presenter.values.chooseProbe(CUSTOM_PROBE)
+    assert presenter.values.probeName() == "linear"
     assert presenter.view.errors == ["there is no custom probe yet: change a value of this probe, and it is one"]
 
 
 @pytest.mark.parametrize(
     ("act", "message"),
     [
-        (lambda p: p.setValue("display.gain_db", 1000.0), "Gain is 1000 dB, expected a number between -"),
-        (lambda p: p.chooseProbe("loud"), "no probe is called 'loud', expected one of phased"),
-        (lambda p: p.setTissue("csf", "mu0", "nan"), "tissue 'csf': mu0 is 'nan', expected a number"),
-        (lambda p: p.assignTissue("csf", "cheese"), "no tissue is called 'cheese'"),
-        (lambda p: p.setLive(True), "no label map chosen; segment the MRI first"),
-        (lambda p: p.loadPreset("/nowhere.json"), "/nowhere.json: cannot be read"),
+        (lambda p: p.values.setValue("display.gain_db", 1000.0), "Gain is 1000 dB, expected a number between -"),
+        (lambda p: p.values.chooseProbe("loud"), "no probe is called 'loud', expected one of phased"),
+        (lambda p: p.tissues.setTissue("csf", "mu0", "nan"), "tissue 'csf': mu0 is 'nan', expected a number"),
+        (lambda p: p.tissues.assignTissue("csf", "cheese"), "no tissue is called 'cheese'"),
+        (lambda p: p.images.setLive(True), "no label map chosen; segment the MRI first"),
+        (lambda p: p.values.loadPreset("/nowhere.json"), "/nowhere.json: cannot be read"),
     ],
 )
 def test_what_a_user_does_wrong_is_shown_and_changes_nothing(presenter, act, message):
@@ -237,16 +239,18 @@ def test_what_a_user_does_wrong_is_shown_and_changes_nothing(presenter, act, mes
 def test_a_bug_of_ours_is_not_swallowed(presenter, monkeypatch):
     monkeypatch.setattr(presenter.logic, "segment", lambda *_, **__: 1 / 0)
     with pytest.raises(ZeroDivisionError):
-        presenter.segment()
-    assert presenter.logic.scene.GetFirstNodeByName("Head tissues") is None and presenter.canSegment()[0]
+        presenter.segmenting.segment()
+    assert presenter.logic.scene.GetFirstNodeByName("Head tissues") is None and presenter.segmenting.canSegment()[0]
 
 
 def test_only_values_of_the_chosen_transmission_are_offered(presenter):
-    presenter.setValue("probe.transmit", "focus")
-    assert presenter.value("probe.focal_zones") is None and presenter.value("probe.transmit_angles") is None
-    presenter.setValue("probe.transmit", "zones")
-    presenter.setValue("probe.focal_zones", 5)
-    assert presenter.value("probe.focal_zones") == 5 and presenter.value("probe.transmit_angles") is None
+    presenter.values.setValue("probe.transmit", "focus")
+    assert (
+        presenter.values.value("probe.focal_zones") is None and presenter.values.value("probe.transmit_angles") is None
+    )
+    presenter.values.setValue("probe.transmit", "zones")
+    presenter.values.setValue("probe.focal_zones", 5)
+    assert presenter.values.value("probe.focal_zones") == 5 and presenter.values.value("probe.transmit_angles") is None
     assert not presenter.view.errors
 
 
@@ -254,19 +258,19 @@ def test_the_notes_say_what_the_shown_labels_were_recognised_as(presenter):
     """They stayed those of the segmentation before; what labels are was in the log alone."""
     from tests.test_label_places import kept, whole_head
 
-    presenter.segment()
-    presenter.simulate()
-    assert presenter.notes().startswith("Head:") and not presenter.view.errors
+    presenter.segmenting.segment()
+    presenter.images.simulate()
+    assert presenter.notes.text().startswith("Head:") and not presenter.view.errors
     scene = presenter.logic.scene
     for name, volume in (("aseg", whole_head()), ("half", kept(whole_head(), 1, -80, 0))):
         node = scene.AddNewNodeByClass("vtkMRMLLabelMapVolumeNode", name)
         write_volume(node, volume)
         presenter.logic.parameters.labels = node
-        presenter.simulate()
-        assert presenter.notes().startswith(f"{name}: FreeSurfer"), presenter.notes()
-    assert "cut off at the front" in presenter.notes() and not presenter.view.errors
-    presenter.simulate()
-    assert presenter.notes().startswith("half:")
+        presenter.images.simulate()
+        assert presenter.notes.text().startswith(f"{name}: FreeSurfer"), presenter.notes.text()
+    assert "cut off at the front" in presenter.notes.text() and not presenter.view.errors
+    presenter.images.simulate()
+    assert presenter.notes.text().startswith("half:")
 
 
 def test_lesions_leave_the_checks_of_the_tissues_under_them_in_the_notes(presenter):
@@ -277,8 +281,8 @@ def test_lesions_leave_the_checks_of_the_tissues_under_them_in_the_notes(present
     half = kept(whole_head(), 1, -80, 0)
     parameters.labels = scene.AddNewNodeByClass("vtkMRMLLabelMapVolumeNode", "half")
     write_volume(parameters.labels, half)
-    presenter.simulate()
-    checks = [line for line in presenter.notes().splitlines() if "cut off at the front" in line]
+    presenter.images.simulate()
+    checks = [line for line in presenter.notes.text().splitlines() if "cut off at the front" in line]
     assert len(checks) == 1
     mask = np.zeros(half.array.shape, np.uint8)
     centre = np.argwhere(half.array > 0).mean(axis=0).astype(int)
@@ -286,48 +290,48 @@ def test_lesions_leave_the_checks_of_the_tissues_under_them_in_the_notes(present
     parameters.lesions = scene.AddNewNodeByClass("vtkMRMLSegmentationNode", "Lesions")
     add_lesion(parameters.lesions, half.with_array(mask), "tumour", "tumour.nii.gz")
     for _ in range(2):
-        presenter.addTissues()
-        lines = presenter.notes().splitlines()
+        presenter.lesions.addTissues()
+        lines = presenter.notes.text().splitlines()
         assert not presenter.view.errors and lines.count(checks[0]) == 1 and any("tumour: " in line for line in lines)
-        presenter.simulate()
-        assert presenter.notes().splitlines() == lines
+        presenter.images.simulate()
+        assert presenter.notes.text().splitlines() == lines
     parameters.labels = scene.AddNewNodeByClass("vtkMRMLLabelMapVolumeNode", "whole")
     write_volume(parameters.labels, whole_head())
-    presenter.addTissues()  # over the tissues of another patient, which were not simulated yet
-    assert "tumour: " in presenter.notes() and checks[0] not in presenter.notes()
+    presenter.lesions.addTissues()  # over the tissues of another patient, which were not simulated yet
+    assert "tumour: " in presenter.notes.text() and checks[0] not in presenter.notes.text()
 
 
 def test_an_image_that_does_not_follow_the_probe_is_said_to_be_frozen(presenter):
-    presenter.segment()
-    presenter.setValue("probe.scan_lines", 48)
-    presenter.setLive(True)
+    presenter.segmenting.segment()
+    presenter.values.setValue("probe.scan_lines", 48)
+    presenter.images.setLive(True)
     output, probe = presenter.logic.parameters.output, presenter.logic.parameters.probe_transform
     assert output.GetParentTransformNode() is probe
-    presenter.setLive(False)
+    presenter.images.setLive(False)
     assert presenter.view.status[-1].startswith("FROZEN: Head, ") and output.GetParentTransformNode() is None
-    presenter.simulate()
+    presenter.images.simulate()
     assert output.GetParentTransformNode() is None and is_frozen(output)
     assert about_image(output)["patient"] == "Head"
 
 
 @pytest.mark.parametrize("label_maps", [False, True])
 def test_the_last_segment_can_be_undone(presenter, label_maps):
-    presenter._label_maps = label_maps
+    presenter.segmenting._label_maps = label_maps
     logic, parameters = presenter.logic, presenter.logic.parameters
-    assert presenter.canUndoSegment() == (False, "Nothing was segmented since the scene was opened")
-    presenter.segment()
-    first, labels, notes = content_of(parameters.labels), parameters.labels, presenter.notes()
+    assert presenter.segmenting.canUndoSegment() == (False, "Nothing was segmented since the scene was opened")
+    presenter.segmenting.segment()
+    first, labels, notes = content_of(parameters.labels), parameters.labels, presenter.notes.text()
     shares = read_shares(labels, *_labels_of(labels, logic))
-    presenter.setValue("scene.thin_sulci", not presenter.value("scene.thin_sulci"))
-    presenter.segment()
+    presenter.values.setValue("scene.thin_sulci", not presenter.values.value("scene.thin_sulci"))
+    presenter.segmenting.segment()
     assert parameters.labels is labels and content_of(labels) != first
-    assert presenter.canUndoSegment() == (True, "")
-    presenter.undoSegment()
-    assert parameters.labels is labels and content_of(labels) == first and presenter.notes() == notes
+    assert presenter.segmenting.canUndoSegment() == (True, "")
+    presenter.segmenting.undoSegment()
+    assert parameters.labels is labels and content_of(labels) == first and presenter.notes.text() == notes
     assert patient_of(labels) == "Head" and logic.mayReplace(labels)
     again = read_shares(labels, *_labels_of(labels, logic))
     np.testing.assert_array_equal(again.second_label, shares.second_label)
-    assert not presenter.canUndoSegment()[0] and not presenter.view.errors
+    assert not presenter.segmenting.canUndoSegment()[0] and not presenter.view.errors
 
 
 def _labels_of(labels_node, logic):
@@ -341,92 +345,93 @@ def test_undo_of_the_first_segment_leaves_the_users_tissues_alone(presenter):
     head = read_volume(parameters.mri)
     write_labels(own, head.with_array((head.array > head.array.mean()).astype(np.uint8)), ["tumour"], parameters.mri)
     parameters.labels, content = own, content_of(own)
-    presenter.segment()
+    presenter.segmenting.segment()
     made = parameters.labels
     assert made is not own and content_of(own) == content
-    presenter.undoSegment()
+    presenter.segmenting.undoSegment()
     assert parameters.labels is own and made.GetScene() is None and content_of(own) == content
-    presenter.undoSegment()
+    presenter.segmenting.undoSegment()
     assert "Nothing was segmented" in presenter.view.errors[-1]
 
 
 def test_undo_takes_back_the_last_segment_whatever_labels_are_chosen(presenter):
     """It removed the chosen tissues, and left those that were made last."""
     parameters = presenter.logic.parameters
-    presenter.segment()
+    presenter.segmenting.segment()
     first, content = parameters.labels, content_of(parameters.labels)
     parameters.labels = None
-    presenter.segment()
+    presenter.segmenting.segment()
     second = parameters.labels
     parameters.labels = first
-    assert first is not second and presenter.canUndoSegment() == (True, "")
-    presenter.undoSegment()
+    assert first is not second and presenter.segmenting.canUndoSegment() == (True, "")
+    presenter.segmenting.undoSegment()
     assert parameters.labels is first and first.GetScene() is not None and content_of(first) == content
     assert second.GetScene() is None and not presenter.view.errors
-    assert not presenter.canUndoSegment()[0]
+    assert not presenter.segmenting.canUndoSegment()[0]
 
 
 def test_undo_of_tissues_that_are_gone_or_opened_is_refused(presenter):
     parameters, scene = presenter.logic.parameters, presenter.logic.scene
-    presenter.segment()
+    presenter.segmenting.segment()
     made = parameters.labels
     opened = scene.AddNewNodeByClass("vtkMRMLSegmentationNode", "opened")
     set_closed_labels(opened, made)
     parameters.labels = opened
-    assert "was opened in 'Head tissues' after Segment" in presenter.canUndoSegment()[1]
-    presenter.undoSegment()
+    assert "was opened in 'Head tissues' after Segment" in presenter.segmenting.canUndoSegment()[1]
+    presenter.segmenting.undoSegment()
     assert opened.GetScene() is made.GetScene() is scene and "close it first" in presenter.view.errors.pop()
     scene.RemoveNode(opened)
     scene.RemoveNode(made)
-    assert "were removed from the scene" in presenter.canUndoSegment()[1]
+    assert "were removed from the scene" in presenter.segmenting.canUndoSegment()[1]
 
 
 @pytest.mark.parametrize("kind", ["Segmentation", "LabelMapVolume"])
 def test_undo_empties_a_node_that_was_empty(presenter, kind):
     parameters, scene = presenter.logic.parameters, presenter.logic.scene
     parameters.labels = own = scene.AddNewNodeByClass(f"vtkMRML{kind}Node", "mine")
-    presenter.segment()
+    presenter.segmenting.segment()
     assert parameters.labels is own and content_of(own)
-    presenter.undoSegment()
+    presenter.segmenting.undoSegment()
     assert parameters.labels is own and not content_of(own) and presenter.logic.mayReplace(own)
-    presenter.segment()
+    presenter.segmenting.segment()
     assert parameters.labels is own and content_of(own) and not presenter.view.errors
 
 
 def test_lesions_that_were_laid_over_the_tissues_after_segment_end_undo(presenter):
     """Undo took them away with the tissues, without a word."""
     parameters, scene = presenter.logic.parameters, presenter.logic.scene
-    presenter.segment()
+    presenter.segmenting.segment()
     labels, names = _labels_of(parameters.labels, presenter.logic)
     mask = np.zeros(labels.array.shape, np.uint8)
     centre = np.argwhere(labels.array == names.index("white matter") + 1).mean(axis=0).astype(int)
     mask[tuple(slice(at - 2, at + 3) for at in centre)] = 1
     parameters.lesions = scene.AddNewNodeByClass("vtkMRMLSegmentationNode", "Lesions")
     add_lesion(parameters.lesions, labels.with_array(mask), "tumour", "tumour.nii.gz")
-    presenter.addTissues()
+    presenter.lesions.addTissues()
     content = content_of(parameters.labels)
-    can, why_not = presenter.canUndoSegment()
+    can, why_not = presenter.segmenting.canUndoSegment()
     assert not can and "was changed after Segment, as by lesions laid over it, and is kept" in why_not
-    presenter.undoSegment()
+    presenter.segmenting.undoSegment()
     assert presenter.view.errors.pop() == why_not and content_of(parameters.labels) == content
-    presenter.segment()  # with the lesions
-    assert presenter.canUndoSegment() == (True, "")
-    presenter.undoSegment()
+    presenter.segmenting.segment()  # with the lesions
+    assert presenter.segmenting.canUndoSegment() == (True, "")
+    presenter.segmenting.undoSegment()
     assert content_of(parameters.labels) == content
 
 
 def test_settings_come_back_with_undo_or_it_says_so(presenter):
-    presenter.segment()
-    thin, notes = presenter.value("scene.thin_sulci"), presenter.notes()
-    presenter.setValue("scene.thin_sulci", not thin)
-    presenter.segment()
-    presenter.undoSegment()
-    assert presenter.value("scene.thin_sulci") == thin and presenter.notes() == notes
-    presenter.setValue("scene.thin_sulci", not thin)
-    presenter.segment()
-    presenter.setValue("scene.classes", 4)  # the user's since, and kept
-    presenter.undoSegment()
-    assert presenter.value("scene.thin_sulci") != thin and presenter.value("scene.classes") == 4
+    presenter.segmenting.segment()
+    thin, notes = presenter.values.value("scene.thin_sulci"), presenter.notes.text()
+    presenter.values.setValue("scene.thin_sulci", not thin)
+    presenter.segmenting.segment()
+    presenter.segmenting.undoSegment()
+    assert presenter.values.value("scene.thin_sulci") == thin and presenter.notes.text() == notes
+    presenter.values.setValue("scene.thin_sulci", not thin)
+    presenter.segmenting.segment()
+    presenter.values.setValue("scene.classes", 4)  # the user's since, and kept
+    presenter.segmenting.undoSegment()
+    assert presenter.values.value("scene.thin_sulci") != thin and presenter.values.value("scene.classes") == 4
     assert (
-        presenter.notes() == f"{notes}\nUndo left the settings of Segment as they are, since they were changed after it"
+        presenter.notes.text()
+        == f"{notes}\nUndo left the settings of Segment as they are, since they were changed after it"
     )

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import fields
+
 import numpy as np
 import pytest
 from hypothesis import given, strategies as st
@@ -83,3 +85,24 @@ def test_a_table_for_other_labels_keeps_edited_tissues():
     assert other[1].mu0 == 0.9 and other[2].name == "tumour" and other.membrane == table.membrane
     with pytest.raises(SimulationError, match="no tissue for 'Segment_1', 'foo'"):
         table.for_names(["Segment_1", "foo", "csf"])
+
+
+PRESETS = [
+    Preset(),
+    *map(Preset, PROBES.values()),
+    Preset().changed("probe", kind="linear", depth_mm=33).changed("display", image_size=(96, 64), grey_map="soft"),
+    Preset().changed("settings", contact_gap_mm=1.5, partial_volume=True),
+    Preset(tissues=TissueTable({})),
+    Preset(tissues=Preset().tissues.with_membrane(None)),
+    Preset(tissues=Preset().tissues.replace("leptomeninges", mu0=0.3)),
+    Preset(tissues=TissueTable.named(["liver", "kidney"])),
+]
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_a_preset_as_texts_has_every_value(preset):
+    texts = preset.to_texts()
+    assert Preset.from_texts(texts) == preset and Preset.from_texts(texts).tissues == preset.tissues
+    assert {f"display.{entry.name}" for entry in fields(preset.display)} <= texts.keys()
+    sources = [tissue.sources for tissue in preset.tissues.all_tissues()]
+    assert [tissue.sources for tissue in Preset.from_texts(texts).tissues.all_tissues()] == sources

@@ -31,7 +31,7 @@ PROBE = PhasedProbe(75.0, 60.0, scan_lines=96)
 
 @pytest.fixture(scope="module")
 def twin(mni):
-    segmentation = segment_mri(mni[0])
+    segmentation = segment_mri(mni[0], thin_sulci=False)
     tissues = TissueTable.brain(segmentation.tissue_names)
     # Five images each way: with three, speckle leaves up to 2.4 degrees, depending on the patient.
     return make_twin(segmentation.labels, tissues, 2, probe=PROBE, crossing=True, frames=5)

@@ -546,7 +546,7 @@ def test_live_update_ends_when_images_take_too_long_and_says_why(bench, monkeypa
         return simulate(*arguments, **options)
 
     monkeypatch.setattr("SlicerUSSim.Logic.mrml.live.perf_counter", lambda: now[0])
-    monkeypatch.setattr(bench.logic, "simulate", slow)
+    monkeypatch.setattr(bench.logic.images, "simulate", slow)
     bench.live(schedule=loop, report=reports.append, stopped=lambda: ended.append(1))
     loop.run()
     for shift in (1, 2, 3):
@@ -574,7 +574,7 @@ def test_live_update_ends_cleanly_with_its_nodes_its_scene_or_its_logic(bench, w
     elif what == "stop":
         bench.logic.stopLiveUpdate()
     elif what == "logic":
-        live = weakref.ref(bench.logic._live)
+        live = weakref.ref(bench.logic.live._update)
         bench.logic = None
         loop.waiting.clear()
         gc.collect()
@@ -756,8 +756,8 @@ def test_the_mri_is_never_the_output_and_other_wrong_content_is_refused(bench):
     write_labels(hollow, cyst().with_array(np.zeros_like(cyst().array)), ("speckle",), bench.grid())
     with pytest.raises(SimulationError, match="'hollow' is empty, expected a segment with voxels"):
         bench.logic.simulate(hollow, bench.probe, bench.image)
-    bench.logic.parameters.preset = "{gain: 3}"
-    with pytest.raises(SimulationError, match="the scene's preset is not JSON"):
+    bench.logic.parameters.node.SetParameter("preset", "{gain: 3}")
+    with pytest.raises(SimulationError, match=r"the scene's preset: preset is '\{gain: 3\}', which is not JSON"):
         bench.simulate()
 
 
@@ -809,7 +809,7 @@ def test_parameters_have_the_form_of_slicers_parameter_node_wrapper(bench):
     assert node is parameters.node and node.GetAttribute("ModuleName") == "USSim"
     assert node.GetNodeReference("labels") is bench.labels and node.HasParameter("labels")
     assert node.GetParameter("thin_sulci") == "False" and node.GetParameter("classes") == "4"
-    assert json.loads(node.GetParameter("preset"))["display"]["image_size"] == [96, 64]
+    assert node.GetParameter("display.image_size") == "96, 64"
     parameters.labels = None
     assert parameters.labels is None
     with pytest.raises(SimulationError, match="no 'label'"):
@@ -829,6 +829,75 @@ def test_parameters_have_the_form_of_slicers_parameter_node_wrapper(bench):
         parameters.bias_correction  # noqa: B018
     with pytest.raises(SimulationError, match=r"mri is a .*LinearTransformNode, expected vtkMRMLScalarVolumeNode"):
         parameters.mri = bench.probe
+
+
+def test_a_changed_value_of_a_preset_is_one_changed_parameter(bench):
+    parameters, logic = bench.logic.parameters, bench.logic
+    logic.preset = Preset()
+    before, events = parameters.texts, []
+    tag = parameters.node.AddObserver(vtkCommand.ModifiedEvent, lambda *_: events.append(1))
+    logic.preset = logic.preset.changed("display", gain_db=3.0, image_size=(64, 48))
+    assert parameters.texts == {**before, "display.gain_db": "3.0", "display.image_size": "64, 48"} and len(events) == 1
+    logic.preset = logic.preset.changed("display", gain_db=3.0)
+    assert len(events) == 1 and logic.preset is logic.preset
+    logic.preset = logic.preset.changed("display", gain_db=0.0, image_size=None)
+    assert parameters.texts == before and logic.preset == Preset() and len(events) == 2
+    parameters.node.RemoveObserver(tag)
+
+
+@pytest.mark.parametrize(
+    "name, text, message",
+    [
+        ("display.gain_db", "loud", "display.gain_db is 'loud', expected a number between -200 and 200"),
+        ("probe.kind", "round", "probe.kind is 'round', expected one of linear, convex, phased"),
+        ("probe.radius_mm", "30", "probe: radius_mm is not a parameter of a phased probe"),
+        ("tissues.2", '{"name": "mud"}', "tissue 2: lacks speed_of_sound_m_s"),
+        ("tissues.2", "mud", "tissues.2 is 'mud', which is not JSON"),
+        ("membrane.fluids", "3", "membrane: fluids is 3, expected"),
+    ],
+)
+def test_an_invalid_value_in_a_scene_is_named(bench, name, text, message):
+    bench.logic.preset = Preset()
+    bench.logic.parameters.node.SetParameter(name, text)
+    with pytest.raises(SimulationError) as caught:
+        bench.simulate()
+    assert str(caught.value).startswith("the scene's preset: ") and message in str(caught.value)
+
+
+def test_a_scene_of_before_with_its_preset_as_one_text_is_read(bench, tmp_path):
+    before = replace(PRESET, tissues=PRESET.tissues.with_membrane(None)).changed("settings", contact_gap_mm=1.0)
+    bench.logic.parameters.labels = bench.labels
+    bench.logic.preset = Preset()
+    bench.logic.parameters.node.SetParameter("preset", json.dumps(before.to_dict()))
+    save_scene(bench.scene, (bench.labels,), tmp_path)
+    scene = slicer.vtkMRMLScene()
+    scene.SetURL(str(tmp_path / "scene.mrml"))
+    assert scene.Connect()
+    logic = UltrasoundSceneLogic(scene)
+    assert logic.preset == before
+    node = logic.parameters.node
+    assert not node.GetParameter("preset") and node.GetParameter("settings.contact_gap_mm") == "1.0"
+    assert UltrasoundSceneLogic(scene).preset == before
+
+
+def test_segment_takes_settings_and_single_values(bench, monkeypatch):
+    asked = []
+
+    def segmented(mri, *, settings, **_):
+        asked.append(settings)
+        raise SimulationError("enough")
+
+    monkeypatch.setattr("SlicerUSSim.Logic.mrml.segment_logic.segment_image", segmented)
+    settings, mri = SegmentationSettings("t2", thin_sulci=False), bench.grid()
+    for chosen, values, expected in (
+        (None, {}, SegmentationSettings()), (settings, {}, settings),
+        (settings, {"filter_radius": 2}, replace(settings, filter_radius=2)),
+    ):  # fmt: skip
+        with pytest.raises(SimulationError, match="enough"):
+            bench.logic.segment(mri, add(bench.scene, "LabelMapVolume"), chosen, **values)
+        assert asked[-1] == expected
+    with pytest.raises(SimulationError, match="segmentation: 'sulci' is unknown, expected one of contrast, classes"):
+        bench.logic.segment(mri, add(bench.scene, "LabelMapVolume"), sulci=True)
 
 
 def test_every_declared_setting_is_remembered_one_by_one_and_together(bench):
@@ -964,7 +1033,7 @@ def test_a_simulation_that_fails_leaves_no_old_image(bench, is_live, monkeypatch
 
 def test_a_patient_is_forgotten(bench):
     bench.simulate()
-    kept = weakref.ref(bench.logic._simulators._simulator)
+    kept = weakref.ref(bench.logic.patients._simulators._simulator)
     bench.logic.clearImage(bench.image)
     bench.logic.forgetPatient()
     gc.collect()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import json
 import os
 import pickle
 from dataclasses import replace
@@ -19,7 +20,6 @@ from SlicerUSSim.Logic.base.vtk_data import vtk_matrix  # noqa: E402
 from SlicerUSSim.Logic.imaging.preset import Preset  # noqa: E402
 from SlicerUSSim.Logic.mri.samples import head_mri  # noqa: E402
 from SlicerUSSim.Logic.mri.segmentation_settings import SegmentationSettings  # noqa: E402
-from SlicerUSSim.Logic.mrml.known_field import KnownField, write_known_field  # noqa: E402
 from SlicerUSSim.Logic.mrml.label_nodes import write_labels  # noqa: E402
 from SlicerUSSim.Logic.mrml.landmark_nodes import Landmark, landmarks_of, write_landmarks  # noqa: E402
 from SlicerUSSim.Logic.mrml.lesion_nodes import add_lesion, read_lesions  # noqa: E402
@@ -35,7 +35,11 @@ from SlicerUSSim.Logic.mrml.scene_record import (  # noqa: E402
     record_scene,
     recorded_values,
 )
-from SlicerUSSim.Logic.mrml.sequence_nodes import add_sequence  # noqa: E402
+from SlicerUSSim.Logic.mrml.sequence_nodes import (  # noqa: E402
+    KnownField,
+    add_sequence,
+    write_known_field,
+)
 from SlicerUSSim.Logic.mrml.taken_image import is_frozen  # noqa: E402
 from SlicerUSSim.Logic.mrml.taken_sequence import put_taken, record_frozen, taken_of  # noqa: E402
 from SlicerUSSim.Logic.probe.image_grid import ImageGrid  # noqa: E402
@@ -166,7 +170,10 @@ def test_values_of_other_versions_are_told_and_have_their_default():
     again = UltrasoundSceneLogic(slicer.vtkMRMLScene())
     lines = put_values(again.parameters, values)
     assert len(lines) == 1 and lines[0].startswith("Contrast in the scene is 't9', expected one of t1")
-    assert again.parameters.segmentation.contrast == "t1"
+    assert again.parameters.segmentation.contrast == "t1" and again.preset == logic.preset
+    old = Preset().changed("display", gain_db=-4.0).changed("probe", kind="convex")
+    assert put_values(again.parameters, {"preset": json.dumps(old.to_dict())}) == [] and again.preset == old
+    assert put_values(again.parameters, {}) == [] and again.preset == Preset()
 
 
 def test_what_does_not_fit_together_leaves_nothing_in_the_scene():

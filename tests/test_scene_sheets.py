@@ -76,7 +76,7 @@ def test_segment_finds_sheets_and_images_show_them(monkeypatch):
         found.append(find_sheets(*arguments, **options))
         return found[-1]
 
-    monkeypatch.setattr("SlicerUSSim.Logic.mrml.logic.find_sheets", find)
+    monkeypatch.setattr("SlicerUSSim.Logic.mrml.segment_logic.find_sheets", find)
     bench, presenter = bench_with_probe()
     mri = head_mri(5.0)
     write_volume(bench.mri, mri)
@@ -84,17 +84,17 @@ def test_segment_finds_sheets_and_images_show_them(monkeypatch):
     parent.SetMatrixTransformToParent(vtk_matrix(TURN))
     bench.mri.SetAndObserveTransformNodeID(parent.GetID())
     parameters = bench.logic.parameters
-    presenter.setValue("scene.sheet_find", True)
-    presenter.setValue("scene.thin_sulci", False)
-    presenter.segment()
+    presenter.values.setValue("scene.sheet_find", True)
+    presenter.values.setValue("scene.thin_sulci", False)
+    presenter.segmenting.segment()
     assert not presenter.view.errors, presenter.view.errors
     model = parameters.sheets
     assert model.GetName() == "Head sheets" and not model.GetDisplayNode().GetVisibility()
     np.testing.assert_allclose(node_to_world(model), TURN)
-    assert "sulcus: " in presenter.notes() and "images show the sheets in 'Head sheets'" in presenter.notes()
+    assert "sulcus: " in presenter.notes.text() and "images show the sheets in 'Head sheets'" in presenter.notes.text()
     assert presenter.view.shares[-1] == 1.0 and np.all(np.diff(presenter.view.shares) >= 0)
-    presenter.placeProbe()
-    presenter.simulate()
+    presenter.placing.placeProbe()
+    presenter.images.simulate()
     shown = bench.logic.lastFrame.image
 
     result = segment_once(mri, classes=None, thin_sulci=False)
@@ -106,18 +106,18 @@ def test_segment_finds_sheets_and_images_show_them(monkeypatch):
     expected = simulator.simulate(preset.probe, pose, preset.display, noise_seed=seed_of_pose(pose)).image
 
     for kind in KINDS:
-        presenter.setValue(f"scene.sheet_{kind}", False)
-    presenter.simulate()
+        presenter.values.setValue(f"scene.sheet_{kind}", False)
+    presenter.images.simulate()
     without = bench.logic.lastFrame.image
     assert np.abs(without.astype(int) - shown).mean() > 10.0 * np.abs(shown.astype(int) - expected).mean()
     parameters.sheets = None
-    presenter.simulate()
+    presenter.images.simulate()
     np.testing.assert_array_equal(bench.logic.lastFrame.image, without)
 
     parameters.sheets = model
-    presenter.setValue("scene.sheet_find", False)
-    presenter.segment()
-    assert parameters.sheets is None and "of an earlier Segment, are not shown any more" in presenter.notes()
+    presenter.values.setValue("scene.sheet_find", False)
+    presenter.segmenting.segment()
+    assert parameters.sheets is None and "of an earlier Segment, are not shown any more" in presenter.notes.text()
 
 
 def test_sheets_of_a_user_are_kept_and_another_model_is_one_line():
@@ -127,23 +127,23 @@ def test_sheets_of_a_user_are_kept_and_another_model_is_one_line():
     write_sheets(mine, some_surfels(), bench.mri)
     mine.RemoveAttribute("SlicerUSSim.result")  # as loaded from a file
     parameters.sheets = mine
-    presenter.segment()
-    assert parameters.sheets is mine and "images show the sheets in 'mine'" in presenter.notes()
+    presenter.segmenting.segment()
+    assert parameters.sheets is mine and "images show the sheets in 'mine'" in presenter.notes.text()
     assert "falx" in bench.logic.tissues(parameters.labels).names()
-    presenter.placeProbe()
-    presenter.simulate()
+    presenter.placing.placeProbe()
+    presenter.images.simulate()
     parameters.sheets = parameters.outline  # a model without sheets
-    presenter.simulate()
+    presenter.images.simulate()
     (line,) = presenter.view.errors
     assert line.startswith("sheets Model 'Ultrasound outline': has no array 'place' of its cells, expected a file of")
 
 
 def test_what_has_no_sheets_is_said_before_anything_is_computed():
     bench, presenter = bench_with_probe()
-    presenter.setValue("scene.sheet_find", True)
+    presenter.values.setValue("scene.sheet_find", True)
     for contrast, words in (("flair", "sheets are not found in contrast 'flair'"), ("ct", "in contrast 'ct'")):
-        presenter.setValue("scene.contrast", contrast)
-        presenter.segment()
+        presenter.values.setValue("scene.contrast", contrast)
+        presenter.segmenting.segment()
         assert words in presenter.view.errors[-1] and presenter.view.shares == []
     assert bench.logic.parameters.labels is None and bench.logic.parameters.sheets is None
     names = {node.GetName() for node in (bench.scene.GetNthNode(n) for n in range(bench.scene.GetNumberOfNodes()))}
@@ -166,11 +166,11 @@ def test_organs_of_a_ct_are_laid_over_its_tissues_wherever_their_node_lies():
     organs.SetAndObserveTransformNodeID(parent.GetID())
     presenter, parameters = bench.presenter(label_maps=True), bench.logic.parameters
     parameters.organs = organs
-    presenter.segment()
+    presenter.segmenting.segment()
     assert "has organs of a CT, and the contrast is t1" in presenter.view.errors[-1]
-    presenter.setValue("scene.contrast", "ct")
-    presenter.segment()
-    assert len(presenter.view.errors) == 1 and "organs: liver" in presenter.notes()
+    presenter.values.setValue("scene.contrast", "ct")
+    presenter.segmenting.segment()
+    assert len(presenter.view.errors) == 1 and "organs: liver" in presenter.notes.text()
     laid = bench.voxels("liver", parameters.labels)
     assert 0.6 * liver.array.sum() < laid <= liver.array.sum()
 
@@ -204,31 +204,34 @@ def proposing() -> tuple[Scene, object, np.ndarray]:
 def test_a_point_in_a_view_proposes_a_lesion_that_is_laid_on_when_accepted():
     bench, presenter, true = proposing()
     parameters = bench.logic.parameters
-    assert presenter.canPropose() == (False, "Segment this MRI first")
-    presenter.pickSeed()
+    assert presenter.lesions.canPropose() == (False, "Segment this MRI first")
+    presenter.lesions.pickSeed()
     assert "segment this MRI first" in presenter.view.errors.pop()
     bench.logic.proposals.segmented(bench.mri, brain("low")[0])
-    assert presenter.canPropose()[0] and presenter.canProposeAtPoint() == (False, "Choose a point in the lesion")
-    presenter.pickSeed()
+    assert presenter.lesions.canPropose()[0] and presenter.lesions.canProposeAtPoint() == (
+        False,
+        "Choose a point in the lesion",
+    )
+    presenter.lesions.pickSeed()
     node, picked = presenter.view.picking
-    assert node is parameters.seed and not presenter.canAccept()[0]
+    assert node is parameters.seed and not presenter.lesions.canAccept()[0]
     node.AddControlPointWorld(0.0, 0.0, 300.0)
     picked()
-    assert "300" not in presenter.notes() and "mm outside the image" in presenter.view.errors.pop()
+    assert "300" not in presenter.notes.text() and "mm outside the image" in presenter.view.errors.pop()
     assert parameters.proposal is None
     node.AddControlPointWorld(*CENTRE)
     picked()
-    assert not presenter.view.errors and parameters.proposal is not None and presenter.canAccept()[0]
-    assert "proposal: tumour" in presenter.notes() and "accept or discard it" in presenter.notes()
+    assert not presenter.view.errors and parameters.proposal is not None and presenter.lesions.canAccept()[0]
+    assert "proposal: tumour" in presenter.notes.text() and "accept or discard it" in presenter.notes.text()
     assert parameters.proposal.GetDisplayNode().GetVisibility()
     with pytest.raises(ValueError, match="not in tuple"):  # nothing is laid over the tissues
         bench.voxels("tumour", parameters.labels)
     first = parameters.proposal
-    presenter.discardProposal()
-    assert parameters.proposal is None and first.GetScene() is None and "proposal: " not in presenter.notes()
-    presenter.proposeAtPoint()
-    presenter.acceptProposal()
-    assert not presenter.view.errors and parameters.proposal is None and "proposal: " not in presenter.notes()
+    presenter.lesions.discardProposal()
+    assert parameters.proposal is None and first.GetScene() is None and "proposal: " not in presenter.notes.text()
+    presenter.lesions.proposeAtPoint()
+    presenter.lesions.acceptProposal()
+    assert not presenter.view.errors and parameters.proposal is None and "proposal: " not in presenter.notes.text()
     laid = bench.voxels("tumour", parameters.labels)
     assert 0.6 * true.sum() < laid < 1.4 * true.sum()
     assert list(parameters.lesions.GetSegmentation().GetSegmentIDs())

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from SlicerUSSim.Logic import TissueTable, UltrasoundSimulator, Volume
-from SlicerUSSim.Logic.fitting.seen import parameters_seen, shares
+from SlicerUSSim.Logic.fitting.tracked_fit import parameters_seen, shares
 from SlicerUSSim.Logic.probe import PROBES, ImageGrid
 from SlicerUSSim.Logic.tissue import Surfels
 from tests.conftest import rigid

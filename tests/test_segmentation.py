@@ -75,8 +75,10 @@ def brain_of(share: dict[str, float], noise: float, seed: int) -> np.ndarray:
 def test_the_template_with_five_percent_noise_is_segmented_well(mni, truth):
     mri, mask = mni[0], mni[0].with_array((mni[0].array > 0).astype(np.uint8))
     noisy = with_rician_noise(mri, 0.05)
-    plain = dice(segment_mri(noisy, mask=mask, filter_radius=0, bias_correction=False).labels.array, truth)
-    result = segment_mri(noisy, mask=mask, bias_correction=False)
+    plain = dice(
+        segment_mri(noisy, mask=mask, filter_radius=0, bias_correction=False, thin_sulci=False).labels.array, truth
+    )
+    result = segment_mri(noisy, mask=mask, bias_correction=False, thin_sulci=False)
     filtered = dice(result.labels.array, truth)
     assert result.tissue_names == ("csf", "grey matter", "white matter")
     assert filtered.mean() > plain.mean()
@@ -199,7 +201,7 @@ def test_noise_is_estimated_beside_edges(sigma):
 def test_classes_are_named_by_contrast(contrast, order):
     head = head_mri(4.0)
     mri = head.with_array(np.where(head.array > 0, 160 - head.array, 0)) if contrast == "t2" else head
-    result = segment_once(mri, contrast=contrast)
+    result = segment_once(mri, contrast=contrast, thin_sulci=False)
     assert result.tissue_names == order
     assert (np.diff(result.means) > 0).all()
 
@@ -217,7 +219,7 @@ def test_the_table_has_a_line_per_label_and_its_millilitres_add_up():
 @pytest.mark.slow
 def test_the_table_has_means_and_deviations_in_any_unit():
     head, unit = head_mri(4.0), 1e-6
-    result = segment_mri(head.with_array((head.array * np.float64(unit)).astype(np.float32)))
+    result = segment_mri(head.with_array((head.array * np.float64(unit)).astype(np.float32)), thin_sulci=False)
     lines = result.table().splitlines()[1:]
     assert len(lines) == len(result.means) == 3 and len(set(map(len, lines))) == 1
     for line, mean, deviation in zip(lines, result.means, result.standard_deviations, strict=True):
@@ -226,7 +228,7 @@ def test_the_table_has_means_and_deviations_in_any_unit():
 
 
 def test_posteriors_sum_to_one_inside_and_agree_with_the_labels():
-    result = segment_once(head_mri(3.0))
+    result = segment_once(head_mri(3.0), thin_sulci=False)
     posteriors = result.posteriors
     inside = result.labels.array > 0
     assert posteriors.shape == (3, *inside.shape) and posteriors.dtype == np.float32
@@ -252,17 +254,19 @@ def test_thin_sulci_are_found_on_their_middle_and_only_there():
     sulcus = result.labels.array == 4
     assert sulcus[4:24, 20, 12:28].mean() > 0.95
     assert sulcus[4:24, 12:18, 12:28].mean() < 0.01
-    assert not (segment_mri(mri, mask=mask).labels.array == 4).any()
+    assert not (segment_mri(mri, mask=mask, thin_sulci=False).labels.array == 4).any()
 
 
 @pytest.mark.slow
 def test_bias_correction_saves_the_classes_of_a_shaded_image():
     head = head_mri(3.0)
     shade = np.linspace(0.72, 1.28, head.array.shape[0])[:, None, None].astype(np.float32)
-    reference = segment_mri(head, bias_correction=False).labels.array
+    reference = segment_mri(head, bias_correction=False, thin_sulci=False).labels.array
     shaded = head.with_array(head.array * shade)
-    plain = (segment_mri(shaded, bias_correction=False).labels.array == reference)[reference > 0].mean()
-    result = segment_mri(shaded)
+    plain = (segment_mri(shaded, bias_correction=False, thin_sulci=False).labels.array == reference)[
+        reference > 0
+    ].mean()
+    result = segment_mri(shaded, thin_sulci=False)
     assert any("across the brain: removed" in line for line in result.notes)
     corrected = (result.labels.array == reference)[reference > 0].mean()
     assert corrected > max(plain + 0.1, 0.95)
@@ -289,14 +293,14 @@ def test_the_field_found_with_the_tissues_is_the_one_that_was_applied():
 
 def test_a_brain_of_which_two_thirds_are_white_matter_keeps_its_grey():
     """Starts with less white matter once put both means into the one peak: 110 and 110 instead of 85 and 110."""
-    np.testing.assert_allclose(segment_once(head_mri(3.0)).means, [40, 85, 110], atol=2)
+    np.testing.assert_allclose(segment_once(head_mri(3.0), thin_sulci=False).means, [40, 85, 110], atol=2)
 
 
 @pytest.mark.parametrize(
     "change, message",
     [
         (dict(contrast="pd"), "contrast is 'pd', expected one of t1, t1gd, t2, flair, ct"),
-        (dict(classes=7), "classes is 7, expected 3 for contrast t1"),
+        (dict(classes=4), "classes is 4, expected 3 for contrast t1"),
         (dict(filter_radius=-1), "filter_radius is -1"),
         (dict(filter_epsilon=float("nan")), "filter_epsilon is nan"),
         (dict(mask=Volume(np.zeros((4, 4, 4)), np.eye(4))), "expected the same grid"),
@@ -331,7 +335,7 @@ def test_a_second_mri_may_lack_a_part_of_the_brain(mni2, is_cropped):
         array[:, end:] = 0
         return mni2.with_array(array)
 
-    found = segment_mri(mni2, contrast="t1", others={"t1gd": without(0.25)})
+    found = segment_mri(mni2, contrast="t1", others={"t1gd": without(0.25)}, thin_sulci=False)
     assert any(re.search(r"t1gd: has no data in (1\d|[89])% of the brain", line) for line in found.warnings)
     refusal = r"has data in [67]\d% of the brain of the" if is_cropped else r"is 0 in \d+% of the brain.*with a gap"
     with pytest.raises(SimulationError, match=f"t1gd: {refusal}"):
@@ -370,7 +374,7 @@ def test_the_map_of_one_tissue_is_refused_as_second_mri(mni2):
 def test_a_small_whole_brain_is_led_by_the_atlas(mni2):
     matrix = mni2.ijk_to_ras.copy()
     matrix[:3, :3] *= (620.0 / 1886.0) ** (1.0 / 3.0)
-    found = segment_mri(Volume(mni2.array, matrix), contrast="t1")
+    found = segment_mri(Volume(mni2.array, matrix), contrast="t1", thin_sulci=False)
     assert any("led by the MNI152 atlas" in line for line in found.notes)
     assert any("expected 1000 to 1900 ml of an adult" in line for line in found.warnings)
 
@@ -443,7 +447,7 @@ def test_white_matter_of_a_part_of_a_brain_is_no_bias_field(part, bias, least):
     if maps is None:
         pytest.skip("needs Colin27")
     case = part_of(phantom(maps, noise=0.03, bias=bias, seed=3), part)
-    found = segment_mri(case.mri, mask=case.mask)
+    found = segment_mri(case.mri, mask=case.mask, thin_sulci=False)
     assert found.atlas is None
     names = dict(enumerate(found.tissue_names, start=1))
     assert scores(found.labels.array, names, case)["grey and white"] >= least
@@ -466,7 +470,11 @@ def test_a_lesion_that_is_bright_in_a_flair_needs_four_classes(mni, mni2):
     k, j, i = (n // 2 for n in flair.shape)
     flair[k + 5 : k + 15, j : j + 10, i + 7 : i + 17] += grey
     line = "are far brighter than grey matter, as lesions are in a FLAIR"
-    assert any(line in said for said in segment_mri(mni2.with_array(flair), contrast="flair").warnings)
-    assert not any(line in said for said in segment_mri(mni2.with_array(healthy), contrast="flair").warnings)
-    found = segment_mri(mni2.with_array(flair), contrast="flair", classes=4)
+    assert any(
+        line in said for said in segment_mri(mni2.with_array(flair), contrast="flair", thin_sulci=False).warnings
+    )
+    assert not any(
+        line in said for said in segment_mri(mni2.with_array(healthy), contrast="flair", thin_sulci=False).warnings
+    )
+    found = segment_mri(mni2.with_array(flair), contrast="flair", classes=4, thin_sulci=False)
     assert not any(line in said for said in found.warnings)

@@ -11,6 +11,7 @@ import threading
 import time
 from datetime import datetime, timedelta
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -195,8 +196,11 @@ def autosave_of(session: OwnSession, told: list[str]):
     with shared.changing() as now:
         now.keeps_session = True
     opener = Opener(scene, logic, None, Files())
-    presenter = PanelPresenter(logic, PlainView())
-    autosave = Autosave(session, shared, logic, presenter, opener, cine, lambda: None, tuple, told.append, calls.append)
+    panel = SimpleNamespace(
+        shared=shared, logic=logic, presenter=PanelPresenter(logic, PlainView()), showError=told.append,
+        tasks=SimpleNamespace(tell=calls.append),
+    )  # fmt: skip
+    autosave = Autosave(session, panel, opener, cine, lambda: None, tuple)
     return autosave, logic, cine, calls, shared
 
 

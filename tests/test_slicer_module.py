@@ -334,6 +334,21 @@ def test_whole_numbers_and_ticks_of_widgets_reach_the_declared_types(session):
     assert session.ui.seedSpinBox.property("value") == 4_000_000_000 and not session.app.errors
 
 
+def test_a_moved_slider_reads_no_other_values(session, monkeypatch):
+    """Nor node lists, tissues and what can be done."""
+    session.ui.gainSlider.setValue(1.0)
+    presenter, read = session.panel.presenter, []
+    value = presenter.values.value
+    monkeypatch.setattr(presenter.values, "value", lambda name: (read.append(name), value(name))[1])
+    for part, name in ((presenter.tissues, "rows"), (session.panel, "_offer_fitting")):
+        monkeypatch.setattr(part, name, lambda *_: 1 / 0)
+    session.ui.gainSlider.setValue(7.0)
+    assert session.logic.preset.display.gain_db == 7.0 and set(read) == {"display.gain_db"}
+    read.clear()
+    session.logic.preset = session.logic.preset.changed("display", gain_db=2.0)  # as by a script
+    assert session.ui.gainSlider.property("value") == 2.0 and set(read) == {"display.gain_db"}
+
+
 def test_a_wrong_value_in_a_scene_is_shown_and_can_be_mended(session):
     session.parameters.mri = session.head()
     session.parameters.node.SetParameter("contrast", "T3")

@@ -141,7 +141,7 @@ def ramp_segmentation():
     rng = np.random.default_rng(0)
     array = (step + rng.normal(0, 4, (24, 24, 61))).astype(np.float32)
     mri = Volume(array, np.eye(4))
-    return segment_mri(mri, mask=mri.with_array(np.ones(array.shape, np.uint8)), filter_radius=0)
+    return segment_mri(mri, mask=mri.with_array(np.ones(array.shape, np.uint8)), filter_radius=0, thin_sulci=False)
 
 
 def test_a_segmentation_knows_second_tissues_and_deviations(ramp_segmentation):

@@ -34,22 +34,24 @@ def brain() -> TissueMaps:
 @pytest.mark.slow
 def test_a_rim_that_enhances_in_a_t1_without_contrast_agent_is_reported():
     case = phantom(with_ring_tumour(brain()), "t1gd", bias=0.0)
-    told = segment_mri(case.mri, contrast="t1", mask=case.mask).warnings
+    told = segment_mri(case.mri, contrast="t1", mask=case.mask, thin_sulci=False).warnings
     assert any("--contrast t1gd" in line for line in told)
-    assert not any("t1gd" in line for line in segment_mri(case.mri, contrast="t1gd", mask=case.mask).warnings)
+    assert not any(
+        "t1gd" in line for line in segment_mri(case.mri, contrast="t1gd", mask=case.mask, thin_sulci=False).warnings
+    )
 
 
 @pytest.mark.slow
 def test_a_t1_in_which_nothing_enhances_is_not_after_contrast_agent():
     case = phantom(brain(), "t1")
-    told = segment_mri(case.mri, contrast="t1gd", mask=case.mask).warnings
+    told = segment_mri(case.mri, contrast="t1gd", mask=case.mask, thin_sulci=False).warnings
     assert any("of the brain enhance, expected 0.05% or more" in line and "choose t1 instead" in line for line in told)
 
 
 @pytest.mark.slow
 def test_a_healthy_t1_is_not_taken_for_one_with_contrast_agent():
     case = phantom(brain(), "t1", noise=0.07)
-    assert not segment_mri(case.mri, contrast="t1", mask=case.mask).warnings
+    assert not segment_mri(case.mri, contrast="t1", mask=case.mask, thin_sulci=False).warnings
 
 
 def test_bright_pieces_smaller_than_2_ml_are_no_contrast_agent():
@@ -76,7 +78,7 @@ def test_cortex_is_not_csf_where_the_mask_leaves_only_the_ventricles():
     case = phantom(replace(whole, shares=shares, mask=kept), "t1", bias=0.0)
     true = float((case.truth.array == 1).sum() / kept.sum())
     assert true < 0.03
-    found = segment_mri(case.mri, contrast="t1", mask=case.mask)
+    found = segment_mri(case.mri, contrast="t1", mask=case.mask, thin_sulci=False)
     share = float((found.labels.array == found.tissue_names.index("csf") + 1).sum() / kept.sum())
     assert 0.3 * true < share < 2.0 * true
     assert scores(found.labels.array, dict(enumerate(found.tissue_names, 1)), case)["grey and white"] > 0.9
@@ -119,8 +121,8 @@ def test_an_mri_as_z_scores_gets_the_labels_of_the_mri():
     inside = shown.mask.array > 0
     values = shown.mri.array[inside]
     scored_values = np.where(inside, (shown.mri.array - values.mean()) / values.std(), 0.0).astype(np.float32)
-    raw = segment_mri(shown.mri, mask=shown.mask)
-    scored = segment_mri(shown.mri.with_array(scored_values), mask=shown.mask)
+    raw = segment_mri(shown.mri, mask=shown.mask, thin_sulci=False)
+    scored = segment_mri(shown.mri.with_array(scored_values), mask=shown.mask, thin_sulci=False)
     for found in (raw, scored):  # which value no signal has is lost, so that the labels are not quite the same
         names = dict(enumerate(found.tissue_names, 1))
         assert scores(found.labels.array, names, shown)["grey and white"] > 0.9

@@ -20,7 +20,7 @@ from SlicerUSSim.Logic import (
     UltrasoundSimulator,
 )
 from SlicerUSSim.Logic.fitting import AppearanceModel
-from SlicerUSSim.Logic.imaging.unevenness import speck_power, unevenness_table
+from SlicerUSSim.Logic.imaging.scattering import speck_power, unevenness_table
 from SlicerUSSim.Logic.opencl.layout import TISSUE
 from SlicerUSSim.Logic.tissue.presets import TISSUES
 from tests.conftest import SPECKLE, block, rigid

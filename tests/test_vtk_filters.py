@@ -289,6 +289,9 @@ def test_segmentation_labels_as_the_function_does_and_names_travel():
 def test_segmentation_has_the_declared_defaults_and_refuses_on_update():
     segmentation = SegmentationFilter()
     assert segmentation._values == asdict(SegmentationSettings())
+    settings = SegmentationSettings("t2", filter_radius=2)
+    segmentation.SetSettings(settings)
+    assert segmentation._values == asdict(settings)
     segmentation.SetInputData(head_mri(4.0).to_vtk())
     for heard in (segmentation, segmentation.GetExecutive()):
         heard.AddObserver("ErrorEvent", lambda *_: None)

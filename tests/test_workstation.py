@@ -28,7 +28,7 @@ from SlicerUSSim.Logic.base.errors import required  # noqa: E402
 from SlicerUSSim.Logic.base.volume import read_array  # noqa: E402
 from SlicerUSSim.Logic.mri.samples import head_mri  # noqa: E402
 from SlicerUSSim.Logic.probe.poses import pose_looking_at  # noqa: E402
-from SlicerUSSim.Workstation.state import NAMES  # noqa: E402
+from SlicerUSSim.Workstation.state import NAMES, value_of  # noqa: E402
 from tests.served import Served, refused, run_script  # noqa: E402
 from tests.test_label_maps import head  # noqa: E402
 from tests.test_lesion_proposals import CENTRE, needs_atlas  # noqa: E402
@@ -173,7 +173,7 @@ def set_state(page: Page, name, value) -> None:
 
 def shown(page: Page, control: str):
     """The value of a control of the panel."""
-    return state(page, NAMES.panel.values)[control]
+    return state(page, value_of(control))
 
 
 def errors(page: Page) -> list[str]:
@@ -405,14 +405,13 @@ def test_slice_views_show_the_field_outlined_and_the_image_blended_in(page):
 @pytest.mark.slow
 def test_every_shown_parameter_has_its_tip_unit_and_range(page):
     from SlicerUSSim.Logic.imaging.preset import preset_parameters
-    from SlicerUSSim.Widget.sections import panel_sections
+    from SlicerUSSim.Widget.sections import value
     from SlicerUSSim.Workstation.page import NOT_SHOWN
 
     shown = {name: entry.shown for name, entry in preset_parameters().items() if entry.shown}
-    controls = {control.value: control for section in panel_sections() for control in section.controls}
-    assert set(shown) <= set(controls) and len(shown) > 30
+    assert len(shown) > 30
     for name, limits in shown.items():
-        control = controls[name]
+        control = value(name)
         if control.widget in NOT_SHOWN:
             continue
         found = page.locator(f"#slider-{control.widget}" if control.kind == "slider" else f"#{control.widget}")

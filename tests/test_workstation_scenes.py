@@ -74,9 +74,9 @@ def module_scene(tmp_path_factory) -> tuple[Path, np.ndarray, np.ndarray]:
     add_lesion(lesions, mri.with_array(mask), "cyst", "cyst.nii.gz")
     logic.parameters.mri, logic.parameters.lesions = node, lesions
     logic.preset = Preset().changed("display", gain_db=5.0).changed("probe", kind="convex", depth_mm=80.0)
-    presenter.segment()
-    presenter.placeProbe()
-    presenter.simulate()
+    presenter.segmenting.segment()
+    presenter.placing.placeProbe()
+    presenter.images.simulate()
     path = tmp_path_factory.mktemp("slicer") / "study.mrb"
     assert app.io_manager.write_scene(path)
     frame = logic.lastFrame

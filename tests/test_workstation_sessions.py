@@ -17,7 +17,7 @@ pytest.importorskip("trame_slicer", reason="the workstation comes with: pip inst
 pytest.importorskip("playwright", reason="browser tests need playwright: pip install '.[test]'")
 
 from SlicerUSSim.Logic.base.volume import Volume, read_array
-from SlicerUSSim.Workstation.state import NAMES
+from SlicerUSSim.Workstation.state import NAMES, value_of
 from tests.served import Served, run_script
 from tests.test_workstation import (
     answer_new_patient,
@@ -87,6 +87,12 @@ def reloaded(page) -> None:
     settled(page)
 
 
+def values(page) -> dict[str, object]:
+    """{name: value} of all controls of the panel but the selectors of nodes."""
+    state = page.evaluate("window.trame.state.state")
+    return {name: value for name, value in state.items() if name.startswith(value_of("")) and "Selector" not in name}
+
+
 def restore(page) -> None:
     """Take the session that is offered, and wait until the page shows it."""
     click(page, "#restore-session")
@@ -141,7 +147,7 @@ def test_after_kill_9_the_page_reconnects_by_itself_and_restores_all(server, bro
     settled(page)
     was = {
         "pose": page.evaluate("window.ussim.image.pose"), "sliders": pose(page), "pixels": pixels(page),
-        "values": {name: value for name, value in state(page, NAMES.panel.values).items() if "Selector" not in name},
+        "values": values(page),
         "tissues": state(page, NAMES.panel.tissues), "curve": state(page, NAMES.fit.curve),
     }  # fmt: skip
     assert any(row["name"] == "white matter" and "0.41" in row["values"] for row in was["tissues"])
@@ -160,8 +166,9 @@ def test_after_kill_9_the_page_reconnects_by_itself_and_restores_all(server, bro
     assert not errors(page)
     np.testing.assert_allclose(page.evaluate("window.ussim.image.pose"), was["pose"], atol=1e-3)
     assert np.array_equal(pixels(page), was["pixels"])
-    values = {name: value for name, value in state(page, NAMES.panel.values).items() if "Selector" not in name}
-    assert {name: (values[name], value) for name, value in was["values"].items() if values[name] != value} == {}
+    now = values(page)
+    assert {name: (now[name], value) for name, value in was["values"].items() if now[name] != value} == {}
+    assert now[value_of("fitEvaluationsSpinBox")] == 20
     assert state(page, NAMES.panel.tissues) == was["tissues"] and state(page, NAMES.fit.curve) == was["curve"]
     assert state(page, NAMES.views.planes)["Green"] == "Sagittal" and state(page, NAMES.sequence.number) == 2
     assert state(page, NAMES.panel.can)["revertFitButton"] and cine > 3

@@ -397,7 +397,7 @@ def test_a_surface_is_cancelled_or_late_and_images_go_on(page, files, tmp_path):
     page.set_input_files("#open-file", ball)
     answer_new_patient(page)
     page.wait_for_function(_AT_WORK, arg="Make the surface")
-    page.evaluate("window.trame.trigger('press', ['closePatient'])")
+    page.evaluate("window.trame.trigger('close_patient')")
     page.wait_for_function("window.ussim.image === null")
     settled(page)
     assert state(page, NAMES.title) == "" and state(page, NAMES.pose) is None

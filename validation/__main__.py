@@ -11,8 +11,8 @@ import click
 
 from SlicerUSSim.Command.cli import ToolCommand
 from SlicerUSSim.Command.options import device_option
-from SlicerUSSim.Command.own_folder import require_own_results, results_of
 from SlicerUSSim.Command.progress import Steps, note
+from SlicerUSSim.Command.whole_line import require_own_results, results_of
 from validation.run import chosen_checks, validate
 
 _TABLES, _SUMMARY = "report.md", "report.json"

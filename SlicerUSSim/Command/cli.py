@@ -24,16 +24,11 @@ from SlicerUSSim.Command.progress import Share, note
 from SlicerUSSim.Command.segment import segment
 from SlicerUSSim.Command.serve import serve
 from SlicerUSSim.Command.simulate import simulate, sweep, volume
-from SlicerUSSim.Logic.base.errors import SimulationError, is_our_warning, user_message
+from SlicerUSSim.Logic.base.errors import is_our_warning, user_message
 from SlicerUSSim.Logic.base.version import __version__
-from SlicerUSSim.Logic.opencl.limits import address_space, doubt_of_address_space, lack_of_address_space
 
 #: Errors of a standard output that is a file on a full or broken disk, or closed
 _NO_MORE = {errno.ENOSPC, errno.EDQUOT, errno.EIO, errno.EBADF}
-
-#: Bytes below which numpy's libraries wait for memory for ever while they are imported
-_LEAST_ADDRESS_SPACE = 500_000_000
-
 
 _HELP = {"help_option_names": ["-h", "--help"]}
 
@@ -61,9 +56,6 @@ class _OneLineErrors(click.Command):
             ctx.exit(128 + signal.SIGINT)
         except Exception as error:
             message = user_message(error)
-            if message is None and isinstance(error, ImportError | MemoryError | OSError):
-                doubt = doubt_of_address_space()  # libraries fail in many ways for want of it
-                message = None if doubt is None else f"{type(error).__name__}; {doubt}"
             if message is None:
                 raise
             click.echo(f"ussim: {message}", err=True)
@@ -86,8 +78,6 @@ class _Commands(_OneLineErrors, click.Group):
 @click.version_option(__version__, prog_name="ussim")
 def main() -> None:
     """B-mode ultrasound simulated from a patient's MRI."""
-    if (address_space() or _LEAST_ADDRESS_SPACE) < _LEAST_ADDRESS_SPACE:
-        raise SimulationError(str(lack_of_address_space()))
     if threading.current_thread() is threading.main_thread():
         end_at_signals()
 

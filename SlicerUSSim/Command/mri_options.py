@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import click
 
 from SlicerUSSim.Command.options import require_no_options_beside_ct
 from SlicerUSSim.Command.progress import Share, note
 from SlicerUSSim.Logic.base.errors import SimulationError, require
-from SlicerUSSim.Logic.mri.segmentation_settings import CT, MRI_CONTRASTS
+from SlicerUSSim.Logic.mri.segmentation_settings import CT, MRI_CONTRASTS, SegmentationSettings
 
 if TYPE_CHECKING:
     from SlicerUSSim.Command.additions import Additions
@@ -72,7 +72,7 @@ def require_no_map(path: str, maps: Iterable[str], organs: str | None) -> None:
 def segmented_file(
     path: str,
     mri: Volume,
-    settings: Mapping[str, Any],
+    settings: SegmentationSettings,
     *,
     mask: str | None = None,
     also: Iterable[str] = (),
@@ -95,7 +95,7 @@ def segmented_file(
     from SlicerUSSim.Logic.mri.modality import has_brain_mask, segment_image
     from SlicerUSSim.Logic.mri.segmentation import Segmentation
 
-    is_of_brain = has_brain_mask(settings["contrast"])
+    is_of_brain = has_brain_mask(settings.contrast)
     if not is_of_brain:
         require_no_options_beside_ct(path)
     require_no_map(path, maps, organs)
@@ -103,12 +103,12 @@ def segmented_file(
     others = read_also(also, path)
     brain = read_mask(mask) if mask else None
     if additions is not None:
-        additions.require_addable(mri, brain, settings["skull_strip"] if is_of_brain else "none")
+        additions.require_addable(mri, brain, settings.skull_strip if is_of_brain else "none")
     found = None if organs is None else _read_organs(organs, maps)
     with Share("segment") as progress, about_file(path):
         result = segment_image(
-            mri, **settings, others=others, mask=brain, organs=found, keep_mask_at=mask_beside(path),
-            device=device, progress=progress,
+            mri, settings, others=others, mask=brain, organs=found, keep_mask_at=mask_beside(path), device=device,
+            progress=progress,
         )  # fmt: skip
     lines = result.notes
     if isinstance(result, Segmentation) and not tell_all:

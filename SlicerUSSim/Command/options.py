@@ -151,10 +151,10 @@ def declared(option: Decorator) -> Any:
 def declared_parameters(
     kind: type, names: Iterable[str] | None = None, *, of_preset: bool = False, also: Iterable[Decorator] = ()
 ) -> Any:
-    """A field of a dataclass of options: {name: value} of the parameters of `kind` that have an option.
+    """A field of a dataclass of options: a `kind` with those of its parameters that have an option.
 
-    `names` selects some of them; `also` are further options for the same values. With `of_preset` it contains only
-    options that were given, and --help refers to the preset for the default.
+    `names` selects some of them; `also` are further options for the same values. With `of_preset` it is {name: value}
+    of the options that were given, and --help refers to the preset for the default.
     """
     entries = [entry for entry in parameters_of(kind) if entry.option and (names is None or entry.name in names)]
     return field(
@@ -162,6 +162,7 @@ def declared_parameters(
             "options": (*(_option(entry, of_preset) for entry in entries), *also),
             "names": tuple(entry.name for entry in entries),
             "flags": {entry.name for entry in entries if entry.type is bool},
+            "made": dict if of_preset else kind,
         }
     )
 
@@ -206,7 +207,8 @@ def _value(entry: Field, given: dict[str, Any]) -> Any:
         return given.pop(entry.name)
     values = {name: given.pop(name) for name in names}
     flags = entry.metadata["flags"]
-    return {name: value for name, value in values.items() if value is not (None if name in flags else _NOT_GIVEN)}
+    was_given = {name: value for name, value in values.items() if value is not (None if name in flags else _NOT_GIVEN)}
+    return entry.metadata["made"](**was_given)
 
 
 def given_options(*names: str) -> list[str]:

@@ -98,8 +98,7 @@ class PatientOptions:
     )  # fmt: skip
     #: LABEL=TISSUE, NAME=TISSUE, files and numbering schemes
     maps: tuple[str, ...] = declared(map_option)
-    #: {parameter: value}
-    segmentation: Mapping[str, Any] = declared_parameters(
+    segmentation: SegmentationSettings = declared_parameters(  # noqa: RUF009
         SegmentationSettings, ("contrast", "skull_strip", "thin_sulci", "outside"), also=(ct_option,)
     )
     #: Label map of organs of a CT
@@ -207,7 +206,8 @@ def open_examination(patient: PatientOptions, pose: np.ndarray | str | None = No
     preset = patient.changed_preset()
     require_no_sequence(patient.mri_or_labels)
     volume = Volume.read(patient.mri_or_labels)
-    is_ct = patient.segmentation["contrast"] == CT
+    chosen = patient.segmentation
+    is_ct = chosen.contrast == CT
     is_labels = patient.is_labels
     craniotomy = Craniotomy.of(patient.craniotomy)
     require(not (is_ct and is_labels), f"{patient.mri_or_labels}: --labels and --ct are given, expected one of them")
@@ -223,18 +223,16 @@ def open_examination(patient: PatientOptions, pose: np.ndarray | str | None = No
         )
     if not is_labels:
         require_no_map(patient.mri_or_labels, patient.maps, patient.organs)
-        kind = {name: patient.segmentation[name] for name in ("outside", "contrast", "skull_strip")}
-        craniotomy.require_head(volume, **kind, has_mask=patient.mask is not None)
+        craniotomy.require_head(
+            volume, outside=chosen.outside, contrast=chosen.contrast, skull_strip=chosen.skull_strip,
+            has_mask=patient.mask is not None,
+        )  # fmt: skip
     if is_labels:
         require_no_mri_options(patient.mri_or_labels, "leave it out, or use --mri if it is one")
     split_also(patient.also)
-    if patient.segmentation["outside"] and not is_ct:
-        require_findable(
-            patient.segmentation["contrast"], patient.segmentation["skull_strip"], patient.mask is not None
-        )
-    sheets = DrawnSheets.of(
-        patient.sheets, patient.no_sheets, is_labels=is_labels, contrast=patient.segmentation["contrast"]
-    )
+    if chosen.outside and not is_ct:
+        require_findable(chosen.contrast, chosen.skull_strip, patient.mask is not None)
+    sheets = DrawnSheets.of(patient.sheets, patient.no_sheets, is_labels=is_labels, contrast=chosen.contrast)
     changes = Changes.of(patient.changes)
     table = TissueTable.read(patient.tissues) if patient.tissues else None
     if is_labels:
@@ -260,7 +258,7 @@ def open_examination(patient: PatientOptions, pose: np.ndarray | str | None = No
     )  # fmt: skip
     labels, names, surfels = segmentation.labels, segmentation.tissue_names, sheets.read
     if isinstance(segmentation, Segmentation):
-        drawn = sheets.found(patient.mri_or_labels, volume, segmentation, patient.segmentation["contrast"])
+        drawn = sheets.found(patient.mri_or_labels, volume, segmentation, patient.segmentation.contrast)
         labels, names, surfels = drawn.labels, drawn.names, drawn.surfels
     if table is not None:
         of_brain = segmentation.brain_names if isinstance(segmentation, Segmentation) else segmentation.tissue_names
@@ -357,7 +355,7 @@ def open_examination_at(patient: PatientOptions, pose: str) -> tuple[Examination
 
     is_chosen = pose == AUTO or pose in STANDARD_VIEWS
     require(
-        not is_chosen or patient.segmentation["contrast"] != CT,
+        not is_chosen or patient.segmentation.contrast != CT,
         f"--pose is {pose}, which is on a head, and the image is a CT (--ct), expected a file with the pose",
     )
     require(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from time import perf_counter
 
@@ -81,17 +81,9 @@ def segment(
         require_seeds(seeds, volume, out)
     start = perf_counter()
     result = segmented_file(
-        mri,
-        volume,
-        asdict(settings),
-        mask=mask,
-        also=also,
-        organs=organs,
-        maps=maps,
-        device=device,
-        additions=masks,
+        mri, volume, settings, mask=mask, also=also, organs=organs, maps=maps, device=device, additions=masks,
         tell_all=True,
-    )
+    )  # fmt: skip
     seconds = perf_counter() - start
     proposals, refused = find_proposals(result, seeds, propose) if isinstance(result, Segmentation) else ([], [])
     labels, names = result.labels, result.tissue_names

@@ -5,6 +5,8 @@ from __future__ import annotations
 import importlib.util
 import os
 import sys
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,7 +16,15 @@ from SlicerUSSim.Command.additions import Additions, add_option, split_additions
 from SlicerUSSim.Command.craniotomy_options import Craniotomy, craniotomy_option
 from SlicerUSSim.Command.interrupts import end_at_once
 from SlicerUSSim.Command.mri_options import also_option, organs_option, read_mri, require_other_files, split_also
-from SlicerUSSim.Command.options import ct_option, device_option, mask_option, parameter_option, require_no_mri_options
+from SlicerUSSim.Command.options import (
+    ct_option,
+    declared,
+    device_option,
+    gathered,
+    mask_option,
+    parameter_option,
+    require_no_mri_options,
+)
 from SlicerUSSim.Command.patient_options import map_option
 from SlicerUSSim.Command.progress import note
 from SlicerUSSim.Command.sequence_options import (
@@ -44,168 +54,156 @@ _NOT_GIVEN = (None, False, ())
 _TEXTS = (".json", ".vtp", ".tfm", ".h5", ".hdf5", ".mat", ".xfm", ".xml", ".tag", ".txt")
 
 
+def _option(*names: str, **about: Any) -> Any:
+    return declared(click.option(*names, **about))
+
+
+@dataclass(frozen=True)
+class ServeOptions:
+    """Arguments and options of `ussim serve`."""
+
+    mri: str | None = declared(click.argument("mri", type=click.Path(), required=False))
+    labels: str | None = _option(
+        "--labels", type=click.Path(), help="Label map, used instead of a segmentation of the MRI."
+    )
+    maps: tuple[str, ...] = declared(map_option)
+    sequence: str | None = _option(
+        "--sequence", type=click.Path(), help="Tracked ultrasound for replay and comparison."
+    )
+    transform: str = declared(transform_option)
+    calibration: str | None = declared(calibration_option)
+    to_mri: str | None = declared(to_mri_option)
+    preset: str | None = _option("--preset", type=click.Path(), help="Probe, display, settings and tissues as JSON.")
+    contrast: str = declared(lambda command: parameter_option(SegmentationSettings, "contrast")(ct_option(command)))
+    skull_strip: str = declared(parameter_option(SegmentationSettings, "skull_strip"))
+    outside: bool = declared(parameter_option(SegmentationSettings, "outside"))
+    mask: str | None = declared(mask_option)
+    also: tuple[str, ...] = declared(also_option)
+    additions: tuple[str, ...] = declared(add_option)
+    organs: str | None = declared(organs_option)
+    craniotomy: str = declared(craniotomy_option)
+    sheets: str = declared(drawn_sheets_option)
+    no_sheets: tuple[str, ...] = declared(no_sheet_option)
+    port: int | None = _option(
+        "--port", type=click.IntRange(0, 65535), help=f"Port (default: {_PORT}, or a free one if it is taken)."
+    )
+    host: str = _option(
+        "--host", default="127.0.0.1", show_default=True,
+        help="Address to listen at. Access requires the token in the printed URL.",
+    )  # fmt: skip
+    cert: str | None = _option(
+        "--cert", type=click.Path(), help="TLS certificate (PEM) for https; with --key. For --host."
+    )
+    key: str | None = _option("--key", type=click.Path(), help="Its private key (PEM), without a password.")
+    igtl: str | None = _option(
+        "--igtl",
+        help="HOST:PORT of a tracker that sends TRANSFORM messages over OpenIGTLink and receives the images. :PORT "
+        "waits for a client on this computer, listen:HOST:PORT for one on another computer (listen:0.0.0.0:18944). "
+        "OpenIGTLink has no authentication: anyone who can reach the port can move the probe and receive the images.",
+    )
+    autosave: bool = _option(
+        "--autosave/--no-autosave", default=True, show_default=True, envvar="USSIM_AUTOSAVE", show_envvar=True,
+        help="Keep patient, probe and settings in a folder of yours, to be restored after a crash; see "
+        "docs/security.md.",
+    )  # fmt: skip
+    igtl_device: str | None = _option(
+        "--igtl-device", help="Name of the transform to follow (default: the first one received)."
+    )
+    device: str | None = declared(device_option)
+
+
 @click.command()
-@click.argument("mri", type=click.Path(), required=False)
-@click.option("--labels", type=click.Path(), help="Label map, used instead of a segmentation of the MRI.")
-@map_option
-@click.option("--sequence", type=click.Path(), help="Tracked ultrasound for replay and comparison.")
-@transform_option
-@calibration_option
-@to_mri_option
-@click.option("--preset", type=click.Path(), help="Probe, display, settings and tissues as JSON.")
-@parameter_option(SegmentationSettings, "contrast")
-@ct_option
-@parameter_option(SegmentationSettings, "skull_strip")
-@parameter_option(SegmentationSettings, "outside")
-@mask_option
-@also_option
-@add_option
-@organs_option
-@craniotomy_option
-@drawn_sheets_option
-@no_sheet_option
-@click.option("--port", type=click.IntRange(0, 65535), help=f"Port (default: {_PORT}, or a free one if it is taken).")
-@click.option(
-    "--host",
-    default="127.0.0.1",
-    show_default=True,
-    help="Address to listen at. Access requires the token in the printed URL.",
-)
-@click.option("--cert", type=click.Path(), help="TLS certificate (PEM) for https; with --key. For --host.")
-@click.option("--key", type=click.Path(), help="Its private key (PEM), without a password.")
-@click.option(
-    "--igtl",
-    help="HOST:PORT of a tracker that sends TRANSFORM messages over OpenIGTLink and receives the images. :PORT waits "
-    "for a client on this computer, listen:HOST:PORT for one on another computer (listen:0.0.0.0:18944). OpenIGTLink "
-    "has no authentication: anyone who can reach the port can move the probe and receive the images.",
-)
-@click.option(
-    "--autosave/--no-autosave",
-    default=True,
-    show_default=True,
-    envvar="USSIM_AUTOSAVE",
-    show_envvar=True,
-    help="Keep patient, probe and settings in a folder of yours, to be restored after a crash; see docs/security.md.",
-)
-@click.option("--igtl-device", help="Name of the transform to follow (default: the first one received).")
-@device_option
-def serve(
-    mri: str | None,
-    labels: str | None,
-    maps: tuple[str, ...],
-    sequence: str | None,
-    transform: str,
-    calibration: str | None,
-    to_mri: str | None,
-    preset: str | None,
-    contrast: str,
-    skull_strip: str,
-    outside: bool,
-    mask: str | None,
-    also: tuple[str, ...],
-    additions: tuple[str, ...],
-    organs: str | None,
-    craniotomy: str,
-    sheets: str,
-    no_sheets: tuple[str, ...],
-    port: int | None,
-    host: str,
-    cert: str | None,
-    key: str | None,
-    igtl: str | None,
-    autosave: bool,
-    igtl_device: str | None,
-    device: str | None,
-) -> None:
+@gathered(options=ServeOptions)
+def serve(options: ServeOptions) -> None:
     """The workstation in the browser, with live images. Without a file it shows the demo brain.
 
     The file is an MRI, or what the page opens, by its content: a scene (.mrb), tracked ultrasound, a preset, ...
     """
     _require_workstation()
-    scene, also_open = None, None
+    scene, scene_name, also_open, mri = None, "", None, options.mri
     if mri is not None and _is_no_image(mri):
         given = click.get_current_context().params
         patient = [name for name in _OF_PATIENT if given[name] not in _NOT_GIVEN]
-        scene, also_open, mri = _opened_first(mri, [f"--{name.replace('_', '-')}" for name in patient])
-    added = split_additions(additions)
-    others = split_also(also)
-    if len(others) > 1:
-        raise SimulationError(f"--also is given {len(others)} times, expected one further MRI in the workstation")
+        (scene, scene_name), also_open, mri = _opened_first(mri, [f"--{name.replace('_', '-')}" for name in patient])
+    added = split_additions(options.additions)
+    others = split_also(options.also)
+    require(len(others) < 2, f"--also is given {len(others)} times, expected one further MRI in the workstation")
     require_other_files(mri, others)
-    files = [
-        file for file in (mri, labels, mask, organs, *(file for _, file in added), *others.values()) if file is not None
-    ]
+    own = (mri, options.labels, options.mask, options.organs)
+    files = [file for file in (*own, *(file for _, file in added), *others.values()) if file is not None]
     # Checked here, so that the error is reported in the terminal and not on the page.
     for file in files:
-        if not Path(file).exists():
-            raise SimulationError(f"{file}: no such file")
-    if maps:
+        require(Path(file).exists(), f"{file}: no such file")
+    if options.maps:
         from SlicerUSSim.Logic.tissue.label_mapping import LabelMapping
 
-        if labels is None and organs is None:
-            raise SimulationError("--map is for a label map, expected --labels too")
-        LabelMapping.of(maps)
-    if labels is not None and mri is None:
-        require_no_mri_options(labels, "give an MRI, too, to segment it")
-    if contrast == CT and mri is None:
-        raise SimulationError(
-            "the contrast is ct (--ct), expected a CT; without a file the demo brain is shown, an MRI"
-        )
-    if outside and contrast != CT:
+        is_for_one = options.labels is not None or options.organs is not None
+        require(is_for_one, "--map is for a label map, expected --labels too")
+        LabelMapping.of(options.maps)
+    if options.labels is not None and mri is None:
+        require_no_mri_options(options.labels, "give an MRI, too, to segment it")
+    is_ct, has_mask = options.contrast == CT, options.mask is not None
+    require(
+        mri is not None or not is_ct,
+        "the contrast is ct (--ct), expected a CT; without a file the demo brain is shown, an MRI",
+    )
+    if options.outside and not is_ct:
         from SlicerUSSim.Logic.mri.outside import require_findable
 
-        require_findable(contrast, skull_strip, mask is not None)
-        if mri is None:
-            raise SimulationError("--outside is for a whole head, expected an MRI of one; the demo brain has no head")
-    require(organs is None or contrast == CT, "--organs is for a CT, expected --ct too")
-    drawn = DrawnSheets.of(sheets, no_sheets, is_labels=labels is not None, contrast=contrast)
-    opening = Craniotomy.of(craniotomy)
-    if opening.is_wanted and labels is None:
+        require_findable(options.contrast, options.skull_strip, has_mask)
+        require(mri is not None, "--outside is for a whole head, expected an MRI of one; the demo brain has no head")
+    require(options.organs is None or is_ct, "--organs is for a CT, expected --ct too")
+    drawn = DrawnSheets.of(
+        options.sheets, options.no_sheets, is_labels=options.labels is not None, contrast=options.contrast
+    )
+    read_head = partial(
+        read_mri, mask=options.mask, skull_strip=options.skull_strip, contrast=options.contrast, is_served=True
+    )
+    opening = Craniotomy.of(options.craniotomy)
+    if opening.is_wanted and options.labels is None:
         require(
             scene is None and also_open is None,
-            f"--craniotomy is {craniotomy}, which opens the skull in the MRI of a head, and the file is none",
+            f"--craniotomy is {options.craniotomy}, which opens the skull in the MRI of a head, and the file is none",
         )
-        head = None
-        if mri is not None and not outside:
-            head = read_mri(mri, mask=mask, skull_strip=skull_strip, contrast=contrast, is_served=True)
         opening.require_head(
-            head, outside=outside, contrast=contrast, skull_strip=skull_strip, has_mask=mask is not None
+            None if mri is None or options.outside else read_head(mri),
+            outside=options.outside, contrast=options.contrast, skull_strip=options.skull_strip, has_mask=has_mask,
         )  # fmt: skip
     if opening.is_file:
         _require_opening(opening.source)
-    if contrast == CT and others:
-        raise SimulationError("--also is for an MRI, and the contrast is ct (--ct); leave it out")
-    if igtl is not None:
+    require(not (is_ct and others), "--also is for an MRI, and the contrast is ct (--ct); leave it out")
+    if options.igtl is not None:
         from SlicerUSSim.Logic.tracked.openigtlink import parse_address, require_usable
 
-        require_usable(parse_address(igtl))
-    require((cert is None) == (key is None), "--cert and --key are for each other, expected both or none")
-    tls = _tls(cert, key)
-    port = _usable_port(host, port)
+        require_usable(parse_address(options.igtl))
+    has_both = (options.cert is None) == (options.key is None)
+    require(has_both, "--cert and --key are for each other, expected both or none")
+    tls = _tls(options.cert, options.key)
+    port = _usable_port(options.host, options.port)
 
     from SlicerUSSim.Logic.base.volume import Volume
     from SlicerUSSim.Logic.imaging.preset import Preset
     from SlicerUSSim.Logic.mri.masks import with_label_names
     from SlicerUSSim.Logic.opencl.devices import choose_device
 
-    choose_device(device)
-    volumes = {file: Volume.read(file) for file in files if file != mri or labels is not None}
-    if mri is not None and labels is None:
-        volumes[mri] = read_mri(mri, mask=mask, skull_strip=skull_strip, contrast=contrast, is_served=True)
+    choose_device(options.device)
+    volumes = {file: Volume.read(file) for file in files if file != mri or options.labels is not None}
+    if mri is not None and options.labels is None:
+        volumes[mri] = read_head(mri)
     checked = Additions.of((tissue, with_label_names(volumes[file], file), file) for tissue, file in added)
-    if mri is not None and labels is None:
+    if mri is not None and options.labels is None:
         checked.require_addable(
-            volumes[mri], None if mask is None else volumes[mask], "none" if contrast == CT else skull_strip
+            volumes[mri],
+            None if options.mask is None else volumes[options.mask],
+            "none" if is_ct else options.skull_strip,
         )
-    if labels is not None and mri is not None and (mask is not None or others):
-        what = " and ".join(
-            name for name, is_given in (("--mask", mask is not None), ("--also", bool(others))) if is_given
-        )
-        note(f"{what}: for Segment in the page; the labels shown are those of {labels}")
+    if options.labels is not None and mri is not None and (has_mask or others):
+        what = " and ".join([*["--mask"] * has_mask, *["--also"] * bool(others)])
+        note(f"{what}: for Segment in the page; the labels shown are those of {options.labels}")
     masks = tuple((tissue, file) for (tissue, _, _), (_, file) in zip(checked.masks, added, strict=True))
-    chosen_preset = Preset.read(preset) if preset else None
-    tracked = read_sequence(sequence, calibration) if sequence else None
-    to_ras = read_to_mri(to_mri) if to_mri else None
+    chosen_preset = Preset.read(options.preset) if options.preset else None
+    tracked = read_sequence(options.sequence, options.calibration) if options.sequence else None
+    to_ras = read_to_mri(options.to_mri) if options.to_mri else None
 
     _prepare_libraries()
     from SlicerUSSim.Logic.mri.segmentation_settings import SheetSettings
@@ -214,23 +212,22 @@ def serve(
     from SlicerUSSim.Workstation.workstation import Workstation
 
     sheet_settings = SheetSettings()
-    if sheets != NONE:
-        sheet_settings = SheetSettings.of_kinds(drawn.kinds, find=sheets == AUTO)
+    if options.sheets != NONE:
+        sheet_settings = SheetSettings.of_kinds(drawn.kinds, find=options.sheets == AUTO)
     workstation = Workstation(
         Files(
-            mri=mri, labels=labels, maps=maps, contrast=contrast, mask=mask, skull_strip=skull_strip, outside=outside,
-            also=others,
-            additions=masks, organs=organs, sheets=None if drawn.read is None else sheets,
-            sheet_settings=sheet_settings,
-            craniotomy=opening.source, craniotomy_mm=opening.diameter_mm, preset=chosen_preset,
-            sequence=tracked, sequence_name=Path(sequence).name.split(".")[0] if sequence else "", transform=transform,
-            to_ras=to_ras, scene=None if scene is None else scene[0], scene_name="" if scene is None else scene[1],
-            also_open=also_open, tracker=igtl, tracker_device=igtl_device, volumes=volumes,
+            mri=mri, labels=options.labels, maps=options.maps, contrast=options.contrast, mask=options.mask,
+            skull_strip=options.skull_strip, outside=options.outside, also=others, additions=masks,
+            organs=options.organs, sheets=None if drawn.read is None else options.sheets,
+            sheet_settings=sheet_settings, craniotomy=opening.source, craniotomy_mm=opening.diameter_mm,
+            preset=chosen_preset, sequence=tracked, sequence_name=Path(options.sequence or "").name.split(".")[0],
+            transform=options.transform, to_ras=to_ras, scene=scene, scene_name=scene_name, also_open=also_open,
+            tracker=options.igtl, tracker_device=options.igtl_device, volumes=volumes,
         ),
-        device,
-        SessionStore(sessions_folder()) if autosave else None,
+        options.device,
+        SessionStore(sessions_folder()) if options.autosave else None,
     )  # fmt: skip
-    _run(workstation, host, port, tls)
+    _run(workstation, options.host, port, tls)
 
 
 def _is_no_image(path: str) -> bool:
@@ -247,8 +244,8 @@ def _is_zip(path: str) -> bool:
         return file.read(4) == b"PK\x03\x04"
 
 
-def _opened_first(path: str, options: list[str]) -> tuple[tuple[SceneRecord, str] | None, str | None, None]:
-    """((scene, name), file that is opened as in the page, None); `options` are those about a patient.
+def _opened_first(path: str, options: list[str]) -> tuple[tuple[SceneRecord | None, str], str | None, None]:
+    """((scene, its name), file that is opened as in the page, None); `options` are those about a patient.
 
     Raises SimulationError for a file that cannot be opened, and for a scene with such options.
     """
@@ -256,7 +253,7 @@ def _opened_first(path: str, options: list[str]) -> tuple[tuple[SceneRecord, str
     from SlicerUSSim.Workstation.scene_files import read_scene
 
     if not _is_zip(path) and content_of(Path(path)).kind is not Kind.SCENE:
-        return None, path, None
+        return (None, ""), path, None
     require(not options, f"{path} is a scene, which has a patient and settings, expected no {', '.join(options)}")
     _prepare_libraries()
     return (read_scene(path), Path(path).name), None, None
@@ -277,8 +274,8 @@ def _require_opening(path: str) -> None:
 def _require_workstation() -> None:
     """Raise SimulationError unless the libraries of the workstation are installed."""
     for name in ("trame_slicer", "greenlet"):
-        if importlib.util.find_spec(name) is None:
-            raise SimulationError(f'the workstation needs {name}; install it with: pip install "SlicerUSSim[serve]"')
+        remedy = f'the workstation needs {name}; install it with: pip install "SlicerUSSim[serve]"'
+        require(importlib.util.find_spec(name) is not None, remedy)
 
 
 def _tls(cert: str | None, key: str | None) -> ssl.SSLContext | None:

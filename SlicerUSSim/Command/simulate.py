@@ -34,7 +34,7 @@ def simulate(patient: PatientOptions, pose: str, out: Path) -> None:
         write_png(out, frame.image)
     else:
         write_own_volume(out, frame.to_volume())
-    kind = "labels" if examination.is_labels else "CT" if patient.segmentation["contrast"] == CT else "MRI"
+    kind = "labels" if examination.is_labels else "CT" if patient.segmentation.contrast == CT else "MRI"
     note(f"wrote {out} ({frame.image.shape[1]}x{frame.image.shape[0]}, from {kind})")
 
 

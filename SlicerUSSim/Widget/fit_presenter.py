@@ -2,10 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from contextlib import AbstractContextManager
-from typing import Any, Protocol
-
 from SlicerUSSim.Logic.base.errors import SimulationError, require, required
 from SlicerUSSim.Logic.base.settings import DisplaySettings
 from SlicerUSSim.Logic.fitting.parameters import FreeParameters, all_names
@@ -13,57 +9,22 @@ from SlicerUSSim.Logic.fitting.search import Progress
 from SlicerUSSim.Logic.fitting.tracked_fit import Fit
 from SlicerUSSim.Logic.imaging.preset import Preset
 from SlicerUSSim.Logic.mrml.fit_nodes import COMPARED, CostPlot
-from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic
 from SlicerUSSim.Logic.mrml.nodes import composite_of, require_node
 from SlicerUSSim.Logic.mrml.own_results import result_called
-from SlicerUSSim.Logic.mrml.parameter_node import SceneParameters
-from SlicerUSSim.Logic.tissue.table import TissueTable
 from SlicerUSSim.Logic.tracked.sequence import checked_apart, frame_numbers
-from SlicerUSSim.Widget.interface import PanelView
+from SlicerUSSim.Widget.interface import PanelHost
+from SlicerUSSim.Widget.tissue_presenter import TissuePresenter
+from SlicerUSSim.Widget.value_presenter import ValuePresenter
 
 _FREE = "scene.fit_free"
 _REGISTRATION = "Ultrasound registration"
 
 
-class FitHost(Protocol):
-    """What FitPresenter requires of the panel's presenter."""
-
-    @property
-    def logic(self) -> UltrasoundSceneLogic: ...
-
-    @property
-    def view(self) -> PanelView: ...
-
-    def value(self, name: str) -> Any:
-        """The displayed form of a value."""
-        ...
-
-    def setValue(self, name: str, shown: Any) -> None:
-        """Set a value from its displayed form."""
-        ...
-
-    def tissueTable(self) -> TissueTable:
-        """The tissues in use."""
-        ...
-
-    def canSimulate(self) -> tuple[bool, str]:
-        """(whether an image can be simulated, the reason if not)"""
-        ...
-
-    def shown(self) -> AbstractContextManager[None]:
-        """Show errors caused by the user in one line."""
-        ...
-
-    def working(self, title: str) -> AbstractContextManager[Callable[[float], None]]:
-        """Show progress; no other work can start meanwhile."""
-        ...
-
-
 class FitPresenter:
     """Sets up, runs, applies and shows fits for the panel."""
 
-    def __init__(self, panel: FitHost) -> None:
-        self._panel = panel
+    def __init__(self, panel: PanelHost, values: ValuePresenter, tissues: TissuePresenter) -> None:
+        self._panel, self._values, self._tissues = panel, values, tissues
         self._fit: tuple[Fit, object] | None = None  # with its labels
         self._before: Preset | None = None  # the preset that Apply replaced
         #: Result of the last fit, as text
@@ -86,21 +47,21 @@ class FitPresenter:
 
     def freeParameters(self) -> list[tuple[str, bool]]:
         """(name, whether it is free) of each parameter that a fit can vary, for the tissues in use."""
-        tissues, free = self._panel.tissueTable(), set(self._free())
+        tissues, free = self._tissues.table(), set(self._free())
         return [(name, name in free) for name in all_names(tissues)]
 
     def setFree(self, name: str, on: bool) -> None:
         """Called when the user ticks or unticks a parameter."""
         names = [known for known, is_free in self.freeParameters() if (on if known == name else is_free)]
-        self._panel.setValue(_FREE, ", ".join(names) or "none")  # an empty text means the default
+        self._values.setValue(_FREE, ", ".join(names) or "none")  # an empty text means the default
 
     def _free(self) -> list[str]:
         return list(dict.fromkeys(name for names in self._groups().values() for name in names))
 
     def _groups(self) -> dict[str, list[str]]:
         """{a name as chosen: the parameters that it stands for}."""
-        names = [name.strip() for name in self._panel.value(_FREE).split(",") if name.strip()]
-        tissues = self._panel.tissueTable()
+        names = [name.strip() for name in self._values.value(_FREE).split(",") if name.strip()]
+        tissues = self._tissues.table()
         known: dict[str, list[str]] = {}
         for name in names:
             try:
@@ -114,14 +75,14 @@ class FitPresenter:
     def canFit(self) -> tuple[bool, str]:
         """(whether Fit is enabled, the reason if not)"""
         can, why_not = self._panel.canSimulate()
-        if can and self._parameters.real is None:
+        if can and self._panel.parameters.real is None:
             return False, "Choose real images first"
         return can, why_not
 
     def fit(self) -> None:
         """Fit to the chosen real images; the preset does not change until apply()."""
-        panel, parameters = self._panel, self._parameters
-        with panel.shown(), panel.working("Fit") as progress:
+        panel, parameters = self._panel, self._panel.parameters
+        with panel.acting(), panel.working("Fit") as progress:
             require(parameters.real is not None, "no real images chosen, expected a sequence or a volume")
             free = list(self._groups())  # "tissues" as such: the fit looks which the images show
             require(bool(free), "nothing is free, tick at least one parameter")
@@ -143,16 +104,15 @@ class FitPresenter:
             self.summary = _in_words(found)
             panel.view.showStatus("")
             self._show("after", found.tracked.numbers[0])
-        panel.view.refresh()
 
     def _frames(self) -> list[int] | None:
-        text, real = self._parameters.fit.frames.strip(), self._parameters.real
+        text, real = self._panel.parameters.fit.frames.strip(), self._panel.parameters.real
         if not text or not real.IsA("vtkMRMLSequenceNode"):
             return None
         return frame_numbers(text, real.GetNumberOfDataNodes())
 
     def _predicted(self) -> list[int]:
-        text, real = self._parameters.fit.validate, self._parameters.real
+        text, real = self._panel.parameters.fit.validate, self._panel.parameters.real
         if not text.strip():
             return []
         require(real.IsA("vtkMRMLSequenceNode"), "a single image leaves none to predict, expected a sequence")
@@ -160,36 +120,32 @@ class FitPresenter:
 
     # ---- apply and revert --------------------------------------------------------------------------------------
 
-    @property
     def canApply(self) -> bool:
         return self._fit is not None and self._before is None
 
-    @property
     def canRevert(self) -> bool:
         return self._before is not None
 
     def apply(self) -> None:
         """Write the result to the preset, and a registration to a transform node, the future parent of the tracking."""
         panel = self._panel
-        with panel.shown():
+        with panel.acting():
             found, labels = required(self._fit, "nothing to apply, fit first")
             before = panel.logic.applyFit(found)
             if found.registration is not None:
                 transform = result_called(self._panel.logic.scene, "LinearTransform", _REGISTRATION)
                 panel.logic.writeRegistration(found, labels, transform)
             self._before, self.summary = before, _in_words(found)
-        panel.view.refresh()
 
     def revert(self) -> None:
         """Restore the values from before apply(), except those that were changed since, which the summary names."""
-        with self._panel.shown():
+        with self._panel.acting():
             before = required(self._before, "nothing to revert to, apply a fit first")
             found, _ = required(self._fit, "nothing to revert, fit first")
             kept = self._panel.logic.revertFit(found, before)
             self._before, self.summary = None, _in_words(found)
             if kept:
                 self.summary += f"\nRevert kept what was changed after Apply: {', '.join(kept)}"
-        self._panel.view.refresh()
 
     # ---- compare -----------------------------------------------------------------------------------------------
 
@@ -197,7 +153,6 @@ class FitPresenter:
         """Numbers of the fitted images."""
         return [] if self._fit is None else list(self._fit[0].tracked.numbers)
 
-    @property
     def canCompare(self) -> bool:
         return self._fit is not None
 
@@ -224,10 +179,6 @@ class FitPresenter:
         view = self._panel.view.sliceNode()
         if view is not None:
             logic.showFitInSlice(view, found, labels, nodes[kind], nodes["real"], number)
-
-    @property
-    def _parameters(self) -> SceneParameters:
-        return self._panel.logic.parameters
 
 
 def _in_words(found: Fit) -> str:

@@ -5,8 +5,9 @@ Widgets are read and written with property() and setProperty(), which exist in P
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from contextlib import contextmanager
+from functools import partial
 from typing import Any
 
 import qt
@@ -16,9 +17,10 @@ from SlicerUSSim.Logic.base.errors import Cancelled, SimulationError, required
 from SlicerUSSim.Logic.mrml.fitting_nodes import offered
 from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic
 from SlicerUSSim.Logic.mrml.nodes import nodes_of_class
-from SlicerUSSim.Widget.controls import Control, by_widget, part_of, shown_by, usable
-from SlicerUSSim.Widget.presenter import TISSUE_COLUMNS, PanelPresenter, TissueRow
+from SlicerUSSim.Widget.interface import Control, by_widget
+from SlicerUSSim.Widget.presenter import PanelPresenter
 from SlicerUSSim.Widget.sections import panel_sections
+from SlicerUSSim.Widget.tissue_presenter import TISSUE_COLUMNS, TissueRow
 from SlicerUSSim.Widget.widgets import build
 
 #: Property that holds a widget's value, and the signal of its change. The first property that the widget has applies.
@@ -40,10 +42,10 @@ class Panel:
     """
 
     def __init__(self, column: Any, logic: UltrasoundSceneLogic, ensure_packages: Callable[[], None]) -> None:
-        sections = panel_sections()
-        self.ui = build(sections, column)
         self.logic = logic
-        self.presenter = PanelPresenter(logic, self)
+        self.presenter = presenter = PanelPresenter(logic, self)
+        sections = panel_sections(presenter)
+        self.ui = build(sections, column)
         #: Whether changes of widgets are written to the scene: not while it is closed or loaded, nor in other modules
         self.isConnected = True
         self._ensure_packages = ensure_packages
@@ -54,10 +56,12 @@ class Panel:
         self._removed: Any = None  # node that is being removed from the scene
         #: Controls with their widgets
         self._controls = [(control, getattr(self.ui, name)) for name, control in by_widget(sections).items()]
-        #: Actions of buttons that use widgets or dialogs of the panel
-        self._own_actions = {
-            "assignTissue": self._assign_tissue, "loadPreset": self._load_preset, "savePreset": self._save_preset,
-        }  # fmt: skip
+        #: Actions that use widgets or dialogs of the panel, in place of those of buttons
+        self._own_actions: dict[Callable[..., object] | None, Callable[[], None]] = {
+            presenter.tissues.assignTissue: self._assign_tissue,
+            presenter.values.loadPreset: self._load_preset,
+            presenter.values.savePreset: self._save_preset,
+        }
         self._show(self.ui.compareComboBox, "after")
         self._prepare_table()
         self._connect()
@@ -76,7 +80,7 @@ class Panel:
 
     def sliceNode(self):
         wanted = self.ui.sliceViewComboBox.property("currentText")
-        if not self.presenter.value("scene.show_in_slice"):
+        if not self.presenter.values.value("scene.show_in_slice"):
             return None
         return next((node for node in self._slice_nodes() if node.GetLayoutName() == wanted), None)
 
@@ -124,27 +128,35 @@ class Panel:
         finally:
             self.ui.progressWidget.setVisible(False)
 
-    def refresh(self) -> None:
-        presenter = self.presenter
-        self._show_slice_names()
-        self._show_tissues()
-        self._show_fit()
+    def refresh(self, changed: Collection[str] | None = None) -> None:
+        if changed is None:
+            self._fill(self.ui.sliceViewComboBox, [node.GetLayoutName() for node in self._slice_nodes()])
+            numbers = self.presenter.fits.comparedNumbers()
+            self._fill(self.ui.compareNumberComboBox, [str(number) for number in numbers])
         for control, widget in self._controls:
-            if control.enabled:
-                can, tip = usable(presenter, control)
-                widget.setEnabled(can)
-                widget.setToolTip(tip)
-            if control.node:
-                self._offer_fitting(control, widget)
-                with _silent(widget):
-                    widget.setCurrentNode(getattr(self.logic.parameters, control.node))
-            elif control.value:
-                value = presenter.value(control.value)
-                widget.setEnabled(value is not None)
-                if value is not None:
-                    self._show(widget, value)
-            elif control.shows:
-                self._show(widget, shown_by(presenter, control.shows))
+            if control.depends_on(changed):
+                self._refresh(control, widget)
+
+    def _refresh(self, control: Control, widget: Any) -> None:
+        if control.enabled:
+            can, tip = control.usable()
+            widget.setEnabled(can)
+            widget.setToolTip(tip)
+        if control.node:
+            self._offer_fitting(control, widget)
+            with _silent(widget):
+                widget.setCurrentNode(getattr(self.logic.parameters, control.node))
+        elif control.value:
+            value = self.presenter.values.value(control.value)
+            widget.setEnabled(value is not None)
+            if value is not None:
+                self._show(widget, value)
+        elif control.kind == "table":
+            self._show_tissues()
+        elif control.kind == "list":
+            self._show_free()
+        elif control.shows:
+            self._show(widget, control.shows())
 
     def _offer_fitting(self, control: Control, widget: Any) -> None:
         """Hide the nodes of a selector's classes that do not fit its role."""
@@ -170,7 +182,7 @@ class Panel:
                 _signal_of(widget).connect(self._changed(self._set_value, control, widget))
             elif control.kind == "button":
                 widget.clicked.connect(self._changed(self._press, control, widget))
-            elif control.action:
+            elif control.sets:
                 _signal_of(widget).connect(self._changed(self._act, control, widget))
         ui.cancelButton.clicked.connect(self._cancel)
         ui.sliceViewComboBox.currentTextChanged.connect(lambda *_: presenter.parametersChanged())
@@ -206,16 +218,18 @@ class Panel:
         self.refresh()
 
     def _set_value(self, control: Control, widget: Any) -> None:
-        self.presenter.setValue(control.value, widget.property(_property_of(widget)))
+        self.presenter.values.setValue(control.value, widget.property(_property_of(widget)))
 
     def _act(self, control: Control, widget: Any) -> None:
-        value, action = widget.property(_property_of(widget)), part_of(self.presenter, control.action)
-        self._do(control, lambda: action(value))
+        if control.sets:
+            self._do(control, partial(control.sets, widget.property(_property_of(widget))))
 
     def _press(self, control: Control, widget: Any) -> None:
-        self._do(control, self._own_actions.get(control.name) or part_of(self.presenter, control.action))
+        action = self._own_actions.get(control.action, control.action)
+        if action:
+            self._do(control, action)
 
-    def _do(self, control: Control, action: Callable[[], None]) -> None:
+    def _do(self, control: Control, action: Callable[[], object]) -> None:
         """Run the action of a control, after installing the packages that it needs (see Control.enabled)."""
         try:
             if control.enabled:
@@ -230,10 +244,11 @@ class Panel:
         self._cancelled = True
 
     def _load_preset(self) -> None:
-        self._with_file(qt.QFileDialog.getOpenFileName, "Load preset", "", self.presenter.loadPreset)
+        self._with_file(qt.QFileDialog.getOpenFileName, "Load preset", "", self.presenter.values.loadPreset)
 
     def _save_preset(self) -> None:
-        self._with_file(qt.QFileDialog.getSaveFileName, "Save preset", "preset.json", self.presenter.savePreset)
+        save = self.presenter.values.savePreset
+        self._with_file(qt.QFileDialog.getSaveFileName, "Save preset", "preset.json", save)
 
     @staticmethod
     def _with_file(ask, title: str, proposal: str, action: Callable[[str], None]) -> None:
@@ -253,7 +268,7 @@ class Panel:
             table.setHorizontalHeaderItem(column, item)
 
     def _show_tissues(self) -> None:
-        rows = self.presenter.tissues()
+        rows = self.presenter.tissues.rows()
         if rows == self._rows:
             return
         self._rows = rows
@@ -274,21 +289,20 @@ class Panel:
         row, name = self._rows[line], TISSUE_COLUMNS[column - 1][0]
         text = self.ui.tissueTable.item(line, column).text()
         self._rows = []  # redraw the table even if the change is rejected
-        self.presenter.setTissue(row.name, name, text)
+        self.presenter.tissues.setTissue(row.name, name, text)
         self._show_tissues()
 
     def _assign_tissue(self) -> None:
         line = self.ui.tissueTable.currentRow
         line = line if isinstance(line, int) else line()  # a property in PythonQt, a method elsewhere
         if 0 <= line < len(self._rows):
-            self.presenter.assignTissue(self._rows[line].name, self.ui.tissuePresetComboBox.property("currentText"))
+            preset = self.ui.tissuePresetComboBox.property("currentText")
+            self.presenter.tissues.assignTissue(self._rows[line].name, preset)
 
     # ---- fit to real ultrasound --------------------------------------------------------------------------------
 
-    def _show_fit(self) -> None:
-        ui, fits = self.ui, self.presenter.fits
-        self._fill(ui.compareNumberComboBox, [str(number) for number in fits.comparedNumbers()])
-        free = fits.freeParameters()
+    def _show_free(self) -> None:
+        ui, free = self.ui, self.presenter.fits.freeParameters()
         with _silent(ui.freeList):
             if [ui.freeList.item(n).text() for n in range(ui.freeList.property("count"))] != [name for name, _ in free]:
                 ui.freeList.clear()
@@ -322,9 +336,6 @@ class Panel:
 
     def _slice_nodes(self) -> list:
         return nodes_of_class(self.logic.scene, "vtkMRMLSliceNode")
-
-    def _show_slice_names(self) -> None:
-        self._fill(self.ui.sliceViewComboBox, [node.GetLayoutName() for node in self._slice_nodes()])
 
     @staticmethod
     def _fill(combo, names: list[str]) -> None:

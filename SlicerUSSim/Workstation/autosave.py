@@ -23,7 +23,6 @@ from trame_server.utils.asynchronous import get_event_loop
 from SlicerUSSim.Logic.base.errors import SimulationError
 from SlicerUSSim.Logic.base.reading import write_values
 from SlicerUSSim.Logic.mrml.landmark_nodes import Landmark
-from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic
 from SlicerUSSim.Logic.mrml.scene_record import (
     SceneRecord,
     SequenceRecord,
@@ -39,11 +38,10 @@ from SlicerUSSim.Logic.mrml.taken_sequence import (
     version_frozen,
     version_taken,
 )
-from SlicerUSSim.Widget.presenter import PanelPresenter
+from SlicerUSSim.Workstation.browser_panel import BrowserPanel
 from SlicerUSSim.Workstation.export import MOST_IMAGES, Cine, CineImage
 from SlicerUSSim.Workstation.opener import Opener
 from SlicerUSSim.Workstation.session_store import OwnSession
-from SlicerUSSim.Workstation.state import SharedState
 
 _log = logging.getLogger(__name__)
 
@@ -64,16 +62,13 @@ class _Taken:
     #: Without its sequence
     anatomy: SceneRecord | None
     sequence: SequenceRecord | None
-    #: Whether there is one at all
-    has_sequence: bool
     #: Images of Simulate sequence
     simulated: SimulatedRecord | None
-    has_simulated: bool
     #: The image that stays where it was taken
     frozen: FrozenRecord | None
-    has_frozen: bool
     fit: tuple | None
-    has_fit: bool
+    #: Names of those of these four that there are not at all
+    missing: tuple[str, ...]
     #: Images that are new, and whether they begin a loop
     cine: list[CineImage]
     is_new_loop: bool
@@ -89,26 +84,15 @@ class Autosave:
     session : where; None: nothing is kept.
     pose : (4, 4) of the probe, or None.
     landmarks : of the registration.
-    told : called with a line if it cannot be kept, once.
-    in_loop : calls a function in the event loop, from any thread.
     """
 
     def __init__(
-        self,
-        session: OwnSession | None,
-        shared: SharedState,
-        logic: UltrasoundSceneLogic,
-        presenter: PanelPresenter,
-        opener: Opener,
-        cine: Cine,
-        pose: Callable[[], np.ndarray | None],
-        landmarks: Callable[[], Sequence[Landmark]],
-        told: Callable[[str], None],
-        in_loop: Callable[[Callable[[], None]], None],
-    ) -> None:
-        self._session, self._shared, self._logic, self._presenter = session, shared, logic, presenter
-        self._opener, self._cine, self._pose = opener, cine, pose
-        self._landmarks, self._told, self._in_loop = landmarks, told, in_loop
+        self, session: OwnSession | None, panel: BrowserPanel, opener: Opener, cine: Cine,
+        pose: Callable[[], np.ndarray | None], landmarks: Callable[[], Sequence[Landmark]],
+    ) -> None:  # fmt: skip
+        self._session, self._shared, self._logic = session, panel.shared, panel.logic
+        self._presenter, self._told, self._in_loop = panel.presenter, panel.showError, panel.tasks.tell
+        self._opener, self._cine, self._pose, self._landmarks = opener, cine, pose, landmarks
         self._is_told = False
         self._is_ended = False
         self._not_before = 0.0  # time, s
@@ -182,7 +166,7 @@ class Autosave:
         seen = (
             anatomy, tuple(self._opener.sent_files.files.items()), parameters.node.GetMTime(),
             None if pose is None else pose.tobytes(), fit is not None, sequence is not None, simulated, frozen, cine,
-            repr(page), self._presenter.noteLines, tuple(map(id, self._landmarks())), of_tissues,
+            repr(page), self._presenter.notes.lines, tuple(map(id, self._landmarks())), of_tissues,
         )  # fmt: skip
         if seen == self._seen and not is_new_fit and not is_new_sequence:
             return
@@ -199,7 +183,7 @@ class Autosave:
             "pose": None if pose is None or labels is None else pose.tolist(),
             "values": recorded_values(parameters),
             "page": page,
-            "notes": list(self._presenter.noteLines),
+            "notes": list(self._presenter.notes.lines),
             "curve": list(self._shared.now.fit.curve),
             "costs": self._shared.now.fit.costs,
             "source": None if source is None else source.to_dict(),
@@ -208,12 +192,12 @@ class Autosave:
             "landmarks": [mark.to_list() for mark in self._landmarks()],
         }
         is_new_loop = self._cine.loop != self._cine_seen[0]
+        parts = {"sequence": sequence, "simulated": simulated, "frozen": frozen, "fit": fit}
         taken = _Taken(
-            self._opener.patient(), state, record,
-            sequence if is_new_sequence else None, sequence is not None, made, simulated is not None,
-            image, frozen is not None,
+            self._opener.patient(), state, record, sequence if is_new_sequence else None, made, image,
             (replace(fit[0], simulator=None), fit[1]) if fit is not None and is_new_fit else None,
-            fit is not None, self._cine.since(0 if is_new_loop else self._cine_seen[1]), is_new_loop,
+            tuple(name for name, part in parts.items() if part is None),
+            self._cine.since(0 if is_new_loop else self._cine_seen[1]), is_new_loop,
             dict(self._opener.sent_files.files),
         )  # fmt: skip
         self._seen, self._anatomy_seen, self._sequence_seen, self._fit_seen = seen, anatomy, sequence, fit
@@ -277,33 +261,20 @@ class Autosave:
         if size > room:
             session.clear()
             raise SimulationError(f"{taken.patient} has {size / 2**30:.1f} GB, expected at most {room / 2**30:.1f} GB")
-        if taken.anatomy is not None:
-            self._put("anatomy", taken.anatomy)
-        if taken.sequence is not None:
-            self._put("sequence", taken.sequence)
-        if taken.simulated is not None:
-            self._put("simulated", taken.simulated)
-        if taken.frozen is not None:
-            self._put("frozen", taken.frozen)
-        if taken.fit is not None:
-            self._put("fit", taken.fit)
+        for part in ("anatomy", "sequence", "simulated", "frozen", "fit"):
+            if getattr(taken, part) is not None:
+                self._put(part, getattr(taken, part))
         # By their places: another patient may have a file of the same name
         sent = {name: self._sent.get(path) or self._copied(path) for name, path in taken.sent.items()}
         self._files["sent"] = {name: file for name, file in sent.items() if file is not None}
-        for part, is_there in (
-            ("sequence", taken.has_sequence), ("simulated", taken.has_simulated), ("frozen", taken.has_frozen),
-            ("fit", taken.has_fit),
-        ):  # fmt: skip
-            if not is_there:
-                self._files.pop(part, None)
+        for part in taken.missing:
+            self._files.pop(part, None)
         if taken.is_new_loop:
             self._chunks = []
         if taken.cine:
             self._number += 1
-            name, images = (
-                f"cine-{self._number}",
-                [(seconds, _jpeg(image), about) for seconds, image, about in taken.cine],
-            )
+            name = f"cine-{self._number}"
+            images = [(seconds, _jpeg(image), about) for seconds, image, about in taken.cine]
             session.write(name, lambda file: write_values(file, images))
             self._chunks.append((name, len(images)))
         while self._chunks and sum(count for _, count in self._chunks[1:]) >= MOST_IMAGES:

@@ -7,7 +7,6 @@ import json
 import os
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -20,16 +19,14 @@ from trame_slicer.core import SlicerApp
 from vtkmodules.vtkCommonCore import vtkOutputWindow
 
 from SlicerUSSim.Logic.base.errors import SimulationError, require, required
-from SlicerUSSim.Logic.imaging.preset import Preset
 from SlicerUSSim.Logic.mrml.label_nodes import read_labels
-from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic
 from SlicerUSSim.Logic.mrml.nodes import nodes_of_class, pose_in_labels
 from SlicerUSSim.Logic.mrml.taken_image import TakenImage
 from SlicerUSSim.Logic.tissue.sheet_looks import with_dura
 from SlicerUSSim.Logic.tissue.surfels import KINDS
+from SlicerUSSim.Workstation.browser_panel import BrowserPanel
 from SlicerUSSim.Workstation.opener import FILE, Opener
 from SlicerUSSim.Workstation.script import LabelSource, python_script
-from SlicerUSSim.Workstation.tasks import Tasks
 from SlicerUSSim.Workstation.zipped import zipped
 
 #: File formats of an image with its geometry.
@@ -157,25 +154,11 @@ class Exports:
     """The contents of the menu Export, by kind: png, .nrrd, .mha, .vti, gif, mrb, json, zip; and the script.
 
     Each is (file name, content, MIME type). Raises SimulationError if there is nothing to export.
-
-    Parameters
-    ----------
-    preset : the settings to save.
-    progress : shows that something is done, by its title, and takes the fraction done; see PanelView.
     """
 
-    def __init__(
-        self,
-        app: SlicerApp,
-        logic: UltrasoundSceneLogic,
-        tasks: Tasks,
-        opener: Opener,
-        cine: Cine,
-        preset: Callable[[], Preset],
-        progress: Callable[[str], AbstractContextManager[Callable[[float], None]]],
-    ) -> None:
-        self._app, self._logic, self._tasks, self._opener = app, logic, tasks, opener
-        self._cine, self._preset, self._progress = cine, preset, progress
+    def __init__(self, app: SlicerApp, panel: BrowserPanel, opener: Opener, cine: Cine) -> None:
+        self._app, self._logic, self._tasks, self._opener = app, panel.logic, panel.tasks, opener
+        self._cine, self._preset, self._progress = cine, panel.presenter.values.presetToSave, panel.progress
 
     def export(self, kind: str) -> tuple[str, bytes, str]:
         """Export one kind, in a task: what takes time can be cancelled, and images go on meanwhile."""

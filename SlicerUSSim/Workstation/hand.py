@@ -22,20 +22,13 @@ from SlicerUSSim.Logic.probe.surface import PatientSurface
 #: Actions of the keys: turn by (rock, tilt, rotate) degrees, slide by (lateral, elevational) mm, lift by mm. With Shift
 #: five times as much.
 KEYS: dict[str, tuple[str, tuple[float, ...]]] = {
-    "ArrowLeft": ("slide", (-2.0, 0.0)),
-    "ArrowRight": ("slide", (2.0, 0.0)),
-    "ArrowUp": ("slide", (0.0, 2.0)),
-    "ArrowDown": ("slide", (0.0, -2.0)),
-    "a": ("turn", (2.0, 0.0, 0.0)),
-    "d": ("turn", (-2.0, 0.0, 0.0)),
-    "w": ("turn", (0.0, 2.0, 0.0)),
-    "s": ("turn", (0.0, -2.0, 0.0)),
-    "q": ("turn", (0.0, 0.0, -2.0)),
-    "e": ("turn", (0.0, 0.0, 2.0)),
-    "+": ("lift", (0.5,)),
-    "-": ("lift", (-0.5,)),
-    "Home": ("upright", ()),
-}
+    "ArrowLeft": ("slide", (-2.0, 0.0)), "ArrowRight": ("slide", (2.0, 0.0)),
+    "ArrowUp": ("slide", (0.0, 2.0)), "ArrowDown": ("slide", (0.0, -2.0)),
+    "a": ("turn", (2.0, 0.0, 0.0)), "d": ("turn", (-2.0, 0.0, 0.0)),
+    "w": ("turn", (0.0, 2.0, 0.0)), "s": ("turn", (0.0, -2.0, 0.0)),
+    "q": ("turn", (0.0, 0.0, -2.0)), "e": ("turn", (0.0, 0.0, 2.0)),
+    "+": ("lift", (0.5,)), "-": ("lift", (-0.5,)), "Home": ("upright", ()),
+}  # fmt: skip
 _DOUBLE_CLICK_S, _DOUBLE_CLICK_PX = 0.4, 5
 #: A drag in a slice view slides the probe if it starts less than this far below the probe face, mm; else it swings it.
 _AT_THE_PROBE_MM = 8.0

@@ -2,50 +2,38 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from time import perf_counter
 
 import numpy as np
 
-from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic
+from SlicerUSSim.Logic.imaging.preset import Preset
 from SlicerUSSim.Logic.mrml.nodes import node_to_world
 from SlicerUSSim.Logic.mrml.taken_image import TakenImage, about_as_json
 from SlicerUSSim.Logic.probe.arrays import Probe
 from SlicerUSSim.Logic.probe.image_grid import ImageGrid
 from SlicerUSSim.Workstation.anatomy import AnatomyViews
+from SlicerUSSim.Workstation.browser_panel import BrowserPanel
 from SlicerUSSim.Workstation.comparison import Comparison
 from SlicerUSSim.Workstation.export import Cine
 from SlicerUSSim.Workstation.latency import LatencyStamps
-from SlicerUSSim.Workstation.ruler import description
-from SlicerUSSim.Workstation.state import SharedState
 from SlicerUSSim.Workstation.streams import ImageStream
 from SlicerUSSim.Workstation.tasks import AtMost
 from SlicerUSSim.Workstation.tracker import Tracker
 
 #: Seconds between two updates of Slicer's views, which delay the image.
 _VIEWS_EVERY_S = 0.12
+#: Height of the image in heights of its letters
+_LETTERS = 36.0
 
 
 class ImageFlow:
-    """Distributes the images of the logic to page, views, comparison, cine loop and tracker.
-
-    Parameters
-    ----------
-    is_busy : whether work is under way for which live images wait.
-    """
+    """Distributes the images of the logic to page, views, comparison, cine loop and tracker."""
 
     def __init__(
-        self,
-        shared: SharedState,
-        logic: UltrasoundSceneLogic,
-        views: AnatomyViews,
-        comparison: Comparison,
-        cine: Cine,
-        tracker: Tracker,
+        self, panel: BrowserPanel, views: AnatomyViews, comparison: Comparison, cine: Cine, tracker: Tracker,
         stamps: LatencyStamps,
-        is_busy: Callable[[], bool],
-    ) -> None:
-        self._shared, self._logic, self._views, self._is_busy = shared, logic, views, is_busy
+    ) -> None:  # fmt: skip
+        self._panel, self._logic, self._views = panel, panel.logic, views
         self._comparison, self._cine, self._tracker, self._stamps = comparison, cine, tracker, stamps
         self._simulated = ImageStream("simulated")
         self._field: tuple[tuple[ImageGrid, Probe], np.ndarray] | None = None
@@ -67,7 +55,7 @@ class ImageFlow:
         if taken is None:
             self.clear()
             return
-        self._simulated.send(taken.image, stamp=self._stamps.computed, **description(taken))
+        self._simulated.send(taken.image, stamp=self._stamps.computed, **_description(taken))
         self._cine.add(taken.image, perf_counter(), about_as_json(taken.node))
         self._show_in_views()
         if self._tracker.is_on:
@@ -76,7 +64,7 @@ class ImageFlow:
             self._comparison.sees_nothing(taken.grid)
         else:
             self._comparison.compare(taken.image, taken.grid)
-        self.tell_frozen()
+        self._panel.tellFrozen()
 
     def clear(self) -> None:
         """Show no image anywhere, since that of before is not of this patient or pose."""
@@ -84,14 +72,7 @@ class ImageFlow:
         self._cine.clear()
         self._views.hide_image()
         self._comparison.sees_nothing(None)
-        self.tell_frozen()
-
-    def tell_frozen(self) -> None:
-        """Mark an image that does not follow the probe, since live images ended or wait for other work."""
-        is_frozen = self._logic.taken is not None and (not self._logic.isLive or self._is_busy())
-        if self._shared.now.is_frozen != is_frozen:
-            with self._shared.changing() as now:
-                now.is_frozen = is_frozen
+        self._panel.tellFrozen()
 
     def show_again(self) -> None:
         """Send the current images again, for a page that has just opened."""
@@ -119,3 +100,31 @@ class ImageFlow:
         if self._field is None or self._field[0] != key:
             self._field = key, grid.field(probe)
         return self._field[1]
+
+
+def _description(taken: TakenImage) -> dict[str, object]:
+    """What pages show with an image, in one message with it, so that it is never that of another image."""
+    return {
+        "ruler": _ruler(taken.grid, taken.preset),
+        "patient": taken.patient,
+        "time": taken.time,
+        "pose": taken.probe_to_world.round(3).tolist(),
+        "sequence": None if taken.number is None else taken.number + 1,
+    }
+
+
+def _ruler(grid: ImageGrid, preset: Preset) -> dict[str, object]:
+    """Edges of an image in the probe frame, mm, marks of depth, size of letters, focus, and dynamic range."""
+    width, height = grid.columns * grid.pixel_spacing_mm[0], grid.rows * grid.pixel_spacing_mm[1]
+    step = 10 if height > 40 else 5
+    depths = range(0, int(grid.top_mm + height) + 1, step)
+    return {
+        "x": grid.left_mm,
+        "y": grid.top_mm,
+        "w": width,
+        "h": height,
+        "ticks": [{"y": depth, "text": str(depth) if depth % (2 * step) == 0 else ""} for depth in depths],
+        "size": height / _LETTERS,
+        "focus": preset.probe.focus_mm or 0.0,
+        "range": f"{preset.display.dynamic_range_db:.0f}",
+    }

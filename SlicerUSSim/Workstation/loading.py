@@ -2,42 +2,43 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Callable, Hashable, Iterable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from trame_slicer.core import SlicerApp
 
 from SlicerUSSim.Logic.base.errors import SimulationError, require
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.mri.given_mask import checked_mask
 from SlicerUSSim.Logic.mri.mask_check import follows
 from SlicerUSSim.Logic.mrml.label_nodes import labels_version
-from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic
-from SlicerUSSim.Logic.mrml.nodes import pose_in_labels, probe_pose, read_volume
+from SlicerUSSim.Logic.mrml.nodes import nodes_of_class, pose_in_labels, probe_pose, read_volume
 from SlicerUSSim.Logic.mrml.taken_sequence import FrozenRecord
 from SlicerUSSim.Logic.placement.craniotomy import disc_diameter_mm
 from SlicerUSSim.Logic.tissue.label_maps import LabelledTissues, as_whole
-from SlicerUSSim.Widget.presenter import PanelPresenter
 from SlicerUSSim.Workstation.anatomy import AnatomyViews
+from SlicerUSSim.Workstation.browser_panel import BrowserPanel
 from SlicerUSSim.Workstation.comparison import Comparison
 from SlicerUSSim.Workstation.content import Kind
-from SlicerUSSim.Workstation.messages import Messages
 from SlicerUSSim.Workstation.opener import FILE, Files, LabelTable, Opener
-from SlicerUSSim.Workstation.patient_nodes import remove_patient_nodes
+from SlicerUSSim.Workstation.pose_registration import Recording, Registration
 from SlicerUSSim.Workstation.probe_control import ProbeControl
-from SlicerUSSim.Workstation.registration import Recording, Registration
 from SlicerUSSim.Workstation.script import LabelSource
-from SlicerUSSim.Workstation.state import ORGANS, SharedState
-from SlicerUSSim.Workstation.tasks import Tasks
+from SlicerUSSim.Workstation.state import ORGANS
 
 #: Roles of nodes of a patient
 _OF_PATIENT = (
     "mri", "labels", "mask", "second_mri", "lesions", "organs", "sheets", "seed", "proposal", "opening", "real",
     "transform_sequence", "image_sequence",
+)  # fmt: skip
+#: What is of a patient: images, labels, surfaces, points, recordings, the costs of a fit
+_PATIENT_CLASSES = (
+    "vtkMRMLSequenceBrowserNode", "vtkMRMLSequenceNode", "vtkMRMLVolumeNode", "vtkMRMLSegmentationNode",
+    "vtkMRMLModelNode", "vtkMRMLMarkupsNode", "vtkMRMLTransformNode", "vtkMRMLPlotChartNode", "vtkMRMLPlotSeriesNode",
+    "vtkMRMLTableNode",
 )  # fmt: skip
 
 
@@ -45,21 +46,11 @@ class Loading:
     """Replaces the patient, or adds data of the same patient. All methods run in a task."""
 
     def __init__(
-        self,
-        shared: SharedState,
-        app: SlicerApp,
-        logic: UltrasoundSceneLogic,
-        tasks: Tasks,
-        opener: Opener,
-        presenter: PanelPresenter,
-        messages: Messages,
-        views: AnatomyViews,
-        probe: ProbeControl,
-        comparison: Comparison,
+        self, panel: BrowserPanel, opener: Opener, views: AnatomyViews, probe: ProbeControl, comparison: Comparison,
         registration: Registration,
-    ) -> None:
-        self._shared, self._scene, self._logic, self._tasks = shared, app.scene, logic, tasks
-        self._opener, self._presenter, self._messages = opener, presenter, messages
+    ) -> None:  # fmt: skip
+        self._shared, self._logic, self._scene, self._tasks = panel.shared, panel.logic, panel.logic.scene, panel.tasks
+        self._panel, self._presenter, self._opener = panel, panel.presenter, opener
         self._views, self._probe, self._comparison = views, probe, comparison
         self._registration = registration
         self._is_new = False  # a patient was opened, on whom the probe is not yet
@@ -93,7 +84,7 @@ class Loading:
                 node, found = self._opener.labels(files.labels)
                 self._take_labels(node, found, self._mri_of(found.labels))
                 if files.additions:
-                    self.add_tissues()
+                    self.lay(self._presenter.lesions.addTissues)
             else:
                 self.segment()
             self._open_at_start(files)
@@ -101,7 +92,7 @@ class Loading:
                 recording = Recording(files.sequence, files.sequence_name, files.transform)
                 self._registration.take(recording, files.to_ras)
             elif files.preset is not None and files.preset.probe_to_ras is not None:
-                self._presenter.takePreset(files.preset)
+                self._presenter.values.takePreset(files.preset)
 
     @property
     def has_users_patient(self) -> bool:
@@ -121,7 +112,7 @@ class Loading:
 
         def take() -> str | None:
             parameters = self._logic.parameters
-            self._messages.clear()
+            self._panel.clearErrors()
             self._take_mri(mri)
             if parameters.segmentation.contrast != contrast:
                 parameters.segmentation = replace(parameters.segmentation, contrast=contrast)
@@ -169,14 +160,14 @@ class Loading:
                 )
             elif mri is not None:
                 checks.append(_of_mri(mri))
-            self._presenter.setNotes(f"{node.GetName()}: {found.message}", *checks)
+            self._presenter.notes.set(f"{node.GetName()}: {found.message}", *checks)
             for warning in found.warnings:
                 self._presenter.view.showError(warning)
             self.show_title()
             self.labels_ready()
 
         def take() -> None:
-            self._messages.clear()
+            self._panel.clearErrors()
             self.forget_patient(node, *kept)
             if are_of_patient is False:
                 self._dropped = ""  # the user said that it is another patient's
@@ -254,7 +245,7 @@ class Loading:
         lesions, organs = parameters.lesions, parameters.organs
         kinds = parameters.sheet.kinds if parameters.sheet.find else ()
         before = self._opener.known_source(parameters.labels)
-        if not self._changed(self._presenter.segment):
+        if not self._changed(self._presenter.segmenting.segment):
             return False
         self._source_before = before
         self._opener.segmented(parameters.labels, *inputs, others, lesions, kinds, organs)
@@ -264,7 +255,7 @@ class Loading:
     def undo_segment(self) -> None:
         """Go back to the tissues from before the last Segment; others that were chosen since stay as they are."""
         chosen = self._logic.parameters.labels
-        is_changed = self._changed(self._presenter.undoSegment)
+        is_changed = self._changed(self._presenter.segmenting.undoSegment)
         labels: Any = self._logic.parameters.labels
         if chosen is not None and labels is None:
             self._logic.clearImage(self._logic.parameters.output)
@@ -275,16 +266,10 @@ class Loading:
             self.labels_ready()
         self.show_title()
 
-    def add_tissues(self) -> None:
-        """Lay the lesions over the tissues."""
+    def lay(self, action: Callable[[], None]) -> None:
+        """Run an action that lays the lesions over the tissues."""
         source, patient = self._opener.known_source(self._logic.parameters.labels), self._opener.patient()
-        if self._changed(self._presenter.addTissues):
-            self._laid(source, patient)
-
-    def accept_proposal(self) -> None:
-        """Move what is proposed to the lesions, and lay them over the tissues."""
-        source, patient = self._opener.known_source(self._logic.parameters.labels), self._opener.patient()
-        if self._changed(self._presenter.acceptProposal):
+        if self._changed(action):
             self._laid(source, patient)
 
     def open_craniotomy(self) -> None:
@@ -292,7 +277,7 @@ class Loading:
         parameters: Any = self._logic.parameters
         labels, patient = parameters.labels, self._opener.patient()
         source = None if labels is None else self._opener.known_source(self._logic.closedLabels(labels))
-        if self._changed(self._presenter.openCraniotomy):
+        if self._changed(self._presenter.placing.openCraniotomy):
             disc = None
             if parameters.opening is None:
                 pose, _ = pose_in_labels(parameters.labels, probe_pose(parameters.probe_transform))
@@ -310,24 +295,19 @@ class Loading:
         if files.craniotomy not in ("auto", "disc:"):
             parameters.opening = self._opener.opening(files.craniotomy)
             self.open_craniotomy()
-            self.place_probe()
+            self.place(self._presenter.placing.placeProbe)
             return
         self._logic.placeProbe(parameters.labels, parameters.probe_transform, will_open=True)
         self.open_craniotomy()
 
     def close_craniotomy(self) -> None:
         """Go back to the labels without the opening."""
-        if self._changed(self._presenter.closeCraniotomy):
+        if self._changed(self._presenter.placing.closeCraniotomy):
             self.labels_ready()
 
-    def place_probe(self) -> None:
-        """Place the probe at a typical craniotomy."""
-        self._presenter.placeProbe()
-        self._probe.look()
-
-    def place_at_view(self) -> None:
-        """Place the probe where the chosen standard view is seen from."""
-        self._presenter.placeAtView()
+    def place(self, action: Callable[[], None]) -> None:
+        """Run an action that places the probe, and look at it."""
+        action()
         self._probe.look()
 
     def show_title(self) -> None:
@@ -349,7 +329,7 @@ class Loading:
         parameters.lesions = node
         try:
             if parameters.labels is not None:
-                self._presenter.layLesions()
+                self._presenter.lesions.layLesions()
         except SimulationError:
             undo()
             parameters.lesions = before
@@ -396,7 +376,7 @@ class Loading:
             parameters.mri = mris[0]
         self._views.show_volume(node if parameters.mri is None else parameters.mri)
         parameters.labels = node
-        self._presenter.setNotes(f"{node.GetName()}: {found.message}", *checks)
+        self._presenter.notes.set(f"{node.GetName()}: {found.message}", *checks)
         self.show_title()
         self.labels_ready()
 
@@ -416,16 +396,17 @@ class Loading:
         """Choose the label map of organs of a CT, which Segment uses."""
         self._logic.parameters.organs = node
         lines = [f"{node.GetName()}: {found.message}; Segment uses it with the contrast ct", found.taken_for]
-        self._presenter.setNotes("\n".join(filter(None, lines)))
+        self._presenter.notes.set("\n".join(filter(None, lines)))
 
     def close_patient(self) -> None:
         """Close the patient: nothing of him stays on the page, in the scene or in memory; settings stay."""
         parameters = self._logic.parameters
-        self._messages.clear()
-        self.forget_patient()
-        parameters.mri = parameters.labels = parameters.mask = parameters.second_mri = None
-        self._presenter.setNotes()
-        self.show_title()
+        with self._presenter.acting():
+            self._panel.clearErrors()
+            self.forget_patient()
+            parameters.mri = parameters.labels = parameters.mask = parameters.second_mri = None
+            self._presenter.notes.set()
+            self.show_title()
 
     def forget_patient(self, *new: Any) -> None:
         """Show, choose and keep nothing of the patient before, when another one is opened; `new` are nodes of his."""
@@ -447,7 +428,7 @@ class Loading:
             node: Any = getattr(parameters, role)
             if node not in kept:
                 setattr(parameters, role, None)
-        remove_patient_nodes(self._scene, kept)
+        _remove_patient_nodes(self._scene, kept)
         with self._shared.changing() as now:
             now.fit.curve, now.fit.costs = [], ""
         self._is_new = True
@@ -460,13 +441,13 @@ class Loading:
         parameters = self._logic.parameters
         self.forget_patient(node)
         parameters.mri = node
-        self._presenter.setNotes()
+        self._presenter.notes.set()
         self.show_title()
         self._views.show_volume(node)
 
     def begin_patient(self, *nodes: Any) -> None:
         """Close the patient before, also the ultrasound that was opened before him; `nodes` are all of the next one."""
-        self._messages.clear()
+        self._panel.clearErrors()
         self._forget_ultrasound()
         self.forget_patient(*nodes)
 
@@ -491,16 +472,51 @@ class Loading:
         The probe `is_placed`, or is placed now if they are of a new patient.
         """
         if self._logic.parameters.probe_transform is None or (self._is_new and not is_placed):
-            self._presenter.placeProbe()
+            self._presenter.placing.placeProbe()
         self._is_new = False
         self.show_title()
         if frozen is not None:
-            self._presenter.showFrozen(frozen)
+            self._presenter.images.showFrozen(frozen)
         elif not self._logic.isLive:
-            self._presenter.setLive(True)
+            self._presenter.images.setLive(True)
         self._probe.update_surface()  # after the start of live images, which do not need it
         self._probe.look()
 
 
 def _of_mri(mri_node: Any) -> str:
     return f"of the MRI {mri_node.GetName()}, which is shown: its intensities follow the labels"
+
+
+def _remove_patient_nodes(scene, kept: Iterable[Any]) -> None:
+    """Remove all nodes of these classes, with what displays and stores them, except those that are kept.
+
+    Nodes that are not saved with the scene belong to the views and stay. The scene is the workstation's own: nobody
+    else puts nodes into it.
+    """
+    ids = {node.GetID() for node in kept if node is not None}
+    for name in _PATIENT_CLASSES:
+        for node in nodes_of_class(scene, name):
+            # One may be gone together with another one before
+            if node.GetSaveWithScene() and node.GetScene() is not None and node.GetID() not in ids and _is_data(node):
+                for helper in _helpers(node):
+                    scene.RemoveNode(helper)
+                scene.RemoveNode(node)
+
+
+def _is_data(node) -> bool:
+    """Not a model of a slice view, which Slicer makes and needs."""
+    return (not (node.GetName() or "").endswith("Volume Slice") and not node.GetHideFromEditors()) or _is_shares(node)
+
+
+def _is_shares(node) -> bool:
+    return node.GetAttribute("SlicerUSSim.sharesOf") is not None
+
+
+def _helpers(node) -> list[Any]:
+    """Display and storage nodes, and the colours of labels."""
+    displays = range(node.GetNumberOfDisplayNodes()) if node.IsA("vtkMRMLDisplayableNode") else ()
+    stores = range(node.GetNumberOfStorageNodes()) if node.IsA("vtkMRMLStorableNode") else ()
+    found = [node.GetNthDisplayNode(number) for number in displays]
+    found += [node.GetNthStorageNode(number) for number in stores]
+    found.append(node.GetNodeReference("tissueColors"))
+    return [helper for helper in found if helper is not None]

@@ -25,13 +25,12 @@ from SlicerUSSim.Logic.mri.samples import demo_mri
 from SlicerUSSim.Logic.mri.segmentation_settings import SheetSettings
 from SlicerUSSim.Logic.mri.sheets.kept import sheets_beside
 from SlicerUSSim.Logic.mri.sheets.polydata import as_polydata, read_surfels
-from SlicerUSSim.Logic.mrml.known_field import KnownField, write_known_field
 from SlicerUSSim.Logic.mrml.label_nodes import read_labels, write_labels
 from SlicerUSSim.Logic.mrml.lesion_nodes import add_lesion
 from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic
 from SlicerUSSim.Logic.mrml.nodes import display_of, write_volume
 from SlicerUSSim.Logic.mrml.scene_record import SceneRecord, SequenceRecord
-from SlicerUSSim.Logic.mrml.sequence_nodes import add_sequence
+from SlicerUSSim.Logic.mrml.sequence_nodes import KnownField, add_sequence, write_known_field
 from SlicerUSSim.Logic.mrml.taken_image import PATIENT, patient_of
 from SlicerUSSim.Logic.placement.craniotomy import is_open, polygon_of_file
 from SlicerUSSim.Logic.probe.arrays import Probe

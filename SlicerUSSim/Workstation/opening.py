@@ -13,19 +13,17 @@ from SlicerUSSim.Logic.mri.markups import markup_points
 from SlicerUSSim.Logic.mri.modality import has_brain_mask
 from SlicerUSSim.Logic.mri.pathology import LESIONS
 from SlicerUSSim.Logic.mri.segmentation_settings import CT, MRI_CONTRASTS
-from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic
 from SlicerUSSim.Logic.placement.craniotomy import POLYGONS
 from SlicerUSSim.Logic.tracked.pose_files import read_pose
-from SlicerUSSim.Widget.presenter import PanelPresenter
+from SlicerUSSim.Workstation.browser_panel import BrowserPanel
 from SlicerUSSim.Workstation.content import Kind
 from SlicerUSSim.Workstation.loading import Loading
 from SlicerUSSim.Workstation.opener import Opener, Upload
 from SlicerUSSim.Workstation.parcel import Parcel
 from SlicerUSSim.Workstation.pose_entry import PoseEntry
+from SlicerUSSim.Workstation.pose_registration import Registration
 from SlicerUSSim.Workstation.questions import Questions
-from SlicerUSSim.Workstation.registration import Registration
-from SlicerUSSim.Workstation.state import Choice, SharedState
-from SlicerUSSim.Workstation.tasks import Tasks
+from SlicerUSSim.Workstation.state import Choice
 from SlicerUSSim.Workstation.uploads import listed
 
 #: Keys of choices
@@ -40,36 +38,20 @@ class Opening:
     """Opens what a page has sent. All methods run in a task."""
 
     def __init__(
-        self,
-        shared: SharedState,
-        logic: UltrasoundSceneLogic,
-        tasks: Tasks,
-        opener: Opener,
-        presenter: PanelPresenter,
-        loading: Loading,
-        registration: Registration,
-        questions: Questions,
+        self, panel: BrowserPanel, opener: Opener, loading: Loading, registration: Registration, questions: Questions,
         poses: PoseEntry,
-    ) -> None:
-        self._shared, self._logic, self._tasks = shared, logic, tasks
-        self._opener, self._presenter, self._loading = opener, presenter, loading
+    ) -> None:  # fmt: skip
+        self._shared, self._logic, self._tasks = panel.shared, panel.logic, panel.tasks
+        self._presenter, self._opener, self._loading = panel.presenter, opener, loading
         self._registration, self._questions, self._poses = registration, questions, poses
         #: Opens a scene (.mrb) by its path, in place of the patient, and returns what was done
         self.open_scene: Callable[[str], str] | None = None
         self._took: dict[Kind, Callable[[Upload, list[Upload]], tuple[str, Callable[[], object]]]] = {
-            Kind.MRI: self._mri,
-            Kind.CT: self._mri,
-            Kind.LABELS: self._labels,
-            Kind.MASK: self._mask,
-            Kind.LESIONS: self._mask,
-            Kind.SEQUENCE: self._sequence,
-            Kind.SHEETS: self._sheets,
-            Kind.SCENE: self._scene,
-            Kind.PRESET: self._preset,
-            Kind.TRANSFORM: self._transform,
-            Kind.POSE: self._pose,
+            Kind.MRI: self._mri, Kind.CT: self._mri, Kind.LABELS: self._labels, Kind.MASK: self._mask,
+            Kind.LESIONS: self._mask, Kind.SEQUENCE: self._sequence, Kind.SHEETS: self._sheets, Kind.SCENE: self._scene,
+            Kind.PRESET: self._preset, Kind.TRANSFORM: self._transform, Kind.POSE: self._pose,
             Kind.POINTS: self._points,
-        }
+        }  # fmt: skip
 
     def open(self, files: Mapping[str, bytes], meant: str = "") -> None:
         """Open what a page has sent, {name: content}: any files of a patient, his ultrasound, and settings.
@@ -288,15 +270,12 @@ class Opening:
             return False
         return True
 
-    def _require_recording(self, upload: Upload) -> None:
-        require(
-            self._registration.recording is not None,
-            f"{upload.name}: {upload.content.what}, expected tracked ultrasound first, to which it belongs",
-        )
-
     def _transform_as(self, upload: Upload, key: str) -> tuple[str, Callable[[], object]]:
         registration = self._registration
-        self._require_recording(upload)
+        require(
+            registration.recording is not None,
+            f"{upload.name}: {upload.content.what}, expected tracked ultrasound first, to which it belongs",
+        )
         if key == _CALIBRATION:
             return "calibration of the tracked ultrasound", registration.reading_calibration(upload.path)
         return "registration of the tracked ultrasound", registration.reading_registration(upload.path)
@@ -308,7 +287,7 @@ class Opening:
     def _preset(self, upload: Upload, beside: list[Upload]) -> tuple[str, Callable[[], object]]:
         preset = self._tasks.doAside(lambda: Preset.read(upload.path))
         moves = "" if preset.probe_to_ras is None else "; the probe is moved to its pose"
-        return f"in place of the settings of before{moves}", lambda: self._presenter.takePreset(preset)
+        return f"in place of the settings of before{moves}", lambda: self._presenter.values.takePreset(preset)
 
     def _pose(self, upload: Upload, beside: list[Upload]) -> tuple[str, Callable[[], object]]:
         pose = self._tasks.doAside(lambda: read_pose(upload.path))

@@ -1,11 +1,13 @@
 """Layout of the page: the panel's sections (left), the ultrasound image (middle), the anatomy and the probe (right).
 
 The page is built from trame's widgets, which are bound to fields of state.PageState through their NAMES. Actions of the
-user reach the workstation as triggers (Workstation._answer_pages) and as changes of those fields.
+user reach the workstation as calls of methods, as triggers by name (Workstation._answer_pages), and as changes of those
+fields.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from html import escape
 from pathlib import Path
@@ -18,12 +20,18 @@ from trame_slicer.views import AbstractView
 
 from SlicerUSSim.Logic.mri.pathology import LESIONS
 from SlicerUSSim.Logic.tissue.label_advice import PAGE_SEVERAL
-from SlicerUSSim.Widget.controls import Control, Section
-from SlicerUSSim.Widget.presenter import FROZEN, TISSUE_COLUMNS
-from SlicerUSSim.Workstation.page_parts import question_dialog, registration_section
-from SlicerUSSim.Workstation.pose_widgets import pose_numbers
-from SlicerUSSim.Workstation.session_widgets import keep_session, session_offer
-from SlicerUSSim.Workstation.state import NAMES, ORGANS, PLANES, SLICE_VIEWS, ComparisonMode
+from SlicerUSSim.Widget.image_presenter import FROZEN
+from SlicerUSSim.Widget.interface import Control, Section
+from SlicerUSSim.Widget.tissue_presenter import TISSUE_COLUMNS
+from SlicerUSSim.Workstation.browser_panel import BrowserPanel
+from SlicerUSSim.Workstation.page_parts import (
+    keep_session,
+    pose_numbers,
+    question_dialog,
+    registration_section,
+    session_offer,
+)
+from SlicerUSSim.Workstation.state import NAMES, ORGANS, PLANES, SLICE_VIEWS, ComparisonMode, value_of
 
 _STATIC = Path(__file__).parent / "static"
 #: Files that the page loads in addition to those of trame.
@@ -72,22 +80,17 @@ POSE_SLIDERS = (
     PoseSlider("tilt_deg", "Tilt", "Out of the image plane (keys W, S; Shift and drag)", -75, 75, 0.5, "°"),
     PoseSlider("lift_mm", "Lift", "Off the surface; negative: pressed in (keys +, -)", -10, 30, 0.5, "mm"),
 )
-_EXPORTS = (
-    ("png", "Image (PNG)"),
-    (".nrrd", "Image with geometry (NRRD)"),
-    (".mha", "Image with geometry (MHA)"),
-    (".vti", "Image with geometry (VTI)"),
-    ("gif", "Cine of the last images (GIF)"),
-    ("mrb", "Scene for 3D Slicer (MRB)"),
-    ("json", "Settings (JSON)"),
-    ("zip", "Python script with its files (ZIP)"),
-)
+_EXPORTS = {
+    "png": "Image (PNG)", ".nrrd": "Image with geometry (NRRD)", ".mha": "Image with geometry (MHA)",
+    ".vti": "Image with geometry (VTI)", "gif": "Cine of the last images (GIF)", "mrb": "Scene for 3D Slicer (MRB)",
+    "json": "Settings (JSON)", "zip": "Python script with its files (ZIP)",
+}  # fmt: skip
 
 #: In the browser's tab
 _PROGRAM = "SlicerUSSim"
 
 
-def build_page(server: Server, sections: tuple[Section, ...], layout: LayoutManager, keys: tuple[str, ...]) -> None:
+def build_page(server: Server, panel: BrowserPanel, layout: LayoutManager, keys: tuple[str, ...]) -> None:
     """Build the page of a server. `layout` is that of the anatomy views, `keys` are the keys sent to the server."""
     server.enable_module(MODULE)
     server.state.trame__title = _PROGRAM
@@ -100,14 +103,14 @@ def build_page(server: Server, sections: tuple[Section, ...], layout: LayoutMana
     with VAppLayout(server) as page:
         page.root.theme = "dark"
         with v3.VNavigationDrawer(permanent=True, width=376, disable_resize_watcher=True, disable_route_watcher=True):
-            _drawer(sections)
+            _drawer(panel)
         with v3.VMain(style="height: 100vh"), html.Div(classes="ussim-main"):
             with html.Div(classes="ussim-image"):
                 session_offer()
                 _tools()
                 _screens(keys)
                 _player()
-                _status()
+                _status(panel)
             with html.Div(classes="ussim-anatomy"):
                 layout.initialize_layout_grid(page)
         _messages()
@@ -138,11 +141,11 @@ def view_tools(_server: Server, _view_id: str, view: AbstractView) -> None:
 # ---- left ------------------------------------------------------------------------------------------------------------
 
 
-def _drawer(sections: tuple[Section, ...]) -> None:
+def _drawer(panel: BrowserPanel) -> None:
     html.Div("Ultrasound Simulator", classes="text-subtitle-1 px-4 pt-2")
     html.Div(f"{{{{ {NAMES.title} }}}}", classes="text-caption px-4 pb-1 text-medium-emphasis", id="title")
     with v3.VExpansionPanels(multiple=True, v_model=(NAMES.open_sections,), variant="accordion"):
-        for section in _in_order(sections):
+        for section in _in_order(panel.sections):
             if section.title.startswith("Fit"):
                 registration_section()
             with v3.VExpansionPanel(value=section.title):
@@ -152,9 +155,9 @@ def _drawer(sections: tuple[Section, ...]) -> None:
                         _open_file()
                     for control in section.controls:
                         if control.widget not in NOT_SHOWN:
-                            _control(control)
+                            _control(control, panel)
                     if section.title == "Probe":
-                        _pose_sliders()
+                        _pose_sliders(panel)
                         pose_numbers()
                     if section.title.startswith("Fit"):
                         _cost_curve()
@@ -190,7 +193,7 @@ def _open_file() -> None:
         raw_attrs=['aria-live="polite"'],
     )  # fmt: skip
     v3.VBtn(
-        "Close patient", size="small", classes="mb-1", id="close-patient", click="trigger('press', ['closePatient'])",
+        "Close patient", size="small", classes="mb-1", id="close-patient", click="trigger('close_patient')",
         title="Nothing of the patient stays on the page, in the scene or in memory; settings stay",
         disabled=(f"{NAMES.title} === ''",),
     )  # fmt: skip
@@ -208,15 +211,15 @@ def _open_file() -> None:
     )  # fmt: skip
 
 
-def _control(control: Control) -> None:
+def _control(control: Control, panel: BrowserPanel) -> None:
     name, kind, low, high = control.widget, control.kind, control.range.low, control.range.high
-    key = f"{NAMES.panel.values}.{name}"
+    key = value_of(name)
     disabled = f"{NAMES.panel.can}.{name} === false"
     if kind == "slider":
         # Values of a loaded preset can exceed the slider's range.
         _slider(
             key, name, control.label, control.tip, f"Math.min({low}, {key} ?? 0)", f"Math.max({high}, {key} ?? 0)",
-            control.range.step, control.unit, control.decimals, f"trigger('set', ['{name}', $event])",
+            control.range.step, control.unit, control.decimals, (panel.set, f"['{name}', $event]"),
         )  # fmt: skip
     elif kind in ("number", "text"):
         unit = f" [{control.unit}]" if control.unit else ""
@@ -239,7 +242,7 @@ def _control(control: Control) -> None:
         with html.Div(title=control.tip):  # a title of the check box would not apply to its label
             v3.VCheckbox(
                 label=control.label, model_value=(key,), density="compact", hide_details=True, id=name,
-                update_modelValue=f"trigger('set', ['{name}', $event])", disabled=(disabled,),
+                update_modelValue=(panel.set, f"['{name}', $event]"), disabled=(disabled,),
             )  # fmt: skip
     elif kind in ("choice", "node"):
         if kind == "node":  # an HTML option cannot be null: "" is no node
@@ -257,7 +260,7 @@ def _control(control: Control) -> None:
     elif kind == "button":
         v3.VBtn(
             control.label, size="small", classes="ma-1", id=name,
-            click=_IN_PAGE.get(name, f"trigger('press', ['{name}'])"), disabled=(disabled,),
+            click=_IN_PAGE.get(name) or (panel.press, f"['{name}']"), disabled=(disabled,),
             title=(f"{NAMES.panel.tips}.{name} ?? `{control.tip}`",),
         )  # fmt: skip
     elif kind == "words":
@@ -276,9 +279,9 @@ def _control(control: Control) -> None:
 
 def _slider(
     key: str, name: str, label: str, tip: str, minimum: str, maximum: str, step: float, unit: str, decimals: int,
-    event: str,
+    event: str | tuple[Callable[..., object], str],
 ) -> None:  # fmt: skip
-    """A slider with its value beside it; `key`, `minimum`, `maximum` and `event` are JavaScript expressions."""
+    """A slider with its value beside it; `key`, `minimum` and `maximum` are JavaScript expressions."""
     with html.Div(classes="ussim-slider", title=tip):
         html.Div(label)
         v3.VSlider(
@@ -304,7 +307,7 @@ def _tissue_table(control: Control) -> None:
     )
 
 
-def _pose_sliders() -> None:
+def _pose_sliders(panel: BrowserPanel) -> None:
     v3.VDivider(classes="my-1")
     for slider in POSE_SLIDERS:
         _slider(
@@ -317,7 +320,7 @@ def _pose_sliders() -> None:
         title="While it slides; otherwise it keeps its angles to the normal", id="upright",
     )  # fmt: skip
     v3.VBtn(
-        "Place at craniotomy", size="small", classes="ma-1", id="place", click="trigger('press', ['placeButton'])",
+        "Place at craniotomy", size="small", classes="ma-1", id="place", click=(panel.press, "['placeButton']"),
         disabled=(f"{NAMES.panel.can}.placeButton === false",),
         title="Coronal view through a parasagittal craniotomy, or into the opening, aimed at a tumour below it",
     )  # fmt: skip
@@ -339,7 +342,7 @@ def _cost_curve() -> None:
 
 
 def _tools() -> None:
-    live = f"{NAMES.panel.values}.liveCheckBox"
+    live = value_of("liveCheckBox")
     with html.Div(classes="ussim-tool"):
         with v3.VBtn(
             icon=True, size="small", variant="text", id="live",
@@ -369,7 +372,7 @@ def _tools() -> None:
             with v3.Template(v_slot_activator="{ props }"):
                 v3.VBtn("Export", size="small", v_bind="props", prepend_icon="mdi-download", id="export")
             with v3.VList(density="compact"):
-                for kind, words in _EXPORTS:
+                for kind, words in _EXPORTS.items():
                     v3.VListItem(title=words, click=f"window.ussim.save('{kind}')", id=f"export-{kind.strip('.')}")
                 v3.VListItem(title="Copy as Python", click="trigger('script')", id="export-python")
 
@@ -452,7 +455,7 @@ def _player() -> None:
         )  # fmt: skip
 
 
-def _status() -> None:
+def _status(panel: BrowserPanel) -> None:
     messages = NAMES.messages
     with html.Div(classes="ussim-bar"):
         with html.Div(
@@ -464,7 +467,7 @@ def _status() -> None:
             v3.VProgressLinear(
                 model_value=(percent,), indeterminate=(f"{percent} === 0",), color="orange", style="width: 140px"
             )
-            v3.VBtn("Cancel", size="x-small", click="trigger('cancel')", id="cancel")
+            v3.VBtn("Cancel", size="x-small", click=(panel.cancel, "[]"), id="cancel")
         html.Div(
             """<span id="upload" hidden><span id="upload-text"></span>
             <button id="upload-cancel" class="ussim-plain">Cancel</button></span>"""

@@ -1,14 +1,27 @@
-"""Parts of the page about what is opened: questions, and calibration and registration of tracked ultrasound."""
+"""Parts of the page: questions, the session, the pose of the probe, and registration of tracked ultrasound."""
 
 from __future__ import annotations
 
 from trame.widgets import html, vuetify3 as v3
 
-from SlicerUSSim.Workstation.registration import PICK_IMAGE, PICK_PATIENT, SECTION
+from SlicerUSSim.Workstation.pose_entry import POSE_SUFFIXES
+from SlicerUSSim.Workstation.pose_registration import PICK_IMAGE, PICK_PATIENT, SECTION
 from SlicerUSSim.Workstation.state import NAMES
 
 #: Names of transforms that calibrations usually are
 _CALIBRATIONS = ("ImageToProbe", "ImageToTransducer", "TransducerToProbe")
+_KEEP_TIP = (
+    "Patient, tissues, probe and settings are kept on the computer of the server, for its user alone, and are there "
+    "after a crash; off: nothing is kept, and what was is removed"
+)
+_NUMBERS_TIP = (
+    "R, A, S of the middle of the probe's face in mm, and its angles about these axes in degrees (turned about R, then "
+    "A, then S; all 0: its depth towards A, its columns towards R)"
+)
+_MATRIX_TIP = "4x4 matrix from the probe to RAS by rows; columns: lateral, depth, elevational, position in mm"
+#: What the formats are for
+_FORMATS = {".json": "for ussim --pose", ".tfm": "ITK, 3D Slicer", ".h5": "ITK, 3D Slicer", ".mat": "ITK",
+            ".txt": "16 numbers"}  # fmt: skip
 
 
 def question_dialog() -> None:
@@ -31,6 +44,66 @@ def question_dialog() -> None:
             <button class="ussim-choice" id="question-cancel" @click="{none}">Cancel
             <small>Nothing is opened</small></button></div></div>"""
         )
+
+
+def session_offer() -> None:
+    """A bar with the question whether the last session is to be restored, and for session.js what it needs."""
+    html.Span(hidden=True, id="proof-key", raw_attrs=[f':data-key="{NAMES.proof_key}"'])
+    is_busy = f"{NAMES.messages.progress_title} !== ''"
+    with html.Div(
+        v_if=NAMES.offer, classes="ussim-bar ussim-offer", id="session-offer", raw_attrs=['role="status"']
+    ):  # fmt: skip
+        html.Span(f"{{{{ {NAMES.offer} }}}}", id="session-offer-text")
+        v3.VBtn(
+            "Restore", size="small", color="primary", click="trigger('restore_session')", id="restore-session",
+            disabled=(is_busy,), title="It takes the place of the patient that is open now",
+        )  # fmt: skip
+        v3.VBtn(
+            "Discard", size="small", variant="outlined", click="trigger('discard_session')", id="discard-session",
+            disabled=(is_busy,), title="Remove it from the disk",
+        )  # fmt: skip
+
+
+def keep_session() -> None:
+    """A tick box: whether this session is kept."""
+    with html.Div(title=_KEEP_TIP):
+        v3.VCheckbox(
+            label="Keep this session for a crash (autosave)", v_model=(NAMES.keeps_session,), density="compact",
+            hide_details=True, id="keeps-session", disabled=(f"!{NAMES.can_keep_session}",),
+        )  # fmt: skip
+
+
+def pose_numbers() -> None:
+    """Fields for the pose, and buttons to open and save it."""
+    is_none = f"{NAMES.pose_numbers} === ''"
+    html.Div(
+        f"""<label for="pose-numbers">Pose</label>
+        <input type="text" id="pose-numbers" :value="{NAMES.pose_numbers}" :disabled="{is_none}"
+        @change="trigger('type_pose', [$event.target.value])">""",
+        classes="ussim-line", title=_NUMBERS_TIP,
+    )  # fmt: skip
+    html.Div(
+        f"""<label for="pose-matrix">Matrix</label>
+        <textarea id="pose-matrix" rows="4" :value="{NAMES.pose_matrix}" :disabled="{is_none}" spellcheck="false"
+        @change="trigger('type_pose', [$event.target.value])"></textarea>""",
+        classes="ussim-line", title=_MATRIX_TIP,
+    )  # fmt: skip
+    suffixes = ",".join(POSE_SUFFIXES)
+    html.Div(
+        f"""<label for="open-pose">Open pose</label><input type="file" id="open-pose" accept="{suffixes}"
+        @change="window.ussim.send($event.target, {{for: 'pose'}})">""",
+        classes="ussim-line", title="JSON, 16 numbers, or a linear transform of ITK as 3D Slicer saves it",
+    )  # fmt: skip
+    options = "".join(f'<option value="{suffix}">{suffix} ({_FORMATS[suffix]})</option>' for suffix in POSE_SUFFIXES)
+    html.Div(
+        f"""<label for="pose-format">Save pose as</label><select id="pose-format">{options}</select>""",
+        classes="ussim-line", title="Format of the file",
+    )  # fmt: skip
+    v3.VBtn(
+        "Save pose", size="small", classes="ma-1", id="save-pose", disabled=(is_none,),
+        click="window.ussim.save('pose' + window.document.getElementById('pose-format').value)",
+        title="The present pose of the probe as a file",
+    )  # fmt: skip
 
 
 def registration_section() -> None:

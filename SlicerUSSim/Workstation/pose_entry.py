@@ -13,9 +13,7 @@ from SlicerUSSim.Logic.base.errors import SimulationError, require, required
 from SlicerUSSim.Logic.base.reading import untrusted_folder
 from SlicerUSSim.Logic.base.transforms import angles_of_pose
 from SlicerUSSim.Logic.tracked.pose_files import pose_of_text, read_pose, write_pose
-from SlicerUSSim.Widget.presenter import PanelPresenter
-from SlicerUSSim.Workstation.state import SharedState
-from SlicerUSSim.Workstation.tasks import Tasks
+from SlicerUSSim.Workstation.browser_panel import BrowserPanel
 from SlicerUSSim.Workstation.uploads import require_whole_files
 
 #: Suffixes of files of poses
@@ -33,14 +31,9 @@ class PoseEntry:
     """
 
     def __init__(
-        self,
-        shared: SharedState,
-        tasks: Tasks,
-        presenter: PanelPresenter,
-        pose: Callable[[], np.ndarray | None],
-        move: Callable[[np.ndarray], None],
+        self, panel: BrowserPanel, pose: Callable[[], np.ndarray | None], move: Callable[[np.ndarray], None]
     ) -> None:
-        self._shared, self._tasks, self._presenter = shared, tasks, presenter
+        self._shared, self._tasks, self._presenter = panel.shared, panel.tasks, panel.presenter
         self._pose, self._move = pose, move
 
     def show(self) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
-from contextlib import AbstractContextManager
 from dataclasses import fields
 from typing import Any
 
@@ -13,13 +12,12 @@ import numpy as np
 from SlicerUSSim.Logic.base.errors import Cancelled, SimulationError
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.mrml.label_nodes import labels_version, read_labels
-from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic
 from SlicerUSSim.Logic.mrml.nodes import node_to_world, probe_pose, set_node_to_world
 from SlicerUSSim.Logic.probe.surface import PatientSurface, SurfacePose
 from SlicerUSSim.Workstation.anatomy import AnatomyViews
+from SlicerUSSim.Workstation.browser_panel import BrowserPanel
 from SlicerUSSim.Workstation.hand import ProbeHand
-from SlicerUSSim.Workstation.state import SharedState
-from SlicerUSSim.Workstation.tasks import AtMost, Tasks
+from SlicerUSSim.Workstation.tasks import AtMost
 
 _log = logging.getLogger(__name__)
 
@@ -36,20 +34,11 @@ class ProbeControl:
     Parameters
     ----------
     about_to_move : called before the user moves the probe with mouse or keys.
-    progress : shows that something is done, by its title, and takes the fraction done; see PanelView.
     """
 
-    def __init__(
-        self,
-        shared: SharedState,
-        logic: UltrasoundSceneLogic,
-        tasks: Tasks,
-        views: AnatomyViews,
-        about_to_move: Callable[[], None],
-        progress: Callable[[str], AbstractContextManager[Callable[[float], None]]],
-    ) -> None:
-        self._shared, self._logic, self._tasks, self._views = shared, logic, tasks, views
-        self._about_to_move, self._progress = about_to_move, progress
+    def __init__(self, panel: BrowserPanel, views: AnatomyViews, about_to_move: Callable[[], None]) -> None:
+        self._shared, self._logic, self._tasks, self._views = panel.shared, panel.logic, panel.tasks, views
+        self._about_to_move, self._progress = about_to_move, panel.progress
         self.surface: PatientSurface | None = None
         self._surface_version: object = None
         self._drawn: tuple | None = None
@@ -62,7 +51,7 @@ class ProbeControl:
             pose=self.pose,
             move=self._move_by_hand,
             surface=lambda: self.surface,
-            upright=lambda: shared.now.upright,
+            upright=lambda: panel.shared.now.upright,
             hold=self._hold,
         )
         for view in (views.threed, *views.slices):

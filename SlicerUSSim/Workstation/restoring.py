@@ -17,8 +17,8 @@ from SlicerUSSim.Logic.base.transforms import check_rigid
 from SlicerUSSim.Logic.fitting.tracked_fit import Fit
 from SlicerUSSim.Logic.imaging.preset import Preset
 from SlicerUSSim.Logic.mrml.landmark_nodes import Landmark
-from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic
 from SlicerUSSim.Logic.mrml.nodes import display_of, set_node_to_world
+from SlicerUSSim.Logic.mrml.parameter_node import preset_texts
 from SlicerUSSim.Logic.mrml.scene_record import ROLES, SceneRecord, SequenceRecord, put_nodes, put_values
 from SlicerUSSim.Logic.mrml.taken_sequence import (
     FrozenRecord,
@@ -28,17 +28,16 @@ from SlicerUSSim.Logic.mrml.taken_sequence import (
     read_taken,
     taken_of,
 )
-from SlicerUSSim.Widget.presenter import PanelPresenter
+from SlicerUSSim.Workstation.browser_panel import BrowserPanel
 from SlicerUSSim.Workstation.export import Cine, CineImage
 from SlicerUSSim.Workstation.loading import Loading
 from SlicerUSSim.Workstation.opener import Opener, show_all_tissue
+from SlicerUSSim.Workstation.pose_registration import Recording, Registration
 from SlicerUSSim.Workstation.probe_control import ProbeControl
-from SlicerUSSim.Workstation.registration import Recording, Registration
 from SlicerUSSim.Workstation.scene_files import read_scene
 from SlicerUSSim.Workstation.script import LabelSource
 from SlicerUSSim.Workstation.session_store import KeptSession, SessionStore
-from SlicerUSSim.Workstation.state import PLANES, SLICE_VIEWS, ComparisonMode, SharedState
-from SlicerUSSim.Workstation.tasks import Tasks
+from SlicerUSSim.Workstation.state import PLANES, SLICE_VIEWS, ComparisonMode
 
 
 class Restoring:
@@ -52,25 +51,14 @@ class Restoring:
     """
 
     def __init__(
-        self,
-        store: SessionStore | None,
-        shared: SharedState,
-        scene,
-        logic: UltrasoundSceneLogic,
-        tasks: Tasks,
-        opener: Opener,
-        presenter: PanelPresenter,
-        loading: Loading,
-        registration: Registration,
-        probe: ProbeControl,
-        cine: Cine,
-        when_kept: Callable[[Callable[[], None]], None],
-        now: Callable[[], float],
-    ) -> None:
-        self._store, self._shared, self._scene, self._logic, self._tasks = store, shared, scene, logic, tasks
-        self._opener, self._presenter, self._loading = opener, presenter, loading
-        self._registration = registration
-        self._probe, self._cine, self._when_kept, self._now = probe, cine, when_kept, now
+        self, store: SessionStore | None, panel: BrowserPanel, opener: Opener, loading: Loading,
+        registration: Registration, probe: ProbeControl, cine: Cine,
+        when_kept: Callable[[Callable[[], None]], None], now: Callable[[], float],
+    ) -> None:  # fmt: skip
+        self._store, self._shared, self._logic, self._scene = store, panel.shared, panel.logic, panel.logic.scene
+        self._tasks, self._presenter, self._opener, self._loading = panel.tasks, panel.presenter, opener, loading
+        self._registration, self._probe, self._cine = registration, probe, cine
+        self._when_kept, self._now = when_kept, now
         self._offered: KeptSession | None = None
 
     # ---- sessions ----------------------------------------------------------------------------------------------
@@ -142,11 +130,11 @@ class Restoring:
             lines.append(f"left out, since the simulator does not use them: {', '.join(record.left_out)}")
         if parameters.labels is None:
             self._loading.segment()
-            self._presenter.addNotes(*lines)
+            self._presenter.notes.add(*lines)
         else:
             message, warnings = self._logic.recognised()
             checks = [f"Check: {warning}" for warning in warnings]
-            self._presenter.setNotes(*lines, f"{parameters.labels.GetName()}: {message}", *checks)
+            self._presenter.notes.set(*lines, f"{parameters.labels.GetName()}: {message}", *checks)
 
     def _take(
         self,
@@ -200,7 +188,7 @@ class Restoring:
             with self._shared.changing() as now:
                 now.fit.curve, now.fit.costs = [float(cost) for cost in kept["curve"]], str(kept["costs"])
         self._cine.restore(images, self._now())
-        self._presenter.setNotes(*map(str, kept.get("notes", ())), *refused)
+        self._presenter.notes.set(*map(str, kept.get("notes", ())), *refused)
         frozen = record.frozen
         if frozen is not None and refused:  # such as kinds of sheets, which the image shows
             frozen = replace(frozen, is_of_tissues=False)
@@ -214,7 +202,7 @@ class Restoring:
 
     def _checked(self, record: SceneRecord, kept: Mapping[str, Any]) -> SceneRecord:
         """A record with its real images prepared. Raises SimulationError for what cannot be shown; nothing changes."""
-        preset = UltrasoundSceneLogic.presetOf(str(kept.get("values", {}).get("preset", "")))
+        preset = Preset.from_texts(preset_texts(kept.get("values", {})), "the scene's preset")
         if record.frozen is not None:
             taken_of(record.frozen, None)
         found = record.sequence

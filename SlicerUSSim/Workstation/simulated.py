@@ -10,11 +10,8 @@ import numpy as np
 from trame_server.utils.asynchronous import get_event_loop
 
 from SlicerUSSim.Logic.base.errors import required
-from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic
-from SlicerUSSim.Logic.mrml.taken_sequence import count_taken
-from SlicerUSSim.Widget.presenter import PanelPresenter
+from SlicerUSSim.Workstation.browser_panel import BrowserPanel
 from SlicerUSSim.Workstation.comparison import Comparison
-from SlicerUSSim.Workstation.state import SharedState
 
 #: Seconds between two images while they are played
 _PLAY_EVERY_S = 0.1
@@ -28,27 +25,10 @@ class SimulatedSequence:
     move : called with the pose (4, 4) of an image.
     """
 
-    def __init__(
-        self,
-        shared: SharedState,
-        logic: UltrasoundSceneLogic,
-        presenter: PanelPresenter,
-        comparison: Comparison,
-        move: Callable[[np.ndarray], None],
-    ) -> None:
-        self._shared, self._logic, self._presenter = shared, logic, presenter
+    def __init__(self, panel: BrowserPanel, comparison: Comparison, move: Callable[[np.ndarray], None]) -> None:
+        self._shared, self._logic, self._presenter = panel.shared, panel.logic, panel.presenter
         self._comparison, self._move = comparison, move
         self._playing: asyncio.Task | None = None
-
-    def look(self) -> None:
-        """Tell the pages how many images the chosen sequence has."""
-        length = count_taken(self._logic.parameters.image_sequence)
-        if length == 0:
-            self.stop()
-        simulated = self._shared.now.simulated
-        if simulated.length != length:
-            with self._shared.changing() as now:
-                now.simulated.length, now.simulated.number = length, 0
 
     def show(self, number: int) -> None:
         """Show the image with this index where it was taken, with the probe there, and the real image of that pose."""
@@ -61,7 +41,7 @@ class SimulatedSequence:
         output = required(parameters.output, "no image is shown yet, expected a patient and a probe first")
         number = int(np.clip(number, 0, max(images.GetNumberOfDataNodes() - 1, 0)))
         pose = self._logic.sequenceImage(images, number).probe_to_world
-        self._presenter.setLive(False)
+        self._presenter.images.setLive(False)
         if not self._comparison.show_at(pose):
             self._move(pose)
         self._logic.showSequenceImage(images, number, output)
@@ -74,7 +54,7 @@ class SimulatedSequence:
             self.stop()
             return
         self._comparison.stop()
-        self._presenter.setLive(False)
+        self._presenter.images.setLive(False)
         self._playing = get_event_loop().create_task(self._play_on())
         self._tell()
 

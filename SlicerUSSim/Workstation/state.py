@@ -6,7 +6,7 @@ below, so that a wrong name is an error of Python and not only of the browser.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from enum import Enum
@@ -52,7 +52,7 @@ class NodeItem:
 
 @dataclass(frozen=True)
 class TissueLine:
-    """A line of the tissue table, in the order of presenter.TISSUE_COLUMNS."""
+    """A line of the tissue table, in the order of tissue_presenter.TISSUE_COLUMNS."""
 
     name: str
     values: list[str]
@@ -95,10 +95,8 @@ class LandmarkLine:
 
 @dataclass
 class PanelState:
-    """The controls of Widget/sections.py. The keys of all mappings are Control.widget."""
+    """The controls of Widget/sections.py. The keys of all mappings are Control.widget. Values: see value_of()."""
 
-    #: Displayed values; None if the preset has no such value
-    values: dict[str, object] = field(default_factory=dict)
     #: Options of the choices
     choices: dict[str, list[str]] = field(default_factory=dict)
     #: Nodes that can be selected
@@ -268,6 +266,14 @@ class PageState:
 NAMES = cast(PageState, TypedState(State(), PageState).name)
 
 
+def value_of(widget: str) -> str:
+    """Name of the displayed value of a control in trame's state: pages are sent those that have changed, one by one.
+
+    The value is None if the preset has no such one.
+    """
+    return f"value_{widget}"
+
+
 class SharedState:
     """A PageState in the state of a trame server, which sends its changes to the pages.
 
@@ -290,6 +296,15 @@ class SharedState:
         """For writing; the changes are sent to the pages at the end of the context."""
         with self._state:
             yield self.now
+
+    def show_values(self, values: Mapping[str, object]) -> None:
+        """Show these values of controls, by Control.widget."""
+        with self._state:
+            self._state.update({value_of(widget): value for widget, value in values.items()})
+
+    def value(self, widget: str) -> object:
+        """The displayed value of a control."""
+        return self._state[value_of(widget)]
 
     def on_change(self, field_of_now: object, method: Callable[..., object]) -> None:
         """Call `method` with the new value when a page or the server changes a field of NAMES."""

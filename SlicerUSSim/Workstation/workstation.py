@@ -6,6 +6,7 @@ import asyncio
 import secrets
 from collections.abc import Callable
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from time import perf_counter
 from typing import Any, cast
@@ -17,35 +18,30 @@ from trame_slicer.core import SlicerApp
 
 from SlicerUSSim.Logic.base.errors import SimulationError
 from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic
-from SlicerUSSim.Widget.sections import panel_sections
 from SlicerUSSim.Workstation.access import proof_key
 from SlicerUSSim.Workstation.anatomy import AnatomyViews
 from SlicerUSSim.Workstation.autosave import Autosave
-from SlicerUSSim.Workstation.buttons import Buttons
+from SlicerUSSim.Workstation.browser_panel import BrowserPanel, Observed
 from SlicerUSSim.Workstation.comparison import Comparison
 from SlicerUSSim.Workstation.export import Cine, Exports
 from SlicerUSSim.Workstation.hand import KEYS
 from SlicerUSSim.Workstation.image_flow import ImageFlow
 from SlicerUSSim.Workstation.latency import LatencyStamps
 from SlicerUSSim.Workstation.loading import Loading
-from SlicerUSSim.Workstation.messages import Messages
-from SlicerUSSim.Workstation.observed import Observed
 from SlicerUSSim.Workstation.opener import Files, Opener
 from SlicerUSSim.Workstation.opening import Opening
 from SlicerUSSim.Workstation.page import build_page, view_tools
-from SlicerUSSim.Workstation.panel import BrowserPanel
 from SlicerUSSim.Workstation.pose_entry import PoseEntry
+from SlicerUSSim.Workstation.pose_registration import Registration
 from SlicerUSSim.Workstation.probe_control import ProbeControl
 from SlicerUSSim.Workstation.questions import Questions
-from SlicerUSSim.Workstation.receiver import Receiver
-from SlicerUSSim.Workstation.registration import Registration
 from SlicerUSSim.Workstation.restoring import Restoring
-from SlicerUSSim.Workstation.sender import Sender
 from SlicerUSSim.Workstation.session_store import OwnSession, SessionStore
 from SlicerUSSim.Workstation.simulated import SimulatedSequence
 from SlicerUSSim.Workstation.state import NAMES, SharedState
 from SlicerUSSim.Workstation.tasks import Tasks
 from SlicerUSSim.Workstation.tracker import Tracker
+from SlicerUSSim.Workstation.transfer import Receiver, Sender
 
 #: Seconds between two checks whether all work is done.
 _LOOK_EVERY_S = 0.02
@@ -68,66 +64,64 @@ class Workstation:
         app = SlicerApp()
         # Registers the classes of sequence nodes; pyright does not see names that slicer imports from its libraries.
         app.register_module_logic(cast(Any, slicer).vtkSlicerSequencesLogic())
-        sections = panel_sections()
         stamps, cine = LatencyStamps(), Cine()
 
-        self._messages = Messages(shared)
-        self._tasks = tasks = Tasks(self._messages.failed)
+        self._tasks = tasks = Tasks(lambda error: self._panel.failed(error))
         self._logic = logic = UltrasoundSceneLogic(app.scene, device, tasks)
-        self._panel = BrowserPanel(shared, self._messages, logic, tasks, sections, stamps.image_begun)
-        self._presenter = presenter = self._panel.presenter
+        self._panel = panel = BrowserPanel(shared, logic, tasks, stamps.image_begun)
+        self._presenter = presenter = panel.presenter
         self._views = AnatomyViews(app, self.server, view_tools)
-        self._probe = ProbeControl(shared, logic, tasks, self._views, stamps.probe_moved, self._panel.progress)
-        self._poses = PoseEntry(shared, tasks, presenter, self._probe.pose, self._probe.move)
-        self._probe.told = self._poses.show
-        self._comparison = Comparison(shared, self._probe.move)
-        self._tracker = Tracker(shared, tasks, self._probe.move)
-        self._images = ImageFlow(
-            shared, logic, self._views, self._comparison, cine, self._tracker, stamps, lambda: presenter.isBusy
-        )
-        self._simulated = SimulatedSequence(shared, logic, presenter, self._comparison, self._probe.move)
-        self._panel.refreshed = self._refreshed
+        self._probe = probe = ProbeControl(panel, self._views, stamps.probe_moved)
+        self._poses = PoseEntry(panel, probe.pose, probe.move)
+        probe.told = self._poses.show
+        self._comparison = comparison = Comparison(shared, probe.move)
+        self._tracker = Tracker(shared, tasks, probe.move)
+        self._images = ImageFlow(panel, self._views, comparison, cine, self._tracker, stamps)
+        self._simulated = SimulatedSequence(panel, comparison, probe.move)
         opener = Opener(app.scene, logic, tasks, files)
-        presenter.maskFile, presenter.sheetsFile = opener.mask_file, opener.sheets_file
-        self._panel.pick = self._probe.hand.pick
-        self._exports = Exports(app, logic, tasks, opener, cine, presenter.presetToSave, self._panel.progress)
-        self._registration = Registration(
-            shared, logic, tasks, opener, presenter, self._comparison, self._probe.hand
-        )  # fmt: skip
-        self._loading = Loading(
-            shared, app, logic, tasks, opener, presenter, self._messages, self._views, self._probe, self._comparison,
-            self._registration,
-        )  # fmt: skip
+        presenter.segmenting.maskFile, presenter.segmenting.sheetsFile = opener.mask_file, opener.sheets_file
+        panel.pick = probe.hand.pick
+        self._exports = Exports(app, panel, opener, cine)
+        self._registration = registration = Registration(panel, opener, comparison, probe.hand)
+        self._loading = loading = Loading(panel, opener, self._views, probe, comparison, registration)
         self._questions = Questions(shared, tasks)
-        self._opening = Opening(
-            shared, logic, tasks, opener, presenter, self._loading, self._registration, self._questions, self._poses
-        )  # fmt: skip
+        self._opening = Opening(panel, opener, loading, registration, self._questions, self._poses)
 
         self._session = self._begun_session(sessions)
-        self._autosave = Autosave(
-            self._session, shared, logic, presenter, opener, cine, self._probe.pose,
-            lambda: self._registration.landmarks, self._messages.show, tasks.tell,
-        )  # fmt: skip
+        self._autosave = Autosave(self._session, panel, opener, cine, probe.pose, lambda: registration.landmarks)
         self._restoring = Restoring(
-            sessions if self._session is not None else None,
-            shared, app.scene, logic, tasks, opener, presenter, self._loading, self._registration,
-            self._probe, cine, self._autosave.when_kept, perf_counter,
+            sessions if self._session is not None else None, panel, opener, loading, registration, probe, cine,
+            self._autosave.when_kept, perf_counter,
         )  # fmt: skip
         self._opening.open_scene = self._restoring.open_scene
 
         self._following = False
-        self._probe_node = Observed("TransformModifiedEvent", self._probe.moved)
+        self._probe_node = Observed("TransformModifiedEvent", probe.moved)
         self._image_node = Observed("ImageDataModifiedEvent", self._images.image_changed)
         self._parameter_node = Observed("ModifiedEvent", self._parameters_changed)
         self._parameter_node.watch(logic.parameters.node)
-        self._answer_pages(Buttons(shared, tasks, presenter, sections, self._loading), stamps)
+        segmenting, lesions, placing = presenter.segmenting, presenter.lesions, presenter.placing
+        panel.own_actions |= {
+            segmenting.segment: loading.segment,
+            segmenting.undoSegment: loading.undo_segment,
+            lesions.addTissues: partial(loading.lay, lesions.addTissues),
+            lesions.acceptProposal: partial(loading.lay, lesions.acceptProposal),
+            placing.openCraniotomy: loading.open_craniotomy,
+            placing.closeCraniotomy: loading.close_craniotomy,
+            placing.placeProbe: partial(loading.place, placing.placeProbe),
+            placing.placeAtView: partial(loading.place, placing.placeAtView),
+        }
+        self._answer_pages(stamps)
         self._follow_pages()
-        receiver = Receiver(self._open_files, self._add_file, self._messages.show, self._open_pose)
+        opened, added = partial(self._then_refresh, self._opening.open), partial(self._then_refresh, loading.add)
+        receiver = Receiver(
+            self._in_task(opened), self._in_task(added), panel.showError, self._in_task(self._poses.open)
+        )  # fmt: skip
         self.server.controller.on_server_bind.add(lambda wslink: receiver.serve(wslink.app))
         self.server.controller.on_server_bind.add(lambda wslink: Sender(self._export).serve(wslink.app))
         self.server.controller.on_server_ready.add(self._ready)
         self.server.controller.on_server_exited.add(self.close)
-        build_page(self.server, sections, self._views.layout, (*KEYS, "Escape"))
+        build_page(self.server, panel, self._views.layout, (*KEYS, "Escape"))
 
     def take_token(self, port: int) -> str:
         """The token of the last server at this port, if it was killed, so that its pages go on; otherwise a new one."""
@@ -160,7 +154,7 @@ class Workstation:
             try:
                 session = sessions.begin()
             except SimulationError as error:
-                self._messages.show(f"this session is not kept: {error}")
+                self._panel.showError(f"this session is not kept: {error}")
         with self._shared.changing() as now:
             now.keeps_session = now.can_keep_session = session is not None
         return session
@@ -174,13 +168,14 @@ class Workstation:
 
     # ---- pages -------------------------------------------------------------------------------------------------
 
-    def _answer_pages(self, buttons: Buttons, stamps: LatencyStamps) -> None:
+    def _answer_pages(self, stamps: LatencyStamps) -> None:
         """Register the triggers by which pages call methods."""
         probe, comparison, registration = self._probe, self._comparison, self._registration
         triggers: dict[str, Callable[..., object]] = {
             "set": self._panel.set,
-            "press": buttons.press,
-            "set_tissue": self._in_task(self._presenter.setTissue),
+            "press": self._panel.press,
+            "close_patient": self._in_task(self._loading.close_patient),
+            "set_tissue": self._in_task(self._presenter.tissues.setTissue),
             "set_free": self._in_task(self._presenter.fits.setFree),
             "set_pose": probe.set_pose,
             "type_pose": self._in_task(self._poses.type),
@@ -202,9 +197,9 @@ class Workstation:
             "remove_landmark": registration.remove_landmark,
             "fit_landmarks": self._in_task(registration.fit),
             "cancel": self._panel.cancel,
-            "dismiss": self._messages.dismiss,
+            "dismiss": self._panel.dismiss,
             "script": self._show_script,
-            "restore_session": self._in_task(lambda: self._then_refresh(self._restoring.restore)),
+            "restore_session": self._in_task(partial(self._then_refresh, self._restoring.restore)),
             "discard_session": self._in_task(self._restoring.discard),
             "session_kept": self._session_kept,
             "stamp": stamps.receive,
@@ -223,15 +218,6 @@ class Workstation:
 
     def _in_task(self, method: Callable[..., None]) -> Callable[..., None]:
         return lambda *arguments: self._tasks.start(lambda: method(*arguments))
-
-    def _open_files(self, files: dict[str, bytes], meant: str) -> None:
-        self._tasks.start(lambda: self._then_refresh(self._opening.open, files, meant))
-
-    def _add_file(self, name: str, content: bytes, tissue: str) -> None:
-        self._tasks.start(lambda: self._then_refresh(self._loading.add, name, content, tissue))
-
-    def _open_pose(self, name: str, content: bytes) -> None:
-        self._tasks.start(lambda: self._poses.open(name, content))
 
     def _then_refresh(self, method: Callable[..., None], *arguments: object) -> None:
         method(*arguments)
@@ -255,10 +241,6 @@ class Workstation:
 
         self._tasks.start(export)
         return await exported
-
-    def _refreshed(self) -> None:
-        self._images.tell_frozen()
-        self._simulated.look()
 
     def _play(self) -> None:
         self._simulated.stop()
@@ -330,7 +312,7 @@ class Workstation:
         if self._image_node.watch(parameters.output) and taken is not None and taken.node is parameters.output:
             self._images.image_changed()  # it is in there already, as the frozen one of a scene at the start
         self._probe.draw()
-        self._images.tell_frozen()
+        self._panel.tellFrozen()
         if self._logic.isLive:
             with self._presenter.shown():
                 self._probe.update_surface()

@@ -4,7 +4,7 @@ In the order in which they can be told apart: the grey map from the real images 
 costs of texture T1 + T2 / 2 (texture_costs.py), to which the paper's cost is nearly blind. T2 counts grains and has no
 gradient, so the search uses none; it is short, since few parameters are left. They see the width of the speckle only to
 a quarter of it, so that the smoothing is found once more, by them and the width (speckle_width.py). The probe's
-bandwidth and aperture by the width of the real speckle are a start that is taken only with T2 (point_spread.py): widths
+bandwidth and aperture by the width of the real speckle are a start that is taken only with T2 (below): widths
 alone do not tell them from smoothing and texture. Its frequency stays, since no image tells it from the bandwidth.
 """
 
@@ -21,11 +21,11 @@ from SlicerUSSim.Logic.base.errors import Cancelled, SimulationError
 from SlicerUSSim.Logic.base.settings import DisplaySettings
 from SlicerUSSim.Logic.fitting.appearance import AppearanceModel
 from SlicerUSSim.Logic.fitting.parameters import DISPLAY_BOUNDS
-from SlicerUSSim.Logic.fitting.point_spread import PointSpread, point_spread
 from SlicerUSSim.Logic.fitting.speckle_width import SpeckleWidth, speckle_widths, width_misfit
 from SlicerUSSim.Logic.fitting.texture_costs import TextureMisfit, TextureReference
 from SlicerUSSim.Logic.imaging.grey_map import estimate_grey_map
 from SlicerUSSim.Logic.imaging.simulator import UltrasoundSimulator
+from SlicerUSSim.Logic.probe.arrays import Probe
 from SlicerUSSim.Logic.tissue.presets import TISSUES
 from SlicerUSSim.Logic.tissue.table import TissueTable
 from SlicerUSSim.Logic.tissue.tissue import Tissue
@@ -279,3 +279,83 @@ def _mean(misfits: Sequence[TextureMisfit]) -> TextureMisfit:
     if not known:
         return TextureMisfit(float("nan"), float("nan"))
     return TextureMisfit(float(np.mean([m.autocorrelation for m in known])), float(np.mean([m.extrema for m in known])))
+
+
+# ---- point spread function by the width of the speckle: a start, which fits accept only with T2 ----------------------
+# Axially the width s tells the band, frequency x fractional bandwidth = 0.2886 / s (mm, MHz: two-way pulses at
+# 1540 m/s), laterally the aperture in wavelengths. Frequency itself is in neither: 3.5 to 6 MHz fit equally. What is
+# measured in a patient is wider than the point spread function, by texture and by the scanner's processing: with the
+# function that has the measured widths, images have half as many grains.
+
+#: Frequency x fractional bandwidth x sigma of the amplitude, MHz mm
+BAND_SIGMA = 0.2886
+#: Bounds of what is estimated, as probes have them
+_BANDWIDTHS, _APERTURES_MM = (0.05, 1.5), (1.0, 60.0)
+
+
+@dataclass(frozen=True)
+class PointSpread:
+    """What the width of the speckle says of a point spread function."""
+
+    #: Width of the band, MHz, and aperture in mm times frequency in MHz; NaN where no speckle could be measured
+    band_mhz: float
+    aperture_mm_mhz: float
+    #: Whether a fit took it; None: not tried
+    is_taken: bool | None = None
+    #: T1 and T2 with it, and without; None: not tried
+    with_it: TextureMisfit | None = None
+    without: TextureMisfit | None = None
+
+    def of(self, probe: Probe) -> Probe:
+        """The probe with this point spread function at its own frequency, which is not known from the images."""
+        changes = {}
+        if np.isfinite(self.band_mhz):
+            changes["fractional_bandwidth"] = float(np.clip(self.band_mhz / probe.frequency_mhz, *_BANDWIDTHS))
+        if np.isfinite(self.aperture_mm_mhz):
+            changes["aperture_mm"] = float(np.clip(self.aperture_mm_mhz / probe.frequency_mhz, *_APERTURES_MM))
+        return replace(probe, **changes)
+
+    def to_dict(self) -> dict:
+        """Plain values for JSON; what could not be measured is None."""
+        values = {"band_mhz": self.band_mhz, "aperture_mm_mhz": self.aperture_mm_mhz}
+        plain = {name: value if np.isfinite(value) else None for name, value in values.items()}
+        tried = {
+            name: {key: value if np.isfinite(value) else None for key, value in vars(misfit).items()}
+            for name, misfit in (("with_it", self.with_it), ("without", self.without))
+            if misfit is not None
+        }
+        return {**plain, "is_taken": self.is_taken, **tried, "frequency_mhz": None}
+
+    def in_words(self) -> str:
+        """One line, with what cannot be known."""
+        taken = {
+            None: "; not tried",
+            True: "; taken, with as many grains",
+            False: "; not taken: its grains are no more like the real ones",
+        }[self.is_taken]
+        return (
+            f"speckle is as wide as that of a band of {self.band_mhz:.2f} MHz and an aperture of "
+            f"{self.aperture_mm_mhz:.0f} mm MHz{taken}; the frequency itself cannot be known from B-mode images"
+        )
+
+
+def point_spread(widths: Sequence[SpeckleWidth], probe: Probe) -> PointSpread:
+    """From the widths at some depths, of which axially the smallest counts, as texture only widens.
+
+    Laterally it is the aperture with which `probe`, at its own frequency, focus and receive f-number, is closest to the
+    measured widths at these depths, by least squares of their logarithms.
+    """
+    axial = [w.axial_mm for w in widths if np.isfinite(w.axial_mm)]
+    band = BAND_SIGMA / min(axial) if axial else float("nan")
+    measured = [(w.depth_mm, w.lateral_mm) for w in widths if np.isfinite(w.lateral_mm)]
+    if not measured:
+        return PointSpread(band, float("nan"))
+    depth, lateral = np.array(measured).T
+    apertures = np.geomspace(*_APERTURES_MM, 41)
+    # Near the face the receive f-number makes the width, whatever the aperture: depths count by how much they tell
+    misfits = [
+        float(np.sum(np.log(replace(probe, aperture_mm=float(size)).speckle_sigma_mm(depth) / lateral) ** 2))
+        for size in apertures
+    ]
+    best = apertures[int(np.argmin(misfits))]
+    return PointSpread(band, float(best * probe.frequency_mhz))

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import json
 import logging
 import os
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 from SlicerUSSim.Logic.base.declaration import Parameter, built, kind_of, parameter_of, parameters_of, short
-from SlicerUSSim.Logic.base.errors import require
+from SlicerUSSim.Logic.base.errors import SimulationError, require
 from SlicerUSSim.Logic.base.files import read_json, write_json
 from SlicerUSSim.Logic.base.own_outputs import MARK
 from SlicerUSSim.Logic.base.reading import reader
@@ -27,6 +29,9 @@ SECTIONS: dict[str, type[DisplaySettings] | type[SimulationSettings]] = {
 }
 #: Name of the pose, as in files of poses
 _POSE = "probe_to_ras"
+_KIND = "probe.kind"
+#: Name in Preset.from_texts of the whole as JSON, as scenes had it
+AS_ONE = "preset"
 #: Tissues of segment_mri with thin sulci.
 _BRAIN = ("csf", "grey matter", "white matter", "leptomeninges")
 
@@ -116,6 +121,39 @@ class Preset:
             _log.info("%s: has no %s; the defaults are used", source, ", ".join(missing))
         return cls(**sections)
 
+    def to_texts(self) -> dict[str, str]:
+        """{name: text} of all values, so that what is kept does not change with the defaults of a later version.
+
+        Names are those of preset_parameters, and "tissues.2" for label 2 or "membrane.fluids", whose values are JSON:
+        null for what this preset lacks. The pose is left out.
+        """
+        values, declared = _flat(self), preset_parameters()
+        return {
+            name: declared[name].to_text(values[name]) if name in declared else json.dumps(values.get(name))
+            for name in {**_flat_default(self.probe.kind), **values}
+        }
+
+    @classmethod
+    def from_texts(cls, texts: Mapping[str, str], source: str = "preset") -> Preset:
+        """The inverse of to_texts. Raises SimulationError that names `source` and the invalid value.
+
+        With AS_ONE, the whole as one JSON text, other names are ignored.
+        """
+        if AS_ONE in texts:
+            return cls.from_dict(_from_json(AS_ONE, texts[AS_ONE], source), source)
+        declared = {name: replace(entry, name=name) for name, entry in preset_parameters().items()}
+        kind = declared[_KIND].from_text(source, texts.get(_KIND, probe_kind().default))
+        values, nested = _flat_default(kind), {"tissues": {}}
+        for name, text in texts.items():
+            values[name] = (
+                declared[name].from_text(source, text) if name in declared else _from_json(name, text, source)
+            )
+        for name, value in {**values, _KIND: kind}.items():
+            section, _, entry = name.partition(".")
+            if value is not None or name in declared:
+                nested.setdefault(section, {})[entry] = value
+        return cls.from_dict(nested, source)
+
     @classmethod
     @reader
     def read(cls, path: str | os.PathLike) -> Preset:
@@ -135,6 +173,22 @@ def preset_parameters() -> dict[str, Parameter]:
     for section, owner in SECTIONS.items():
         found |= {f"{section}.{entry.name}": entry for entry in parameters_of(owner)}
     return found
+
+
+def _flat(preset: Preset) -> dict[str, Any]:
+    sections = {**preset.to_dict(), _POSE: {}}
+    return {f"{section}.{name}": value for section, values in sections.items() for name, value in values.items()}
+
+
+def _flat_default(kind: str) -> dict[str, Any]:
+    return {**_flat(Preset(PROBES[kind])), _KIND: probe_kind().default}
+
+
+def _from_json(name: str, text: str, source: str) -> Any:
+    try:
+        return json.loads(text)
+    except ValueError as error:
+        raise SimulationError(f"{source}: {name} is {short(text)}, which is not JSON ({error})") from None
 
 
 def _check_section(section: str) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from scipy import ndimage
@@ -17,6 +18,7 @@ from SlicerUSSim.Logic.mri.ct_organs import laid_over, organs_of_ct
 from SlicerUSSim.Logic.mri.ct_unit import hounsfield_offset, padding_of
 from SlicerUSSim.Logic.mri.filtering import estimate_noise, guided_filter
 from SlicerUSSim.Logic.mri.recognition import check_finite
+from SlicerUSSim.Logic.mri.segmentation_settings import SegmentationSettings
 from SlicerUSSim.Logic.mri.segmentation_steps import StepTimes
 from SlicerUSSim.Logic.opencl.device import DeviceChoice
 from SlicerUSSim.Logic.tissue.label_maps import LabelledTissues
@@ -81,14 +83,14 @@ class CtSegmentation:
 
 def segment_ct(
     ct: Volume,
+    settings: SegmentationSettings | None = None,
     *,
     organs: LabelledTissues | None = None,
     mask: Volume | None = None,
-    filter_radius: int = 1,
-    filter_epsilon: float | None = None,
     skin_mm: float = SKIN_MM,
     device: DeviceChoice = None,
     progress: Callable[[float], None] | None = None,
+    **values: Any,
 ) -> CtSegmentation:
     """Label the tissues of a CT of any part of the body by Hounsfield units: docs/ct.md.
 
@@ -102,8 +104,7 @@ def segment_ct(
         soft tissues replace muscle and blood; its bones fill what the numbers leave open in them. Gas, fat and cortex
         stay as the numbers have them.
     mask : the patient on the grid of `ct` (non-zero is inside); default: found, without couch and clothes.
-    filter_radius : of the guided filter in voxels; 0 disables it.
-    filter_epsilon : of the guided filter, HU squared; default: from the noise estimated in the image.
+    settings : of which the guided filter's are used, with its epsilon in HU squared; `values` change them by name.
     skin_mm : thickness of the skin, the outermost layer of the patient; 0: none.
     progress : called with the completed fraction, 0 to 1; it may raise errors.Cancelled.
 
@@ -121,10 +122,7 @@ def segment_ct(
     ('skin', 'fat', 'muscle', 'cancellous bone', 'bone')
     """
     require_kind("ct", ct, Volume, "Volume.read reads a file")
-    require(
-        isinstance(filter_radius, int) and 0 <= filter_radius <= 64,
-        f"filter_radius is {filter_radius!r}, expected a whole number from 0 to 64",
-    )
+    settings = (settings or SegmentationSettings()).changed(**values)
     require_between("segmentation", "skin_mm", skin_mm, 0.0, 10.0)
     report = progress or (lambda share: None)
     timed, notes, warnings = StepTimes(), [], []
@@ -141,11 +139,11 @@ def segment_ct(
     if padding is not None:
         extend_into(hu, padding, axis_of_slices(ct))
     noise = _noise_of(hu)
-    if filter_radius:
-        epsilon = (_EPSILON_PER_NOISE * noise) ** 2 if filter_epsilon is None else filter_epsilon
-        hu = _filtered(hu, filter_radius, epsilon, device, lambda share: report(0.05 + 0.45 * share))
+    if settings.filter_radius:
+        epsilon = (_EPSILON_PER_NOISE * noise) ** 2 if settings.filter_epsilon is None else settings.filter_epsilon
+        hu = _filtered(hu, settings.filter_radius, epsilon, device, lambda share: report(0.05 + 0.45 * share))
     timed("filter")
-    left = _NOISE_LEFT * noise if filter_radius else noise
+    left = _NOISE_LEFT * noise if settings.filter_radius else noise
     sharp = sharpened(hu, left)
     timed("borders")
     report(0.6)

@@ -10,40 +10,39 @@ from SlicerUSSim.Logic.base.errors import require
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.mri.ct import CtSegmentation, segment_ct
 from SlicerUSSim.Logic.mri.segmentation import Segmentation, segment_mri
-from SlicerUSSim.Logic.mri.segmentation_settings import CT
+from SlicerUSSim.Logic.mri.segmentation_settings import CT, SegmentationSettings
 from SlicerUSSim.Logic.opencl.device import DeviceChoice
 from SlicerUSSim.Logic.tissue.label_maps import LabelledTissues
 
 
 def segment_image(
     image: Volume,
+    settings: SegmentationSettings | None = None,
     *,
-    contrast: str,
     others: Mapping[str, Volume] | None = None,
     mask: Volume | None = None,
     organs: LabelledTissues | None = None,
-    filter_radius: int = 1,
-    filter_epsilon: float | None = None,
     keep_mask_at: Path | None = None,
     device: DeviceChoice = None,
     progress: Callable[[float], None] | None = None,
-    **of_mri: Any,
+    **values: Any,
 ) -> Segmentation | CtSegmentation:
-    """segment_ct of a CT (contrast "ct"), and segment_mri of an MRI, which alone has `others` and `of_mri`.
+    """segment_ct of a CT (contrast "ct"), and segment_mri of an MRI, which alone has `others`.
 
-    Raises SimulationError as they do, for other images beside a CT, and for organs beside an MRI.
+    `values` change those of `settings`. Raises SimulationError as they do, for other images beside a CT, and for organs
+    beside an MRI.
     """
-    if contrast != CT:
-        require(organs is None, f"organs are for a CT, and contrast is {contrast}; a CT has the contrast ct (--ct)")
-        return segment_mri(
-            image, contrast=contrast, others=others, mask=mask, filter_radius=filter_radius,
-            filter_epsilon=filter_epsilon, keep_mask_at=keep_mask_at, device=device, progress=progress, **of_mri,
-        )  # fmt: skip
-    require(not others, f"{' and '.join(others or ())} cannot be classified together with a CT, expected the CT alone")
-    return segment_ct(
-        image, organs=organs, mask=mask, filter_radius=filter_radius, filter_epsilon=filter_epsilon, device=device,
-        progress=progress,
-    )  # fmt: skip
+    settings = (settings or SegmentationSettings()).changed(**values)
+    if settings.contrast == CT:
+        names = " and ".join(others or ())
+        require(not others, f"{names} cannot be classified together with a CT, expected the CT alone")
+        return segment_ct(image, settings, organs=organs, mask=mask, device=device, progress=progress)
+    require(
+        organs is None, f"organs are for a CT, and contrast is {settings.contrast}; a CT has the contrast ct (--ct)"
+    )
+    return segment_mri(
+        image, settings, others=others, mask=mask, keep_mask_at=keep_mask_at, device=device, progress=progress
+    )
 
 
 def has_brain_mask(contrast: str) -> bool:

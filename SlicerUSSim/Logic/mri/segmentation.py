@@ -6,6 +6,7 @@ import logging
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -142,33 +143,31 @@ class Segmentation:
 
 def segment_mri(
     mri: Volume,
+    settings: SegmentationSettings | None = None,
     *,
-    classes: int | None = SegmentationSettings.classes,
-    contrast: str = SegmentationSettings.contrast,
     others: Mapping[str, Volume] | None = None,
     mask: Volume | None = None,
-    filter_radius: int = SegmentationSettings.filter_radius,
-    filter_epsilon: float | None = SegmentationSettings.filter_epsilon,
-    bias_correction: bool | None = SegmentationSettings.bias_correction,
-    thin_sulci: bool = False,
-    outside: bool = SegmentationSettings.outside,
-    skull_strip: str = SegmentationSettings.skull_strip,
     keep_mask_at: Path | None = None,
     device: DeviceChoice = None,
     progress: Callable[[float], None] | None = None,
+    **values: Any,
 ) -> Segmentation:
     """Label the tissues of a brain MRI by intensity, led by an atlas where nilearn and a whole brain are there.
 
     Parameters
     ----------
     mri : the image: a whole head, a skull-stripped brain, or any image with a `mask`.
-    classes : number of tissues; default: 3, or 4 with contrast agent, whose fourth is what enhances.
-    contrast : "t1", "t1gd", "t2" or "flair"; orders and names the classes.
+    settings : see below; single ones can be given by name: contrast="t2".
     others : more volumes of the same patient by their contrast, on any grid. They are registered to `mri` rigidly and
         classified together with it; labels are then CSF, grey and white matter, and what enhances.
     mask : foreground on the same grid (non-zero is inside); default: found by `skull_strip`.
-    filter_radius : of the guided filter in voxels; 0 disables it.
-    filter_epsilon : of the guided filter, squared intensity; default: from the noise estimated in the image.
+    keep_mask_at : file in which the mask of a whole head is kept, so that it is extracted once; see brain.find_brain.
+    progress : called with the completed fraction, 0 to 1.
+
+    Settings
+    --------
+    classes : number of tissues; default: 3, or 4 with contrast agent, whose fourth is what enhances.
+    contrast : "t1", "t1gd", "t2" or "flair"; orders and names the classes.
     bias_correction : remove the bias field, with N4 (some seconds); default: where the image has one, with N4 only
         where it is strong or there is no atlas; see bias.corrected.
     thin_sulci : also label the middle of sulci that are too narrow to reach CSF intensity, one voxel thick, as an extra
@@ -177,8 +176,6 @@ def segment_mri(
     outside : also label what is outside the brain of a whole head (t1, t1gd), after all others: see
         outside.find_outside. Probabilities are those of the brain.
     skull_strip : how the brain is found without a `mask`; see brain.find_brain.
-    keep_mask_at : file in which the mask of a whole head is kept, so that it is extracted once; see brain.find_brain.
-    progress : called with the completed fraction, 0 to 1.
 
     Raises SimulationError for an unknown contrast or number of classes, an image that is constant or not finite or has
     the order of intensities of another contrast, a mask that is empty or on another grid, and volumes that are not of
@@ -193,9 +190,11 @@ def segment_mri(
     dtype('uint8')
     """
     require_kind("mri", mri, Volume, "Volume.read reads a file")
+    settings = (settings or SegmentationSettings()).changed(**values)
+    contrast = settings.contrast
     told = progress or (lambda share: None)
     begin = _SHARE_OF_BRAIN if mask is None else 0.0
-    end = _SHARE_OF_TISSUES if outside else 1.0
+    end = _SHARE_OF_TISSUES if settings.outside else 1.0
     report = lambda share: told(begin + (end - begin) * share)  # noqa: E731
     others = dict(others or {})
     require(
@@ -203,11 +202,8 @@ def segment_mri(
         f"there are two volumes of contrast {contrast}, expected one: choose another contrast for the second",
     )
     contrasts = (contrast, *others)
-    names = class_names(contrasts, classes)
-    settings = SegmentationSettings(
-        contrast, classes, skull_strip, thin_sulci, outside, bias_correction, filter_radius, filter_epsilon
-    )
-    if outside:
+    names = class_names(contrasts, settings.classes)
+    if settings.outside:
         require_findable(contrast, settings.skull_strip, mask is not None)
     timed = StepTimes()
     intensity = finite(mri)
@@ -227,7 +223,7 @@ def segment_mri(
             "registered to each other; a lesion is added with --add tumour=FILE",
         )
     require(
-        not outside or brain.method != "stripped",
+        not settings.outside or brain.method != "stripped",
         "image is a brain without its head (skull-stripped), and what is outside the brain (--outside) is found in a "
         "whole head",
     )
@@ -275,9 +271,9 @@ def segment_mri(
                 warnings += require_contrast(image, part.inside, prior, name)
 
     with_fields = tuple(part.images)
-    if bias_correction is not False:
+    if settings.bias_correction is not False:
         share = lambda done: report(0.4 + 0.3 * done)  # noqa: E731
-        notes += remove_fields(part, contrasts, atlas, prior, bias_correction, share)
+        notes += remove_fields(part, contrasts, atlas, prior, settings.bias_correction, share)
         timed("bias field")
     report(0.7)
     filtered = [
@@ -286,13 +282,13 @@ def segment_mri(
     ]
     timed("filter")
     report(0.8)
-    values = np.stack([image[part.inside] for image, _, _ in filtered])
-    require_different(values, contrasts)
+    intensities = np.stack([image[part.inside] for image, _, _ in filtered])
+    require_different(intensities, contrasts)
     voxel_mm = float(mri.spacing_mm.mean())
-    found = classify(values, contrasts, names, prior, FILTER_BLUR if settings.filter_radius else 1.0, voxel_mm)
+    found = classify(intensities, contrasts, names, prior, FILTER_BLUR if settings.filter_radius else 1.0, voxel_mm)
     timed("mixture")
     if atlas:
-        found = with_nuclei(found, values, atlas, part.images[0], part.inside)
+        found = with_nuclei(found, intensities, atlas, part.images[0], part.inside)
         timed("nuclei")
     found = replace(found, posteriors=less_sure(smoothed_posteriors(found.posteriors, part.inside)))
     timed("neighbours")
@@ -306,16 +302,16 @@ def segment_mri(
     labels[part.inside] = found.posteriors.argmax(axis=0) + 1
     tissue_names = names
     thickest_mm = float(mri.spacing_mm.max())
-    if thin_sulci and thickest_mm > _THICK_SLICE_MM:
+    if settings.thin_sulci and thickest_mm > _THICK_SLICE_MM:
         notes.append(f"thin sulci get no label of their own: voxels of {thickest_mm:.3g} mm are thicker than they are")
-    elif thin_sulci:
+    elif settings.thin_sulci:
         middles = narrow_sulci(labels, found, filtered[0][0], filtered[0][1])
         labels[middles] = len(names) + 1
         tissue_names = (*names, "leptomeninges")
         timed("thin sulci")
         _log.info("thin sulci: %d voxels become leptomeninges", int(middles.sum()))
     whole, brain_labels = mri.with_array(part.whole(labels)), len(tissue_names)
-    if outside:
+    if settings.outside:
         t2 = images[contrasts.index("t2")].array if "t2" in contrasts else None
         fluid = None if t2 is None else watery(t2, names, whole.array)
         around = find_outside(images[0], foreground, fluid)

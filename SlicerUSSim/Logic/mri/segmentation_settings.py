@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, fields
+from dataclasses import asdict, dataclass, fields
+from typing import Any
 
-from SlicerUSSim.Logic.base.declaration import Declared, Shown, parameter
+from SlicerUSSim.Logic.base.declaration import Declared, Shown, built, parameter
 
 #: Contrasts of MRIs, which segment_mri has; and the name of a CT, which is segment_ct's
 MRI_CONTRASTS, CT = ("t1", "t1gd", "t2", "flair"), "ct"
@@ -34,7 +35,7 @@ class SegmentationSettings(Declared):
     thin_sulci: bool = parameter(
         True, "Label thin sulci",
         "Label sulci too narrow to reach CSF intensity as leptomeninges, one voxel thick", shown=True,
-        option="thin-sulci/no-thin-sulci", note="segment_mri itself has it off by default",
+        option="thin-sulci/no-thin-sulci",
     )  # fmt: skip
     outside: bool = parameter(
         False, "Label what is outside the brain",
@@ -52,6 +53,10 @@ class SegmentationSettings(Declared):
         None, "Filter epsilon", "Strength of the guided filter, squared intensity; none: from the image noise",
         bounds=(0, 1e30),
     )  # fmt: skip
+
+    def changed(self, **values: Any) -> SegmentationSettings:
+        """Settings with values changed by name. Raises SimulationError for an unknown name and an invalid value."""
+        return built(SegmentationSettings, {**asdict(self), **values}, "segmentation")
 
     def _owner(self) -> str:
         return "segmentation"

@@ -34,12 +34,15 @@ def is_opened(labels_node: Any) -> bool:
 
 
 def set_closed_labels(labels_node: Any, closed_node: Any | None) -> None:
-    """Record that labels are those of another node with an opening, or that they no longer are."""
+    """Record that labels are those of another node with an opening, or that they no longer are; hides the piece."""
     labels_node.SetNodeReferenceID(_CLOSED, None if closed_node is None else closed_node.GetID())
+    hide_flap(labels_node)
 
 
-def opening_of(opening_node: Any, labels: Volume, names: tuple[str, ...], world_to_labels: np.ndarray) -> np.ndarray:
-    """(k, j, i) bool of a markups node (the polygon of its points), a label map or a segmentation.
+def opening_of(
+    opening_node: Any, labels: Volume, names: tuple[str, ...], world_to_labels: np.ndarray
+) -> tuple[np.ndarray, str, tuple[str, ...]]:
+    """((k, j, i) bool, what it is, warnings) of a markups node (the polygon of its points), label map or segmentation.
 
     Segments that are hidden are left out. `world_to_labels` (4, 4) leads to the frame of `labels`. Raises
     SimulationError for another or an empty node.
@@ -48,16 +51,20 @@ def opening_of(opening_node: Any, labels: Volume, names: tuple[str, ...], world_
     if opening_node.IsA("vtkMRMLMarkupsNode"):
         points = control_points(opening_node)
         require(len(points) >= 3, f"opening {named(opening_node)} has {len(points)} points, expected three or more")
-        return polygon_opening(labels, names, points @ world_to_labels[:3, :3].T + world_to_labels[:3, 3])
+        places = points @ world_to_labels[:3, :3].T + world_to_labels[:3, 3]
+        return polygon_opening(labels, names, places), named(opening_node), ()
     hidden = hidden_segments(opening_node) if opening_node.IsA("vtkMRMLSegmentationNode") else {}
     require(
         not hidden or len(hidden) < opening_node.GetSegmentation().GetNumberOfSegments(),
         f"opening {named(opening_node)}: all its segments are hidden, expected a visible one to open",
     )
-    mask, _ = node_labels(opening_node, hidden)
+    mask, segments = node_labels(opening_node, hidden)
     mask = mask.with_array((mask.array != 0).astype(np.uint8))
     placed = Volume(mask.array, world_to_labels @ node_to_world(opening_node) @ mask.ijk_to_ras)
-    return mask_opening(labels, placed, named(opening_node))
+    what = named(opening_node)
+    left_out = (f"of {what} what is hidden is not opened: {', '.join(hidden.values())}",) if hidden else ()
+    with_segments = f" with {', '.join(segments.values())}" if opening_node.IsA("vtkMRMLSegmentationNode") else ""
+    return mask_opening(labels, placed, what), what + with_segments, left_out
 
 
 def show_flap(labels_node: Any, removed: Volume) -> Any:
@@ -67,9 +74,8 @@ def show_flap(labels_node: Any, removed: Volume) -> Any:
     scene = labels_node.GetScene()
     model = labels_node.GetNodeReference(_FLAP)
     if model is None or not may_replace_result(model):
-        model = scene.AddNewNodeByClass(
-            "vtkMRMLModelNode", scene.GenerateUniqueName(f"{labels_node.GetName()} removed")
-        )
+        name = scene.GenerateUniqueName(f"{labels_node.GetName()} removed")
+        model = scene.AddNewNodeByClass("vtkMRMLModelNode", name)
         labels_node.SetNodeReferenceID(_FLAP, model.GetID())
     model.SetAndObservePolyData(_surface(removed))
     mark_as_result(model, FLAP)

@@ -11,7 +11,7 @@ import numpy as np
 from vtkmodules.vtkCommonCore import vtkDoubleArray
 from vtkmodules.vtkCommonMath import vtkMatrix4x4
 
-from SlicerUSSim.Logic.base.errors import SimulationError, require
+from SlicerUSSim.Logic.base.errors import SimulationError, require, required
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.base.vtk_data import matrix_array
 from SlicerUSSim.Logic.fitting.control_costs import neighbours_of
@@ -45,14 +45,9 @@ _PLOT_EVERY = 0.25
 
 
 def tracked_images(
-    images_node,
-    numbers: Sequence[int] | None,
-    probe: Probe,
-    *,
-    probe_to_world: np.ndarray | None = None,
-    estimate_geometry: bool = False,
-    apart: Sequence[int] = (),
-) -> TrackedImages:
+    images_node, numbers: Sequence[int] | None, probe: Probe, *, probe_to_world: np.ndarray | None = None,
+    estimate_geometry: bool = False, apart: Sequence[int] = (),
+) -> TrackedImages:  # fmt: skip
     """Real images from a sequence of volumes, from a volume of one slice, or a slice of a 3D volume under the probe.
 
     The poses of a sequence are those of its browser's transforms at the same times. With `estimate_geometry` the
@@ -68,10 +63,8 @@ def tracked_images(
     else:
         volume = read_volume(images_node, "real image")
         if volume.array.shape[0] > 1:
-            if probe_to_world is None:
-                raise SimulationError(
-                    f"{named(images_node)} is a 3D volume, expected a probe transform to select its image plane"
-                )
+            what = f"{named(images_node)} is a 3D volume, expected a probe transform to select its image plane"
+            probe_to_world = required(probe_to_world, what)
             _log.info("%s is a 3D volume, resampled in the plane of the probe", named(images_node))
             placed = Volume(volume.array, node_to_world(images_node) @ volume.ijk_to_ras)
             sequence = TrackedSequence.from_volume(placed, probe, [probe_to_world])
@@ -93,14 +86,8 @@ def sequence_of(sequence_node) -> TrackedSequence:
     """
     count = sequence_node.GetNumberOfDataNodes()
     require(count > 0, f"sequence {named(sequence_node)} is empty, expected images")
-    browser = next(
-        (
-            node
-            for node in nodes_of_class(sequence_node.GetScene(), "vtkMRMLSequenceBrowserNode")
-            if node.IsSynchronizedSequenceNode(sequence_node, True)
-        ),
-        None,
-    )
+    browsers = nodes_of_class(sequence_node.GetScene(), "vtkMRMLSequenceBrowserNode")
+    browser = next((node for node in browsers if node.IsSynchronizedSequenceNode(sequence_node, True)), None)
     shown = None if browser is None else browser.GetProxyNode(sequence_node)
     if shown is None:
         _log.info("%s: is in no browser, so the geometry of its images is used", named(sequence_node))
@@ -207,9 +194,8 @@ def write_compared(nodes: dict, fit: Fit, number: int, to_world: np.ndarray) -> 
     `to_world` (4, 4) is from the frame of the fit's poses. Raises SimulationError for an image that was not fitted.
     """
     tracked = fit.tracked
-    if number not in tracked.numbers:
-        known = ", ".join(map(str, tracked.numbers))
-        raise SimulationError(f"image {number} was not fitted, expected one of {known}")
+    known = ", ".join(map(str, tracked.numbers))
+    require(number in tracked.numbers, f"image {number} was not fitted, expected one of {known}")
     place = tracked.numbers.index(number)
     real, after = np.where(tracked.mask, tracked.images[place], 0), fit.after[place]
     difference = np.where(tracked.mask, 127.5 + 0.5 * (after.astype(float) - real), 0)

@@ -6,25 +6,14 @@ from collections.abc import Callable
 from typing import Any
 
 from SlicerUSSim.Logic.mrml.landmark_nodes import is_landmarks
-from SlicerUSSim.Logic.mrml.own_results import (
-    IMAGE,
-    OUTLINE,
-    SEQUENCE,
-    is_empty,
-    kind_of_result,
-    may_replace_result,
-)
-from SlicerUSSim.Logic.mrml.ownership import is_claimed
+from SlicerUSSim.Logic.mrml.own_results import IMAGE, OUTLINE, SEQUENCE, is_own, kind_of_result
 from SlicerUSSim.Logic.mrml.parameter_node import NODE_PARAMETERS, SceneParameters
 from SlicerUSSim.Logic.mrml.sheet_nodes import holds_sheets
 
 #: Of transforms and models that Slicer keeps for its slice views; they are hidden from editors only as a rule
 _OF_SLICE_VIEWS = ("Volume Slice", "Slice Transform", "Volume Slice Transform")
 #: {role: roles of which a node cannot have one at the same time}
-_OTHERS = {
-    "second_mri": ("mri",),
-    "real": ("mri", "second_mri"),
-}
+_OTHERS = {"second_mri": ("mri",), "real": ("mri", "second_mri")}
 #: Attribute of nodes that only views show, which are nobody's data
 _DRAWN = "SlicerUSSim.drawn"
 
@@ -67,29 +56,15 @@ def _holds(sequence_node, class_name: str) -> bool:
     return not sequence_node.GetNumberOfDataNodes() or bool(sequence_node.GetNthDataNode(0).IsA(class_name))
 
 
-def _made_as(kind: str) -> Callable[[Any], bool]:
-    """Empty, or holding a result of this kind that may be replaced."""
-
-    def is_own(node) -> bool:
-        if is_empty(node):
-            return kind_of_result(node) in (None, kind, "1")
-        # Items of a sequence are compared when it is replaced
-        if node.IsA("vtkMRMLSequenceNode"):
-            return kind_of_result(node) == kind and is_claimed(node)
-        return kind_of_result(node) == kind and may_replace_result(node)
-
-    return is_own
-
-
 _RULES: dict[str, Callable[[Any], bool]] = {
     "mri": _is_anatomy,
     "second_mri": _is_anatomy,
     "sheets": holds_sheets,
     "seed": lambda node: not is_landmarks(node),
     "probe_transform": lambda node: kind_of_result(node) is None,
-    "output": lambda node: not node.IsA("vtkMRMLLabelMapVolumeNode") and _made_as(IMAGE)(node),
-    "outline": _made_as(OUTLINE),
+    "output": lambda node: not node.IsA("vtkMRMLLabelMapVolumeNode") and is_own(node, IMAGE),
+    "outline": lambda node: is_own(node, OUTLINE),
     "real": _is_real,
     "transform_sequence": lambda node: kind_of_result(node) is None and _holds(node, "vtkMRMLTransformNode"),
-    "image_sequence": _made_as(SEQUENCE),
+    "image_sequence": lambda node: is_own(node, SEQUENCE),
 }

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Collection, Hashable, Iterable
-from dataclasses import dataclass
 
 import numpy as np
 import slicer
@@ -21,7 +20,6 @@ from SlicerUSSim.Logic.mrml.nodes import (
     ijk_to_ras,
     named,
     node_to_world,
-    pose_in_labels,
     read_volume,
     require_node,
     write_volume,
@@ -41,56 +39,6 @@ LABEL_CLASSES = ("vtkMRMLLabelMapVolumeNode", "vtkMRMLSegmentationNode")
 _DEFAULT_COLOURS = "GenericAnatomyColors"
 #: Tissues of label 0, 1, 2, ... of every preset that nobody has changed
 _OF_EVERY_BRAIN = tuple(Preset().tissues.names())
-
-
-@dataclass(frozen=True, eq=False)
-class Patient:
-    """A copy of all data of a label node for the simulator; the node is not accessed again."""
-
-    #: Description of the node in messages
-    name: str
-    #: uint8 labels, one per tissue, in a frame with a rigid transform to the world
-    labels: Volume
-    #: Name of the tissue of label 1, 2, ...
-    names: tuple[str, ...]
-    #: (4, 4) rigid, from the world (RAS) to the frame of `labels`
-    world_to_patient: np.ndarray
-    #: Version of the node's voxels and names, see labels_version; and of the inputs of simulators, which also include
-    #: the tissues of the names and a scaling transform
-    node_version: Hashable
-    version: Hashable
-
-    def pose(self, probe_to_world: np.ndarray) -> np.ndarray:
-        """(4, 4) of a probe in the frame of `labels`."""
-        return self.world_to_patient @ probe_to_world
-
-
-class PatientReader:
-    """Reads label nodes, and caches the last labels as long as node and tissues do not change."""
-
-    def __init__(self) -> None:
-        self._read: tuple[Hashable, LabelledTissues] | None = None
-
-    @property
-    def recognised(self) -> tuple[str, tuple[str, ...]]:
-        """(what the labels that were read last are, warnings about them)"""
-        return ("", ()) if self._read is None else (self._read[1].message, self._read[1].warnings)
-
-    def read(self, labels_node, tissues: TissueTable) -> Patient:
-        """The content and position of a label map or segmentation; see read_labels for `tissues` and errors."""
-        require_node(labels_node, *LABEL_CLASSES, use="label map")
-        node_version = labels_version(labels_node)
-        # Names are not sufficient: a label map without names takes those of `tissues` by label.
-        version = (node_version, tuple((label, tissue.name) for label, tissue in tissues.items()))
-        if self._read is None or self._read[0] != version:
-            self._read = (version, read_labels(labels_node, tissues))
-            _log.debug("%s: labels read from the node", named(labels_node))
-        labelled = self._read[1]
-        world_to_patient, scaling = pose_in_labels(labels_node, np.eye(4))
-        labels = Volume(labelled.labels.array, scaling @ labelled.labels.ijk_to_ras)
-        return Patient(
-            named(labels_node), labels, labelled.names, world_to_patient, node_version, (version, scaling.tobytes())
-        )
 
 
 def read_mask(mask_node, mri_node) -> Volume:
@@ -123,12 +71,8 @@ def labels_version(labels_node) -> Hashable:
             parts.append((segment_id, segment.GetName(), None if source is None else source.GetMTime()))
         return tuple(parts)
     image, colours = labels_node.GetImageData(), _colour_node(labels_node)
-    return (
-        labels_node.GetID(),
-        None if image is None else image.GetMTime(),
-        ijk_to_ras(labels_node).tobytes(),
-        None if colours is None else colours.GetMTime(),
-    )
+    times = tuple(None if one is None else one.GetMTime() for one in (image, colours))
+    return labels_node.GetID(), times, ijk_to_ras(labels_node).tobytes()
 
 
 def read_labels(labels_node, tissues: TissueTable, *, of_ct: bool = False) -> LabelledTissues:
@@ -163,12 +107,10 @@ def read_labels(labels_node, tissues: TissueTable, *, of_ct: bool = False) -> La
 def hidden_segments(segmentation_node) -> dict[str, str]:
     """{ID: name} of the segments of a segmentation that its display hides one by one."""
     display, segmentation = segmentation_node.GetDisplayNode(), segmentation_node.GetSegmentation()
-    ids = (
-        []
-        if display is None
-        else [name for name in segmentation.GetSegmentIDs() if not display.GetSegmentVisibility(name)]
-    )
-    return {segment_id: segmentation.GetSegment(segment_id).GetName() for segment_id in ids}
+    if display is None:
+        return {}
+    hidden = (name for name in segmentation.GetSegmentIDs() if not display.GetSegmentVisibility(name))
+    return {segment_id: segmentation.GetSegment(segment_id).GetName() for segment_id in hidden}
 
 
 def node_labels(labels_node, without: Collection[str] = ()) -> tuple[Volume, dict[int, str]]:

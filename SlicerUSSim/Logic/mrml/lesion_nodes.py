@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Hashable, Sequence
+
 import numpy as np
 import slicer
 from vtkmodules.vtkCommonCore import mutable
@@ -11,7 +13,7 @@ from SlicerUSSim.Logic.base.errors import SimulationError, require
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.base.vtk_data import matrix_array, vtk_matrix
 from SlicerUSSim.Logic.mri.masks import read_masks
-from SlicerUSSim.Logic.mri.pathology import box_ras, tissue_to_add
+from SlicerUSSim.Logic.mri.pathology import Added, add_tissues, box_ras, tissue_to_add
 from SlicerUSSim.Logic.mrml.nodes import named, node_to_world, require_node
 from SlicerUSSim.Logic.tissue.label_advice import SCENE, Advice
 from SlicerUSSim.Logic.tissue.presets import TISSUES, colour_of
@@ -21,9 +23,13 @@ from SlicerUSSim.Logic.tissue.table import TissueTable
 _MOST_PADDING = 40
 #: Tags of a segment: what it was made from (a file), and what a user should check about that, in lines
 _SOURCE, _CHECKS = "SlicerUSSim.source", "SlicerUSSim.checks"
+#: (tissue, mask, name in messages)
+Lesion = tuple[str, Volume, str]
+#: {lesion, see place_of: (messages, warnings) when it was laid over labels that did not have it}
+Told = dict[Hashable, tuple[tuple[str, ...], tuple[str, ...]]]
 
 
-def read_lesions(lesions_node, to_frame_of, tissues: TissueTable) -> tuple[list[tuple[str, Volume, str]], list[str]]:
+def read_lesions(lesions_node, to_frame_of, tissues: TissueTable) -> tuple[list[Lesion], list[str]]:
     """([(tissue, mask, name in messages)], warnings) of the segments that are called as tissues.
 
     Warnings are about segments that are not added, and those of add_lesion.
@@ -98,6 +104,23 @@ def tag_of(segment, tag: str) -> str:
     return str(text) if segment.GetTag(tag, text) else ""
 
 
+def with_lesions(
+    labels: Volume, names: Sequence[str], lesions: list[Lesion], *, also: list[str], before: Told, has_brain_mask: bool
+) -> tuple[Added, Told]:
+    """(labels with lesions, what is told about each); `before` is that about those which the labels have.
+
+    See pathology.add_tissues.
+    """
+    added, told = Added(labels, tuple(names)), {}
+    for lesion in lesions:
+        added = add_tissues(added.labels, added.tissue_names, [lesion], also=also, has_brain_mask=has_brain_mask)
+        tissue, mask, source = lesion
+        place = (tissue, source, *place_of(mask))
+        told[place] = before.get(place, (added.messages, added.warnings))
+    lines = [tuple(line for one in told.values() for line in one[kind]) for kind in (0, 1)]
+    return Added(added.labels, added.tissue_names, *lines), told
+
+
 def place_of(mask: Volume) -> tuple[float, ...]:
     """Volume in ml, centre and box in RAS mm of a mask that is not empty: equal for a lesion that nobody has edited."""
     inside = mask.array > 0
@@ -106,7 +129,7 @@ def place_of(mask: Volume) -> tuple[float, ...]:
     return tuple(round(float(number), 3) for number in numbers)
 
 
-def padded_for(lesions: list[tuple[str, Volume, str]], labels: Volume) -> Volume:
+def padded_for(lesions: list[Lesion], labels: Volume) -> Volume:
     """Labels on a larger grid, if necessary, that contains the lesions beside them."""
     low, high = np.zeros(3, int), np.array(labels.array.shape[::-1]) - 1
     for _, mask, _ in lesions:

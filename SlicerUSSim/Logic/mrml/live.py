@@ -1,10 +1,10 @@
-"""LiveUpdate: one image per burst of changes; all observers are removed at the end."""
+"""LiveLogic: an image that follows the probe, one for each burst of changes."""
 
 from __future__ import annotations
 
 import logging
 import weakref
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
 from time import perf_counter
 from typing import Any, NamedTuple
 
@@ -12,6 +12,10 @@ import slicer
 from vtkmodules.vtkCommonCore import VTK_OBJECT, vtkCommand
 
 from SlicerUSSim.Logic.base.errors import user_message
+from SlicerUSSim.Logic.mrml.image_logic import ImageLogic
+from SlicerUSSim.Logic.mrml.label_nodes import labels_version
+from SlicerUSSim.Logic.mrml.nodes import node_to_world, show_in_slice
+from SlicerUSSim.Logic.mrml.patient_logic import PatientLogic
 
 _log = logging.getLogger(__name__)
 
@@ -22,6 +26,7 @@ _CLAIMED = vtkCommand.UserEvent + 7301
 _SLOWEST_S, _SLOW_IMAGES = 10.0, 2
 #: Priority of an observer that is called before others, whose is 0
 _FIRST = 1000.0
+_Schedule = Callable[[Callable[[], None]], None]
 
 
 class LiveNodes(NamedTuple):
@@ -35,19 +40,15 @@ class LiveNodes(NamedTuple):
 
 
 class LiveUpdate:
-    """Keeps an output volume up to date with a probe transform, for UltrasoundSceneLogic.startLiveUpdate."""
+    """Keeps an output volume up to date with a probe transform; all observers are removed at the end."""
 
     running = False
 
     def __init__(
-        self,
-        logic,
-        nodes: LiveNodes,
-        schedule: Callable[[Callable[[], None]], None] | None,
-        report: Callable[[str], None] | None,
-        stopped: Callable[[], None] | None,
-    ) -> None:
-        self._logic = weakref.ref(logic)  # the logic owns this object
+        self, patient: PatientLogic, images: ImageLogic, nodes: LiveNodes, schedule: _Schedule | None,
+        report: Callable[[str], None] | None, stopped: Callable[[], None] | None,
+    ) -> None:  # fmt: skip
+        self._parameters, self._images = patient.parameters, images
         self._nodes: LiveNodes | None = nodes
         labels_node, transform_node, output_node = nodes.labels, nodes.probe_transform, nodes.output
         self._schedule, self._report, self._stopped = schedule, report, stopped
@@ -55,11 +56,11 @@ class LiveUpdate:
         self._is_claimed = False  # by another live update, whose image is in the output now
         self._logged = ""
         self._slow = 0  # images in a row
-        self._outlined = logic.preset.probe
+        self._outlined = patient.parameters.preset.probe
         self._observed: list[tuple[Any, int]] = []
         self.running = True
 
-        scene = logic.scene
+        scene = patient.scene
         output_node.InvokeEvent(_CLAIMED)  # stops a live update that wrote to it before
         self._observe(output_node, _CLAIMED, self._claimed)
         self._observe(scene, scene.StartCloseEvent, self.stop)
@@ -70,17 +71,13 @@ class LiveUpdate:
         self._observe(labels_node, labels_node.TransformModifiedEvent, self.request)
         if labels_node.IsA("vtkMRMLSegmentationNode"):
             segmentation, events = labels_node.GetSegmentation(), slicer.vtkSegmentation
-            for event in (
-                events.SourceRepresentationModified,
-                events.SegmentAdded,
-                events.SegmentRemoved,
-                events.SegmentModified,
-            ):
+            segments = events.SegmentAdded, events.SegmentRemoved, events.SegmentModified
+            for event in (events.SourceRepresentationModified, *segments):
                 self._observe(segmentation, event, self.request)
         else:
             self._observe(labels_node, labels_node.ImageDataModifiedEvent, self.request)
             self._observe(labels_node, vtkCommand.ModifiedEvent, self.request)
-        self._observe(logic.parameters.node, vtkCommand.ModifiedEvent, self.request)
+        self._observe(patient.parameters.node, vtkCommand.ModifiedEvent, self.request)
 
     def _claimed(self) -> None:
         self._is_claimed = True
@@ -94,15 +91,15 @@ class LiveUpdate:
         for observed, tag in self._observed:
             observed.RemoveObserver(tag)
         self._observed.clear()
-        nodes, self._nodes, logic = self._nodes, None, self._logic()
-        if nodes is not None and logic is not None and not self._is_claimed and nodes.output.GetScene() is not None:
-            logic.holdImage(nodes.output)
+        nodes, self._nodes = self._nodes, None
+        if nodes is not None and not self._is_claimed and nodes.output.GetScene() is not None:
+            self._images.holdImage(nodes.output)
         stopped, self._stopped, self._report = self._stopped, None, None
         if stopped is not None:
             stopped()
 
     def __del__(self) -> None:
-        self._stopped = None
+        self._stopped = self._nodes = None
         self.stop()
 
     def _observe(self, subject, event, method, call_data=None, priority=0.0) -> None:
@@ -140,20 +137,21 @@ class LiveUpdate:
                 self._run()
 
     def _run(self) -> None:
-        logic, nodes = self._logic(), self._nodes
-        if self._busy or not self._pending or logic is None or nodes is None:
+        images, nodes = self._images, self._nodes
+        if self._busy or not self._pending or nodes is None:
             return  # changes can occur while the work is done in another thread
         self._pending = False
         self._busy = True
         begun = perf_counter()
         try:
             caught: list[Warning] = []
-            logic.simulate(nodes.labels, nodes.probe_transform, nodes.output, warned=caught.append)
-            if nodes.outline is not None and logic.preset.probe != self._outlined:
-                logic.showOutline(nodes.outline, nodes.probe_transform)
-                self._outlined = logic.preset.probe
-            if nodes.slice_view is not None:
-                logic.showInSlice(nodes.slice_view, nodes.output, nodes.probe_transform, fit=False)
+            images.simulate(nodes.labels, nodes.probe_transform, nodes.output, warned=caught.append)
+            probe = self._parameters.preset.probe
+            if nodes.outline is not None and probe != self._outlined:
+                images.showOutline(nodes.outline, nodes.probe_transform)
+                self._outlined = probe
+            if nodes.slice_view is not None and images.taken is not None:
+                show_in_slice(nodes.slice_view, nodes.output, images.taken.probe_to_world, probe, fit=False)
             message = "; ".join(map(str, caught))
         except Exception as error:
             message = user_message(error)
@@ -178,3 +176,63 @@ class LiveUpdate:
             self.stop()
         if self._pending and self._schedule is not None and self.running:
             self._schedule(self._run)
+
+
+class LiveLogic:
+    """Starts and ends the live update of a scene."""
+
+    def __init__(self, patient: PatientLogic, images: ImageLogic) -> None:
+        self._patient, self._images = patient, images
+        self._update: LiveUpdate | None = None
+
+    @property
+    def isLive(self) -> bool:
+        """Whether a live update is running."""
+        return self._update is not None and self._update.running
+
+    def startLiveUpdate(
+        self, labels_node, probe_transform_node, output_node, outline_node=None, slice_node=None, *,
+        schedule: _Schedule | None = None, report: Callable[[str], None] | None = None,
+        stopped: Callable[[], None] | None = None,
+    ) -> None:  # fmt: skip
+        """Simulate now, and again whenever the transform or its parents, the labels or the preset change.
+
+        `outline_node` is a model for the outline of the imaged field, `slice_node` a slice view that follows its plane.
+        `schedule(function)` must call `function` once, soon, from the event loop (in Slicer: qt.QTimer.singleShot(0,
+        function)). One image is then computed for all changes before the call. Without `schedule` an image is computed
+        synchronously with each change.
+        `report` is called with "" after an image, and otherwise with one line that describes the error; the update
+        continues, since the error may be corrected. `stopped` is called when it ends: by stopLiveUpdate, when one of
+        its nodes or the scene is removed, or when another live update uses the output.
+        """
+        self.stopLiveUpdate()
+        images = self._images
+        caught: list[Warning] = []
+
+        def version() -> tuple[Hashable, ...]:
+            pose = node_to_world(probe_transform_node).tobytes()
+            return pose, labels_version(labels_node), self._patient.parameters.node.GetMTime()
+
+        before = version()
+        images.simulate(labels_node, probe_transform_node, output_node, warned=caught.append)  # raises errors now
+        if outline_node is not None:
+            images.showOutline(outline_node, probe_transform_node)
+        if slice_node is not None:
+            images.showInSlice(slice_node, output_node, probe_transform_node)
+        nodes = LiveNodes(labels_node, probe_transform_node, output_node, outline_node, slice_node)
+        self._update = LiveUpdate(self._patient, images, nodes, schedule, report, stopped)
+        if report is not None:
+            report("; ".join(map(str, caught)))
+        if version() != before:  # changed while the first image was computed, before anything was observed
+            self.request()
+
+    def request(self) -> None:
+        """Another image of the live update, if one is running."""
+        if self._update is not None:
+            self._update.request()
+
+    def stopLiveUpdate(self) -> None:
+        """End the live update and remove its observers."""
+        if self._update is not None:
+            self._update.stop()
+            self._update = None

@@ -14,7 +14,6 @@ from SlicerUSSim.Logic.base.errors import SimulationError, require
 from SlicerUSSim.Logic.base.transforms import check_rigid
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.base.vtk_data import matrix_array, vtk_matrix
-from SlicerUSSim.Logic.imaging.frame import Frame
 from SlicerUSSim.Logic.probe.arrays import Probe
 from SlicerUSSim.Logic.probe.shape import outline_polydata
 
@@ -142,18 +141,7 @@ def write_volume(volume_node, volume: Volume) -> None:
     volume_node.SetAndObserveImageData(Volume(volume.array, np.eye(4)).to_vtk())
 
 
-# ---- labels ----------------------------------------------------------------------------------------------------------
-
-
 # ---- simulated images -----------------------------------------------------------------------------------------------
-
-
-def write_image(volume_node, frame: Frame, transform_node=None) -> None:
-    """Write a frame into a volume node: fixed geometry in the probe frame, under the probe's transform node.
-
-    The slice therefore moves with the transform immediately, before its pixels are updated.
-    """
-    write_slice(volume_node, Volume(frame.image[None], frame.grid.slice_to_probe), transform_node)
 
 
 def write_slice(volume_node, in_probe: Volume, transform_node=None) -> None:

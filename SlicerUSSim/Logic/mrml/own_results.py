@@ -1,30 +1,53 @@
 """Marks of nodes that hold results of this module, so that it never overwrites what others made.
 
 A result is this module's own as long as three things hold: its node has the kind of the result as an attribute, refers
-to itself (ownership: a copy does not), and has the data that this module wrote, by a hash that is an attribute, too.
+to itself (claim), and has the data that this module wrote, by a hash that is an attribute, too.
 All are saved with the scene, and formats that keep voxels, points and matrices as they are (NRRD, VTK, HDF5) keep the
 hash: results that were saved and loaded are replaced again. Data that the user put in their place, or edited, are the
 user's.
+
+Attributes are copied with a node, and the number in a node's ID may change when a scene is imported into another one.
+A reference to the node itself does right in both: a copy (clone) refers to the node that it was copied from, and scenes
+put references right when they give nodes other IDs, on import as on loading. Nodes of scenes that were saved by
+versions without this reference are taken for their users', and kept.
 """
 
 from __future__ import annotations
 
 import hashlib
+from typing import Any
 
 import numpy as np
+from scipy import ndimage
 from vtkmodules.util.numpy_support import vtk_to_numpy
 
-from SlicerUSSim.Logic.base.errors import require
+from SlicerUSSim.Logic.base.errors import SimulationError, require
+from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.base.vtk_data import matrix_array
+from SlicerUSSim.Logic.mrml.label_nodes import node_labels, overlapping_segments
 from SlicerUSSim.Logic.mrml.nodes import named, nodes_of_class
-from SlicerUSSim.Logic.mrml.ownership import claim, is_claimed
 
+#: Role of the reference of a node to itself; saved with the scene
+OWN = "SlicerUSSim.own"
 #: Attributes of a node, saved with the scene: kind of result ("1" by earlier versions), and a hash of its data
 _RESULT, _DATA = "SlicerUSSim.result", "SlicerUSSim.resultData"
+#: The same of a node with labels: a hash of voxels, place and names as Segment wrote them
+_MADE = "SlicerUSSim.made"
 #: Kinds of results
 IMAGE, OUTLINE, SEQUENCE, SHEETS, FLAP, COMPARED, REGISTRATION = (
     "image", "outline", "sequence", "sheets", "flap", "compared", "registration"
 )  # fmt: skip
+
+
+def claim(node: Any) -> None:
+    """Record that this module filled a node; one outside a scene, as an item of a sequence, has no ID and stays."""
+    if node.GetScene() is not None and not is_claimed(node):
+        node.SetNodeReferenceID(OWN, node.GetID())
+
+
+def is_claimed(node: Any) -> bool:
+    """Whether this module filled this very node, and not one that it is a copy of."""
+    return node.GetID() is not None and node.GetNodeReferenceID(OWN) == node.GetID()
 
 
 def mark_as_result(node, kind: str) -> None:
@@ -59,6 +82,15 @@ def may_replace_result(node) -> bool:
     )
 
 
+def is_own(node, kind: str) -> bool:
+    """Whether a node is empty, or holds a result of this kind that may be replaced."""
+    if is_empty(node):
+        return kind_of_result(node) in (None, kind, "1")
+    # Items of a sequence are compared when it is replaced
+    may_be = is_claimed if node.IsA("vtkMRMLSequenceNode") else may_replace_result
+    return kind_of_result(node) == kind and may_be(node)
+
+
 def require_result(node, use: str) -> None:
     """Raise SimulationError for a node with data that this module did not make; `use` is what the node is for."""
     require(
@@ -77,11 +109,15 @@ def result_called(scene, kind: str, name: str):
 
 
 def is_empty(node) -> bool:
-    """Whether a volume, model, sequence or linear transform node has no data."""
+    """Whether a volume, model, sequence, linear transform, segmentation or markups node has no data."""
     if node.IsA("vtkMRMLSequenceNode"):
         return node.GetNumberOfDataNodes() == 0
     if node.IsA("vtkMRMLLinearTransformNode"):
         return bool(np.array_equal(matrix_array(node.GetMatrixTransformToParent()), np.eye(4)))
+    if node.IsA("vtkMRMLSegmentationNode"):
+        return node.GetSegmentation().GetNumberOfSegments() == 0
+    if node.IsA("vtkMRMLMarkupsNode"):
+        return node.GetNumberOfControlPoints() == 0
     data = node.GetPolyData() if node.IsA("vtkMRMLModelNode") else node.GetImageData()
     return data is None or data.GetNumberOfPoints() == 0
 
@@ -109,3 +145,61 @@ def _hash_of(node) -> str:
             found.update(f"{image.GetDimensions()} {image.GetScalarTypeAsString()} ".encode())
             found.update(np.ascontiguousarray(vtk_to_numpy(scalars)).data)
     return found.hexdigest()
+
+
+# ---- labels ----------------------------------------------------------------------------------------------------------
+
+
+def mark_as_made(labels_node) -> None:
+    """Record that the present content of a label map or segmentation node was made by this program."""
+    labels_node.SetAttribute(_MADE, content_of(labels_node))
+    claim(labels_node)
+
+
+def content_as_made(labels_node) -> str | None:
+    """content_of a node when mark_as_made was called with it last; None if it never was, or with a node copied."""
+    return labels_node.GetAttribute(_MADE) if is_claimed(labels_node) else None
+
+
+def may_replace(labels_node) -> bool:
+    """Whether a node is new, or has labels that this program made, and nobody has edited since.
+
+    A new one has neither segments nor voxels; segments without voxels are somebody's plan. A copy of labels is of whom
+    copied them, see claim.
+    """
+    made = content_as_made(labels_node)
+    return is_empty(labels_node) or (made is not None and content_of(labels_node) == made)
+
+
+def content_of(labels_node) -> str:
+    """A hash of voxels, position and names, the same after saving and loading; "" if no voxel has a label.
+
+    Where segments overlap, the voxels of each count, since those below others are as much somebody's work. Without
+    overlaps, as Segment writes its results, the hash is that of earlier versions, which knew the topmost segment of
+    every voxel only: what these made is known again. What they made with overlaps is taken for its user's, and kept.
+    """
+    try:
+        volume, names = node_labels(labels_node)
+    except SimulationError:  # no segments, or none with a voxel
+        return ""
+    if not volume.array.any():
+        return ""
+    content = hashlib.sha256()
+    _add(content, volume, sorted(names.items()))
+    if labels_node.IsA("vtkMRMLSegmentationNode"):
+        for number, segment in enumerate(overlapping_segments(labels_node)):
+            _add(content, segment, number)
+    return content.hexdigest()
+
+
+def _add(content, volume: Volume, about: object) -> None:
+    """Add the voxels of a volume that are not 0, their place and something `about` them to a hash.
+
+    Only the part with such voxels counts, since segmentations are stored cropped.
+    """
+    boxes = ndimage.find_objects((volume.array != 0).view(np.uint8)) or [(slice(0, 0),) * 3]
+    part = volume.array[boxes[0]]
+    place = volume.ijk_to_ras.copy()
+    place[:3, 3] = (volume.ijk_to_ras @ [*(side.start for side in reversed(boxes[0])), 1])[:3]
+    content.update(repr((part.shape, (place.round(3) + 0.0).tolist(), about)).encode())
+    content.update(part.astype(np.int32).tobytes())

@@ -7,12 +7,14 @@ Scenes can therefore be exchanged between scripts and the module. Values are tho
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Generic, TypeVar, overload
 
 from SlicerUSSim.Logic.base.declaration import Declared, Parameter, Shown, parameter, parameters_of
 from SlicerUSSim.Logic.base.errors import SimulationError, require
 from SlicerUSSim.Logic.fitting.fit_settings import FitSettings
+from SlicerUSSim.Logic.imaging.preset import AS_ONE, Preset
 from SlicerUSSim.Logic.mri.lesions.seeded import LESION_TISSUES
 from SlicerUSSim.Logic.mri.segmentation_settings import MRI_CONTRASTS, SegmentationSettings, SheetSettings
 from SlicerUSSim.Logic.placement.views import VIEWS
@@ -57,7 +59,6 @@ class PanelSettings(Declared):
         False, "Pose in presets", "Save preset saves the pose of the probe, too; a preset with a pose moves the probe "
         "there when it is loaded", shown=True,
     )  # fmt: skip
-    preset: str = parameter("", "Preset", "The JSON text of a Preset; empty: the default")
 
     def _owner(self) -> str:
         return "panel"
@@ -73,7 +74,7 @@ class NodeParameter:
         self.name = name
 
     def __get__(self, parameters: SceneParameters, owner: type | None = None) -> Any:
-        return self if parameters is None else parameters.node.GetNodeReference(self.name)
+        return parameters.node.GetNodeReference(self.name)
 
     def __set__(self, parameters: SceneParameters, value) -> None:
         require(
@@ -94,8 +95,6 @@ class ValueParameter:
         self.declared = declared
 
     def __get__(self, parameters: SceneParameters, owner: type | None = None) -> Any:
-        if parameters is None:
-            return self
         text = parameters.node.GetParameter(self.declared.name)
         return self.declared.default if text == "" else self.declared.from_text(_OWNER, text)
 
@@ -136,6 +135,36 @@ class SettingsParameter(Generic[S]):
         node.EndModify(was_modifying)
 
 
+def preset_texts(texts: Mapping[str, str]) -> dict[str, str]:
+    """Those of a scene's {name: text} that are of its preset, see Preset.to_texts."""
+    sections = ("probe", "display", "settings", "tissues", "membrane", AS_ONE)
+    return {name: text for name, text in texts.items() if text and name.split(".")[0] in sections}
+
+
+class PresetParameter:
+    """Probe, display, settings and tissues; each value is a parameter, see Preset.to_texts.
+
+    A pose is not kept. The text AS_ONE of older scenes is replaced when it is read.
+    """
+
+    def __get__(self, parameters: SceneParameters, owner: type | None = None) -> Preset:
+        texts = preset_texts(parameters.texts)
+        if vars(parameters).get("_preset", (None, None))[0] != texts:
+            vars(parameters)["_preset"] = texts, Preset.from_texts(texts, "the scene's preset")
+            if AS_ONE in texts:
+                self.__set__(parameters, vars(parameters)["_preset"][1])
+        return vars(parameters)["_preset"][1]
+
+    def __set__(self, parameters: SceneParameters, preset: Preset) -> None:
+        texts = preset.to_texts()
+        parameters.put_preset(texts)
+        vars(parameters)["_preset"] = texts, replace(preset, probe_to_ras=None)
+
+
+#: What SceneParameters has
+_PARAMETERS = NodeParameter | ValueParameter | SettingsParameter | PresetParameter
+
+
 class SceneParameters:
     """The parameters of one scene as attributes: parameters.mri, parameters.contrast = "t2", parameters.fit.register.
 
@@ -171,6 +200,7 @@ class SceneParameters:
     sheet = SettingsParameter(SheetSettings, "sheet_")
     fit = SettingsParameter(FitSettings, "fit_")
     panel = SettingsParameter(PanelSettings)
+    preset = PresetParameter()
 
     def __init__(self, scene) -> None:
         object.__setattr__(self, "scene", scene)
@@ -189,15 +219,29 @@ class SceneParameters:
         node.SetAttribute("ModuleName", MODULE_NAME)  # closing a scene may remove it
         return node
 
-    if TYPE_CHECKING:  # type checkers use the names declared above
-        preset: str
-    else:
+    @property
+    def texts(self) -> dict[str, str]:
+        """{name: text} of all that the node has."""
+        node = self.node
+        return {name: node.GetParameter(name) for name in node.GetParameterNames()}
+
+    def put_preset(self, texts: Mapping[str, str]) -> None:
+        """Set the texts of a preset as they are; one change of the node, or none."""
+        node, texts = self.node, preset_texts(texts)
+        was_modifying = node.StartModify()
+        for name in preset_texts(self.texts).keys() - texts:
+            node.UnsetParameter(name)
+        for name, text in texts.items():
+            node.SetParameter(name, text)
+        node.EndModify(was_modifying)
+
+    if not TYPE_CHECKING:  # type checkers use the names declared above
 
         def __getattr__(self, name: str):
             raise SimulationError(f"scene parameters have no {name!r}")
 
         def __setattr__(self, name: str, value) -> None:
-            if not isinstance(vars(type(self)).get(name), NodeParameter | ValueParameter | SettingsParameter):
+            if not isinstance(vars(type(self)).get(name), _PARAMETERS):
                 raise SimulationError(f"scene parameters have no {name!r}")
             object.__setattr__(self, name, value)
 

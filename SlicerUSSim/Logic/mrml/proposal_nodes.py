@@ -14,8 +14,8 @@ from SlicerUSSim.Logic.mri.lesions.proposal import Proposal
 from SlicerUSSim.Logic.mri.lesions.seeded import grow_lesion
 from SlicerUSSim.Logic.mri.segmentation import Segmentation
 from SlicerUSSim.Logic.mrml.lesion_nodes import add_lesion
-from SlicerUSSim.Logic.mrml.nodes import control_points, named, node_to_world, require_node
-from SlicerUSSim.Logic.mrml.own_labels import mark_as_made, may_replace
+from SlicerUSSim.Logic.mrml.nodes import control_points, named, node_to_world, nodes_of_class, require_node
+from SlicerUSSim.Logic.mrml.own_results import mark_as_made, may_replace
 
 #: Name of the node with a proposal
 NAME = "Lesion proposal"
@@ -51,22 +51,18 @@ class LesionProposals:
             mri_node.GetID(), _version(mri_node),
         )  # fmt: skip
 
-    def grow(self, mri_node, seed_world_mm: Sequence[float], tissue: str | None = None):
-        """The segmentation node with the lesion around a point in world RAS mm; see seeded.grow_lesion.
-
-        Raises SimulationError, and changes nothing, if the MRI was not segmented or has changed since, and for a point
-        in what is no lesion.
-        """
-        result = self._segmentation_of(mri_node)
-        seed = np.linalg.inv(node_to_world(mri_node)) @ [*np.asarray(seed_world_mm, float), 1.0]
-        return self._written([self._work(lambda: grow_lesion(result, seed[:3].tolist(), tissue))], mri_node)
-
     def growFrom(self, mri_node, points_node, tissue: str | None = None):
-        """As grow, from the last control point of a markups node that is placed."""
+        """The segmentation node with the lesion around the last control point of a markups node that is placed.
+
+        See seeded.grow_lesion. Raises SimulationError, and changes nothing, if the MRI was not segmented or has changed
+        since, and for a point in what is no lesion.
+        """
         require_node(points_node, "vtkMRMLMarkupsFiducialNode", use="point in the lesion")
         placed = control_points(points_node)
         require(len(placed) > 0, f"{named(points_node)} has no point, expected one in the lesion; click it in a slice")
-        return self.grow(mri_node, placed[-1].tolist(), tissue)
+        result = self._segmentation_of(mri_node)
+        seed = np.linalg.inv(node_to_world(mri_node)) @ [*placed[-1], 1.0]
+        return self._written([self._work(lambda: grow_lesion(result, seed[:3].tolist(), tissue))], mri_node)
 
     def propose(self, mri_node):
         """The segmentation node with what looks like lesions, without a point; None if nothing does."""
@@ -110,16 +106,15 @@ class LesionProposals:
 
     def _segmentation_of(self, mri_node) -> Segmentation:
         require_node(mri_node, "vtkMRMLScalarVolumeNode", use="MRI")
-        last = self._last
-        is_known = last is not None and last[:2] == (mri_node.GetID(), _version(mri_node))
-        if last is None or not is_known:
+        if self._last is None or not self.knows(mri_node):
             raise SimulationError(f"{named(mri_node)} was not segmented yet, or has changed since; segment it first")
-        return last[2]
+        return self._last[2]
 
     def _written(self, proposals: Sequence[Proposal], mri_node):
         """The node with these proposals: the last one if nobody has edited it, else a new one."""
-        known = [node for node in _called(self._scene, NAME) if may_replace(node)]
-        node = known[0] if known else self._scene.AddNewNodeByClass("vtkMRMLSegmentationNode", NAME)
+        nodes = nodes_of_class(self._scene, "vtkMRMLSegmentationNode")
+        known = (node for node in nodes if node.GetName().startswith(NAME) and may_replace(node))
+        node = next(known, None) or self._scene.AddNewNodeByClass("vtkMRMLSegmentationNode", NAME)
         node.GetSegmentation().RemoveAllSegments()
         node.SetAndObserveTransformNodeID(mri_node.GetTransformNodeID())
         for proposal in proposals:
@@ -129,13 +124,6 @@ class LesionProposals:
         self.notes = tuple(proposal.message for proposal in proposals)
         self.warnings = tuple(line for proposal in proposals for line in proposal.warnings)
         return node
-
-
-def _called(scene, name: str) -> list:
-    nodes = scene.GetNodesByClass("vtkMRMLSegmentationNode")
-    nodes.UnRegister(None)
-    found = [nodes.GetItemAsObject(n) for n in range(nodes.GetNumberOfItems())]
-    return [node for node in found if node.GetName().startswith(name)]
 
 
 def _version(volume_node) -> object:

@@ -22,7 +22,6 @@ from SlicerUSSim.Logic.base.vtk_data import matrix_array, vtk_matrix
 from SlicerUSSim.Logic.mri.sheets.polydata import as_polydata, surfels_of
 from SlicerUSSim.Logic.mrml.craniotomy_nodes import closed_labels, set_closed_labels, show_flap
 from SlicerUSSim.Logic.mrml.fit_nodes import sequence_of
-from SlicerUSSim.Logic.mrml.known_field import known_field
 from SlicerUSSim.Logic.mrml.label_nodes import colour_table, node_labels, read_mask, set_colour_table
 from SlicerUSSim.Logic.mrml.landmark_nodes import Landmark, landmarks_of
 from SlicerUSSim.Logic.mrml.lesion_nodes import tag_of
@@ -36,8 +35,9 @@ from SlicerUSSim.Logic.mrml.nodes import (
     probe_pose,
     write_volume,
 )
-from SlicerUSSim.Logic.mrml.ownership import OWN, claim, is_claimed
-from SlicerUSSim.Logic.mrml.parameter_node import VALUE_PARAMETERS, SceneParameters
+from SlicerUSSim.Logic.mrml.own_results import OWN, claim, is_claimed, is_empty
+from SlicerUSSim.Logic.mrml.parameter_node import VALUE_PARAMETERS, SceneParameters, preset_texts
+from SlicerUSSim.Logic.mrml.sequence_nodes import known_field
 from SlicerUSSim.Logic.mrml.share_nodes import set_shares_node, shares_node
 from SlicerUSSim.Logic.mrml.taken_image import was_live
 from SlicerUSSim.Logic.mrml.taken_sequence import FrozenRecord, SimulatedRecord, record_frozen, record_taken
@@ -159,7 +159,7 @@ def record_nodes(parameters: SceneParameters, roles: Iterable[str] = ROLES) -> d
     found: dict[str, NodeRecord] = {}
     for role in roles:
         node: Any = getattr(parameters, role)
-        if node is None or node.IsA("vtkMRMLSequenceNode") or _is_empty(node):
+        if node is None or node.IsA("vtkMRMLSequenceNode") or is_empty(node):
             continue
         if role == "labels":
             closed = closed_labels(node)
@@ -185,9 +185,9 @@ def nodes_version(parameters: SceneParameters, roles: Iterable[str] = ROLES) -> 
 
 
 def recorded_values(parameters: SceneParameters) -> dict[str, str]:
-    """{name: text} of the scene's values that are not the default."""
-    node = parameters.node
-    return {name: node.GetParameter(name) for name in VALUE_PARAMETERS if node.GetParameter(name)}
+    """{name: text} of the scene's values and preset that are not the default."""
+    texts = parameters.texts
+    return {**{name: texts[name] for name in VALUE_PARAMETERS if texts.get(name)}, **preset_texts(texts)}
 
 
 def record_scene(scene) -> SceneRecord:
@@ -231,7 +231,7 @@ def _choose_missing(scene, parameters: SceneParameters) -> None:
     if parameters.mri is not None or parameters.labels is not None:
         return
     for node in nodes_of_class(scene, _VOLUME):
-        if node.GetClassName() == _VOLUME and not node.GetHideFromEditors() and not _is_empty(node):
+        if node.GetClassName() == _VOLUME and not node.GetHideFromEditors() and not is_empty(node):
             parameters.mri = node
             return
 
@@ -248,17 +248,6 @@ def _others(scene, parameters: SceneParameters) -> Iterable[str]:
             is_own = is_own or (node.GetName() or "").endswith("Volume Slice")
             if node.GetID() not in chosen and not is_own and node.GetSaveWithScene():
                 yield node.GetName() or node.GetID()
-
-
-def _is_empty(node) -> bool:
-    if node.IsA("vtkMRMLVolumeNode"):
-        image = node.GetImageData()
-        return image is None or image.GetNumberOfPoints() == 0
-    if node.IsA(_SEGMENTS):
-        return node.GetSegmentation().GetNumberOfSegments() == 0
-    if node.IsA(_MODEL):
-        return node.GetPolyData() is None or node.GetPolyData().GetNumberOfCells() == 0
-    return node.GetNumberOfControlPoints() == 0
 
 
 def _version(node) -> Hashable:
@@ -369,7 +358,10 @@ def put_nodes(scene, record: SceneRecord) -> dict[str, Any]:
 
 
 def put_values(parameters: SceneParameters, values: Mapping[str, str]) -> list[str]:
-    """Set the scene's values from their texts; returns lines about those that this version does not take."""
+    """Set the scene's values and preset from their texts; returns lines about values that this version does not take.
+
+    A preset is taken as it is, and checked when it is used.
+    """
     node, refused = parameters.node, []
     was_modifying = node.StartModify()
     for name, declared in VALUE_PARAMETERS.items():
@@ -379,6 +371,7 @@ def put_values(parameters: SceneParameters, values: Mapping[str, str]) -> list[s
             setattr(parameters, name, value)
         except SimulationError as error:
             refused.append(str(error).replace(f"scene: {name} is ", f"{declared.label or name} in the scene is ", 1))
+    parameters.put_preset(values)
     node.EndModify(was_modifying)
     return refused
 

@@ -1,24 +1,32 @@
-"""Sequence nodes: index values of their items, and tracked images with a browser."""
+"""Sequence nodes: index values of their items, tracked images with a browser, and what is known of these."""
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from itertools import count, pairwise
 from math import inf, isfinite, nan, ulp
+from typing import Any
 
 import numpy as np
 import slicer
 
+from SlicerUSSim.Logic.base.errors import SimulationError
+from SlicerUSSim.Logic.base.transforms import check_affine, check_rigid
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.base.vtk_data import vtk_matrix
-from SlicerUSSim.Logic.mrml.nodes import write_volume
+from SlicerUSSim.Logic.mrml.nodes import named, write_volume
+from SlicerUSSim.Logic.probe.arrays import probe_from_dict
+from SlicerUSSim.Logic.tracked.imaged_field import ImagedField
 from SlicerUSSim.Logic.tracked.sequence import TrackedSequence
 
 #: Attribute of an image in a sequence: its time in seconds, independent of its index value.
 TIME = "SlicerUSSim.time"
 #: Reference of a sequence of simulated images to that of their transforms, and of a browser to the probe's poses
 MADE_FROM, POSES = "SlicerUSSim.transforms", "SlicerUSSim.poses"
+#: Attribute of a sequence node with real images: probe, its place in the images and registration, as JSON
+_KNOWN = "SlicerUSSim.field"
 #: Default tolerance within which a sequence node considers numbers equal; step between generated values.
 _TOLERANCE, _STEP = 1e-3, 1e-6
 
@@ -55,13 +63,9 @@ class SequenceIndex:
     def of_node(cls, sequence_node) -> SequenceIndex:
         """Index of a vtkMRMLSequenceNode."""
         count = sequence_node.GetNumberOfDataNodes()
-        return cls(
-            tuple(sequence_node.GetNthIndexValue(number) for number in range(count)),
-            sequence_node.GetIndexName(),
-            sequence_node.GetIndexUnit(),
-            sequence_node.GetIndexType() == sequence_node.TextIndex,
-            sequence_node.GetNumericIndexValueTolerance(),
-        )
+        values, name = map(sequence_node.GetNthIndexValue, range(count)), sequence_node.GetIndexName()
+        unit, is_text = sequence_node.GetIndexUnit(), sequence_node.GetIndexType() == sequence_node.TextIndex
+        return cls(tuple(values), name, unit, is_text, sequence_node.GetNumericIndexValueTolerance())
 
     def fill(self, sequence_node, items: Iterable) -> None:
         """Replace the content of a vtkMRMLSequenceNode by `items`, a data node for each value."""
@@ -106,14 +110,9 @@ def number_in(text: str) -> float:
 
 
 def add_sequence(
-    scene,
-    sequence: TrackedSequence,
-    name: str,
-    path: str = "ImageToReference",
-    to_ras: np.ndarray | None = None,
-    poses: Sequence[np.ndarray] = (),
-    probe_transform_node=None,
-):
+    scene, sequence: TrackedSequence, name: str, path: str = "ImageToReference", to_ras: np.ndarray | None = None,
+    poses: Sequence[np.ndarray] = (), probe_transform_node=None,
+):  # fmt: skip
     """(browser, images): a vtkMRMLSequenceBrowserNode and the vtkMRMLSequenceNode of the images in `scene`.
 
     The images are in pixels, under the recorded transforms to the world (RAS); `path` and `to_ras` (4, 4) are those of
@@ -170,3 +169,43 @@ def _transform(name: str, matrix: np.ndarray):
     node.SetName(name)
     node.SetMatrixTransformToParent(vtk_matrix(matrix))
     return node
+
+
+@dataclass(frozen=True, eq=False)
+class KnownField:
+    """What was found or given when the images were opened."""
+
+    field: ImagedField
+    #: (4, 4) from the frame in which the images were tracked to the world
+    to_ras: np.ndarray
+
+
+def write_known_field(images_node: Any, known: KnownField) -> None:
+    """Keep it with a vtkMRMLSequenceNode of images, also in the scene's file."""
+    values = {
+        "probe": known.field.probe.to_dict(),
+        "image_to_probe": known.field.image_to_probe.tolist(),
+        "to_ras": known.to_ras.tolist(),
+    }
+    images_node.SetAttribute(_KNOWN, json.dumps(values))
+
+
+def known_field(images_node: Any, shape: tuple[int, int]) -> KnownField | None:
+    """What write_known_field kept with a node of images of `shape` (rows, columns); None if it kept nothing.
+
+    Raises SimulationError for an attribute with something else.
+    """
+    text = images_node.GetAttribute(_KNOWN)
+    if text is None:
+        return None
+    try:
+        values = json.loads(text)
+        probe = probe_from_dict(values["probe"], "the probe of real images")
+        image_to_probe = check_affine("image_to_probe", np.array(values["image_to_probe"], float))
+        to_ras = check_rigid("to_ras", np.array(values["to_ras"], float))
+    except (SimulationError, ValueError, LookupError, TypeError, AttributeError) as error:
+        raise SimulationError(
+            f"{named(images_node)}: its attribute {_KNOWN} is damaged ({error}); without it the probe is looked for in "
+            "the images"
+        ) from None
+    return KnownField(ImagedField.of(probe, image_to_probe, shape), to_ras)

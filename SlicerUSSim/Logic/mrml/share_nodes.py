@@ -15,12 +15,12 @@ import numpy as np
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.mrml.label_nodes import LABEL_CLASSES
 from SlicerUSSim.Logic.mrml.nodes import nodes_of_class, read_volume, write_volume
-from SlicerUSSim.Logic.mrml.own_labels import content_of
+from SlicerUSSim.Logic.mrml.own_results import content_of
 from SlicerUSSim.Logic.tissue.texture import Texture
 
 #: Reference of the labels' node to the volume
 _ROLE = "SlicerUSSim.shares"
-#: Attributes of the volume: the content of the labels' node (own_labels.content_of), and the names of its labels
+#: Attributes of the volume: the content of the labels' node (own_results.content_of), and the names of its labels
 _OF, _NAMES = "SlicerUSSim.sharesOf", "SlicerUSSim.sharesNames"
 #: Bytes of a voxel: second label, its probability, the part of the voxel that it fills, whether that is known
 _PROBABILITY, _FILLED, _IS_FILLED = 8, 16, 24

@@ -52,8 +52,6 @@ def read_sheets(model_node, world_to_labels: np.ndarray, kinds: Iterable[str]) -
     data: Any = model_node.GetPolyData()
     if data is None or data.GetNumberOfCells() == 0:
         return Surfels.joined([])
-    surfels = surfels_of(data, f"sheets {named(model_node)}")
-    placed = surfels_of_squares(
-        data, surfels, world_to_labels @ node_to_world(model_node), f"sheets {named(model_node)}"
-    )
+    what = f"sheets {named(model_node)}"
+    placed = surfels_of_squares(data, surfels_of(data, what), world_to_labels @ node_to_world(model_node), what)
     return placed.of_kind(*(kind for kind in KINDS if kind in set(kinds)))

@@ -17,6 +17,8 @@ from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.base.vtk_data import vtk_matrix
 from SlicerUSSim.Logic.imaging.frame import Frame
 from SlicerUSSim.Logic.imaging.preset import Preset
+from SlicerUSSim.Logic.mrml.nodes import write_slice
+from SlicerUSSim.Logic.mrml.own_results import IMAGE, mark_as_result
 from SlicerUSSim.Logic.probe.image_grid import ImageGrid
 
 #: Attribute of a node with an MRI or labels: the name of the patient; without it the node's own name is
@@ -64,12 +66,8 @@ class TakenImage:
 
     def about(self) -> dict[str, object]:
         """Patient, time, pose and preset, as JSON can hold them."""
-        return {
-            "patient": self.patient,
-            "time": self.time,
-            "probe_to_ras": self.probe_to_world.round(6).tolist(),
-            "preset": self.preset.to_dict(),
-        }
+        pose, preset = self.probe_to_world.round(6).tolist(), self.preset.to_dict()
+        return {"patient": self.patient, "time": self.time, "probe_to_ras": pose, "preset": preset}
 
 
 def patient_of(node) -> str:
@@ -77,20 +75,24 @@ def patient_of(node) -> str:
     return node.GetAttribute(PATIENT) or node.GetName() or ""
 
 
-def write_about(taken: TakenImage) -> None:
-    """Keep with the volume node what its image is of; it follows the probe from now on."""
-    about = {
-        **taken.about(),
-        "probe_to_ras": taken.probe_to_world.tolist(),  # all digits: scripts make the same pixels again
-        "is_empty": taken.is_empty,
-        **({} if taken.number is None else {"number": taken.number}),
-    }
+def write_image(taken: TakenImage, transform_node=None) -> None:
+    """Write an image and what it is of into its node: fixed geometry in the probe frame, under the probe's transform.
+
+    The slice therefore moves with the transform immediately, before its pixels are updated.
+    """
+    was_modifying = taken.node.StartModify()
+    pose = taken.probe_to_world.tolist()  # all digits: scripts make the same pixels again
+    about = {**taken.about(), "probe_to_ras": pose, "is_empty": taken.is_empty}
+    about |= {} if taken.number is None else {"number": taken.number}
     taken.node.SetAttribute(_ABOUT, json.dumps(about))
     taken.node.RemoveAttribute(_FROZEN)
+    write_slice(taken.node, Volume(taken.image[None], taken.grid.slice_to_probe), transform_node)
+    mark_as_result(taken.node, IMAGE)
+    taken.node.EndModify(was_modifying)
 
 
 def about_as_json(volume_node) -> str:
-    """What the image in a volume node is of, as write_about keeps it; "" of a volume that is no such image."""
+    """What the image in a volume node is of, as write_image keeps it; "" of a volume that is no such image."""
     return volume_node.GetAttribute(_ABOUT) or ""
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Hashable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -14,10 +14,10 @@ from SlicerUSSim.Logic.base.errors import SimulationError, require
 from SlicerUSSim.Logic.base.transforms import check_rigid
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.imaging.preset import Preset
-from SlicerUSSim.Logic.mrml.nodes import ijk_to_ras, named, write_slice
-from SlicerUSSim.Logic.mrml.own_results import IMAGE, SEQUENCE, mark_as_result
+from SlicerUSSim.Logic.mrml.nodes import ijk_to_ras, named
+from SlicerUSSim.Logic.mrml.own_results import SEQUENCE, mark_as_result
 from SlicerUSSim.Logic.mrml.sequence_nodes import SequenceIndex
-from SlicerUSSim.Logic.mrml.taken_image import TakenImage, about_image, is_frozen, write_about
+from SlicerUSSim.Logic.mrml.taken_image import TakenImage, about_image, is_frozen, write_image
 from SlicerUSSim.Logic.probe.image_grid import ImageGrid
 
 #: Attribute of a sequence node with images: what each is of, as JSON. Those of its items are lost when Slicer saves
@@ -35,14 +35,9 @@ def write_taken(images_node, index: SequenceIndex, taken: Sequence[TakenImage]) 
         preset = about.pop("preset")
         if preset not in presets:  # one for all, as a rule
             presets.append(preset)  # type: ignore[arg-type]
-        lines.append(
-            {
-                **about,
-                "preset": presets.index(preset),  # type: ignore[arg-type]
-                "probe_to_ras": image.probe_to_world.tolist(),  # all digits: scripts make the same pixels again
-                "is_empty": image.is_empty,
-            }
-        )
+        pose = image.probe_to_world.tolist()  # all digits: scripts make the same pixels again
+        is_of = {"preset": presets.index(preset), "probe_to_ras": pose, "is_empty": image.is_empty}  # type: ignore[arg-type]
+        lines.append({**about, **is_of})
     images_node.SetAttribute(_ABOUT, json.dumps({"presets": presets, "images": lines}))
     mark_as_result(images_node, SEQUENCE)
 
@@ -57,13 +52,12 @@ def read_taken(images_node, number: int, anatomy: Hashable = None) -> TakenImage
     node = images_node.GetNthDataNode(number)
     try:
         image = Volume.from_vtk(node.GetImageData(), ijk_to_ras(node)).array[0].copy()
-        taken = _taken(images_node.GetAttribute(_ABOUT) or "{}", number, image, anatomy, node)
+        return _taken(images_node.GetAttribute(_ABOUT) or "{}", number, image, anatomy, node)
     except (ValueError, LookupError, TypeError, AttributeError):
         raise SimulationError(
             f"{named(images_node)} does not say what its images are of, expected those of Simulate sequence; make them "
             "again"
         ) from None
-    return taken
 
 
 def _taken(about: str, number: int, image: np.ndarray, anatomy: Hashable, node: Any) -> TakenImage:
@@ -95,11 +89,6 @@ def count_taken(images_node: Any) -> int:
     if images_node is None or images_node.GetAttribute(_ABOUT) is None:
         return 0
     return images_node.GetNumberOfDataNodes()
-
-
-def in_node(taken: TakenImage, volume_node: Any) -> TakenImage:
-    """The same image, in another volume node."""
-    return replace(taken, node=volume_node)
 
 
 # ---- a frozen image --------------------------------------------------------------------------------------------------
@@ -196,9 +185,7 @@ def put_taken(scene, record: SimulatedRecord):
             found = _taken(record.about, number, image, None, node)
         except (ValueError, LookupError, TypeError, AttributeError) as error:
             raise SimulationError(f"the images of {record.name!r} are damaged ({error})") from None
-        write_about(found)
-        write_slice(node, Volume(found.image[None], found.grid.slice_to_probe))
-        mark_as_result(node, IMAGE)
+        write_image(found)
         taken.append(found)
     require(len(taken) == len(record.index.values), f"the images of {record.name!r} have {len(taken)} places")
     images = scene.AddNewNodeByClass("vtkMRMLSequenceNode", scene.GenerateUniqueName(record.name))

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from SlicerUSSim.Logic.base.errors import SimulationError
-from SlicerUSSim.Logic.opencl.limits import doubt_of_address_space, lack_of_address_space, lack_of_cache
+from SlicerUSSim.Logic.opencl.limits import lack_of_address_space, lack_of_cache
 from SlicerUSSim.Logic.opencl.pocl import cache_folder
 from SlicerUSSim.Logic.opencl.runtimes import INTEL_RUNTIME, load_pyopencl, pocl_of_pip
 
@@ -118,11 +118,7 @@ def choose_device(device: str | DeviceInfo | None = None) -> tuple[DeviceInfo, s
     devices = list_devices()
     _log.debug("OpenCL devices: %s", "; ".join(map(str, devices)) or "none")
     if not devices:
-        why = (
-            lack_of_address_space()
-            or doubt_of_address_space()
-            or (lack_of_cache(cache_folder()) if _has_pocl() else None)
-        )
+        why = lack_of_address_space() or (lack_of_cache(cache_folder()) if _has_pocl() else None)
         raise SimulationError(f"no OpenCL device found; {why or _how_to_get_one()}")
     for choice, source in (
         (device, "argument"),

@@ -8,41 +8,22 @@ from pathlib import Path
 
 #: Address space in bytes below which runtimes fail, or end the process: measured with PoCL 3.0 and Intel's of 2025
 LEAST_ADDRESS_SPACE = {"Intel": 1_500_000_000, "": 1_000_000_000}
-#: Above which nothing is for want of it: other libraries, which were loaded before a runtime, have taken some
-_ENOUGH_ADDRESS_SPACE = 2_000_000_000
 _LEAST_DISK = 4_000_000  # bytes of the programs of a simulator
 
 
-def address_space() -> int | None:
-    """Bytes of address space that this process may have (`ulimit -v`), or None for no limit."""
+def lack_of_address_space(platform: str = "") -> str | None:
+    """What to say if the runtime of an OpenCL platform cannot work in this process's address space, else None."""
     try:
         import resource
     except ImportError:  # Windows
         return None
     limit = resource.getrlimit(resource.RLIMIT_AS)[0]
-    return None if limit == resource.RLIM_INFINITY else limit
-
-
-def lack_of_address_space(platform: str = "") -> str | None:
-    """What to say if the runtime of an OpenCL platform cannot work in this process's address space, else None."""
-    limit = address_space()
     least = next(size for name, size in LEAST_ADDRESS_SPACE.items() if name in platform)
-    if limit is None or limit >= least:
+    if limit == resource.RLIM_INFINITY or limit >= least:
         return None
     return (
         f"the address space of this process is limited to {limit / 1e6:.0f} MB (ulimit -v), expected at least "
         f"{least / 1e6:.0f} MB"
-    )
-
-
-def doubt_of_address_space() -> str | None:
-    """What to say, where something has failed, if this process's address space may be the reason, else None."""
-    limit = address_space()
-    if limit is None or limit >= _ENOUGH_ADDRESS_SPACE:
-        return None
-    return (
-        f"the address space of this process is limited to {limit / 1e6:.0f} MB (ulimit -v), which may be too little: "
-        f"{_ENOUGH_ADDRESS_SPACE / 1e6:.0f} MB are enough"
     )
 
 

@@ -15,7 +15,7 @@ import numpy as np
 from SlicerUSSim.Logic.base.errors import SimulationError, either, require, require_kind
 from SlicerUSSim.Logic.base.label_numbers import whole_numbers
 from SlicerUSSim.Logic.base.volume import Volume
-from SlicerUSSim.Logic.tissue.body_orientation import has_exchanged_sides, places_of, wrong_body
+from SlicerUSSim.Logic.tissue.body_orientation import has_exchanged_sides, places_of, wrong_body, wrong_way_up
 from SlicerUSSim.Logic.tissue.label_advice import COMMAND, Advice
 from SlicerUSSim.Logic.tissue.label_findings import UNNAMED, Findings, listed
 from SlicerUSSim.Logic.tissue.label_mapping import LabelMapping
@@ -24,7 +24,6 @@ from SlicerUSSim.Logic.tissue.presets import TISSUES
 from SlicerUSSim.Logic.tissue.schemes import Scheme, recognised, recognised_in_ct, scheme_with_names, schemes, title_of
 from SlicerUSSim.Logic.tissue.table import MAX_LABEL, TissueTable
 from SlicerUSSim.Logic.tissue.tissue import Tissue
-from SlicerUSSim.Logic.tissue.upright import wrong_way_up
 
 _log = logging.getLogger(__name__)
 

@@ -151,6 +151,10 @@ class SegmentationFilter(_ImageFilter):
         self._notes: tuple[str, ...] = ()
         self._warnings: tuple[str, ...] = ()
 
+    def SetSettings(self, settings: SegmentationSettings) -> None:
+        """All values at once."""
+        self._change("_values", asdict(settings))
+
     def SetClasses(self, classes: int | None) -> None:
         """Number of tissues to distinguish by intensity; None: by the contrast."""
         self._set("classes", classes)
@@ -243,17 +247,13 @@ class SegmentationFilter(_ImageFilter):
         masked = inInfo[1].GetNumberOfInformationObjects() > 0
         masks = [(tissue, Volume.from_vtk(image), f"the mask of {tissue}") for tissue, image in self._added]
         image, mask = Volume.from_vtk(mri), Volume.from_vtk(vtkImageData.GetData(inInfo[1])) if masked else None
-        is_of_brain = has_brain_mask(self._values["contrast"])
-        require_addable(
-            image,
-            masks,
-            mask=mask,
-            skull_strip=self._values["skull_strip"] if is_of_brain else "none",
-            advice=MRI_SCRIPT,
-        )
+        settings, others = SegmentationSettings(**self._values), self._others.items()
+        is_of_brain = has_brain_mask(settings.contrast)
+        skull_strip = settings.skull_strip if is_of_brain else "none"
+        require_addable(image, masks, mask=mask, skull_strip=skull_strip, advice=MRI_SCRIPT)
         found = segment_image(
-            image, others={name: Volume.from_vtk(other) for name, other in self._others.items()}, mask=mask,
-            **self._values, device=self._device, progress=self._report,
+            image, settings, others={name: Volume.from_vtk(other) for name, other in others}, mask=mask,
+            device=self._device, progress=self._report,
         )  # fmt: skip
         output = vtkImageData.GetData(outInfo)
         output.CopyStructure(mri)

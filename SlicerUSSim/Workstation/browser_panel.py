@@ -1,9 +1,13 @@
-"""BrowserPanel: connects the panel's controls on the page to a PanelPresenter."""
+"""BrowserPanel: connects the panel's controls on the page to a PanelPresenter.
+
+Besides: Observed, which observes the node that has a role.
+"""
 
 from __future__ import annotations
 
+import logging
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from time import perf_counter
@@ -12,26 +16,57 @@ from typing import Any
 import numpy as np
 from greenlet import getcurrent, greenlet
 
-from SlicerUSSim.Logic.base.errors import Cancelled, SimulationError
+from SlicerUSSim.Logic.base.errors import Cancelled, SimulationError, require, required, user_message
 from SlicerUSSim.Logic.mrml.fitting_nodes import offered
 from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic
 from SlicerUSSim.Logic.mrml.nodes import nodes_of_class
-from SlicerUSSim.Widget.controls import Control, Section, by_widget, part_of, shown_by, usable, value_parameter
-from SlicerUSSim.Widget.presenter import PanelPresenter, TissueRow
-from SlicerUSSim.Workstation.messages import Messages
-from SlicerUSSim.Workstation.observed import Observed
+from SlicerUSSim.Logic.mrml.taken_sequence import count_taken
+from SlicerUSSim.Widget.interface import Control, by_widget
+from SlicerUSSim.Widget.presenter import PanelPresenter
+from SlicerUSSim.Widget.sections import panel_sections
+from SlicerUSSim.Widget.tissue_presenter import TissueRow
+from SlicerUSSim.Widget.value_presenter import value_parameter
 from SlicerUSSim.Workstation.state import FreeParameter, NodeItem, SharedState, TissueLine
 from SlicerUSSim.Workstation.tasks import Tasks
 
+_log = logging.getLogger(__name__)
+
+#: Number of messages; more would cover the page.
+_MOST = 5
 #: End of the presenter's messages about the frame rate, and the least time between two of them on a page.
 _RATE, _STATUS_EVERY_S = "images per second", 1.0
 #: The class of all markups, of which there is no node itself
 _MARKUPS = "vtkMRMLMarkupsNode"
 #: Maximum number of points of the cost curve on the page.
 _CURVE_POINTS = 150
-
-
 _CLICK = "click in the lesion, in a slice view (Escape: not)"
+
+
+class Observed:
+    """Observes the node that currently has a role.
+
+    Parameters
+    ----------
+    event : name of an event of that node, such as "TransformModifiedEvent".
+    method : called on this event.
+    """
+
+    def __init__(self, event: str, method: Callable[[], None]) -> None:
+        self._event, self._method = event, method
+        self._node: Any = None
+        self._tag = 0
+
+    def watch(self, node: Any) -> bool:
+        """Observe this node from now on, or none; whether it is another one than before."""
+        if node is self._node:
+            return False
+        if self._node is not None:
+            self._node.RemoveObserver(self._tag)
+        self._node = node
+        if node is not None:
+            event = getattr(node, self._event, self._event)  # VTK takes its own events by name, MRML's by number
+            self._tag = node.AddObserver(event, lambda *_: self._method())
+        return True
 
 
 @dataclass(eq=False)
@@ -51,27 +86,17 @@ class BrowserPanel:
     Parameters
     ----------
     tasks : runs functions that may wait for computations.
-    sections : of the panel.
     about_to_compute : called before a live image is computed, in the event loop.
     """
 
     def __init__(
-        self,
-        shared: SharedState,
-        messages: Messages,
-        logic: UltrasoundSceneLogic,
-        tasks: Tasks,
-        sections: tuple[Section, ...],
-        about_to_compute: Callable[[], None],
+        self, shared: SharedState, logic: UltrasoundSceneLogic, tasks: Tasks, about_to_compute: Callable[[], None]
     ) -> None:
-        self._shared, self._messages, self._logic, self._tasks = shared, messages, logic, tasks
+        self.shared, self.logic, self.tasks = shared, logic, tasks
         self._about_to_compute = about_to_compute
-        self._controls = by_widget(sections)
         self._thread = threading.get_ident()
         #: Calls a function with the point (3,), in the world, of the next click in a slice view, or None
         self.pick: Callable[[Callable[[np.ndarray | None], None]], None] = lambda clicked: None
-        #: Called after every change, such as when live images have ended, or begun to wait for other work
-        self.refreshed: Callable[[], None] = lambda: None
         #: The work under way: its title, whether it is cancelled, and the task that does it. The last is shown
         self._under_way: list[_Work] = []
         self._status, self._status_until = "", 0.0
@@ -80,15 +105,23 @@ class BrowserPanel:
         self.presenter = PanelPresenter(
             logic, self, handles=False, label_maps=True
         )  # label maps: filled ten times as fast as segmentations, and usable as overlays of the slice views
+        self.sections = panel_sections(self.presenter)
+        self._controls = by_widget(self.sections)
+        #: Actions of the page in place of those of buttons
+        self.own_actions: dict[Callable[..., object] | None, Callable[[], object]] = {
+            self.presenter.tissues.assignTissue: self._assign_tissue
+        }
         with shared.changing() as now:
-            now.open_sections = [section.title for section in sections if section.is_open]
+            now.open_sections = [section.title for section in self.sections if section.is_open]
             now.panel.choices = {name: list(control.choices) for name, control in self._controls.items()}
-            now.panel.values = {name: next(iter(control.choices), None) for name, control in self._controls.items()}
+        shared.show_values({name: next(iter(control.choices), None) for name, control in self._controls.items()})
 
     # ---- PanelView ---------------------------------------------------------------------------------------------
 
     def showError(self, message: str) -> None:
-        self._messages.show(message)
+        _log.warning("%s", message)
+        with self.shared.changing() as now:
+            now.messages.errors = [*now.messages.errors, message][-_MOST:]
 
     def showStatus(self, message: str) -> None:
         # The frame rate is reported with every image, which is too often for updates of the page.
@@ -102,7 +135,7 @@ class BrowserPanel:
             self._about_to_compute()
             function()
 
-        self._tasks.start(run)
+        self.tasks.start(run)
 
     def sliceNode(self) -> None:
         """None: anatomy.py aligns the slice views with the probe."""
@@ -116,7 +149,7 @@ class BrowserPanel:
             if point_world is None:
                 return
             points_node.AddControlPointWorld(*point_world.tolist())
-            self._tasks.start(picked)
+            self.tasks.start(picked)
 
         self.pick(clicked)
         self.showStatus(_CLICK)
@@ -125,23 +158,34 @@ class BrowserPanel:
         """Draw the costs in the table of a chart, and update the curve when the table changes."""
         self._table = chart_node.GetNthPlotSeriesNode(0).GetTableNode()
         self._costs.watch(self._table)
-        with self._shared.changing() as now:
+        with self.shared.changing() as now:
             now.fit.curve, now.fit.costs = [], ""
 
-    def refresh(self) -> None:
-        presenter = self.presenter
-        can = {name: usable(presenter, control) for name, control in self._controls.items() if control.enabled}
-        with self._shared.changing() as now:
+    def refresh(self, changed: Collection[str] | None = None) -> None:
+        stale = {name: control for name, control in self._controls.items() if control.depends_on(changed)}
+        can = {name: control.usable() for name, control in stale.items() if control.enabled}
+        nodes = {name: self._nodes_for(control) for name, control in stale.items() if control.node}
+        shown = {name for name, control in stale.items() if control.value or control.node or control.shows}
+        self.shared.show_values({name: self._shown_value(stale[name]) for name in shown})
+        with self.shared.changing() as now:
             panel = now.panel
-            panel.values = {**panel.values, **self._shown_values()}
-            panel.nodes = {
-                name: self._nodes_for(control) for name, control in self._controls.items() if control.kind == "node"
-            }
-            panel.tissues = [_line(row) for row in presenter.tissues()]
-            panel.can = {name: is_usable for name, (is_usable, _) in can.items()}
-            panel.tips = {name: tip for name, (_, tip) in can.items()}
-            now.fit.free = [FreeParameter(name, on) for name, on in presenter.fits.freeParameters()]
-        self.refreshed()
+            if nodes or can:
+                panel.nodes = {**panel.nodes, **nodes}
+                panel.can = {**panel.can, **{name: is_usable for name, (is_usable, _) in can.items()}}
+                panel.tips = {**panel.tips, **{name: tip for name, (_, tip) in can.items()}}
+            if any(control.kind == "table" for control in stale.values()):
+                panel.tissues = [_line(row) for row in self.presenter.tissues.rows()]
+            if any(control.kind == "list" for control in stale.values()):
+                now.fit.free = [FreeParameter(name, on) for name, on in self.presenter.fits.freeParameters()]
+            length = count_taken(self.logic.parameters.image_sequence)
+            if now.simulated.length != length:
+                now.simulated.length, now.simulated.number = length, 0
+        self.tellFrozen()
+
+    def tellFrozen(self) -> None:
+        """Mark an image that does not follow the probe, since live images ended or wait for other work."""
+        with self.shared.changing() as now:
+            now.is_frozen = self.logic.taken is not None and (not self.logic.isLive or self.presenter.isBusy)
 
     @contextmanager
     def progress(self, title: str) -> Iterator[Callable[[float], None]]:
@@ -163,26 +207,48 @@ class BrowserPanel:
             self._under_way.remove(work)
             self._show_work()
 
+    def clearErrors(self) -> None:
+        """Remove all errors, which are about another patient than the one that is opened now."""
+        with self.shared.changing() as now:
+            now.messages.errors = []
+
+    def failed(self, error: Exception) -> None:
+        """Show an exception that a task did not catch; an internal error is also logged with its traceback."""
+        message = user_message(error)
+        if message is None:
+            _log.error("a mistake of the program", exc_info=error)
+            message = f"something went wrong ({type(error).__name__}: {error})"
+        self.showError(message)
+
     # ---- triggers of the page ----------------------------------------------------------------------------------
+
+    def dismiss(self, number: int) -> None:
+        """Remove an error that the user has closed."""
+        with self.shared.changing() as now:
+            now.messages.errors = [message for n, message in enumerate(now.messages.errors) if n != number]
 
     def cancel(self) -> None:
         """Stop the work under way, within a second."""
         if self._under_way:
             work = self._under_way[-1]
             work.is_cancelled.set()
-            self._tasks.abandonSoon(work.task, lambda: work in self._under_way, self._logic.renewSimulator)
+            self.tasks.abandonSoon(work.task, lambda: work in self._under_way, self.logic.renewSimulator)
 
     def set(self, name: str, value: Any) -> None:
         """Called when the user changes the value of a control."""
         control = self._controls[name]
-        if control.value or control.node or control.action:
-            self._tasks.start(lambda: self._changed(control, value))
+        if control.value or control.node or control.sets:
+            self.tasks.start(lambda: self._changed(control, value))
         else:
-            with self._shared.changing() as now:  # used when a button is pressed
-                now.panel.values = {**now.panel.values, name: value}
+            self.shared.show_values({name: value})  # used when a button is pressed
+
+    def press(self, name: str) -> None:
+        """Called when the user presses a button."""
+        action = self._controls[name].action
+        self.tasks.start(self.own_actions.get(action) or required(action, f"{name} is no button"))
 
     def _changed(self, control: Control, value: Any) -> None:
-        presenter, parameters = self.presenter, self._logic.parameters
+        presenter, parameters = self.presenter, self.logic.parameters
         none_at = control.range.none_at
         if control.kind == "number" and none_at is not None:
             if value is None:  # an empty field
@@ -193,13 +259,13 @@ class BrowserPanel:
         if value == self._shown_value(control):
             return
         if control.value:
-            presenter.setValue(control.value, value)
+            presenter.values.setValue(control.value, value)
         elif control.node:
             with presenter.shown():
-                setattr(parameters, control.node, self._logic.scene.GetNodeByID(value) if value else None)
-        else:
-            part_of(presenter, control.action)(value)
-        self.refresh()
+                setattr(parameters, control.node, self.logic.scene.GetNodeByID(value) if value else None)
+        elif control.sets:
+            control.sets(value)
+        self.refresh(presenter.values.changes())
 
     def _refuse(self, control: Control, value: float) -> None:
         """Say that a number is out of the range of its parameter."""
@@ -211,31 +277,30 @@ class BrowserPanel:
                 f"{declared.name} is {whole}, expected more than {control.range.none_at:g}, or nothing"
             )
 
-    # ---- helpers -----------------------------------------------------------------------------------------------
+    def _assign_tissue(self) -> None:
+        tissue = self.shared.now.panel.chosen_tissue
+        with self.presenter.shown():
+            require(bool(tissue), "no tissue chosen, click on its line in the table")
+            self.presenter.tissues.assignTissue(tissue, str(self.shared.value("tissuePresetComboBox")))
 
-    def _shown_values(self) -> dict[str, object]:
-        return {
-            name: self._shown_value(control)
-            for name, control in self._controls.items()
-            if control.value or control.node or control.shows
-        }
+    # ---- helpers -----------------------------------------------------------------------------------------------
 
     def _shown_value(self, control: Control) -> object:
         if control.value:
-            return self.presenter.value(control.value)
+            return self.presenter.values.value(control.value)
         if control.node:
-            node = getattr(self._logic.parameters, control.node)
+            node = getattr(self.logic.parameters, control.node)
             return None if node is None else node.GetID()
-        return shown_by(self.presenter, control.shows)
+        return None if control.shows is None else control.shows()
 
     def _nodes_for(self, control: Control) -> list[NodeItem]:
-        scene = self._logic.scene
+        scene = self.logic.scene
         found = [
             node
             for name in control.node_classes
             for node in nodes_of_class(scene, name)
             # A label map is a volume, too, and is chosen elsewhere; of markups there is no node but of its kinds
-            if name in (node.GetClassName(), _MARKUPS) and offered(control.node, node, self._logic.parameters)
+            if name in (node.GetClassName(), _MARKUPS) and offered(control.node, node, self.logic.parameters)
         ]
         return [NodeItem("None", None), *(NodeItem(node.GetName(), node.GetID()) for node in found)]
 
@@ -247,18 +312,18 @@ class BrowserPanel:
         evaluations, best = (np.asarray(memoryview(columns[n])) for n in (0, 2))
         best = np.minimum.accumulate(best)  # restarts, which measure identifiability, begin with high costs
         chosen = np.unique(np.linspace(0, len(best) - 1, _CURVE_POINTS).round().astype(int))
-        with self._shared.changing() as now:
+        with self.shared.changing() as now:
             curve = now.fit.curve = best[chosen].round(5).tolist()
             # Of the rounded numbers: rounding 0.23449998 at once gives 0.234, rounding it twice 0.235
             now.fit.costs = f"cost {curve[0]:.3f} → {curve[-1]:.3f} after {evaluations[-1]:.0f} evaluations"
 
     def _send_status(self, message: str) -> None:
-        with self._shared.changing() as now:
+        with self.shared.changing() as now:
             now.messages.status = message
 
     def _show_work(self) -> None:
         work = self._under_way[-1] if self._under_way else None
-        with self._shared.changing() as now:
+        with self.shared.changing() as now:
             now.messages.progress_title = "" if work is None else work.title
             now.messages.progress_percent = 0 if work is None else work.percent
 
@@ -266,7 +331,7 @@ class BrowserPanel:
         if threading.get_ident() == self._thread:
             function()
         else:
-            self._tasks.tell(function)
+            self.tasks.tell(function)
 
 
 def _line(row: TissueRow) -> TissueLine:

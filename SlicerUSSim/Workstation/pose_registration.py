@@ -14,18 +14,16 @@ import numpy as np
 from SlicerUSSim.Logic.base.errors import SimulationError, require, required
 from SlicerUSSim.Logic.base.transforms import check_affine, check_rigid
 from SlicerUSSim.Logic.mrml.landmark_nodes import Landmark, write_landmarks
-from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic
 from SlicerUSSim.Logic.mrml.nodes import display_of
 from SlicerUSSim.Logic.mrml.scene_record import SequenceRecord
 from SlicerUSSim.Logic.mrml.sequence_nodes import MADE_FROM, POSES
 from SlicerUSSim.Logic.tracked.pose_files import fit_landmarks, read_calibration, read_registration
 from SlicerUSSim.Logic.tracked.sequence import TrackedSequence
-from SlicerUSSim.Widget.presenter import PanelPresenter
+from SlicerUSSim.Workstation.browser_panel import BrowserPanel
 from SlicerUSSim.Workstation.comparison import Comparison
 from SlicerUSSim.Workstation.hand import ProbeHand
 from SlicerUSSim.Workstation.opener import Opener
-from SlicerUSSim.Workstation.state import ComparisonMode, LandmarkLine, SharedState
-from SlicerUSSim.Workstation.tasks import Tasks
+from SlicerUSSim.Workstation.state import ComparisonMode, LandmarkLine
 
 _IMAGE, _REFERENCE = "Image", "Reference"
 _CALIBRATION, _REGISTRATION = "Calibration", "Registration"
@@ -64,18 +62,9 @@ class Recording:
 class Registration:
     """The tracked ultrasound of the page. Methods that change it run in a task."""
 
-    def __init__(
-        self,
-        shared: SharedState,
-        logic: UltrasoundSceneLogic,
-        tasks: Tasks,
-        opener: Opener,
-        presenter: PanelPresenter,
-        comparison: Comparison,
-        hand: ProbeHand,
-    ) -> None:
-        self._shared, self._logic, self._tasks = shared, logic, tasks
-        self._opener, self._presenter, self._comparison, self._hand = opener, presenter, comparison, hand
+    def __init__(self, panel: BrowserPanel, opener: Opener, comparison: Comparison, hand: ProbeHand) -> None:
+        self._shared, self._logic, self._tasks = panel.shared, panel.logic, panel.tasks
+        self._presenter, self._opener, self._comparison, self._hand = panel.presenter, opener, comparison, hand
         self.recording: Recording | None = None
         self._calibration: dict[str, np.ndarray] = {}
         self._to_ras = np.eye(4)

@@ -1,0 +1,159 @@
+"""SequenceLogic: sequences of images, and images of before that are shown again."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Hashable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+
+import numpy as np
+
+from SlicerUSSim.Logic.base.errors import require, required, warn_again
+from SlicerUSSim.Logic.base.transforms import check_rigid
+from SlicerUSSim.Logic.mrml.image_logic import ImageLogic
+from SlicerUSSim.Logic.mrml.live import LiveLogic
+from SlicerUSSim.Logic.mrml.nodes import named, node_to_world, require_node
+from SlicerUSSim.Logic.mrml.own_results import require_result
+from SlicerUSSim.Logic.mrml.patient_logic import PatientLogic
+from SlicerUSSim.Logic.mrml.sequence_nodes import SequenceIndex
+from SlicerUSSim.Logic.mrml.taken_image import TakenImage, follow, freeze, write_image
+from SlicerUSSim.Logic.mrml.taken_sequence import FrozenRecord, read_taken, taken_of, write_taken
+
+
+class SequenceLogic:
+    """Images of many poses, and whether they are of the patient as it is now."""
+
+    def __init__(self, patient: PatientLogic, images: ImageLogic, live: LiveLogic) -> None:
+        self._patient, self._images, self._live = patient, images, live
+        self.forget()
+
+    def forget(self) -> None:
+        """Release what is kept in memory of the last patient."""
+        #: ID of the last simulated sequence, and what its images show of the patient
+        self._last: tuple[str, Hashable] = ("", None)
+
+    def simulateSequence(
+        self, labels_node, transforms_node, images_node, *, browser_node=None,
+        progress: Callable[[float], None] | None = None,
+    ) -> int:  # fmt: skip
+        """A sequence of simulated images from a vtkMRMLSequenceNode of linear transforms; returns how many.
+
+        Images are in the probe frame with the transforms' index values; SequenceIndex changes values that a sequence
+        node cannot distinguish, so that no image is lost. Their numbers are the seeds of their noise. With the browser
+        of the transforms, the parents of its current transform are applied, and the images are added to it, under that
+        transform. `progress` is called with the fraction done and may raise errors.Cancelled; `images_node` is then
+        unchanged. Raises SimulationError for an `images_node` with data that this module did not make.
+        """
+        require_node(transforms_node, "vtkMRMLSequenceNode", use="sequence of transforms")
+        require_node(images_node, "vtkMRMLSequenceNode", use="sequence of images")
+        require(
+            images_node is not transforms_node,
+            f"input and output are both {named(images_node)}, expected different nodes",
+        )
+        require_result(images_node, "sequence of images")
+        count = transforms_node.GetNumberOfDataNodes()
+        require(count > 0, f"sequence {named(transforms_node)} is empty, expected transforms")
+        proxy = None if browser_node is None else browser_node.GetProxyNode(transforms_node)
+        parent = None if proxy is None else proxy.GetParentTransformNode()
+        to_world = np.eye(4) if parent is None else node_to_world(parent)
+
+        images: list[TakenImage] = []
+        for number in range(count):
+            item = transforms_node.GetNthDataNode(number)
+            require_node(item, "vtkMRMLTransformNode", use=f"item {number} of {named(transforms_node)}")
+            pose = check_rigid(f"item {number} of {named(transforms_node)}", to_world @ node_to_world(item))
+            image = self._patient.scene.CreateNodeByClass("vtkMRMLScalarVolumeNode")
+            image.UnRegister(None)
+            taken = self._images.take(labels_node, pose, image, warn_again, number)
+            write_image(taken)  # the browser's node for the shown image is a copy of it
+            images.append(replace(taken, frame=None))  # whose signals are many times larger
+            if progress is not None:
+                progress((number + 1) / count)
+        require_node(images_node, "vtkMRMLSequenceNode", use="sequence of images")
+
+        write_taken(images_node, SequenceIndex.of_node(transforms_node), images)
+        same = {image.anatomy for image in images}
+        self._last = (images_node.GetID(), images[0].anatomy if len(same) == 1 else None)
+        if browser_node is not None:
+            if not browser_node.IsSynchronizedSequenceNode(images_node, True):
+                browser_node.AddSynchronizedSequenceNode(images_node)
+            shown = browser_node.GetProxyNode(images_node)
+            if shown is not None and proxy is not None:
+                shown.SetAndObserveTransformNodeID(proxy.GetID())
+        return count
+
+    def sequenceImage(self, images_node, number: int) -> TakenImage:
+        """The image with a number, from 0, that simulateSequence made, with all that it is of.
+
+        Raises SimulationError for a sequence of something else.
+        """
+        require_node(images_node, "vtkMRMLSequenceNode", use="sequence of images")
+        node_id, anatomy = self._last
+        return read_taken(images_node, number, anatomy if node_id == images_node.GetID() else None)
+
+    def showSequenceImage(self, images_node, number: int, output_node) -> TakenImage:
+        """Write an image that simulateSequence made into a scalar volume node, where it was taken; it stays there.
+
+        Ends live update, whose next image would take its place. Raises SimulationError for an output with data that
+        this module did not make.
+        """
+        return self._show_frozen(lambda: self.sequenceImage(images_node, number), output_node)
+
+    def showFrozen(self, record: FrozenRecord, output_node) -> TakenImage:
+        """Write an image of a scene that was saved into a scalar volume node, where it was taken; it stays there.
+
+        The chosen labels and sheets are those of the scene, if the record is of them. Ends live update.
+        Raises SimulationError for a damaged record, and for an output that this module did not make.
+        """
+        labels = self._patient.parameters.labels if record.is_of_tissues else None
+        anatomy = None if labels is None else self._patient.anatomyOf(labels)
+        return self._show_frozen(lambda: replace(taken_of(record, output_node), anatomy=anatomy), output_node)
+
+    def _show_frozen(self, read: Callable[[], TakenImage], output_node) -> TakenImage:
+        require_node(output_node, "vtkMRMLScalarVolumeNode", use="output")
+        require_result(output_node, "output")
+        taken = replace(read(), node=output_node)
+        self._live.stopLiveUpdate()
+        self._images.taken = taken
+        was_modifying = output_node.StartModify()
+        write_image(taken)
+        freeze(taken)
+        output_node.EndModify(was_modifying)
+        return taken
+
+    @contextmanager
+    def imageHeld(self) -> Iterator[None]:
+        """While a scene is saved: as if Live ended, so that the image is where it was taken; it goes on after that.
+
+        The scene says that the image is live. Saving lays the segments of tissues together into one label map. The
+        images are of them as before.
+        """
+        parameters = self._patient.parameters
+        taken, labels, images = self._images.taken, parameters.labels, parameters.image_sequence
+        is_of_tissues, are_of_tissues = self.areOfTissues()
+        transform = taken.node.GetParentTransformNode() if taken is not None and self._live.isLive else None
+        if taken is not None and transform is not None:
+            freeze(taken, while_saved=True)
+        try:
+            yield
+        finally:
+            if taken is not None and transform is not None:
+                follow(taken, transform)
+            if taken is not None and is_of_tissues:
+                self._images.taken = replace(taken, anatomy=self._patient.anatomyOf(labels))
+            if are_of_tissues:
+                self.sequenceIsOfTissues(images)
+
+    def areOfTissues(self) -> tuple[bool, bool]:
+        """(whether the last image, whether those of the chosen sequence) show labels and sheets as they are now."""
+        labels, images = self._patient.parameters.labels, self._patient.parameters.image_sequence
+        if labels is None:
+            return False, False
+        now, (node_id, in_sequence) = self._patient.anatomyOf(labels), self._last
+        taken, is_known = self._images.taken, images is not None and images.GetID() == node_id
+        return taken is not None and taken.anatomy == now, is_known and in_sequence == now
+
+    def sequenceIsOfTissues(self, images_node) -> None:
+        """Take the images of a sequence for those of the chosen labels and sheets, with which it was restored."""
+        labels = required(self._patient.parameters.labels, "no label map is chosen, expected that of the images")
+        self._last = images_node.GetID(), self._patient.anatomyOf(labels)

@@ -1,0 +1,142 @@
+"""ImagePresenter: single images, live images, and those of a recorded sequence of poses, without Qt."""
+
+from __future__ import annotations
+
+from time import perf_counter
+from typing import Any
+
+from SlicerUSSim.Logic.base.errors import require
+from SlicerUSSim.Logic.mrml.nodes import nodes_of_class
+from SlicerUSSim.Logic.mrml.parameter_node import SceneParameters
+from SlicerUSSim.Logic.mrml.sequence_nodes import MADE_FROM
+from SlicerUSSim.Logic.mrml.taken_sequence import FrozenRecord
+from SlicerUSSim.Widget.interface import PanelHost
+from SlicerUSSim.Widget.notes import Notes
+from SlicerUSSim.Widget.placement_presenter import PlacementPresenter
+
+#: What is said of an image that does not follow the probe any more
+FROZEN = "FROZEN"
+
+
+class ImagePresenter:
+    """Simulates images into the chosen nodes, or into new ones."""
+
+    def __init__(self, panel: PanelHost, notes: Notes, placing: PlacementPresenter) -> None:
+        self._panel, self._notes, self._placing = panel, notes, placing
+        self._last_image: float | None = None
+        self._followed: tuple = ()  # the nodes of the live update
+
+    def simulate(self) -> None:
+        """Simulate one image, into the chosen volume or a new one."""
+        logic, view = self._panel.logic, self._panel.view
+        with self._panel.acting():
+            nodes = self._nodes()
+            start = perf_counter()
+            caught: list[Warning] = []
+            logic.simulate(nodes.labels, nodes.probe_transform, nodes.output, warned=caught.append)
+            self._notes.recognise(nodes.labels)
+            view.showStatus("; ".join(map(str, caught)) or f"{(perf_counter() - start) * 1e3:.0f} ms")
+            logic.showOutline(nodes.outline, nodes.probe_transform)
+            if view.sliceNode() is not None:
+                logic.showInSlice(view.sliceNode(), nodes.output, nodes.probe_transform)
+            if not logic.isLive:
+                logic.holdImage(nodes.output)
+
+    def showFrozen(self, record: FrozenRecord) -> None:
+        """Show the image of a scene that was saved, which stays where it was taken."""
+        with self._panel.shown():
+            self._panel.logic.showFrozen(record, self._nodes().output)
+            self._stopped()
+
+    # ---- live images -------------------------------------------------------------------------------------------
+
+    def isLive(self) -> bool:
+        """Whether live images are on."""
+        return self._panel.logic.isLive
+
+    def setLive(self, on: bool) -> None:
+        """Start or stop live update."""
+        logic = self._panel.logic
+        if on == logic.isLive:
+            return
+        if not on:
+            logic.stopLiveUpdate()
+            return
+        with self._panel.acting():
+            self._nodes()
+            self._last_image = None
+            self._followed = self._live_nodes()
+            logic.startLiveUpdate(
+                *self._followed, schedule=self._panel.view.schedule, report=self._reported, stopped=self._stopped
+            )
+            self._notes.recognise(self._panel.parameters.labels)
+
+    def followChoices(self) -> None:
+        """Begin live update anew if other nodes or another slice view were chosen."""
+        if self._panel.logic.isLive and self._live_nodes() != self._followed:
+            self._panel.logic.stopLiveUpdate()
+            self.setLive(True)
+
+    def _live_nodes(self) -> tuple:
+        nodes = self._panel.parameters
+        return nodes.labels, nodes.probe_transform, nodes.output, nodes.outline, self._panel.view.sliceNode()
+
+    def _reported(self, message: str) -> None:
+        now = perf_counter()
+        if not message and self._last_image is not None and now - self._last_image < 1.0:
+            message = f"{1.0 / max(now - self._last_image, 1e-3):.0f} images per second"
+        self._panel.view.showStatus(message)
+        self._last_image = now
+        if self._notes.probeSaysOther():
+            self._panel.view.refresh()
+
+    def _stopped(self) -> None:
+        taken = self._panel.logic.taken
+        self._panel.view.showStatus("" if taken is None else f"{FROZEN}: {taken.patient}, {taken.time[11:19]} UTC")
+        self._panel.view.refresh()
+
+    # ---- sequence ----------------------------------------------------------------------------------------------
+
+    def simulateSequence(self) -> None:
+        """Simulate an image for each transform of the chosen sequence; its sequence browser plays both."""
+        panel, parameters = self._panel, self._panel.parameters
+        transforms_node: Any = parameters.transform_sequence
+        images_node: Any = parameters.image_sequence
+        with panel.acting(), panel.working("Simulate sequence") as progress:
+            require(transforms_node is not None, "no sequence of transforms chosen, expected a Sequence node")
+            own = (None, transforms_node.GetID())
+            if images_node is not None and images_node.GetNodeReferenceID(MADE_FROM) not in own:
+                images_node = None  # those of other transforms stay
+            with panel.made(images_node, "Sequence", f"{transforms_node.GetName()} ultrasound") as images:
+                browser = self._browser_of(transforms_node)
+                count = panel.logic.simulateSequence(
+                    parameters.labels, transforms_node, images, browser_node=browser, progress=progress
+                )
+            images.SetNodeReferenceID(MADE_FROM, transforms_node.GetID())
+            parameters.image_sequence = images  # in place of which the next ones come
+            panel.view.showStatus(f"{count} images in {images.GetName()!r}")
+
+    def _browser_of(self, sequence_node: Any) -> Any:
+        browsers = nodes_of_class(self._panel.logic.scene, "vtkMRMLSequenceBrowserNode")
+        return next((node for node in browsers if node.IsSynchronizedSequenceNode(sequence_node, True)), None)
+
+    # ---- nodes -------------------------------------------------------------------------------------------------
+
+    def _nodes(self) -> SceneParameters:
+        """The parameters, with the nodes that simulation needs; nodes that are not selected are created."""
+        parameters = self._panel.parameters
+        require(parameters.labels is not None, "no label map chosen; segment the MRI first")
+        if parameters.probe_transform is None:
+            self._placing.put()
+        parameters.output = self._own(parameters.output, "ScalarVolume", "Ultrasound")
+        parameters.outline = self._own(parameters.outline, "Model", "Ultrasound outline")
+        return parameters
+
+    def _own(self, chosen: Any, kind: str, name: str) -> Any:
+        """The chosen node, or a new one if none is chosen or it has data of others, which the notes say."""
+        if chosen is not None and self._panel.logic.mayReplaceResult(chosen):
+            return chosen
+        node = self._panel.add(kind, name)
+        if chosen is not None:
+            self._notes.add(f"{chosen.GetName()!r} has data of others and is kept; the result is {node.GetName()!r}")
+        return node
