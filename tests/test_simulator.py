@@ -13,7 +13,6 @@ from scipy.spatial.transform import Rotation
 
 from SlicerUSSim.Logic import (
     ConvexProbe,
-    DisplaySettings,
     LinearProbe,
     Membrane,
     PhasedProbe,
@@ -31,7 +30,7 @@ from SlicerUSSim.Logic.opencl.layout import CONSTANTS
 from SlicerUSSim.Logic.tissue import read_label_map
 from SlicerUSSim.Logic.tissue.presets import TISSUES
 from SlicerUSSim.Logic.tissue.table import MAX_LABEL
-from tests.conftest import FLUID, SPECKLE, block, rigid, simulator
+from tests.conftest import FLUID, SPECKLE, block, even_display, rigid, simulator
 from validation.checks import ORIENTATIONS
 from validation.measurement import level_db
 from validation.phantoms import band_power
@@ -41,7 +40,7 @@ PROBES = {
     "convex": ConvexProbe(40, 60, 50, scan_lines=161),
     "phased": PhasedProbe(75, 50, scan_lines=161),
 }
-QUIET = DisplaySettings(tgc_db_cm_mhz=0.0, noise_db=None)
+QUIET = even_display(tgc_db_cm_mhz=0.0, noise_db=None)
 
 
 @pytest.fixture(scope="module")
@@ -95,7 +94,7 @@ def test_outside_the_field_the_image_is_black(solid, kind):
 @settings(max_examples=4)
 def test_the_image_has_the_size_asked_for_and_holds_the_field(solid, rows, columns):
     probe = PROBES["convex"]
-    frame = solid.simulate(probe, rigid(np.eye(3), [0, -25, 0]), DisplaySettings(image_size=(rows, columns)))
+    frame = solid.simulate(probe, rigid(np.eye(3), [0, -25, 0]), even_display(image_size=(rows, columns)))
     assert frame.image.shape == (rows, columns)
     left, right, top, bottom = probe.image_bounds_mm()
     assert frame.pixel_spacing_mm == pytest.approx(((right - left) / columns, (bottom - top) / rows))
@@ -105,7 +104,7 @@ def test_tgc_undoes_the_attenuation_it_is_set_to():
     lossy = replace(SPECKLE, attenuation_db_cm_mhz=0.5)
     sim = simulator(block(lambda x, y, z: np.ones_like(x)), lossy)
     frame = sim.simulate(
-        PROBES["linear"], rigid(np.eye(3), [0, -25, 0]), DisplaySettings(tgc_db_cm_mhz=0.5, noise_db=None)
+        PROBES["linear"], rigid(np.eye(3), [0, -25, 0]), even_display(tgc_db_cm_mhz=0.5, noise_db=None)
     )
     dz = frame.sample_interval_mm
     raw = [level_db(frame.iq[:, int(d / dz) : int((d + 8) / dz)]) for d in (5, 37)]
@@ -118,7 +117,7 @@ def test_tgc_undoes_the_attenuation_it_is_set_to():
 def test_tgc_rises_down_to_its_reach_and_stays_there(solid, reach):
     """Of a band of 5 MHz about its centre, each frequency by itself (tests/test_band.py has wider ones)."""
     pose, probe = rigid(np.eye(3), [0, -25, 0]), PROBES["linear"]
-    display = DisplaySettings(tgc_db_cm_mhz=0.5, tgc_reach=reach, noise_db=None)
+    display = even_display(tgc_db_cm_mhz=0.5, tgc_reach=reach, noise_db=None)
     raised, plain = (solid.simulate(probe, pose, shown) for shown in (display, replace(display, tgc_db_cm_mhz=0.0)))
     decibels = 20 * np.log10((raised.envelope / plain.envelope).mean(axis=0))
     depth_cm = 0.1 * raised.sample_interval_mm * np.arange(decibels.size)
@@ -141,7 +140,7 @@ def test_grey_levels_are_decibels_in_the_dynamic_range(solid):
 def test_noise_has_the_level_asked_for_and_is_seeded():
     empty = block(lambda x, y, z: np.ones_like(x))
     pose = rigid(np.eye(3), [0, -25, 0])
-    noisy = DisplaySettings(tgc_db_cm_mhz=0.0, noise_db=-40.0)
+    noisy = even_display(tgc_db_cm_mhz=0.0, noise_db=-40.0)
     frames = [simulator(empty, FLUID, seed=seed).simulate(PROBES["linear"], pose, noisy) for seed in (1, 1, 2)]
     assert level_db(frames[0].envelope) == pytest.approx(-40, abs=0.1)
     np.testing.assert_array_equal(frames[0].envelope, frames[1].envelope)
@@ -443,7 +442,7 @@ def test_a_change_gives_the_image_of_a_new_simulator():
     tables = [sim.medium.tissues, sim.medium.tissues.replace("louder", sigma0=0.4)]
     changes = [
         (tables[0], sim.settings, QUIET),
-        (tables[0], sim.settings, DisplaySettings(gain_db=-5, noise_db=-10)),
+        (tables[0], sim.settings, even_display(gain_db=-5, noise_db=-10)),
         (tables[1], sim.settings, QUIET),
         (tables[1], replace(sim.settings, seed=3), QUIET),
         (tables[1], replace(sim.settings, interfaces=False), QUIET),

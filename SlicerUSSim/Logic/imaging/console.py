@@ -170,9 +170,7 @@ def gains_along(display: DisplaySettings, probe: Probe, depth_mm: np.ndarray) ->
 
 
 def gains_across(display: DisplaySettings, probe: Probe, lines: int) -> np.ndarray:
-    """(lines,) float32 dB of the gain by line, from the first to the last, straight between five knots, and of the look.
-
-    """
+    """(lines,) float32 dB of the gain by line: the look's, and what is straight between five knots."""
     knots = [getattr(display, f"line_gain_{n}_db") for n in range(1, 6)]
     own = np.interp(np.linspace(0.0, 1.0, lines), np.linspace(0.0, 1.0, 5), knots)
     return (own + look_of(display, probe).across(lines)).astype(np.float32)

@@ -110,7 +110,10 @@ class Preset:
             sections["probe"] = probe_from_dict(values["probe"], f"{source}: probe")
         for name, kind in SECTIONS.items():
             if name in values:
-                sections[name] = built(kind, values[name], f"{source}: {name}")
+                given = values[name]
+                if name == "display" and isinstance(given, dict):  # those of older versions, without a look, were even
+                    given = {"look": "even", **given}
+                sections[name] = built(kind, given, f"{source}: {name}")
         if "tissues" in values or "membrane" in values:
             sections["tissues"] = TissueTable.from_dict(values, source)
         if values.get(_POSE) is not None:
