@@ -54,7 +54,7 @@ def _with_node(method):
 class SliderWidget(QtWidgets.QWidget):
     """ctkSliderWidget: a slider and a spin box side by side."""
 
-    valueChanged = QtCore.Signal(float)  # noqa: N815
+    valueChanged = QtCore.Signal(float)
 
     def __init__(self, parent=None) -> None:
         super().__init__(parent)
@@ -93,10 +93,8 @@ class SliderWidget(QtWidgets.QWidget):
     value = QtCore.Property(float, lambda self: self._box.value(), setValue)
     minimum = QtCore.Property(float, lambda self: self._box.minimum(), _set_minimum)
     maximum = QtCore.Property(float, lambda self: self._box.maximum(), _set_maximum)
-    singleStep = QtCore.Property(  # noqa: N815
-        float, lambda self: self._box.singleStep(), lambda self, v: self._box.setSingleStep(v)
-    )
-    pageStep = QtCore.Property(float, lambda self: 1.0, lambda self, v: None)  # noqa: N815
+    singleStep = QtCore.Property(float, lambda self: self._box.singleStep(), lambda self, v: self._box.setSingleStep(v))
+    pageStep = QtCore.Property(float, lambda self: 1.0, lambda self, v: None)
     decimals = QtCore.Property(int, lambda self: self._box.decimals(), lambda self, v: self._box.setDecimals(v))
     suffix = QtCore.Property(str, lambda self: self._box.suffix(), lambda self, v: self._box.setSuffix(v))
 
@@ -112,7 +110,7 @@ class NodeFilter(QtCore.QObject):
         self.hidden = list(ids)
         self._selector._fill()
 
-    hiddenNodeIDs = QtCore.Property("QStringList", lambda self: self.hidden, _hide)  # noqa: N815
+    hiddenNodeIDs = QtCore.Property("QStringList", lambda self: self.hidden, _hide)
 
 
 class NodeComboBox(QtWidgets.QComboBox):
@@ -122,7 +120,7 @@ class NodeComboBox(QtWidgets.QComboBox):
     the user had chosen it.
     """
 
-    currentNodeChanged = QtCore.Signal(object)  # noqa: N815
+    currentNodeChanged = QtCore.Signal(object)
 
     def __init__(self, parent=None) -> None:
         super().__init__(parent)
@@ -194,11 +192,11 @@ class NodeComboBox(QtWidgets.QComboBox):
             bool, lambda self: self._options.get(name, False), lambda self, v: self._options.__setitem__(name, v)
         )
 
-    nodeTypes = QtCore.Property("QStringList", lambda self: self._types, _set_types)  # noqa: N815
-    noneEnabled, addEnabled = _option("none"), _option("add")  # noqa: N815
-    removeEnabled, renameEnabled = _option("remove"), _option("rename")  # noqa: N815
-    showChildNodeTypes, selectNodeUponCreation = _option("child"), _option("select")  # noqa: N815
-    baseName = QtCore.Property(  # noqa: N815
+    nodeTypes = QtCore.Property("QStringList", lambda self: self._types, _set_types)
+    noneEnabled, addEnabled = _option("none"), _option("add")
+    removeEnabled, renameEnabled = _option("remove"), _option("rename")
+    showChildNodeTypes, selectNodeUponCreation = _option("child"), _option("select")
+    baseName = QtCore.Property(
         str, lambda self: self._options.get("base", ""), lambda self, v: self._options.__setitem__("base", v)
     )
 

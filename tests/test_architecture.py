@@ -43,8 +43,8 @@ HEAVY = {
 #: Lines of Python that a room, or a folder beside the product, may have. Raising one is a decision: the commit says
 #: what users get for it.
 BUDGETS = {
-    "base": 3800, "opencl": 1250, "probe": 1470, "tissue": 3780, "tracked": 2140, "mri": 11080, "placement": 830,
-    "imaging": 4740, "fitting": 4400, "vtk": 530, "mrml": 4505, "Widget": 2660, "Workstation": 7780, "Command": 3290,
+    "base": 3800, "opencl": 1250, "probe": 1470, "tissue": 3780, "tracked": 2140, "mri": 11090, "placement": 830,
+    "imaging": 4740, "fitting": 4410, "vtk": 530, "mrml": 4530, "Widget": 2660, "Workstation": 7780, "Command": 3290,
     "module": 370, "validation": 6000, "benchmarks": 3750, "tests": 32000, "tests/reference": 500,
 }  # fmt: skip
 #: Lines of all of SlicerUSSim/, and of kernels/

@@ -27,10 +27,17 @@ from SlicerUSSim.Logic.base.errors import Cancelled
 from SlicerUSSim.Logic.fitting.appearance import AppearanceModel
 from SlicerUSSim.Logic.fitting.identifiability import variance_db
 from SlicerUSSim.Logic.fitting.image_similarity import SimilaritySettings
-from SlicerUSSim.Logic.fitting.optimization import AGAIN, AppearanceCost, _identifiability, _restarted
+from SlicerUSSim.Logic.fitting.optimization import (
+    AGAIN,
+    FIRST_STEP,
+    AppearanceCost,
+    _identifiability,
+    _restarted,
+    patch_statistics,
+    search_axes,
+)
 from SlicerUSSim.Logic.fitting.parameters import FreeParameters
 from SlicerUSSim.Logic.fitting.search import Evaluation, Search
-from SlicerUSSim.Logic.fitting.sensitivity import FIRST_STEP, patch_statistics, search_axes
 from SlicerUSSim.Logic.mri.samples import head_mri
 from SlicerUSSim.Logic.probe import pose_looking_at
 from SlicerUSSim.Logic.probe.beam import FWHM_PER_SIGMA

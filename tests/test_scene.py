@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import inspect
 import json
 import weakref
 from dataclasses import replace
@@ -28,6 +29,7 @@ from SlicerUSSim.Logic import (  # noqa: E402
     UltrasoundSimulator,
     Volume,
     seed_of_pose,
+    segment_mri,
 )
 from SlicerUSSim.Logic.base.errors import Cancelled  # noqa: E402
 from SlicerUSSim.Logic.base.vtk_data import vtk_matrix  # noqa: E402
@@ -829,6 +831,17 @@ def test_parameters_have_the_form_of_slicers_parameter_node_wrapper(bench):
         parameters.bias_correction  # noqa: B018
     with pytest.raises(SimulationError, match=r"mri is a .*LinearTransformNode, expected vtkMRMLScalarVolumeNode"):
         parameters.mri = bench.probe
+
+
+def test_methods_of_the_logic_are_those_of_the_class_with_their_words():
+    assert "Label the tissues" in (UltrasoundSceneLogic.segment.__doc__ or "")
+    assert "mri_node" in inspect.signature(UltrasoundSceneLogic.segment).parameters
+
+
+@pytest.mark.parametrize("settings", ["t1", {"contrast": "t1"}])
+def test_settings_of_another_kind_are_refused(settings):
+    with pytest.raises(SimulationError, match=r"settings is .*, expected a SegmentationSettings"):
+        segment_mri(cyst(), settings)
 
 
 def test_a_changed_value_of_a_preset_is_one_changed_parameter(bench):

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-SentFiles = pytest.importorskip("SlicerUSSim.Workstation.sent_files").SentFiles
+SentFiles = pytest.importorskip("SlicerUSSim.Workstation.opener").SentFiles
 
 
 def bundled(sent, *names: str) -> dict[str, bytes]:

@@ -349,6 +349,29 @@ def test_a_moved_slider_reads_no_other_values(session, monkeypatch):
     assert session.ui.gainSlider.property("value") == 2.0 and set(read) == {"display.gain_db"}
 
 
+def test_the_tissue_table_follows_which_sheets_are_drawn(session):
+    from SlicerUSSim.Logic.mrml.sheet_nodes import write_sheets
+    from SlicerUSSim.Logic.tissue import Surfels
+
+    session.segmented()
+    sheets = session.add("Model", "sheets")
+    write_sheets(sheets, Surfels.of("falx", np.zeros((4, 3)), np.eye(3)[[0, 1, 2, 0]], 0.5, 0.7, 0.8), sheets)
+    session.parameters.sheets = sheets
+    session.process()
+    table = session.ui.tissueTable
+
+    def names():
+        return [
+            table.item(row, 0).text() for row in range(table.rowCount() if callable(table.rowCount) else table.rowCount)
+        ]
+
+    assert "falx" in names()
+    session.ui.sheetFalxCheckBox.setChecked(False)
+    assert "falx" not in names()
+    session.ui.sheetFalxCheckBox.setChecked(True)
+    assert "falx" in names()
+
+
 def test_a_wrong_value_in_a_scene_is_shown_and_can_be_mended(session):
     session.parameters.mri = session.head()
     session.parameters.node.SetParameter("contrast", "T3")

@@ -24,6 +24,8 @@ from SlicerUSSim.Widget.value_presenter import CUSTOM_PROBE, OPTIONAL, SCENE, SH
 
 #: Values of the probe that are adjusted while viewing the image; shown in Ultrasound.
 _CONSOLE = ("probe.depth_mm", "probe.frequency_mhz", "probe.focus_mm")
+#: What decides which sheets images show, whose tissue the tissues then have
+_DRAWN = tuple(f"{SCENE}.{name}" for name in SceneParameters.sheet.values)
 
 
 def panel_sections(panel: PanelPresenter) -> tuple[Section, ...]:
@@ -200,7 +202,7 @@ def _tissues(panel: PanelPresenter) -> tuple[Row, ...]:
         Control(
             "tissue", "table",
             tip=f"Acoustic and scatterer parameters of each tissue: {', '.join(columns)}; double-click to edit; "
-            "the tool tip of a value is its source", depends=("tissues",),
+            "the tool tip of a value is its source", depends=("tissues", *_DRAWN),
         ),
         (
             Control("tissuePreset", "choice", tip="Tissue to copy to the selected line", choices=tuple(TISSUES)),
@@ -235,7 +237,7 @@ def _fit(panel: PanelPresenter) -> tuple[Row, ...]:
         Control(
             "free", "list", "Free",
             "Parameters that the fit varies; its result marks those that the images do not determine",
-            depends=("tissues", "scene.fit_free"),
+            depends=("tissues", "scene.fit_free", *_DRAWN),
         ),
         (
             button(

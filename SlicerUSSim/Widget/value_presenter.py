@@ -80,7 +80,7 @@ class ValuePresenter:
         node, preset, before = self._panel.parameters.node, self._panel.preset, self._known
         nodes = (self._panel.logic.scene.GetNumberOfNodes(), *map(node.GetNodeReferenceID, NODE_PARAMETERS))
         self._known = {"nodes": nodes, "tissues": preset.tissues}
-        self._known |= {f"{SCENE}.{name}": node.GetParameter(name) for name in VALUE_PARAMETERS if name != "preset"}
+        self._known |= {f"{SCENE}.{name}": node.GetParameter(name) for name in VALUE_PARAMETERS}
         for name in preset_parameters():
             section, attribute = name.split(".")
             self._known[name] = getattr(getattr(preset, section), attribute, None)

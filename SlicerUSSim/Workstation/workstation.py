@@ -25,8 +25,7 @@ from SlicerUSSim.Workstation.browser_panel import BrowserPanel, Observed
 from SlicerUSSim.Workstation.comparison import Comparison
 from SlicerUSSim.Workstation.export import Cine, Exports
 from SlicerUSSim.Workstation.hand import KEYS
-from SlicerUSSim.Workstation.image_flow import ImageFlow
-from SlicerUSSim.Workstation.latency import LatencyStamps
+from SlicerUSSim.Workstation.image_flow import ImageFlow, LatencyStamps
 from SlicerUSSim.Workstation.loading import Loading
 from SlicerUSSim.Workstation.opener import Files, Opener
 from SlicerUSSim.Workstation.opening import Opening

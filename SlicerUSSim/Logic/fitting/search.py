@@ -117,7 +117,7 @@ class Search:
         algorithm, stage : nlopt's name, and that of the entries in the history.
         step : first step of local searches, of positions or along the axes.
         axes : (parameters, parameters), columns by which positions change per unit of the search's coordinates (see
-            sensitivity.py); default: the parameters themselves. Coordinates have no bounds: beyond those of the
+            optimization.py); default: the parameters themselves. Coordinates have no bounds: beyond those of the
             parameters the cost is that at the bound, and rises with the distance.
 
         Raises SimulationError for an algorithm that nlopt does not have or that cannot be used here.

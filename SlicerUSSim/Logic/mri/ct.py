@@ -122,7 +122,7 @@ def segment_ct(
     ('skin', 'fat', 'muscle', 'cancellous bone', 'bone')
     """
     require_kind("ct", ct, Volume, "Volume.read reads a file")
-    settings = (settings or SegmentationSettings()).changed(**values)
+    settings = SegmentationSettings.of(settings, **values)
     require_between("segmentation", "skin_mm", skin_mm, 0.0, 10.0)
     report = progress or (lambda share: None)
     timed, notes, warnings = StepTimes(), [], []

@@ -32,7 +32,7 @@ def segment_image(
     `values` change those of `settings`. Raises SimulationError as they do, for other images beside a CT, and for organs
     beside an MRI.
     """
-    settings = (settings or SegmentationSettings()).changed(**values)
+    settings = SegmentationSettings.of(settings, **values)
     if settings.contrast == CT:
         names = " and ".join(others or ())
         require(not others, f"{names} cannot be classified together with a CT, expected the CT alone")

@@ -157,15 +157,12 @@ def segment_mri(
     Parameters
     ----------
     mri : the image: a whole head, a skull-stripped brain, or any image with a `mask`.
-    settings : see below; single ones can be given by name: contrast="t2".
+    settings : or single ones by name, from `classes` on: contrast="t2".
     others : more volumes of the same patient by their contrast, on any grid. They are registered to `mri` rigidly and
         classified together with it; labels are then CSF, grey and white matter, and what enhances.
     mask : foreground on the same grid (non-zero is inside); default: found by `skull_strip`.
     keep_mask_at : file in which the mask of a whole head is kept, so that it is extracted once; see brain.find_brain.
     progress : called with the completed fraction, 0 to 1.
-
-    Settings
-    --------
     classes : number of tissues; default: 3, or 4 with contrast agent, whose fourth is what enhances.
     contrast : "t1", "t1gd", "t2" or "flair"; orders and names the classes.
     bias_correction : remove the bias field, with N4 (some seconds); default: where the image has one, with N4 only
@@ -190,7 +187,7 @@ def segment_mri(
     dtype('uint8')
     """
     require_kind("mri", mri, Volume, "Volume.read reads a file")
-    settings = (settings or SegmentationSettings()).changed(**values)
+    settings = SegmentationSettings.of(settings, **values)
     contrast = settings.contrast
     told = progress or (lambda share: None)
     begin = _SHARE_OF_BRAIN if mask is None else 0.0

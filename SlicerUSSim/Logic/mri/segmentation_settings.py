@@ -7,6 +7,7 @@ from dataclasses import asdict, dataclass, fields
 from typing import Any
 
 from SlicerUSSim.Logic.base.declaration import Declared, Shown, built, parameter
+from SlicerUSSim.Logic.base.errors import require_kind
 
 #: Contrasts of MRIs, which segment_mri has; and the name of a CT, which is segment_ct's
 MRI_CONTRASTS, CT = ("t1", "t1gd", "t2", "flair"), "ct"
@@ -54,9 +55,15 @@ class SegmentationSettings(Declared):
         bounds=(0, 1e30),
     )  # fmt: skip
 
-    def changed(self, **values: Any) -> SegmentationSettings:
-        """Settings with values changed by name. Raises SimulationError for an unknown name and an invalid value."""
-        return built(SegmentationSettings, {**asdict(self), **values}, "segmentation")
+    @classmethod
+    def of(cls, settings: SegmentationSettings | None, **values: Any) -> SegmentationSettings:
+        """Settings, by default the defaults, with values changed by name.
+
+        Raises SimulationError for what is no SegmentationSettings, an unknown name and an invalid value.
+        """
+        settings = cls() if settings is None else settings
+        require_kind("settings", settings, cls, 'or single values by name, such as contrast="t2"')
+        return built(cls, {**asdict(settings), **values}, "segmentation")
 
     def _owner(self) -> str:
         return "segmentation"

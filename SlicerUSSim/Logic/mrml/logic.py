@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any, Concatenate, Generic, ParamSpec, TypeVar, overload
+
 from SlicerUSSim.Logic.imaging.frame import Frame
 from SlicerUSSim.Logic.imaging.preset import Preset
 from SlicerUSSim.Logic.mrml.craniotomy_nodes import hide_flap
@@ -15,13 +18,32 @@ from SlicerUSSim.Logic.mrml.segment_logic import SegmentLogic
 from SlicerUSSim.Logic.mrml.sequence_logic import SequenceLogic
 from SlicerUSSim.Logic.mrml.taken_image import TakenImage
 
+P = ParamSpec("P")
+R = TypeVar("R")
+
+
+class _Of(Generic[P, R]):
+    """A method of a part as one of the class that has the part."""
+
+    def __init__(self, part: str, method: Callable[Concatenate[Any, P], R]) -> None:
+        self._part, self._method = part, method
+
+    @overload
+    def __get__(self, logic: None, owner: type) -> Callable[Concatenate[Any, P], R]: ...
+
+    @overload
+    def __get__(self, logic: UltrasoundSceneLogic, owner: type) -> Callable[P, R]: ...
+
+    def __get__(self, logic, owner):
+        return self._method if logic is None else getattr(getattr(logic, self._part), self._method.__name__)
+
 
 class UltrasoundSceneLogic:
     """Simulates on the nodes of one scene.
 
-    Every method is that of the part with its subject, which has its documentation. The choices (`preset`, and the nodes
-    of the module) are saved in the scene, see parameter_node. All methods raise SimulationError for a node that is
-    missing, empty, of the wrong kind or under a transform that is not linear.
+    Every method is that of the part with its subject. The choices (`preset`, and the nodes of the module) are saved in
+    the scene, see parameter_node. All methods raise SimulationError for a node that is missing, empty, of the wrong
+    kind or under a transform that is not linear.
 
     Parameters
     ----------
@@ -34,36 +56,35 @@ class UltrasoundSceneLogic:
         self.scene, self.device = scene, device
         self.patients = patients = PatientLogic(scene, device, work or AtOnce())
         self.images = images = ImageLogic(patients)
-        self.live = live = LiveLogic(patients, images)
-        self.labels = labels = SegmentLogic(patients, live)
-        self.sequences = sequences = SequenceLogic(patients, images, live)
-        self.fits = fits = FitLogic(patients)
+        self.live = LiveLogic(patients, images)
+        self.labels = SegmentLogic(patients, self.live)
+        self.sequences = SequenceLogic(patients, images, self.live)
+        self.fits = FitLogic(patients)
         self.parameters = patients.parameters
 
-        self.tissues, self.settings, self.recognised = patients.tissues, patients.settings, patients.recognised
-        self.anatomyOf, self.renewSimulator = patients.anatomyOf, patients.renewSimulator
-
-        self.segment, self.mayReplace, self.addTissues = labels.segment, labels.mayReplace, labels.addTissues
-        self.writeBrain, self.isOwnBrain, self.brainOf = labels.writeBrain, labels.isOwnBrain, labels.brainOf
-        self.openCraniotomy, self.closedLabels = labels.openCraniotomy, labels.closedLabels
-        self.hideOpening = hide_flap
-
-        self.simulate, self.holdImage, self.clearImage = images.simulate, images.holdImage, images.clearImage
-        self.clearOutline, self.lastImage, self.placeProbe = images.clearOutline, images.lastImage, images.placeProbe
-        self.aboutBone, self.aboutContact = images.aboutBone, images.aboutContact
-        self.showOutline, self.showInSlice = images.showOutline, images.showInSlice
-        self.mayReplaceResult = may_replace_result
-
-        self.startLiveUpdate, self.stopLiveUpdate = live.startLiveUpdate, live.stopLiveUpdate
-
-        self.simulateSequence, self.sequenceImage = sequences.simulateSequence, sequences.sequenceImage
-        self.showSequenceImage, self.showFrozen = sequences.showSequenceImage, sequences.showFrozen
-        self.imageHeld, self.areOfTissues = sequences.imageHeld, sequences.areOfTissues
-        self.sequenceIsOfTissues = sequences.sequenceIsOfTissues
-
-        self.optimize, self.applyFit, self.revertFit = fits.optimize, fits.applyFit, fits.revertFit
-        self.writeRegistration, self.showFit = fits.writeRegistration, fits.showFit
-        self.showFitInSlice = fits.showFitInSlice
+    tissues, settings = _Of("patients", PatientLogic.tissues), _Of("patients", PatientLogic.settings)
+    recognised, anatomyOf = _Of("patients", PatientLogic.recognised), _Of("patients", PatientLogic.anatomyOf)
+    renewSimulator = _Of("patients", PatientLogic.renewSimulator)
+    segment, mayReplace = _Of("labels", SegmentLogic.segment), _Of("labels", SegmentLogic.mayReplace)
+    addTissues, writeBrain = _Of("labels", SegmentLogic.addTissues), _Of("labels", SegmentLogic.writeBrain)
+    isOwnBrain, brainOf = _Of("labels", SegmentLogic.isOwnBrain), _Of("labels", SegmentLogic.brainOf)
+    openCraniotomy, closedLabels = _Of("labels", SegmentLogic.openCraniotomy), _Of("labels", SegmentLogic.closedLabels)
+    hideOpening, mayReplaceResult = staticmethod(hide_flap), staticmethod(may_replace_result)
+    simulate, holdImage = _Of("images", ImageLogic.simulate), _Of("images", ImageLogic.holdImage)
+    clearImage, clearOutline = _Of("images", ImageLogic.clearImage), _Of("images", ImageLogic.clearOutline)
+    lastImage, placeProbe = _Of("images", ImageLogic.lastImage), _Of("images", ImageLogic.placeProbe)
+    aboutBone, aboutContact = _Of("images", ImageLogic.aboutBone), _Of("images", ImageLogic.aboutContact)
+    showOutline, showInSlice = _Of("images", ImageLogic.showOutline), _Of("images", ImageLogic.showInSlice)
+    startLiveUpdate, stopLiveUpdate = _Of("live", LiveLogic.startLiveUpdate), _Of("live", LiveLogic.stopLiveUpdate)
+    simulateSequence = _Of("sequences", SequenceLogic.simulateSequence)
+    sequenceImage = _Of("sequences", SequenceLogic.sequenceImage)
+    showSequenceImage = _Of("sequences", SequenceLogic.showSequenceImage)
+    showFrozen, imageHeld = _Of("sequences", SequenceLogic.showFrozen), _Of("sequences", SequenceLogic.imageHeld)
+    areOfTissues = _Of("sequences", SequenceLogic.areOfTissues)
+    sequenceIsOfTissues = _Of("sequences", SequenceLogic.sequenceIsOfTissues)
+    optimize, applyFit = _Of("fits", FitLogic.optimize), _Of("fits", FitLogic.applyFit)
+    revertFit, writeRegistration = _Of("fits", FitLogic.revertFit), _Of("fits", FitLogic.writeRegistration)
+    showFit, showFitInSlice = _Of("fits", FitLogic.showFit), _Of("fits", FitLogic.showFitInSlice)
 
     @property
     def preset(self) -> Preset:

@@ -83,7 +83,7 @@ class SegmentLogic:
         Raises SimulationError for a node with labels that were not made by this method, or edited since; `overwrite`
         replaces them nevertheless.
         """
-        settings = (settings or SegmentationSettings()).changed(**values)
+        settings = SegmentationSettings.of(settings, **values)
         contrast, is_of_brain = settings.contrast, has_brain_mask(settings.contrast)
         require_node(labels_node, *LABEL_CLASSES, use="output of Segment")
         require(labels_node is not mri_node, f"input and output are both {named(mri_node)}, expected different nodes")
