@@ -146,7 +146,7 @@ def smoothing_sigmas(frame: DeviceFrame) -> tuple[float, float]:
     """
     display, probe = frame.display, frame.probe
     look = look_of(display, probe)
-    own_mm = look.smoothing_wavelengths / float(frame.acquisition["cycles_per_mm"])
+    own_mm = look.smoothing_cycles / float(frame.acquisition["cycles_per_mm"])
     along = float(np.hypot(display.smoothing_axial_mm, own_mm)) / float(frame.acquisition["sample_mm"])
     angle = float(np.deg2rad(np.hypot(display.smoothing_lateral_deg, look.smoothing_deg)))
     if probe.is_linear and probe.focus_mm is not None:
@@ -166,7 +166,7 @@ def gains_along(display: DisplaySettings, probe: Probe, depth_mm: np.ndarray) ->
     sliders = [getattr(display, f"depth_gain_{n}_db") for n in range(1, 9)]
     places = (np.arange(8) + 0.5) / 8.0 * probe.depth_mm
     near = display.near_gain_db * np.exp(-np.maximum(depth_mm, 0.0) / _NEAR_GAIN_MM)
-    return np.interp(depth_mm, places, sliders) + near + look_of(display, probe).along(depth_mm, probe.received_mhz)
+    return np.interp(depth_mm, places, sliders) + near + look_of(display, probe).along(probe, depth_mm)
 
 
 def gains_across(display: DisplaySettings, probe: Probe, lines: int) -> np.ndarray:
@@ -192,40 +192,46 @@ def _edge_step(frame: DeviceFrame) -> int:
 class Look:
     """The part of a display that is a scanner's own: it adds to gains and smoothing of DisplaySettings."""
 
-    #: (frequency x depth in MHz cm, dB): what is left of attenuation, straight between these and even beyond
+    #: (frequency x depth in MHz cm, dB): what compensation leaves of attenuation, straight between these
     by_path: tuple[tuple[float, float], ...] = ((0.0, 0.0),)
     #: dB by scan line, at even distances from the first to the last: contact is poor at the edges
     by_line: tuple[float, ...] = (0.0,)
-    #: Sigmas of the envelope's smoothing along the lines, in wavelengths of 1540 m/s, and across them
-    smoothing_wavelengths: float = 0.0
+    #: Sigmas of the envelope's smoothing along the lines, in cycles, and across them
+    smoothing_cycles: float = 0.0
     smoothing_deg: float = 0.0
 
-    def along(self, depth_mm: np.ndarray, frequency_mhz: float) -> np.ndarray:
-        """(samples,) dB by depth."""
-        path, gain_db = np.transpose(self.by_path)
-        return np.interp(0.1 * frequency_mhz * depth_mm, path, gain_db)
+    def along(self, probe: Probe, depth_mm: np.ndarray) -> np.ndarray:
+        """(samples,) dB by depth. The curve of a deeper image is stretched, as the sliders of a console are."""
+        path = 0.1 * probe.received_mhz * depth_mm
+        stretched = max(0.1 * probe.received_mhz * probe.depth_mm / _PENETRATION_MHZ_CM, 1.0)
+        return np.interp(path / stretched, *np.transpose(self.by_path))
 
     def across(self, lines: int) -> np.ndarray:
         """(lines,) dB."""
-        knots = len(self.by_line)
-        return np.interp(np.linspace(0.0, 1.0, lines), np.linspace(0.0, 1.0, knots), self.by_line)
+        return np.interp(np.linspace(0.0, len(self.by_line) - 1.0, lines), np.arange(len(self.by_line)), self.by_line)
 
 
-EVEN = Look()
-#: By kind of probe; with their sources in docs/realism.md#look
-SCANNERS = {
-    "phased": Look(
-        ((0.0, 13.0), (5.0, 15.5), (16.5, 10.0), (25.0, -3.0), (37.0, -16.0)), (-11.0, 1.0, -1.0, 2.0, -10.0),
-        0.27, 0.26,
-    ),
-    "convex": Look(
-        ((0.0, 3.0), (8.0, 3.0), (13.0, -3.0), (21.0, -6.0), (38.0, -7.0), (50.0, -12.0)),
-        (-8.0, -1.0, 1.0, 2.0, -4.0), 0.27, 0.2,
-    ),
-    "linear": Look(((0.0, 3.0), (2.0, 3.0), (9.0, -6.0), (36.0, -8.0)), (-2.5, 0.5, 1.0, 0.0, -2.0), 0.27, 0.2),
-}  # fmt: skip
+#: Frequency x depth that a scanner is set to look through: that of the default probe
+_PENETRATION_MHZ_CM = 45.0
+#: Largest radius of an array that looks through a small window, as the sector of 4.5 mm of the real sweep does; larger
+#: ones are laid on an abdomen
+_SMALL_RADIUS_MM = 20.0
+_EVEN = Look()
+#: From a real sweep of a brain, of a liver, and of a bone (docs/realism.md#look)
+_SECTOR = Look(
+    ((0.0, 13.0), (5.0, 15.5), (16.5, 10.0), (25.0, -3.0), (37.0, -16.0)), (-5.0, 1.5, 0.0, 0.5, -8.0), 0.27, 0.26,
+)  # fmt: skip
+_CONVEX = Look(
+    ((0.0, 3.0), (6.5, 3.0), (10.5, -3.0), (17.0, -6.0), (30.5, -7.0), (40.0, -12.0)), (-8.0, -1.0, 1.0, 2.0, -4.0),
+    0.27, 0.2,
+)  # fmt: skip
+_LINEAR = Look(((0.0, 3.0), (2.0, 3.0), (9.0, -6.0), (36.0, -8.0)), (-2.5, 0.5, 1.0, 0.0, -2.0), 0.27, 0.2)
 
 
 def look_of(display: DisplaySettings, probe: Probe) -> Look:
     """The look of a display with a probe."""
-    return EVEN if display.look == "even" else SCANNERS[probe.kind]
+    if display.look == "even":
+        return _EVEN
+    if probe.is_linear:
+        return _LINEAR
+    return _SECTOR if probe.apex_radius_mm <= _SMALL_RADIUS_MM else _CONVEX
