@@ -32,10 +32,10 @@
 //
 // Buffers: voxels, segments as in raytracing.cl; planes uint [k][j][i] of sheets.cl (one element without sheets);
 // texture uint [k][j][i] (one element without TEXTURE); sites float2 [label], the share of cells with a scatterer, in
-// 1/65536, and its amplitude, behind them whether it is dark (with LOBES), behind that UNEVEN_WORDS of imaging/scattering.py;
-// re, im float [2 traced line + side][stride]; with VARIED also [part] before these, and part_of int [label], -1 for a
-// tissue in none; with LOBES lobes float [LOBE_DEPTHS][LOBE_DISTANCES], and behind them the distance of the last column
-// [LOBE_DEPTHS].
+// 1/65536, and its amplitude, behind them whether it is dark (with LOBES), behind that UNEVEN_WORDS of
+// imaging/scattering.py; re, im float [2 traced line + side][stride]; with VARIED also [part] before these, and part_of
+// int [label], -1 for a tissue in none; with LOBES lobes float [LOBE_DEPTHS][LOBE_DISTANCES], and behind them the
+// distance of the last column [LOBE_DEPTHS].
 
 #include "common.clh"
 #include "sheets.clh"
@@ -542,6 +542,27 @@ inline void vary_scatterers(const Patient *patient, const Piece *piece, Batch *b
 }
 #endif
 
+// The place of a scatterer in the patient, RAS mm.
+inline float3 place_of(const Piece *piece, const Batch *batch, int i) {
+  const int u = piece->u, v = piece->v;
+  const float along[3] = {batch->u[i] + piece->start.x, batch->v[i] + piece->start.y, batch->w[i] + piece->start.z};
+  return (float3)(along[u == 0   ? 0
+                        : v == 0 ? 1
+                                 : 2],
+                  along[u == 1   ? 0
+                        : v == 1 ? 1
+                                 : 2],
+                  along[u == 2   ? 0
+                        : v == 2 ? 1
+                                 : 2]);
+}
+
+// The factor of the amplitude of a membrane's scatterers there: a log-normal one, whose mean power is 1.
+inline float patch_gain(Frame frame, float3 place) {
+  const float octaves = frame->membrane_octaves;
+  return exp2_scalar(octaves * (patch_at(frame, place) - 0.6931472f * octaves));
+}
+
 inline void add_echoes(const Patient *patient, const Piece *piece, const Batch *batch, Echoes *sum) {
   for (int i = 0; i < batch->count; i++) {
     const int label = TISSUE_OF(batch->label[i]);
@@ -554,13 +575,7 @@ inline void add_echoes(const Patient *patient, const Piece *piece, const Batch *
     if (IS_ON_MEMBRANE(batch->label[i])) {
       const float3 at = (float3)(batch->fx[i], batch->fy[i], batch->fz[i]);
       strength *= gain_on_membrane(patient, piece, batch->voxel[i], at);
-      if (patient->frame->membrane_octaves != 0.0f) {
-        const int u = piece->u, v = piece->v;
-        const float along[3] = {batch->u[i] + piece->start.x, batch->v[i] + piece->start.y, batch->w[i] + piece->start.z};
-        const float3 place = (float3)(along[u == 0 ? 0 : v == 0 ? 1 : 2], along[u == 1 ? 0 : v == 1 ? 1 : 2],
-                                      along[u == 2 ? 0 : v == 2 ? 1 : 2]);
-        strength *= exp2_scalar(patient->frame->membrane_octaves * (patch_at(patient->frame, place) - 0.35f * patient->frame->membrane_octaves));
-      }
+      if (patient->frame->membrane_octaves != 0.0f) strength *= patch_gain(patient->frame, place_of(piece, batch, i));
     }
 #ifdef UNEVEN
     strength *= batch->uneven[i];

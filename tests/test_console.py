@@ -19,8 +19,9 @@ from SlicerUSSim.Logic import (
     optimize_appearance,
 )
 from SlicerUSSim.Logic.fitting import AppearanceModel, FreeParameters, speckle_widths
+from SlicerUSSim.Logic.imaging.console import gains_across, gains_along
 from SlicerUSSim.Logic.imaging.grey_map import GREY_MAPS, TABLE_SIZE, estimate_grey_map, grey_table, slope_at
-from SlicerUSSim.Logic.probe import ImageGrid, probe_from_dict
+from SlicerUSSim.Logic.probe import PROBES, ImageGrid, probe_from_dict
 from SlicerUSSim.Logic.tracked import TrackedImages
 from tests.conftest import SHARED, SPECKLE, block, even_display, needs_shared, rigid, simulator
 from tests.reference.display import image_of
@@ -264,3 +265,17 @@ def test_persistence_keeps_a_part_of_the_last_images():
     first = made.simulate(probe, pose, small).image
     np.testing.assert_array_equal(first, made.simulate(probe, pose, replace(small, persistence=0.0)).image)
     np.testing.assert_array_equal(made.simulate(probe, pose, lasting).image, plain[0])
+
+
+def test_the_look_of_a_scanner_falls_off_with_depth_and_at_the_edges(solid):
+    """And a deeper image has its curve stretched; controls add to it."""
+    display, depth = DisplaySettings(noise_db=None), np.array([10.0, 60.0])
+    for name, fall_db in (("phased", 20.0), ("abdominal", 4.0), ("linear", 4.0)):
+        near, far = gains_along(display, PROBES[name], depth * (0.5 if name == "linear" else 1.0))
+        across = gains_across(display, PROBES[name], 101)
+        assert near - far > fall_db and across[50] > across[[0, -1]].max()
+    deeper = replace(PROBES["phased"], depth_mm=180.0)
+    np.testing.assert_allclose(gains_along(display, deeper, 2.0 * depth), gains_along(display, PROBES["phased"], depth))
+    sliders = gains_along(replace(display, near_gain_db=-6.0), PROBES["phased"], np.zeros(1))
+    assert sliders == gains_along(display, PROBES["phased"], np.zeros(1)) - 6.0
+    assert not gains_along(even_display(), PROBES["phased"], depth).any()

@@ -9,6 +9,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
+from scipy.ndimage import uniform_filter1d
 from scipy.spatial.transform import Rotation
 
 from SlicerUSSim.Logic import (
@@ -551,3 +552,24 @@ def test_a_probe_that_would_take_minutes_is_refused_with_the_numbers():
     for use in (lambda: small.simulate(probe, np.eye(4)), lambda: small.volume(probe, [np.eye(4)])):
         with pytest.raises(SimulationError, match=words):
             use()
+
+
+def test_a_wall_breaks_where_its_roughness_varies_and_keeps_its_level():
+    """Levels along a flat wall vary from patch to patch; the mean power of its scatterers stays."""
+    bright = replace(SPECKLE, mu0=1.0, sigma0=0.5)
+    silent, csf = replace(SPECKLE, mu0=0.0, sigma0=0.0), replace(FLUID, name="csf")
+    labels = block(lambda x, y, z: np.where(y < 0, 2, 1), half_mm=(40, 20, 20))
+    probe, pose = LinearProbe(60, 30, scan_lines=181), rigid(np.eye(3), [0, -15, 0])
+    level = {}
+    for patch_db in (0.0, 7.0):
+        power = 0.0
+        for seed in range(12):
+            membrane = Membrane(bright, 0.6, ("csf",), diffuse_db=0.0, patch_db=patch_db)
+            table = TissueTable({0: silent, 1: silent, 2: csf}, membrane)
+            made = UltrasoundSimulator(labels, table, SimulationSettings(seed=seed, interfaces=False, ring_down=False))
+            power = power + (np.abs(made.simulate(probe, pose).iq) ** 2).sum(axis=1)[20:-20]
+            level.setdefault(f"single {patch_db}", power)
+        level[patch_db] = power
+    assert 10 * np.log10(level[7.0].mean() / level[0.0].mean()) == pytest.approx(0.0, abs=1.5)
+    wide = {db: uniform_filter1d(level[f"single {db}"], 12)[6:-6] for db in (0.0, 7.0)}  # over the speckle
+    assert np.log10(wide[7.0]).std() > 1.5 * np.log10(wide[0.0]).std()
