@@ -303,7 +303,7 @@ inline float gain_on_membrane(const Patient *patient, const Piece *piece, int he
   Frame frame = patient->frame;
   __global const ushort *corner = patient->voxels + here;
   float3 normal, offset;
-  float level = frame->membrane_gain;
+  float level = frame->membrane_gain, exponent = frame->membrane_exponent;
   int of_dura = 0;
   Sheet sheet = {0u, 0u};
   if (frame->sheet_label >= 0) sheet = nearest_sheet(frame, planes_at(patient, here), at, &offset);
@@ -316,16 +316,19 @@ inline float gain_on_membrane(const Patient *patient, const Piece *piece, int he
     const float gy = blend(lines.y - lines.x, lines.w - lines.z, at.z);
     const float gz = blend(lines.z, lines.w, at.y) - blend(lines.x, lines.y, at.y);
     normal = gx * piece->row_i + gy * piece->row_j + gz * piece->row_k;
-  } else if (LOOK(sheet)) {
-    level *= level_of_look(LOOK(sheet));
-    of_dura = is_dura(LOOK(sheet));
+  } else {
+    exponent = frame->sheet_exponent;
+    if (LOOK(sheet)) {
+      level *= level_of_look(LOOK(sheet));
+      of_dura = is_dura(LOOK(sheet));
+    }
   }
   const float cosine = fabs(dot3(normal, piece->direction)) / fmax(length3(normal), 1e-6f);
   if (of_dura) {
     const float isotropic = frame->dura_isotropic;
     return level * sqrt(isotropic + (1.0f - isotropic) * cosine * cosine);
   }
-  return level * exp2_scalar(max(frame->membrane_exponent * log2_scalar(fmax(cosine, 1e-6f)), -100.0f));
+  return level * exp2_scalar(max(exponent * log2_scalar(fmax(cosine, 1e-6f)), -100.0f));
 }
 
 // By how much tissue varies at LANES places in the patient, as factors of amplitudes. `words` are those of the tissue

@@ -148,7 +148,7 @@ TISSUES: dict[str, Tissue] = {
 
 #: Leptomeninges and ependyma: their lines break and fade as those of the real sweep (docs/realism.md#look)
 MEMBRANE = Membrane(
-    TISSUES["leptomeninges"], thickness_mm=0.35, diffuse_exponent=3.5, patch_db=7.0,
+    TISSUES["leptomeninges"], thickness_mm=0.35, diffuse_exponent=3.5, sheet_exponent=0.8, patch_db=7.0,
     roughness_octaves=1.0,
 )  # fmt: skip
 

@@ -125,6 +125,10 @@ class Membrane(Declared):
         12.0, "Diffuse echo", "Level of its scatterers where the beam meets the sheet squarely, re those of its tissue",
         unit="dB", bounds=(-100, 40),
     )  # fmt: skip
+    sheet_exponent: float | None = parameter(
+        None, "Diffuse exponent of sheets", "The same for sulci and other sheets, which hold vessels; none: as on walls",
+        bounds=(0, 20), can_be_none=True,
+    )  # fmt: skip
     roughness_octaves: float = parameter(
         0.0, "Variation of roughness", "Standard deviation of the roughness from patch to patch, which breaks lines",
         unit="octaves", bounds=(0, 4),
