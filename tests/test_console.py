@@ -268,14 +268,18 @@ def test_persistence_keeps_a_part_of_the_last_images():
 
 
 def test_the_look_of_a_scanner_falls_off_with_depth_and_at_the_edges(solid):
-    """And a deeper image has its curve stretched; controls add to it."""
+    """Controls add to it, and it does not change with the depth of the image or jump with a radius."""
     display, depth = DisplaySettings(noise_db=None), np.array([10.0, 60.0])
     for name, fall_db in (("phased", 20.0), ("abdominal", 4.0), ("linear", 4.0)):
         near, far = gains_along(display, PROBES[name], depth * (0.5 if name == "linear" else 1.0))
         across = gains_across(display, PROBES[name], 101)
         assert near - far > fall_db and across[50] > across[[0, -1]].max()
     deeper = replace(PROBES["phased"], depth_mm=180.0)
-    np.testing.assert_allclose(gains_along(display, deeper, 2.0 * depth), gains_along(display, PROBES["phased"], depth))
+    np.testing.assert_allclose(gains_along(display, deeper, depth), gains_along(display, PROBES["phased"], depth))
+    radii = [gains_along(display, replace(PROBES["convex"], radius_mm=r), depth) for r in np.arange(10.0, 60.0, 0.5)]
+    assert np.abs(np.diff(radii, axis=0)).max() < 0.5
+    straight, trapezoid = (replace(PROBES["linear"], trapezoid_deg=angle) for angle in (0.0, 1.0))
+    np.testing.assert_allclose(gains_along(display, straight, depth), gains_along(display, trapezoid, depth))
     sliders = gains_along(replace(display, near_gain_db=-6.0), PROBES["phased"], np.zeros(1))
     assert sliders == gains_along(display, PROBES["phased"], np.zeros(1)) - 6.0
     assert not gains_along(even_display(), PROBES["phased"], depth).any()

@@ -181,7 +181,7 @@ class DisplaySettings(Declared):
     look: str = parameter(
         "scanner", "Look",
         "scanner: a scanner's preset, which leaves some attenuation, uneven contact and smoothing in the image. even: "
-        "compensated, even and as sharp as the beam, for work on algorithms. Gains and smoothing below are added",
+        "compensated, even and as sharp as the beam, for work on algorithms. Gains and smoothing add to it",
         choices=("scanner", "even"), shown=True, option="look",
     )  # fmt: skip
     gain_db: float = parameter(

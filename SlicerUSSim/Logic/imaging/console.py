@@ -12,7 +12,7 @@ from SlicerUSSim.Logic.imaging.grey_map import TABLE_SIZE, grey_table, is_linear
 from SlicerUSSim.Logic.imaging.signals import RayTree
 from SlicerUSSim.Logic.imaging.stage import DeviceFrame, Stage, Work
 from SlicerUSSim.Logic.opencl.device import Device, Workspace
-from SlicerUSSim.Logic.probe.arrays import Probe
+from SlicerUSSim.Logic.probe.arrays import LinearProbe, Probe
 
 if TYPE_CHECKING:
     from pyopencl import Buffer
@@ -145,10 +145,14 @@ def smoothing_sigmas(frame: DeviceFrame) -> tuple[float, float]:
     seen from the depth of the focus.
     """
     display, probe = frame.display, frame.probe
-    look = look_of(display, probe)
-    own_mm = look.smoothing_cycles / float(frame.acquisition["cycles_per_mm"])
+    looks = looks_of(display, probe)
+    own_mm = sum(share * look.smoothing_cycles for share, look in looks) / float(frame.acquisition["cycles_per_mm"])
+    own_deg = sum(share * look.smoothing_deg for share, look in looks)
     along = float(np.hypot(display.smoothing_axial_mm, own_mm)) / float(frame.acquisition["sample_mm"])
-    angle = float(np.deg2rad(np.hypot(display.smoothing_lateral_deg, look.smoothing_deg)))
+    if not np.isinf(probe.apex_radius_mm):  # seen from the face
+        focus = probe.focus_mm or probe.depth_mm
+        own_deg *= focus / (probe.apex_radius_mm + focus)
+    angle = float(np.deg2rad(np.hypot(display.smoothing_lateral_deg, own_deg)))
     if probe.is_linear and probe.focus_mm is not None:
         angle *= probe.focus_mm
     return along if along >= 0.2 else 0.0, across if (across := angle / probe.line_spacing) >= 0.1 else 0.0
@@ -166,14 +170,16 @@ def gains_along(display: DisplaySettings, probe: Probe, depth_mm: np.ndarray) ->
     sliders = [getattr(display, f"depth_gain_{n}_db") for n in range(1, 9)]
     places = (np.arange(8) + 0.5) / 8.0 * probe.depth_mm
     near = display.near_gain_db * np.exp(-np.maximum(depth_mm, 0.0) / _NEAR_GAIN_MM)
-    return np.interp(depth_mm, places, sliders) + near + look_of(display, probe).along(probe, depth_mm)
+    own = sum(share * look.along(probe, depth_mm) for share, look in looks_of(display, probe))
+    return np.interp(depth_mm, places, sliders) + near + own
 
 
 def gains_across(display: DisplaySettings, probe: Probe, lines: int) -> np.ndarray:
     """(lines,) float32 dB of the gain by line: the look's, and what is straight between five knots."""
     knots = [getattr(display, f"line_gain_{n}_db") for n in range(1, 6)]
     own = np.interp(np.linspace(0.0, 1.0, lines), np.linspace(0.0, 1.0, 5), knots)
-    return (own + look_of(display, probe).across(lines)).astype(np.float32)
+    own = own + sum(share * look.across(lines) for share, look in looks_of(display, probe))
+    return own.astype(np.float32)
 
 
 def _maps(frame: DeviceFrame) -> bool:
@@ -201,21 +207,17 @@ class Look:
     smoothing_deg: float = 0.0
 
     def along(self, probe: Probe, depth_mm: np.ndarray) -> np.ndarray:
-        """(samples,) dB by depth. The curve of a deeper image is stretched, as the sliders of a console are."""
-        path = 0.1 * probe.received_mhz * depth_mm
-        stretched = max(0.1 * probe.received_mhz * probe.depth_mm / _PENETRATION_MHZ_CM, 1.0)
-        return np.interp(path / stretched, *np.transpose(self.by_path))
+        """(samples,) dB by depth, which do not change with the depth of the image."""
+        return np.interp(0.1 * probe.received_mhz * depth_mm, *np.transpose(self.by_path))
 
     def across(self, lines: int) -> np.ndarray:
         """(lines,) dB."""
         return np.interp(np.linspace(0.0, len(self.by_line) - 1.0, lines), np.arange(len(self.by_line)), self.by_line)
 
 
-#: Frequency x depth that a scanner is set to look through: that of the default probe
-_PENETRATION_MHZ_CM = 45.0
-#: Largest radius of an array that looks through a small window, as the sector of 4.5 mm of the real sweep does; larger
-#: ones are laid on an abdomen
-_SMALL_RADIUS_MM = 20.0
+#: Radii of arrays that look through a small window, as the sector of 4.5 mm of the real sweep does, and of those that
+#: are laid on an abdomen; between them both looks mix
+_SMALL_RADIUS_MM, _LARGE_RADIUS_MM = 15.0, 40.0
 _EVEN = Look()
 #: From a real sweep of a brain, of a liver, and of a bone (docs/realism.md#look)
 _SECTOR = Look(
@@ -229,10 +231,11 @@ _CONVEX = Look(
 _LINEAR = Look(((0.0, 3.0), (2.0, 3.0), (9.0, -6.0), (36.0, -8.0)), (-2.5, 0.5, 1.0, 0.0, -2.0), 0.27, 0.2)
 
 
-def look_of(display: DisplaySettings, probe: Probe) -> Look:
-    """The look of a display with a probe."""
+def looks_of(display: DisplaySettings, probe: Probe) -> tuple[tuple[float, Look], ...]:
+    """(share, look) of a display with a probe; the shares add up to 1."""
     if display.look == "even":
-        return _EVEN
-    if probe.is_linear:
-        return _LINEAR
-    return _SECTOR if probe.apex_radius_mm <= _SMALL_RADIUS_MM else _CONVEX
+        return ((1.0, _EVEN),)
+    if isinstance(probe, LinearProbe):  # a trapezoid's radius is that of where its lines come from
+        return ((1.0, _LINEAR),)
+    large = float(np.interp(probe.apex_radius_mm, (_SMALL_RADIUS_MM, _LARGE_RADIUS_MM), (0.0, 1.0)))
+    return ((1.0 - large, _SECTOR), (large, _CONVEX))

@@ -32,6 +32,8 @@ _POSE = "probe_to_ras"
 _KIND = "probe.kind"
 #: Name in Preset.from_texts of the whole as JSON, as scenes had it
 AS_ONE = "preset"
+#: A display with all of these and without a look was written by a version whose displays were even
+_OLD_DISPLAY = {"gain_db", "dynamic_range_db", "tgc_db_cm_mhz", "noise_db", "image_size"}
 #: Tissues of segment_mri with thin sulci.
 _BRAIN = ("csf", "grey matter", "white matter", "leptomeninges")
 
@@ -111,7 +113,7 @@ class Preset:
         for name, kind in SECTIONS.items():
             if name in values:
                 given = values[name]
-                if name == "display" and isinstance(given, dict):  # those of older versions, without a look, were even
+                if name == "display" and isinstance(given, dict) and given.keys() >= _OLD_DISPLAY:
                     given = {"look": "even", **given}
                 sections[name] = built(kind, given, f"{source}: {name}")
         if "tissues" in values or "membrane" in values:
@@ -147,6 +149,8 @@ class Preset:
         declared = {name: replace(entry, name=name) for name, entry in preset_parameters().items()}
         kind = declared[_KIND].from_text(source, texts.get(_KIND, probe_kind().default))
         values, nested = _flat_default(kind), {"tissues": {}}
+        if texts.keys() >= {f"display.{name}" for name in _OLD_DISPLAY}:
+            values["display.look"] = "even"
         for name, text in texts.items():
             values[name] = (
                 declared[name].from_text(source, text) if name in declared else _from_json(name, text, source)

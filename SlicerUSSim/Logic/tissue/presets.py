@@ -30,8 +30,8 @@ _TEXTURE, _SHEET = {"texture_db": 3.5, "texture_mm": 0.8}, {"texture_db": 6.0, "
 _SPECKS = {"specks_per_mm3": 0.01, "speck_db": 14.0}
 _UNEVEN: dict[str, dict[str, float]] = {
     # Vessels across the beam are dots: more of them, and brighter, in white matter
-    "white matter": {**_TEXTURE, "specks_per_mm3": 0.03, "speck_db": 20.0},
-    "grey matter": {**_TEXTURE, "specks_per_mm3": 0.015, "speck_db": 18.0},
+    "white matter": {**_TEXTURE, "specks_per_mm3": 0.015, "speck_db": 17.0},
+    "grey matter": {**_TEXTURE, "specks_per_mm3": 0.01, "speck_db": 16.0},
     "corpus callosum": {**_TEXTURE, **_SPECKS, "specks_per_mm3": 0.005},
     "oedema": {**_TEXTURE, **_SPECKS, "specks_per_mm3": 0.005},
     "enhancing": {**_TEXTURE, **_SPECKS},

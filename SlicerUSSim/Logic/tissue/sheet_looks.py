@@ -39,8 +39,6 @@ DURA_KINDS = tuple(kind for kind, name in _TISSUES.items() if name == DURA)
 #: Most of a layer that is drawn, mm: dura is 0.3 to 0.8 mm (Protasoni et al., J. Neurosurg. 114(6), 2011); a sulcus is
 #: as wide as it was found, up to the fluid that voxels of 1 mm show as such
 _MOST_MM = {"sulcus": 1.5, "falx": 0.8, "tentorium": 0.8, "ependyma": 0.0}
-#: Re the membrane: the wall of a ventricle has no vessels in it as a sulcus has (docs/realism.md#look)
-_EPENDYMA_DB = -8.0
 _OWN_VARIANCE = TISSUES["leptomeninges"].scatterer_variance
 
 
@@ -57,7 +55,6 @@ def looks_of(tissues: TissueTable) -> dict[str, SheetLook]:
         if name is not None and not is_dura:
             # Re the membrane's by the presets: where a fit changes the membrane's level, that of the dura follows.
             level_db = 10.0 * np.log10(TISSUES[name].scatterer_variance / _OWN_VARIANCE)
-        level_db += _EPENDYMA_DB if kind == "ependyma" else 0.0
         most = max(_MOST_MM[kind], membrane.thickness_mm)
         result[kind] = SheetLook(membrane.thickness_mm, most, float(level_db), is_dura, _of_layer(tissue, around))
     return result

@@ -126,7 +126,7 @@ class Membrane(Declared):
         unit="dB", bounds=(-100, 40),
     )  # fmt: skip
     sheet_exponent: float | None = parameter(
-        None, "Diffuse exponent of sheets", "The same for sulci and other sheets, which hold vessels; none: as on walls",
+        None, "Diffuse exponent of sheets", "The same of sulci and other sheets, which hold vessels; none: as of walls",
         bounds=(0, 20), can_be_none=True,
     )  # fmt: skip
     roughness_octaves: float = parameter(
