@@ -28,7 +28,7 @@
 // With FOUND defined, planes have two words: some are of sheets that were found in the MRI (sheets.clh). Beside these
 // nothing else is membrane.
 //
-// With UNEVEN defined, some tissues have an echogenicity that varies within them (imaging/scattering.py).
+// With UNEVEN defined, some tissues have an echogenicity that varies within them (scattering.py).
 //
 // Buffers: voxels, segments as in raytracing.cl; planes uint [k][j][i] of sheets.cl (one element without sheets);
 // texture uint [k][j][i] (one element without TEXTURE); sites float2 [label], the share of cells with a scatterer, in

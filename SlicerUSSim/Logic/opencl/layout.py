@@ -40,7 +40,7 @@ CONSTANTS = {
     "SHEET_LEVEL_STEP_DB": 0.25,
     "SHEET_REFLECTION_STEP": 0.008,
     "TEXTURE_STEP_DB": 0.1,  # of the gain in texture.py
-    "UNEVEN_WORDS": 8,  # per label, of imaging/scattering.py
+    "UNEVEN_WORDS": 8,  # per label, of scattering.py
     "MAX_SEGMENTS": 256,  # per traced line
     "MAX_HITS": 96,  # per traced ray
     "SOFT_SPEED": 0.105,  # largest relative difference of speed of sound at a soft border (common.clh), ...
