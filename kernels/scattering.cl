@@ -32,10 +32,10 @@
 //
 // Buffers: voxels, segments as in raytracing.cl; planes uint [k][j][i] of sheets.cl (one element without sheets);
 // texture uint [k][j][i] (one element without TEXTURE); sites float2 [label], the share of cells with a scatterer, in
-// 1/65536, and its amplitude, behind them whether it is dark (with LOBES), behind that UNEVEN_WORDS of scattering.py;
-// re, im float [2 traced line + side][stride]; with VARIED also [part] before these, and part_of int [label], -1 for a
-// tissue in none; with LOBES lobes float [LOBE_DEPTHS][LOBE_DISTANCES], and behind them the distance of the last column
-// [LOBE_DEPTHS].
+// 1/65536, and its amplitude, behind them whether it is dark (with LOBES), behind that UNEVEN_WORDS of
+// imaging/scattering.py; re, im float [2 traced line + side][stride]; with VARIED also [part] before these, and part_of
+// int [label], -1 for a tissue in none; with LOBES lobes float [LOBE_DEPTHS][LOBE_DISTANCES], and behind them the
+// distance of the last column [LOBE_DEPTHS].
 
 #include "common.clh"
 #include "sheets.clh"
@@ -303,7 +303,7 @@ inline float gain_on_membrane(const Patient *patient, const Piece *piece, int he
   Frame frame = patient->frame;
   __global const ushort *corner = patient->voxels + here;
   float3 normal, offset;
-  float level = frame->membrane_gain;
+  float level = frame->membrane_gain, exponent = frame->membrane_exponent;
   int of_dura = 0;
   Sheet sheet = {0u, 0u};
   if (frame->sheet_label >= 0) sheet = nearest_sheet(frame, planes_at(patient, here), at, &offset);
@@ -316,16 +316,19 @@ inline float gain_on_membrane(const Patient *patient, const Piece *piece, int he
     const float gy = blend(lines.y - lines.x, lines.w - lines.z, at.z);
     const float gz = blend(lines.z, lines.w, at.y) - blend(lines.x, lines.y, at.y);
     normal = gx * piece->row_i + gy * piece->row_j + gz * piece->row_k;
-  } else if (LOOK(sheet)) {
-    level *= level_of_look(LOOK(sheet));
-    of_dura = is_dura(LOOK(sheet));
+  } else {
+    exponent = frame->sheet_exponent;
+    if (LOOK(sheet)) {
+      level *= level_of_look(LOOK(sheet));
+      of_dura = is_dura(LOOK(sheet));
+    }
   }
   const float cosine = fabs(dot3(normal, piece->direction)) / fmax(length3(normal), 1e-6f);
   if (of_dura) {
     const float isotropic = frame->dura_isotropic;
     return level * sqrt(isotropic + (1.0f - isotropic) * cosine * cosine);
   }
-  return level * exp2_scalar(max(frame->membrane_exponent * log2_scalar(fmax(cosine, 1e-6f)), -100.0f));
+  return level * exp2_scalar(max(exponent * log2_scalar(fmax(cosine, 1e-6f)), -100.0f));
 }
 
 // By how much tissue varies at LANES places in the patient, as factors of amplitudes. `words` are those of the tissue
@@ -542,6 +545,27 @@ inline void vary_scatterers(const Patient *patient, const Piece *piece, Batch *b
 }
 #endif
 
+// The place of a scatterer in the patient, RAS mm.
+inline float3 place_of(const Piece *piece, const Batch *batch, int i) {
+  const int u = piece->u, v = piece->v;
+  const float along[3] = {batch->u[i] + piece->start.x, batch->v[i] + piece->start.y, batch->w[i] + piece->start.z};
+  return (float3)(along[u == 0   ? 0
+                        : v == 0 ? 1
+                                 : 2],
+                  along[u == 1   ? 0
+                        : v == 1 ? 1
+                                 : 2],
+                  along[u == 2   ? 0
+                        : v == 2 ? 1
+                                 : 2]);
+}
+
+// The factor of the amplitude of a membrane's scatterers there: a log-normal one, whose mean power is 1.
+inline float patch_gain(Frame frame, float3 place) {
+  const float octaves = frame->membrane_octaves;
+  return exp2_scalar(octaves * (patch_at(frame, place) - 0.6931472f * octaves));
+}
+
 inline void add_echoes(const Patient *patient, const Piece *piece, const Batch *batch, Echoes *sum) {
   for (int i = 0; i < batch->count; i++) {
     const int label = TISSUE_OF(batch->label[i]);
@@ -554,6 +578,7 @@ inline void add_echoes(const Patient *patient, const Piece *piece, const Batch *
     if (IS_ON_MEMBRANE(batch->label[i])) {
       const float3 at = (float3)(batch->fx[i], batch->fy[i], batch->fz[i]);
       strength *= gain_on_membrane(patient, piece, batch->voxel[i], at);
+      if (patient->frame->membrane_octaves != 0.0f) strength *= patch_gain(patient->frame, place_of(piece, batch, i));
     }
 #ifdef UNEVEN
     strength *= batch->uneven[i];

@@ -51,8 +51,7 @@ __kernel void sheet_hits(Frame frame, __global const uint *planes, __global cons
       normal *= (dot3(normal, direction) > 0.0f ? -1.0f : 1.0f) / length3(normal);
       if (count < MAX_HITS) {
         Hit hit = hit_on_segment(frame, segment, along, quantile, normal, reflection_of_look(words.y));
-        const float phase = frame->membrane_phase * hit.cos_incidence;
-        hit.echo *= exp_fast(-0.5f * phase * phase);
+        hit.echo *= coherence_of_sheet(frame, start + along * direction, hit.cos_incidence);
         hits[slot * MAX_HITS + count] = hit;
       }
       count++;

@@ -7,7 +7,7 @@ import locale
 import os
 import sys
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 
 import hypothesis
@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 from SlicerUSSim.Logic import (
+    DisplaySettings,
     PhasedProbe,
     SimulationSettings,
     Tissue,
@@ -42,6 +43,8 @@ SPECKLE = replace(
     TISSUES["white matter"], name="speckle", attenuation_db_cm_mhz=0.0, texture_db=0.0, specks_per_mm3=0.0
 )
 FLUID = Tissue("fluid", 1540.0, 1.54, 0.0)
+#: A display without a scanner's look
+even_display = partial(DisplaySettings, look="even")
 
 
 def rigid(rotation: np.ndarray, translation) -> np.ndarray:

@@ -10,7 +10,7 @@ import pytest
 from SlicerUSSim.Logic import DisplaySettings, SimulationSettings, TissueTable, UltrasoundSimulator
 from SlicerUSSim.Logic.imaging.frame import Frame
 from SlicerUSSim.Logic.probe.arrays import PROBES, Probe
-from tests.conftest import SPECKLE, block, rigid
+from tests.conftest import SPECKLE, block, even_display, rigid
 from validation.measurement import depth_window, level_db
 from validation.phantoms import band_power
 
@@ -56,7 +56,7 @@ def test_levels_are_those_of_a_band_wise_sum_down_to_the_full_depth(name):
 def test_time_gain_compensation_of_the_tissue_makes_it_even(name):
     """It compensated the loss of the centre frequency: the far fields of these were 5 to 12 dB too bright."""
     probe = replace(PROBES[name], scan_lines=128)
-    found = frames(probe, 0.5, DisplaySettings(tgc_db_cm_mhz=0.5, tgc_reach=1.0, noise_db=None))
+    found = frames(probe, 0.5, even_display(tgc_db_cm_mhz=0.5, tgc_reach=1.0, noise_db=None))
     levels = []
     for part in (0.3, 0.6, 0.9):
         ends = ((np.array([-0.04, 0.04]) + part) * probe.depth_mm / found[0].sample_interval_mm).astype(int)
@@ -68,7 +68,7 @@ def test_without_downshift_the_compensation_is_in_proportion_to_depth():
     probe = replace(PROBES["matrix"], scan_lines=32)
     simulator = speckle(0.5, 0, frequency_downshift=False)
     with_tgc, without = (
-        simulator.simulate(probe, np.eye(4), DisplaySettings(tgc_db_cm_mhz=tgc, tgc_reach=1.0, noise_db=None)).envelope
+        simulator.simulate(probe, np.eye(4), even_display(tgc_db_cm_mhz=tgc, tgc_reach=1.0, noise_db=None)).envelope
         for tgc in (0.5, 0.0)
     )
     samples = np.array([500, 1000, 1500])

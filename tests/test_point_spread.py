@@ -27,7 +27,7 @@ TRUE = ConvexProbe(12.0, 70.0, 45.0, scan_lines=180, fractional_bandwidth=0.35, 
 GIVEN = replace(TRUE, fractional_bandwidth=0.8, aperture_mm=16.0)
 LABELS = block(lambda x, y, z: np.ones_like(x), half_mm=(40, 36, 12))
 EVEN = TissueTable.named(["liver"]).replace("liver", texture_db=0.0, specks_per_mm3=0.0)
-SHOWN = DisplaySettings(gain_db=4.0, noise_db=None, image_size=(300, 320))
+SHOWN = DisplaySettings(look="even", gain_db=4.0, noise_db=None, image_size=(300, 320))
 
 
 def recorded(smoothing_mm: float = 0.0) -> TrackedImages:

@@ -156,7 +156,7 @@ def test_any_chain_of_rigid_parents_gives_the_same_image_as_their_product(bench)
 def noisy(bench) -> None:
     """Noise only, which fills the image."""
     fluid = TissueTable({0: FLUID, 1: Tissue("speckle", 1540.0, 1.54, 0.0), 2: FLUID})
-    display = DisplaySettings(noise_db=-5.0, tgc_db_cm_mhz=0.0, image_size=(96, 64))
+    display = DisplaySettings(look="even", noise_db=-5.0, tgc_db_cm_mhz=0.0, image_size=(96, 64))
     bench.logic.preset = Preset(PRESET.probe, display, PRESET.settings, fluid)
 
 

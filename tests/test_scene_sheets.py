@@ -109,7 +109,7 @@ def test_segment_finds_sheets_and_images_show_them(monkeypatch):
         presenter.values.setValue(f"scene.sheet_{kind}", False)
     presenter.images.simulate()
     without = bench.logic.lastFrame.image
-    assert np.abs(without.astype(int) - shown).mean() > 10.0 * np.abs(shown.astype(int) - expected).mean()
+    assert np.abs(without.astype(int) - shown).mean() > 5.0 * np.abs(shown.astype(int) - expected).mean()
     parameters.sheets = None
     presenter.images.simulate()
     np.testing.assert_array_equal(bench.logic.lastFrame.image, without)

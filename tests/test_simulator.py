@@ -9,11 +9,11 @@ from itertools import pairwise
 import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
+from scipy.ndimage import uniform_filter1d
 from scipy.spatial.transform import Rotation
 
 from SlicerUSSim.Logic import (
     ConvexProbe,
-    DisplaySettings,
     LinearProbe,
     Membrane,
     PhasedProbe,
@@ -31,7 +31,7 @@ from SlicerUSSim.Logic.opencl.layout import CONSTANTS
 from SlicerUSSim.Logic.tissue import read_label_map
 from SlicerUSSim.Logic.tissue.presets import TISSUES
 from SlicerUSSim.Logic.tissue.table import MAX_LABEL
-from tests.conftest import FLUID, SPECKLE, block, rigid, simulator
+from tests.conftest import FLUID, SPECKLE, block, even_display, rigid, simulator
 from validation.checks import ORIENTATIONS
 from validation.measurement import level_db
 from validation.phantoms import band_power
@@ -41,7 +41,7 @@ PROBES = {
     "convex": ConvexProbe(40, 60, 50, scan_lines=161),
     "phased": PhasedProbe(75, 50, scan_lines=161),
 }
-QUIET = DisplaySettings(tgc_db_cm_mhz=0.0, noise_db=None)
+QUIET = even_display(tgc_db_cm_mhz=0.0, noise_db=None)
 
 
 @pytest.fixture(scope="module")
@@ -95,7 +95,7 @@ def test_outside_the_field_the_image_is_black(solid, kind):
 @settings(max_examples=4)
 def test_the_image_has_the_size_asked_for_and_holds_the_field(solid, rows, columns):
     probe = PROBES["convex"]
-    frame = solid.simulate(probe, rigid(np.eye(3), [0, -25, 0]), DisplaySettings(image_size=(rows, columns)))
+    frame = solid.simulate(probe, rigid(np.eye(3), [0, -25, 0]), even_display(image_size=(rows, columns)))
     assert frame.image.shape == (rows, columns)
     left, right, top, bottom = probe.image_bounds_mm()
     assert frame.pixel_spacing_mm == pytest.approx(((right - left) / columns, (bottom - top) / rows))
@@ -105,7 +105,7 @@ def test_tgc_undoes_the_attenuation_it_is_set_to():
     lossy = replace(SPECKLE, attenuation_db_cm_mhz=0.5)
     sim = simulator(block(lambda x, y, z: np.ones_like(x)), lossy)
     frame = sim.simulate(
-        PROBES["linear"], rigid(np.eye(3), [0, -25, 0]), DisplaySettings(tgc_db_cm_mhz=0.5, noise_db=None)
+        PROBES["linear"], rigid(np.eye(3), [0, -25, 0]), even_display(tgc_db_cm_mhz=0.5, noise_db=None)
     )
     dz = frame.sample_interval_mm
     raw = [level_db(frame.iq[:, int(d / dz) : int((d + 8) / dz)]) for d in (5, 37)]
@@ -118,7 +118,7 @@ def test_tgc_undoes_the_attenuation_it_is_set_to():
 def test_tgc_rises_down_to_its_reach_and_stays_there(solid, reach):
     """Of a band of 5 MHz about its centre, each frequency by itself (tests/test_band.py has wider ones)."""
     pose, probe = rigid(np.eye(3), [0, -25, 0]), PROBES["linear"]
-    display = DisplaySettings(tgc_db_cm_mhz=0.5, tgc_reach=reach, noise_db=None)
+    display = even_display(tgc_db_cm_mhz=0.5, tgc_reach=reach, noise_db=None)
     raised, plain = (solid.simulate(probe, pose, shown) for shown in (display, replace(display, tgc_db_cm_mhz=0.0)))
     decibels = 20 * np.log10((raised.envelope / plain.envelope).mean(axis=0))
     depth_cm = 0.1 * raised.sample_interval_mm * np.arange(decibels.size)
@@ -141,7 +141,7 @@ def test_grey_levels_are_decibels_in_the_dynamic_range(solid):
 def test_noise_has_the_level_asked_for_and_is_seeded():
     empty = block(lambda x, y, z: np.ones_like(x))
     pose = rigid(np.eye(3), [0, -25, 0])
-    noisy = DisplaySettings(tgc_db_cm_mhz=0.0, noise_db=-40.0)
+    noisy = even_display(tgc_db_cm_mhz=0.0, noise_db=-40.0)
     frames = [simulator(empty, FLUID, seed=seed).simulate(PROBES["linear"], pose, noisy) for seed in (1, 1, 2)]
     assert level_db(frames[0].envelope) == pytest.approx(-40, abs=0.1)
     np.testing.assert_array_equal(frames[0].envelope, frames[1].envelope)
@@ -443,7 +443,7 @@ def test_a_change_gives_the_image_of_a_new_simulator():
     tables = [sim.medium.tissues, sim.medium.tissues.replace("louder", sigma0=0.4)]
     changes = [
         (tables[0], sim.settings, QUIET),
-        (tables[0], sim.settings, DisplaySettings(gain_db=-5, noise_db=-10)),
+        (tables[0], sim.settings, even_display(gain_db=-5, noise_db=-10)),
         (tables[1], sim.settings, QUIET),
         (tables[1], replace(sim.settings, seed=3), QUIET),
         (tables[1], replace(sim.settings, interfaces=False), QUIET),
@@ -552,3 +552,24 @@ def test_a_probe_that_would_take_minutes_is_refused_with_the_numbers():
     for use in (lambda: small.simulate(probe, np.eye(4)), lambda: small.volume(probe, [np.eye(4)])):
         with pytest.raises(SimulationError, match=words):
             use()
+
+
+def test_a_wall_breaks_where_its_roughness_varies_and_keeps_its_level():
+    """Levels along a flat wall vary from patch to patch; the mean power of its scatterers stays."""
+    bright = replace(SPECKLE, mu0=1.0, sigma0=0.5)
+    silent, csf = replace(SPECKLE, mu0=0.0, sigma0=0.0), replace(FLUID, name="csf")
+    labels = block(lambda x, y, z: np.where(y < 0, 2, 1), half_mm=(40, 20, 20))
+    probe, pose = LinearProbe(60, 30, scan_lines=181), rigid(np.eye(3), [0, -15, 0])
+    level = {}
+    for patch_db in (0.0, 7.0):
+        power = 0.0
+        for seed in range(12):
+            membrane = Membrane(bright, 0.6, ("csf",), diffuse_db=0.0, patch_db=patch_db)
+            table = TissueTable({0: silent, 1: silent, 2: csf}, membrane)
+            made = UltrasoundSimulator(labels, table, SimulationSettings(seed=seed, interfaces=False, ring_down=False))
+            power = power + (np.abs(made.simulate(probe, pose).iq) ** 2).sum(axis=1)[20:-20]
+            level.setdefault(f"single {patch_db}", power)
+        level[patch_db] = power
+    assert 10 * np.log10(level[7.0].mean() / level[0.0].mean()) == pytest.approx(0.0, abs=1.5)
+    wide = {db: uniform_filter1d(level[f"single {db}"], 12)[6:-6] for db in (0.0, 7.0)}  # over the speckle
+    assert np.log10(wide[7.0]).std() > 1.5 * np.log10(wide[0.0]).std()

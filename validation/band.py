@@ -14,7 +14,7 @@ from SlicerUSSim.Logic.imaging.simulator import UltrasoundSimulator
 from SlicerUSSim.Logic.probe.arrays import PROBES, ConvexProbe, LinearProbe, PhasedProbe, Probe
 from SlicerUSSim.Logic.probe.poses import elevational_motion
 from validation.checks import Check, Outcome, Row
-from validation.measurement import correlation, depth_window, level_db
+from validation.measurement import EVEN, correlation, depth_window, level_db
 from validation.phantoms import BACKGROUND, band_power, uniform_speckle
 from validation.pictures import Curve, Plot, draw_plots
 
@@ -42,7 +42,7 @@ def downshift(rotation: np.ndarray, device) -> Outcome:
     ]
     rows, curves = [], []
     for name, probe in _PROBES.items():
-        frames = [simulator.simulate(probe, phantom.probe_to_ras) for simulator in simulators]
+        frames = [simulator.simulate(probe, phantom.probe_to_ras, EVEN) for simulator in simulators]
         dz = frames[0].sample_interval_mm
         for depth in _DEPTHS_MM:
             near = [depth_window(frame, depth, _HALF_MM) for frame in frames]
@@ -70,7 +70,7 @@ def _wide_bands(rotation: np.ndarray, device) -> list[Row]:
     """Levels down to the end of the image, and after TGC, which is that of the band."""
     tissue = replace(BACKGROUND, attenuation_db_cm_mhz=_MUCH_DB_CM_MHZ)
     phantom = uniform_speckle(tissue, rotation)
-    display = DisplaySettings(tgc_db_cm_mhz=_MUCH_DB_CM_MHZ, tgc_reach=1.0, noise_db=None)
+    display = DisplaySettings(look="even", tgc_db_cm_mhz=_MUCH_DB_CM_MHZ, tgc_reach=1.0, noise_db=None)
     rows, even = [], 10 * np.log10(tissue.scatterer_variance)
     for name in _WIDE:
         probe = PROBES[name]
@@ -112,7 +112,7 @@ def _widths(name: str, probe: Probe, pose: np.ndarray, simulators, frames: list[
     lag = max(1, round(sigma_l / apart))
     near = [depth_window(frame, depth, _HALF_MM) for frame in frames]
     beside = pose @ elevational_motion(0.8 * sigma_e)
-    others = [depth_window(simulator.simulate(probe, beside), depth, _HALF_MM) for simulator in simulators]
+    others = [depth_window(simulator.simulate(probe, beside, EVEN), depth, _HALF_MM) for simulator in simulators]
     for direction, distance, sigma, pairs in (
         ("lateral", lag * apart, sigma_l, [(signal[:-lag], signal[lag:]) for signal in near]),
         ("elevational", 0.8 * sigma_e, sigma_e, list(zip(near, others, strict=True))),

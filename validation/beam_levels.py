@@ -14,6 +14,7 @@ from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.imaging.simulator import UltrasoundSimulator
 from SlicerUSSim.Logic.probe.arrays import PhasedProbe, Probe
 from SlicerUSSim.Logic.tissue.table import TissueTable
+from validation.measurement import EVEN
 from validation.wave import Map
 
 _Result = TypeVar("_Result")
@@ -61,7 +62,7 @@ def levels_and_widths(
         own = other = common = 0.0
         for seed in range(seeds):
             simulator.settings = replace(settings, seed=seed)
-            frame = simulator.simulate(probe, pose)
+            frame = simulator.simulate(probe, pose, EVEN)
             starts = (edges_mm / frame.sample_interval_mm).astype(int)
             first, second = (frame.iq[part, : starts[-1]].astype(np.complex128) for part in (lines, following))
             own, other, common = (

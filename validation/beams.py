@@ -16,7 +16,7 @@ from SlicerUSSim.Logic.imaging.simulator import UltrasoundSimulator
 from SlicerUSSim.Logic.probe.beam import FWHM_PER_SIGMA
 from SlicerUSSim.Logic.probe.poses import elevational_motion, sample, slide_sweep, tilt_sweep
 from validation.checks import PROBES, Check, Outcome, Row
-from validation.measurement import depth_window, echo_near, full_width
+from validation.measurement import EVEN, depth_window, echo_near, full_width
 from validation.phantoms import (
     FLUID,
     Echo,
@@ -43,7 +43,7 @@ def echo_level(rotation: np.ndarray, device) -> Outcome:
         simulator.settings = replace(simulator.settings, interface_reflection=kind)
         for name, probe in PROBES.items():
             low = replace(probe, frequency_mhz=2.0)  # as for reverberation
-            peak = echo_near(simulator.simulate(low, phantom.probe_to_ras), low, (0.0, 25.0), 1.0)[2]
+            peak = echo_near(simulator.simulate(low, phantom.probe_to_ras, EVEN), low, (0.0, 25.0), 1.0)[2]
             # The lines of a sector meet a plane at right angles only in the middle: at y it is y^2 / 2 R further away.
             radius = low.apex_radius_mm + 25.0
             turns = 2 * np.pi * low.cycles_per_mm * float(low.beam_sigma_mm(25.0)[0]) ** 2 / radius
@@ -95,7 +95,7 @@ def tilted_in_elevation(rotation: np.ndarray, device) -> Outcome:
             motion = elevational_motion(angle_deg=tilt)
             # The plane's point on the axis lies `depth` before the face.
             motion[:3, 3] = [0.0, 25.0, 0.0] - motion[:3, :3] @ [0.0, depth, 0.0]
-            frame = simulator.simulate(probe, phantom.probe_to_ras @ motion)
+            frame = simulator.simulate(probe, phantom.probe_to_ras @ motion, EVEN)
             return echo_near(frame, probe, (0.0, depth), 2.0)[2]
 
         peaks = {tilt: peak(low, tilt, 25.0) for tilt in (0.0, 2.0, 3.0, 8.0)}
@@ -125,7 +125,7 @@ def interface_width(rotation: np.ndarray, device) -> Outcome:
         sigma_l, sigma_e = (float(s) for s in low.beam_sigma_mm(depth))
 
         def echo(offset_mm: float, low=low) -> np.ndarray:
-            frame = simulator.simulate(low, phantom.probe_to_ras @ elevational_motion(offset_mm))
+            frame = simulator.simulate(low, phantom.probe_to_ras @ elevational_motion(offset_mm), EVEN)
             return np.abs(depth_window(frame, depth, 2.0)).max(axis=1)
 
         across = low.line_positions() / low.line_spacing * low.line_distance_mm(depth)
@@ -161,7 +161,7 @@ def resolution(rotation: np.ndarray, device) -> Outcome:
     rows, curves = [], []
     for name, probe in PROBES.items():
         fine = replace(probe, scan_lines=481)
-        frame = simulator.simulate(fine, phantom.probe_to_ras)
+        frame = simulator.simulate(fine, phantom.probe_to_ras, EVEN)
         for wire in (
             e
             for e in phantom.expected(fine)
@@ -197,9 +197,8 @@ def slice_thickness(rotation: np.ndarray, device) -> Outcome:
         offsets = sigma * np.array([0.0, 0.5, 1.0, 1.5, 2.0])
         # To both sides: one has too few independent scatterers for the limits below.
         poses = [phantom.probe_to_ras @ elevational_motion(offset) for offset in (*offsets, *-offsets)]
-        powers = np.reshape([_band_power(frame, wide, depth) for frame in simulator.sweep(wide, poses)], (2, -1)).mean(
-            0
-        )
+        powers = [_band_power(frame, wide, depth) for frame in simulator.sweep(wide, poses, EVEN)]
+        powers = np.reshape(powers, (2, -1)).mean(0)
         measured = 10 * np.log10(np.maximum(powers, 1e-30) / powers[0])
         expected = _bar_fall_db(offsets, sigma, width)
         rows += [
@@ -236,7 +235,7 @@ def compounding(rotation: np.ndarray, device) -> Outcome:
     settings = SimulationSettings(scatterers_per_mm3=300.0)
     simulator = UltrasoundSimulator(phantom.labels, phantom.tissues, settings, device)
     probe = replace(PROBES["linear"], width_mm=20.0, scan_lines=101, elevation_focus_mm=55.0)
-    display = DisplaySettings(gain_db=-25.0, dynamic_range_db=100.0, tgc_db_cm_mhz=0.0, noise_db=None)
+    display = DisplaySettings(look="even", gain_db=-25.0, dynamic_range_db=100.0, tgc_db_cm_mhz=0.0, noise_db=None)
     sigma = float(probe.beam_sigma_mm(depth)[1])
     sweeps = {
         "slide": slide_sweep(phantom.probe_to_ras, 10.0, 41),

@@ -13,7 +13,7 @@ from SlicerUSSim.Logic.imaging.simulator import UltrasoundSimulator
 from SlicerUSSim.Logic.probe.arrays import LinearProbe
 from validation.beams import BEHIND
 from validation.checks import Check, Outcome, Row
-from validation.measurement import depth_window
+from validation.measurement import EVEN, depth_window
 from validation.phantoms import FLUID, curved_wall, reflection_coefficient
 from validation.pictures import Curve, Plot, draw_plots
 
@@ -56,7 +56,7 @@ def curved_walls(rotation: np.ndarray, device) -> Outcome:
                 turned = rotation @ _turn(grid)
                 phantom = curved_wall(shape, radius, turned, depth_mm=_DEPTH_MM, spacing_mm=spacing)
                 simulator = UltrasoundSimulator(phantom.labels, phantom.tissues, _SETTINGS, device)
-                frame = simulator.simulate(_PROBE, phantom.probe_to_ras)
+                frame = simulator.simulate(_PROBE, phantom.probe_to_ras, EVEN)
                 near = depth_window(frame, _DEPTH_MM, min(2.0, 0.8 * radius))[75:86]
                 levels.append(20 * np.log10(np.abs(near).max()) - square)
             means.append(float(np.mean(levels)))

@@ -18,7 +18,7 @@ from SlicerUSSim.Logic.probe.arrays import PROBES, LinearProbe, Probe
 from SlicerUSSim.Logic.tissue.table import TissueTable
 from validation.beams import BEHIND
 from validation.checks import Check, Outcome, Row
-from validation.measurement import depth_window
+from validation.measurement import EVEN, depth_window
 from validation.phantoms import FLUID, Phantom, layered, reflection_coefficient
 from validation.pictures import Curve, Plot, draw_plots
 
@@ -90,13 +90,13 @@ def turned_planes(rotation: np.ndarray, device) -> Outcome:
                 [FLUID, BEHIND], [_DEPTH_MM], turned, spacing_mm=spacing, half_width_mm=36.0, half_thickness_mm=30.0
             )
             simulator = UltrasoundSimulator(phantom.labels, phantom.tissues, _SETTINGS, device)
-            along = _levels(simulator.simulate(_PROBE, phantom.probe_to_ras), _DEPTH_MM, 3.0) - level
+            along = _levels(simulator.simulate(_PROBE, phantom.probe_to_ras, EVEN), _DEPTH_MM, 3.0) - level
             lowest.append(float(along.min()))
             voxels = f"turned by {turn:g} degrees, {spacing:g} mm"
             rows.append(Row(f"lowest level, {voxels}", "dB", 0.0, lowest[-1], loss, "at least"))
             rows.append(Row(f"highest level, {voxels}", "dB", 0.0, float(along.max()), 0.5, "at most"))
             tilted = phantom.probe_to_ras @ _tilt_about(_DEPTH_MM, _TILT_DEG)
-            variation = float(np.ptp(_levels(simulator.simulate(_PROBE, tilted), _DEPTH_MM, 3.0)))
+            variation = float(np.ptp(_levels(simulator.simulate(_PROBE, tilted, EVEN), _DEPTH_MM, 3.0)))
             what = f"variation along a plane tilted by {_TILT_DEG:g} degrees, {voxels}"
             rows.append(Row(what, "dB", 0.0, variation, _VARIATION_DB, "at most"))
         turns = np.array(list(_TURNS))
@@ -193,7 +193,7 @@ def planes_along_diagonals(rotation: np.ndarray, device) -> Outcome:
             )  # fmt: skip
             simulator = UltrasoundSimulator(phantom.labels, phantom.tissues, _SETTINGS, device)
             tilted = phantom.probe_to_ras @ _tilt_about(_DEPTH_MM, _TILT_DEG)
-            variations.append(float(np.ptp(_levels(simulator.simulate(_PROBE, tilted), _DEPTH_MM, 3.0))))
+            variations.append(float(np.ptp(_levels(simulator.simulate(_PROBE, tilted, EVEN), _DEPTH_MM, 3.0))))
         worst = int(np.argmax(variations))
         what = f"{_FROM_DIAGONAL[worst]:g} degrees from {across}, {spacing:g} mm"
         quantity = f"largest variation along a plane tilted by {_TILT_DEG:g} degrees, {what}"
@@ -206,7 +206,7 @@ def _along_plane(simulator: UltrasoundSimulator, probe: Probe, pose: np.ndarray,
 
     The plane lies _DEPTH_MM deep on the axis and has the unit normal (3,) in the frame of the probe.
     """
-    frame = simulator.simulate(probe, pose)
+    frame = simulator.simulate(probe, pose, EVEN)
     origins, directions = probe.origins_mm(), probe.directions()
     path = ((np.array([0.0, _DEPTH_MM, 0.0]) - origins) @ normal) / (directions @ normal)
     is_near = (path > 0.0) & (np.abs((origins + path[:, None] * directions)[:, 0]) < 14.0)
@@ -266,7 +266,7 @@ def flat_layers(rotation: np.ndarray, device) -> Outcome:
                 [FLUID, BEHIND, FLUID], depths, turned, spacing_mm=spacing, half_width_mm=36.0, half_thickness_mm=30.0
             )
             simulator = UltrasoundSimulator(phantom.labels, phantom.tissues, _SETTINGS, device)
-            frame = simulator.simulate(_PROBE, phantom.probe_to_ras)
+            frame = simulator.simulate(_PROBE, phantom.probe_to_ras, EVEN)
             shown = depths[0] + thickness * phantom.tissues[0].speed_of_sound_m_s / BEHIND.speed_of_sound_m_s
             for wall, depth, expected in (("front", depths[0], square), ("back", shown, square + through)):
                 along = _levels(frame, depth, min(1.5, 0.4 * thickness)) - expected
@@ -307,7 +307,7 @@ def walls_near_ends(rotation: np.ndarray, device) -> Outcome:
         shown = _DEPTH_MM + thickness * FLUID.speed_of_sound_m_s / BEHIND.speed_of_sound_m_s
         for place, from_end in enumerate(_FROM_END):
             labels, tissues = _cut(phantom, from_end)
-            frame = UltrasoundSimulator(labels, tissues, _SETTINGS, device).simulate(_PROBE, phantom.probe_to_ras)
+            frame = UltrasoundSimulator(labels, tissues, _SETTINGS, device).simulate(_PROBE, phantom.probe_to_ras, EVEN)
             for wall, depth in enumerate((_DEPTH_MM, shown)[: len(borders)]):
                 half = min(1.5, 0.4 * thickness) if voxels else 3.0
                 lowest[place, wall] = (_levels(frame, depth, half, 1.0) - square - wall * through).min()

@@ -7,11 +7,11 @@ from functools import partial
 
 import numpy as np
 
-from SlicerUSSim.Logic.base.settings import DisplaySettings, SimulationSettings
+from SlicerUSSim.Logic.base.settings import SimulationSettings
 from SlicerUSSim.Logic.imaging.simulator import UltrasoundSimulator
 from SlicerUSSim.Logic.probe.arrays import ConvexProbe, PhasedProbe, Probe
 from validation.checks import Check, Outcome, Row
-from validation.measurement import depth_window, level_db
+from validation.measurement import EVEN, depth_window, level_db
 from validation.phantoms import FLUID, clutter_power, round_cyst, uniform_speckle
 from validation.pictures import Curve, Plot, draw_plots
 
@@ -67,7 +67,7 @@ def _contrast_db(probe: Probe, depth: float, rotation: np.ndarray, device) -> fl
     simulator = UltrasoundSimulator(phantom.labels, phantom.tissues, device=device)
     for seed in range(_SEEDS):
         simulator.settings = SimulationSettings(seed=seed, interfaces=False)
-        window = depth_window(simulator.simulate(probe, phantom.probe_to_ras), depth, 1.0)
+        window = depth_window(simulator.simulate(probe, phantom.probe_to_ras, EVEN), depth, 1.0)
         inside.append(window[middle - near : middle + near + 1])
         outside += [window[middle - far : middle - far + 2 * near], window[middle + far - 2 * near : middle + far]]
     return level_db(np.stack(inside)) - level_db(np.stack(outside))
@@ -80,7 +80,7 @@ def ring_down(rotation: np.ndarray, device) -> Outcome:
     rows = []
     for name, probe in _PROBES.items():
         ringing = replace(probe, ring_down_mm=2.0, ring_down_db=6.0)
-        frame = simulator.simulate(ringing, phantom.probe_to_ras, DisplaySettings(noise_db=None, tgc_db_cm_mhz=0.0))
+        frame = simulator.simulate(ringing, phantom.probe_to_ras, replace(EVEN, noise_db=None, tgc_db_cm_mhz=0.0))
         level = 20.0 * np.log10(frame.envelope.mean(axis=0) + 1e-9)
         pulse = round(2.4 * probe.axial_sigma_mm / frame.sample_interval_mm)
         end = round(2.0 / frame.sample_interval_mm)

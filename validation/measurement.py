@@ -9,8 +9,12 @@ import numpy as np
 from scipy import integrate, special
 
 from SlicerUSSim.Logic.base.errors import require
+from SlicerUSSim.Logic.base.settings import DisplaySettings
 from SlicerUSSim.Logic.imaging.frame import Frame
 from SlicerUSSim.Logic.probe.arrays import Probe
+
+#: Without a scanner's look, which theory does not have
+EVEN = DisplaySettings(look="even")
 
 
 def level_db(signal: np.ndarray) -> float:

@@ -12,6 +12,7 @@ from SlicerUSSim.Logic.imaging.simulator import UltrasoundSimulator
 from SlicerUSSim.Logic.probe.arrays import LinearProbe
 from SlicerUSSim.Logic.tissue.tissue import Tissue
 from validation.checks import PROBES, Check, Outcome, Row
+from validation.measurement import EVEN
 from validation.phantoms import (
     FLUID,
     Phantom,
@@ -82,7 +83,7 @@ def total_reflection(rotation: np.ndarray, device) -> Outcome:
     hits = tree.hits[(tree.hits["reflections"] == 0) & (tree.hits["label_behind"] == 2)]
     through = (tree.segments["reflections"] == 0) & (tree.segments["label"] == 2)
     view = View(
-        "total reflection", phantom, PROBES["linear"], simulator.simulate(PROBES["linear"], phantom.probe_to_ras)
+        "total reflection", phantom, PROBES["linear"], simulator.simulate(PROBES["linear"], phantom.probe_to_ras, EVEN)
     )
     reached = float(hits["reflectance"].min()) if len(hits) else 0.0
     return Outcome(
@@ -112,7 +113,7 @@ def attenuation_and_time(rotation: np.ndarray, device) -> Outcome:
             # Over the aperture, steps of a voxel through 0.9 dB/mm: an oblique slab is some 0.2 mm off.
             Row(f"two-way loss to the back, {name}", "dB", loss, float(measured), 0.3),
         ]
-    frame = simulator.simulate(PROBES["convex"], phantom.probe_to_ras)
+    frame = simulator.simulate(PROBES["convex"], phantom.probe_to_ras, EVEN)
     return Outcome(tuple(rows), partial(draw_views, views=[View("fast slab", phantom, PROBES["convex"], frame)]))
 
 
@@ -125,7 +126,7 @@ def sub_voxel_interfaces(rotation: np.ndarray, device) -> Outcome:
     hits = simulator.trace(probe, phantom.probe_to_ras).hits
     front = hits[hits["label_before"] == 0]
     seen = replace(PROBES["convex"], depth_mm=60.0)
-    image = simulator.simulate(seen, phantom.probe_to_ras)
+    image = simulator.simulate(seen, phantom.probe_to_ras, EVEN)
     from_centre = front["position"] - np.array(phantom.centre_ras)
     radius = np.linalg.norm(from_centre, axis=1)
     angle = np.degrees(np.arccos(np.clip((front["normal"] * from_centre / radius[:, None]).sum(axis=1), -1, 1)))
@@ -150,7 +151,7 @@ def thin_sheet(rotation: np.ndarray, device) -> Outcome:
         crossed = set(zip(tree.hit_line[front], tree.hit_ray[front], strict=True))
         rays = len(np.unique(tree.segment_line)) * simulator.settings.elevational_rays
         rows.append(Row(f"fraction of rays that hit it, {name}", "", 1.0, len(crossed) / rays, 0.0))
-    frame = simulator.simulate(PROBES["convex"], phantom.probe_to_ras)
+    frame = simulator.simulate(PROBES["convex"], phantom.probe_to_ras, EVEN)
     return Outcome(
         tuple(rows), partial(draw_views, views=[View("sheet of one voxel", phantom, PROBES["convex"], frame)])
     )

@@ -18,14 +18,17 @@ from SlicerUSSim.Logic.tissue.table import TissueTable
 from SlicerUSSim.Logic.tissue.tissue import Membrane
 from validation.beams import BEHIND
 from validation.checks import Check, Outcome, Row
-from validation.measurement import depth_window, full_width
+from validation.measurement import EVEN, depth_window, full_width
 from validation.phantoms import FLUID, Phantom, layered, reflection_coefficient, rough_plane
 from validation.pictures import Curve, Plot, draw_plots
 
 _DEPTH_MM, _IMAGED_MM = 25.0, 40.0  # of the sheet, and of images: deeper samples are not looked at
 _SILENT = SimulationSettings(scattering=False, specular_exponent=0.0, ring_down=False, side_lobes=False)
 _LOUD = replace(_SILENT, scattering=True)
-_GREY, _PIA = (replace(TISSUES[name], attenuation_db_cm_mhz=0.0) for name in ("grey matter", "leptomeninges"))
+_GREY, _PIA = (
+    replace(TISSUES[name], attenuation_db_cm_mhz=0.0, texture_db=0.0, specks_per_mm3=0.0)
+    for name in ("grey matter", "leptomeninges")
+)
 #: A sheet thinner than the voxels of the plane beneath it allow for
 _MEMBRANE = Membrane(replace(_PIA, speed_of_sound_m_s=FLUID.speed_of_sound_m_s), 0.2, (FLUID.name,))
 _TILTS_DEG = (0.0, 4.0, 8.0)
@@ -98,7 +101,7 @@ def coherent_part(rotation: np.ndarray, device) -> Outcome:
                 membrane = replace(table.membrane, roughness_mm=_of_phase(probe, phase))
                 simulator.set_tissues(table.with_membrane(membrane))
                 for m, tilt in enumerate(_TILTS_DEG):
-                    frame = simulator.simulate(probe, phantom.probe_to_ras @ _tilted(tilt))
+                    frame = simulator.simulate(probe, phantom.probe_to_ras @ _tilted(tilt), EVEN)
                     levels[n, m] = _middle_db(frame, probe)
             lost = levels[1:] - levels[0]
             power = np.outer(np.square(_PHASES), np.cos(np.radians(_TILTS_DEG)) ** 2)
@@ -129,7 +132,7 @@ def _diffuse_rows(phantom: Phantom, tissues: TissueTable, device) -> list[Row]:
         echoes = []
         for seed in range(_SEEDS):
             simulator.settings = replace(_LOUD, seed=seed)
-            frame = simulator.simulate(probe, phantom.probe_to_ras)
+            frame = simulator.simulate(probe, phantom.probe_to_ras, EVEN)
             near = np.abs(probe.line_positions()) < 5.0
             echoes.append(frame.iq[near, round(_DEPTH_MM / frame.sample_interval_mm)])
         levels = 10 * np.log10([np.abs(np.mean(echoes)) ** 2, np.var(echoes)])
@@ -181,7 +184,7 @@ def rough_planes(rotation: np.ndarray, device) -> Outcome:
                 heights = _surface(seed, rms)
                 phantom = rough_plane(heights, step, [FLUID, BEHIND], rotation, depth_mm=_DEPTH_MM)
                 frame = UltrasoundSimulator(phantom.labels, phantom.tissues, _SILENT, device).simulate(
-                    probe, phantom.probe_to_ras
+                    probe, phantom.probe_to_ras, EVEN
                 )
                 peaks = np.abs(depth_window(frame, _DEPTH_MM, 1.5)).max(axis=1)[near]
                 found.append(20 * np.log10(peaks) - square)
@@ -213,7 +216,7 @@ def thickness_of_sheets(rotation: np.ndarray, device) -> Outcome:
             power = 0.0
             for seed in range(_SEEDS):
                 simulator.settings = replace(_LOUD, seed=seed, interfaces=False)
-                frame = simulator.simulate(probe, phantom.probe_to_ras)
+                frame = simulator.simulate(probe, phantom.probe_to_ras, EVEN)
                 power = power + _profile(frame, probe)
             measured = np.sqrt(power / _SEEDS)
             sigma = probe.axial_sigma_mm

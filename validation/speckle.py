@@ -9,7 +9,7 @@ from functools import partial
 import numpy as np
 from scipy import stats
 
-from SlicerUSSim.Logic.base.settings import DisplaySettings, SimulationSettings
+from SlicerUSSim.Logic.base.settings import SimulationSettings
 from SlicerUSSim.Logic.imaging.frame import Frame
 from SlicerUSSim.Logic.imaging.scattering import PAPER_SITES_PER_MM3, sites_per_mm3
 from SlicerUSSim.Logic.imaging.simulator import UltrasoundSimulator
@@ -19,6 +19,7 @@ from SlicerUSSim.Logic.tissue.table import TissueTable
 from SlicerUSSim.Logic.tissue.tissue import Tissue
 from validation.checks import PROBES, Check, Outcome, Row
 from validation.measurement import (
+    EVEN,
     correlation,
     depth_window,
     envelope_snr,
@@ -72,7 +73,7 @@ def statistics(rotation: np.ndarray, device) -> Outcome:
     phantom, simulators = _simulators(rotation, device)
     rows = []
     for name, probe in PROBES.items():
-        signals = [s.simulate(probe, phantom.probe_to_ras).iq[:, 64:-64] for s in simulators]
+        signals = [s.simulate(probe, phantom.probe_to_ras, EVEN).iq[:, 64:-64] for s in simulators]
         envelope = np.abs(np.stack(signals))
         variance = 10 * np.log10(SPECKLE.scatterer_variance)
         snr = float(envelope.mean() / envelope.std())
@@ -81,7 +82,7 @@ def statistics(rotation: np.ndarray, device) -> Outcome:
             Row(f"level, {name}", "dB", variance, level_db(envelope), 0.5),
             Row(f"spectral peak over surroundings, {name}", "", 8.0, _spectral_peak(envelope), 0.0, "at most"),
         ]
-    frame = simulators[0].simulate(PROBES["convex"], phantom.probe_to_ras, DisplaySettings(tgc_db_cm_mhz=0.0))
+    frame = simulators[0].simulate(PROBES["convex"], phantom.probe_to_ras, replace(EVEN, tgc_db_cm_mhz=0.0))
     return Outcome(tuple(rows), partial(draw_views, views=[View("speckle", phantom, PROBES["convex"], frame)]))
 
 
@@ -104,14 +105,14 @@ def everywhere(rotation: np.ndarray, device) -> Outcome:
     rows = []
     phantom, simulators = _simulators(rotation, device)
     for name, probe in SHIPPED.items():
-        frames = [s.simulate(probe, phantom.probe_to_ras) for s in simulators]
+        frames = [s.simulate(probe, phantom.probe_to_ras, EVEN) for s in simulators]
         for place, depth in {"near the face": 0.1, "at the focus": 0.6, "far": 0.9}.items():
             found = _window_statistics(frames, depth * probe.depth_mm, 0.06 * probe.depth_mm)
             rows += _statistics_rows(f"{place}, {name}", SPECKLE, *found)
     probe = PROBES["linear"]
     for name, tissue in TISSUES_OF_SPECKLE.items():
         phantom, simulators = _simulators(rotation, device, tissue)
-        frames = [s.simulate(probe, phantom.probe_to_ras) for s in simulators]
+        frames = [s.simulate(probe, phantom.probe_to_ras, EVEN) for s in simulators]
         rows += _statistics_rows(name, tissue, *_window_statistics(frames, 28.0, 20.0))
     return Outcome(tuple(rows))
 
@@ -125,7 +126,7 @@ def sparse(rotation: np.ndarray, device) -> Outcome:
         probe = SHIPPED[name]
         half = 0.04 * probe.depth_mm
         depth, cell, expected = smallest_cell(probe, tissue, half)
-        frames = [s.simulate(probe, phantom.probe_to_ras) for s in simulators]
+        frames = [s.simulate(probe, phantom.probe_to_ras, EVEN) for s in simulators]
         found, level = _window_statistics(frames, depth, half)
         few = f"{name}, {PAPER_SITES_PER_MM3 * tissue.scatterer_share * cell:.2g} in a cell"
         rows.append(Row(f"mean / standard deviation, {few}", "", expected, found, 0.015 * expected))
@@ -168,14 +169,14 @@ def correlations(rotation: np.ndarray, device) -> Outcome:
     phantom, simulators = _simulators(rotation, device)
     rows, curves = [], []
     for name, probe in PROBES.items():
-        frames = [s.simulate(probe, phantom.probe_to_ras) for s in simulators]
+        frames = [s.simulate(probe, phantom.probe_to_ras, EVEN) for s in simulators]
         for depth in DEPTHS_MM:
             sigma_l = float(probe.speckle_sigma_mm(depth))
             half_l, half_e = _half_lengths_of_waves(probe, depth)
             apart = float(probe.line_distance_mm(depth))
             lag = max(1, round(sigma_l / apart))
             beside = phantom.probe_to_ras @ elevational_motion(half_e)
-            others = [s.simulate(probe, beside) for s in simulators]
+            others = [s.simulate(probe, beside, EVEN) for s in simulators]
             near = [depth_window(f, depth, 1.0) for f in frames]
             wide = [depth_window(f, depth, 3.0) for f in frames]
             dz, sigma_a = frames[0].sample_interval_mm, probe.axial_sigma_mm
@@ -237,9 +238,9 @@ def coherence(rotation: np.ndarray, device) -> Outcome:
         name: PROBES[name] for name in ("convex", "phased")
     }
     for name, probe in probes.items():
-        here = simulator.simulate(probe, phantom.probe_to_ras)
-        moved = simulator.simulate(probe, phantom.probe_to_ras @ one_line_on(probe))
-        again = simulator.simulate(probe, phantom.probe_to_ras)
+        here = simulator.simulate(probe, phantom.probe_to_ras, EVEN)
+        moved = simulator.simulate(probe, phantom.probe_to_ras @ one_line_on(probe), EVEN)
+        again = simulator.simulate(probe, phantom.probe_to_ras, EVEN)
         kept = correlation(here.iq[1:], moved.iq[:-1])
         if name == "convex":
             images = {
@@ -278,7 +279,7 @@ def uneven(rotation: np.ndarray, device) -> Outcome:
         for seed in range(3 * len(SEEDS)):
             for place, tissue in enumerate((SPECKLE, replace(SPECKLE, **changes))):
                 phantom, (simulator,) = _simulators(rotation, device, tissue, seeds=(seed,))
-                frame = simulator.simulate(PROBES["linear"], phantom.probe_to_ras)
+                frame = simulator.simulate(PROBES["linear"], phantom.probe_to_ras, EVEN)
                 power[place] += 10.0 ** (0.1 * level_db(frame.iq[:, 64:-64]))
         change = float(10.0 * np.log10(power[1] / power[0]))
         rows.append(Row(f"level re even tissue, {name}", "dB", 0.0, change, 0.1))
@@ -300,7 +301,7 @@ def echogenicity(rotation: np.ndarray, device) -> Outcome:
     }.items():
         tissue = replace(SPECKLE, **changes)
         phantom, simulators = _simulators(rotation, device, tissue, seeds=range(2))
-        frames = [s.simulate(PROBES["linear"], phantom.probe_to_ras) for s in simulators]
+        frames = [s.simulate(PROBES["linear"], phantom.probe_to_ras, EVEN) for s in simulators]
         level = level_db(np.stack([f.iq[:, 64:-64] for f in frames]))
         rows.append(Row(name, "dB", 10 * np.log10(tissue.scatterer_variance), level, 0.5))
     for speed in SPEEDS:
@@ -308,7 +309,7 @@ def echogenicity(rotation: np.ndarray, device) -> Outcome:
         phantom, simulators = _simulators(rotation, device, tissue)
         for name in ("linear", "phased"):
             probe = PROBES[name]
-            frames = [s.simulate(probe, phantom.probe_to_ras) for s in simulators]
+            frames = [s.simulate(probe, phantom.probe_to_ras, EVEN) for s in simulators]
             for part in (0.25, 0.75):
                 _, level = _window_statistics(frames, part * probe.depth_mm, 0.2 * probe.depth_mm)
                 what = f"{speed:.0f} m/s, {name}, at {part * probe.depth_mm:.0f} mm"
@@ -332,7 +333,7 @@ def rayleigh(rotation: np.ndarray, device) -> Outcome:
     phantom, simulators = _simulators(
         rotation, device, tissue, range(3), scatterers_per_mm3=RAYLEIGH_SITES_PER_MM3, reflections=False
     )
-    frames = [s.simulate(probe, phantom.probe_to_ras) for s in simulators]
+    frames = [s.simulate(probe, phantom.probe_to_ras, EVEN) for s in simulators]
     first = int(first_mm / frames[0].sample_interval_mm)
     envelope = np.abs(np.stack([frame.iq[:, first:-64] for frame in frames]))
     fit = fit_rayleigh(envelope)

@@ -18,6 +18,7 @@ from SlicerUSSim.Logic.tissue.sheet_looks import DURA, DURA_ISOTROPIC
 from SlicerUSSim.Logic.tissue.table import TissueTable
 from SlicerUSSim.Logic.tissue.tissue import Membrane
 from validation.checks import Check, Outcome, Row
+from validation.measurement import EVEN
 from validation.phantoms import layered
 from validation.pictures import Curve, Plot, draw_plots
 from validation.rough import plane_of_dura
@@ -25,7 +26,8 @@ from validation.rough import plane_of_dura
 _DEPTH_MM, _BAND_MM = 15.0, 0.6  # of the sheet's middle; about it levels are means
 _PROBE = LinearProbe(24.0, 30.0, scan_lines=97, frequency_mhz=5.0, focus_mm=_DEPTH_MM, elevation_focus_mm=_DEPTH_MM)
 _GREY, _PIA, _DURA = (
-    replace(TISSUES[name], attenuation_db_cm_mhz=0.0) for name in ("grey matter", "leptomeninges", DURA)
+    replace(TISSUES[name], attenuation_db_cm_mhz=0.0, texture_db=0.0, specks_per_mm3=0.0)
+    for name in ("grey matter", "leptomeninges", DURA)
 )
 #: At the speed of the brain, so that its wall is seen where it is
 _CSF = replace(_GREY, name="csf", mu0=0.0, sigma0=0.0)
@@ -59,7 +61,7 @@ def _levels_db(kind: str, rotation: np.ndarray, spacing_mm: float, device) -> np
         power = []
         for seed in range(_SEEDS):
             simulator.settings = replace(_SETTINGS, seed=seed)
-            frame = simulator.simulate(_PROBE, phantom.probe_to_ras @ motion)
+            frame = simulator.simulate(_PROBE, phantom.probe_to_ras @ motion, EVEN)
             depth = (np.arange(frame.iq.shape[1]) + 0.5) * frame.sample_interval_mm - _DEPTH_MM
             aside = _PROBE.line_positions()[:, None]
             across = np.sin(angle) * aside + np.cos(angle) * depth

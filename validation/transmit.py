@@ -15,7 +15,7 @@ from SlicerUSSim.Logic.probe.arrays import LinearProbe, Probe
 from SlicerUSSim.Logic.probe.beam import FWHM_PER_SIGMA, LEAKED, MAIN_LOBE
 from SlicerUSSim.Logic.probe.image_grid import ImageGrid
 from validation.checks import PROBES, Check, Outcome, Row
-from validation.measurement import correlation, depth_window, echo_near, full_width, level_db
+from validation.measurement import EVEN, correlation, depth_window, echo_near, full_width, level_db
 from validation.phantoms import Echo, Phantom, uniform_speckle, wires_and_cysts
 from validation.pictures import Curve, Plot, View, draw_plots, draw_views
 from validation.speckle import SPECKLE
@@ -73,7 +73,7 @@ def compounded_angles(rotation: np.ndarray, device) -> Outcome:
         rows += [
             Row(f"lateral FWHM at {depth} mm, {name}", "mm", width, found[depth], 0.15 * width) for depth in (20, 30)
         ]
-        frames = [s.simulate(probe, tissue.probe_to_ras) for s in speckle]
+        frames = [s.simulate(probe, tissue.probe_to_ras, EVEN) for s in speckle]
         depths = np.array([8.0, 22.0, 38.0])
         lengths = np.array([_correlation_length(frames, probe, depth) for depth in depths])
         rows += [
@@ -113,14 +113,14 @@ def steered_lines(rotation: np.ndarray, device) -> Outcome:
     speckle = UltrasoundSimulator(tissue.labels, tissue.tissues, device=device)
     rows, views = [], []
     for name, probe in _STEERED.items():
-        frame = simulator.simulate(probe, phantom.probe_to_ras)
+        frame = simulator.simulate(probe, phantom.probe_to_ras, EVEN)
         for wire in _echoes(phantom, probe):
             if not probe.holds(*np.array(wire.shown_mm)):
                 continue
             x, y, _ = echo_near(frame, probe, wire.shown_mm, 1.5)
             off = float(np.hypot(x - wire.shown_mm[0], y - wire.shown_mm[1]))
             rows.append(Row(f"position error of the {wire.name}, {name}", "mm", 0.0, off, 0.15, "at most"))
-        full = DisplaySettings(dynamic_range_db=200.0, tgc_db_cm_mhz=0.0)
+        full = DisplaySettings(look="even", dynamic_range_db=200.0, tgc_db_cm_mhz=0.0)
         frame = speckle.simulate(probe, tissue.probe_to_ras, full)
         field = ImageGrid.for_probe(probe, None).field(probe)
         wrong = float(((frame.image > 0) != field).mean())
@@ -128,7 +128,7 @@ def steered_lines(rotation: np.ndarray, device) -> Outcome:
         inside = depth_window(frame, 30.0 + float(probe.line_starts_mm(0.0)), 5.0)
         level = 10 * np.log10(SPECKLE.scatterer_variance)
         rows.append(Row(f"level of speckle, {name}", "dB", level, level_db(inside), 1.0))
-        views.append(View(name, phantom, probe, simulator.simulate(probe, phantom.probe_to_ras)))
+        views.append(View(name, phantom, probe, simulator.simulate(probe, phantom.probe_to_ras, EVEN)))
     rows += _levels_of_lines(tissue, device)
     return Outcome(tuple(rows), partial(draw_views, views=views))
 
@@ -137,7 +137,7 @@ def _levels_of_lines(tissue: Phantom, device) -> list[Row]:
     """Near the face and deeper, the level of speckle along the inner and outer lines of a wide trapezoid."""
     frames = [
         UltrasoundSimulator(tissue.labels, tissue.tissues, SimulationSettings(seed=seed), device).simulate(
-            _WIDE, tissue.probe_to_ras
+            _WIDE, tissue.probe_to_ras, EVEN
         )
         for seed in range(8)
     ]
@@ -170,7 +170,7 @@ def harmonic(rotation: np.ndarray, device) -> Outcome:
         # At equal f-numbers: transmitted twice at half the frequency, received once at the whole.
         ratio = np.sqrt(2.0 / 6.0)
         rows.append(Row(f"width of a wire re the fundamental, {name}", "", ratio, widths[1] / widths[0], 0.1 * ratio))
-        frames = [s.simulate(second, tissue.probe_to_ras, DisplaySettings(noise_db=None)) for s in speckle]
+        frames = [s.simulate(second, tissue.probe_to_ras, DisplaySettings(look="even", noise_db=None)) for s in speckle]
         windows = [depth_window(frame, 30.0, 8.0) for frame in frames]
         turn = sum((w[:, 1:] * w[:, :-1].conj()).sum() for w in windows)
         carrier = frames[0].cycles_per_mm + float(np.angle(turn)) / (2 * np.pi * frames[0].sample_interval_mm)
@@ -215,7 +215,7 @@ def _echoes(phantom, probe: Probe) -> list[Echo]:
 
 def _wire_widths(simulator: UltrasoundSimulator, phantom, probe: Probe) -> dict[int, float]:
     """{depth of a wire in mm: lateral FWHM of its echo}."""
-    frame = simulator.simulate(probe, phantom.probe_to_ras)
+    frame = simulator.simulate(probe, phantom.probe_to_ras, EVEN)
     widths = {}
     for wire in _echoes(phantom, probe):
         position, depth = (float(v) for v in probe.line_through(*wire.shown_mm))

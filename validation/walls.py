@@ -14,7 +14,7 @@ from SlicerUSSim.Logic.probe.beam import FWHM_PER_SIGMA
 from SlicerUSSim.Logic.tissue.table import TissueTable
 from validation.beams import BEHIND
 from validation.checks import Check, Outcome, Row
-from validation.measurement import depth_window
+from validation.measurement import EVEN, depth_window
 from validation.phantoms import FLUID, Phantom, layered, reflection_coefficient, thin_slab
 from validation.pictures import Curve, Plot, draw_plots
 
@@ -54,7 +54,7 @@ def _level_db(simulator: UltrasoundSimulator, phantom: Phantom, probe: Probe, ti
     about_axis[::2, ::2][:2, :2] = [[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]]
     motion = motion @ about_axis
     motion[:3, 3] = [0.0, _DEPTH_MM, 0.0] - motion[:3, :3] @ [0.0, _DEPTH_MM, 0.0]
-    frame = simulator.simulate(probe, phantom.probe_to_ras @ motion)
+    frame = simulator.simulate(probe, phantom.probe_to_ras @ motion, EVEN)
     middle = depth_window(frame, _DEPTH_MM, 3.0)[probe.scan_lines // 2]
     return float(20 * np.log10(np.abs(middle).max() + 1e-12))
 
@@ -131,7 +131,7 @@ def sheets(rotation: np.ndarray, device) -> Outcome:
     for thickness in (0.1, 0.15, 0.3, 0.45):
         phantom = thin_slab(thickness, rotation)
         simulator = UltrasoundSimulator(phantom.labels, phantom.tissues, _SETTINGS, device)
-        frame = simulator.simulate(probe, phantom.probe_to_ras)
+        frame = simulator.simulate(probe, phantom.probe_to_ras, EVEN)
         measured = 20 * np.log10(np.abs(depth_window(frame, 15.0, 2.0)[probe.scan_lines // 2]).max()) - front
         back = (1 - r * r) * np.exp(-2j * np.pi * probe.cycles_per_mm * thickness)
         echo = np.exp(-0.5 * (depth / sigma) ** 2) - back * np.exp(-0.5 * ((depth - thickness) / sigma) ** 2)

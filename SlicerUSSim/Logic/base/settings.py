@@ -178,6 +178,12 @@ class DisplaySettings(Declared):
     3.0
     """
 
+    look: str = parameter(
+        "scanner", "Look",
+        "scanner: a scanner's preset, which leaves some attenuation, uneven contact and smoothing in the image. even: "
+        "compensated, even and as sharp as the beam, for work on algorithms. Gains and smoothing add to it",
+        choices=("scanner", "even"), shown=True, option="look",
+    )  # fmt: skip
     gain_db: float = parameter(
         0.0, "Gain", "Brightness of all echoes", unit="dB", bounds=(-200, 200),
         shown=Shown(-40, 40, 0.5, is_slider=True), option="gain", fit=Fit(-30, 30, tolerance=1.5),

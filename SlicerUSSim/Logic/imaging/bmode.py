@@ -185,7 +185,7 @@ class Compressor(Stage):
         display, samples, rises_mm = frame.display, frame.line_shape[1], frame.display.tgc_reach * frame.probe.depth_mm
         sample_mm, mhz, shift = (float(frame.acquisition[n]) for n in ("sample_mm", "frequency_mhz", "downshift"))
         depth_mm = np.arange(samples) * sample_mm
-        sliders = gains_along(display, depth_mm, frame.probe.depth_mm)
+        sliders = gains_along(display, frame.probe, depth_mm)
         key = (samples, rises_mm, display.tgc_db_cm_mhz, sample_mm, mhz, shift, sliders.tobytes())
         if self._gains is None or self._gains[0] != key:
             path_cm = 0.2 * np.minimum(depth_mm, rises_mm)  # both ways
@@ -196,7 +196,7 @@ class Compressor(Stage):
 
     def _line_gains(self, frame: DeviceFrame) -> Buffer:
         """float32 [scan line] dB."""
-        gains = gains_across(frame.display, frame.line_shape[0])
+        gains = gains_across(frame.display, frame.probe, frame.line_shape[0])
         if self._across is None or self._across[0] != gains.tobytes():
             self._across = gains.tobytes(), self.device.upload(gains)
         return self._across[1]

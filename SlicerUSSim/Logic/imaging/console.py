@@ -1,7 +1,8 @@
-"""Host code of kernels/console.cl: what a scanner does to the envelope and to grey levels, each off by default."""
+"""Host code of kernels/console.cl: what a scanner does to the envelope and to grey levels; and its look."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -11,6 +12,7 @@ from SlicerUSSim.Logic.imaging.grey_map import TABLE_SIZE, grey_table, is_linear
 from SlicerUSSim.Logic.imaging.signals import RayTree
 from SlicerUSSim.Logic.imaging.stage import DeviceFrame, Stage, Work
 from SlicerUSSim.Logic.opencl.device import Device, Workspace
+from SlicerUSSim.Logic.probe.arrays import LinearProbe, Probe
 
 if TYPE_CHECKING:
     from pyopencl import Buffer
@@ -143,8 +145,14 @@ def smoothing_sigmas(frame: DeviceFrame) -> tuple[float, float]:
     seen from the depth of the focus.
     """
     display, probe = frame.display, frame.probe
-    along = display.smoothing_axial_mm / float(frame.acquisition["sample_mm"])
-    angle = float(np.deg2rad(display.smoothing_lateral_deg))
+    looks = looks_of(display, probe)
+    own_mm = sum(share * look.smoothing_cycles for share, look in looks) / float(frame.acquisition["cycles_per_mm"])
+    own_deg = sum(share * look.smoothing_deg for share, look in looks)
+    along = float(np.hypot(display.smoothing_axial_mm, own_mm)) / float(frame.acquisition["sample_mm"])
+    if not np.isinf(probe.apex_radius_mm):  # seen from the face
+        focus = probe.focus_mm or probe.depth_mm
+        own_deg *= focus / (probe.apex_radius_mm + focus)
+    angle = float(np.deg2rad(np.hypot(display.smoothing_lateral_deg, own_deg)))
     if probe.is_linear and probe.focus_mm is not None:
         angle *= probe.focus_mm
     return along if along >= 0.2 else 0.0, across if (across := angle / probe.line_spacing) >= 0.1 else 0.0
@@ -157,18 +165,21 @@ def gaussian_taps(sigma: float) -> np.ndarray:
     return (taps / taps.sum()).astype(np.float32)
 
 
-def gains_along(display: DisplaySettings, depth_mm: np.ndarray, image_depth_mm: float) -> np.ndarray:
-    """(samples,) dB of the eight sliders of the gain by depth, straight between their middles, and of the near gain."""
+def gains_along(display: DisplaySettings, probe: Probe, depth_mm: np.ndarray) -> np.ndarray:
+    """(samples,) dB of the eight sliders of the gain by depth, straight between their middles, near gain and look."""
     sliders = [getattr(display, f"depth_gain_{n}_db") for n in range(1, 9)]
-    places = (np.arange(8) + 0.5) / 8.0 * image_depth_mm
+    places = (np.arange(8) + 0.5) / 8.0 * probe.depth_mm
     near = display.near_gain_db * np.exp(-np.maximum(depth_mm, 0.0) / _NEAR_GAIN_MM)
-    return np.interp(depth_mm, places, sliders) + near
+    own = sum(share * look.along(probe, depth_mm) for share, look in looks_of(display, probe))
+    return np.interp(depth_mm, places, sliders) + near + own
 
 
-def gains_across(display: DisplaySettings, lines: int) -> np.ndarray:
-    """(lines,) float32 dB of the gain by line, from the first to the last, straight between five knots."""
+def gains_across(display: DisplaySettings, probe: Probe, lines: int) -> np.ndarray:
+    """(lines,) float32 dB of the gain by line: the look's, and what is straight between five knots."""
     knots = [getattr(display, f"line_gain_{n}_db") for n in range(1, 6)]
-    return np.interp(np.linspace(0.0, 1.0, lines), np.linspace(0.0, 1.0, 5), knots).astype(np.float32)
+    own = np.interp(np.linspace(0.0, 1.0, lines), np.linspace(0.0, 1.0, 5), knots)
+    own = own + sum(share * look.across(lines) for share, look in looks_of(display, probe))
+    return own.astype(np.float32)
 
 
 def _maps(frame: DeviceFrame) -> bool:
@@ -178,3 +189,53 @@ def _maps(frame: DeviceFrame) -> bool:
 def _edge_step(frame: DeviceFrame) -> int:
     """Samples between those of the mean."""
     return max(round(_EDGE_MM / _EDGE_SAMPLES / float(frame.acquisition["sample_mm"])), 1)
+
+
+# ---- look: what a scanner adds to the controls of its console, which therefore stand in the middle -------------------
+
+
+@dataclass(frozen=True)
+class Look:
+    """The part of a display that is a scanner's own: it adds to gains and smoothing of DisplaySettings."""
+
+    #: (frequency x depth in MHz cm, dB): what compensation leaves of attenuation, straight between these
+    by_path: tuple[tuple[float, float], ...] = ((0.0, 0.0),)
+    #: dB by scan line, at even distances from the first to the last: contact is poor at the edges
+    by_line: tuple[float, ...] = (0.0,)
+    #: Sigmas of the envelope's smoothing along the lines, in cycles, and across them
+    smoothing_cycles: float = 0.0
+    smoothing_deg: float = 0.0
+
+    def along(self, probe: Probe, depth_mm: np.ndarray) -> np.ndarray:
+        """(samples,) dB by depth, which do not change with the depth of the image."""
+        return np.interp(0.1 * probe.received_mhz * depth_mm, *np.transpose(self.by_path))
+
+    def across(self, lines: int) -> np.ndarray:
+        """(lines,) dB."""
+        return np.interp(np.linspace(0.0, len(self.by_line) - 1.0, lines), np.arange(len(self.by_line)), self.by_line)
+
+
+#: Radii of arrays that look through a small window, as the sector of 4.5 mm of the real sweep does, and of those that
+#: are laid on an abdomen; between them both looks mix
+_SMALL_RADIUS_MM, _LARGE_RADIUS_MM = 15.0, 40.0
+_EVEN = Look()
+#: From a real sweep of a brain, of a liver, and of a bone (docs/realism.md#look)
+_SECTOR = Look(
+    ((0.0, 14.0), (5.0, 16.5), (16.5, 11.5), (25.0, -3.0), (33.0, -12.5), (45.0, -11.0)), (-5.0, 1.5, 0.0, 0.5, -8.0),
+    0.27, 0.26,
+)  # fmt: skip
+_CONVEX = Look(
+    ((0.0, 3.0), (6.5, 3.0), (10.5, -3.0), (17.0, -6.0), (30.5, -7.0), (40.0, -12.0)), (-8.0, -1.0, 1.0, 2.0, -4.0),
+    0.27, 0.2,
+)  # fmt: skip
+_LINEAR = Look(((0.0, 3.0), (2.0, 3.0), (9.0, -6.0), (36.0, -8.0)), (-2.5, 0.5, 1.0, 0.0, -2.0), 0.27, 0.2)
+
+
+def looks_of(display: DisplaySettings, probe: Probe) -> tuple[tuple[float, Look], ...]:
+    """(share, look) of a display with a probe; the shares add up to 1."""
+    if display.look == "even":
+        return ((1.0, _EVEN),)
+    if isinstance(probe, LinearProbe):  # a trapezoid's radius is that of where its lines come from
+        return ((1.0, _LINEAR),)
+    large = float(np.interp(probe.apex_radius_mm, (_SMALL_RADIUS_MM, _LARGE_RADIUS_MM), (0.0, 1.0)))
+    return ((1.0 - large, _SECTOR), (large, _CONVEX))

@@ -32,6 +32,8 @@ _POSE = "probe_to_ras"
 _KIND = "probe.kind"
 #: Name in Preset.from_texts of the whole as JSON, as scenes had it
 AS_ONE = "preset"
+#: A display with all of these and without a look was written by a version whose displays were even
+_OLD_DISPLAY = {"gain_db", "dynamic_range_db", "tgc_db_cm_mhz", "noise_db", "image_size"}
 #: Tissues of segment_mri with thin sulci.
 _BRAIN = ("csf", "grey matter", "white matter", "leptomeninges")
 
@@ -110,7 +112,10 @@ class Preset:
             sections["probe"] = probe_from_dict(values["probe"], f"{source}: probe")
         for name, kind in SECTIONS.items():
             if name in values:
-                sections[name] = built(kind, values[name], f"{source}: {name}")
+                given = values[name]
+                if name == "display" and isinstance(given, dict) and given.keys() >= _OLD_DISPLAY:
+                    given = {"look": "even", **given}
+                sections[name] = built(kind, given, f"{source}: {name}")
         if "tissues" in values or "membrane" in values:
             sections["tissues"] = TissueTable.from_dict(values, source)
         if values.get(_POSE) is not None:
@@ -144,6 +149,8 @@ class Preset:
         declared = {name: replace(entry, name=name) for name, entry in preset_parameters().items()}
         kind = declared[_KIND].from_text(source, texts.get(_KIND, probe_kind().default))
         values, nested = _flat_default(kind), {"tissues": {}}
+        if texts.keys() >= {f"display.{name}" for name in _OLD_DISPLAY}:
+            values["display.look"] = "even"
         for name, text in texts.items():
             values[name] = (
                 declared[name].from_text(source, text) if name in declared else _from_json(name, text, source)

@@ -432,7 +432,12 @@ class UltrasoundSimulator:
         if membrane is not None:
             acquisition["sheet_reach_mm"] = 0.5 * membrane.thickness_mm
             acquisition["membrane_gain"] = 10.0 ** (membrane.diffuse_db / 20.0)
+            of_sheets = membrane.sheet_exponent
             acquisition["membrane_exponent"] = membrane.diffuse_exponent
+            acquisition["sheet_exponent"] = membrane.diffuse_exponent if of_sheets is None else of_sheets
+            acquisition["patches_per_mm"] = 1.0 / membrane.patch_mm
+            acquisition["membrane_variation"] = membrane.roughness_octaves
+            acquisition["membrane_octaves"] = membrane.patch_db / 6.0206
             # 2 k s of the range's deviation s: the carrier has 2 k / 2 pi cycles per millimetre of depth.
             acquisition["membrane_phase"] = 2.0 * np.pi * self._cycles_per_mm(probe) * membrane.roughness_mm
         acquisition["linear"] = probe.is_linear

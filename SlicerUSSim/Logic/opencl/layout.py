@@ -80,8 +80,12 @@ ACQUISITION = np.dtype(
         ("dura_label", _INT),  # of the tissue of falx and tentorium that were found, if sheets have it
         ("sheet_reach_mm", _FLOAT),  # half the thickness of such a sheet
         ("membrane_gain", _FLOAT),  # of the amplitude of its scatterers at normal incidence
-        ("membrane_exponent", _FLOAT),  # of the cosine of incidence by which it falls
+        ("membrane_exponent", _FLOAT),  # of the cosine of incidence by which it falls on walls, and on sheets
+        ("sheet_exponent", _FLOAT),
         ("dura_isotropic", _FLOAT),  # part of the power of falx and tentorium that were found that does not fall
+        ("patches_per_mm", _FLOAT),  # one over the size of its patches, and octaves by which they differ in roughness
+        ("membrane_variation", _FLOAT),
+        ("membrane_octaves", _FLOAT),  # and in amplitude
         ("membrane_phase", _FLOAT),  # deviation of the echo's phase by its roughness, radians at normal incidence
         # probe and pose
         ("probe_to_ras", _FLOAT, 12),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from SlicerUSSim.Logic.tissue.tissue import Tissue
+from SlicerUSSim.Logic.tissue.tissue import Membrane, Tissue
 
 _ITIS = "IT'IS Foundation tissue properties database v4"
 _SZABO = "Szabo, Diagnostic Ultrasound Imaging (2004), table B.1"
@@ -26,11 +26,19 @@ def _level(text: str) -> str:
 # How echogenicity varies within tissues of the brain, by trial: with a soft grey map and the envelope smoothed, these
 # give the speckle of a real brain its size, number of grains, bright tail and deviation. No other organ was compared.
 _FROM_SPECKLE = _level("by trial, from the speckle of a real sweep of a brain (docs/realism.md)")
-_WITH_VESSELS = {"texture_db": 3.5, "texture_mm": 0.8, "specks_per_mm3": 0.005, "speck_db": 14.0}
-_WITH_SPECKS = {**_WITH_VESSELS, "specks_per_mm3": 0.01}
-_UNEVEN = {
-    **dict.fromkeys(("grey matter", "white matter", "corpus callosum", "oedema"), _WITH_VESSELS),
-    **dict.fromkeys(("tumour", "enhancing", "necrosis"), _WITH_SPECKS),
+_TEXTURE, _SHEET = {"texture_db": 3.5, "texture_mm": 0.8}, {"texture_db": 6.0, "texture_mm": 1.2}
+_SPECKS = {"specks_per_mm3": 0.01, "speck_db": 14.0}
+_UNEVEN: dict[str, dict[str, float]] = {
+    # Vessels across the beam are dots: more of them, and brighter, in white matter
+    "white matter": {**_TEXTURE, "specks_per_mm3": 0.015, "speck_db": 17.0},
+    "grey matter": {**_TEXTURE, "specks_per_mm3": 0.01, "speck_db": 16.0},
+    "corpus callosum": {**_TEXTURE, **_SPECKS, "specks_per_mm3": 0.005},
+    "oedema": {**_TEXTURE, **_SPECKS, "specks_per_mm3": 0.005},
+    "enhancing": {**_TEXTURE, **_SPECKS},
+    "necrosis": {**_TEXTURE, **_SPECKS},
+    "tumour": {"texture_db": 4.0, "texture_mm": 1.6, **_SPECKS},
+    "leptomeninges": _SHEET,
+    "falx": _SHEET,
 }
 
 
@@ -78,13 +86,13 @@ TISSUES: dict[str, Tissue] = {
         _tissue("enhancing", 1550.0, "within the range for tumours, " + _DUCK, 1.63, "glioma, as for tumour", 0.60,
                 "between brain and tumour", 0.70, 0.0, 0.35, _level("vessels, choroid plexus: 7 dB above white")),
         _tissue("tumour", 1550.0, "within the range for tumours, " + _DUCK, 1.63, "slightly denser than brain", 0.70,
-                "more than brain, " + _DUCK, 0.60, 0.0, 0.28,
-                _level(f"5 dB above white matter; gliomas are echogenic ({_MCGAHAN}), the more the denser their cells "
+                "more than brain, " + _DUCK, 0.80, 0.0, 0.38,
+                _level(f"8 dB above white matter; gliomas are echogenic ({_MCGAHAN}), the more the denser their cells "
                        "(Camp et al., J. Ther. Ultrasound 5:2, 2017)")),
         _tissue("oedema", 1534.0, _WETTER, 1.589, _WETTER, 0.43, _WETTER, 0.44, 0.0, 0.20,
                 _level("2.5 dB above white matter, below tumour: brighter than brain, without a sharp border")),
-        _tissue("necrosis", 1530.0, _DEAD, 1.58, _DEAD, 0.33, _DEAD, 0.42, 1.5, 0.25,
-                _level("4 dB below white matter, few strong scatterers: dark with bright dots; necrosis may also be "
+        _tissue("necrosis", 1530.0, _DEAD, 1.58, _DEAD, 0.33, _DEAD, 0.27, 1.5, 0.16,
+                _level("8 dB below white matter, few strong scatterers: dark with bright dots; necrosis may also be "
                        f"echogenic ({_MCGAHAN}), as tumour")),
         _tissue("cyst", 1515.0, _LIQUID, 1.538, _LIQUID, 0.02, _LIQUID),
         _tissue("cavity", 1504.5, "as CSF: a resection cavity full of saline", 1.515, "as CSF", 0.002, _SELBEKK),
@@ -137,6 +145,12 @@ TISSUES: dict[str, Tissue] = {
     )
 }
 # fmt: on
+
+#: Leptomeninges and ependyma: their lines break and fade as those of the real sweep (docs/realism.md#look)
+MEMBRANE = Membrane(
+    TISSUES["leptomeninges"], thickness_mm=0.35, diffuse_exponent=3.5, sheet_exponent=0.8, patch_db=7.0,
+    roughness_octaves=1.0,
+)  # fmt: skip
 
 #: Colours of tissues in figures, label maps and segmentations: muted but distinguishable; red, green, blue, 0 to 1.
 _COLOURS = {

@@ -15,7 +15,7 @@ from SlicerUSSim.Logic.base.errors import SimulationError, require, require_kind
 from SlicerUSSim.Logic.base.files import read_json, write_json
 from SlicerUSSim.Logic.base.reading import PlainValue, reader
 from SlicerUSSim.Logic.tissue.names import plain_name, tissue_named
-from SlicerUSSim.Logic.tissue.presets import TISSUES
+from SlicerUSSim.Logic.tissue.presets import MEMBRANE, TISSUES
 from SlicerUSSim.Logic.tissue.tissue import Membrane, Tissue
 
 _log = logging.getLogger(__name__)
@@ -72,7 +72,7 @@ class TissueTable(PlainValue, Mapping[int, Tissue]):
     @classmethod
     def brain(cls, tissue_names: Iterable[str] = ("csf", "grey matter", "white matter")) -> TissueTable:
         """Presets for labels 1, 2, ... named `tissue_names`, with leptomeninges and ependyma as the membrane."""
-        return cls.named(tissue_names, Membrane(TISSUES["leptomeninges"]))
+        return cls.named(tissue_names, MEMBRANE)
 
     @classmethod
     def named(cls, tissue_names: Iterable[str], membrane: Membrane | None = None) -> TissueTable:

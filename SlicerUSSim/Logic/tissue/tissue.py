@@ -125,6 +125,19 @@ class Membrane(Declared):
         12.0, "Diffuse echo", "Level of its scatterers where the beam meets the sheet squarely, re those of its tissue",
         unit="dB", bounds=(-100, 40),
     )  # fmt: skip
+    sheet_exponent: float | None = parameter(
+        None, "Diffuse exponent of sheets", "The same of sulci and other sheets, which hold vessels; none: as of walls",
+        bounds=(0, 20), can_be_none=True,
+    )  # fmt: skip
+    roughness_octaves: float = parameter(
+        0.0, "Variation of roughness", "Standard deviation of the roughness from patch to patch, which breaks lines",
+        unit="octaves", bounds=(0, 4),
+    )  # fmt: skip
+    patch_db: float = parameter(
+        0.0, "Variation of the diffuse echo", "Standard deviation of its level from patch to patch; its mean stays",
+        unit="dB", bounds=(0, 20),
+    )  # fmt: skip
+    patch_mm: float = parameter(5.0, "Patches", "Size of the patches along a sheet", unit="mm", bounds=(0.5, 50))
     diffuse_exponent: float = parameter(
         1.5, "Diffuse exponent", "Exponent n of cosⁿ of the angle of incidence, for the scatterers of the sheet",
         bounds=(0, 20), note="1 is Lambert's law; 0 a sheet that is equally bright on all sides",
