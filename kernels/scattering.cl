@@ -317,7 +317,7 @@ inline float gain_on_membrane(const Patient *patient, const Piece *piece, int he
     const float gz = blend(lines.z, lines.w, at.y) - blend(lines.x, lines.y, at.y);
     normal = gx * piece->row_i + gy * piece->row_j + gz * piece->row_k;
   } else {
-    exponent = frame->sheet_exponent;
+    if (!is_wall(LOOK(sheet))) exponent = frame->sheet_exponent;
     if (LOOK(sheet)) {
       level *= level_of_look(LOOK(sheet));
       of_dura = is_dura(LOOK(sheet));

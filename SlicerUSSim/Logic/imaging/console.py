@@ -145,7 +145,7 @@ def smoothing_sigmas(frame: DeviceFrame) -> tuple[float, float]:
     seen from the depth of the focus.
     """
     display, probe = frame.display, frame.probe
-    looks = looks_of(display, probe)
+    looks = scanner_looks(display, probe)
     own_mm = sum(share * look.smoothing_cycles for share, look in looks) / float(frame.acquisition["cycles_per_mm"])
     own_deg = sum(share * look.smoothing_deg for share, look in looks)
     along = float(np.hypot(display.smoothing_axial_mm, own_mm)) / float(frame.acquisition["sample_mm"])
@@ -170,7 +170,7 @@ def gains_along(display: DisplaySettings, probe: Probe, depth_mm: np.ndarray) ->
     sliders = [getattr(display, f"depth_gain_{n}_db") for n in range(1, 9)]
     places = (np.arange(8) + 0.5) / 8.0 * probe.depth_mm
     near = display.near_gain_db * np.exp(-np.maximum(depth_mm, 0.0) / _NEAR_GAIN_MM)
-    own = sum(share * look.along(probe, depth_mm) for share, look in looks_of(display, probe))
+    own = sum(share * look.along(probe, depth_mm) for share, look in scanner_looks(display, probe))
     return np.interp(depth_mm, places, sliders) + near + own
 
 
@@ -178,7 +178,7 @@ def gains_across(display: DisplaySettings, probe: Probe, lines: int) -> np.ndarr
     """(lines,) float32 dB of the gain by line: the look's, and what is straight between five knots."""
     knots = [getattr(display, f"line_gain_{n}_db") for n in range(1, 6)]
     own = np.interp(np.linspace(0.0, 1.0, lines), np.linspace(0.0, 1.0, 5), knots)
-    own = own + sum(share * look.across(lines) for share, look in looks_of(display, probe))
+    own = own + sum(share * look.across(lines) for share, look in scanner_looks(display, probe))
     return own.astype(np.float32)
 
 
@@ -221,8 +221,8 @@ _SMALL_RADIUS_MM, _LARGE_RADIUS_MM = 15.0, 40.0
 _EVEN = Look()
 #: From a real sweep of a brain, of a liver, and of a bone (docs/realism.md#look)
 _SECTOR = Look(
-    ((0.0, 14.0), (5.0, 16.5), (16.5, 11.5), (25.0, -3.0), (33.0, -12.5), (45.0, -11.0)), (-5.0, 1.5, 0.0, 0.5, -8.0),
-    0.27, 0.26,
+    ((0.0, 14.0), (5.0, 17.0), (16.5, 11.5), (22.0, 0.0), (27.0, -8.0), (33.0, -12.0), (45.0, -10.0)),
+    (-5.0, 1.5, 0.0, 0.5, -8.0), 0.27, 0.26,
 )  # fmt: skip
 _CONVEX = Look(
     ((0.0, 3.0), (6.5, 3.0), (10.5, -3.0), (17.0, -6.0), (30.5, -7.0), (40.0, -12.0)), (-8.0, -1.0, 1.0, 2.0, -4.0),
@@ -231,7 +231,7 @@ _CONVEX = Look(
 _LINEAR = Look(((0.0, 3.0), (2.0, 3.0), (9.0, -6.0), (36.0, -8.0)), (-2.5, 0.5, 1.0, 0.0, -2.0), 0.27, 0.2)
 
 
-def looks_of(display: DisplaySettings, probe: Probe) -> tuple[tuple[float, Look], ...]:
+def scanner_looks(display: DisplaySettings, probe: Probe) -> tuple[tuple[float, Look], ...]:
     """(share, look) of a display with a probe; the shares add up to 1."""
     if display.look == "even":
         return ((1.0, _EVEN),)

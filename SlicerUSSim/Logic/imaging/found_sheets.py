@@ -279,9 +279,9 @@ def _words(
 ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
     """((n, 2) uint32 of kernels/sheets.clh, without the label beside; (n,) half the thickness as stored, mm)."""
     of_kind = [looks[name] for name in KINDS]
-    least, most, level, is_dura, reflection = (
+    least, most, level, is_wall, is_dura, reflection = (
         np.array([getattr(look, name) for look in of_kind])[kind]
-        for name in ("least_thickness_mm", "most_thickness_mm", "level_db", "is_dura", "reflection")
+        for name in ("least_thickness_mm", "most_thickness_mm", "level_db", "is_wall", "is_dura", "reflection")
     )
     # From millimetres of distance along the normal to voxels along the gradient in voxels
     gradient = normal.astype(float) @ grid.ijk_to_ras[:3, :3]
@@ -299,8 +299,8 @@ def _words(
     with np.errstate(divide="ignore"):
         amplitude = level + 20.0 * np.log10(confidence)
     second = _bits(1024.0 + steps, 0, 2047) | _bits(halves, 11, 255)
-    second |= _bits(192.0 + amplitude / CONSTANTS["SHEET_LEVEL_STEP_DB"], 19, 255)
-    second |= is_dura.astype(np.int64) << 27
+    second |= _bits(96.0 + amplitude / CONSTANTS["SHEET_LEVEL_STEP_DB"], 19, 127)
+    second |= is_wall.astype(np.int64) << 26 | is_dura.astype(np.int64) << 27
     # A wall of a ventricle is a border, too, which has the coherent echo.
     second |= _bits(np.abs(reflection) * confidence / CONSTANTS["SHEET_REFLECTION_STEP"], 28, 15)
     return np.stack([first, second], axis=1).astype(np.uint32), halves * CONSTANTS["SHEET_HALF_STEP"]

@@ -297,9 +297,9 @@ def scatterer_counts(
 
 # ---- echogenicity that varies within a tissue (docs/physics.md#uneven-tissue) ----------------------------------------
 # The level of a tissue's scatterers, in dB, is a random field of unit variance times texture_db, plus specks: spheres
-# that are speck_db brighter in their middle, less by the square of the distance from there. Both come from hashes of
-# lattice indices and are fixed in the patient. Amplitudes are divided by the root of the mean power, so that the tissue
-# keeps its echogenicity.
+# of the diameter texture_mm that are speck_db brighter in their middle, less by the square of the distance from there.
+# Both come from hashes of lattice indices and are fixed in the patient. Amplitudes are divided by the root of the mean
+# power, so that the tissue keeps its echogenicity.
 
 #: Distance, in steps of the lattice of g, at which its correlation is one half
 HALF_CORRELATION = 0.754
@@ -323,8 +323,8 @@ def unevenness_table(tissues: np.ndarray) -> np.ndarray:
     per_mm = 1.0 / np.where(length > 0.0, length, 1.0)
     table[:, 0] = np.where(has_texture, HALF_CORRELATION * per_mm, 0.0)
     table[:, 1] = np.where(has_texture, _LOG2_PER_DB * deviation, 0.0)
-    table[:, 3] = np.where(has_specks, 0.5 * per_mm, 0.0)
-    share = np.minimum(np.rint(65536.0 * number * (2.0 * length) ** 3), 65536.0)
+    table[:, 3] = np.where(has_specks, per_mm, 0.0)
+    share = np.minimum(np.rint(65536.0 * number * length**3), 65536.0)
     table[:, 4] = np.where(has_specks, share, 0.0)
     table[:, 5] = np.where(has_specks, _LOG2_PER_DB * bright, 0.0)
     # The mean of 10^(d g / 10) of a normal g is exp((d ln 10 / 10)^2 / 2)

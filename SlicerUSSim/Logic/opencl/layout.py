@@ -37,7 +37,7 @@ CONSTANTS = {
     "SHEET_DISTANCE_STEP": 0.015625,  # of the stored distance, voxels
     # Of sheets found in the MRI (found_sheets.py): half the thickness in mm, level in dB, reflection coefficient
     "SHEET_HALF_STEP": 0.0078125,
-    "SHEET_LEVEL_STEP_DB": 0.25,
+    "SHEET_LEVEL_STEP_DB": 0.5,
     "SHEET_REFLECTION_STEP": 0.008,
     "TEXTURE_STEP_DB": 0.1,  # of the gain in texture.py
     "UNEVEN_WORDS": 8,  # per label, of scattering.py

@@ -27,11 +27,11 @@ def _level(text: str) -> str:
 # give the speckle of a real brain its size, number of grains, bright tail and deviation. No other organ was compared.
 _FROM_SPECKLE = _level("by trial, from the speckle of a real sweep of a brain (docs/realism.md)")
 _TEXTURE, _SHEET = {"texture_db": 3.5, "texture_mm": 0.8}, {"texture_db": 6.0, "texture_mm": 1.2}
-_SPECKS = {"specks_per_mm3": 0.01, "speck_db": 14.0}
+_SPECKS = {"specks_per_mm3": 0.01, "speck_db": 22.0}
 _UNEVEN: dict[str, dict[str, float]] = {
     # Vessels across the beam are dots: more of them, and brighter, in white matter
-    "white matter": {**_TEXTURE, "specks_per_mm3": 0.015, "speck_db": 17.0},
-    "grey matter": {**_TEXTURE, "specks_per_mm3": 0.01, "speck_db": 16.0},
+    "white matter": {**_TEXTURE, "specks_per_mm3": 0.015, "speck_db": 25.0},
+    "grey matter": {**_TEXTURE, "specks_per_mm3": 0.01, "speck_db": 24.0},
     "corpus callosum": {**_TEXTURE, **_SPECKS, "specks_per_mm3": 0.005},
     "oedema": {**_TEXTURE, **_SPECKS, "specks_per_mm3": 0.005},
     "enhancing": {**_TEXTURE, **_SPECKS},

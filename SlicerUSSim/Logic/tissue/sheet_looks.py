@@ -22,6 +22,8 @@ class SheetLook:
     most_thickness_mm: float
     #: Their level re those of that tissue, dB
     level_db: float
+    #: Whether it is the border of a ventricle, whose scatterers fade with the angle as those of any wall
+    is_wall: bool
     #: Whether these are of the tissue DURA of the table, and otherwise of the membrane's
     is_dura: bool
     #: Amplitude reflection coefficient of the layer where the beam meets it squarely and it is smooth
@@ -56,7 +58,9 @@ def looks_of(tissues: TissueTable) -> dict[str, SheetLook]:
             # Re the membrane's by the presets: where a fit changes the membrane's level, that of the dura follows.
             level_db = 10.0 * np.log10(TISSUES[name].scatterer_variance / _OWN_VARIANCE)
         most = max(_MOST_MM[kind], membrane.thickness_mm)
-        result[kind] = SheetLook(membrane.thickness_mm, most, float(level_db), is_dura, _of_layer(tissue, around))
+        result[kind] = SheetLook(
+            membrane.thickness_mm, most, float(level_db), kind == "ependyma", is_dura, _of_layer(tissue, around)
+        )
     return result
 
 

@@ -63,7 +63,7 @@ class Tissue(Declared):
         "that images show about half of it",
     )  # fmt: skip
     texture_mm: float = parameter(
-        0.5, "Texture length", "Distance at which the echogenicity's correlation is one half, and radius of specks",
+        0.5, "Texture length", "Distance at which the echogenicity's correlation is one half, and diameter of specks",
         unit="mm", symbol="ℓₜ", bounds=(0.1, 20),
     )  # fmt: skip
     specks_per_mm3: float = parameter(
