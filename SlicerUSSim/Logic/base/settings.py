@@ -178,12 +178,6 @@ class DisplaySettings(Declared):
     3.0
     """
 
-    look: str = parameter(
-        "scanner", "Look",
-        "scanner: a scanner's preset, which leaves some attenuation, uneven contact and smoothing in the image. even: "
-        "compensated, even and as sharp as the beam, for work on algorithms. Gains and smoothing add to it",
-        choices=("scanner", "even"), shown=True, option="look",
-    )  # fmt: skip
     gain_db: float = parameter(
         0.0, "Gain", "Brightness of all echoes", unit="dB", bounds=(-200, 200),
         shown=Shown(-40, 40, 0.5, is_slider=True), option="gain", fit=Fit(-30, 30, tolerance=1.5),
@@ -239,6 +233,12 @@ class DisplaySettings(Declared):
         "Part of the last image that stays in the next one of the same probe: with 0.5 half of what is old goes",
         bounds=(0, 0.98), shown=Shown(0, 0.95, 0.05, is_slider=True),
         note="Of images that follow each other, live and in sweeps; fits and comparisons have none",
+    )  # fmt: skip
+    look: str = parameter(
+        "scanner", "Look",
+        "scanner: a scanner's preset, which leaves some attenuation, uneven contact and smoothing in the image. even: "
+        "compensated, even and as sharp as the beam, for work on algorithms. Gains and smoothing add to it",
+        choices=("scanner", "even"), shown=True, option="look",
     )  # fmt: skip
     grey_map: str = parameter(
         "linear", "Grey map",
