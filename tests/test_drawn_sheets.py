@@ -71,6 +71,21 @@ def test_confidence_scales_the_amplitude():
     assert levels[0] - levels[1] == pytest.approx(6.0, abs=0.5)
 
 
+def test_found_walls_fade_with_the_angle_as_walls_and_sulci_by_an_exponent_of_their_own():
+    phantom, tissues = grey()
+    membrane = replace(sulci._MEMBRANE, diffuse_exponent=3.0, sheet_exponent=1.0)
+    fade = {}
+    for kind in ("ependyma", "sulcus"):
+        surfels = plane(kind, phantom.probe_to_ras)
+        simulator = UltrasoundSimulator(
+            phantom.labels, tissues.with_membrane(membrane), sulci._SETTINGS, sheets=surfels
+        )
+        square, oblique = (level_db(simulator, phantom.probe_to_ras, angle) for angle in (0.0, 45.0))
+        fade[kind] = square - oblique
+    # cos^3 against cos: 3 dB for every exponent of the power at 45 degrees
+    assert fade["ependyma"] - fade["sulcus"] == pytest.approx(6.0, abs=1.0)
+
+
 def test_dura_has_a_coherent_echo_that_is_seen_square_only():
     phantom, tissues = grey()
     mirror = replace(sulci._SETTINGS, interfaces=True, scattering=False)

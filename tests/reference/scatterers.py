@@ -107,7 +107,7 @@ def unevenness(seed: int, rows: np.ndarray, places: np.ndarray) -> np.ndarray:
     )
     length = np.maximum(length, 1e-6)
     specked = (specks > 0.0) & (speck_db > 0.0)
-    share = np.where(specked, np.minimum(np.rint(65536.0 * specks * (2.0 * length) ** 3), 65536.0), 0.0)
+    share = np.where(specked, np.minimum(np.rint(65536.0 * specks * length**3), 65536.0), 0.0)
     place = places * (0.754 / length)[:, None]
     corner = np.floor(place)
     total, squares = np.zeros(len(places)), np.zeros(len(places))
@@ -115,7 +115,7 @@ def unevenness(seed: int, rows: np.ndarray, places: np.ndarray) -> np.ndarray:
         weight = np.where(np.array(step) == 1, place - corner, 1.0 - (place - corner)).prod(axis=1)
         total += weight * gaussian(hash_of_cells(corner + np.array(step), seed + 0x68E31DA4))
         squares += weight**2
-    cell = places * (0.5 / length)[:, None]
+    cell = places / length[:, None]
     near = np.maximum(1.0 - 4.0 * ((cell - np.floor(cell) - 0.5) ** 2).sum(axis=1), 0.0)
     drawn = (hash_of_cells(np.floor(cell), seed + 0xB5297A4D) >> np.uint32(16)) + 0.5 < share
     level_db = texture_db * total / np.sqrt(squares) + drawn * speck_db * near

@@ -221,7 +221,7 @@ _SMALL_RADIUS_MM, _LARGE_RADIUS_MM = 15.0, 40.0
 _EVEN = Look()
 #: From a real sweep of a brain, of a liver, and of a bone (docs/realism.md#look)
 _SECTOR = Look(
-    ((0.0, 14.0), (5.0, 17.0), (16.5, 11.5), (22.0, 0.0), (27.0, -8.0), (33.0, -12.0), (45.0, -10.0)),
+    ((0.0, 14.0), (5.0, 16.5), (16.5, 11.0), (25.0, -4.5), (33.0, -12.5), (45.0, -11.0)),
     (-5.0, 1.5, 0.0, 0.5, -8.0), 0.27, 0.26,
 )  # fmt: skip
 _CONVEX = Look(
