@@ -116,7 +116,7 @@ def test_options_and_names_of_those_that_have_one_are_unique():
 def test_one_parameter_by_name_and_the_names_there_are():
     assert parameter_of(DisplaySettings, "gain_db").full_label == "Gain [dB]"
     with pytest.raises(
-        SimulationError, match="DisplaySettings has no 'gain', expected one of look, gain_db, dynamic_range_db"
+        SimulationError, match="DisplaySettings has no 'gain', expected one of gain_db, dynamic_range_db"
     ):
         parameter_of(DisplaySettings, "gain")
     assert preset_parameters()["settings.seed"] == parameter_of(SimulationSettings, "seed")
@@ -258,7 +258,7 @@ BAD = [
     ({"x" * 5000: {}}, "has 'xxx"),
     # display and settings
     ({"display": None}, "display: is null, expected an object"),
-    (display(gain=3), "display: 'gain' is unknown, expected one of look, gain_db, dynamic_range_db, tgc_db_cm_mhz"),
+    (display(gain=3), "display: 'gain' is unknown, expected one of gain_db, dynamic_range_db, tgc_db_cm_mhz"),
     (display(gain_db="3"), "display: gain_db is '3', expected a number between -200 and 200"),
     (display(image_size=[512, 512.0]), "display: image_size is [512, 512.0], expected 2 whole numbers"),
     (settings(seed=3.0), "settings: seed is 3.0, expected a whole number between 0 and 4294967295"),

@@ -71,7 +71,7 @@ def test_confidence_scales_the_amplitude():
     assert levels[0] - levels[1] == pytest.approx(6.0, abs=0.5)
 
 
-def test_found_walls_fade_with_the_angle_as_walls_and_sulci_by_an_exponent_of_their_own():
+def test_found_walls_fade_with_the_angle_more_than_sulci():
     phantom, tissues = grey()
     membrane = replace(sulci._MEMBRANE, diffuse_exponent=3.0, sheet_exponent=1.0)
     fade = {}
