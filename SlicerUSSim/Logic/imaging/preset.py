@@ -114,6 +114,8 @@ class Preset:
             if name in values:
                 given = values[name]
                 if name == "display" and isinstance(given, dict) and given.keys() >= _OLD_DISPLAY:
+                    if "look" not in given:
+                        _log.info("%s: its display was written before there were looks, and is read as even", source)
                     given = {"look": "even", **given}
                 sections[name] = built(kind, given, f"{source}: {name}")
         if "tissues" in values or "membrane" in values:
