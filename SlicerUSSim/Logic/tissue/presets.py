@@ -87,8 +87,8 @@ TISSUES: dict[str, Tissue] = {
                 "between brain and tumour", 0.70, 0.0, 0.35, _level("vessels, choroid plexus: 7 dB above white")),
         _tissue("tumour", 1550.0, "within the range for tumours, " + _DUCK, 1.63, "slightly denser than brain", 0.70,
                 "more than brain, " + _DUCK, 1.13, 0.0, 0.53,
-                _level(f"11 dB above white matter, 7 to 9 in the image; gliomas are echogenic ({_MCGAHAN}), the more the denser their cells "
-                       "(Camp et al., J. Ther. Ultrasound 5:2, 2017)")),
+                _level(f"11 dB above white matter, 8 to 10 in the image; gliomas are echogenic ({_MCGAHAN}), the more "
+                       "the denser their cells (Camp et al., J. Ther. Ultrasound 5:2, 2017)")),
         _tissue("oedema", 1534.0, _WETTER, 1.589, _WETTER, 0.43, _WETTER, 0.44, 0.0, 0.20,
                 _level("2.5 dB above white matter, below tumour: brighter than brain, without a sharp border")),
         _tissue("necrosis", 1530.0, _DEAD, 1.58, _DEAD, 0.33, _DEAD, 0.27, 1.5, 0.16,
