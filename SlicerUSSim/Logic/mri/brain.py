@@ -26,9 +26,7 @@ from SlicerUSSim.Logic.mri.recognition import (
     USUAL_ML,
     Shown,
     above_noise,
-    check_position,
     recognise,
-    require_no_ultrasound,
     stripped_brain,
 )
 from SlicerUSSim.Logic.mri.refinement import on_grid, refined, signed_distance
@@ -74,7 +72,7 @@ def find_brain(
     mri : the image, with its orientation and voxel size as in the patient.
     method : how a brain is extracted from a whole head: "robex", "deepbet" or "atlas"; "auto" for the atlas, and for
         the programs that are installed if its result is doubtful; "none" takes everything brighter than the background,
-        whatever the image shows, but no ultrasound.
+        whatever the image shows.
     keep_at : file in which the mask of a whole head is kept and from which it is read again; see mask_beside.
     progress : called with the fraction done, 0 to 1; may raise errors.Cancelled, which ends the extraction at once.
 
@@ -83,7 +81,6 @@ def find_brain(
     method = parameter_of(SegmentationSettings, "skull_strip").checked("segmentation", method)
     start, report = perf_counter(), _forwards(progress)
     if method == "none":
-        require_no_ultrasound(mri)
         inside = above_noise(mri)
         mask, millilitres = mri.with_array(inside.astype(np.uint8)), _millilitres(inside, mri)
         message = f"everything brighter than the background, {millilitres:.0f} ml"
@@ -201,8 +198,6 @@ def _extracted(mri: Volume, shown: Shown, method: str, robex: Program, report: R
         elif sureness is None or sureness >= _SURE:
             return replace(found, warnings=tuple(failures))
         else:
-            if not unsure and alignment is not None:
-                check_position(mri, alignment)
             unsure.append(found)
             failures.append(f"the mask by {_NAMES[name]} agrees with the atlas by {sureness:.2f} only; check it")
         if name != candidates[-1]:
