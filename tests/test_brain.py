@@ -511,50 +511,10 @@ def test_a_mask_that_cuts_the_vertex_is_reported_and_a_whole_one_is_not(head, fo
     assert "at the bottom; check the cortex there" in warning
 
 
-@needs_nilearn
-@pytest.mark.long
-def test_masks_that_take_in_skull_or_lie_below_the_cortex_are_reported(head):
-    mri, brain = head
-    distance = refinement.signed_distance(brain, mri.spacing_mm, 25.0)
-
-    def doubts(from_mm):
-        return given_brain(mri.with_array((distance < from_mm).astype(np.uint8)), mri).warnings
-
-    assert doubts(0.0) == doubts(2.0) == ()
-    wide = doubts(8.0)
-    reach = [line for line in wide if "beyond the surface of the brain" in line]
-    (number,) = [int(line.split("reaches ")[1].split(" mm")[0]) for line in reach]
-    assert abs(number - 8) <= 1
-    assert not any("cortex" in line for line in wide)
-    below = [line for line in doubts(-5.0) if "ends in tissue as bright as the brain" in line]
-    assert len(below) == 1 and "all around; check the cortex" in below[0]
 
 
-@needs_nilearn
-@pytest.mark.long
-def test_a_shifted_or_turned_mask_is_called_so(head):
-    mri, brain = head
-    step = round(20.0 / mri.spacing_mm[0])
-    for moved in (np.roll(brain, step, axis=2), np.rot90(brain, axes=(0, 1))[: len(brain)]):
-        mask = np.zeros(brain.shape, np.uint8)
-        part = tuple(map(slice, np.minimum(moved.shape, brain.shape)))
-        mask[part] = moved[part]
-        given = given_brain(mri.with_array(mask), mri)
-        (line,) = [line for line in given.warnings if "of the mask lie outside the brain that the atlas finds" in line]
-        assert "shifted or turned" in line and not any("cortex" in line for line in given.warnings)
-        assert given.takes_in_more
-    tight = refinement.signed_distance(brain, mri.spacing_mm, 25.0) < -5.0
-    assert not given_brain(mri.with_array(tight.astype(np.uint8)), mri).takes_in_more
 
 
-@pytest.mark.slow
-@needs_nilearn
-def test_a_mask_without_the_ventricles_is_reported(head):
-    mri, brain = head
-    depth = refinement.signed_distance(brain, mri.spacing_mm, 25.0)
-    hollow = brain & (depth > -35.0)
-    lines = [line for line in given_brain(mri.with_array(hollow.astype(np.uint8)), mri).warnings if "deep" in line]
-    assert len(lines) == 1 and "a brain mask includes the CSF" in lines[0]
 
 
 @needs_nilearn

@@ -120,12 +120,6 @@ def refused(*arguments) -> str:
     return errors[0]
 
 
-def test_probabilities_of_a_lesion_in_place_of_an_mri_get_the_hint(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    mask = tumour((1, 1, 1))
-    mask.with_array(0.8 * ndimage.gaussian_filter(mask.array.astype(np.float32), 2.0)).write("soft.nii.gz")
-    message = refused("segment", "-o", "out.nii.gz", "soft.nii.gz")
-    assert "the probabilities of a lesion are added to an MRI with --add tumour=FILE" in message
 
 
 # ---- names -----------------------------------------------------------------------------------------------------------

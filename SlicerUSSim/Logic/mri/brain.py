@@ -53,8 +53,6 @@ class BrainMask:
     #: One line each, for what a user should check
     warnings: tuple[str, ...] = ()
     seconds: float = 0.0
-    #: Whether a given mask also holds skull or scalp, as far as it can be told
-    takes_in_more: bool = False
 
     @property
     def volume_ml(self) -> float:
@@ -142,11 +140,8 @@ def given_brain(mask: Volume, mri: Volume) -> BrainMask:
     inside = checked_mask(mask, mri)
     millilitres = _millilitres(inside, mri)
     found = mri.with_array(inside.astype(np.uint8))
-    doubts = mask_doubts(mri, inside)
-    return BrainMask(
-        found, "given", f"brain mask as given, {millilitres:.0f} ml", (*label_doubts(mask), *doubts.lines),
-        takes_in_more=doubts.takes_in_more,
-    )  # fmt: skip
+    warnings = (*label_doubts(mask), *mask_doubts(mri, inside))
+    return BrainMask(found, "given", f"brain mask as given, {millilitres:.0f} ml", warnings)
 
 
 def left_out(mask: Volume, lesion: Volume) -> float:
@@ -296,8 +291,7 @@ def _kept(path: Path, mri: Volume, method: str) -> BrainMask | None:
     mask = mri.with_array(kept.inside.astype(np.uint8))
     if not kept.is_edited:
         return BrainMask(mask, kept.method, message, kept.warnings, 0.0)
-    doubts = mask_doubts(mri, kept.inside)
-    return BrainMask(mask, "given", message, doubts.lines, 0.0, doubts.takes_in_more)
+    return BrainMask(mask, "given", message, mask_doubts(mri, kept.inside))
 
 
 def _head_warnings(millilitres: float) -> tuple[str, ...]:

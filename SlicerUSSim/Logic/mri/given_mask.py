@@ -10,7 +10,7 @@ from scipy import ndimage
 
 from SlicerUSSim.Logic.base.errors import require, require_kind
 from SlicerUSSim.Logic.base.volume import Volume
-from SlicerUSSim.Logic.mri.mask_check import MaskDoubts, border_doubts
+from SlicerUSSim.Logic.mri.mask_check import cut_off
 from SlicerUSSim.Logic.mri.masks import several_segments
 from SlicerUSSim.Logic.mri.plausibility import is_whole_brain
 from SlicerUSSim.Logic.mri.recognition import POSSIBLE_ML, USUAL_ML
@@ -122,7 +122,7 @@ def _is_probability(array: np.ndarray) -> bool:
     return bool(some.size and (some > 0.95).mean() > 0.5)
 
 
-def mask_doubts(mri: Volume, inside: np.ndarray) -> MaskDoubts:
+def mask_doubts(mri: Volume, inside: np.ndarray) -> tuple[str, ...]:
     """What should be checked in a mask (k, j, i) that a user made."""
     millilitres = float(inside.sum() * mri.voxel_ml)
     if millilitres < POSSIBLE_ML[0]:
@@ -130,13 +130,12 @@ def mask_doubts(mri: Volume, inside: np.ndarray) -> MaskDoubts:
             f"the mask has {millilitres:.3g} ml, expected a brain of {USUAL_ML[0]:.0f} to {USUAL_ML[1]:.0f} ml or a "
             "large part of one; what is outside it has no tissue (a lesion is added with --add tumour=FILE)"
         )
-        return MaskDoubts((*_islands(mri, inside), small))
+        return (*_islands(mri, inside), small)
     reason = is_whole_brain(mri, inside)
     warnings = volume_warnings(millilitres)
     if reason and not warnings:
         warnings = (f"the mask is not that of a whole brain: {reason}",)
-    border = border_doubts(mri, inside)
-    return replace(border, lines=(*warnings, *_islands(mri, inside), *border.lines))
+    return (*warnings, *_islands(mri, inside), *cut_off(mri, inside))
 
 
 def label_doubts(mask: Volume) -> tuple[str, ...]:

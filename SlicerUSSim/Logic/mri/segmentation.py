@@ -287,7 +287,7 @@ def segment_mri(
     timed("neighbours")
     report(0.9)
     warnings += doubts(found, part, filtered[0][1], atlas, contrasts)
-    if contrasts in (("t1",), ("flair",)) and len(names) == 3 and not brain.takes_in_more:  # fat is as bright
+    if contrasts in (("t1",), ("flair",)) and len(names) == 3:
         voxel_ml = part.images[0].voxel_ml
         warnings += brighter_than_tissue(filtered[0][0], part.inside, *found.grey_and_white, voxel_ml, contrast)
 
