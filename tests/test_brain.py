@@ -511,12 +511,6 @@ def test_a_mask_that_cuts_the_vertex_is_reported_and_a_whole_one_is_not(head, fo
     assert "at the bottom; check the cortex there" in warning
 
 
-
-
-
-
-
-
 @needs_nilearn
 @pytest.mark.slow
 def test_false_voxels_off_the_brain_and_labels_in_a_mask_are_reported(head):

@@ -18,7 +18,6 @@ from SlicerUSSim.Logic.mri import segment_mri
 from SlicerUSSim.Logic.mri.samples import head_mri
 from SlicerUSSim.Logic.tissue import LabelMapping, names_of_file, read_label_file, read_label_map
 from SlicerUSSim.Logic.tissue.freesurfer import freesurfer_names
-from SlicerUSSim.Logic.tissue.interpolated_labels import is_smoothed
 from SlicerUSSim.Logic.tissue.label_sources import is_label_file
 from SlicerUSSim.Logic.tissue.names import nearest_tissue, tissue_named
 from SlicerUSSim.Logic.tissue.presets import TISSUES
@@ -118,8 +117,6 @@ def refused(*arguments) -> str:
     errors = [line for line in result.stderr.splitlines() if line.startswith("ussim: ")]
     assert result.exit_code == 2 and len(errors) == 1 and "Traceback" not in result.output, result.output
     return errors[0]
-
-
 
 
 # ---- names -----------------------------------------------------------------------------------------------------------
@@ -669,15 +666,6 @@ def test_an_mri_in_other_units_is_an_mri(mni):
     assert not t1.with_array(np.rint(z * 4).astype(np.int8)).looks_like_labels()
 
 
-def test_a_label_map_resampled_with_interpolation_is_refused(small_mni):
-    t1, labels = small_mni
-    bent = t1.with_array(ndimage.shift(labels.array.astype(np.float32), (0.4, 0.3, 0.2), order=1))
-    with pytest.raises(SimulationError, match=r"aseg\.nii\.gz: is mostly uniform regions of whole"):
-        is_label_file(Path("aseg.nii.gz"), bent)
-    shifted = t1.with_array(ndimage.shift(t1.array.astype(np.float32), (0, 0, 0.5), order=1))
-    assert not is_label_file(Path("t1.nii.gz"), shifted)  # half of its voxels are whole numbers
-
-
 def test_labels_with_rounding_errors_are_labels(small_mni):
     t1, labels = small_mni
     rounded = t1.with_array((labels.array + 1e-4).astype(np.float32))
@@ -789,30 +777,6 @@ def test_an_mri_with_a_whole_background_is_no_interpolated_label_map(mni):
     scaled = np.where(inside, t1 / 104.3 - 1.0, -1.0).astype(np.float32)
     scaled[inside & (np.indices(inside.shape).sum(axis=0) % 9 == 0)] = 1.0  # clipped
     assert not is_label_file(Path("t1.nii.gz"), Volume(scaled, np.eye(4)))
-
-
-@pytest.mark.parametrize("change", ["smoothed by half a voxel", "smoothed by a voxel", "cubic spline"])
-def test_a_label_map_that_was_smoothed_is_called_so(change, tmp_path):
-    """Its left half, whose numbers are smaller, was called cut off."""
-    volume = head(2.0)
-    labels = volume.array.astype(np.float32)
-    smooth = {
-        "smoothed by half a voxel": lambda: ndimage.gaussian_filter(labels, 0.5),
-        "smoothed by a voxel": lambda: ndimage.gaussian_filter(labels, 1.0),
-        "cubic spline": lambda: ndimage.shift(labels, (0.4, 0.3, 0.2), order=3),
-    }[change]()
-    path = tmp_path / "aseg.nii.gz"
-    volume.with_array(smooth).write(path)
-    message = refused("segment", path, "-o", tmp_path / "o.nii.gz")
-    assert "as a label map that was" in message and "resampled with interpolation" in message, message
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("sigma", [0.7, 2.0])
-def test_a_smoothed_mri_or_tissue_map_is_no_smoothed_label_map(sigma, mni):
-    for volume in mni:
-        image = volume.array.astype(np.float32)
-        assert not is_smoothed(ndimage.gaussian_filter(np.rint(255 * image / image.max()), sigma))
 
 
 def test_a_head_of_freesurfer_is_simulated_as_float_and_whole_numbers(tmp_path):

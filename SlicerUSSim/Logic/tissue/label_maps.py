@@ -15,7 +15,6 @@ import numpy as np
 from SlicerUSSim.Logic.base.errors import SimulationError, either, require, require_kind
 from SlicerUSSim.Logic.base.label_numbers import whole_numbers
 from SlicerUSSim.Logic.base.volume import Volume
-from SlicerUSSim.Logic.tissue.body_orientation import has_exchanged_sides, places_of, wrong_body, wrong_way_up
 from SlicerUSSim.Logic.tissue.label_advice import COMMAND, Advice
 from SlicerUSSim.Logic.tissue.label_findings import UNNAMED, Findings, listed
 from SlicerUSSim.Logic.tissue.label_mapping import LabelMapping
@@ -93,7 +92,7 @@ def read_label_map(
     advice : remedies in messages.
 
     Raises SimulationError for numbers that are no labels, labels without a tissue, which it lists, numbers that fit
-    several programs, a head that is upside down, and for a mask or lesion without a patient.
+    several programs, and for a mask or lesion without a patient.
 
     >>> import numpy as np
     >>> from SlicerUSSim.Logic import Volume
@@ -156,7 +155,6 @@ class _Reading:
         require(self._present, f"{source}: is 0 everywhere, expected labels that are not 0")
         everything = {**names, **mapping.names}
         self._names = {label: everything[label] for label in self._present if label in everything}
-        self._warnings: list[str] = []
 
     def unchanged(self) -> LabelledTissues | None:
         """The labels as they are, if the table by number has all of them and nobody says anything else about them."""
@@ -187,7 +185,6 @@ class _Reading:
         )  # fmt: skip
         findings.require_patient()
         findings.require_known()
-        self._require_upright(names, is_whole=not findings.is_part_of_brain)
         coupling = (self._by_number or self._tissues)[0]
         order: list[Tissue] = []
         relabelled = {0: 0}
@@ -212,7 +209,7 @@ class _Reading:
         labels = self._volume.with_array(lookup[self._volume.array])
         tissues = f"{len(order)} tissue{'s' * (len(order) > 1)}"
         message = f"{self._title(findings)}: {findings.number()} to {tissues}"
-        return LabelledTissues(labels, table, relabelled, message, (*self._warnings, *findings.doubts()))
+        return LabelledTissues(labels, table, relabelled, message, tuple(findings.doubts()))
 
     def _require_background(self) -> None:
         """Raise SimulationError for a background that is not 0: a label without a name around everything else."""
@@ -230,19 +227,6 @@ class _Reading:
             f"{self._source}: label {corner} fills {share:.0%} of the volume and all its corners, as a background "
             f"does, which is expected to be 0; {self._advice.background.format(label=corner)}"
         )
-
-    def _require_upright(self, names: Mapping[int, str | None], *, is_whole: bool) -> None:
-        """Raise SimulationError for a head or body that is upside down by what its labels are called."""
-        own = {label: name for label, name in names.items() if self._mapping.tissue_of(label, name) is None}
-        places = places_of(self._volume, own)
-        wrong = wrong_way_up(self._volume, own, is_whole=is_whole) or wrong_body(places)
-        require(
-            wrong is None,
-            f"{self._source}: by its header, {wrong}; correct the orientation in its header, or export it again with "
-            "that of its image",
-        )
-        if has_exchanged_sides(places):
-            self._warn_of_sides()
 
     # ---- what it is --------------------------------------------------------------------------------------------
 
@@ -309,10 +293,6 @@ class _Reading:
         if recognition.order:
             raise SimulationError(f"{self._source}: {self._likely(recognition.order)}")
         return recognition.scheme
-
-    def _warn_of_sides(self) -> None:
-        line = f"{self._source}: labels of the left side are on the right; check the orientation in its header"
-        self._warnings.append(line)
 
     def _likely(self, order: Mapping[int, str]) -> str:
         """What three labels of a brain probably are, and how to say so."""
