@@ -272,16 +272,6 @@ def test_an_mri_of_their_range_is_no_tissue_map_whatever_it_is_called(cut_at, mn
             assert combined_probability_maps(tmp_path / name, volume) is None
 
 
-def test_a_background_that_is_not_0_is_recognised():
-    """ITK-SNAP and machine learning use 255; it was one more label that no program knows."""
-    right = in_order((1, 2, 3))
-    volume = right.with_array(np.where(right.array == 0, 255, right.array).astype(np.uint8))
-    with pytest.raises(SimulationError, match=r"label 255 fills \d+% of the volume and all its corners.*--map 255=0"):
-        read_label_map(volume, source="b.nii.gz")
-    found = read_label_map(volume, mapping=LabelMapping.of(["255=0"]), source="b.nii.gz")
-    np.testing.assert_array_equal(found.labels.array, read_label_map(right).labels.array)
-
-
 def test_a_mirrored_freesurfer_map_of_few_structures_says_so():
     """Formerly "no program's numbers are recognised", with the advice to leave all labels out."""
     array = np.zeros((30, 30, 30), np.uint8)

@@ -9,32 +9,35 @@ from pathlib import PurePath
 
 import numpy as np
 
-from SlicerUSSim.Logic.base.errors import SimulationError, either
+from SlicerUSSim.Logic.base.errors import SimulationError
 from SlicerUSSim.Logic.base.volume import Volume
-from SlicerUSSim.Logic.tissue.label_advice import Advice
 from SlicerUSSim.Logic.tissue.label_mapping import LabelMapping
 from SlicerUSSim.Logic.tissue.names import nearest_tissue, plain_name, same_name, tissue_named
 from SlicerUSSim.Logic.tissue.presets import TISSUES
-from SlicerUSSim.Logic.tissue.schemes import Scheme, schemes, schemes_of_ct
+from SlicerUSSim.Logic.tissue.schemes import Scheme, schemes
 from SlicerUSSim.Logic.tissue.table import TissueTable
 from SlicerUSSim.Logic.tissue.thinning import centres_of, label_places
 from SlicerUSSim.Logic.tissue.tissue import Tissue
 
 _LONGEST_LIST = 12
-#: As many tissues as `ussim segment` writes at most, with all that --outside, --sheets and --add give
-_MOST_OF_OURS = 20
-#: So few labels are not recognised by their places.
-_TOO_FEW = 3
-#: More unknown labels may be the intensities of an image
-MOST_LABELS = 100
+#: About labels without a tissue, before the list of tissues
+MAP_THEM = (
+    "map them with --map {label}=TISSUE (0 removes a label), a .json file, a table of names or the names of segments, "
+    "to one of"
+)
+#: About numbers that several programs use
+SAY_WHICH = "say which with --map {key}"
+#: About a mask or lesion without a patient
+_NO_PATIENT = (
+    "add it to a segmentation with --add {added}, or simulate it alone with {maps} (ussim simulate); in 3D Slicer, add "
+    "it as a segment"
+)
 #: A label map without a name, in messages
 UNNAMED = "label map"
 #: Tissues of a lesion, which alone are no patient
 _LESIONS = ("tumour", "oedema", "necrosis", "cyst", "cavity", "enhancing")
 #: Centres nearer to each other tell nothing of sides, and share of structures whose sides are exchanged
 _APART_MM, _MOST_EXCHANGED = 2.0, 0.8
-#: A larger binary mask is that of a brain or a head.
-_LARGEST_LESION_ML = 500.0
 
 
 class NoPatientError(SimulationError):
@@ -57,7 +60,6 @@ class Findings:
     scheme: Scheme | None
     mapping: LabelMapping
     tissues: TissueTable
-    advice: Advice
     #: Whether it is of organs of a CT
     of_ct: bool = False
 
@@ -68,8 +70,8 @@ class Findings:
 
     @property
     def _file(self) -> str:
-        """The label map in options; FILE for one that has no name."""
-        return "FILE" if self.source == UNNAMED else self.source
+        """The label map in options; FILE for one that is no file."""
+        return "FILE" if self.source == UNNAMED or "'" in self.source else self.source
 
     def number(self) -> str:
         """Their number in words: "41 labels"."""
@@ -90,17 +92,15 @@ class Findings:
             what = f"a lesion ({', '.join(names)}; {size})"
         else:
             return
-        of_file = _tissue_of_file(self.source) or self.advice.mask_tissue
-        pairs = zip(self.names, known, strict=True)
-        maps = self.advice.maps(f"{label}={tissue or of_file}" for label, tissue in pairs)
+        of_file = _tissue_of_file(self.source) or ("liver" if self.of_ct else "tumour")
+        maps = options(f"{label}={tissue or of_file}" for label, tissue in zip(self.names, known, strict=True))
         is_brats = self.scheme is not None and self.scheme.is_lesion
         tissue = "brats" if is_brats or len(set(known)) > 1 else known[0] or of_file
-        is_large = len(known) == 1 and self._millilitres(self.names) > _LARGEST_LESION_ML
-        advice = self.advice.brain_mask if is_large else self.advice.lesion
-        added = shlex.quote(f"{tissue}={self._file}")
-        remedy = advice.format(added=added, tissue=tissue, source=self._file, maps=maps)
+        remedy = _NO_PATIENT.format(added=shlex.quote(f"{tissue}={self._file}"), maps=maps)
+        if self.of_ct:
+            remedy = f"say which organ it is with {maps}"
         if self.scheme is not None and is_brats and set(self.names) <= set(schemes()["ussim"].names):
-            remedy += f"; if it is a brain, {self.advice.ambiguous.format(key='ussim')}"
+            remedy += f"; if it is a brain, {SAY_WHICH.format(key='ussim')}"
         raise NoPatientError(f"{self.source}: {what}, not a patient's tissues; {remedy}")
 
     def require_known(self) -> None:
@@ -108,33 +108,13 @@ class Findings:
         unknown = [label for label, tissue in self.found.items() if tissue is None]
         if not unknown:
             return
-        remedy = self.advice.unknown.format(label=unknown[0])
         nothing = "no program's numbers are recognised, and " if len(unknown) == len(self.names) else ""
-        if len(unknown) > 1 and not nothing and self.advice.leave_out:
-            maps = self.advice.maps(f"{n}=0" for n in unknown[:_LONGEST_LIST])
-            maps += " ..." * (len(unknown) > _LONGEST_LIST)
-            remedy = f"{self.advice.leave_out.format(maps=maps)}; or {remedy}"
-        if nothing:
-            is_ours = sorted(self.names) == list(range(1, len(self.names) + 1)) and len(self.names) <= _MOST_OF_OURS
-            remedy = f"{self._if_of_a_program(unknown)}{self.advice.own if is_ours else ''}{remedy}"
-        if nothing and len(unknown) > MOST_LABELS:
-            remedy = f"if these are intensities of an MRI, its file may be incomplete; {remedy}"
         known = ", ".join(dict.fromkeys([*self.tissues.names()[1:], *TISSUES]))
         called = listed(map(self._described, unknown))
         unused = self.mapping.unused(self.names)
-        mistaken = f"; it has no label {listed(unused)}, which {self.advice.mapping} mentions" if unused else ""
+        mistaken = f"; it has no label {listed(unused)}, which --map mentions" if unused else ""
+        remedy = MAP_THEM.format(label=unknown[0])
         raise SimulationError(f"{self.source}: {nothing}no tissue is called {called}{mistaken}; {remedy}: {known}")
-
-    def _if_of_a_program(self, labels: list[int]) -> str:
-        """Which programs have all these numbers, though they are too few to be recognised, and how to say so."""
-        known = schemes_of_ct() if self.of_ct else schemes().values()
-        programs = [scheme for scheme in known if scheme.order and set(labels) <= set(scheme.names)]
-        if not programs or len(labels) > _TOO_FEW:
-            return ""
-        first = programs[0]
-        called = ", ".join(f"{label} {first.names[label]}" for label in labels)
-        titles = either([f"{first.title} ({called})", *(scheme.title for scheme in programs[1:])])
-        return f"if the numbers are those of {titles}, {self.advice.ambiguous.format(key=first.key)}; "
 
     def doubts(self) -> list[str]:
         """What a user should know, each in one line."""
@@ -150,7 +130,7 @@ class Findings:
             doubts.append(f"{self.source}: the nearest tissue is used for {pairs}")
         unused = self.mapping.unused(self.names)
         if unused:
-            doubts.append(f"{self.source}: has no label {listed(unused)}, which {self.advice.mapping} mentions")
+            doubts.append(f"{self.source}: has no label {listed(unused)}, which --map mentions")
         if self._has_exchanged_sides():
             doubts.append(
                 f"{self.source}: labels of the left side are on the right; check the orientation in its header"
@@ -160,7 +140,7 @@ class Findings:
             share = self.counts[0] / self.counts.sum()
             doubts.append(
                 f"{self.source}: {share:.0%} of the volume has no label and is the coupling medium, also between the "
-                f"organs; {self.advice.between}"
+                "organs; --map 0=fat gives it a tissue"
             )
         return doubts
 
@@ -179,8 +159,6 @@ class Findings:
     def _described(self, label: int) -> str:
         """'Left-Lesion' (25, 3.1 ml)"""
         name = self.names[label]
-        if not self.advice.gives_sizes:
-            return repr(name or f"label {label}")
         return f"{name!r} ({label}, {self._size([label])})" if name else f"label {label} ({self._size([label])})"
 
     def _millilitres(self, labels: Iterable[int]) -> float:
@@ -194,6 +172,11 @@ class Findings:
 def _words(name: str) -> frozenset[str]:
     """The words of a name, in any order: "kidney_left" and "Left kidney"."""
     return frozenset({"lh": "left", "rh": "right"}.get(word, word) for word in plain_name(name).split())
+
+
+def options(texts: Iterable[str]) -> str:
+    """Options of texts for LabelMapping.of: --map 1=csf --map 2=tumour."""
+    return " ".join(f"--map {shlex.quote(text)}" for text in texts)
 
 
 def listed(items: Iterable[object], most: int = _LONGEST_LIST) -> str:

@@ -12,7 +12,6 @@ from SlicerUSSim.Logic.base.errors import require
 from SlicerUSSim.Logic.base.files import read_json
 from SlicerUSSim.Logic.base.label_numbers import has_uniform_fractions
 from SlicerUSSim.Logic.base.volume import Volume
-from SlicerUSSim.Logic.tissue.label_advice import COMMAND, Advice
 from SlicerUSSim.Logic.tissue.label_files import names_of_file
 from SlicerUSSim.Logic.tissue.label_mapping import LabelMapping
 from SlicerUSSim.Logic.tissue.label_maps import LabelledTissues, as_whole, read_label_map
@@ -66,7 +65,6 @@ def read_label_file(
     preset: TissueTable | None = None,
     default: TissueTable | None = None,
     of_ct: bool = False,
-    advice: Advice = COMMAND,
 ) -> LabelledTissues:
     """The tissues of a label map that was read from a file.
 
@@ -86,10 +84,8 @@ def read_label_file(
     maps = _without_labels(path, volume)
     if maps is not None:
         if not any(mapping.tissue_of(label, name) for label, name in maps.names.items()):
-            maps.require_order(str(path), advice)
-        found = read_label_map(
-            maps.labels, maps.names, mapping, source=str(path), tissues=table or preset or default, advice=advice
-        )
+            maps.require_order(str(path))
+        found = read_label_map(maps.labels, maps.names, mapping, source=str(path), tissues=table or preset or default)
         return replace(found, message=maps.message.removeprefix(f"{path}: "))
     own = table
     if own is None and preset is None:
@@ -103,7 +99,6 @@ def read_label_file(
         by_number = preset
     found = read_label_map(
         volume, names, mapping, source=str(path), tissues=own or preset or default, by_number=by_number, of_ct=of_ct,
-        advice=advice,
     )  # fmt: skip
     return replace(found, message=f"{found.message}, named in {where}") if names else found
 

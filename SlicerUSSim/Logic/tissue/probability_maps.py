@@ -22,7 +22,7 @@ import numpy as np
 from SlicerUSSim.Logic.base.errors import SimulationError, require
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.tissue.brain_orders import BRAIN_TISSUES, BrainLabels
-from SlicerUSSim.Logic.tissue.label_advice import COMMAND, Advice
+from SlicerUSSim.Logic.tissue.label_findings import options
 
 #: (program, regular expression of a file name with the part that differs as group "part", {part: tissue})
 _PATTERNS: tuple[tuple[str, str, dict[str, str]], ...] = (
@@ -74,7 +74,7 @@ class CombinedMaps:
         """{label: tissue}."""
         return dict(enumerate(BRAIN_TISSUES, 1))
 
-    def require_order(self, source: str, advice: Advice = COMMAND) -> None:
+    def require_order(self, source: str) -> None:
         """Raise SimulationError if amounts and places of the tissues show that they are exchanged.
 
         Maps by brightness have to fit, as FAST's of a T2 do not; those by tissue are believed unless one other order,
@@ -86,7 +86,7 @@ class CombinedMaps:
             return
         is_known = len(orders) == 1
         order = dict(sorted(orders[0].items())) if is_known else self.names
-        maps = advice.maps(f"{label}={tissue.split()[0]}" for label, tissue in order.items())
+        maps = options(f"{label}={tissue.split()[0]}" for label, tissue in order.items())
         numbered = ", ".join(f"{label} {file}" for label, file in enumerate(self.files, 1))
         found = ", ".join(f"{label} {tissue} ({brain.shares[label]:.0%})" for label, tissue in order.items())
         is_of_t2 = self.is_by_brightness and list(order.values()) == [*reversed(BRAIN_TISSUES)]
@@ -94,7 +94,7 @@ class CombinedMaps:
             f"{source}: a tissue probability map, but by amounts and places its maps (labels {numbered}) are not "
             + (f"CSF, grey and white matter but {found}" if is_known else f"surely {found}")
             + (", as of a T2" if is_of_t2 else "")
-            + f"; {advice.likely.format(maps=maps)}"
+            + f"; if that is right, say so with {maps}"
         )
 
 
