@@ -27,7 +27,6 @@ from SlicerUSSim.Logic.mri.mask_check import cut_off, ends_at_edge
 from SlicerUSSim.Logic.mri.no_data import no_data, without_blank
 from SlicerUSSim.Logic.mri.recognition import recognise, stripped_brain
 from SlicerUSSim.Logic.mri.samples import head_mri
-from SlicerUSSim.Logic.mri.segmentation import segment_mri
 from tests.conftest import SHARED, needs_shared
 
 needs_nilearn = pytest.mark.skipif(importlib.util.find_spec("nilearn") is None, reason="nilearn is not installed")
@@ -133,24 +132,6 @@ def test_what_is_no_mri_is_reported(change, message):
     assert message in str(caught.value) and "\n" not in str(caught.value)
 
 
-@needs_nilearn
-@pytest.mark.parametrize(
-    ("value", "message"),
-    [
-        (60.0, r"has a border of one value \(60\) that is as bright as tissue .*, expected a dark background; crop it"),
-        (500.0, r"the background \(500\) is as bright as .*, or it has a bright border"),
-    ],
-)
-def test_a_border_as_bright_as_tissue_is_named(head, value, message):
-    """It was taken for 16 litres of tissue."""
-    mri, _ = head
-    array = np.pad(mri.array, 20, constant_values=value)
-    matrix = mri.ijk_to_ras.copy()
-    matrix[:3, 3] -= matrix[:3, :3] @ (20.0, 20.0, 20.0)
-    with pytest.raises(SimulationError, match=message):
-        find_brain(Volume(array, matrix))
-
-
 @pytest.mark.long
 @needs_nilearn
 def test_voxels_without_data_are_left_out_with_a_warning(head, found):
@@ -232,18 +213,6 @@ def test_a_ct_head_whose_air_is_0_is_told_from_an_mri_by_its_flat_brain(head, fo
     recognition._head(mri, CoarseImage.of(mri), found.alignment)  # the MRI is taken
     with pytest.raises(SimulationError, match=r"brain in this head differ by \d%, as in CT, expected 10% or more"):
         recognition._head(ct, CoarseImage.of(ct), found.alignment)
-
-
-def test_a_ct_whose_air_was_set_to_0_is_not_asked_for_a_dark_background():
-    axis = np.arange(-100.0, 100.0, 3.0)
-    z, y, x = np.meshgrid(axis, axis, axis, indexing="ij")
-    r = np.sqrt(x**2 + (0.8 * y) ** 2 + z**2)
-    array = np.select([r < 62, r < 70, r < 72, r < 78], [35.0, 1100.0, -600.0, -100.0], 0.0)
-    noisy = array + np.where(r < 78, np.random.default_rng(0).normal(0, 8, r.shape), 0.0)
-    with pytest.raises(
-        SimulationError, match=r"values from -\d+, as the fat and air of a CT .* with --ct \(contrast ct\)"
-    ):
-        find_brain(Volume(noisy.astype(np.float32), np.diag([3.0, 3.0, 3.0, 1.0])))
 
 
 # ---- extraction ------------------------------------------------------------------------------------------------------
@@ -432,7 +401,7 @@ def test_an_edited_kept_mask_is_checked_as_one_that_is_given(edit, head, found, 
         used = find_brain(head[0], keep_at=path)
         assert used.volume_ml == pytest.approx((mask > 0).sum() * head[0].voxel_ml, rel=0.05)
         return
-    with pytest.raises(SimulationError, match=r"head.brain-mask.nrrd covers.*or delete it"):
+    with pytest.raises(SimulationError, match=r"head.brain-mask.nrrd has .* covers 100% .*or delete it"):
         find_brain(head[0], keep_at=path)
 
 
@@ -622,16 +591,6 @@ def test_a_program_that_is_not_installed_is_an_error_first(monkeypatch):
             find_brain(mri, method)
 
 
-def test_a_lesion_given_as_the_brain_is_refused():
-    """Else the simulation would show a lesion in water."""
-    mri = head_mri(4.0)
-    lesion = np.zeros(mri.array.shape, np.uint8)
-    lesion[tuple(slice(n // 2 - 2, n // 2 + 2) for n in lesion.shape)] = 1
-    message = r"mask has 4.1 ml, 0.\d% of what .* \(1000 to 1900 ml.*--add tumour=FILE"
-    with pytest.raises(SimulationError, match=message):
-        segment_mri(mri, mask=mri.with_array(lesion))
-
-
 def test_masks_of_an_infant_of_a_part_and_of_a_small_image_are_taken():
     def of(millilitres, box_mm):
         """A ball of so many ml in a noisy cube, without whole heads' surroundings."""
@@ -645,8 +604,7 @@ def test_masks_of_an_infant_of_a_part_and_of_a_small_image_are_taken():
         mri, mask = of(millilitres, box_mm)
         assert given_brain(mask, mri).volume_ml == pytest.approx(millilitres, rel=0.05)
     mri, mask = of(60.0, 160.0)
-    with pytest.raises(SimulationError, match=r"mask has \d+ ml, 1.5% of what the image shows"):
-        given_brain(mask, mri)
+    assert "the mask has 60" in given_brain(mask, mri).warnings[-1]
     stripped = mri.with_array(mri.array * mask.array)  # a small brain in a large empty box
     assert given_brain(mask, stripped).volume_ml == pytest.approx(60.0, rel=0.05)
 

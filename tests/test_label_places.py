@@ -245,16 +245,6 @@ def test_cat12s_partial_volume_map_is_read_as_its_nearest_tissues(tmp_path):
     assert found.names == NAMES and np.mean(found.labels.array[::2, ::2, ::2] == labels.array) > 0.95
 
 
-@pytest.mark.parametrize("name", ["mwp1T1.nii", "smwc1T1.nii", "m0wp1T1.nii"])
-def test_a_modulated_map_is_refused_as_one(name, tmp_path):
-    """It was refused with the contrast that it resembles."""
-    probability_maps(tmp_path, SPM)
-    grey = Volume.read(tmp_path / SPM["grey matter"])
-    grey.with_array(grey.array * np.float32(1.3)).write(tmp_path / name)
-    message = refused("segment", tmp_path / name, "-o", tmp_path / "l.nii.gz")
-    assert f"{name}: a modulated tissue map ({name[:-6]}, volumes" in message and "c1, c2, c3 of SPM" in message
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("cut_at", [100, 80])  # also with the brightest cut off, as pictures have
 def test_an_mri_of_their_range_is_no_tissue_map_whatever_it_is_called(cut_at, mni, tmp_path):

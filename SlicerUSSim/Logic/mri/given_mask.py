@@ -21,9 +21,6 @@ _MOST_MASK_VALUES = 128
 _LISTED = 6
 
 
-#: What a brain mask holds at least, ml or as a share of what the image shows. Lesions are 0.1 to 100 ml in heads of
-#: 3000 ml and brains of 1200 ml, at most 0.08; the newborn's brain has 250 ml and more.
-_LEAST_ML, _LEAST_SHARE = 100.0, 0.3
 #: What a filter leaves beyond 0 and 1
 _ROUNDING = 1e-3
 #: Pieces of a mask smaller than this share of the largest are no part of a brain; and how much of them is said, ml
@@ -55,37 +52,13 @@ def checked_mask(mask: Volume, mri: Volume) -> np.ndarray:
     )
     inside = mask.array > 0
     require(bool(inside.any()), f"{name} is empty, expected at least one voxel inside")
-    _require_brain_and_not_lesion(name, inside, mri)
-    millilitres, share = float(inside.sum() * mri.voxel_ml), float(inside.mean())
-    require(
-        share < 0.98 or millilitres <= POSSIBLE_ML[1],
-        f"{name} covers {share:.0%} of the image, {millilitres:.0f} ml, expected the brain only; "
-        "to use the whole image, give --skull-strip none and no mask",
-    )
+    millilitres = float(inside.sum() * mri.voxel_ml)
     require(
         millilitres <= POSSIBLE_ML[1],
         f"{name} has {millilitres:.0f} ml, expected a brain ({USUAL_ML[0]:.0f} to {USUAL_ML[1]:.0f} ml) or a part of "
-        "one",
+        f"one; it covers {inside.mean():.0%} of the image: for all of that, give --skull-strip none and no mask",
     )
     return inside
-
-
-def _require_brain_and_not_lesion(name: str, inside: np.ndarray, mri: Volume) -> None:
-    """Raise SimulationError for a mask that is small in millilitres and in its image.
-
-    One of a small image, as of the field of an operation or a phantom, is most of what is shown there.
-    """
-    millilitres = float(inside.sum() * mri.voxel_ml)
-    if millilitres >= _LEAST_ML:
-        return
-    shown = mri.array > np.nanmin(mri.array)  # the background of an image without skull is one value
-    share = float((inside & shown).sum() / max(int(shown.sum()), 1))
-    require(
-        share >= _LEAST_SHARE,
-        f"{name} has {millilitres:.3g} ml, {share:.1%} of what the image shows, expected a brain "
-        f"({USUAL_ML[0]:.0f} to {USUAL_ML[1]:.0f} ml, an infant's less) or {_LEAST_ML:.0f} ml and more of one; a "
-        "lesion is added with --add tumour=FILE, and needs no mask",
-    )
 
 
 def _reordered(mask: Volume, mri: Volume) -> Volume:

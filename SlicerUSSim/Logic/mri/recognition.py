@@ -33,10 +33,6 @@ _LEAST_SHOWN, _USUAL_SHOWN = 0.75, 0.95
 #: Between the 5th and 95th percentile of the inner brain, relative to its median. T1 and T2 had 0.46 to 0.82;
 #: CT whose air is stored as 0 has 0.01 to 0.05 (25 to 50 HU on 1000).
 _LEAST_CONTRAST = 0.1
-#: Share of the voxels at the edges of an image from which their most frequent value is its border
-_LEAST_BORDER = 0.5
-#: Numbers from which on down there is no MRI's tissue
-_BELOW_MRI = -200.0
 #: Volume of what may be a head
 _LEAST_HEAD_ML, _MOST_HEAD_ML = 900.0, 9000.0
 #: Share of the directions in which what has the shape of a brain has a skull
@@ -64,7 +60,6 @@ def recognise(mri: Volume, progress: Callable[[float], None] | None = None) -> S
     report(0.1)
     if stripped is not None:
         return Shown(stripped)
-    _require_dark_border(mri)
     image = CoarseImage.of(mri)
     _check_size(image, mri)
     if mni152() is None:
@@ -156,30 +151,6 @@ def _check_values(mri: Volume) -> None:
         not (around >= bright and around > low),
         f"the background ({around:g}) is as bright as the brightest tissue ({bright:g}): the intensities are inverted, "
         "or it has a bright border; expected an MRI with a dark background",
-    )
-
-
-def _require_dark_border(mri: Volume) -> None:
-    """Raise SimulationError for an image within a border of one value that is as bright as tissue."""
-    from skimage.filters import threshold_otsu
-
-    values = mri.array
-    around, share = edge_value(values)
-    if share < _LEAST_BORDER or around <= values.min():  # as around most heads: nothing is darker
-        return
-    within = values[values != around]
-    if within.size < 1000:
-        return
-    low, bright = np.percentile(within, (1.0, 99.0))
-    require(
-        low > _BELOW_MRI,
-        f"image has values from {low:.0f}, as the fat and air of a CT have, and a border of {around:g}, expected an "
-        "MRI; segment a CT in Hounsfield units, with its air, with --ct (contrast ct)",
-    )
-    require(
-        around <= low + 0.25 * (threshold_otsu(within[:: max(1, within.size // 500_000)]) - low),
-        f"image has a border of one value ({around:g}) that is as bright as tissue (the rest has {low:g} to "
-        f"{bright:g}), expected a dark background; crop it, or set it to {low:g}",
     )
 
 

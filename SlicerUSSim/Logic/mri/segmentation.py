@@ -20,7 +20,7 @@ from SlicerUSSim.Logic.mri.evidence import Evidence
 from SlicerUSSim.Logic.mri.filtering import denoised, estimate_noise as estimate_noise
 from SlicerUSSim.Logic.mri.nuclei import with_nuclei
 from SlicerUSSim.Logic.mri.outside import find_outside, require_findable, watery
-from SlicerUSSim.Logic.mri.plausibility import brighter_than_tissue, require_contrast
+from SlicerUSSim.Logic.mri.plausibility import require_contrast
 from SlicerUSSim.Logic.mri.recognition import check_intensities, require_no_hounsfield
 from SlicerUSSim.Logic.mri.segmentation_settings import SegmentationSettings
 from SlicerUSSim.Logic.mri.segmentation_steps import (
@@ -287,9 +287,6 @@ def segment_mri(
     timed("neighbours")
     report(0.9)
     warnings += doubts(found, part, filtered[0][1], atlas, contrasts)
-    if contrasts in (("t1",), ("flair",)) and len(names) == 3:
-        voxel_ml = part.images[0].voxel_ml
-        warnings += brighter_than_tissue(filtered[0][0], part.inside, *found.grey_and_white, voxel_ml, contrast)
 
     labels = np.zeros(part.inside.shape, np.uint8)
     labels[part.inside] = found.posteriors.argmax(axis=0) + 1
