@@ -17,8 +17,9 @@ import numpy as np
 
 from SlicerUSSim.Logic.base.errors import require
 from SlicerUSSim.Logic.base.files import read_json, write_json
+from SlicerUSSim.Logic.base.image_files import read_image
 from SlicerUSSim.Logic.base.reading import in_child
-from SlicerUSSim.Logic.base.volume import MADE_BY, Volume, read_itk_image
+from SlicerUSSim.Logic.base.volume import MADE_BY, Volume
 
 _PROGRAM = "SlicerUSSim"
 #: Entry of a JSON file with its mark, and beginning of the last line of an HTML file
@@ -135,11 +136,6 @@ def _is_own_vti(path: Path) -> bool:
 
 
 def _is_own_itk(path: Path) -> bool:
-    import SimpleITK as sitk
-
-    image = read_itk_image(path)
-    array = sitk.GetArrayFromImage(image)
-    if image.GetNumberOfComponentsPerPixel() > 1:  # the images of a sequence in NRRD
-        array = np.moveaxis(array, -1, 0)
-    keys = [key for key in (MADE_BY, "ITK_FileNotes") if image.HasMetaDataKey(key)]
-    return any(image.GetMetaData(key) == mark_of(array) for key in keys)
+    image = read_image(path)
+    array = np.moveaxis(image.array, -1, 0) if image.has_components else image.array  # a sequence in NRRD
+    return any(image.header.get(key) == mark_of(array) for key in (MADE_BY, "ITK_FileNotes"))

@@ -140,11 +140,6 @@ def _reading(function: Callable[_P, _T], *, always_in_child: bool) -> Callable[_
     return read
 
 
-def is_in_child() -> bool:
-    """Whether this process reads a file for another."""
-    return _is_child
-
-
 def starts_like_hdf5(path: Path) -> bool:
     """Whether a file is HDF5, as MINC 2 and ITK's .h5 are."""
     with path.open("rb") as file:

@@ -11,8 +11,9 @@ import numpy as np
 
 from SlicerUSSim.Logic.base.errors import SimulationError
 from SlicerUSSim.Logic.base.files import make_folder, written_whole
+from SlicerUSSim.Logic.base.image_files import read_image
 from SlicerUSSim.Logic.base.version import __version__
-from SlicerUSSim.Logic.base.volume import Volume, read_itk_image
+from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.mri.given_mask import checked_mask
 
 _log = logging.getLogger(__name__)
@@ -63,7 +64,7 @@ def named_beside(mri_path: str | Path, ending: str) -> Path:
 def is_kept_mask(path: Path) -> bool:
     """Whether a file is a brain mask that `keep` has written, also if it was edited since."""
     try:
-        return path.is_file() and read_itk_image(path).HasMetaDataKey(f"{_PREFIX}mask")
+        return path.is_file() and f"{_PREFIX}mask" in read_image(path).header
     except SimulationError:
         return False
 
@@ -147,12 +148,12 @@ def _write(path: Path, mask: Volume, entries: dict[str, str]) -> None:
 def _why_not_ours(path: Path) -> str | None:
     """Why a file stays as it is; None if `keep` has written it and nobody has edited it since."""
     try:
-        image = read_itk_image(path)
-        mask = Volume.from_sitk(image, str(path))
+        image = read_image(path)
+        mask = Volume.from_image_file(image, str(path))
     except SimulationError:
         return "cannot be read and stays as it is; the brain mask is not kept (delete that file to keep it there)"
     key = f"{_PREFIX}mask"
-    if image.HasMetaDataKey(key) and _is_as_written(mask, image.GetMetaData(key)):
+    if key in image.header and _is_as_written(mask, image.header[key]):
         return None
     return (
         "was not written by ussim, or was edited, and stays as it is; the brain mask is not kept (to use that file, "
@@ -170,14 +171,12 @@ def _read(path: Path, mri: Volume, method: str, fingerprint: str) -> KeptMask | 
     if not path.is_file():
         return None
     try:
-        image = read_itk_image(path)
-        mask = Volume.from_sitk(image, str(path))
+        image = read_image(path)
+        mask = Volume.from_image_file(image, str(path))
     except SimulationError as error:
         _log.warning("%s", error)
         return None
-    entries = {
-        key.removeprefix(_PREFIX): image.GetMetaData(key) for key in image.GetMetaDataKeys() if key.startswith(_PREFIX)
-    }
+    entries = {key.removeprefix(_PREFIX): text for key, text in image.header.items() if key.startswith(_PREFIX)}
     # Without our entries: another program wrote it under this name, and most programs drop them from what they edit.
     is_same_grid = mask.array.shape == mri.array.shape and np.allclose(mask.ijk_to_ras, mri.ijk_to_ras, atol=1e-3)
     is_mask = bool(entries) or len(np.unique(np.nan_to_num(mask.array))) <= 2
