@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import logging
 import re
-import warnings
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
@@ -15,7 +13,13 @@ from typing import Any
 import numpy as np
 
 from SlicerUSSim.Logic.base.errors import SimulationError, require, require_package
-from SlicerUSSim.Logic.base.image_files import ImageFile, require_readable_name, require_spacing, require_voxels
+from SlicerUSSim.Logic.base.image_files import (
+    ImageFile,
+    remarks_withheld,
+    require_readable_name,
+    require_spacing,
+    require_voxels,
+)
 from SlicerUSSim.Logic.base.reading import in_child, reader
 from SlicerUSSim.Logic.base.segments import Segment, flattened
 from SlicerUSSim.Logic.base.transforms import LPS_TO_RAS
@@ -117,25 +121,10 @@ def is_dicom(file: Path) -> bool:
         return opened.read(132)[128:] == b"DICM"
 
 
-@contextmanager
-def _without_remarks() -> Iterator[None]:
-    """Keep quiet what pydicom and highdicom remark about values that are not used here."""
-    levels = {name: logging.getLogger(name).level for name in ("pydicom", "highdicom")}
-    for name in levels:
-        logging.getLogger(name).setLevel(logging.CRITICAL)
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            yield
-    finally:
-        for name, level in levels.items():
-            logging.getLogger(name).setLevel(level)
-
-
 def _header(file: Path, tags: Sequence[str] | None = _TAGS) -> Any:
     import pydicom
 
-    with _without_remarks():
+    with remarks_withheld():
         header = pydicom.dcmread(
             file, stop_before_pixels=True, force=True, specific_tags=None if tags is None else [*tags]
         )
@@ -250,7 +239,7 @@ def _read_compressed(path: Path, files: Sequence[str]) -> ImageFile:
 def _read_files(path: Path, files: Sequence[str]) -> ImageFile:
     import pydicom
 
-    with _without_remarks():
+    with remarks_withheld():
         datasets = [pydicom.dcmread(file, force=True) for file in files]
         first = datasets[0]
         require("Rows" in first and "PixelData" in first, f"{path}: has no image, expected one with rows and pixels")
@@ -304,7 +293,7 @@ def _stack(path: Path, files: Sequence[str], datasets: Sequence[Any]) -> ImageFi
 
 
 def _frames(path: Path, dataset: Any) -> ImageFile:
-    """A file with many frames: enhanced MR, CT and ultrasound volumes, and older classes whose frames have no places."""
+    """A file with many frames: enhanced MR, CT and ultrasound volumes, and older classes without places of frames."""
     import highdicom
 
     doubts = () if "PerFrameFunctionalGroupsSequence" in dataset else (_give_places(path, dataset),)
@@ -420,11 +409,11 @@ def _require_even(path: Path, positions: np.ndarray, cosines: np.ndarray) -> Non
     axes = cosines.reshape(2, 3)
     require(
         np.abs(axes @ axes.T - np.eye(2)).max() < _SAME,
-        f"{path}: has the ImageOrientationPatient {cosines.tolist()}, expected two perpendicular directions of length 1",
+        f"{path}: has the ImageOrientationPatient {cosines.tolist()}, expected two perpendicular unit vectors",
     )
     if len(positions) < 2:
         return
-    normal = np.cross(*axes)
+    normal = np.cross(axes[0], axes[1])
     along = np.sort(positions @ normal)
     steps = np.diff(along)
     usual = float(np.median(steps))

@@ -12,8 +12,10 @@ import logging
 import math
 import os
 import re
+import warnings
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -69,6 +71,7 @@ class ImageFile:
     #: {field of the header: voxels along i, j, k}, {field: their size in mm}, and {field: (4, 4) as ijk_to_ras}
     sizes: Mapping[str, Sequence[int]] = field(default_factory=dict)
     spacings: Mapping[str, Sequence[float]] = field(default_factory=dict)
+    #: The first of these is used
     matrices: Mapping[str, np.ndarray] = field(default_factory=dict)
     label_names: Mapping[int, str] = field(default_factory=dict)
     #: One line each, without the name of the file
@@ -127,10 +130,13 @@ def checked_image(path: Path, found: ImageFile) -> ImageFile:
             doubts.append(
                 f"its {name} says voxels of {_times(spacing)} mm, its axes {_times(lengths)} mm, which is used"
             )
+    used = next(iter(found.matrices), "")
     for name, matrix in found.matrices.items():
         apart = _distance_mm(matrix, found.ijk_to_ras, space)
         if not apart <= _SAME_MM:
-            doubts.append(f"its {name} puts it up to {apart:.1f} mm away from where it is read; check left and right")
+            doubts.append(
+                f"its {name} puts it {apart:.1f} mm away from its {used}, which is used; check left and right"
+            )
     bad = array.size - int(np.isfinite(array).sum()) if array.dtype.kind == "f" else 0
     if bad:
         require(bad < array.size, f"{path}: no voxel is a finite number, expected an image")
@@ -191,6 +197,22 @@ def content_of(path: Path) -> bytes:
         raise SimulationError(f"{path}: its compressed content is damaged; copy or export it again") from None
 
 
+@contextmanager
+def remarks_withheld() -> Iterator[None]:
+    """Keep quiet what libraries remark about headers, which are checked here."""
+    loggers = [logging.getLogger(name) for name in ("nibabel.global", "pydicom", "highdicom")]
+    levels = [logger.level for logger in loggers]
+    for logger in loggers:
+        logger.setLevel(logging.CRITICAL)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            yield
+    finally:
+        for logger, level in zip(loggers, levels, strict=True):
+            logger.setLevel(level)
+
+
 def _native(array: np.ndarray) -> np.ndarray:
     """In the byte order of this computer, and in that of C."""
     return np.ascontiguousarray(array.astype(array.dtype.newbyteorder("="), copy=False))
@@ -201,9 +223,8 @@ def _native(array: np.ndarray) -> np.ndarray:
 
 def _read_nifti(path: Path) -> ImageFile:
     import nibabel
-    from nibabel.imageglobals import LoggingOutputSuppressor
 
-    with LoggingOutputSuppressor():  # it prints what it corrects in a header, which is compared below
+    with remarks_withheld():  # what nibabel corrects in a header is compared below
         if path.suffix.lower() in (".hdr", ".img"):
             image: Any = nibabel.load(path)  # type: ignore[attr-defined]
             if not isinstance(image, nibabel.Nifti1Pair):  # Analyze 7.5, which has no orientation
@@ -214,7 +235,7 @@ def _read_nifti(path: Path) -> ImageFile:
             is_second = _NIFTI2_HEADER in (int.from_bytes(content[:4], order) for order in ("little", "big"))
             kind = nibabel.Nifti2Image if is_second else nibabel.Nifti1Image
             raw = kind.header_class(content[: kind.header_class.sizeof_hdr], check=False)
-            require_voxels(path, raw["dim"][1 : max(int(raw["dim"][0]), 0) + 1])
+            require_voxels(path, [int(n) for n in raw["dim"][1 : max(int(raw["dim"][0]), 0) + 1]])
             image = kind.from_bytes(content)
         array = np.asanyarray(image.dataobj)
         qform = np.array(image.header.get_qform())
@@ -303,48 +324,49 @@ def _read_nrrd(path: Path) -> ImageFile:
     require_voxels(path, values["sizes"])
     array, values = nrrd.read(str(path), index_order="C")
     header = {key: value for key, value in values.items() if isinstance(value, str)}
-    array, kinds = np.asarray(array), [str(kind) for kind in values.get("kinds", ["domain"] * np.ndim(array))]
+    segments = segments_of(header, str(path))
+    count, spacings, doubts = array.ndim, {}, []
+    kinds = [str(kind) for kind in values.get("kinds", ["domain"] * count)]
+    steps = np.full((count, 3), np.nan)
     vectors, lengths = values.get("space directions"), values.get("spacings")
-    steps = [None] * array.ndim if vectors is None else [np.asarray(vector, float) for vector in vectors]
-    is_space = [kind in ("domain", "space", "???", "none") for kind in kinds]
-    if vectors is not None:
-        is_space = [bool(np.isfinite(step).all()) for step in steps]
-    doubts, axes = [], [axis for axis in range(array.ndim) if is_space[axis]][:3]
-    others = [axis for axis in range(array.ndim) if axis not in axes]
-    is_time = [kinds[axis] in ("list", "time", "domain") for axis in others]
-    # Slowest axis first: axis n of the file is axis -1 - n of the array
-    first = [array.ndim - 1 - axis for axis, slow in zip(others, is_time, strict=True) if slow]
-    last = [array.ndim - 1 - axis for axis, slow in zip(others, is_time, strict=True) if not slow]
-    middle = [array.ndim - 1 - axis for axis in axes[::-1]]
-    array = array.transpose([*first, *middle, *last])
-    matrix, spacings = np.eye(4), {}
-    unit = next(iter(values.get("space units") or values.get("units") or [""]))
-    scale = _NRRD_UNITS.get(str(unit).lower())
-    if scale is None:
+    for axis, vector in enumerate([] if vectors is None else vectors):
+        if np.size(vector) == 3:
+            steps[axis] = vector
+    is_space = [kind in ("domain", "space") for kind in kinds] if vectors is None else np.isfinite(steps).all(axis=1)
+    axes = np.flatnonzero(is_space)[:3].tolist()
+    lengths = np.full(count, np.nan) if lengths is None else np.asarray(lengths, float)
+    # Lists are images one after another, and the layers of segments; axis n of the file is axis -1 - n of the array.
+    slow = [
+        axis for axis in range(count) if axis not in axes and kinds[axis] in ("list", "time", "domain") and not segments
+    ]
+    fast = [axis for axis in range(count) if axis not in axes and axis not in slow]
+    array = array.transpose([count - 1 - axis for axis in (*slow[::-1], *axes[::-1], *fast[::-1])])
+    unit = str(next(iter(values.get("space units") or values.get("units") or [""]))).lower()
+    scale = _NRRD_UNITS.get(unit, 1.0)
+    if unit not in _NRRD_UNITS:
         doubts.append(f"its space units {unit!r} are unknown, expected mm, cm, m or um; read as millimetres")
+    matrix = np.eye(4)
     for place, axis in enumerate(axes):
-        if steps[axis] is not None:
+        if np.isfinite(steps[axis]).all():
             matrix[:3, place] = steps[axis]
-        elif lengths is not None and np.isfinite(lengths[axis]):
+        elif np.isfinite(lengths[axis]):
             matrix[place, place] = lengths[axis]
-    if lengths is not None and vectors is not None and np.isfinite(np.asarray(lengths, float)[axes]).all():
-        spacings["spacings"] = tuple(float(lengths[axis]) * (scale or 1.0) for axis in axes)
+    if np.isfinite(lengths[axes]).all():
+        spacings["spacings"] = tuple((lengths[axes] * scale).tolist())
     if values.get("space origin") is not None:
         matrix[:3, 3] = values["space origin"]
     signs = _NRRD_SPACES.get(str(values.get("space", "")).lower().removesuffix("-time"))
     if signs is None and len(axes) == 3:
-        signs = (-1, -1, 1)  # as ITK and 3D Slicer read it
-        doubts.append(
-            f"its space is {values.get('space', 'missing')}, not an anatomical one, read as LPS; check left and right"
-        )
-    matrix[:3] *= scale or 1.0
+        space = f"its space is {values['space']}, which is not anatomical" if "space" in values else "it has no space"
+        doubts.append(f"{space}, read as LPS, as 3D Slicer does; check left and right")
+    matrix[:3] *= scale
     return ImageFile(
-        _native(array), np.diag([*(signs or (-1, -1, 1)), 1.0]) @ matrix, bool(last), header, spacings=spacings,
-        label_names={segment.label: segment.name for segment in segments_of(header, str(path))}, doubts=tuple(doubts),
+        _native(array), np.diag([*(signs or (-1, -1, 1)), 1.0]) @ matrix, bool(fast), header, spacings=spacings,
+        label_names={segment.label: segment.name for segment in segments}, doubts=tuple(doubts),
     )  # fmt: skip
 
 
-# ---- ITK, whose child process ends with it at damaged files -------------------------------------------------------------
+# ---- ITK, whose child process ends with it at damaged files ----------------------------------------------------------
 
 
 @in_child

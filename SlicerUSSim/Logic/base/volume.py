@@ -16,6 +16,7 @@ from SlicerUSSim.Logic.base.files import messages_withheld, require_space, writt
 from SlicerUSSim.Logic.base.image_files import (
     ImageFile,
     checked_image,
+    of_sitk,
     read_image,
     require_readable_name,
     require_spacing,

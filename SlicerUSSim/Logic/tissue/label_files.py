@@ -1,6 +1,6 @@
 """Names of labels in files: in a label map's own header, or in a table beside it.
 
-Headers: segments of DICOM SEG and of 3D Slicer's .seg.nrrd, and the label table that TotalSegmentator writes into NIfTI.
+Headers: segments of DICOM SEG and 3D Slicer's .seg.nrrd, and the label table that TotalSegmentator writes into NIfTI.
 Tables: ITK-SNAP's label descriptions, 3D Slicer's colour tables (.ctbl), FreeSurfer's colour look-up tables, and those
 of BIDS (.tsv with columns index and name).
 """

@@ -227,7 +227,6 @@ class TrackedSequence:
         require_path(path)
         path = Path(path)
         require(path.is_file(), f"{path}: no such file")
-        is_nrrd = path.name.lower().endswith((".nrrd", ".nhdr"))
         pixels, header = _read_images(path)
         return _from_header(pixels, header, str(path))
 
