@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import copy
 import logging
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -21,7 +22,7 @@ from SlicerUSSim.Logic.base.image_files import (
     require_voxels,
 )
 from SlicerUSSim.Logic.base.reading import in_child, reader
-from SlicerUSSim.Logic.base.segments import Segment, flattened
+from SlicerUSSim.Logic.base.segments import Segment, flattened, is_meaningful
 from SlicerUSSim.Logic.base.transforms import LPS_TO_RAS
 
 _log = logging.getLogger(__name__)
@@ -296,7 +297,9 @@ def _frames(path: Path, dataset: Any) -> ImageFile:
     """A file with many frames: enhanced MR, CT and ultrasound volumes, and older classes without places of frames."""
     import highdicom
 
-    doubts = () if "PerFrameFunctionalGroupsSequence" in dataset else (_give_places(path, dataset),)
+    if "PerFrameFunctionalGroupsSequence" not in dataset:
+        slices, doubt = _as_slices(path, dataset)
+        return replace(_stack(path, [str(path)] * len(slices), slices), doubts=(doubt,))
     shared = dataset.get("SharedFunctionalGroupsSequence") or [{}]
     positions, cosines = [], []
     for number, frame in enumerate(dataset.PerFrameFunctionalGroupsSequence, 1):
@@ -317,7 +320,7 @@ def _frames(path: Path, dataset: Any) -> ImageFile:
     dataset.FrameOfReferenceUID = dataset.get("FrameOfReferenceUID") or "1.2.3"
     kind = np.float32 if int(dataset.BitsAllocated) <= 16 else np.float64
     image = highdicom.Image.from_dataset(dataset, copy=False)
-    return _image(image.get_volume(dtype=kind, rtol=_UNEVEN, **_VALUES), doubts)
+    return _image(image.get_volume(dtype=kind, rtol=_UNEVEN, **_VALUES))
 
 
 def _name_as_of_patients(group: Any) -> None:
@@ -332,28 +335,21 @@ def _name_as_of_patients(group: Any) -> None:
             setattr(group, f"{macro}Sequence", [item])
 
 
-def _give_places(path: Path, dataset: Any) -> str:
-    """Give the frames of a class without places evenly spaced ones, which is returned as a doubt."""
-    from pydicom.dataset import Dataset
+def _as_slices(path: Path, dataset: Any) -> tuple[list[Any], str]:
+    """The frames of a class without places as images, evenly spaced, which is returned as a doubt."""
+    from pydicom.uid import ExplicitVRLittleEndian
 
-    step = dataset.get("SpacingBetweenSlices") or dataset.get("SliceThickness")
-    require(step, f"{path}: its frames have neither places nor SpacingBetweenSlices, expected one; without there is no "
-            "volume")  # fmt: skip
-    first, cosines = (_numbers(dataset, f"Image{what}Patient", n, str(path)) for what, n in
-                      (("Position", 3), ("Orientation", 6)))  # fmt: skip
-    spacing = _numbers(dataset, "PixelSpacing", 2, str(path))
-    shared, orientation, measures = Dataset(), Dataset(), Dataset()
-    orientation.ImageOrientationPatient, measures.PixelSpacing = cosines.tolist(), spacing.tolist()
-    measures.SliceThickness = measures.SpacingBetweenSlices = step
-    shared.PlaneOrientationSequence, shared.PixelMeasuresSequence = [orientation], [measures]
-    frames = []
-    for number in range(int(dataset.NumberOfFrames)):
-        frame, position = Dataset(), Dataset()
-        position.ImagePositionPatient = (first + number * float(step) * np.cross(cosines[:3], cosines[3:])).tolist()
-        frame.PlanePositionSequence = [position]
-        frames.append(frame)
-    dataset.SharedFunctionalGroupsSequence, dataset.PerFrameFunctionalGroupsSequence = [shared], frames
-    return f"its frames have no places, read as {float(step):g} mm apart, towards the normal; check left and right"
+    step = float(dataset.get("SpacingBetweenSlices") or dataset.get("SliceThickness") or 0.0)
+    require(step > 0, f"{path}: its frames have neither places nor SpacingBetweenSlices; without there is no volume")
+    first = _numbers(dataset, "ImagePositionPatient", 3, str(path))
+    cosines = _numbers(dataset, "ImageOrientationPatient", 6, str(path))
+    pixels = dataset.pixel_array
+    del dataset.PixelData, dataset.NumberOfFrames
+    slices = [copy.deepcopy(dataset) for _ in pixels]
+    for number, (one, values) in enumerate(zip(slices, pixels, strict=True)):
+        one.ImagePositionPatient = (first + number * step * np.cross(cosines[:3], cosines[3:])).tolist()
+        one.PixelData, one.file_meta.TransferSyntaxUID = values.tobytes(), ExplicitVRLittleEndian
+    return slices, f"its frames have no places, read as {step:g} mm apart, towards the normal; check left and right"
 
 
 def _segments(path: Path, dataset: Any) -> ImageFile:
@@ -370,14 +366,14 @@ def _segments(path: Path, dataset: Any) -> ImageFile:
             segment_numbers=[number], combine_segments=False, allow_missing_positions=True, dtype=np.float32
         )
         layers.append((np.asarray(volume.array)[..., 0] > 0.5).astype(np.uint8))
-        found.append(Segment(name if re.search(r"[^\d\W_]{2}", name) else kind, place, 1, int(number)))
+        found.append(Segment(name if is_meaningful(name) else kind, place, 1, int(number)))
     require(volume is not None, f"{path}: has no segments")
     voxel_ml = float(abs(np.linalg.det(volume.affine[:3, :3])) / 1000.0)  # type: ignore[union-attr]
     labels = flattened(np.stack(layers, axis=-1), found, voxel_ml, str(path))
     return _image(volume.with_array(labels), names={one.label: one.name for one in found})  # type: ignore[union-attr]
 
 
-def _image(volume: Any, doubts: Sequence[str] = (), names: Mapping[int, str] | None = None) -> ImageFile:
+def _image(volume: Any, names: Mapping[int, str] | None = None) -> ImageFile:
     """A highdicom.Volume (slices, rows, columns; LPS), with slices in the order of their normal, as ITK has them."""
     array, matrix = np.asarray(volume.array), LPS_TO_RAS @ np.asarray(volume.affine)[:, [2, 1, 0, 3]]
     if np.linalg.det(matrix[:3, :3]) < 0:
@@ -388,7 +384,7 @@ def _image(volume: Any, doubts: Sequence[str] = (), names: Mapping[int, str] | N
     if np.array_equal(whole, array):
         is_short = whole.min() >= -(2**15) and whole.max() < 2**15
         array = whole.astype(np.int16 if is_short else np.int32)
-    return ImageFile(np.ascontiguousarray(array), matrix, label_names=names or {}, doubts=tuple(doubts))
+    return ImageFile(np.ascontiguousarray(array), matrix, label_names=names or {})
 
 
 def _numbers(dataset: Any, keyword: str, count: int, name: str) -> np.ndarray:

@@ -13,6 +13,7 @@ from pathlib import Path
 
 from SlicerUSSim.Logic.base.errors import SimulationError, require
 from SlicerUSSim.Logic.base.reading import reader
+from SlicerUSSim.Logic.base.segments import is_meaningful
 from SlicerUSSim.Logic.base.volume import Volume
 
 _log = logging.getLogger(__name__)
@@ -23,8 +24,6 @@ TABLE_SUFFIXES = (".txt", ".ctbl", ".label", ".lut", ".tsv", ".csv")
 _SNAP = re.compile(r'\s*(\d+)\s[\d\s.]+"([^"]*)"\s*')
 #: 24  CSF  60 60 60 0
 _PLAIN = re.compile(r"\s*(\d+)[\s,;]+(.*?)((?:[\s,;]+[\d.]+){3,8})?\s*")
-#: Names that programs give when the user gave none
-_MEANINGLESS = re.compile(r"(label|segment|region|class|colou?r|unnamed|\(none\)|n/?a)?[ _-]*\d*", re.IGNORECASE)
 
 
 def names_of_file(path: Path, volume: Volume) -> tuple[dict[int, str], str]:
@@ -84,8 +83,3 @@ def _entry(line: str) -> tuple[int | None, str]:
     if line.lstrip().startswith("#") or not found:
         return None, ""
     return int(found[1]), found[2].strip().strip('"').strip()
-
-
-def is_meaningful(name: str | None) -> bool:
-    """Whether somebody gave this name, and no program ("Label 3", "Segment_1")."""
-    return bool(name) and not _MEANINGLESS.fullmatch(str(name).strip())
