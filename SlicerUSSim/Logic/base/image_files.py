@@ -14,7 +14,7 @@ import os
 import re
 import warnings
 import zlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -88,18 +88,26 @@ def read_image(path: Path) -> ImageFile:
     require_readable_name(path)
     require(path.is_file(), f"{path}: no such file")
     require(path.stat().st_size > 0, f"{path}: cannot be read as an image (it is empty, 0 bytes)")
+    try:
+        found = _reader_of(path)(path)
+    except SimulationError:
+        raise
+    except Exception as error:  # the libraries raise various exceptions for damaged files
+        reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
+        raise SimulationError(f"{path}: cannot be read as an image ({reason[:200]})") from error
+    return checked_image(path, found)
+
+
+def _reader_of(path: Path) -> Callable[[Path], ImageFile]:
     name = path.name.lower()
     if name.endswith(_NIFTI_SUFFIXES):
-        found = _read_nifti(path)
-    elif name.endswith((".mgz", ".mgh")):
-        found = _read_mgh(path)
-    elif name.endswith((".nrrd", ".nhdr")):
-        found = _read_nrrd(path)
-    elif name.endswith(".mnc") and path.read_bytes()[:3] == b"CDF":
-        found = _read_minc1(path)
-    else:
-        found = _read_by_itk(path)
-    return checked_image(path, found)
+        return _read_nifti
+    if name.endswith((".mgz", ".mgh")):
+        return _read_mgh
+    if name.endswith((".nrrd", ".nhdr")):
+        return _read_nrrd
+    with path.open("rb") as file:
+        return _read_minc1 if name.endswith(".mnc") and file.read(3) == b"CDF" else _read_by_itk
 
 
 def checked_image(path: Path, found: ImageFile) -> ImageFile:
@@ -126,7 +134,7 @@ def checked_image(path: Path, found: ImageFile) -> ImageFile:
         "resample it to a regular grid",
     )
     for name, spacing in found.spacings.items():
-        if not np.allclose(spacing, lengths, rtol=_SAME_SPACING, atol=0.0):
+        if len(spacing) == 3 and not np.allclose(spacing, lengths, rtol=_SAME_SPACING, atol=0.0):
             doubts.append(
                 f"its {name} says voxels of {_times(spacing)} mm, its axes {_times(lengths)} mm, which is used"
             )
@@ -232,6 +240,7 @@ def _read_nifti(path: Path) -> ImageFile:
             raw = image.header
         else:
             content = content_of(path)
+            require(len(content) > 4, f"{path}: cannot be read as an image (it has {len(content)} bytes of content)")
             is_second = _NIFTI2_HEADER in (int.from_bytes(content[:4], order) for order in ("little", "big"))
             kind = nibabel.Nifti2Image if is_second else nibabel.Nifti1Image
             raw = kind.header_class(content[: kind.header_class.sizeof_hdr], check=False)
@@ -249,7 +258,7 @@ def _read_nifti(path: Path) -> ImageFile:
     matrices, doubts = {}, []
     if int(raw["sform_code"]) > 0:
         matrices["sform"] = scale @ raw.get_sform()
-    if int(raw["qform_code"]) > 0:
+    if int(raw["qform_code"]) > 0 and pixdim.all():
         matrices["qform"] = scale @ qform
     if not matrices:  # as ITK and 3D Slicer read it
         matrices["size"] = LPS_TO_RAS @ np.diag([*np.abs(pixdim), 1.0])
@@ -330,8 +339,8 @@ def _read_nrrd(path: Path) -> ImageFile:
     steps = np.full((count, 3), np.nan)
     vectors, lengths = values.get("space directions"), values.get("spacings")
     for axis, vector in enumerate([] if vectors is None else vectors):
-        if np.size(vector) == 3:
-            steps[axis] = vector
+        if np.size(vector) in (2, 3):
+            steps[axis] = np.resize([*vector, 0.0], 3)
     is_space = [kind in ("domain", "space") for kind in kinds] if vectors is None else np.isfinite(steps).all(axis=1)
     axes = np.flatnonzero(is_space)[:3].tolist()
     lengths = np.full(count, np.nan) if lengths is None else np.asarray(lengths, float)
@@ -354,7 +363,7 @@ def _read_nrrd(path: Path) -> ImageFile:
     if np.isfinite(lengths[axes]).all():
         spacings["spacings"] = tuple((lengths[axes] * scale).tolist())
     if values.get("space origin") is not None:
-        matrix[:3, 3] = values["space origin"]
+        matrix[:3, 3] = np.resize([*values["space origin"], 0.0], 3)
     signs = _NRRD_SPACES.get(str(values.get("space", "")).lower().removesuffix("-time"))
     if signs is None and len(axes) == 3:
         space = f"its space is {values['space']}, which is not anatomical" if "space" in values else "it has no space"
