@@ -7,6 +7,7 @@ voxels that contradict each other cause a warning with both, and the one that th
 from __future__ import annotations
 
 import gzip
+import importlib.util
 import itertools
 import logging
 import math
@@ -23,7 +24,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from SlicerUSSim.Logic.base.errors import SimulationError, require, shown_path
+from SlicerUSSim.Logic.base.errors import SimulationError, require, require_package, shown_path
 from SlicerUSSim.Logic.base.reading import in_child, reader
 from SlicerUSSim.Logic.base.segments import segments_of
 from SlicerUSSim.Logic.base.transforms import LPS_TO_RAS
@@ -99,12 +100,13 @@ def read_image(path: Path) -> ImageFile:
 
 
 def _reader_of(path: Path) -> Callable[[Path], ImageFile]:
-    name = path.name.lower()
-    if name.endswith(_NIFTI_SUFFIXES):
+    """The reader of a format; without its library, as in 3D Slicer, ITK."""
+    name, has_nibabel = path.name.lower(), importlib.util.find_spec("nibabel") is not None
+    if name.endswith(_NIFTI_SUFFIXES) and has_nibabel:
         return _read_nifti
-    if name.endswith((".mgz", ".mgh")):
+    if name.endswith((".mgz", ".mgh")) and has_nibabel:
         return _read_mgh
-    if name.endswith((".nrrd", ".nhdr")):
+    if name.endswith((".nrrd", ".nhdr")) and importlib.util.find_spec("nrrd") is not None:
         return _read_nrrd
     with path.open("rb") as file:
         return _read_minc1 if name.endswith(".mnc") and file.read(3) == b"CDF" else _read_by_itk
@@ -312,6 +314,7 @@ def _read_mgh(path: Path) -> ImageFile:
 
 def _read_minc1(path: Path) -> ImageFile:
     """MINC 1, which is NetCDF; MINC 2 is HDF5, which ITK reads."""
+    require_package("nibabel", "nibabel", f"{path}: reading MINC 1")
     import nibabel
 
     image: Any = nibabel.Minc1Image.from_filename(path)
