@@ -27,8 +27,7 @@ from SlicerUSSim.Logic.placement.craniotomy import (
 )
 from SlicerUSSim.Logic.placement.views import view_pose
 from SlicerUSSim.Logic.probe.poses import pose_looking_at
-from SlicerUSSim.Logic.tissue.own_files import write_label_files
-from SlicerUSSim.Logic.tissue.table import TissueTable
+from SlicerUSSim.Logic.tissue.table import TissueTable, write_label_files
 
 NAMES = ("csf", "grey matter", *OUTSIDE)
 #: Outer radii in mm; 2 is the brain, 0 between it and the skull
