@@ -288,7 +288,7 @@ def require_no_input(out: Path) -> None:
     """Raise SimulationError if an output of the running command would replace a file that it reads."""
     for file in _inputs():
         is_same = out.resolve() == file.resolve() or (out.exists() and file.exists() and out.samefile(file))
-        require(not is_same, f"{out}: is an input, which it would replace; give another name")
+        require(not is_same, f"{out} is an input, which it would replace; give another name")
 
 
 def _inputs() -> list[Path]:
