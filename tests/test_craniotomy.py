@@ -228,7 +228,7 @@ def test_a_file_with_two_segments_is_no_opening_and_both_are_named(head, tmp_pat
 def image(tmp_path, *arguments) -> tuple[np.ndarray, str]:
     picture = str(tmp_path / "a.png")
     done = CliRunner().invoke(
-        main, ["simulate", str(tmp_path / "head.nii.gz"), *arguments, "--look", "even", "-o", picture]
+        main, ["simulate", str(tmp_path / "head.nii.gz"), *arguments, "--look", "even", "-o", picture, "--overwrite"]
     )
     assert done.exit_code == 0, done.output
     return np.asarray(Image.open(picture), float), done.stderr
