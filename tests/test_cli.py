@@ -227,7 +227,7 @@ def test_values_that_are_no_text_and_sweeps_without_end_are_refused(labels, tmp_
         (("--tilt", "nan"), "a sweep tilts over nan degrees"), (("--slide", "inf"), "a sweep slides over inf mm"),
         (("--tilt", 10, "--frames", 1_000_000), "not in the range 1<=x<=10000"),
     ):  # fmt: skip
-        result = ussim("volume", labels, "--pose", "auto", "-o", out, "--overwrite", *options)
+        result = ussim("volume", labels, "--pose", "auto", "-o", out, *options)
         assert result.exit_code == 2 and words in result.stderr and not out.exists()
 
 
