@@ -40,7 +40,7 @@ from SlicerUSSim.Logic.probe.arrays import PROBES
 from SlicerUSSim.Logic.probe.image_grid import ImageGrid
 from SlicerUSSim.Logic.probe.poses import craniotomy_pose, tilt_sweep, turned
 from SlicerUSSim.Logic.probe.shape import field_polydata, probe_polydata
-from SlicerUSSim.Logic.tissue.own_files import write_label_files
+from SlicerUSSim.Logic.tissue.table import write_label_files
 from SlicerUSSim.Logic.tracked.sequence import TrackedSequence
 from SlicerUSSim.Workstation.script import LabelSource, python_script
 

@@ -31,10 +31,6 @@ _log = logging.getLogger(__name__)
 #: A smaller or larger side of a volume indicates a wrong unit.
 SMALLEST_MM, LARGEST_MM = 5.0, 2500.0
 WRITABLE_SUFFIXES = (".nii", ".nii.gz", ".nrrd", ".nhdr", ".mha", ".mhd", ".mnc", ".vti")
-#: Entry of a header for the origin of an image
-MADE_BY = "ussim_made_by"
-
-
 #: Names of the sides towards which R, A and S decrease and increase
 SIDES = (("left", "right"), ("back", "front"), ("bottom", "top"))
 
@@ -179,13 +175,10 @@ class Volume:
         image.SetDirection(direction.ravel().tolist())
         return image
 
-    def write(
-        self, path: str | os.PathLike, made_by: str | None = None, about: Mapping[str, str] | None = None
-    ) -> None:
+    def write(self, path: str | os.PathLike, about: Mapping[str, str] | None = None) -> None:
         """Write the volume in the format of the suffix; on failure an existing file is kept.
 
-        `made_by` is a text about its origin, up to 79 characters, for the file's header (MINC has no place for it).
-        `about` are further lines of it, {key: text without line ends}, of NRRD, MetaImage and VTI.
+        `about` are further lines of its header, {key: text without line ends}, of NRRD, MetaImage and VTI.
         Raises SimulationError for an unknown suffix or if the file cannot be written.
         """
         path = Path(path)
@@ -195,14 +188,12 @@ class Volume:
             require_space(path, self.array.nbytes)
         with written_whole(path) as partial, messages_withheld():
             if suffix == ".vti":
-                self._write_vti(partial, {**({} if made_by is None else {MADE_BY: made_by}), **(about or {})})
+                self._write_vti(partial, about or {})
             else:
                 import SimpleITK as sitk
 
                 image = self.to_sitk()
                 is_nifti = path.name.lower().endswith((".nii", ".nii.gz"))
-                if made_by is not None:
-                    image.SetMetaData("ITK_FileNotes" if is_nifti else MADE_BY, made_by)
                 for key, text in (about or {}).items():
                     image.SetMetaData(key, text)
                 sitk.WriteImage(image, str(partial), useCompression=not path.name.lower().endswith(".mhd"))

@@ -22,7 +22,6 @@ import numpy as np
 from SlicerUSSim.Logic.base.errors import SimulationError, require, require_package, require_path
 from SlicerUSSim.Logic.base.files import read_small, written_whole
 from SlicerUSSim.Logic.base.image_files import read_image
-from SlicerUSSim.Logic.base.own_outputs import MADE_BY
 from SlicerUSSim.Logic.base.reading import reader
 from SlicerUSSim.Logic.base.transforms import check_affine, is_singular
 from SlicerUSSim.Logic.base.volume import Volume
@@ -34,6 +33,8 @@ SEQUENCE_SUFFIXES = (".igs.mha", ".seq.mha", ".mha", ".mhd", ".seq.nrrd", ".nrrd
 _FRAME_FIELD = re.compile(r"Seq_Frame(\d+)_(.+)")
 #: Field of sequences whose images are simulated
 SIMULATED = "SlicerUSSimSimulated"
+#: Field of those of `ussim sweep` of earlier versions
+_SIMULATED_BEFORE = "ussim_made_by"
 #: Field of sequences whose images are slices of a 3D ultrasound volume
 _CUT = "SlicerUSSimCutFromVolume"
 _ORIENTATION, _TYPE = "UltrasoundImageOrientation", "UltrasoundImageType"
@@ -113,7 +114,7 @@ class TrackedSequence:
     @property
     def is_simulated(self) -> bool:
         """Whether its images say that this package simulated them, as a twin's and those of `ussim sweep` do."""
-        return SIMULATED in self.fields or MADE_BY in self.fields
+        return not self.fields.keys().isdisjoint((SIMULATED, _SIMULATED_BEFORE))
 
     @property
     def is_recorded(self) -> bool:
