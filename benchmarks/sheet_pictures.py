@@ -19,7 +19,6 @@ from PIL import Image
 
 from benchmarks.brain_extraction import SHARED
 from SlicerUSSim.Logic import Segmentation, TissueTable, UltrasoundSimulator, Volume, segment_mri
-from SlicerUSSim.Logic.base.own_outputs import save_marked_png
 from SlicerUSSim.Logic.mri import demo_mri
 from SlicerUSSim.Logic.mri.pathology import add_tissues
 from SlicerUSSim.Logic.mri.sheets import STRUCTURES, Sheets, find_sheets
@@ -131,7 +130,7 @@ def main() -> None:
         if arguments.views:
             columns.append(view(found, sheets))
     if arguments.views:
-        save_marked_png(arguments.views, Image.fromarray(np.hstack(columns)))
+        Image.fromarray(np.hstack(columns)).save(arguments.views, "PNG")
 
 
 if __name__ == "__main__":

@@ -364,7 +364,7 @@ def save_edited(place, array, path):
 
 @needs_nilearn
 @pytest.mark.slow
-def test_an_edited_kept_mask_is_used_and_reported_and_never_overwritten(head, found, tmp_path):
+def test_an_edited_kept_mask_is_used_and_reported_and_never_overwritten(head, found, tmp_path, own_cache):
     array = found.result.mask.array.copy()
     array[: array.shape[0] // 2] = 0
     place = tmp_path / "edited.nrrd"
@@ -376,19 +376,6 @@ def test_an_edited_kept_mask_is_used_and_reported_and_never_overwritten(head, fo
     before = place.read_bytes()
     assert not brain_module.keep(place, other, array > 0, "atlas", 1.0, ()).is_beside
     assert place.read_bytes() == before
-
-
-def test_a_file_of_somebody_else_is_not_overwritten(tmp_path):
-    mri = head_mri(4.0)
-    place = tmp_path / "head.brain-mask.nrrd"
-    mri.write(place)
-    before = place.read_bytes()
-    kept = brain_module.keep(place, mri, mri.array > 0, "atlas", 1.0, ())
-    assert "was not written by ussim" in kept.text and place.read_bytes() == before
-    place.write_bytes(before[: len(before) // 2])  # cut short while it was copied
-    kept = brain_module.keep(place, mri, mri.array > 0, "atlas", 1.0, ())
-    assert kept.text.startswith(f"{place} cannot be read and stays as it is") and "edited" not in kept.text
-    assert not kept.is_beside and place.read_bytes() == before[: len(before) // 2]
 
 
 @pytest.mark.parametrize("edit", ["everything", pytest.param("smoothed", marks=pytest.mark.slow)])
@@ -426,15 +413,18 @@ def test_a_mask_of_another_image_or_method_is_not_used(tmp_path):
     assert brain_module.read_kept(place, mri.with_array(mri.array * 2), "auto") is None
 
 
-def test_without_a_writable_folder_the_mask_is_kept_in_the_cache(tmp_path, monkeypatch):
-    import platformdirs
-
-    monkeypatch.setattr(platformdirs, "user_cache_dir", lambda *a, **k: str(tmp_path / "cache"))
+@pytest.mark.parametrize("is_taken", [True, False])
+def test_a_mask_is_kept_in_the_cache_where_it_cannot_be_beside(is_taken, tmp_path, own_cache):
     mri = head_mri(4.0)
     place = tmp_path / "absent" / "head.brain-mask.nrrd"  # a folder that cannot be written, also for root
+    if is_taken:
+        place.parent.mkdir()
+        place.write_text("mine")
     kept = brain_module.keep(place, mri, mri.array > 0, "robex", 1.0, ())
-    assert str(tmp_path / "cache") in kept.text and not kept.is_beside
+    why = f"{place} exists" if is_taken else f"{place.parent} cannot be written"
+    assert str(own_cache) in kept.text and kept.text.endswith(f"since {why}") and not kept.is_beside
     assert brain_module.read_kept(place, mri, "auto").method == "robex"
+    assert not is_taken or place.read_text() == "mine"
 
 
 # ---- masks that are given, and lesions -------------------------------------------------------------------------------

@@ -31,7 +31,7 @@ from SlicerUSSim.Logic import (
     UltrasoundSimulator,
 )
 from SlicerUSSim.Logic.base.errors import Cancelled
-from SlicerUSSim.Logic.base.volume import Volume, read_array
+from SlicerUSSim.Logic.base.volume import Volume, read_image_file
 from SlicerUSSim.Logic.imaging.noise import seed_of_pose
 from SlicerUSSim.Logic.imaging.preset import Preset
 from SlicerUSSim.Logic.mri.samples import head_mri
@@ -40,7 +40,7 @@ from SlicerUSSim.Logic.probe.arrays import PROBES
 from SlicerUSSim.Logic.probe.image_grid import ImageGrid
 from SlicerUSSim.Logic.probe.poses import craniotomy_pose, tilt_sweep, turned
 from SlicerUSSim.Logic.probe.shape import field_polydata, probe_polydata
-from SlicerUSSim.Logic.tissue.own_files import write_label_files
+from SlicerUSSim.Logic.tissue.table import write_label_files
 from SlicerUSSim.Logic.tracked.sequence import TrackedSequence
 from SlicerUSSim.Workstation.script import LabelSource, python_script
 
@@ -461,7 +461,7 @@ def run_again(script: str, folder) -> np.ndarray:
     """The (rows, columns) image written by a script."""
     (folder / "again.py").write_text(script, encoding="utf-8")
     run_script(folder / "again.py")
-    return read_array(folder / "image.nrrd")[0][0]
+    return read_image_file(folder / "image.nrrd").array[0]
 
 
 @pytest.mark.slow

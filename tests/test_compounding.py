@@ -208,7 +208,7 @@ def test_the_command_writes_a_volume_that_lies_in_the_patient(tmp_path):
     np.savetxt(tmp_path / "pose.txt", rigid(np.eye(3), [0, -28, 0]))
     out = tmp_path / "volume.nrrd"
     arguments = ["volume", str(tmp_path / "labels.nii.gz"), "--map", "ussim", "--pose", str(tmp_path / "pose.txt")]
-    arguments += ["-o", str(out)]
+    arguments += ["-o", str(out), "--overwrite"]
     result = CliRunner().invoke(main, [*arguments, "--slide", "10", "--frames", "6", "--spacing", "1.5"])
     assert result.exit_code == 0, result.output
     volume = Volume.read(out)

@@ -27,8 +27,7 @@ from SlicerUSSim.Logic.placement.craniotomy import (
 )
 from SlicerUSSim.Logic.placement.views import view_pose
 from SlicerUSSim.Logic.probe.poses import pose_looking_at
-from SlicerUSSim.Logic.tissue.own_files import write_label_files
-from SlicerUSSim.Logic.tissue.table import TissueTable
+from SlicerUSSim.Logic.tissue.table import TissueTable, write_label_files
 
 NAMES = ("csf", "grey matter", *OUTSIDE)
 #: Outer radii in mm; 2 is the brain, 0 between it and the skull
@@ -229,7 +228,7 @@ def test_a_file_with_two_segments_is_no_opening_and_both_are_named(head, tmp_pat
 def image(tmp_path, *arguments) -> tuple[np.ndarray, str]:
     picture = str(tmp_path / "a.png")
     done = CliRunner().invoke(
-        main, ["simulate", str(tmp_path / "head.nii.gz"), *arguments, "--look", "even", "-o", picture]
+        main, ["simulate", str(tmp_path / "head.nii.gz"), *arguments, "--look", "even", "-o", picture, "--overwrite"]
     )
     assert done.exit_code == 0, done.output
     return np.asarray(Image.open(picture), float), done.stderr

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import os
 import re
 from pathlib import Path
@@ -10,7 +9,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import SimpleITK as sitk
-from vtkmodules.vtkIOXML import vtkXMLImageDataWriter
 
 from SlicerUSSim.Logic import SimulationError, Volume
 from SlicerUSSim.Logic.tissue import TissueTable
@@ -41,35 +39,22 @@ def refused(path: Path, words: str, read=Volume.read) -> None:
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "words"),
+    ("suffix", "old", "new", "words"),
     [
-        (b"NDims = 3", b"NDims = 999999999999999999999", "NDims is '999999999999999999999'"),
-        (b"-1 0 0 0 -1 0 0 0 1", b"-1 0 0 0 -1 0 0 nan 1", "TransformMatrix is"),
-        (b"DimSize = 4 5 6", b"DimSize = 4 5 4294967296", "has 4x5x4294967296 voxels, expected at most"),
-        (b"DimSize = 4 5 6", b"DimSize = 4 5 600000", "which its"),
-        (b"DimSize = 4 5 6", b"DimSize = 4 5 12", "enough for 6 of 12 slices"),  # the rest was what the memory held
-        (b"ElementSpacing = 1 1 2", b"ElementSpacing = 1 1 \xff", "is not text"),
-        (b"ElementDataFile", b"ElementDataPile", "its header"),
-        (b"LOCAL", b"%n%n.raw 1 9 1", "ElementDataFile is '%n%n.raw 1 9 1', expected a file"),  # went to printf
-        (b"DimSize = 4 5 6", "DimSize = 4 5 \u0666".encode(), "DimSize is '4 5 \u0666', expected whole numbers"),
+        (".mha", b"NDims = 3", b"NDims = 999999999999999999999", "the library that reads it crashed"),
+        (".mha", b"-1 0 0 0 -1 0 0 0 1", b"-1 0 0 0 -1 0 0 nan 1", "cannot be read as an image"),
+        (".mha", b"DimSize = 4 5 6", b"DimSize = 4 5 4294967296", "has 4x5x4294967296 voxels, expected at most"),
+        (".mha", b"DimSize = 4 5 6", b"DimSize = 4 5 600000", "copy or export it again"),
+        (".mha", b"DimSize = 4 5 6", b"DimSize = 4 5 12", "has 240 bytes of voxels, expected 480 for 4x5x12"),
+        (".mha", b"ElementDataFile", b"ElementDataPile", "its header has no line ElementDataFile"),
+        (".mha", b"LOCAL", b"%n%n.raw 1 9 1", "ElementDataFile is '%n%n.raw 1 9 1', expected a file"),  # went to printf
+        (".vti", b'WholeExtent="0 3 0 4 0 5"', b'WholeExtent="0 999999999 0 4 0 5"', "cannot be read"),
+        (".vti", b'Spacing="1 1 2"', b'Spacing="1 1 1e308"', "ijk_to_ras is singular"),
+        (".vti", b"<ImageData", b"<ImageDada", "cannot be read as a VTK image"),
     ],
 )
-def test_a_metaimage_that_no_reader_survives_is_refused(tmp_path, old, new, words):
-    refused(with_bytes(written(tmp_path, ".mha"), old, new), words)
-
-
-@pytest.mark.parametrize(
-    ("old", "new", "words"),
-    [
-        (b'WholeExtent="0 3 0 4 0 5"', b'WholeExtent="0 999999999 0 4 0 5"', "voxels, expected at most"),
-        (b'WholeExtent="0 3 0 4 0 5"', b'WholeExtent="0 9999 0 9999 0 5"', "which its"),
-        (b'WholeExtent="0 3 0 4 0 5"', b'WholeExtent="0 3 0 4 0 2"', "the extent of its piece is"),
-        (b'Spacing="1 1 2"', b'Spacing="1 1 1e308"', "Spacing is '1 1 1e308'"),
-        (b"<ImageData", b"<ImageDada", "cannot be read as a VTK image"),
-    ],
-)
-def test_a_vti_that_no_reader_survives_is_refused(tmp_path, old, new, words):
-    refused(with_bytes(written(tmp_path, ".vti"), old, new), words)
+def test_an_image_that_no_reader_survives_is_refused(tmp_path, suffix, old, new, words):
+    refused(with_bytes(written(tmp_path, suffix), old, new), words)
 
 
 def test_slices_in_numbered_files_are_read(tmp_path):
@@ -81,35 +66,6 @@ def test_slices_in_numbered_files_are_read(tmp_path):
     header = header.replace(b"BinaryData = False", b"BinaryData = True")
     (tmp_path / "image.mhd").write_bytes(header + b"ElementDataFile = slice%03d.raw 1 6 1\n")
     np.testing.assert_array_equal(Volume.read(tmp_path / "image.mhd").array, ARRAY)
-
-
-@pytest.mark.parametrize(
-    ("mode", "compressor", "bits"),
-    [
-        ("Binary", "None", 32), ("Binary", "ZLib", 64), ("Appended", "None", 32), ("Appended", "ZLib", 64),
-        ("Raw", "None", 64), ("Raw", "ZLib", 32),
-    ],
-)  # fmt: skip
-def test_numbers_in_front_of_the_values_of_a_vti_are_no_more_than_it_holds(tmp_path, mode, compressor, bits):
-    """VTK allocated gigabytes for a file of 1 kB."""
-    path = tmp_path / "image.vti"
-    writer = vtkXMLImageDataWriter()
-    getattr(writer, f"SetDataModeTo{'Appended' if mode == 'Raw' else mode}")()
-    writer.SetEncodeAppendedData(mode != "Raw")
-    getattr(writer, f"SetCompressorTypeTo{compressor}")()
-    writer.SetHeaderType(bits)
-    writer.SetFileName(str(path))
-    writer.SetInputData(Volume(ARRAY, np.diag([1.0, 1.0, 2.0, 1.0])).to_vtk())
-    writer.Write()
-    np.testing.assert_array_equal(Volume.read(path).array, ARRAY)
-    many = np.array([10**9] * (1 if compressor == "None" else 3), f"<u{bits // 8}").tobytes()
-    numbers = many if mode == "Raw" else base64.b64encode(many)
-    content = path.read_bytes()
-    place = content.index(b"_", content.index(b"<AppendedData")) + 1 if mode in ("Appended", "Raw") else None
-    if place is None:
-        place = re.search(rb'format="binary"[^>]*>\s*', content).end()
-    path.write_bytes(content[:place] + numbers + content[place + len(numbers) :])
-    refused(path, "bytes, which its")
 
 
 @pytest.mark.parametrize(

@@ -60,7 +60,7 @@ def optimize(folder, *options):
     arguments = [
         "optimize", folder / "labels.nii.gz", "--sequence", folder / "tracked.igs.mha", "--probe",
         folder / "probe.json", "--frames", "1", "--free", "gain_db", "--evaluations", 6, "--restarts", 0, "-o",
-        folder / "result.json", *options,
+        folder / "result.json", "--overwrite", *options,
     ]  # fmt: skip
     return CliRunner().invoke(main, list(map(str, arguments)))
 

@@ -21,7 +21,7 @@ import SimpleITK as sitk
 from hypothesis import HealthCheck, given, settings, strategies as st
 
 from SlicerUSSim.Logic import SimulationError, TissueTable, Volume
-from SlicerUSSim.Logic.base.volume import read_array
+from SlicerUSSim.Logic.base.volume import read_image_file
 from SlicerUSSim.Logic.imaging.preset import Preset
 from SlicerUSSim.Logic.mri.sheets.polydata import read_surfels, write_surfels
 from SlicerUSSim.Logic.tissue import Surfels
@@ -125,19 +125,19 @@ class Format(NamedTuple):
 
 
 FORMATS = {
-    "mha": Format("v.mha", write_volume, Volume.read, 400),
+    "mha": Format("v.mha", write_volume, Volume.read, 400, in_child=True),
     "nii": Format("v.nii", write_volume, Volume.read, 352),
     "nii.gz": Format("v.nii.gz", write_volume, Volume.read, 400),
     "nrrd": Format("v.nrrd", write_volume, Volume.read, 400),
-    "vti": Format("v.vti", write_volume, Volume.read, 1200),
+    "vti": Format("v.vti", write_volume, Volume.read, 1200, in_child=True),
     "mgz": Format("v.mgz", write_mgh, Volume.read, 400),
     "mgh": Format("v.mgh", write_mgh, Volume.read, 284),
     "mnc": Format("v.mnc", write_volume, Volume.read, 9000, in_child=True),
     "dcm": Format("v.dcm", write_dicom, Volume.read, 900),
     "IM": Format("IM1", write_bare_dicom, Volume.read, 900),
-    "j2k": Format("j.dcm", write_compressed_dicom, read_array, 900, in_child=True),
+    "j2k": Format("j.dcm", write_compressed_dicom, read_image_file, 900, in_child=True),
     "dcms": Format("3.dcm", write_dicom_series, Volume.read, 900, folder=True),
-    "mhaseq": Format("s.igs.mha", write_sequence, TrackedSequence.read, 1500),
+    "mhaseq": Format("s.igs.mha", write_sequence, TrackedSequence.read, 1500, in_child=True),
     "nrrdseq": Format("s.seq.nrrd", write_sequence, TrackedSequence.read, 1500),
     "pose": Format("p.json", lambda path: write_pose(path, np.eye(4)), read_pose, 250),
     "pose.txt": Format("p.txt", text("1 0 0 4\n0 1 0 5\n0 0 1 6\n0 0 0 1\n"), read_pose, 40),

@@ -495,7 +495,7 @@ def test_tables_of_names_of_every_program_are_read(suffix, text, tmp_path):
     volume = tumour((5, 12, 12))
     volume.write(path)
     (tmp_path / f"seg{suffix}").write_text(text)
-    names, where = names_of_file(path)
+    names, where = names_of_file(path, Volume.read(path))
     assert (names[5][-6:], names[12][:5], 9 in names) == ("kidney", "Liver", False)
     found = read_label_file(path, volume)
     assert found.message == f"labels with names: 2 labels to 2 tissues, named in {where}" and where == f"seg{suffix}"
@@ -515,7 +515,7 @@ def test_segments_of_slicer_and_totalsegmentators_header_name_the_labels(tmp_pat
               "Segment1_LabelValue": "7", "Segment2_Name": "Skull", "Segment2_LabelValue": "12"}  # fmt: skip
     path = tmp_path / "painted.seg.nrrd"
     nrrd.write(str(path), volume.array.T, {"space": "left-posterior-superior", **header})
-    assert names_of_file(path) == ({5: "Left kidney", 12: "Skull"}, "its header")
+    assert names_of_file(path, Volume.read(path)) == ({5: "Left kidney", 12: "Skull"}, "its header")
     image = nibabel.Nifti1Image(volume.array.T, volume.ijk_to_ras)
     labels = "".join(
         f'<Label Key="{n}" Red="0"><![CDATA[{name}]]></Label>' for n, name in ((5, "liver"), (12, "aorta"))
@@ -524,8 +524,8 @@ def test_segments_of_slicer_and_totalsegmentators_header_name_the_labels(tmp_pat
     image.header.extensions.append(nibabel.nifti1.Nifti1Extension(0, xml.encode()))
     path = tmp_path / "segmentations.nii.gz"
     nibabel.save(image, path)
-    assert names_of_file(path) == ({5: "liver", 12: "aorta"}, "its header")
-    assert read_label_file(path, volume).names == ("liver", "blood")
+    assert names_of_file(path, Volume.read(path)) == ({5: "liver", 12: "aorta"}, "its header")
+    assert read_label_file(path, Volume.read(path)).names == ("liver", "blood")
 
 
 def layered(path, values: tuple[int, ...]) -> Volume:
@@ -579,7 +579,7 @@ def test_a_header_that_expands_without_limit_is_not_read(tmp_path):
     image = nibabel.Nifti1Image(np.ones((4, 4, 4), np.uint8), np.eye(4))
     image.header.extensions.append(nibabel.nifti1.Nifti1Extension(0, bomb.encode()))
     nibabel.save(image, tmp_path / "seg.nii.gz")
-    assert names_of_file(tmp_path / "seg.nii.gz") == ({}, "")
+    assert names_of_file(tmp_path / "seg.nii.gz", Volume.read(tmp_path / "seg.nii.gz")) == ({}, "")
 
 
 def test_mgz_is_read_where_nifti_is(tmp_path):
@@ -594,7 +594,7 @@ def test_mgz_is_read_where_nifti_is(tmp_path):
     np.testing.assert_array_equal(one.array, other.array)
     np.testing.assert_allclose(one.ijk_to_ras, other.ijk_to_ras, atol=1e-5)
     (tmp_path / "broken.mgz").write_bytes(b"no")
-    with pytest.raises(SimulationError, match=r"broken\.mgz: cannot be read as MGZ"):
+    with pytest.raises(SimulationError, match=r"broken\.mgz: cannot be read as an image"):
         Volume.read(tmp_path / "broken.mgz")
 
 

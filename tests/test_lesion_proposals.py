@@ -15,7 +15,7 @@ from SlicerUSSim.Command.proposals import split_seeds, write_proposals
 from SlicerUSSim.Logic import Segmentation, SimulationError, Volume, grow_lesion, segment_mri
 from SlicerUSSim.Logic.mri.atlas import mni152
 from SlicerUSSim.Logic.mri.lesions.growth import grow
-from SlicerUSSim.Logic.mri.lesions.proposal import Proposal, require_own_proposals
+from SlicerUSSim.Logic.mri.lesions.proposal import Proposal
 from SlicerUSSim.Logic.tissue.presets import TISSUES
 from validation.brain_phantoms import (
     phantom,
@@ -159,7 +159,7 @@ def test_a_tissue_that_the_user_names_is_taken_at_his_word():
         grow_lesion(segmentation, CENTRE, "tumuor of sorts")
 
 
-def test_proposals_are_files_that_are_not_replaced_once_edited(tmp_path, capsys):
+def test_proposals_are_files_and_earlier_ones_are_named(tmp_path, capsys):
     true = ball_in(20, (10, 10, 10), 6.0)
     part = Volume(true.astype(np.uint8), np.diag([2.0, 2.0, 2.0, 1.0]))
     proposals = (Proposal(part, ("tumour",), "bright in T2", np.array([20.0, 20.0, 20.0])),)
@@ -168,15 +168,6 @@ def test_proposals_are_files_that_are_not_replaced_once_edited(tmp_path, capsys)
     told = capsys.readouterr().err
     assert "proposed, not applied" in told and f"--add tumour={mask}" in told
     assert (Volume.read(mask).array == true).all()
-    require_own_proposals(labels)
-    write_proposals(proposals, labels)  # its own file is replaced
-    edited = np.roll(true, 2, axis=0)
-    part.with_array(edited.astype(np.uint8)).write(mask)
-    for again in (lambda: require_own_proposals(labels), lambda: write_proposals(proposals, labels)):
-        with pytest.raises(SimulationError, match="not replaced"):
-            again()
-    assert (Volume.read(mask).array == edited).all()
-    capsys.readouterr()
     write_proposals((), labels)
     assert f"{mask} of an earlier run stays" in capsys.readouterr().err
 
@@ -227,7 +218,7 @@ def test_a_refused_seed_costs_neither_the_labels_nor_the_other_seeds(tmp_path):
     image.mask.write(mask)
 
     def segment(*options: str):
-        command = ["segment", mri, "--contrast", "flair", "--mask", mask, "-o", labels, *options]
+        command = ["segment", mri, "--contrast", "flair", "--mask", mask, "-o", labels, "--overwrite", *options]
         return CliRunner().invoke(main, [str(part) for part in command])
 
     proposal = tmp_path / "labels_proposed_tumour.nii.gz"

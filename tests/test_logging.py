@@ -180,7 +180,7 @@ def test_images_that_were_not_tracked_are_a_warning(log, files):
 
 def simulate(files, before=(), after=()):
     out = files / "image.png"
-    return ussim(*before, "simulate", files / "labels.nii.gz", "--pose", "auto", "-o", out, *after)
+    return ussim(*before, "simulate", files / "labels.nii.gz", "--pose", "auto", "-o", out, "--overwrite", *after)
 
 
 @pytest.mark.parametrize(

@@ -138,7 +138,7 @@ def test_the_commands_label_what_is_outside_the_brain(tmp_path):
     }
     picture = str(tmp_path / "a.png")
     for arguments in ([image, "--mask", mask, "--outside"], [out]):
-        done = CliRunner().invoke(main, ["simulate", *arguments, "--pose", "auto", "-o", picture])
+        done = CliRunner().invoke(main, ["simulate", *arguments, "--pose", "auto", "-o", picture, "--overwrite"])
         assert done.exit_code == 0, done.output
     for arguments, message in (
         ([out, "--outside"], "is a label map, and --outside is for an MRI"),
@@ -151,7 +151,7 @@ def test_the_commands_label_what_is_outside_the_brain(tmp_path):
             "(--outside) are found in a whole head of contrast t1 or t1gd, and this is t2",
         ),
     ):
-        done = CliRunner().invoke(main, ["simulate", *arguments, "--pose", "auto", "-o", picture])
+        done = CliRunner().invoke(main, ["simulate", *arguments, "--pose", "auto", "-o", picture, "--overwrite"])
         assert done.exit_code == 2 and message in done.stderr
 
 

@@ -248,7 +248,8 @@ def test_the_command_takes_its_settings_for_an_mri_and_not_for_labels(tmp_path):
     from PIL import Image
 
     head_mri(spacing_mm=4.0).write(tmp_path / "mri.nii.gz")
-    arguments = ["simulate", str(tmp_path / "mri.nii.gz"), "--pose", "auto", "-o", str(tmp_path / "a.png")]
+    arguments = ["simulate", str(tmp_path / "mri.nii.gz"), "--pose", "auto", "--overwrite"]
+    arguments += ["-o", str(tmp_path / "a.png")]
     images = []
     for extra in ([], ["--hard-labels"], ["--mri-modulation", "3"]):
         result = CliRunner().invoke(main, [*arguments, *extra])

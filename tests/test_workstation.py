@@ -25,7 +25,7 @@ from playwright.sync_api import Page, sync_playwright  # noqa: E402
 
 from SlicerUSSim.Logic import TissueTable, Volume  # noqa: E402
 from SlicerUSSim.Logic.base.errors import required  # noqa: E402
-from SlicerUSSim.Logic.base.volume import read_array  # noqa: E402
+from SlicerUSSim.Logic.base.volume import read_image_file  # noqa: E402
 from SlicerUSSim.Logic.mri.samples import head_mri  # noqa: E402
 from SlicerUSSim.Logic.probe.poses import pose_looking_at  # noqa: E402
 from SlicerUSSim.Workstation.state import NAMES, value_of  # noqa: E402
@@ -343,7 +343,7 @@ def run_again(script: str, folder: Path) -> np.ndarray:
     """The (rows, columns) image that a script writes in a folder."""
     (folder / "again.py").write_text(script)
     run_script(folder / "again.py")
-    return read_array(folder / "image.nrrd")[0][0]
+    return read_image_file(folder / "image.nrrd").array[0]
 
 
 def open_section(page: Page, title: str) -> None:
@@ -689,7 +689,7 @@ def test_images_are_exported_as_they_are_seen_with_their_place(page):
         file = download(page, kind)
         named = file.with_suffix(f".{kind}")
         shutil.copy(file, named)
-        arrays.append(Volume.read(named) if kind == "vti" else read_array(named))
+        arrays.append(read_image_file(named))
     (nrrd, to_ras), (mha, to_ras_mha) = arrays[:2]
     assert np.array_equal(nrrd[0], png) and np.array_equal(mha[0], png) and np.allclose(to_ras, to_ras_mha, atol=1e-4)
     assert np.array_equal(arrays[2].array[0], png) and np.allclose(arrays[2].ijk_to_ras, to_ras, atol=1e-4)

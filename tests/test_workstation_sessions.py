@@ -16,7 +16,7 @@ from PIL import Image
 pytest.importorskip("trame_slicer", reason="the workstation comes with: pip install '.[serve]'")
 pytest.importorskip("playwright", reason="browser tests need playwright: pip install '.[test]'")
 
-from SlicerUSSim.Logic.base.volume import Volume, read_array
+from SlicerUSSim.Logic.base.volume import Volume, read_image_file
 from SlicerUSSim.Workstation.state import NAMES, value_of
 from tests.served import Served, run_script
 from tests.test_workstation import (
@@ -356,7 +356,7 @@ def bundled(page, folder: Path) -> np.ndarray:
     with zipfile.ZipFile(download(page, "zip")) as archive:
         archive.extractall(folder)
     run_script(folder / "image.py")
-    return read_array(folder / "image.nrrd")[0][0]
+    return read_image_file(folder / "image.nrrd").array[0]
 
 
 @pytest.mark.long

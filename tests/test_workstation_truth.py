@@ -19,7 +19,7 @@ from PIL import Image
 from vtkmodules.vtkIOXML import vtkXMLImageDataReader
 
 from SlicerUSSim.Logic import Volume
-from SlicerUSSim.Logic.base.volume import read_array
+from SlicerUSSim.Logic.base.volume import read_image_file
 from SlicerUSSim.Logic.tracked.sequence import TrackedSequence
 from SlicerUSSim.Workstation.scene_files import read_scene
 from SlicerUSSim.Workstation.state import NAMES
@@ -154,10 +154,11 @@ def test_a_frozen_image_stays_where_it_was_taken_in_every_export(head_page, file
     settled(page)
     assert page.evaluate("window.ussim.image.pose") == taken and np.array_equal(pixels(page), seen)
     shutil.copy(download(page, "nrrd"), tmp_path / "frozen.nrrd")
-    array, to_ras = read_array(tmp_path / "frozen.nrrd")
+    frozen = read_image_file(tmp_path / "frozen.nrrd")
+    array, to_ras = frozen.array, frozen.ijk_to_ras
     script = script_of(page)
     assert np.array_equal(run_again(script, tmp_path), array[0])
-    np.testing.assert_allclose(read_array(tmp_path / "image.nrrd")[1], to_ras, atol=1e-3)
+    np.testing.assert_allclose(read_image_file(tmp_path / "image.nrrd").ijk_to_ras, to_ras, atol=1e-3)
     node, in_scene = output_of_scene(download(page, "mrb"), tmp_path)
     np.testing.assert_allclose(in_scene, to_ras, atol=1e-3)
     assert node.GetAttribute("SlicerUSSim.frozen")
@@ -186,7 +187,7 @@ def output_of_scene(bundle: Path, folder: Path):
 def test_a_live_image_is_saved_where_it_was_taken(page, tmp_path):
     shutil.copy(download(page, "nrrd"), tmp_path / "live.nrrd")
     _, in_scene = output_of_scene(download(page, "mrb"), tmp_path)
-    np.testing.assert_allclose(in_scene, read_array(tmp_path / "live.nrrd")[1], atol=1e-3)
+    np.testing.assert_allclose(in_scene, read_image_file(tmp_path / "live.nrrd").ijk_to_ras, atol=1e-3)
     with new_image(page):
         page.keyboard.press("a")
     assert page.locator("#frozen").is_hidden()

@@ -10,9 +10,9 @@ from pathlib import Path
 import click
 
 from SlicerUSSim.Command.cli import ToolCommand
-from SlicerUSSim.Command.options import device_option
+from SlicerUSSim.Command.options import check_results, device_option
 from SlicerUSSim.Command.progress import Steps, note
-from SlicerUSSim.Command.whole_line import require_own_results, results_of
+from SlicerUSSim.Command.whole_line import results_of
 from validation.run import chosen_checks, validate
 
 _TABLES, _SUMMARY = "report.md", "report.json"
@@ -33,7 +33,7 @@ _TABLES, _SUMMARY = "report.md", "report.json"
 @click.pass_context
 def main(ctx: click.Context, out: Path, only: tuple[str, ...], device: str | None) -> None:
     checks = chosen_checks(only)
-    require_own_results(out, (_TABLES, *(check.picture for check in checks)), _SUMMARY)
+    check_results(out, (_TABLES, *(check.picture for check in checks)), _SUMMARY)
     count = sum(len(check.orientations) for check in checks)
     with results_of(out, _SUMMARY) as (folder, summary), Steps(count) as step:
         report = validate(folder, device, only, step)

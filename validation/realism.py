@@ -29,13 +29,12 @@ import numpy as np
 from scipy import ndimage
 
 from SlicerUSSim.Command.cli import ToolCommand
-from SlicerUSSim.Command.options import check_outputs, gathered
+from SlicerUSSim.Command.options import check_outputs, gathered, overwrite_option
 from SlicerUSSim.Command.patient_options import PatientOptions
 from SlicerUSSim.Command.progress import note
 from SlicerUSSim.Command.sequence_options import SequenceOptions, open_tracked
 from SlicerUSSim.Logic.base.errors import SimulationError, require
-from SlicerUSSim.Logic.base.files import written_whole
-from SlicerUSSim.Logic.base.own_outputs import save_marked_png, write_own_json
+from SlicerUSSim.Logic.base.files import write_json, written_whole
 from SlicerUSSim.Logic.base.settings import DisplaySettings
 from SlicerUSSim.Logic.fitting.control_costs import (
     NEIGHBOURS,
@@ -270,7 +269,7 @@ def draw_sources(path: str | os.PathLike, found: Realism) -> None:
             picture.paste(Image.fromarray(image), (corner[0], corner[1] + head))
             draw.text((corner[0] + 4, corner[1] + 2), f"{name}, image {number}", fill=255)
     with written_whole(path) as partial:
-        save_marked_png(partial, picture)
+        picture.save(partial, "PNG")
 
 
 def blurred(image: np.ndarray) -> np.ndarray:
@@ -291,6 +290,7 @@ def at_level_of(image: np.ndarray, real: np.ndarray, tracked: TrackedImages) -> 
 @gathered(patient=PatientOptions, recording=SequenceOptions)
 @click.option("--json", "out", type=click.Path(path_type=Path), help="All numbers: .json")
 @click.option("--picture", type=click.Path(path_type=Path), help="Real and simulated images and controls: .png")
+@overwrite_option
 def main(patient: PatientOptions, recording: SequenceOptions, out: Path | None, picture: Path | None) -> None:
     """Measure how much simulated images are like tracked real ones: costs, speckle, grey levels, sheets."""
     check_outputs(out, picture, recording.field)
@@ -301,7 +301,7 @@ def main(patient: PatientOptions, recording: SequenceOptions, out: Path | None, 
         real, {"simulated": images}, simulator, neighbours=neighbours_of(tracked.sequence, real), display=display
     )
     if out:
-        write_own_json(out, found.to_dict())
+        write_json(out, found.to_dict())
     if picture:
         draw_sources(picture, found)
     for title, heads, rows in found.tables():

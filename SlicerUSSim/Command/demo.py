@@ -11,7 +11,7 @@ import click
 
 from SlicerUSSim.Command.additions import Additions, add_option
 from SlicerUSSim.Command.mri_options import also_option, read_also, read_mri
-from SlicerUSSim.Command.options import device_option, mask_option, parameter_option
+from SlicerUSSim.Command.options import check_results, device_option, mask_option, parameter_option
 from SlicerUSSim.Command.progress import Steps, note
 from SlicerUSSim.Logic.base.settings import DisplaySettings, SimulationSettings
 from SlicerUSSim.Logic.mri.segmentation_settings import SegmentationSettings
@@ -57,12 +57,13 @@ def demo(
     also: tuple[str, ...], additions: tuple[str, ...], device: str | None,
 ) -> None:  # fmt: skip
     """Segment a brain MRI, simulate a view through a craniotomy, and write figures."""
-    from SlicerUSSim.Command.whole_line import run_whole_line
+    from SlicerUSSim.Command.whole_line import RESULTS, SUMMARY, run_whole_line
     from SlicerUSSim.Logic.mri.kept_mask import mask_beside
     from SlicerUSSim.Logic.mri.masks import read_mask
     from SlicerUSSim.Logic.mri.samples import demo_mri
     from SlicerUSSim.Logic.probe.arrays import PROBES
 
+    check_results(out, RESULTS, SUMMARY)
     settings = SimulationSettings(seed=seed)
     masks = Additions.read(additions)
     volume, source = demo_mri() if mri is None else (

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from SlicerUSSim.Command.options import check_outputs, check_places, gathered
+from SlicerUSSim.Command.options import check_outputs, gathered, overwrite_option
 from SlicerUSSim.Command.patient_options import PatientOptions
 from SlicerUSSim.Command.progress import Curve, note
 from SlicerUSSim.Command.sequence_options import SequenceOptions, TrackedExamination, open_tracked
@@ -57,6 +57,7 @@ _STATE_BYTES = 2**30
     help="With --register: the refined map from the ultrasound's reference frame to the MRI, whole, as --to-mri takes "
     "it: .json",
 )
+@overwrite_option
 def optimize(
     patient: PatientOptions,
     recording: SequenceOptions,
@@ -70,7 +71,6 @@ def optimize(
 ) -> None:
     """Fit display and tissue parameters to tracked real ultrasound."""
     from SlicerUSSim.Logic.base.files import read_json, write_json
-    from SlicerUSSim.Logic.base.own_outputs import write_own_json
     from SlicerUSSim.Logic.fitting.control_costs import neighbours_of
     from SlicerUSSim.Logic.fitting.held_out import predict
     from SlicerUSSim.Logic.fitting.tracked_fit import fit
@@ -79,7 +79,7 @@ def optimize(
 
     places = [place for place in (out, report, save_preset, save_transform, state, recording.field) if place]
     check_outputs(out, report, save_preset, save_transform, recording.field)
-    check_places(state)  # which is read before it is written
+    check_outputs(state, may_replace=True)  # which is read before it is written
     for place in places:
         same = [other for other in places if other.resolve() == place.resolve()]
         require(len(same) == 1, f"{place}: given for {len(same)} outputs, expected a separate file for each")
@@ -109,14 +109,14 @@ def optimize(
                 max_evaluations=settings.evaluations, restarts=settings.restarts, progress=curve,
             )  # fmt: skip
             found = replace(found, prediction=prediction)
-    write_own_json(out, found.to_dict())
+    write_json(out, found.to_dict())
     if save_preset:
         result = found.appearance
         preset = Preset(found.tracked.probe, result.display, simulator.settings, result.tissues)
-        write_own_json(save_preset, preset.to_dict())
+        preset.write(save_preset)
     if save_transform and found.registration:
         to_mri = found.registration.correction @ tracked.reference_to_ras
-        write_own_json(save_transform, {"probe_to_ras": to_mri.tolist()})
+        write_json(save_transform, {"probe_to_ras": to_mri.tolist()})
     if report:
         _write_report(report, found, tracked, patient, recording)
     _tell(found)

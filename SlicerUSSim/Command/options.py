@@ -247,48 +247,65 @@ def _require_not_given(what: str, remedy: str, *names: str) -> None:
     require(not given, f"{what}, and {' and '.join(given)} {verb} for {kind}; {remedy}")
 
 
-def require_no_input(*outputs: Path | None) -> None:
-    """Raise SimulationError if an output of the running command would replace a file that it reads.
+overwrite_option = click.option(
+    "--overwrite", is_flag=True, expose_value=False, help="Replace outputs that exist; an input is never replaced."
+)
 
-    Files that a command reads are the values of its options and arguments that are text (outputs are Path objects),
-    also behind a name, as in tumour=FILE.
+
+def check_outputs(*outputs: Path | None, may_replace: bool = False) -> None:
+    """Raise SimulationError before the computation if an output cannot be written, is an input, or exists.
+
+    One that exists is let through with `may_replace`, and with the running command's --overwrite. None stands for an
+    output that was not asked for.
     """
-    given = click.get_current_context().params.values()
-    texts = [text for value in given for text in (value if isinstance(value, tuple) else (value,))]
-    files = [Path(part) for text in texts if isinstance(text, str) for part in (text, text.partition("=")[2]) if part]
-    for out in outputs:
-        if out is not None and out.exists():
-            require(
-                not any(file.exists() and out.samefile(file) for file in files),
-                f"{out} is an input, which it would replace, expected another name",
-            )
-
-
-def check_output(out: Path, png: bool = False) -> None:
-    """Raise SimulationError before the computation if an image cannot be written, or would replace an input or a file
-    that is not as this program wrote it."""
-    from SlicerUSSim.Logic.base.volume import require_image_name
-
-    require_image_name(out, also=(".png",) if png else ())
-    check_outputs(out)
-
-
-def check_outputs(*outputs: Path | None) -> None:
-    """As check_output, for files of any kind; None stands for an output that was not asked for."""
-    from SlicerUSSim.Logic.base.own_outputs import require_own
-
-    check_places(*outputs)
-    require_own(*outputs)
-
-
-def check_places(*outputs: Path | None) -> None:
-    """Raise SimulationError before the computation if an output cannot be written, or is an input; None as above."""
     from SlicerUSSim.Logic.base.files import require_place
 
-    for out in outputs:
-        if out is not None:
-            require_place(out)
-    require_no_input(*outputs)
+    may_replace = may_replace or bool(given_options("overwrite"))
+    for out in filter(None, outputs):
+        require_place(out)
+        require_no_input(out)
+        require(may_replace or not out.exists(), f"{out}: exists; give another name, or --overwrite to replace it")
+
+
+def check_results(folder: Path, names: Iterable[str], summary: str) -> None:
+    """Raise SimulationError if a folder of results cannot be written, or has one of these files without the `summary`.
+
+    With it, a command wrote the files before and replaces them, unless it reads one.
+    """
+    from SlicerUSSim.Logic.base.files import require_folder
+
+    require_folder(folder)
+    is_own = (folder / summary).is_file()
+    for path in (folder / name for name in (*names, summary)):
+        require_no_input(path)
+        require(
+            is_own or not path.exists(),
+            f"{path}: exists, and without {summary} the folder is not one of this command; give another folder (--out)",
+        )
+
+
+def require_no_input(out: Path) -> None:
+    """Raise SimulationError if an output of the running command would replace a file that it reads."""
+    for file in _inputs():
+        is_same = out.resolve() == file.resolve() or (out.exists() and file.exists() and out.samefile(file))
+        require(not is_same, f"{out} is an input, which it would replace; give another name")
+
+
+def _inputs() -> list[Path]:
+    """Files that the running command reads, and those that it reads or keeps beside the patient's.
+
+    They are the values of its options and arguments that are text (outputs are Path objects), also behind a name, as in
+    tumour=FILE.
+    """
+    from SlicerUSSim.Logic.mri.kept_mask import mask_beside
+    from SlicerUSSim.Logic.tissue.table import tissues_beside
+
+    params = click.get_current_context().params
+    texts = [text for value in params.values() for text in (value if isinstance(value, tuple) else (value,))]
+    files = [Path(part) for text in texts if isinstance(text, str) for part in (text, *text.partition("=")) if part]
+    mri, labels = params.get("mri"), params.get("mri_or_labels")
+    files += [mask_beside(patient) for patient in (mri, labels) if patient]
+    return [*files, tissues_beside(Path(labels))] if labels else files
 
 
 # ---- the package's log on stderr: `ussim: LEVEL: MESSAGE` ------------------------------------------------------------

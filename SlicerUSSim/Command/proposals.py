@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import click
 
+from SlicerUSSim.Command.options import check_outputs
 from SlicerUSSim.Command.progress import note
 from SlicerUSSim.Logic.base.errors import SimulationError, require
 
@@ -74,13 +75,13 @@ def _points_of(place: str) -> list[tuple[float, ...]]:
 
 
 def require_seeds(seeds: Iterable[str], mri: Volume, labels_path: Path) -> None:
-    """Raise SimulationError, before a segmentation, for seeds outside the image and for proposals that were edited."""
-    from SlicerUSSim.Logic.mri.lesions.proposal import require_own_proposals
+    """Raise SimulationError, before a segmentation, for seeds outside the image and for proposals that exist."""
+    from SlicerUSSim.Logic.mri.lesions.proposal import proposals_beside
     from SlicerUSSim.Logic.mri.lesions.seeded import require_in_image
 
     for point, _ in split_seeds(seeds):
         require_in_image(mri, point)
-    require_own_proposals(labels_path)
+    check_outputs(*proposals_beside(labels_path))
 
 
 def grown_at(segmentation: Segmentation, seeds: Iterable[str]) -> tuple[list[Proposal], list[str]]:

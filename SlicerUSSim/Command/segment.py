@@ -10,7 +10,7 @@ import click
 
 from SlicerUSSim.Command.additions import Additions, add_option
 from SlicerUSSim.Command.mri_options import also_option, organs_option, read_mri, segmented_file, split_also
-from SlicerUSSim.Command.options import check_places, ct_option, device_option, gathered, mask_option
+from SlicerUSSim.Command.options import check_outputs, ct_option, device_option, gathered, mask_option, overwrite_option
 from SlicerUSSim.Command.patient_options import map_option
 from SlicerUSSim.Command.progress import note
 from SlicerUSSim.Command.proposals import (
@@ -45,28 +45,22 @@ from SlicerUSSim.Logic.mri.segmentation_settings import CT, SegmentationSettings
 @seed_option
 @sheets_option
 @sheet_kind_option
-@click.option(
-    "--overwrite", is_flag=True, help="Replace labels that were made by others, or edited since they were written."
-)
+@overwrite_option
 @device_option
 def segment(
     mri: str, out: Path, settings: SegmentationSettings, mask: str | None, also: tuple[str, ...],
     organs: str | None, maps: tuple[str, ...], additions: tuple[str, ...], seeds: tuple[str, ...],
-    sheets: Path | None, sheet_kinds: tuple[str, ...], overwrite: bool, device: str | None,
+    sheets: Path | None, sheet_kinds: tuple[str, ...], device: str | None,
 ) -> None:  # fmt: skip
     """Segment an MRI of a head or a brain, or a CT (--ct), into tissues."""
     from SlicerUSSim.Logic.base.volume import require_image_name
     from SlicerUSSim.Logic.mri.modality import has_brain_mask
     from SlicerUSSim.Logic.mri.outside import require_findable
     from SlicerUSSim.Logic.mri.segmentation import Segmentation
-    from SlicerUSSim.Logic.tissue.own_files import require_replaceable, write_label_files
-    from SlicerUSSim.Logic.tissue.table import TissueTable
+    from SlicerUSSim.Logic.tissue.table import TissueTable, tissues_beside, write_label_files
 
     require_image_name(out)
-    check_places(out)
-    _require_no_kept_mask(out, mri)
-    if not overwrite:
-        require_replaceable(out)
+    check_outputs(out, tissues_beside(out))
     if settings.outside and settings.contrast != CT:
         require_findable(settings.contrast, settings.skull_strip, mask is not None)
     require_sheets(sheets, sheet_kinds, settings.contrast)
@@ -93,14 +87,3 @@ def segment(
     note(f"segmented in {seconds:.1f} s; wrote {out} and {beside}")
     write_proposals(proposals, out)
     require_none_refused(refused, out)  # at last: a wrong seed does not cost a segmentation
-
-
-def _require_no_kept_mask(out: Path, mri: str) -> None:
-    """Raise SimulationError if the output would replace a kept brain mask, also with --overwrite."""
-    from SlicerUSSim.Logic.mri.kept_mask import is_kept_mask, mask_beside
-
-    require(
-        out.resolve() != mask_beside(mri).resolve(),
-        f"-o is {out}, where the brain mask of {mri} is kept, expected another name",
-    )
-    require(not is_kept_mask(out), f"-o is {out}, the kept brain mask of another MRI, expected another name")

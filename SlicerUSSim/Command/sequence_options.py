@@ -105,13 +105,10 @@ def open_tracked(
     """
     import numpy as np
 
-    from SlicerUSSim.Logic.base.files import require_place
     from SlicerUSSim.Logic.tracked.imaged_field import draw_field
     from SlicerUSSim.Logic.tracked.images import TrackedImages
     from SlicerUSSim.Logic.tracked.sequence import checked_apart, frame_numbers
 
-    if recording.field:
-        require_place(recording.field)
     to_ras = read_to_mri(recording.to_mri) if recording.to_mri else np.eye(4)
     if recording.cut:
         cuts = _read_cuts(recording.cut, recording)

@@ -118,14 +118,13 @@ def require_sheets(path: Path | None, kinds: tuple[str, ...], contrast: str) -> 
     require(path is not None or not kinds, "--sheet chooses what --sheets FILE looks for; give --sheets, too")
     if path is None:
         return
-    from SlicerUSSim.Command.options import check_places
+    from SlicerUSSim.Command.options import check_outputs
     from SlicerUSSim.Logic.mri.sheets.finding import require_findable
-    from SlicerUSSim.Logic.mri.sheets.polydata import require_own_surface, require_surfel_file
+    from SlicerUSSim.Logic.mri.sheets.polydata import require_surfel_file
 
     require_findable(kinds, contrast)
     require_surfel_file(path)
-    check_places(path)
-    require_own_surface(path)
+    check_outputs(path)
 
 
 def write_sheets(

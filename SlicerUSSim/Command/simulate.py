@@ -7,7 +7,7 @@ from pathlib import Path
 
 import click
 
-from SlicerUSSim.Command.options import check_output, check_outputs, gathered
+from SlicerUSSim.Command.options import check_outputs, gathered, overwrite_option
 from SlicerUSSim.Command.patient_options import PatientOptions, open_examination_at, pose_option, say_contact
 from SlicerUSSim.Command.progress import Share, note
 from SlicerUSSim.Command.sequence_options import SequenceOptions, open_tracked
@@ -21,19 +21,21 @@ from SlicerUSSim.Logic.mri.segmentation_settings import CT
 @click.option(
     "-o", "--out", type=click.Path(path_type=Path), required=True, help="Image: .png .mha .nrrd .nii.gz or .vti"
 )
+@overwrite_option
 def simulate(patient: PatientOptions, pose: str, out: Path) -> None:
     """Simulate one B-mode image from an MRI or a label map at a given pose."""
-    from SlicerUSSim.Logic.base.own_outputs import write_own_volume
+    from SlicerUSSim.Logic.base.volume import require_image_name
     from SlicerUSSim.Logic.imaging.figures import write_png
 
-    check_output(out, png=True)
+    require_image_name(out, also=(".png",))
+    check_outputs(out)
     examination, probe_to_ras = open_examination_at(patient, pose)
     say_contact(examination, examination.probe, [probe_to_ras])
     frame = examination.simulator.simulate(examination.probe, probe_to_ras, examination.display)
     if out.suffix.lower() == ".png":
         write_png(out, frame.image)
     else:
-        write_own_volume(out, frame.to_volume())
+        frame.to_volume().write(out)
     kind = "labels" if examination.is_labels else "CT" if patient.segmentation.contrast == CT else "MRI"
     note(f"wrote {out} ({frame.image.shape[1]}x{frame.image.shape[0]}, from {kind})")
 
@@ -43,13 +45,12 @@ def simulate(patient: PatientOptions, pose: str, out: Path) -> None:
 @click.option(
     "-o", "--out", type=click.Path(path_type=Path), required=True, help="Sequence: .igs.mha .seq.mha .mhd or .nrrd"
 )
+@overwrite_option
 def sweep(patient: PatientOptions, recording: SequenceOptions, out: Path) -> None:
     """Simulate the images of a tracked sequence, at its poses and on its pixels."""
     import numpy as np
 
-    from SlicerUSSim.Logic.base.own_outputs import mark_of
-    from SlicerUSSim.Logic.base.volume import MADE_BY
-    from SlicerUSSim.Logic.tracked.sequence import require_sequence_name
+    from SlicerUSSim.Logic.tracked.sequence import SIMULATED, require_sequence_name
 
     require_sequence_name(out)
     check_outputs(out, recording.field)
@@ -65,7 +66,7 @@ def sweep(patient: PatientOptions, recording: SequenceOptions, out: Path) -> Non
             simulated[place][real.field.window] = frame.image
             progress((place + 1) / len(real.poses))
     sequence = tracked.sequence.with_images(real.numbers, simulated)
-    replace(sequence, fields={**sequence.fields, MADE_BY: mark_of(simulated)}).write(out)
+    replace(sequence, fields={**sequence.fields, SIMULATED: "sweep"}).write(out)
     figure = f", {recording.field}" if recording.field else ""
     note(f"wrote {out} ({len(simulated)} images of {columns}x{rows}){figure}")
 
@@ -83,16 +84,17 @@ def sweep(patient: PatientOptions, recording: SequenceOptions, out: Path) -> Non
 )
 @click.option("--spacing", type=float, default=0.5, show_default=True, help="Voxel size [mm].")
 @click.option("--like", type=click.Path(), help="Use the voxel grid of this volume, such as the MRI.")
+@overwrite_option
 def volume(
     patient: PatientOptions, pose: str, out: Path, tilt: float | None, slide: float | None, frames: int,
     spacing: float, like: str | None,
 ) -> None:  # fmt: skip
     """Simulate a 3D ultrasound volume: a sweep of images around a pose, compounded in patient space."""
-    from SlicerUSSim.Logic.base.own_outputs import write_own_volume
-    from SlicerUSSim.Logic.base.volume import Volume
+    from SlicerUSSim.Logic.base.volume import Volume, require_image_name
     from SlicerUSSim.Logic.probe.poses import slide_sweep, tilt_sweep
 
-    check_output(out)
+    require_image_name(out)
+    check_outputs(out)
     if tilt is not None and slide is None:
         poses_around, extent = tilt_sweep, tilt
     elif slide is not None and tilt is None:
@@ -108,5 +110,5 @@ def volume(
             examination.probe, poses, examination.display, spacing_mm=spacing, like=grid,
             progress=lambda done: progress(done / frames),
         )  # fmt: skip
-    write_own_volume(out, result)
+    result.write(out)
     note(f"wrote {out} ({result.size_text} voxels from {frames} images)")

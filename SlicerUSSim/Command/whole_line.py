@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -12,14 +12,11 @@ from typing import Any
 import numpy as np
 
 from SlicerUSSim.Command.additions import Additions
-from SlicerUSSim.Logic.base.errors import SimulationError, about_file, require
+from SlicerUSSim.Logic.base.errors import SimulationError, about_file
 from SlicerUSSim.Logic.base.files import (
-    hash_of_file,
     make_folder,
     move_into,
     partial_folder,
-    read_json,
-    require_folder,
     write_json,
 )
 from SlicerUSSim.Logic.base.settings import DisplaySettings, SimulationSettings
@@ -31,12 +28,11 @@ from SlicerUSSim.Logic.mri.segmentation import Segmentation, segment_mri
 from SlicerUSSim.Logic.mri.segmentation_settings import SegmentationSettings
 from SlicerUSSim.Logic.probe.arrays import Probe
 from SlicerUSSim.Logic.probe.poses import craniotomy_pose, slice_under_probe
-from SlicerUSSim.Logic.tissue.own_files import write_label_files
-from SlicerUSSim.Logic.tissue.table import TissueTable
+from SlicerUSSim.Logic.tissue.table import TissueTable, write_label_files
 from SlicerUSSim.Logic.tracked.pose_files import write_pose
 
 #: Files of the results, and the one that says what was done
-_RESULTS = (
+RESULTS = (
     "figure.png", "mri.png", "labels.png", "bmode.png", "bmode.mha", "labels.nii.gz", "labels.json", "pose.json",
     "preset.json",
 )  # fmt: skip
@@ -64,8 +60,6 @@ def run_whole_line(
     Raises SimulationError for errors that the caller can correct.
     """
     require_matplotlib()  # before the computation, not after it
-    require_folder(out)  # created with the results: a refused image leaves nothing behind
-    require_own_results(out, _RESULTS, SUMMARY)
     timings: dict[str, float] = {}
 
     progress("segment the MRI")
@@ -142,41 +136,12 @@ def run_whole_line(
     return summary
 
 
-# ---- the folder of a command's results, in which only what the command wrote itself is replaced ----------------------
-
-#: Entry of the summary: {file name: hash, as it was written}
-_FILES = "files_sha256"
-
-
-def require_own_results(folder: Path, names: Iterable[str], summary: str) -> None:
-    """Raise SimulationError if one of these files is in the folder and is not as its `summary` says it was written."""
-    written = _written(folder, summary)
-    for name in (*names, summary):
-        path = folder / name
-        is_ours = bool(written) if name == summary else path.exists() and written.get(name) == hash_of_file(path)
-        require(
-            not path.exists() or is_ours,
-            f"{path}: exists and is not as this command wrote it, so it is not replaced; choose another folder (--out)",
-        )
-
-
-def _written(folder: Path, summary: str) -> dict[str, str]:
-    """{file name: hash} of the files that were written to the folder before."""
-    try:
-        if (folder / summary).exists():
-            return dict(read_json(folder / summary).get(_FILES, {}))
-    except (SimulationError, AttributeError, TypeError, ValueError):  # somebody else's file of that name
-        pass
-    return {}
-
-
 @contextmanager
 def results_of(folder: Path, summary: str) -> Iterator[tuple[Path, dict]]:
     """(a temporary folder for files, the summary to be filled): both are moved to `folder` if the block succeeds.
 
-    So a run that fails or is interrupted changes nothing. The summary also has the hashes of what earlier runs wrote,
-    which may be more files. Raises SimulationError if the folder cannot be created or a file cannot be written, naming
-    it by its later place.
+    So a run that fails or is interrupted changes nothing. Raises SimulationError if the folder cannot be created or a
+    file cannot be written, naming it by its later place.
     """
     is_new = not folder.exists()
     make_folder(folder)
@@ -186,8 +151,7 @@ def results_of(folder: Path, summary: str) -> Iterator[tuple[Path, dict]]:
             try:
                 yield partial, content
                 files = sorted(file for file in partial.iterdir() if file.name != summary)
-                hashes = _written(folder, summary) | {file.name: hash_of_file(file) for file in files}
-                write_json(partial / summary, {**content, _FILES: hashes})
+                write_json(partial / summary, content)
             except SimulationError as error:  # the user knows no temporary folder
                 raise SimulationError(str(error).replace(str(partial), str(folder))) from None
             move_into(folder, [*files, partial / summary])

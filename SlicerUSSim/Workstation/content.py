@@ -107,7 +107,7 @@ def _of_labels(path: Path, volume: Volume, size: str) -> Content:
         return Content(Kind.LABELS, f"tissue probabilities, {size}", volume, files)
     values = np.flatnonzero(np.bincount(labels.array.ravel())).tolist()
     values = [value for value in values if value]
-    names = names_of_file(path)[0]
+    names = names_of_file(path, volume)[0]
     if len(values) <= 1:
         of_what = f" called {names[values[0]]!r}" if values and values[0] in names else ""
         millilitres = float((labels.array > 0).sum() * labels.voxel_ml)

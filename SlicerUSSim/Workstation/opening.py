@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from typing import Any
 
-from SlicerUSSim.Logic.base.dicom import FoundSeries
+from SlicerUSSim.Logic.base.dicom import Series
 from SlicerUSSim.Logic.base.errors import Cancelled, SimulationError, require
 from SlicerUSSim.Logic.imaging.preset import Preset
 from SlicerUSSim.Logic.mri.markups import markup_points
@@ -100,7 +100,7 @@ class Opening:
         with self._shared.changing() as now:
             now.opened = [*now.opened, self._opener.as_known(line)]
 
-    def _choose_series(self, parcel: Parcel, series: list[FoundSeries]) -> None:
+    def _choose_series(self, parcel: Parcel, series: list[Series]) -> None:
         """Take the only series that is a volume, or the one that the user chooses."""
         volumes = [one for one in series if one.is_volume]
         listing = "; ".join(f"{one.title}: {one.images}" for one in series[:12])
@@ -111,16 +111,17 @@ class Opening:
         )
         chosen = volumes[0]
         if len(volumes) > 1:
-            patients = len({one.patient for one in volumes})
-            whose = f" of {patients} different patients" if patients > 1 else ""
+            patients = list(dict.fromkeys(one.patient for one in volumes))
+            whose = f" of {len(patients)} different patients" if len(patients) > 1 else ""
             others = len(series) - len(volumes)
             more = f"; {others} more {'are no volumes' if others > 1 else 'is no volume'}" if others else ""
             number = self._ask(
                 "Which series?",
                 f"The DICOM files have {len(volumes)} series that are volumes{whose}{more}.",
                 [
-                    Choice(str(n), f"{one.title}: {one.images}{f', patient {one.patient + 1}' if patients > 1 else ''}")
+                    Choice(str(n), f"{one.title}: {one.images}{number}")
                     for n, one in enumerate(volumes)
+                    for number in [f", patient {patients.index(one.patient) + 1}" * (len(patients) > 1)]
                 ],
             )
             chosen = volumes[int(number)]

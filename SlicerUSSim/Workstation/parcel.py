@@ -7,7 +7,7 @@ import os
 from collections.abc import Mapping
 from pathlib import Path
 
-from SlicerUSSim.Logic.base.dicom import FoundSeries, list_series
+from SlicerUSSim.Logic.base.dicom import Series, list_series
 from SlicerUSSim.Logic.base.errors import SimulationError, require
 from SlicerUSSim.Workstation.formats import is_dicom_file, is_text_name, readable_name
 from SlicerUSSim.Workstation.uploads import require_whole_files
@@ -68,11 +68,11 @@ class Parcel:
         """Whether there are DICOM files, which `series` and `take` make into a volume."""
         return (self._folder / _DICOM).is_dir()
 
-    def series(self) -> list[FoundSeries]:
+    def series(self) -> list[Series]:
         """The DICOM series; takes up to seconds."""
         return list_series(self._folder / _DICOM)
 
-    def take(self, chosen: FoundSeries, others: list[FoundSeries]) -> Path:
+    def take(self, chosen: Series, others: list[Series]) -> Path:
         """A folder with the images of one series, called as it is described; `others` are those of the parcel.
 
         Files that are in no series stay with it: they may be damaged images of it, which its reader says.

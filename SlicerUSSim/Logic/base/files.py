@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gzip
 import hashlib
 import json
 import os
@@ -11,7 +10,6 @@ import re
 import shutil
 import sys
 import tempfile
-import zlib
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -21,8 +19,6 @@ from typing import IO
 from SlicerUSSim.Logic.base.errors import SimulationError, require, require_path
 
 _DEEPEST_NESTING = 16
-#: The first number in a NIfTI-2 file, its header's size: https://nifti.nimh.nih.gov/nifti-2
-_NIFTI2_HEADER = 540
 #: Beginning of the names of folders for what is not complete yet
 _PARTIAL = ".ussim-"
 #: Suffixes of headers with voxels in a second file, and endings of that
@@ -371,27 +367,3 @@ def write_json(path: str | os.PathLike, values) -> None:
     """Write plain values as JSON; on failure an existing file is kept."""
     with written_whole(path) as partial:
         partial.write_text(json.dumps(values, indent=2) + "\n", encoding="utf-8")
-
-
-def why_unreadable(path: Path) -> str | None:
-    """What is wrong with an image file that no reader takes, by its first bytes; None if they do not tell."""
-    with path.open("rb") as file:
-        start = file.read(4)
-    if not start:
-        return "it is empty, 0 bytes"
-    is_gzip, says_gzip = start[:2] == b"\x1f\x8b", path.name.lower().endswith(".gz")
-    if is_gzip and not says_gzip:
-        return f"it is compressed by gzip: rename it to {path.name}.gz"
-    if says_gzip and not is_gzip:
-        return "it is not compressed by gzip, as its name says"
-    if is_gzip:
-        try:
-            with gzip.open(path) as file:
-                start = file.read(4)
-                while file.read(2**20):
-                    pass
-        except (OSError, EOFError, zlib.error):
-            return "its compressed content is damaged"
-    if _NIFTI2_HEADER in (int.from_bytes(start, "little"), int.from_bytes(start, "big")):
-        return "it is NIfTI-2, expected NIfTI-1, which nearly all programs write"
-    return None

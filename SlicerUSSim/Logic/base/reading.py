@@ -13,6 +13,7 @@ import io
 import logging
 import os
 import pickle
+import shutil
 import signal
 import subprocess
 import sys
@@ -140,11 +141,6 @@ def _reading(function: Callable[_P, _T], *, always_in_child: bool) -> Callable[_
     return read
 
 
-def is_in_child() -> bool:
-    """Whether this process reads a file for another."""
-    return _is_child
-
-
 def starts_like_hdf5(path: Path) -> bool:
     """Whether a file is HDF5, as MINC 2 and ITK's .h5 are."""
     with path.open("rb") as file:
@@ -196,7 +192,7 @@ def _in_child(function: Callable, args: tuple, kwargs: dict[str, Any], path: Pat
         environment["PYTHONPATH"] = os.pathsep.join(filter(None, sys.path))
         try:
             ended = subprocess.run(
-                [sys.executable, "-c", f"from {__name__} import answer_parent; answer_parent()"],
+                [_python(), "-c", f"from {__name__} import answer_parent; answer_parent()"],
                 input=pickle.dumps(task), capture_output=True, timeout=seconds, env=environment, check=False,
             )  # fmt: skip
         except subprocess.TimeoutExpired:
@@ -219,6 +215,11 @@ def _in_child(function: Callable, args: tuple, kwargs: dict[str, Any], path: Pat
     if kind == "error":
         raise value
     return value
+
+
+def _python() -> str:
+    """The interpreter, also in 3D Slicer, whose executable is the application."""
+    return shutil.which("PythonSlicer") or sys.executable
 
 
 def _ending(code: int) -> str:

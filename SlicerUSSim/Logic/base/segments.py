@@ -18,6 +18,9 @@ from SlicerUSSim.Logic.base.errors import require
 
 _log = logging.getLogger(__name__)
 
+#: Names that programs give when the user gave none
+_MEANINGLESS = re.compile(r"(label|segment|region|class|colou?r|unnamed|\(none\)|n/?a)?[ _-]*\d*", re.IGNORECASE)
+
 
 @dataclass(frozen=True)
 class Segment:
@@ -75,3 +78,8 @@ def flattened(layers: np.ndarray, segments: list[Segment], voxel_ml: float, name
     if overlaps:
         _log.warning("%s: segments overlap, the last is taken: %s", name, "; ".join(overlaps))
     return labels
+
+
+def is_meaningful(name: str | None) -> bool:
+    """Whether somebody gave this name, and no program ("Label 3", "Segment_1")."""
+    return bool(name) and not _MEANINGLESS.fullmatch(str(name).strip())

@@ -5,38 +5,24 @@ from __future__ import annotations
 import logging
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
-from SlicerUSSim.Logic.base.dicom import has_compressed, read_dicom_folder, read_series, series_with
-from SlicerUSSim.Logic.base.dicom_elements import is_compressed, require_whole_pixels
-from SlicerUSSim.Logic.base.errors import SimulationError, require, require_package, require_path
-from SlicerUSSim.Logic.base.files import (
-    messages_withheld,
-    require_space,
-    why_unreadable,
-    written_whole,
-)
-from SlicerUSSim.Logic.base.headers import (
-    is_dicom,
-    require_bytes,
+from SlicerUSSim.Logic.base.dicom import is_dicom, read_dicom
+from SlicerUSSim.Logic.base.errors import require, require_path
+from SlicerUSSim.Logic.base.files import messages_withheld, require_space, written_whole
+from SlicerUSSim.Logic.base.image_files import (
+    ImageFile,
+    checked_image,
+    of_sitk,
+    read_image,
     require_readable_name,
-    require_sound_header,
     require_spacing,
-    require_whole_metaimage,
-    require_whole_nrrd,
 )
 from SlicerUSSim.Logic.base.label_numbers import numbers_of
-from SlicerUSSim.Logic.base.nifti import (
-    check_numbers,
-    log_nifti_geometry,
-    require_complete,
-    require_whole_gzip,
-    require_written,
-)
-from SlicerUSSim.Logic.base.reading import in_child, is_in_child, reader, starts_like_hdf5
+from SlicerUSSim.Logic.base.reading import in_child, reader
 from SlicerUSSim.Logic.base.segments import flattened, segments_of
 from SlicerUSSim.Logic.base.transforms import LPS_TO_RAS, check_affine, is_singular, nearest_rotation
 
@@ -45,10 +31,6 @@ _log = logging.getLogger(__name__)
 #: A smaller or larger side of a volume indicates a wrong unit.
 SMALLEST_MM, LARGEST_MM = 5.0, 2500.0
 WRITABLE_SUFFIXES = (".nii", ".nii.gz", ".nrrd", ".nhdr", ".mha", ".mhd", ".mnc", ".vti")
-#: Entry of a header for the origin of an image
-MADE_BY = "ussim_made_by"
-
-
 #: Names of the sides towards which R, A and S decrease and increase
 SIDES = (("left", "right"), ("back", "front"), ("bottom", "top"))
 
@@ -152,61 +134,34 @@ class Volume:
 
         Raises SimulationError for a missing or unreadable file and for an image that is not 3D and scalar.
         """
-        require_path(path)
-        require_readable_name(path)
-        path, doubts = Path(path), ()
-        require(path.exists(), f"{path}: no such file or folder")
-        if has_compressed(path) and not is_in_child():
-            return cls._read_compressed(path)
-        if path.suffix.lower() == ".vti":
-            volume = cls._read_vti(path)
-            _log.info("%s: coordinates are read as RAS millimetres, since VTI files do not specify them", path)
-        elif path.is_dir():
-            volume = cls.from_sitk(read_dicom_folder(path), name=str(path))
-        elif path.name.lower().endswith((".mgz", ".mgh")):
-            volume = cls(*_read_mgh(path))
-        elif (series := series_with(path)) is not None:
-            volume = cls.from_sitk(read_series(series, str(path)), name=str(path))
-        elif not is_minc1(path):
-            image = read_itk_image(path)
-            volume = cls.from_sitk(image, name=str(path))
-            log_nifti_geometry(image, volume.ijk_to_ras, str(path))
-            doubts = check_numbers(path, image)
-        else:
-            array, ijk_to_ras = _read_minc1(path)
-            _require_volume(array.shape[::-1], str(path))
-            volume = cls(array, ijk_to_ras)
+        path = Path(path)
+        found = read_image_file(path)
+        volume = cls.from_image_file(found, str(path))
         require_spacing(str(path), tuple(volume.spacing_mm))
         _log_size(volume, path)
-        return replace(volume, name=str(path), doubts=doubts)
+        return volume
 
     @classmethod
-    @in_child
-    def _read_compressed(cls, path: Path) -> Volume:
-        return cls.read(path)
-
-    @classmethod
-    def from_sitk(cls, image, name: str = "image") -> Volume:
-        """From a SimpleITK image (LPS); overlapping segments of 3D Slicer become one label map, the last on top.
+    def from_image_file(cls, found: ImageFile, name: str) -> Volume:
+        """From what is in a file; overlapping segments of 3D Slicer become one label map, the last on top.
 
         Raises SimulationError if it is not 3D and scalar.
         """
-        import SimpleITK as sitk
-
-        if image.GetDimension() == 4 and image.GetSize()[3] == 1:
-            image = image[..., 0]  # NIfTI files often carry a time axis of length one
-            _log.info("%s: has a time axis of length one, which is ignored", name)
-        _require_volume(image.GetSize(), name)
-        channels, ijk_to_ras = image.GetNumberOfComponentsPerPixel(), _itk_ijk_to_ras(image)
-        array = sitk.GetArrayFromImage(image)
-        if channels > 1:
-            segments = segments_of({key: image.GetMetaData(key) for key in image.GetMetaDataKeys()}, name)
+        array, size = found.array, found.array.shape[::-1][found.has_components :]
+        _require_volume(size, name)
+        if found.has_components:
+            segments = segments_of(found.header, name)
             require(
                 segments,
-                f"{name}: has {channels} components per voxel, expected 1; save one of them, or a label map",
+                f"{name}: has {array.shape[-1]} components per voxel, expected 1; save one of them, or a label map",
             )
-            array = flattened(array, segments, float(abs(np.linalg.det(ijk_to_ras[:3, :3])) / 1000.0), name)
-        return cls(array, ijk_to_ras)
+            array = flattened(array, segments, float(abs(np.linalg.det(found.ijk_to_ras[:3, :3])) / 1000.0), name)
+        return cls(array, found.ijk_to_ras, name, found.label_names, found.doubts)
+
+    @classmethod
+    def from_sitk(cls, image, name: str = "image") -> Volume:
+        """From a SimpleITK image (LPS). Raises SimulationError if it is not 3D and scalar."""
+        return cls.from_image_file(of_sitk(image), name)
 
     def to_sitk(self):
         """A SimpleITK image (LPS). Raises SimulationError if the axes are not perpendicular (ITK cannot store that)."""
@@ -220,13 +175,10 @@ class Volume:
         image.SetDirection(direction.ravel().tolist())
         return image
 
-    def write(
-        self, path: str | os.PathLike, made_by: str | None = None, about: Mapping[str, str] | None = None
-    ) -> None:
+    def write(self, path: str | os.PathLike, about: Mapping[str, str] | None = None) -> None:
         """Write the volume in the format of the suffix; on failure an existing file is kept.
 
-        `made_by` is a text about its origin, up to 79 characters, for the file's header (MINC has no place for it).
-        `about` are further lines of it, {key: text without line ends}, of NRRD, MetaImage and VTI.
+        `about` are further lines of its header, {key: text without line ends}, of NRRD, MetaImage and VTI.
         Raises SimulationError for an unknown suffix or if the file cannot be written.
         """
         path = Path(path)
@@ -236,22 +188,20 @@ class Volume:
             require_space(path, self.array.nbytes)
         with written_whole(path) as partial, messages_withheld():
             if suffix == ".vti":
-                self._write_vti(partial, {**({} if made_by is None else {MADE_BY: made_by}), **(about or {})})
+                self._write_vti(partial, about or {})
             else:
                 import SimpleITK as sitk
 
                 image = self.to_sitk()
                 is_nifti = path.name.lower().endswith((".nii", ".nii.gz"))
-                if made_by is not None:
-                    image.SetMetaData("ITK_FileNotes" if is_nifti else MADE_BY, made_by)
                 for key, text in (about or {}).items():
                     image.SetMetaData(key, text)
                 sitk.WriteImage(image, str(partial), useCompression=not path.name.lower().endswith(".mhd"))
-                if is_nifti:
-                    require_written(partial, self.array.nbytes)
-                elif suffix in (".nrrd", ".mnc"):  # of which the last blocks may be missing without a word
+                if is_nifti or suffix in (".nrrd", ".mnc"):  # of which the last blocks may be missing without a word
                     written = sitk.GetArrayFromImage(sitk.ReadImage(str(partial)))
-                    if not np.array_equal(written, sitk.GetArrayViewFromImage(image), equal_nan=True):
+                    wanted = sitk.GetArrayFromImage(image)
+                    is_kept = (written == wanted) | ~np.isfinite(wanted)  # of NIfTI, ITK reads NaN as 0
+                    if not is_kept.all():
                         raise OSError("not all voxels are in the file; is the disk full?")
 
     # ---- VTK ---------------------------------------------------------------------------------------------------
@@ -301,17 +251,6 @@ class Volume:
         skew = np.abs(direction.T @ direction - np.eye(3)).max()
         require(skew < 1e-4, f"volume axes are not perpendicular (cosine {skew:.3g}); resample it to a regular grid")
         return nearest_rotation(direction), spacing, matrix[:3, 3]  # ITK and VTK require exactly orthogonal axes
-
-    @classmethod
-    def _read_vti(cls, path: Path) -> Volume:
-        from vtkmodules.vtkIOXML import vtkXMLImageDataReader
-
-        require_sound_header(path)
-        file = vtkXMLImageDataReader()
-        require(bool(file.CanReadFile(str(path))), f"{path}: cannot be read as a VTK image")
-        file.SetFileName(str(path))
-        file.Update()
-        return cls.from_vtk(file.GetOutput())
 
     def _write_vti(self, path: Path, about: Mapping[str, str]) -> None:
         from vtkmodules.vtkCommonCore import vtkStringArray
@@ -365,67 +304,37 @@ def require_image_name(path: Path, also: tuple[str, ...] = ()) -> None:
 
 
 @reader
-def read_array(path: str | os.PathLike) -> tuple[np.ndarray, np.ndarray]:
-    """((k, j, i) voxels, (4, 4) ijk_to_ras) of an image file, which may have only one slice.
+def read_image_file(path: str | os.PathLike) -> ImageFile:
+    """What is in a file of any format that Volume.read reads, which may also have several components or one slice.
 
-    Raises SimulationError for a missing or unreadable file and for an image that is not 3D.
+    Raises SimulationError for a missing or unreadable file.
     """
-    path = Path(path)
-    require(path.is_file(), f"{path}: no such file")
-    if is_minc1(path):
-        return _read_minc1(path)
-    import SimpleITK as sitk
-
-    image = read_itk_image(path)
-    require(image.GetDimension() == 3, f"{path}: has {image.GetDimension()} dimensions, expected 3")
-    return sitk.GetArrayFromImage(image), _itk_ijk_to_ras(image)
-
-
-@reader
-def read_itk_image(path: Path):
-    """A SimpleITK image of any file that ITK can read. Raises SimulationError, naming the file, for others."""
+    require_path(path)
     require_readable_name(path)
-    if path.is_file() and (starts_like_hdf5(path) or (is_dicom(path) and is_compressed(path))):
-        return _read_by_itk_in_child(path)
-    return _read_by_itk(path)
+    path = Path(path)
+    require(path.exists(), f"{path}: no such file or folder")
+    if path.is_dir() or is_dicom(path):
+        return checked_image(path, read_dicom(path))
+    if path.suffix.lower() == ".vti":
+        _log.info("%s: coordinates are read as RAS millimetres, since VTI files do not specify them", path)
+        return checked_image(path, _read_vti(path))
+    return read_image(path)
 
 
-@in_child  # the libraries end the process for some damaged files
-def _read_by_itk_in_child(path: Path):
-    return _read_by_itk(path)
+@in_child  # VTK ends the process for some damaged files
+def _read_vti(path: Path) -> ImageFile:
+    from vtkmodules.vtkIOXML import vtkXMLImageDataReader
 
-
-def _read_by_itk(path: Path):
-    import SimpleITK as sitk
-
-    require_sound_header(path)
-    sitk.ProcessObject.SetGlobalWarningDisplay(False)
-    file = sitk.ImageFileReader()
+    file = vtkXMLImageDataReader()
+    require(bool(file.CanReadFile(str(path))), f"{path}: cannot be read as a VTK image")
     file.SetFileName(str(path))
-    try:
-        file.ReadImageInformation()
-        require_bytes(path, file.GetSize(), file.GetNumberOfComponents())
-        if is_dicom(path):
-            require_whole_pixels(path)
-        image = file.Execute()
-    except RuntimeError as error:
-        reason = why_unreadable(path) or str(error).strip().splitlines()[-1].removeprefix("sitk::ERROR: ")
-        if "Unable to determine ImageIO reader" in reason:  # SimpleITK's words
-            reason = "its content is of no known format, expected NIfTI, NRRD, MetaImage, MGH, MINC, VTK or DICOM"
-        if "No such file" in reason and path.exists():  # ITK's words for voxels that it could not read
-            reason = "its voxels are missing or incomplete; copy or export it again"
-        if "orthonormal" in reason:  # ITK's words for the sform of NIfTI
-            reason = (
-                "its axes are not perpendicular, as after an affine registration that was written into the header; "
-                "resample it to a regular grid"
-            )
-        raise SimulationError(f"{path}: cannot be read as an image ({reason})") from None
-    require_complete(path)
-    require_whole_nrrd(path)
-    require_whole_metaimage(path)
-    is_complex = "complex" in image.GetPixelIDTypeAsString()
-    require(not is_complex, f"{path}: holds complex numbers, expected real ones; save its magnitude")
-    return image
+    file.Update()
+    require(
+        file.GetErrorCode() == 0 and min(file.GetOutput().GetDimensions()) > 0,
+        f"{path}: cannot be read as a VTK image, it is incomplete or damaged; copy or export it again",
+    )
+    volume = Volume.from_vtk(file.GetOutput())
+    return ImageFile(volume.array, volume.ijk_to_ras)
 
 
 def _require_volume(size, name: str) -> None:
@@ -433,55 +342,3 @@ def _require_volume(size, name: str) -> None:
         len(size) == 3 and min(size) > 1,
         f"{name}: is a {'x'.join(map(str, size))} image, expected three dimensions with two or more samples each",
     )
-
-
-def _itk_ijk_to_ras(image) -> np.ndarray:
-    index_to_lps = np.eye(4)
-    index_to_lps[:3, :3] = np.reshape(image.GetDirection(), (3, 3)) * np.array(image.GetSpacing())
-    index_to_lps[:3, 3] = image.GetOrigin()
-    return LPS_TO_RAS @ index_to_lps
-
-
-def is_minc1(path: Path) -> bool:
-    """Whether a file is MINC 1, which is NetCDF (MINC 2 is HDF5, which ITK reads)."""
-    with open(path, "rb") as file:
-        return path.suffix.lower() == ".mnc" and file.read(3) == b"CDF"
-
-
-def _read_minc1(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    require_package("nibabel", "nibabel", f"{path}: reading MINC 1")
-    import nibabel
-
-    try:
-        image = nibabel.Minc1Image.from_filename(path)
-        values = np.asarray(image.dataobj)
-    except Exception as error:  # scipy's NetCDF reader and nibabel raise various exceptions for damaged files
-        raise SimulationError(
-            f"{path}: cannot be read as MINC 1 ({str(error).strip() or type(error).__name__})"
-        ) from None
-    require(values.ndim == 3, f"{path}: has {values.ndim} dimensions, expected 3")
-    whole = values.round()
-    if np.issubdtype(image.get_data_dtype(), np.integer) and np.abs(values - whole).max() < 1e-3:
-        values = whole.astype(np.int32)  # nibabel always scales to floating point
-        _log.info("%s: values are read as whole numbers, as they are stored", path)
-    # nibabel's indices are (z, y, x) as in the file; its millimetres are in MNI world coordinates, which are RAS.
-    return values, np.array(image.affine)[:, [2, 1, 0, 3]]
-
-
-def _read_mgh(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """FreeSurfer's MGH and MGZ, whose millimetres are RAS of the scanner."""
-    require_package("nibabel", "nibabel", f"{path}: reading MGZ")
-    import nibabel
-
-    try:
-        image = nibabel.MGHImage.from_filename(path)
-        values = np.asarray(image.dataobj)
-    except Exception as error:  # nibabel and gzip raise various exceptions for damaged files
-        reason = str(error).strip() or type(error).__name__
-        raise SimulationError(f"{path}: cannot be read as MGZ ({reason.splitlines()[0]})") from None
-    require_whole_gzip(path)  # afterwards: what is no gzip at all is called so, and gzip's checksum comes at its end
-    if values.ndim == 4 and values.shape[3] == 1:
-        values = values[..., 0]
-    _require_volume(values.shape, str(path))
-    native = values.astype(values.dtype.newbyteorder("="), copy=False)  # files have the most significant byte first
-    return np.ascontiguousarray(native.T), np.array(image.affine)

@@ -14,7 +14,6 @@ from tempfile import TemporaryDirectory
 import numpy as np
 
 from SlicerUSSim.Logic.base.files import written_whole
-from SlicerUSSim.Logic.base.own_outputs import marked_html
 from SlicerUSSim.Logic.fitting.control_costs import FITTED, UNIFORM, Cost, mean_cost
 from SlicerUSSim.Logic.fitting.identifiability import Spread
 from SlicerUSSim.Logic.fitting.optimization import AGAIN, STAGES, AppearanceResult
@@ -107,7 +106,7 @@ def write_report(
     }
     template = Template(_TEMPLATE.read_text(encoding="utf-8"))
     with written_whole(path) as partial:
-        partial.write_text(marked_html(template.substitute(fill)), encoding="utf-8")
+        partial.write_text(template.substitute(fill), encoding="utf-8")
 
 
 def grey_levels_per_tissue(

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import importlib.util
-import io
 import os
 
 import numpy as np
 
 from SlicerUSSim.Logic.base.errors import SimulationError
 from SlicerUSSim.Logic.base.files import written_whole
-from SlicerUSSim.Logic.base.own_outputs import save_marked_png
 from SlicerUSSim.Logic.probe.arrays import Probe
 from SlicerUSSim.Logic.tissue.presets import colour_of
 
@@ -76,22 +74,17 @@ def draw_views(
 
 
 def save_figure(path: str | os.PathLike, figure, background: str) -> None:
-    """Write a matplotlib figure as PNG, marked as made by this program; on failure an existing file is kept."""
-    from PIL import Image
-
-    data = io.BytesIO()
-    figure.savefig(data, format="png", facecolor=background)
+    """Write a matplotlib figure as PNG; on failure an existing file is kept."""
     with written_whole(path) as partial:
-        save_marked_png(partial, Image.open(data))
+        figure.savefig(partial, format="png", facecolor=background)
 
 
 def write_png(path: str | os.PathLike, image: np.ndarray) -> None:
-    """Write a (rows, columns) uint8 image unchanged, marked as made by this program; on failure an existing file is
-    kept."""
+    """Write a (rows, columns) uint8 image unchanged as PNG; on failure an existing file is kept."""
     from PIL import Image
 
     with written_whole(path) as partial:
-        save_marked_png(partial, Image.fromarray(image))
+        Image.fromarray(image).save(partial, "PNG")
 
 
 def _scale_bar(axis, right: float, bottom: float) -> None:

@@ -12,7 +12,6 @@ from typing import Any
 from SlicerUSSim.Logic.base.declaration import Parameter, built, kind_of, parameter_of, parameters_of, short
 from SlicerUSSim.Logic.base.errors import SimulationError, require
 from SlicerUSSim.Logic.base.files import read_json, write_json
-from SlicerUSSim.Logic.base.own_outputs import MARK
 from SlicerUSSim.Logic.base.reading import reader
 from SlicerUSSim.Logic.base.settings import DisplaySettings, SimulationSettings
 from SlicerUSSim.Logic.base.transforms import check_rigid
@@ -30,6 +29,8 @@ SECTIONS: dict[str, type[DisplaySettings] | type[SimulationSettings]] = {
 #: Name of the pose, as in files of poses
 _POSE = "probe_to_ras"
 _KIND = "probe.kind"
+#: Name of a text that presets of earlier fits have
+_MADE_BY = "made_by"
 #: Name in Preset.from_texts of the whole as JSON, as scenes had it
 AS_ONE = "preset"
 #: A display with all of these and without a look was written by a version whose displays were even
@@ -106,7 +107,7 @@ class Preset:
             f"{source}: is the result of a fit, expected a preset, as ussim optimize --save-preset writes it",
         )
         for name in values:
-            require(name in (*known, MARK), f"{source}: has {short(name)}, expected {', '.join(known)}")
+            require(name in (*known, _MADE_BY), f"{source}: has {short(name)}, expected {', '.join(known)}")
         sections: dict[str, Any] = {}
         if "probe" in values:
             sections["probe"] = probe_from_dict(values["probe"], f"{source}: probe")
@@ -121,7 +122,7 @@ class Preset:
         if "tissues" in values or "membrane" in values:
             sections["tissues"] = TissueTable.from_dict(values, source)
         if values.get(_POSE) is not None:
-            require(values.keys() - {MARK, _POSE} != set(), f"{source}: is a pose and no preset; open it as a pose")
+            require(values.keys() - {_MADE_BY, _POSE} != set(), f"{source}: is a pose and no preset; open it as a pose")
             sections[_POSE] = check_rigid(f"{source}: {_POSE}", values[_POSE])
         missing = [name for name in known[:-2] if name not in values]
         if missing:

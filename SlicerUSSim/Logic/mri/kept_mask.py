@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import logging
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -11,8 +12,9 @@ import numpy as np
 
 from SlicerUSSim.Logic.base.errors import SimulationError
 from SlicerUSSim.Logic.base.files import make_folder, written_whole
+from SlicerUSSim.Logic.base.image_files import read_image
 from SlicerUSSim.Logic.base.version import __version__
-from SlicerUSSim.Logic.base.volume import Volume, read_itk_image
+from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.mri.given_mask import checked_mask
 
 _log = logging.getLogger(__name__)
@@ -38,7 +40,7 @@ class KeptMask:
 
 @dataclass(frozen=True)
 class Kept:
-    """What became of a mask that was to be kept."""
+    """What became of a file that was to be kept."""
 
     #: One line for the user
     text: str
@@ -60,14 +62,6 @@ def named_beside(mri_path: str | Path, ending: str) -> Path:
     return path.with_name(f"{name[: len(name) - len(suffix)]}.{ending}")
 
 
-def is_kept_mask(path: Path) -> bool:
-    """Whether a file is a brain mask that `keep` has written, also if it was edited since."""
-    try:
-        return path.is_file() and read_itk_image(path).HasMetaDataKey(f"{_PREFIX}mask")
-    except SimulationError:
-        return False
-
-
 def read_kept(path: Path, mri: Volume, method: str) -> KeptMask | None:
     """The mask kept for this MRI and method; None if there is none, or it belongs to another image or method.
 
@@ -85,31 +79,35 @@ def keep(
     path: Path, mri: Volume, inside: np.ndarray, method: str, seconds: float, warnings: tuple[str, ...],
     asked: str = "auto",
 ) -> Kept:  # fmt: skip
-    """Write the mask to `path`, or to the user's cache folder if that cannot be written; returns one line about it.
+    """Write the mask to `path`, or to the user's cache folder as keep_file does.
 
-    `asked` is what the user asked for, of which `method` came. A file that was not written by this function is never
-    replaced.
+    `asked` is what the user asked for, of which `method` came. A file at `path` is never replaced.
     """
-    why = _why_not_ours(path) if path.exists() else None
-    if why is not None:
-        return Kept(f"{path} {why}", False)
     mask = mri.with_array(inside.astype(np.uint8))
     entries = {
         "mri": fingerprint_of(mri), "mask": _hash(mask.array), "method": method, "seconds": f"{seconds:.1f}",
         "version": __version__, "warnings": " | ".join(warnings), "asked": asked,
     }  # fmt: skip
+    in_cache = _in_cache(path, entries["mri"])
+    return keep_file(path, in_cache, "the brain mask is", lambda place: _write(place, mask, entries))
+
+
+def keep_file(path: Path, in_cache: Path, what: str, write: Callable[[Path], None]) -> Kept:
+    """Write a file to `path`, or to the user's cache folder if `path` exists or cannot be written."""
+    why = f"{path} exists"
+    if not path.exists():
+        try:
+            write(path)
+            return Kept(f"{what} kept in {path}", True)
+        except SimulationError as error:
+            _log.info("%s", error)
+            why = f"{path.parent} cannot be written"
     try:
-        _write(path, mask, entries)
-        return Kept(f"the brain mask is kept in {path}", True)
+        make_folder(in_cache.parent)
+        write(in_cache)
     except SimulationError as error:
-        _log.info("the mask cannot be kept beside the MRI: %s", error)
-    place = _in_cache(path, entries["mri"])
-    try:
-        make_folder(place.parent)
-        _write(place, mask, entries)
-    except SimulationError as error:
-        return Kept(f"the brain mask cannot be kept: {error}", False)
-    return Kept(f"the brain mask is kept in {place}, since {path.parent} cannot be written", False)
+        return Kept(f"{what} not kept: {error}", False)
+    return Kept(f"{what} kept in {in_cache}, since {why}", False)
 
 
 def fingerprint_of(mri: Volume) -> str:
@@ -144,22 +142,6 @@ def _write(path: Path, mask: Volume, entries: dict[str, str]) -> None:
         sitk.WriteImage(image, str(partial), useCompression=True)
 
 
-def _why_not_ours(path: Path) -> str | None:
-    """Why a file stays as it is; None if `keep` has written it and nobody has edited it since."""
-    try:
-        image = read_itk_image(path)
-        mask = Volume.from_sitk(image, str(path))
-    except SimulationError:
-        return "cannot be read and stays as it is; the brain mask is not kept (delete that file to keep it there)"
-    key = f"{_PREFIX}mask"
-    if image.HasMetaDataKey(key) and _is_as_written(mask, image.GetMetaData(key)):
-        return None
-    return (
-        "was not written by ussim, or was edited, and stays as it is; the brain mask is not kept (to use that file, "
-        "give it as --mask)"
-    )
-
-
 def _is_as_written(mask: Volume, digest: str) -> bool:
     """Whether nobody has edited a mask since its voxels, 0 and 1, had this hash."""
     inside = mask.array > 0
@@ -170,14 +152,12 @@ def _read(path: Path, mri: Volume, method: str, fingerprint: str) -> KeptMask | 
     if not path.is_file():
         return None
     try:
-        image = read_itk_image(path)
-        mask = Volume.from_sitk(image, str(path))
+        image = read_image(path)
+        mask = Volume.from_image_file(image, str(path))
     except SimulationError as error:
         _log.warning("%s", error)
         return None
-    entries = {
-        key.removeprefix(_PREFIX): image.GetMetaData(key) for key in image.GetMetaDataKeys() if key.startswith(_PREFIX)
-    }
+    entries = {key.removeprefix(_PREFIX): text for key, text in image.header.items() if key.startswith(_PREFIX)}
     # Without our entries: another program wrote it under this name, and most programs drop them from what they edit.
     is_same_grid = mask.array.shape == mri.array.shape and np.allclose(mask.ijk_to_ras, mri.ijk_to_ras, atol=1e-3)
     is_mask = bool(entries) or len(np.unique(np.nan_to_num(mask.array))) <= 2

@@ -67,7 +67,7 @@ def read_mask(path: str | os.PathLike) -> Volume:
 
 def with_label_names(volume: Volume, path: str | os.PathLike) -> Volume:
     """The volume of a file with the names of its labels. Raises SimulationError for a table that cannot be read."""
-    return replace(volume, label_names=names_of_file(Path(path))[0])
+    return replace(volume, label_names=names_of_file(Path(path), volume)[0])
 
 
 def read_masks(volume: Volume, tissue: str, source: str) -> Masks:

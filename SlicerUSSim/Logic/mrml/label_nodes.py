@@ -12,6 +12,7 @@ from vtkmodules.vtkCommonCore import vtkIntArray, vtkStringArray
 from vtkmodules.vtkCommonMath import vtkMatrix4x4
 
 from SlicerUSSim.Logic.base.errors import require
+from SlicerUSSim.Logic.base.segments import is_meaningful
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.base.vtk_data import matrix_array, vtk_matrix
 from SlicerUSSim.Logic.imaging.preset import Preset
@@ -24,7 +25,6 @@ from SlicerUSSim.Logic.mrml.nodes import (
     require_node,
     write_volume,
 )
-from SlicerUSSim.Logic.tissue.label_files import is_meaningful
 from SlicerUSSim.Logic.tissue.label_maps import LabelledTissues, as_whole, read_label_map
 from SlicerUSSim.Logic.tissue.presets import colour_of
 from SlicerUSSim.Logic.tissue.table import TissueTable

@@ -1,6 +1,6 @@
 """Names of labels in files: in a label map's own header, or in a table beside it.
 
-Headers: segments of 3D Slicer's .seg.nrrd, and the label table that TotalSegmentator writes into a NIfTI extension.
+Headers: segments of DICOM SEG and 3D Slicer's .seg.nrrd, and the label table that TotalSegmentator writes into NIfTI.
 Tables: ITK-SNAP's label descriptions, 3D Slicer's colour tables (.ctbl), FreeSurfer's colour look-up tables, and those
 of BIDS (.tsv with columns index and name).
 """
@@ -13,7 +13,8 @@ from pathlib import Path
 
 from SlicerUSSim.Logic.base.errors import SimulationError, require
 from SlicerUSSim.Logic.base.reading import reader
-from SlicerUSSim.Logic.base.segments import segments_of
+from SlicerUSSim.Logic.base.segments import is_meaningful
+from SlicerUSSim.Logic.base.volume import Volume
 
 _log = logging.getLogger(__name__)
 
@@ -23,16 +24,14 @@ TABLE_SUFFIXES = (".txt", ".ctbl", ".label", ".lut", ".tsv", ".csv")
 _SNAP = re.compile(r'\s*(\d+)\s[\d\s.]+"([^"]*)"\s*')
 #: 24  CSF  60 60 60 0
 _PLAIN = re.compile(r"\s*(\d+)[\s,;]+(.*?)((?:[\s,;]+[\d.]+){3,8})?\s*")
-#: Names that programs give when the user gave none
-_MEANINGLESS = re.compile(r"(label|segment|region|class|colou?r|unnamed|\(none\)|n/?a)?[ _-]*\d*", re.IGNORECASE)
 
 
-def names_of_file(path: Path) -> tuple[dict[int, str], str]:
-    """({label: name}, where they are from) of a label map's file; ({}, "") if it has none.
+def names_of_file(path: Path, volume: Volume) -> tuple[dict[int, str], str]:
+    """({label: name}, where they are from) of a label map, read from a file; ({}, "") if it has none.
 
     Raises SimulationError for a table beside it that cannot be read.
     """
-    names = _header_names(path)
+    names = {label: name for label, name in volume.label_names.items() if is_meaningful(name)}
     if names:
         return names, "its header"
     stem = path.name
@@ -84,44 +83,3 @@ def _entry(line: str) -> tuple[int | None, str]:
     if line.lstrip().startswith("#") or not found:
         return None, ""
     return int(found[1]), found[2].strip().strip('"').strip()
-
-
-def is_meaningful(name: str | None) -> bool:
-    """Whether somebody gave this name, and no program ("Label 3", "Segment_1")."""
-    return bool(name) and not _MEANINGLESS.fullmatch(str(name).strip())
-
-
-def _header_names(path: Path) -> dict[int, str]:
-    name = path.name.lower()
-    try:
-        if name.endswith((".nrrd", ".nhdr")):
-            return _nrrd_names(path)
-        if name.endswith((".nii", ".nii.gz")):
-            return _nifti_names(path)
-    except Exception as error:  # the image itself was read by ITK; nibabel and nrrd raise various exceptions
-        _log.info("%s: names in its header cannot be read (%s)", path, error)
-    return {}
-
-
-def _nrrd_names(path: Path) -> dict[int, str]:
-    import nrrd
-
-    found = {segment.label: segment.name for segment in segments_of(nrrd.read_header(str(path)), str(path))}
-    return {label: name for label, name in found.items() if is_meaningful(name)}
-
-
-def _nifti_names(path: Path) -> dict[int, str]:
-    """Names in a label table of Connectome Workbench's XML, which TotalSegmentator writes."""
-    from xml.etree import ElementTree
-
-    import nibabel
-
-    names = {}
-    for extension in nibabel.load(path).header.extensions:  # type: ignore[attr-defined]
-        content = extension.get_content()
-        text = content.decode("utf-8", "replace") if isinstance(content, bytes) else str(content)
-        if "<LabelTable" not in text or "<!" in text.replace("<![CDATA[", "") or len(text) > _LARGEST_TABLE:
-            continue  # with a document type a small text can expand without limit
-        for label in ElementTree.fromstring(text.strip("\0 \n")).iter("Label"):
-            names[int(label.get("Key", "0"))] = (label.text or "").strip()
-    return {label: name for label, name in names.items() if label and is_meaningful(name)}

@@ -90,7 +90,7 @@ def read_label_file(
     own = table
     if own is None and preset is None:
         own = table_beside(path)
-    names, where = names_of_file(path)
+    names, where = names_of_file(path, volume)
     present = np.flatnonzero(np.bincount(as_whole(volume, str(path)).array.ravel())).tolist()
     by_number = own
     if own is not None and all(label in own for label in present if label not in mapping.by_label):

@@ -7,6 +7,7 @@ import os
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -17,6 +18,9 @@ from SlicerUSSim.Logic.base.reading import PlainValue, reader
 from SlicerUSSim.Logic.tissue.names import plain_name, tissue_named
 from SlicerUSSim.Logic.tissue.presets import MEMBRANE, TISSUES
 from SlicerUSSim.Logic.tissue.tissue import Membrane, Tissue
+
+if TYPE_CHECKING:
+    from SlicerUSSim.Logic.base.volume import Volume
 
 _log = logging.getLogger(__name__)
 
@@ -257,3 +261,14 @@ def tissues_beside(labels: Path) -> Path:
         if suffix and name.endswith(suffix):
             return labels.with_name(name[: -len(suffix)] + ".json")
     return labels.with_name(name + ".json")
+
+
+def write_label_files(path: Path, labels: Volume, tissues: TissueTable) -> Path:
+    """Write a label map, and its tissue table beside it, whose path is returned.
+
+    Raises SimulationError if one of them cannot be written.
+    """
+    beside = tissues_beside(path)
+    labels.write(path)
+    tissues.write(beside)
+    return beside

@@ -16,7 +16,6 @@ from scipy import ndimage, signal
 
 from SlicerUSSim.Logic.base.errors import SimulationError, require, require_between
 from SlicerUSSim.Logic.base.files import written_whole
-from SlicerUSSim.Logic.base.own_outputs import save_marked_png
 from SlicerUSSim.Logic.probe.arrays import Probe, probe_from_dict
 
 _log = logging.getLogger(__name__)
@@ -180,7 +179,7 @@ def draw_field(path: str | os.PathLike, image: np.ndarray, field: ImagedField) -
     fits = "" if np.isnan(field.overlap) else f", overlap {field.overlap:.0%}"
     draw.text((8, picture.height - 16), f"{kind}, {field.probe.depth_mm:.1f} mm deep{fits}", fill=(255, 200, 61))
     with written_whole(path) as partial:
-        save_marked_png(partial, picture)
+        picture.save(partial, "PNG")
 
 
 def bright_region(images: np.ndarray) -> np.ndarray:

@@ -21,8 +21,7 @@ import numpy as np
 
 from SlicerUSSim.Logic.base.errors import SimulationError, require, require_package, require_path
 from SlicerUSSim.Logic.base.files import read_small, written_whole
-from SlicerUSSim.Logic.base.headers import require_whole_nrrd
-from SlicerUSSim.Logic.base.own_outputs import MADE_BY
+from SlicerUSSim.Logic.base.image_files import read_image
 from SlicerUSSim.Logic.base.reading import reader
 from SlicerUSSim.Logic.base.transforms import check_affine, is_singular
 from SlicerUSSim.Logic.base.volume import Volume
@@ -34,6 +33,8 @@ SEQUENCE_SUFFIXES = (".igs.mha", ".seq.mha", ".mha", ".mhd", ".seq.nrrd", ".nrrd
 _FRAME_FIELD = re.compile(r"Seq_Frame(\d+)_(.+)")
 #: Field of sequences whose images are simulated
 SIMULATED = "SlicerUSSimSimulated"
+#: Field of those of `ussim sweep` of earlier versions
+_SIMULATED_BEFORE = "ussim_made_by"
 #: Field of sequences whose images are slices of a 3D ultrasound volume
 _CUT = "SlicerUSSimCutFromVolume"
 _ORIENTATION, _TYPE = "UltrasoundImageOrientation", "UltrasoundImageType"
@@ -113,7 +114,7 @@ class TrackedSequence:
     @property
     def is_simulated(self) -> bool:
         """Whether its images say that this package simulated them, as a twin's and those of `ussim sweep` do."""
-        return SIMULATED in self.fields or MADE_BY in self.fields
+        return not self.fields.keys().isdisjoint((SIMULATED, _SIMULATED_BEFORE))
 
     @property
     def is_recorded(self) -> bool:
@@ -227,8 +228,7 @@ class TrackedSequence:
         require_path(path)
         path = Path(path)
         require(path.is_file(), f"{path}: no such file")
-        is_nrrd = path.name.lower().endswith((".nrrd", ".nhdr"))
-        pixels, header = _read_nrrd(path) if is_nrrd else _read_metaimage(path)
+        pixels, header = _read_images(path)
         return _from_header(pixels, header, str(path))
 
     def write(self, path: str | os.PathLike, compress: bool = True) -> None:
@@ -547,14 +547,14 @@ def _colour_maps(colours: np.ndarray, grey: np.ndarray) -> Iterable[np.ndarray]:
 # ---- formats ---------------------------------------------------------------------------------------------------------
 
 
-def _read_metaimage(path: Path) -> tuple[_Pixels, dict[str, str]]:
-    import SimpleITK as sitk
-
-    from SlicerUSSim.Logic.base.volume import read_itk_image
-
-    image = read_itk_image(path)
-    header = {key: image.GetMetaData(key) for key in image.GetMetaDataKeys()}
-    return _as_images(sitk.GetArrayFromImage(image), image.GetNumberOfComponentsPerPixel(), str(path)), header
+def _read_images(path: Path) -> tuple[_Pixels, dict[str, str]]:
+    """Images and header of a sequence in MetaImage or NRRD."""
+    found = read_image(path)
+    # Plus writes the two general fields in the style of NRRD.
+    names = {"ultrasound image orientation": _ORIENTATION, "ultrasound image type": _TYPE}
+    components = found.array.shape[-1] if found.has_components else 1
+    header = {names.get(key, key): value for key, value in found.header.items()}
+    return _as_images(found.array, components, str(path)), header
 
 
 def _write_metaimage(path: Path, images: np.ndarray, header: Mapping[str, str], compress: bool) -> None:
@@ -564,29 +564,6 @@ def _write_metaimage(path: Path, images: np.ndarray, header: Mapping[str, str], 
     for key, value in header.items():
         image.SetMetaData(key, value)
     sitk.WriteImage(image, str(path), useCompression=compress)
-
-
-def _read_nrrd(path: Path) -> tuple[_Pixels, dict[str, str]]:
-    require_package("nrrd", "pynrrd", f"{path}: reading NRRD sequences")
-    import nrrd
-
-    try:
-        array, header = nrrd.read(str(path), index_order="C")
-    except (OSError, ValueError, nrrd.NRRDError) as error:
-        raise SimulationError(f"{path}: cannot be read as NRRD ({str(error).splitlines()[-1]})") from None
-    require_whole_nrrd(path)
-    kinds = list(header.get("kinds", []))[::-1]  # slowest axis first, as the array
-    components = 1
-    for axis, kind in enumerate(kinds):
-        if kind == "list":
-            array = np.moveaxis(array, axis, 0)
-        elif "color" in kind.lower() or "vector" in kind.lower():
-            array, components = np.moveaxis(array, axis, -1), array.shape[axis]
-    # Plus writes the two general fields in the style of NRRD.
-    names = {"ultrasound image orientation": _ORIENTATION, "ultrasound image type": _TYPE}
-    return _as_images(array, components, str(path)), {
-        names.get(key, key): value for key, value in header.items() if isinstance(value, str)
-    }
 
 
 def _write_nrrd(path: Path, images: np.ndarray, header: Mapping[str, str], compress: bool) -> None:
@@ -605,9 +582,11 @@ def _write_nrrd(path: Path, images: np.ndarray, header: Mapping[str, str], compr
 
 def _read_slice(path: Path) -> tuple[np.ndarray, np.ndarray]:
     """((rows, columns), image_to_ras) of a file with one slice, whose axis of length 1 may be any of the three."""
-    from SlicerUSSim.Logic.base.volume import read_array
+    from SlicerUSSim.Logic.base.volume import read_image_file
 
-    array, ijk_to_ras = read_array(path)
+    found = read_image_file(path)
+    array, ijk_to_ras = found.array, found.ijk_to_ras
+    require(array.ndim == 3, f"{path}: has {array.ndim} dimensions, expected 3")
     flat = [axis for axis in range(3) if array.shape[axis] == 1]
     require(len(flat) == 1, f"{path}: is {'x'.join(map(str, array.shape[::-1]))}, expected one slice")
     rows, columns = (axis for axis in range(3) if axis != flat[0])

@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 from scipy import ndimage
 
-from SlicerUSSim.Logic.base.own_outputs import require_own, write_own_volume
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.tissue.names import labels_of
 
@@ -58,21 +57,11 @@ class Proposal:
         return {tissue: Path(labels_path).with_name(f"{stem}{which}{tissue}{suffix}") for tissue in self.tissues}
 
     def write(self, labels_path: str | os.PathLike, number: int = 1) -> dict[str, Path]:
-        """Write a mask for each part beside a label map; {tissue: file}.
-
-        Raises SimulationError for a file that exists and is not as this program wrote it, as after an edit; none is
-        written then.
-        """
+        """Write a mask for each part beside a label map; {tissue: file}."""
         files = self.files(labels_path, number)
-        require_own(*files.values())
         for tissue, path in files.items():
-            write_own_volume(path, self.mask(tissue))
+            self.mask(tissue).write(path)
         return files
-
-
-def require_own_proposals(labels_path: str | os.PathLike) -> None:
-    """Raise SimulationError for a proposal beside a label map that was edited since write(), or made by others."""
-    require_own(*proposals_beside(labels_path))
 
 
 def proposals_beside(labels_path: str | os.PathLike) -> tuple[Path, ...]:

@@ -12,10 +12,10 @@ from pathlib import Path
 import numpy as np
 
 from SlicerUSSim.Logic.base.errors import SimulationError, require
-from SlicerUSSim.Logic.base.files import make_folder, written_whole
+from SlicerUSSim.Logic.base.files import written_whole
 from SlicerUSSim.Logic.base.version import __version__
 from SlicerUSSim.Logic.base.volume import Volume
-from SlicerUSSim.Logic.mri.kept_mask import cache_folder, fingerprint_of, named_beside
+from SlicerUSSim.Logic.mri.kept_mask import cache_folder, fingerprint_of, keep_file, named_beside
 from SlicerUSSim.Logic.mri.segmentation import Segmentation
 from SlicerUSSim.Logic.tissue.surfels import Surfels
 
@@ -55,26 +55,12 @@ def read_kept_sheets(path: Path, key: str, kinds: tuple[str, ...]) -> tuple[Surf
 
 
 def keep_sheets(path: Path, key: str, kinds: tuple[str, ...], surfels: Surfels, structures: np.ndarray) -> str:
-    """Write them to `path`, or to the user's cache folder if that cannot be written; returns one line about it.
-
-    A file that was not written by this function is never replaced.
-    """
-    if path.exists() and not _is_ours(path):
-        return f"{path} was not written by ussim or is damaged, and stays as it is; without it the sheets would be kept"
+    """Write them to `path`, or to the user's cache folder as keep_file does; returns one line about it."""
     arrays = _hash_of(surfels, structures)
     head = json.dumps({"key": key, "kinds": kinds, "version": __version__, "arrays": arrays})
-    try:
-        _write(path, head, surfels, structures)
-        return f"the sheets are kept in {path}"
-    except SimulationError as error:
-        _log.info("the sheets cannot be kept beside the MRI: %s", error)
-    place = _in_cache(path, key)
-    try:
-        make_folder(place.parent)
-        _write(place, head, surfels, structures)
-    except SimulationError as error:
-        return f"the sheets cannot be kept: {error}"
-    return f"the sheets are kept in {place}, since {path.parent} cannot be written"
+    return keep_file(
+        path, _in_cache(path, key), "the sheets are", lambda place: _write(place, head, surfels, structures)
+    ).text
 
 
 def _write(path: Path, head: str, surfels: Surfels, structures: np.ndarray) -> None:
@@ -90,14 +76,6 @@ def _hash_of(surfels: Surfels, structures: np.ndarray) -> str:
         found.update(f"{array.dtype} {array.shape}".encode())
         found.update(np.ascontiguousarray(array).tobytes())
     return found.hexdigest()
-
-
-def _is_ours(path: Path) -> bool:
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            return "ussim_sheets" in file.files
-    except (OSError, ValueError, zipfile.BadZipFile):
-        return False
 
 
 def _holds(kept: set[str], wanted: set[str]) -> bool:

@@ -11,7 +11,6 @@ import numpy as np
 
 from SlicerUSSim.Logic.base.errors import require
 from SlicerUSSim.Logic.base.files import messages_withheld, written_whole
-from SlicerUSSim.Logic.base.own_outputs import mark_of, require_known
 from SlicerUSSim.Logic.base.reading import in_child
 from SlicerUSSim.Logic.tissue.surfels import KINDS, Surfels
 
@@ -19,8 +18,6 @@ if TYPE_CHECKING:
     from vtkmodules.vtkCommonDataModel import vtkPolyData
 
 _SUFFIXES = (".vtp", ".ply")
-#: Array of a .vtp and comment of a .ply with a hash of the surface, by which a file that nobody edited is known
-_MARK = "ussim_mark"
 #: By so much the middle of a square may differ from its surfel's place, for what other programs round, mm
 _MOVED_MM = 0.05
 #: Colours of the kinds, 0 to 255
@@ -50,7 +47,6 @@ def write_surfels(path: str | os.PathLike, surfels: Surfels) -> None:
         if is_ply:
             writer = vtkPLYWriter()
             writer.SetArrayName("colour")
-            writer.AddComment(f"{_MARK}={_mark_of(data)}")
         else:
             writer = vtkXMLPolyDataWriter()
         writer.SetInputData(data)
@@ -119,45 +115,13 @@ def as_polydata(surfels: Surfels, signs: tuple[float, float, float] = (1.0, 1.0,
     result.GetPointData().SetActiveScalars("colour")
     # SPACE is what Slicer looks for; without it, it takes a file to be in LPS.
     space = "RAS" if signs[0] > 0 else "LPS"
-    for name, texts in (("SPACE", [space]), ("kinds", KINDS), (_MARK, [_mark_of(result)])):
+    for name, texts in (("SPACE", [space]), ("kinds", KINDS)):
         strings = vtkStringArray()
         strings.SetName(name)
         for text in texts:
             strings.InsertNextValue(text)
         result.GetFieldData().AddArray(strings)
     return result
-
-
-def require_own_surface(path: Path) -> None:
-    """Raise SimulationError for a file that exists and is not as write_surfels wrote it, before it is replaced."""
-    require_known(path, _is_own)
-
-
-@in_child  # VTK ends the process for some damaged files
-def _is_own(path: Path) -> bool:
-    from vtkmodules.vtkIOPLY import vtkPLYReader
-    from vtkmodules.vtkIOXML import vtkXMLPolyDataReader
-
-    is_ply = path.suffix.lower() == ".ply"
-    reader = vtkPLYReader() if is_ply else vtkXMLPolyDataReader()
-    if not reader.CanReadFile(str(path)):
-        return False
-    reader.SetFileName(str(path))
-    reader.Update()
-    if isinstance(reader, vtkPLYReader):
-        comments = reader.GetComments()
-        texts = [comments.GetValue(n) for n in range(comments.GetNumberOfValues())]
-        return f"{_MARK}={_mark_of(reader.GetOutput())}" in texts
-    array = reader.GetOutput().GetFieldData().GetAbstractArray(_MARK)
-    return array is not None and array.GetValue(0) == _mark_of(reader.GetOutput())
-
-
-def _mark_of(data: vtkPolyData) -> str:
-    """A hash of the corners."""
-    from vtkmodules.util.numpy_support import vtk_to_numpy
-
-    corners = data.GetPoints()
-    return mark_of(vtk_to_numpy(corners.GetData()) if corners.GetNumberOfPoints() else np.zeros(0, np.float32))
 
 
 @in_child  # VTK ends the process for some damaged files
