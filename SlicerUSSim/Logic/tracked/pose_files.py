@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from SlicerUSSim.Logic.base.errors import SimulationError, require, required
-from SlicerUSSim.Logic.base.files import read_json, read_small, write_json, written_whole
+from SlicerUSSim.Logic.base.files import read_json, read_text, write_json, written_whole
 from SlicerUSSim.Logic.base.reading import in_child, reader, starts_like_hdf5
 from SlicerUSSim.Logic.base.transforms import (
     LPS_TO_RAS,
@@ -39,46 +39,54 @@ def read_pose(path: str | os.PathLike) -> np.ndarray:
     file (.tfm, .h5, .mat, .txt) contains the map from world to probe in LPS, as Slicer writes a linear transform.
     Raises SimulationError for other files and for a matrix that is not rigid.
     """
-    path = Path(path)
-    require(path.is_file(), f"{path}: no such file")
-    if path.suffix.lower() == ".json":
-        values = read_json(path)
-        if isinstance(values, dict):
-            require("probe_to_ras" in values, f'{path}: has no "probe_to_ras", expected a 4x4 matrix under that name')
-            values = values["probe_to_ras"]
-        else:
-            _log.info("%s: a bare matrix, taken for probe_to_ras", path)
-        return check_rigid(f"{path}: probe_to_ras", values)
-    if path.suffix.lower() in _ITK_SUFFIXES or _starts_like_itk(path):
-        _log.info("%s: ITK transform, taken for the map from world to probe in LPS, as 3D Slicer saves it", path)
-        return _read_itk(path)
-    _log.info("%s: 16 numbers, taken for probe_to_ras by rows", path)
-    return check_rigid(f"{path}: probe_to_ras", _numbers(path))
+    return check_rigid(f"{path}: probe_to_ras", _matrix(Path(path)))
 
 
 @reader
 def read_matrix(path: str | os.PathLike) -> np.ndarray:
-    """(4, 4) affine matrix, such as a calibration, from a text file of sixteen numbers by rows or from JSON rows.
+    """(4, 4) affine matrix, such as a calibration, which may scale, in any format of read_pose.
 
-    An ITK file (.tfm, .h5, .mat, .txt) contains the inverse map in LPS, as Slicer writes a linear transform.
-    The matrix may scale. Raises SimulationError for other files.
+    Raises SimulationError for other files.
     """
-    path = Path(path)
+    return check_affine(str(path), _matrix(Path(path)))
+
+
+def _matrix(path: Path):
+    """What a file has for a matrix, which is to be checked."""
     require(path.is_file(), f"{path}: no such file")
-    if path.suffix.lower() in _ITK_SUFFIXES or _starts_like_itk(path):
-        return check_affine(f"{path}: transform", _itk_to_world(path))
+    suffix = path.suffix.lower()
+    if suffix == ".json":
+        values = read_json(path)
+        if isinstance(values, dict):
+            require("probe_to_ras" in values, f'{path}: has no "probe_to_ras", expected a 4x4 matrix under that name')
+            return values["probe_to_ras"]
+        _log.info("%s: a bare matrix, taken for probe_to_ras", path)
+        return values
+    if suffix in _ITK_SUFFIXES or _starts_like_itk(path):
+        require(
+            suffix != ".mat" or not _has_numbers(path),
+            f"{path}: has 16 numbers, as FSL's FLIRT writes them, relative to the voxels of two images; expected a map "
+            f"in millimetres: convert it by c3d_affine_tool -ref REFERENCE -src IMAGE {path.name} -fsl2ras -oitk "
+            "pose.tfm, or name it .txt if it is one in RAS",
+        )
+        _log.info("%s: ITK transform, taken for the map from world to probe in LPS, as 3D Slicer saves it", path)
+        return _itk_to_world(path)
+    _log.info("%s: 16 numbers, taken for probe_to_ras by rows", path)
+    return _numbers(path)
+
+
+def _has_numbers(path: Path) -> bool:
     try:
-        matrix = np.array(read_json(path), float) if path.suffix.lower() == ".json" else _numbers(path)
-    except (TypeError, ValueError):
-        raise SimulationError(f"{path}: is not a matrix, expected four rows of four numbers") from None
-    return check_affine(str(path), matrix)
+        return bool(_numbers(path).size)
+    except SimulationError:
+        return False
 
 
 def _numbers(path: Path) -> np.ndarray:
     """(4, 4) of sixteen numbers in a text file."""
     try:
-        numbers = np.array(read_small(path).decode().replace(",", " ").split(), float)
-    except (ValueError, UnicodeDecodeError):
+        numbers = np.array(read_text(path).replace(",", " ").split(), float)
+    except ValueError:
         raise SimulationError(f"{path}: is not a pose, expected 16 numbers by rows, JSON or an ITK transform") from None
     require(numbers.size == 16, f"{path}: has {numbers.size} numbers, expected 16 (a 4x4 matrix by rows)")
     return numbers.reshape(4, 4)
@@ -130,10 +138,6 @@ def _starts_like_itk(path: Path) -> bool:
         return file.read(8) == b"#Insight"
 
 
-def _read_itk(path: Path) -> np.ndarray:
-    return check_rigid(f"{path}: transform", _itk_to_world(path))
-
-
 def _itk_to_world(path: Path) -> np.ndarray:
     """(4, 4) in RAS of the inverse of an ITK file's linear map, which is in LPS."""
     is_binary = path.suffix.lower() in _BINARY or starts_like_hdf5(path)
@@ -157,7 +161,8 @@ def _linear_map(path: Path) -> np.ndarray:
     """(4, 4) of a linear ITK transform, in LPS."""
     import SimpleITK as sitk
 
-    if path.suffix.lower() not in _BINARY and not starts_like_hdf5(path):
+    is_text = path.suffix.lower() not in _BINARY and not starts_like_hdf5(path)
+    if is_text:
         require_sound_text(path)
     try:
         transform = sitk.ReadTransform(str(path))
@@ -165,7 +170,8 @@ def _linear_map(path: Path) -> np.ndarray:
         raise SimulationError(
             f"{path}: cannot be read as a transform ({str(error).splitlines()[-1].strip()})"
         ) from None
-    require_sound(path, transform)
+    if not is_text:
+        require_sound(path, transform)
     # A linear map is determined by the images of the origin and the axes.
     origin = np.array(transform.TransformPoint((0.0, 0.0, 0.0)))
     world_to_probe = np.eye(4)
@@ -292,7 +298,7 @@ def _read_xfm(path: Path) -> np.ndarray:
 def _mni_text(path: Path, first_words: str) -> str:
     require(path.is_file(), f"{path}: no such file")
     try:
-        text = io.StringIO(read_small(path).decode(), newline=None).read()  # all kinds of line ends
+        text = io.StringIO(read_text(path), newline=None).read()  # all kinds of line ends
     except UnicodeDecodeError:
         text = ""
     require(text.lstrip().startswith(first_words), f"{path}: does not start with {first_words!r}")
@@ -326,11 +332,14 @@ _NUMBER = r"[-+]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][-+]?[0-9]{1,3})?"
 
 def require_sound_text(path: Path) -> None:
     """Raise SimulationError unless a text file holds one linear transform, or a chain of them, with all its numbers."""
-    content = read_small(path)
-    require(_is_text(content), f"{path}: is not a text, expected an ITK transform")
+    try:
+        text = read_text(path)
+    except UnicodeDecodeError:
+        text = "\0"
+    require("\0" not in text, f"{path}: is not a text, expected an ITK transform")
     fields = [
         (name.strip(), value.strip())
-        for name, colon, value in (line.partition(":") for line in content.decode("utf-8").split("\n"))
+        for name, colon, value in (line.partition(":") for line in text.split("\n"))
         if colon and not name.lstrip().startswith("#")
     ]
     kinds = [value for name, value in fields if name == "Transform"]
@@ -364,14 +373,16 @@ def require_sound(path: Path, transform) -> None:
     import SimpleITK as sitk
 
     require(transform.IsLinear(), f"{path}: the transform is not linear, expected a rigid one")
+    parts = [transform]
     if transform.GetName() == _COMPOSITE:
         chain = sitk.CompositeTransform(transform)
-        for n in range(chain.GetNumberOfTransforms()):
-            require_sound(path, chain.GetNthTransform(n))
-        return
-    kind, found = transform.GetName(), len(transform.GetParameters())
-    require(kind in _LINEAR, f"{path}: {kind} is not read, expected one of {', '.join(_LINEAR)}")
-    require(found == _LINEAR[kind], _counted(path, kind, found))
+        parts = [chain.GetNthTransform(n) for n in range(chain.GetNumberOfTransforms())]
+    for part in parts:
+        kind, found = part.GetName(), len(part.GetParameters())
+        if kind == _COMPOSITE:  # SimpleITK has no class for ITK's base class, and shows it as a chain of itself
+            kind = "MatrixOffsetTransformBase"
+        require(kind in _LINEAR, f"{path}: {kind} is not read, expected one of {', '.join(_LINEAR)}")
+        require(found == _LINEAR[kind], _counted(path, kind, found))
 
 
 def _known(path: Path, kind: str) -> str:
@@ -387,10 +398,3 @@ def _known(path: Path, kind: str) -> str:
 
 def _counted(path: Path, kind: str, found: int) -> str:
     return f"{path}: {kind} has {found} parameters, expected {_LINEAR[kind]}"
-
-
-def _is_text(content: bytes) -> bool:
-    try:
-        return "\0" not in content.decode("utf-8")
-    except UnicodeDecodeError:
-        return False
