@@ -11,7 +11,7 @@ import click
 from SlicerUSSim.Command.options import declared
 from SlicerUSSim.Command.patient_options import Examination, PatientOptions, open_examination, say_contact
 from SlicerUSSim.Command.progress import note
-from SlicerUSSim.Logic.base.errors import SimulationError
+from SlicerUSSim.Logic.base.errors import SimulationError, require
 
 if TYPE_CHECKING:
     import numpy as np
@@ -41,8 +41,9 @@ class SequenceOptions:
     sequence: str = declared(
         click.option(
             "--sequence", type=click.Path(), required=True,
-            help="Tracked images: .igs.mha .seq.mha .mhd .nrrd (Plus, 3D Slicer), a folder of MINC slices, or with "
-            "--cut a 3D ultrasound volume. Without --probe or --preset, the geometry is estimated from the images.",
+            help="Tracked images: .igs.mha .seq.mha .mhd .nrrd (Plus, 3D Slicer; poses alone for a sweep), a folder of "
+            "MINC slices, or with --cut a 3D ultrasound volume. Without --probe or --preset, the geometry is estimated "
+            "from the images.",
         )
     )  # fmt: skip
     frames: str | None = declared(
@@ -107,7 +108,7 @@ def open_tracked(
 
     from SlicerUSSim.Logic.base.files import require_place
     from SlicerUSSim.Logic.tracked.imaged_field import draw_field
-    from SlicerUSSim.Logic.tracked.images import TrackedImages
+    from SlicerUSSim.Logic.tracked.images import TrackedImages, pixels_for_poses
     from SlicerUSSim.Logic.tracked.sequence import checked_apart, frame_numbers
 
     if recording.field:
@@ -121,17 +122,23 @@ def open_tracked(
         sequence = read_sequence(recording.sequence, recording.calibration)
         examination = open_examination(patient)
         known_probe = examination.probe if patient.gives_probe else None
+    path, field = recording.transform, None
+    if not sequence.has_images:
+        require(not finds_marks, f"{recording.sequence}: has poses without images, expected images to compare or draw")
+        known_probe = examination.probe
+        sequence, path, field = pixels_for_poses(sequence, path, known_probe)
     chosen = None if recording.frames is None else frame_numbers(recording.frames, len(sequence))
     beside = checked_apart(apart, chosen, len(sequence))
     images = TrackedImages.of(
         sequence,
         chosen,
-        path=recording.transform,
+        path=path,
         reference_to_ras=to_ras,
         probe=known_probe,
         beam=examination.probe,
         most=most,
         apart=beside,
+        field=field,
         finds_marks=finds_marks,
     )
     others = None

@@ -1,7 +1,7 @@
 """Names of labels in files: in a label map's own header, or in a table beside it.
 
 Headers: segments of 3D Slicer's .seg.nrrd, and the label table that TotalSegmentator writes into a NIfTI extension.
-Tables: ITK-SNAP's label descriptions, 3D Slicer's colour tables (.ctbl, .csv), FreeSurfer's colour look-up tables, and those
+Tables: ITK-SNAP's label descriptions, 3D Slicer's colour tables (.ctbl, .csv), FreeSurfer's look-up tables, and those
 of BIDS (.tsv with columns index and name).
 """
 

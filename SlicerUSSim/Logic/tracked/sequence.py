@@ -12,7 +12,7 @@ import logging
 import os
 import re
 from collections import deque
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import NamedTuple
@@ -20,7 +20,7 @@ from typing import NamedTuple
 import numpy as np
 
 from SlicerUSSim.Logic.base.errors import SimulationError, require, require_package, require_path
-from SlicerUSSim.Logic.base.files import read_small, written_whole
+from SlicerUSSim.Logic.base.files import read_small, read_text, written_whole
 from SlicerUSSim.Logic.base.headers import require_whole_nrrd
 from SlicerUSSim.Logic.base.own_outputs import MADE_BY
 from SlicerUSSim.Logic.base.reading import reader
@@ -37,6 +37,11 @@ SIMULATED = "SlicerUSSimSimulated"
 #: Field of sequences whose images are slices of a 3D ultrasound volume
 _CUT = "SlicerUSSimCutFromVolume"
 _ORIENTATION, _TYPE = "UltrasoundImageOrientation", "UltrasoundImageType"
+_MOST_HEADER_BYTES = 2**26
+#: Name of a transform, split at the last To followed by a capital letter or digit
+_FROM_TO = re.compile(r"(.+)To([A-Z0-9].*)")
+#: Header of transforms without images: 3D Slicer writes images of 0 x 0 pixels, Plus of 1 x 1
+_NO_IMAGES = re.compile(rb"^(?:DimSize *=|sizes:) *(?:[01] +){2,}(\d{1,9}) *\r?$", re.MULTILINE)
 _OK = "OK"
 #: Fields of ITK and NRRD files that do not belong to a sequence.
 _NOT_OURS = (
@@ -74,7 +79,7 @@ class TrackedSequence:
     1
     """
 
-    #: [n, row, column], or [n, scan line, sample] for RF data
+    #: [n, row, column], or [n, scan line, sample] for RF data; [n, 0, 0] for poses without images
     images: np.ndarray
     #: {"ProbeToTracker": (4, 4), ...} for each image, without transforms that were not tracked
     transforms: tuple[Mapping[str, np.ndarray], ...]
@@ -91,7 +96,7 @@ class TrackedSequence:
 
     def __post_init__(self) -> None:
         images = np.asarray(self.images)
-        require(images.ndim == 3 and images.size > 0, f"images have shape {images.shape}, expected (n, rows, columns)")
+        require(images.ndim == 3 and len(images) > 0, f"images have shape {images.shape}, expected (n, rows, columns)")
         count = len(images)
         transforms = tuple(
             {name: _matrix(f"image {n}: {name}", m) for name, m in entry.items()}
@@ -109,6 +114,11 @@ class TrackedSequence:
 
     def __len__(self) -> int:
         return len(self.images)
+
+    @property
+    def has_images(self) -> bool:
+        """Whether it has images, and not only poses."""
+        return self.images.size > 0
 
     @property
     def is_simulated(self) -> bool:
@@ -151,7 +161,7 @@ class TrackedSequence:
             steps.setdefault(start, []).append((end, matrix, known))
             if not is_singular(matrix):
                 steps.setdefault(end, []).append((start, np.linalg.inv(matrix), f"inverse of {known}"))
-        source, target = self._asked_ends(name, set(steps))
+        source, target = asked_ends(name, set(steps))
         found: dict[str, tuple[np.ndarray, list[str]]] = {source: (np.eye(4), [])}
         waiting = deque([source])
         while waiting and target not in found:
@@ -176,14 +186,23 @@ class TrackedSequence:
         return True
 
     def with_transforms(self, constant: Mapping[str, np.ndarray]) -> TrackedSequence:
-        """The sequence with additional transforms that are constant over all images: a calibration, a registration."""
-        constant = {name: _matrix(name, matrix) for name, matrix in constant.items()}
-        for name in constant:
-            replaced = any(name in entry for entry in self.transforms)
-            _log.info(
-                "%s %s", name, "takes the place of the sequence's own" if replaced else "is added to the sequence"
-            )
-        return replace(self, transforms=tuple({**entry, **constant} for entry in self.transforms))
+        """The sequence with additional transforms that are constant over all images: a calibration, a registration.
+
+        A calibration of the image, ImageToProbe, takes the place of its own. Others between frames that the transforms
+        of the sequence connect are not used, even where these were lost: they were measured. A warning says so.
+        """
+        keys = set().union(*self.transforms, *self.frame_fields)
+        names = {re.sub(r"Transform(Status)?$", "", key) for key in keys}
+        known = {name: np.eye(4) for name in names if _FROM_TO.fullmatch(name)}
+        of_file = replace(self.select([0]), transforms=(known,))
+        added = {}
+        for name, matrix in constant.items():
+            if not name.startswith("ImageTo") and of_file.has_pose(0, name):
+                _log.warning("%s is not used: the sequence has measured it, or transforms that give it", name)
+            else:
+                _log.info("%s is %s", name, "used in place of the sequence's own" if name in known else "added")
+                added[name] = _matrix(name, matrix)
+        return replace(self, transforms=tuple({**entry, **added} for entry in self.transforms))
 
     def select(self, numbers: Sequence[int]) -> TrackedSequence:
         """The sequence of only these images. Raises SimulationError for images that do not exist."""
@@ -207,12 +226,6 @@ class TrackedSequence:
         """The images `numbers` with other pixels [n, row, column], and with their original transforms and times."""
         return replace(self.select(numbers), images=images)
 
-    def _asked_ends(self, name: str, known: set[str]) -> tuple[str, str]:
-        splits = [(name[: m.start()], name[m.end() :]) for m in re.finditer("To", name)]
-        splits = [(start, end) for start, end in splits if start and end]
-        require(bool(splits), f"transform is {name!r}, expected two frames joined by To, such as ImageToReference")
-        return max(splits, key=lambda ends: sum(end in known for end in ends))
-
     # ---- files -------------------------------------------------------------------------------------------------
 
     @classmethod
@@ -220,15 +233,20 @@ class TrackedSequence:
     def read(cls, path: str | os.PathLike) -> TrackedSequence:
         """Read a sequence metafile (.igs.mha, .seq.mha, .mhd, .nrrd), compressed or not, in any image orientation.
 
-        Transforms whose status is not OK were not tracked and are omitted. Colours are converted to grey levels, those
-        of a colour map with a warning.
+        Transforms whose status is not OK were not tracked and are omitted, and so are those whose name or matrix is
+        none. Colours are converted to grey levels, those of a colour map with a warning. Transforms alone, as 3D Slicer
+        saves a sequence of them, are poses without images.
         Raises SimulationError for a file that is missing, unreadable or of another format.
         """
         require_path(path)
         path = Path(path)
         require(path.is_file(), f"{path}: no such file")
-        is_nrrd = path.name.lower().endswith((".nrrd", ".nhdr"))
-        pixels, header = _read_nrrd(path) if is_nrrd else _read_metaimage(path)
+        with path.open("rb") as file:
+            start = file.read(65536)
+        if (found := _NO_IMAGES.search(start)) is not None:
+            pixels, header = _read_poses(path, int(found[1]))
+        else:
+            pixels, header = _read_nrrd(path) if start.startswith(b"NRRD") else _read_metaimage(path)
         return _from_header(pixels, header, str(path))
 
     def write(self, path: str | os.PathLike, compress: bool = True) -> None:
@@ -251,13 +269,12 @@ class TrackedSequence:
         header = {**self.fields, _ORIENTATION: "FM" if is_rf else "MF", _TYPE: self.image_type}
         names = sorted({name for entry in self.transforms for name in entry})
         for n, (entry, extra) in enumerate(zip(self.transforms, self.frame_fields, strict=True)):
-            start = f"Seq_Frame{n:04d}_"
+            frame = {"ImageStatus": _OK, **extra, "Timestamp": f"{self.timestamps[n]:.6f}"}
             for name in names:
                 matrix = entry.get(name, np.eye(4))
-                header[f"{start}{name}Transform"] = " ".join(f"{value:.9g}" for value in matrix.ravel())
-                header[f"{start}{name}TransformStatus"] = _OK if name in entry else "INVALID"
-            header[f"{start}Timestamp"] = f"{self.timestamps[n]:.6f}"
-            header |= {f"{start}{name}": value for name, value in {"ImageStatus": _OK, **extra}.items()}
+                frame[f"{name}Transform"] = " ".join(f"{value:.9g}" for value in matrix.ravel())
+                frame[f"{name}TransformStatus"] = _OK if name in entry else "INVALID"
+            header |= {f"Seq_Frame{n:04d}_{key}": value for key, value in frame.items()}
         return header
 
     # ---- other sources -----------------------------------------------------------------------------------------
@@ -377,10 +394,19 @@ def read_coordinate_definitions(path: str | os.PathLike) -> dict[str, np.ndarray
 
 
 def _ends(name: str) -> tuple[str, str]:
-    """Frames of a transform in a file: the name is split at the last To followed by a capital letter or digit."""
-    splits = [m for m in re.finditer(r"To(?=[A-Z0-9])", name) if m.start() > 0]
-    require(bool(splits), f"transform is {name!r}, expected two frames joined by To, such as ProbeToTracker")
-    return name[: splits[-1].start()], name[splits[-1].end() :]
+    """Frames of a transform in a file."""
+    found = _FROM_TO.fullmatch(name)
+    if found is None:
+        raise SimulationError(f"transform is {name!r}, expected two frames joined by To, such as ProbeToTracker")
+    return found[1], found[2]
+
+
+def asked_ends(name: str, known: Collection[str]) -> tuple[str, str]:
+    """Frames of a transform that is asked for, if possible `known` ones. Raises SimulationError for other names."""
+    splits = [(name[: m.start()], name[m.end() :]) for m in re.finditer("To", name)]
+    splits = [(start, end) for start, end in splits if start and end]
+    require(bool(splits), f"transform is {name!r}, expected two frames joined by To, such as ImageToReference")
+    return max(splits, key=lambda ends: sum(end in known for end in ends))
 
 
 def _calibration_hint(source: str, steps: Mapping) -> str:
@@ -409,6 +435,7 @@ def _from_header(pixels: _Pixels, header: Mapping[str, str], source: str) -> Tra
     others: list[dict] = [{} for _ in range(count)]
     timestamps = np.full(count, np.nan)
     fields = {}
+    lost, damaged = 0, {}
     for key, text in header.items():
         match = _FRAME_FIELD.fullmatch(key)
         if match is None:
@@ -417,48 +444,57 @@ def _from_header(pixels: _Pixels, header: Mapping[str, str], source: str) -> Tra
             continue
         number, name = int(match.group(1)), match.group(2)
         require(number < count, f"{source}: has the field {key}, expected numbers below {count}, the number of images")
-        if name.endswith("TransformStatus"):
-            continue
-        if name.endswith("Transform"):
-            if header.get(f"{key}Status", _OK).strip().upper() == _OK:
-                name = name.removesuffix("Transform")
-                transforms[number][name] = _numbers(f"{source}: {key}", text)
-        elif name == "Timestamp":
+        short = name.removesuffix("Transform")
+        if name == "Timestamp":
             try:
                 timestamps[number] = float(text)
             except ValueError:
                 raise SimulationError(f"{source}: {key} is {text!r}, expected seconds") from None
-        else:
-            others[number][name] = text
-    left_out = sum(
-        1 for key in header if key.endswith("Transform") and header.get(f"{key}Status", _OK).strip().upper() != _OK
-    )
+            continue
+        if short != name and _FROM_TO.fullmatch(short):
+            try:
+                if header.get(f"{key}Status", _OK).strip().upper() == _OK:
+                    transforms[number][short] = _numbers(key, text)
+                    continue
+                lost += 1
+            except SimulationError as error:
+                damaged.setdefault(short, str(error))
+        others[number][name] = text
     _log.info("%s: %d images, transforms %s", source, count, ", ".join(sorted(set().union(*transforms))) or "none")
-    if left_out:
-        _log.info("%s: %d transforms were not tracked (their status is not OK) and are left out", source, left_out)
+    if lost:
+        _log.info("%s: %d transforms were not tracked (their status is not OK) and are left out", source, lost)
+    for why in damaged.values():
+        _log.warning("%s: %s; such transforms are left out", source, why)
     if not np.isfinite(timestamps).all():
         _log.info("%s: some images have no timestamp; their number is used instead", source)
     # Without timestamps the order of the images is used.
     timestamps = np.where(np.isfinite(timestamps), timestamps, np.arange(count))
-    for key, default in ((_TYPE, "BRIGHTNESS"), (_ORIENTATION, "rows away from the probe, columns to its mark")):
-        if key not in header:
-            _log.info("%s: has no %s, taken for %s", source, key, default)
-    image_type = header.get(_TYPE, "BRIGHTNESS").strip()
+    image_type = _value(header, _TYPE, "BRIGHTNESS", source)
     image_type = "BRIGHTNESS" if image_type == "RGB_COLOR" else image_type
     wanted = "MF" if image_type == "BRIGHTNESS" else "FM"
-    orientation = header.get(_ORIENTATION, wanted).strip().upper()
+    orientation = _value(header, _ORIENTATION, wanted, source)
     array = _oriented(pixels.grey, orientation, wanted, source)
     coloured = None if pixels.coloured is None else _oriented(pixels.coloured[None], orientation, wanted, source)[0]
     return TrackedSequence(array, tuple(transforms), timestamps, image_type, fields, tuple(others), coloured)
+
+
+def _value(header: Mapping[str, str], key: str, default: str, source: str) -> str:
+    """A general field, `default` if it is missing or unknown (XX, ??), of which the latter is a warning."""
+    text = re.sub(r"^(?:US_IMG_)?(.*?)\1?$", r"\1", header.get(key, "").strip().upper())  # some write it twice
+    if set(text) - set("?X"):
+        return text
+    meaning = f"{default}, rows away from the probe and columns towards its mark" if default == "MF" else default
+    if key in header:
+        _log.warning("%s: its %s is %r, which is unknown, taken for %s", source, key, header[key], meaning)
+    else:
+        _log.info("%s: has no %s, taken for %s", source, key, meaning)
+    return default
 
 
 def _oriented(array: np.ndarray, orientation: str, wanted: str, source: str) -> np.ndarray:
     """[n, y, x] images, transposed and flipped from `orientation` of the axes x, y to `wanted`."""
     letters = orientation[:2]
     known = len(orientation) in (2, 3) and any(letters in (a + b, b + a) for a in "MU" for b in "FN")
-    if orientation in ("XX", "XXX"):
-        _log.info("%s: its orientation is unknown (%s), images stay as they are", source, orientation)
-        return array
     require(known, f"{source}: {_ORIENTATION} is {orientation!r}, expected a code such as MF, UF, MN or MFA")
     if letters != wanted:
         _log.info("%s: images are reoriented from %s to %s", source, letters, wanted)
@@ -545,6 +581,20 @@ def _colour_maps(colours: np.ndarray, grey: np.ndarray) -> Iterable[np.ndarray]:
 
 
 # ---- formats ---------------------------------------------------------------------------------------------------------
+
+
+def _read_poses(path: Path, count: int) -> tuple[_Pixels, dict[str, str]]:
+    """What a file of `count` transforms without images has."""
+    text = read_text(path, _MOST_HEADER_BYTES, errors="replace")
+    fields = dict(re.findall(r"^(Seq_Frame[^=:\n]+?) *:?= *(.*?)\s*$", text, re.MULTILINE))
+    require(
+        0 < count <= len(fields), f"{path}: promises {count} poses without images, has {len(fields)} fields of them"
+    )
+    names = {found[1] for key in fields if (found := re.fullmatch(r"Seq_Frame\d+_(.+)Transform", key))}
+    if len(names) == 1 and not _FROM_TO.fullmatch(only := names.pop()):
+        _log.warning("%s: its only transform is %s, taken for ProbeToReference", path, only)
+        fields = {key.replace(f"_{only}Transform", "_ProbeToReferenceTransform"): fields[key] for key in fields}
+    return _Pixels(np.zeros((count, 0, 0), np.uint8), None), fields
 
 
 def _read_metaimage(path: Path) -> tuple[_Pixels, dict[str, str]]:
