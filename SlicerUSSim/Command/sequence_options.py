@@ -17,7 +17,6 @@ if TYPE_CHECKING:
     import numpy as np
 
     from SlicerUSSim.Logic.base import Volume
-    from SlicerUSSim.Logic.probe import Probe
     from SlicerUSSim.Logic.tracked import TrackedImages, TrackedSequence
 
 transform_option = click.option(
@@ -109,15 +108,16 @@ def open_tracked(
     from SlicerUSSim.Logic.base.files import require_place
     from SlicerUSSim.Logic.tracked.imaged_field import draw_field
     from SlicerUSSim.Logic.tracked.images import TrackedImages, pixels_for_poses
-    from SlicerUSSim.Logic.tracked.sequence import checked_apart, frame_numbers
+    from SlicerUSSim.Logic.tracked.sequence import TrackedSequence, checked_apart, frame_numbers
 
     if recording.field:
         require_place(recording.field)
     to_ras = read_to_mri(recording.to_mri) if recording.to_mri else np.eye(4)
     if recording.cut:
-        cuts = _read_cuts(recording.cut, recording)
+        volume, poses = _read_cuts(recording.cut, recording)
         examination = open_examination(patient)
-        known_probe, sequence = examination.probe, cuts.seen_by(examination.probe)
+        known_probe = examination.probe
+        sequence = TrackedSequence.from_volume(volume, known_probe, poses)
     else:
         sequence = read_sequence(recording.sequence, recording.calibration)
         examination = open_examination(patient)
@@ -173,23 +173,8 @@ def read_to_mri(path: str) -> np.ndarray:
     return to_ras
 
 
-@dataclass(frozen=True, eq=False)
-class _Cuts:
-    """An ultrasound volume, and poses of a probe in it."""
-
-    volume: Volume
-    #: (4, 4) each, from the probe to the frame of the volume
-    poses: list[np.ndarray]
-
-    def seen_by(self, probe: Probe) -> TrackedSequence:
-        """The images in the planes of `probe` at these poses."""
-        from SlicerUSSim.Logic.tracked.sequence import TrackedSequence
-
-        return TrackedSequence.from_volume(self.volume, probe, self.poses)
-
-
-def _read_cuts(pose_file: str, recording: SequenceOptions) -> _Cuts:
-    """The volume of --sequence, with the pose of --cut and neighbouring poses."""
+def _read_cuts(pose_file: str, recording: SequenceOptions) -> tuple[Volume, list[np.ndarray]]:
+    """The volume of --sequence, and (4, 4) the pose of --cut and neighbouring poses in its frame."""
     from SlicerUSSim.Logic.base.volume import Volume
     from SlicerUSSim.Logic.probe.poses import slide_sweep, tilt_sweep
     from SlicerUSSim.Logic.tracked.pose_files import read_pose
@@ -202,4 +187,4 @@ def _read_cuts(pose_file: str, recording: SequenceOptions) -> _Cuts:
         poses = tilt_sweep(pose, recording.cut_tilt, recording.cuts)
     elif recording.cut_slide is not None:
         poses = slide_sweep(pose, recording.cut_slide, recording.cuts)
-    return _Cuts(Volume.read(recording.sequence), poses)
+    return Volume.read(recording.sequence), poses

@@ -6,6 +6,7 @@ import io
 import logging
 import os
 import re
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -309,6 +310,7 @@ def _mni_text(path: Path, first_words: str) -> str:
 # ITK takes fewer numbers than a kind needs, and reads beyond their end; a number that it cannot read, such as `inf`,
 # ends a list without a word (itkTxtTransformIO.hxx, SetParameters of itkEuler3DTransform.hxx).
 
+_COMPOSITE = "CompositeTransform"
 #: Parameters of the linear kinds in three dimensions
 _LINEAR = {
     "IdentityTransform": 0,
@@ -325,8 +327,10 @@ _LINEAR = {
     "MatrixOffsetTransformBase": 12,
     "ComposeScaleSkewVersor3DTransform": 12,
     "ScaleSkewVersor3DTransform": 15,
+    _COMPOSITE: 0,
 }
-_COMPOSITE = "CompositeTransform"
+#: Name, whether there are numbers, and these
+_BLOCK = r"(?m)^Transform: *(.*)\n(Parameters:(.*)\nFixedParameters:(.*)\n)?"
 _NUMBER = r"[-+]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][-+]?[0-9]{1,3})?"
 
 
@@ -337,35 +341,23 @@ def require_sound_text(path: Path) -> None:
     except UnicodeDecodeError:
         text = "\0"
     require("\0" not in text, f"{path}: is not a text, expected an ITK transform")
-    fields = [
-        (name.strip(), value.strip())
-        for name, colon, value in (line.partition(":") for line in text.split("\n"))
-        if colon and not name.lstrip().startswith("#")
-    ]
-    kinds = [value for name, value in fields if name == "Transform"]
-    require(bool(kinds), f"{path}: has no line Transform, expected an ITK transform")
-    is_chain = kinds[0].startswith(_COMPOSITE)
+    lines = [line.strip() for line in text.split("\n") if ":" in line and not line.lstrip().startswith("#")]
+    blocks = re.findall(_BLOCK, "".join(f"{line}\n" for line in lines))
+    require(bool(blocks), f"{path}: has no line Transform, expected an ITK transform")
     require(
-        is_chain or len(kinds) == 1, f"{path}: has {len(kinds)} transforms that are not chained, expected one transform"
-    )
-    expected = []
-    for kind in kinds:
-        name = _known(path, kind)
-        expected.append(("Transform", kind))
-        if name != _COMPOSITE:
-            expected += [("Parameters", name), ("FixedParameters", name)]
-    require(
-        [name for name, _ in fields] == [name for name, _ in expected],
-        f"{path}: has the lines {', '.join(name[:20] for name, _ in fields[:9])}, expected Transform, Parameters and "
+        len(lines) == sum(3 if parameters else 1 for _, parameters, *_ in blocks),
+        f"{path}: has the lines {', '.join(line[:20] for line in lines[:9])}, expected Transform, Parameters and "
         "FixedParameters of each",
     )
-    for (field, text), (_, kind) in zip(fields, expected, strict=True):
-        if field == "Transform":
-            continue
-        numbers = text.split()
-        wrong = next((part for part in numbers if not re.fullmatch(_NUMBER, part) or abs(float(part)) > 1e300), None)
-        require(wrong is None, f"{path}: {field} of {kind} has {wrong!r:.40}, expected numbers")
-        require(field != "Parameters" or len(numbers) == _LINEAR[kind], _counted(path, kind, len(numbers)))
+    is_chain = blocks[0][0].startswith(_COMPOSITE)
+    require(is_chain or len(blocks) == 1, f"{path}: has {len(blocks)} transforms that are not chained, expected one")
+    for whole, _, parameters, fixed in blocks:
+        kind = re.sub(r"_(double|float)_3_3$", "", whole)
+        for name, numbers in (("Parameters", parameters.split()), ("FixedParameters", fixed.split())):
+            for part in numbers:
+                is_number = re.fullmatch(_NUMBER, part) and abs(float(part)) <= 1e300
+                require(bool(is_number), f"{path}: {name} of {kind} has {part!r:.40}, expected numbers")
+        _require_parameters(path, kind, parameters.split())
 
 
 def require_sound(path: Path, transform) -> None:
@@ -378,23 +370,15 @@ def require_sound(path: Path, transform) -> None:
         chain = sitk.CompositeTransform(transform)
         parts = [chain.GetNthTransform(n) for n in range(chain.GetNumberOfTransforms())]
     for part in parts:
-        kind, found = part.GetName(), len(part.GetParameters())
+        kind, found = part.GetName(), part.GetParameters()
         if kind == _COMPOSITE:  # SimpleITK has no class for ITK's base class, and shows it as a chain of itself
             kind = "MatrixOffsetTransformBase"
-        require(kind in _LINEAR, f"{path}: {kind} is not read, expected one of {', '.join(_LINEAR)}")
-        require(found == _LINEAR[kind], _counted(path, kind, found))
+        _require_parameters(path, kind, found)
 
 
-def _known(path: Path, kind: str) -> str:
-    """The name of a kind that is read, as of "Euler3DTransform_double_3_3"."""
-    name, _, rest = kind.partition("_")
-    is_known = re.fullmatch(r"(double|float)_3_3", rest) is not None and (name in _LINEAR or name == _COMPOSITE)
+def _require_parameters(path: Path, kind: str, found: Sequence) -> None:
     require(
-        is_known,
+        kind in _LINEAR,
         f"{path}: the transform is {kind!r:.60}, expected a linear one in three dimensions: {', '.join(_LINEAR)}",
     )
-    return name
-
-
-def _counted(path: Path, kind: str, found: int) -> str:
-    return f"{path}: {kind} has {found} parameters, expected {_LINEAR[kind]}"
+    require(len(found) == _LINEAR[kind], f"{path}: {kind} has {len(found)} parameters, expected {_LINEAR[kind]}")

@@ -19,7 +19,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from SlicerUSSim.Logic.base.errors import SimulationError, require, require_package, require_path
+from SlicerUSSim.Logic.base.errors import SimulationError, require, require_package, require_path, required
 from SlicerUSSim.Logic.base.files import read_small, read_text, written_whole
 from SlicerUSSim.Logic.base.headers import require_whole_nrrd
 from SlicerUSSim.Logic.base.own_outputs import MADE_BY
@@ -150,10 +150,7 @@ class TrackedSequence:
         return self._composed(number, name)[1]
 
     def _composed(self, number: int, name: str) -> tuple[np.ndarray, list[str]]:
-        count = len(self)
-        require(
-            int(number) == number and 0 <= number < count, f"image {number} does not exist, expected 0 to {count - 1}"
-        )
+        self._require_images([number])
         entry = self.transforms[number]
         steps: dict[str, list[tuple[str, np.ndarray, str]]] = {}
         for known, matrix in entry.items():
@@ -171,9 +168,10 @@ class TrackedSequence:
                     found[there] = matrix @ found[here][0], [*found[here][1], step]
                     waiting.append(there)
         if target not in found:
+            hint = ", such as the calibration ImageToProbe" if source == "Image" and source not in steps else ""
             raise SimulationError(
                 f"image {number}: no path from {source} to {target}, the file has {', '.join(sorted(entry)) or 'no'} "
-                f"transforms; give the missing one{_calibration_hint(source, steps)}"
+                f"transforms; give the missing one{hint}"
             )
         return found[target]
 
@@ -206,12 +204,7 @@ class TrackedSequence:
 
     def select(self, numbers: Sequence[int]) -> TrackedSequence:
         """The sequence of only these images. Raises SimulationError for images that do not exist."""
-        count = len(self)
-        for number in numbers:
-            require(
-                int(number) == number and 0 <= number < count,
-                f"image {number} does not exist, expected 0 to {count - 1}",
-            )
+        self._require_images(numbers)
         require(len(numbers) > 0, "no image chosen, expected at least one")
         pick = list(numbers)
         return replace(
@@ -221,6 +214,12 @@ class TrackedSequence:
             timestamps=self.timestamps[pick],
             frame_fields=tuple(self.frame_fields[n] for n in pick),
         )
+
+    def _require_images(self, numbers: Sequence[int]) -> None:
+        last = len(self) - 1
+        for number in numbers:
+            exists = int(number) == number and 0 <= number <= last
+            require(exists, f"image {number} does not exist, expected 0 to {last}")
 
     def with_images(self, numbers: Sequence[int], images: np.ndarray) -> TrackedSequence:
         """The images `numbers` with other pixels [n, row, column], and with their original transforms and times."""
@@ -377,8 +376,6 @@ def read_coordinate_definitions(path: str | os.PathLike) -> dict[str, np.ndarray
     path = Path(path)
     try:
         root = ElementTree.fromstring(read_small(path))
-    except OSError as error:
-        raise SimulationError(f"{path}: cannot be read ({error.strerror})") from None
     except ElementTree.ParseError as error:
         raise SimulationError(f"{path}: is not XML ({error})") from None
     transforms = {}
@@ -395,10 +392,8 @@ def read_coordinate_definitions(path: str | os.PathLike) -> dict[str, np.ndarray
 
 def _ends(name: str) -> tuple[str, str]:
     """Frames of a transform in a file."""
-    found = _FROM_TO.fullmatch(name)
-    if found is None:
-        raise SimulationError(f"transform is {name!r}, expected two frames joined by To, such as ProbeToTracker")
-    return found[1], found[2]
+    is_name = f"transform is {name!r}, expected two frames joined by To, such as ProbeToTracker"
+    return required(_FROM_TO.fullmatch(name), is_name).group(1, 2)
 
 
 def asked_ends(name: str, known: Collection[str]) -> tuple[str, str]:
@@ -407,10 +402,6 @@ def asked_ends(name: str, known: Collection[str]) -> tuple[str, str]:
     splits = [(start, end) for start, end in splits if start and end]
     require(bool(splits), f"transform is {name!r}, expected two frames joined by To, such as ImageToReference")
     return max(splits, key=lambda ends: sum(end in known for end in ends))
-
-
-def _calibration_hint(source: str, steps: Mapping) -> str:
-    return ", such as the calibration ImageToProbe" if source == "Image" and source not in steps else ""
 
 
 def _matrix(name: str, matrix) -> np.ndarray:
