@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from SlicerUSSim.Logic.base.errors import SimulationError, require, required
-from SlicerUSSim.Logic.base.files import read_json, read_text, write_json, written_whole
+from SlicerUSSim.Logic.base.files import read_json, read_small, read_text, write_json, written_whole
 from SlicerUSSim.Logic.base.reading import in_child, reader, starts_like_hdf5
 from SlicerUSSim.Logic.base.transforms import (
     LPS_TO_RAS,
@@ -65,22 +65,15 @@ def _matrix(path: Path):
         return values
     if suffix in _ITK_SUFFIXES or _starts_like_itk(path):
         require(
-            suffix != ".mat" or not _has_numbers(path),
-            f"{path}: has 16 numbers, as FSL's FLIRT writes them, relative to the voxels of two images; expected a map "
-            f"in millimetres: convert it by c3d_affine_tool -ref REFERENCE -src IMAGE {path.name} -fsl2ras -oitk "
-            "pose.tfm, or name it .txt if it is one in RAS",
+            suffix != ".mat" or b"\0" in read_small(path),
+            f"{path}: is a text, as FSL's FLIRT writes a matrix relative to the voxels of two images; expected a map "
+            f"in millimetres: c3d_affine_tool -ref REFERENCE -src IMAGE {path.name} -fsl2ras -oitk pose.tfm converts "
+            "it; if it is one in RAS, name it .txt",
         )
         _log.info("%s: ITK transform, taken for the map from world to probe in LPS, as 3D Slicer saves it", path)
         return _itk_to_world(path)
     _log.info("%s: 16 numbers, taken for probe_to_ras by rows", path)
     return _numbers(path)
-
-
-def _has_numbers(path: Path) -> bool:
-    try:
-        return bool(_numbers(path).size)
-    except SimulationError:
-        return False
 
 
 def _numbers(path: Path) -> np.ndarray:
@@ -141,8 +134,11 @@ def _starts_like_itk(path: Path) -> bool:
 
 def _itk_to_world(path: Path) -> np.ndarray:
     """(4, 4) in RAS of the inverse of an ITK file's linear map, which is in LPS."""
-    is_binary = path.suffix.lower() in _BINARY or starts_like_hdf5(path)
-    world_to_probe = _linear_map_of_binary(path) if is_binary else _linear_map(path)
+    if path.suffix.lower() in _BINARY or starts_like_hdf5(path):
+        world_to_probe = _linear_map_of_binary(path)
+    else:
+        require_sound_text(path)
+        world_to_probe = _linear_map(path)
     require(not is_singular(world_to_probe), f"{path}: the transform is singular, expected a rigid one")
     return LPS_TO_RAS @ np.linalg.inv(world_to_probe) @ LPS_TO_RAS
 
@@ -158,20 +154,17 @@ def _write_itk(path: Path, pose: np.ndarray) -> None:
         sitk.WriteTransform(transform, str(partial))
 
 
-def _linear_map(path: Path) -> np.ndarray:
+def _linear_map(path: Path, is_binary: bool = False) -> np.ndarray:
     """(4, 4) of a linear ITK transform, in LPS."""
     import SimpleITK as sitk
 
-    is_text = path.suffix.lower() not in _BINARY and not starts_like_hdf5(path)
-    if is_text:
-        require_sound_text(path)
     try:
         transform = sitk.ReadTransform(str(path))
     except RuntimeError as error:
         raise SimulationError(
             f"{path}: cannot be read as a transform ({str(error).splitlines()[-1].strip()})"
         ) from None
-    if not is_text:
+    if is_binary:
         require_sound(path, transform)
     # A linear map is determined by the images of the origin and the axes.
     origin = np.array(transform.TransformPoint((0.0, 0.0, 0.0)))
@@ -184,7 +177,7 @@ def _linear_map(path: Path) -> np.ndarray:
 
 @in_child  # ITK ends the process for some damaged files
 def _linear_map_of_binary(path: Path) -> np.ndarray:
-    return _linear_map(path)
+    return _linear_map(path, is_binary=True)
 
 
 @reader

@@ -15,7 +15,6 @@ from collections import deque
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
@@ -193,13 +192,10 @@ class TrackedSequence:
         names = {re.sub(r"Transform(Status)?$", "", key) for key in keys}
         known = {name: np.eye(4) for name in names if _FROM_TO.fullmatch(name)}
         of_file = replace(self.select([0]), transforms=(known,))
-        added = {}
-        for name, matrix in constant.items():
-            if not name.startswith("ImageTo") and of_file.has_pose(0, name):
-                _log.warning("%s is not used: the sequence has measured it, or transforms that give it", name)
-            else:
-                _log.info("%s is %s", name, "used in place of the sequence's own" if name in known else "added")
-                added[name] = _matrix(name, matrix)
+        measured = {name for name in constant if not name.startswith("ImageTo") and of_file.has_pose(0, name)}
+        if measured:
+            _log.warning("not used, as the sequence has measured it: constant %s", ", ".join(sorted(measured)))
+        added = {name: _matrix(name, matrix) for name, matrix in constant.items() if name not in measured}
         return replace(self, transforms=tuple({**entry, **added} for entry in self.transforms))
 
     def select(self, numbers: Sequence[int]) -> TrackedSequence:
@@ -392,8 +388,9 @@ def read_coordinate_definitions(path: str | os.PathLike) -> dict[str, np.ndarray
 
 def _ends(name: str) -> tuple[str, str]:
     """Frames of a transform in a file."""
-    is_name = f"transform is {name!r}, expected two frames joined by To, such as ProbeToTracker"
-    return required(_FROM_TO.fullmatch(name), is_name).group(1, 2)
+    expected = f"transform is {name!r}, expected two frames joined by To, such as ProbeToTracker"
+    found = required(_FROM_TO.fullmatch(name), expected)
+    return found[1], found[2]
 
 
 def asked_ends(name: str, known: Collection[str]) -> tuple[str, str]:
@@ -421,7 +418,8 @@ def _numbers(name: str, text: str) -> np.ndarray:
 
 def _from_header(pixels: _Pixels, header: Mapping[str, str], source: str) -> TrackedSequence:
     """A sequence from the pixels of a file and its header fields."""
-    count = len(pixels.grey)
+    grey, coloured = pixels
+    count = len(grey)
     transforms: list[dict] = [{} for _ in range(count)]
     others: list[dict] = [{} for _ in range(count)]
     timestamps = np.full(count, np.nan)
@@ -464,8 +462,9 @@ def _from_header(pixels: _Pixels, header: Mapping[str, str], source: str) -> Tra
     image_type = "BRIGHTNESS" if image_type == "RGB_COLOR" else image_type
     wanted = "MF" if image_type == "BRIGHTNESS" else "FM"
     orientation = _value(header, _ORIENTATION, wanted, source)
-    array = _oriented(pixels.grey, orientation, wanted, source)
-    coloured = None if pixels.coloured is None else _oriented(pixels.coloured[None], orientation, wanted, source)[0]
+    array = _oriented(grey, orientation, wanted, source)
+    if coloured is not None:
+        coloured = _oriented(coloured[None], orientation, wanted, source)[0]
     return TrackedSequence(array, tuple(transforms), timestamps, image_type, fields, tuple(others), coloured)
 
 
@@ -498,13 +497,8 @@ def _oriented(array: np.ndarray, orientation: str, wanted: str, source: str) -> 
     return np.ascontiguousarray(array)
 
 
-class _Pixels(NamedTuple):
-    """The pixels of a file, and which of them have a colour."""
-
-    #: [n, y, x]
-    grey: np.ndarray
-    #: (y, x) bool, in any image; None without
-    coloured: np.ndarray | None
+#: ([n, y, x] grey levels of a file, (y, x) bool whether a pixel has a colour in any image; None without)
+_Pixels = tuple[np.ndarray, np.ndarray | None]
 
 
 def _as_images(array: np.ndarray, components: int, source: str) -> _Pixels:
@@ -524,7 +518,7 @@ def _as_images(array: np.ndarray, components: int, source: str) -> _Pixels:
     if array.ndim == 2:
         array = array[None]
     require(array.ndim == 3, f"{source}: has {array.ndim} dimensions, expected columns, rows and images")
-    return _Pixels(array, coloured)
+    return array, coloured
 
 
 def _are_coloured(colours: np.ndarray, grey: np.ndarray, source: str) -> np.ndarray:
@@ -585,7 +579,7 @@ def _read_poses(path: Path, count: int) -> tuple[_Pixels, dict[str, str]]:
     if len(names) == 1 and not _FROM_TO.fullmatch(only := names.pop()):
         _log.warning("%s: its only transform is %s, taken for ProbeToReference", path, only)
         fields = {key.replace(f"_{only}Transform", "_ProbeToReferenceTransform"): fields[key] for key in fields}
-    return _Pixels(np.zeros((count, 0, 0), np.uint8), None), fields
+    return (np.zeros((count, 0, 0), np.uint8), None), fields
 
 
 def _read_metaimage(path: Path) -> tuple[_Pixels, dict[str, str]]:
