@@ -234,6 +234,19 @@ def slicer_sequence(kind: str, path: Path, name: str = "Image", nodes: Callable 
     return storage, sequence
 
 
+def linear_transforms(matrices) -> Callable:
+    """Nodes for slicer_sequence."""
+
+    def nodes(slicer):
+        for matrix in matrices:
+            to_parent, node = vtkMatrix4x4(), slicer.vtkMRMLLinearTransformNode()
+            to_parent.DeepCopy(matrix.ravel())
+            node.SetMatrixTransformToParent(to_parent)
+            yield node
+
+    return nodes
+
+
 def test_slicer_reads_the_transforms_that_are_written(tmp_path):
     tracked = tuple({"ProbeToTracker": rigid(n)} for n in range(3))
     TrackedSequence(chain().images, tracked, [0.0, 0.5, 1.0]).write(tmp_path / "sweep.seq.mha", compress=False)
@@ -247,14 +260,7 @@ def test_slicer_reads_the_transforms_that_are_written(tmp_path):
 @pytest.mark.parametrize("name", ["ProbeToReference", "Needle pose"])
 @pytest.mark.parametrize("suffix", [".seq.mha", ".seq.mhd", ".seq.nrrd"])
 def test_transforms_of_slicer_are_poses_without_images(tmp_path, suffix, name):
-    def nodes(slicer):
-        for n in range(3):
-            to_parent = vtkMatrix4x4()
-            to_parent.DeepCopy(rigid(n).ravel())
-            node = slicer.vtkMRMLLinearTransformNode()
-            node.SetMatrixTransformToParent(to_parent)
-            yield node
-
+    nodes = linear_transforms([rigid(n) for n in range(3)])
     storage, sequence = slicer_sequence("LinearTransform", tmp_path / f"poses{suffix}", name, nodes)
     assert storage.WriteData(sequence) == 1
     found = TrackedSequence.read(tmp_path / f"poses{suffix}")
