@@ -18,8 +18,14 @@ from vtkmodules.vtkCommonMath import vtkMatrix4x4
 from SlicerUSSim.Logic import LinearProbe, SimulationError, TrackedSequence, Volume
 from SlicerUSSim.Logic.base.transforms import rigid_between
 from SlicerUSSim.Logic.tracked.images import TrackedImages
-from SlicerUSSim.Logic.tracked.pose_files import fit_landmarks, read_calibration, read_matrix, read_tags, read_transform
-from SlicerUSSim.Logic.tracked.sequence import read_coordinate_definitions
+from SlicerUSSim.Logic.tracked.pose_files import (
+    fit_landmarks,
+    read_calibration,
+    read_coordinate_definitions,
+    read_matrix,
+    read_tags,
+    read_transform,
+)
 from tests.conftest import SHARED, needs_shared
 
 names = st.sampled_from(["ImageToProbe", "ProbeToTracker", "ReferenceToTracker", "ReferenceToRas"])

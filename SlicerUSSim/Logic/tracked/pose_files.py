@@ -73,17 +73,17 @@ def _matrix(path: Path):
         _log.info("%s: ITK transform, taken for the map from world to probe in LPS, as 3D Slicer saves it", path)
         return _itk_to_world(path)
     _log.info("%s: 16 numbers, taken for probe_to_ras by rows", path)
-    return _numbers(path)
+    return matrix_of_text(str(path), read_text(path))
 
 
-def _numbers(path: Path) -> np.ndarray:
-    """(4, 4) of sixteen numbers in a text file."""
+def matrix_of_text(name: str, text: str) -> np.ndarray:
+    """(4, 4) of a text of sixteen numbers by rows. Raises SimulationError for others, and if it is not affine."""
     try:
-        numbers = np.array(read_text(path).replace(",", " ").split(), float)
+        numbers = np.array(text.replace(",", " ").split(), float)
     except ValueError:
-        raise SimulationError(f"{path}: is not a pose, expected 16 numbers by rows, JSON or an ITK transform") from None
-    require(numbers.size == 16, f"{path}: has {numbers.size} numbers, expected 16 (a 4x4 matrix by rows)")
-    return numbers.reshape(4, 4)
+        raise SimulationError(f"{name} is {text.strip()[:40]!r}, expected 16 numbers, a 4x4 matrix by rows") from None
+    require(numbers.size == 16, f"{name} has {numbers.size} numbers, expected 16, a 4x4 matrix by rows")
+    return check_affine(name, numbers.reshape(4, 4))
 
 
 def write_pose(path: str | os.PathLike, probe_to_ras: np.ndarray) -> None:
@@ -225,11 +225,31 @@ def read_calibration(path: str | os.PathLike, name: str = "ImageToProbe") -> dic
     That is 16 numbers by rows, JSON rows, or a linear ITK transform as 3D Slicer saves it (.tfm, .h5); it may scale.
     Raises SimulationError for other files.
     """
-    from SlicerUSSim.Logic.tracked.sequence import read_coordinate_definitions
-
     if Path(path).suffix.lower() == ".xml":
         return read_coordinate_definitions(path)
     return {name: read_matrix(path)}
+
+
+@reader
+def read_coordinate_definitions(path: str | os.PathLike) -> dict[str, np.ndarray]:
+    """{"ImageToProbe": (4, 4), ...} from the <CoordinateDefinitions> of a Plus configuration file (XML).
+
+    Raises SimulationError for other files, and for a matrix that is not 4x4.
+    """
+    from xml.etree import ElementTree
+
+    path = Path(path)
+    try:
+        root = ElementTree.fromstring(read_small(path))
+    except ElementTree.ParseError as error:
+        raise SimulationError(f"{path}: is not XML ({error})") from None
+    transforms = {}
+    for entry in root.iter("Transform"):
+        start, end, text = entry.get("From"), entry.get("To"), entry.get("Matrix")
+        if start and end and text:
+            transforms[f"{start}To{end}"] = matrix_of_text(f"{path}: {start} to {end}", text)
+    require(bool(transforms), f"{path}: has no <Transform From= To= Matrix=>, expected a Plus configuration")
+    return transforms
 
 
 def read_registration(path: str | os.PathLike) -> tuple[np.ndarray, str]:

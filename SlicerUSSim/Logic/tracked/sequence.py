@@ -19,12 +19,13 @@ from pathlib import Path
 import numpy as np
 
 from SlicerUSSim.Logic.base.errors import SimulationError, require, require_package, require_path, required
-from SlicerUSSim.Logic.base.files import read_small, read_text, written_whole
+from SlicerUSSim.Logic.base.files import read_text, written_whole
 from SlicerUSSim.Logic.base.headers import require_whole_nrrd
 from SlicerUSSim.Logic.base.own_outputs import MADE_BY
 from SlicerUSSim.Logic.base.reading import reader
 from SlicerUSSim.Logic.base.transforms import check_affine, is_singular
 from SlicerUSSim.Logic.base.volume import Volume
+from SlicerUSSim.Logic.tracked.pose_files import matrix_of_text
 
 _log = logging.getLogger(__name__)
 
@@ -361,28 +362,6 @@ def checked_apart(text: str, fitted: Sequence[int] | None, count: int) -> list[i
     return numbers
 
 
-@reader
-def read_coordinate_definitions(path: str | os.PathLike) -> dict[str, np.ndarray]:
-    """{"ImageToProbe": (4, 4), ...} from the <CoordinateDefinitions> of a Plus configuration file (XML).
-
-    Raises SimulationError for other files, and for a matrix that is not 4x4.
-    """
-    from xml.etree import ElementTree
-
-    path = Path(path)
-    try:
-        root = ElementTree.fromstring(read_small(path))
-    except ElementTree.ParseError as error:
-        raise SimulationError(f"{path}: is not XML ({error})") from None
-    transforms = {}
-    for entry in root.iter("Transform"):
-        start, end, text = entry.get("From"), entry.get("To"), entry.get("Matrix")
-        if start and end and text:
-            transforms[f"{start}To{end}"] = _numbers(f"{path}: {start} to {end}", text)
-    require(bool(transforms), f"{path}: has no <Transform From= To= Matrix=>, expected a Plus configuration")
-    return transforms
-
-
 # ---- fields ----------------------------------------------------------------------------------------------------------
 
 
@@ -405,15 +384,6 @@ def _matrix(name: str, matrix) -> np.ndarray:
     array = check_affine(name, matrix)
     array.setflags(write=False)
     return array
-
-
-def _numbers(name: str, text: str) -> np.ndarray:
-    try:
-        values = np.array(text.split(), float)
-    except ValueError:
-        raise SimulationError(f"{name} is {text.strip()[:40]!r}, expected 16 numbers") from None
-    require(values.size == 16, f"{name} has {values.size} numbers, expected 16")
-    return _matrix(name, values.reshape(4, 4))
 
 
 def _from_header(pixels: _Pixels, header: Mapping[str, str], source: str) -> TrackedSequence:
@@ -443,7 +413,7 @@ def _from_header(pixels: _Pixels, header: Mapping[str, str], source: str) -> Tra
         if short != name and _FROM_TO.fullmatch(short):
             try:
                 if header.get(f"{key}Status", _OK).strip().upper() == _OK:
-                    transforms[number][short] = _numbers(key, text)
+                    transforms[number][short] = matrix_of_text(key, text)
                     continue
                 lost += 1
             except SimulationError as error:
