@@ -73,7 +73,7 @@ def _matrix(path: Path):
         _log.info("%s: ITK transform, taken for the map from world to probe in LPS, as 3D Slicer saves it", path)
         return _itk_to_world(path)
     _log.info("%s: 16 numbers, taken for probe_to_ras by rows", path)
-    return matrix_of_text(str(path), read_text(path))
+    return matrix_of_text(f"{path}:", read_text(path))
 
 
 def matrix_of_text(name: str, text: str) -> np.ndarray:
