@@ -541,6 +541,7 @@ def _colour_maps(colours: np.ndarray, grey: np.ndarray) -> Iterable[np.ndarray]:
 def _read_poses(path: Path, count: int) -> tuple[_Pixels, dict[str, str]]:
     """What a file of `count` transforms without images has."""
     text = read_text(path, _MOST_HEADER_BYTES, errors="replace")
+    text = re.sub(r"-Sequence(_\d+)?(?=Transform)", "", text)  # 3D Slicer adds it to the name of what it records
     fields = dict(re.findall(r"^(Seq_Frame[^=:\n]+?) *:?= *(.*?)\s*$", text, re.MULTILINE))
     require(
         0 < count <= len(fields), f"{path}: promises {count} poses without images, has {len(fields)} fields of them"
