@@ -26,8 +26,15 @@ from SlicerUSSim.Logic.imaging.preset import Preset
 from SlicerUSSim.Logic.mri.sheets.polydata import read_surfels, write_surfels
 from SlicerUSSim.Logic.tissue import Surfels
 from SlicerUSSim.Logic.tissue.label_files import read_names
-from SlicerUSSim.Logic.tracked.pose_files import read_matrix, read_pose, read_tags, read_transform, write_pose
-from SlicerUSSim.Logic.tracked.sequence import TrackedSequence, read_coordinate_definitions
+from SlicerUSSim.Logic.tracked.pose_files import (
+    read_coordinate_definitions,
+    read_matrix,
+    read_pose,
+    read_tags,
+    read_transform,
+    write_pose,
+)
+from SlicerUSSim.Logic.tracked.sequence import TrackedSequence
 
 CORPUS = sorted((Path(__file__).parent / "corpus").iterdir())
 #: What stands in damaged headers for a number

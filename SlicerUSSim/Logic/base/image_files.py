@@ -106,10 +106,11 @@ def _reader_of(path: Path) -> Callable[[Path], ImageFile]:
         return _read_nifti
     if name.endswith((".mgz", ".mgh")) and has_nibabel:
         return _read_mgh
-    if name.endswith((".nrrd", ".nhdr")) and importlib.util.find_spec("nrrd") is not None:
-        return _read_nrrd
     with path.open("rb") as file:
-        return _read_minc1 if name.endswith(".mnc") and file.read(3) == b"CDF" else _read_by_itk
+        start = file.read(4)
+    if (start == b"NRRD" or name.endswith((".nrrd", ".nhdr"))) and importlib.util.find_spec("nrrd") is not None:
+        return _read_nrrd
+    return _read_minc1 if name.endswith(".mnc") and start[:3] == b"CDF" else _read_by_itk
 
 
 def checked_image(path: Path, found: ImageFile) -> ImageFile:
