@@ -27,7 +27,7 @@ import numpy as np
 from SlicerUSSim.Logic.base.errors import SimulationError, require, require_package, shown_path
 from SlicerUSSim.Logic.base.reading import in_child, reader
 from SlicerUSSim.Logic.base.segments import segments_of
-from SlicerUSSim.Logic.base.transforms import LPS_TO_RAS
+from SlicerUSSim.Logic.base.transforms import LPS_TO_RAS, is_singular
 
 _log = logging.getLogger(__name__)
 
@@ -263,9 +263,12 @@ def _read_nifti(path: Path) -> ImageFile:
         matrices["sform"] = scale @ raw.get_sform()
     if int(raw["qform_code"]) > 0 and pixdim.all():
         matrices["qform"] = scale @ qform
+    for name in [name for name, matrix in matrices.items() if is_singular(matrix)]:
+        del matrices[name]
+        doubts.append(f"its {name} has no three axes and is not used")
     if not matrices:  # as ITK and 3D Slicer read it
         matrices["size"] = LPS_TO_RAS @ np.diag([*np.abs(pixdim), 1.0])
-        doubts.append("has no orientation (sform and qform have code 0), read as LPS; check left and right")
+        doubts.append("has no orientation (no sform and no qform), read as LPS; check left and right")
     require(
         "sform" in matrices or pixdim.all(),
         f"{path}: pixdim is {_times(pixdim)} and there is no sform, expected the size of its voxels",
