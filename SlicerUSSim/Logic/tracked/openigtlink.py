@@ -28,6 +28,10 @@ DEFAULT_PORT = 18944
 _RETRY_S, _STALLED_S = 0.25, 5.0
 #: Limit of the message size; a larger size in a header means that the data are not OpenIGTLink.
 _LARGEST_BYTES = 1 << 28
+#: Messages with poses that are not read
+_OTHER_POSES = ("TDATA", "QTDATA", "POSITION")
+#: In metadata, whether a pose is valid: 1 or 0, and OK or else what is wrong (Plus)
+_VALID = ("1", "TRUE", "OK", "VALID")
 
 #: A name or IPv4 address, or an IPv6 address in brackets.
 _HOST = r"\[[^\[\]]*:[^\[\]]*\]|[^\[\]:]+"
@@ -98,7 +102,7 @@ class TrackerLink:
         self._device, self._image_name = device, image_name
         #: State of the connection, for display
         self.status = ""
-        #: Numbers of poses used, of poses dropped because they are not rigid or farther than 100 m, and of images sent
+        #: Numbers of poses used, of poses dropped because they are damaged, not valid or not rigid, and of images sent
         self.received = self.dropped = self.sent = 0
         self._refused = 0  # poses since the last that was used
         self._passed_over: set[str] = set()
@@ -186,14 +190,25 @@ class TrackerLink:
                 self.sent += 1
 
     def _receive(self, peer: socket.socket) -> None:
-        from pyigtl.messages import MessageBase, TransformMessage
+        from pyigtl.messages import CRC64, MessageBase, TransformMessage
 
-        header = MessageBase.parse_header(_exactly(peer, MessageBase.IGTL_HEADER_SIZE))
-        size = header["body_size"]
+        packed = _exactly(peer, MessageBase.IGTL_HEADER_SIZE)
+        header = MessageBase.parse_header(packed)
+        size, kind, name = header["body_size"], header["message_type"], f"transform {header['device_name']!r}"
         require(size <= _LARGEST_BYTES, f"message size is {size} bytes, expected at most {_LARGEST_BYTES}")
         body = _exactly(peer, size)
-        if header["message_type"] != "TRANSFORM":
-            self._notice(f"messages of type {header['message_type']!s} are passed over")
+        if kind != "TRANSFORM":
+            self._notice(f"messages of type {kind} are passed over")
+            if kind in _OTHER_POSES and not self.received:
+                self._say(
+                    f"{self._peer_name} sends {kind} messages, expected TRANSFORM: configure it to send TRANSFORM "
+                    "messages of the probe's pose",
+                    logging.WARNING,
+                )
+            return
+        crc, expected = int.from_bytes(packed[-8:], "big"), CRC64(body)
+        if crc != expected:
+            self._refuse(f"{name} is damaged: its CRC is {crc:#x}, expected {expected:#x}")
             return
         message = TransformMessage()
         message.unpack(header, body)
@@ -201,10 +216,11 @@ class TrackerLink:
             self._device = message.device_name
             _log.info("OpenIGTLink: no transform was chosen, the first that came is followed: %r", self._device)
         if message.device_name != self._device:
-            self._notice(f"transform {message.device_name!r} is passed over, {self._device!r} is followed")
+            self._notice(f"{name} is passed over, {self._device!r} is followed")
             return
         try:
-            pose = check_rigid(f"transform {message.device_name!r}", _orthonormal(message.matrix))
+            _require_valid(name, message.device_name, message.metadata)
+            pose = check_rigid(name, _orthonormal(message.matrix))
         except SimulationError as error:  # a tracker may send any matrix while it does not see its tool
             self._refuse(str(error))
             return
@@ -274,6 +290,14 @@ def _exactly(peer: socket.socket, count: int) -> bytes:
         parts.append(part)
         missing -= len(part)
     return b"".join(parts)
+
+
+def _require_valid(name: str, device: str, metadata: dict[str, str]) -> None:
+    """Raise SimulationError for a pose that the tracker itself calls invalid, as of a tool that it does not see."""
+    keys = {first + last for first in ("Transform", device, f"{device}Transform") for last in ("Valid", "Status")}
+    for key, value in metadata.items():
+        if key in keys:
+            require(value.upper() in _VALID, f"{name} has {key} {value}, expected OK: the last valid pose stays")
 
 
 def _orthonormal(matrix: np.ndarray) -> np.ndarray:
