@@ -43,7 +43,7 @@ HEAVY = {
 #: Lines of Python that a room, or a folder beside the product, may have. Raising one is a decision: the commit says
 #: what users get for it.
 BUDGETS = {
-    "base": 3800, "opencl": 1250, "probe": 1470, "tissue": 3800, "tracked": 2140, "mri": 11090, "placement": 830,
+    "base": 3820, "opencl": 1250, "probe": 1470, "tissue": 3800, "tracked": 2140, "mri": 11090, "placement": 830,
     "imaging": 4815, "fitting": 4410, "vtk": 530, "mrml": 4530, "Widget": 2660, "Workstation": 7780, "Command": 3290,
     "module": 370, "validation": 6030, "benchmarks": 3750, "tests": 32000, "tests/reference": 500,
 }  # fmt: skip

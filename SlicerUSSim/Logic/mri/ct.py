@@ -175,7 +175,7 @@ def segment_ct(
         _log.warning("%s", line)
     _log.debug("segmentation of a CT: %s", timed)
     report(1.0)
-    labels, hu, sharp = (ct.with_array(array).along(given.ijk_to_ras).array for array in (labels, hu, sharp))
+    labels, hu, sharp = (ct.with_array(array).along(given).array for array in (labels, hu, sharp))
     return CtSegmentation(
         given.with_array(labels), names, means, deviations, noise, tuple(notes), tuple(warnings), hu, sharp
     )

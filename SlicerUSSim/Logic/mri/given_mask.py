@@ -34,7 +34,7 @@ def checked_mask(mask: Volume, mri: Volume) -> np.ndarray:
     """(k, j, i) True in the mask. Raises SimulationError as brain.given_brain."""
     require_kind("mask", mask, Volume, "Volume.read reads a file")
     name = f"mask {mask.name}" if mask.name else "mask"
-    mask = mask.along(mri.ijk_to_ras)
+    mask = mask.along(mri)
     require(
         mask.array.shape == mri.array.shape,
         f"{name} has {mask.size_text} voxels and the MRI {mri.size_text}, expected the same grid; resample the mask",

@@ -326,13 +326,13 @@ def segment_mri(
     told(1.0)
 
     def as_given(array: np.ndarray) -> Volume:
-        return images[0].with_array(part.whole(array)).along(mri.ijk_to_ras)
+        return images[0].with_array(part.whole(array)).along(mri)
 
     known = BrainPart.of([as_given(image) for image, _, _ in filtered], brain.mask.array > 0)
     number = np.zeros(part.inside.shape, np.int32)
     number[part.inside] = np.arange(np.count_nonzero(part.inside))
     return Segmentation(
-        labels=mri.with_array(whole.along(mri.ijk_to_ras).array),
+        labels=mri.with_array(whole.along(mri).array),
         tissue_names=tissue_names,
         means=found.means[:, 0] + above,
         standard_deviations=found.standard_deviations[:, 0],

@@ -148,12 +148,10 @@ class TrackerLink:
                     continue
                 with peer:
                     self._serve(peer)
-            except (OSError, ValueError, SimulationError) as error:
+            except Exception as error:  # pyigtl raises various exceptions for a message that it cannot parse
                 self._say(f"connection to {self._peer_name} lost ({error}), reconnecting", logging.WARNING)
-                self._wait(_RETRY_S)
-            except Exception as error:  # a message that cannot be parsed: drop the connection
-                self._say(f"invalid OpenIGTLink data from {self._peer_name} ({error}), reconnecting", logging.WARNING)
-                self._wait(_RETRY_S)
+                select.select([self._wake_in], [], [], _RETRY_S)
+                self._awake()
 
     def _say(self, status: str, level: int = logging.INFO) -> None:
         """Another status, which the log has once."""
@@ -194,42 +192,33 @@ class TrackerLink:
 
         packed = _exactly(peer, MessageBase.IGTL_HEADER_SIZE)
         header = MessageBase.parse_header(packed)
-        size, kind, name = header["body_size"], header["message_type"], f"transform {header['device_name']!r}"
+        size, kind, device = header["body_size"], header["message_type"], header["device_name"]
         require(size <= _LARGEST_BYTES, f"message size is {size} bytes, expected at most {_LARGEST_BYTES}")
         body = _exactly(peer, size)
         if kind != "TRANSFORM":
             self._notice(f"messages of type {kind} are passed over")
             if kind in _OTHER_POSES and not self.received:
-                self._say(
-                    f"{self._peer_name} sends {kind} messages, expected TRANSFORM: configure it to send TRANSFORM "
-                    "messages of the probe's pose",
-                    logging.WARNING,
-                )
+                remedy = "expected TRANSFORM: configure it to send TRANSFORM messages of the probe's pose"
+                self._say(f"{self._peer_name} sends {kind} messages, {remedy}", logging.WARNING)
             return
-        crc, expected = int.from_bytes(packed[-8:], "big"), CRC64(body)
-        if crc != expected:
-            self._refuse(f"{name} is damaged: its CRC is {crc:#x}, expected {expected:#x}")
-            return
-        message = TransformMessage()
-        message.unpack(header, body)
         if self._device is None:
-            self._device = message.device_name
-            _log.info("OpenIGTLink: no transform was chosen, the first that came is followed: %r", self._device)
-        if message.device_name != self._device:
-            self._notice(f"{name} is passed over, {self._device!r} is followed")
+            self._device = device
+            _log.info("OpenIGTLink: no transform was chosen, the first that came is followed: %r", device)
+        if device != self._device:
+            self._notice(f"transform {device!r} is passed over, {self._device!r} is followed")
             return
+        message, name, crc, expected = TransformMessage(), f"transform {device!r}", packed[-8:].hex(), CRC64(body)
         try:
-            _require_valid(name, message.device_name, message.metadata)
-            pose = check_rigid(name, _orthonormal(message.matrix))
+            require(crc == f"{expected:016x}", f"{name} is damaged: its CRC is {crc}, expected {expected:016x}")
+            message.unpack(header, body)
+            _require_valid(name, device, message.metadata)
+            pose = check_rigid(name, message.matrix)
         except SimulationError as error:  # a tracker may send any matrix while it does not see its tool
             self._refuse(str(error))
             return
-        following = f"connected to {self._peer_name}, following {self._device}"
-        if self._refused:
-            _log.info("OpenIGTLink: poses are used again, %d were refused", self._refused)
-            self._refused = 0
-            self.status = following  # which is no news
-        self._say(following)
+        pose[:3, :3] = nearest_rotation(pose[:3, :3])  # without the rounding of single precision
+        self._refused = 0
+        self._say(f"connected to {self._peer_name}, following {self._device}")
         self.received += 1
         self._moved(pose)
 
@@ -256,12 +245,6 @@ class TrackerLink:
                 pass
         except BlockingIOError:
             pass
-
-    def _wait(self, seconds: float) -> None:
-        select.select([self._wake_in], [], [], seconds)
-        if self._stopping:
-            return
-        self._awake()
 
 
 def _require_pyigtl() -> None:
@@ -298,13 +281,3 @@ def _require_valid(name: str, device: str, metadata: dict[str, str]) -> None:
     for key, value in metadata.items():
         if key in keys:
             require(value.upper() in _VALID, f"{name} has {key} {value}, expected OK: the last valid pose stays")
-
-
-def _orthonormal(matrix: np.ndarray) -> np.ndarray:
-    """Correct rounding errors of a rotation in single precision; other matrices are returned unchanged."""
-    matrix = np.array(matrix, float)
-    if np.isfinite(matrix).all():
-        rotation = nearest_rotation(matrix[:3, :3])
-        if np.abs(matrix[:3, :3] - rotation).max() < 1e-3:
-            matrix[:3, :3] = rotation
-    return matrix
