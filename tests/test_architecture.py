@@ -43,7 +43,7 @@ HEAVY = {
 #: Lines of Python that a room, or a folder beside the product, may have. Raising one is a decision: the commit says
 #: what users get for it.
 BUDGETS = {
-    "base": 3190, "opencl": 1250, "probe": 1470, "tissue": 3715, "tracked": 2160, "mri": 10980, "placement": 830,
+    "base": 3215, "opencl": 1250, "probe": 1470, "tissue": 3715, "tracked": 2160, "mri": 10980, "placement": 830,
     "imaging": 4800, "fitting": 4390, "vtk": 530, "mrml": 4530, "Widget": 2660, "Workstation": 7780, "Command": 3250,
     "module": 370, "validation": 6030, "benchmarks": 3750, "tests": 31890, "tests/reference": 500,
 }  # fmt: skip
