@@ -10,7 +10,7 @@ import pytest
 from SlicerUSSim.Logic import Volume
 from SlicerUSSim.Logic.mri.pathology import add_tissues
 from SlicerUSSim.Logic.placement.aiming import FARTHEST_DEG, opening_pose
-from SlicerUSSim.Logic.placement.bone_before_probe import CLOSED_DB, SCENE, about_bone
+from SlicerUSSim.Logic.placement.bone_before_probe import CLOSED_DB, about_bone
 from SlicerUSSim.Logic.placement.craniotomy import default_pose, disc_opening, middle_of, opened, without_outside
 from SlicerUSSim.Logic.placement.views import view_pose
 from SlicerUSSim.Logic.probe import PROBES, ConvexProbe, LinearProbe, Probe
@@ -41,7 +41,7 @@ def off_axis_mm(pose: np.ndarray, place) -> float:
 
 
 def notes_of(labels: Volume, probe: Probe, pose: np.ndarray, *, is_open: bool, names=ILL):
-    return about_bone(labels, names, TISSUES.values(), probe, pose, is_open=is_open, words=SCENE)
+    return about_bone(labels, names, TISSUES.values(), probe, pose, is_open=is_open)
 
 
 @pytest.mark.slow
@@ -166,7 +166,7 @@ def test_a_closed_skull_that_leaves_no_signal_is_told(head):  # noqa: F811
     (line,) = notes_of(head, probe, pose, is_open=False, names=NAMES)
     assert line.startswith("the skull is closed in front of the probe, and 7 mm of bone take ")  # 6 mm obliquely
     assert float(line.split("take ")[1].split(" dB")[0]) > CLOSED_DB
-    assert "choose a craniotomy (Open skull in Craniotomy)" in line
+    assert "choose a craniotomy (--craniotomy auto, disc:MM or a file; Open skull" in line
     labels, _ = with_disc(head, 30.0)
     assert notes_of(labels, probe, ON_SKIN, is_open=True) == ()
     elsewhere = pose_looking_at((78.5, 0.0, 0.0), (0.0, 0.0, 0.0), (0.0, 1.0, 0.0))

@@ -43,12 +43,12 @@ HEAVY = {
 #: Lines of Python that a room, or a folder beside the product, may have. Raising one is a decision: the commit says
 #: what users get for it.
 BUDGETS = {
-    "base": 3215, "opencl": 1250, "probe": 1470, "tissue": 3715, "tracked": 2160, "mri": 10980, "placement": 830,
-    "imaging": 4800, "fitting": 4390, "vtk": 530, "mrml": 4530, "Widget": 2660, "Workstation": 7780, "Command": 3250,
-    "module": 370, "validation": 6030, "benchmarks": 3750, "tests": 31890, "tests/reference": 500,
+    "base": 3215, "opencl": 1250, "probe": 1470, "tissue": 2935, "tracked": 2155, "mri": 10065, "placement": 815,
+    "imaging": 4800, "fitting": 4390, "vtk": 530, "mrml": 4480, "Widget": 2640, "Workstation": 7765, "Command": 3240,
+    "module": 370, "validation": 6030, "benchmarks": 3750, "tests": 30960, "tests/reference": 500,
 }  # fmt: skip
 #: Lines of all of SlicerUSSim/, and of kernels/
-LARGEST_PRODUCT, LARGEST_KERNELS = 52_260, 5_600
+LARGEST_PRODUCT, LARGEST_KERNELS = 50_000, 5_600
 #: Packages of the checkout that use the product and are not installed with it
 CHECKOUT = {"validation", "benchmarks", "tests", "examples"}
 

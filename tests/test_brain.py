@@ -25,10 +25,8 @@ from SlicerUSSim.Logic.mri.coarse import CoarseImage
 from SlicerUSSim.Logic.mri.kept_mask import mask_beside
 from SlicerUSSim.Logic.mri.mask_check import cut_off, ends_at_edge
 from SlicerUSSim.Logic.mri.no_data import no_data, without_blank
-from SlicerUSSim.Logic.mri.not_a_head import cut_ends, is_phantom, is_symmetric, is_ultrasound
 from SlicerUSSim.Logic.mri.recognition import recognise, stripped_brain
 from SlicerUSSim.Logic.mri.samples import head_mri
-from SlicerUSSim.Logic.mri.segmentation import segment_mri
 from tests.conftest import SHARED, needs_shared
 
 needs_nilearn = pytest.mark.skipif(importlib.util.find_spec("nilearn") is None, reason="nilearn is not installed")
@@ -134,48 +132,6 @@ def test_what_is_no_mri_is_reported(change, message):
     assert message in str(caught.value) and "\n" not in str(caught.value)
 
 
-@needs_nilearn
-def test_a_phantom_of_shells_is_refused_as_one():
-    grid, _ = ellipsoid((80, 96, 80))
-    places = (np.indices(grid.array.shape).T * 3.0 - np.array(grid.array.shape) * 1.5).T
-    depth = np.sqrt(sum((place / radius) ** 2 for place, radius in zip(places, (72, 92, 75), strict=True)))
-    values = np.select([depth < 0.4, depth < 0.7, depth < 0.9, depth < 1.0], [120.0, 80.0, 30.0, 100.0], 0.0)
-    values = values + np.random.default_rng(1).normal(0.0, 4.0, values.shape)
-    with pytest.raises(SimulationError, match=r"looks the same upside down and from the back, as a phantom does"):
-        find_brain(Volume(values.astype(np.float32), grid.ijk_to_ras))
-
-
-@needs_nilearn
-def test_a_phantom_as_large_as_a_brain_is_refused_as_one():
-    """Its background has one value, as that of a skull-stripped brain."""
-    empty, radius = ellipsoid((60, 80, 65))
-    points = np.argwhere(radius < 10.0) * 3.0
-    array = np.where(radius < 1, 100.0 + np.random.default_rng(0).normal(0, 3, radius.shape), 0.0)
-    for at in ((40, 60, 50), (100, 120, 80), (70, 100, 70), (60, 130, 90)):
-        ball = (np.linalg.norm(points - at, axis=1) < 14.0).reshape(radius.shape)
-        array[ball & (radius < 1)] += 60.0
-    with pytest.raises(SimulationError, match="with uniform parts, as a phantom has and no brain"):
-        find_brain(empty.with_array(array.astype(np.float32)))
-
-
-@needs_nilearn
-@pytest.mark.parametrize(
-    ("value", "message"),
-    [
-        (60.0, r"has a border of one value \(60\) that is as bright as tissue .*, expected a dark background; crop it"),
-        (500.0, r"the background \(500\) is as bright as .*, or it has a bright border"),
-    ],
-)
-def test_a_border_as_bright_as_tissue_is_named(head, value, message):
-    """It was taken for 16 litres of tissue."""
-    mri, _ = head
-    array = np.pad(mri.array, 20, constant_values=value)
-    matrix = mri.ijk_to_ras.copy()
-    matrix[:3, 3] -= matrix[:3, :3] @ (20.0, 20.0, 20.0)
-    with pytest.raises(SimulationError, match=message):
-        find_brain(Volume(array, matrix))
-
-
 @pytest.mark.long
 @needs_nilearn
 def test_voxels_without_data_are_left_out_with_a_warning(head, found):
@@ -201,76 +157,6 @@ def test_a_blank_within_the_image_has_data():
     assert blank[radius > 1.1].all() and not blank[radius < 0.9].any()
 
 
-@pytest.mark.slow
-def test_an_image_of_noise_is_refused_as_one():
-    noise = np.random.default_rng(0).normal(100.0, 20.0, (40, 40, 40)).astype(np.float32)
-    with pytest.raises(SimulationError, match="is noise, in which neighbours have nothing in common"):
-        find_brain(Volume(noise, np.diag([4.0, 4.0, 4.0, 1.0])))
-
-
-def test_a_head_is_no_phantom_no_ultrasound_and_is_cut_nowhere(head):
-    assert (
-        not is_phantom(CoarseImage.of(head[0]))
-        and not is_symmetric(CoarseImage.of(head[0]))
-        and not is_ultrasound(head[0])
-        and cut_ends(head[0]) == ()
-    )
-    assert not is_ultrasound(head_mri(3.0))
-
-
-def fan(opening_deg, background=0.0):
-    """A volume of speckle in a fan, as a swept curved array records it."""
-    k, _, i = np.indices((90, 30, 120)).astype(float)
-    x, depth = i - 60.0, k + 20.0
-    inside = (np.abs(np.degrees(np.arctan2(x, depth))) < opening_deg / 2) & (np.hypot(x, depth) < 100) & (k > 2)
-    rng = np.random.default_rng(0)
-    speckle = np.hypot(*(ndimage.gaussian_filter(rng.normal(size=x.shape), 1.0) for _ in range(2)))
-    return Volume(np.where(inside, 50.0 + 300.0 * speckle, background).astype(np.float32), np.eye(4))
-
-
-@pytest.mark.parametrize(("opening_deg", "method"), [(45.0, "auto"), (85.0, "none")])
-def test_an_ultrasound_volume_is_refused_as_one_at_once(opening_deg, method):
-    with pytest.raises(SimulationError, match="a fan on a constant background, as ultrasound does"):
-        find_brain(fan(opening_deg, background=3.0), method)
-
-
-@pytest.mark.slow
-@needs_shared
-def test_a_real_ultrasound_sweep_is_refused_as_one():
-    with pytest.raises(SimulationError, match="as ultrasound does, expected an MRI"):
-        find_brain(Volume.read(SHARED / "brain_sweep" / "brain_sweep.igs.mha"))
-
-
-def test_an_image_resampled_along_other_axes_is_no_fan(head):
-    """Its corners are empty, and the border between is straight, but of a box."""
-    shown = np.ones((60, 60, 60), np.float32) * np.random.default_rng(0).uniform(1, 9, (60, 60, 60)).astype(np.float32)
-    turned = ndimage.rotate(np.pad(shown, 20), 25.0, axes=(1, 2), reshape=False, order=0)
-    assert (turned == 0).mean() > 0.4
-    assert not is_ultrasound(Volume(turned, np.eye(4)))
-
-
-@pytest.mark.parametrize("axis, half, end", [(1, 1, "back"), (2, 0, "right"), (0, 0, "top")])
-def test_where_a_head_is_cut_is_found_in_any_order_of_its_axes(head, axis, half, end):
-    mri = head[0]
-    n = mri.array.shape[axis] // 2
-    part = np.take(mri.array, np.arange(n) if half == 0 else np.arange(n, mri.array.shape[axis]), axis)
-    cut = Volume(part, mri.ijk_to_ras)
-    assert cut_ends(cut) == (end,)
-    emptied = np.zeros_like(mri.array)
-    emptied[(slice(None),) * axis + (slice(None, n) if half == 0 else slice(n, None),)] = part
-    assert cut_ends(mri.with_array(emptied)) == (end,)
-    assert cut_ends(Volume.from_sitk(sitk.DICOMOrient(cut.to_sitk(), "PIR"), "turned")) == (end,)
-
-
-@pytest.mark.slow
-@needs_nilearn
-def test_a_stripped_brain_that_lies_unlike_its_header_is_refused(head):
-    stripped = np.where(head[1], head[0].array, 0.0)
-    assert find_brain(head[0].with_array(stripped)).method == "stripped"
-    with pytest.raises(SimulationError, match="its face is where the header says back"):
-        find_brain(head[0].with_array(np.flip(stripped, 1).copy()))
-
-
 def test_a_tiny_object_is_too_small_for_a_head():
     mri = head_mri(3.0)
     with pytest.raises(SimulationError, match="too little for a head; correct the voxel size"):
@@ -288,13 +174,6 @@ def test_a_small_head_on_zeros_is_not_taken_for_a_stripped_brain(head):
     assert stripped_brain(brain) is not None
 
 
-def test_half_a_brain_is_called_so(head):
-    image, brain = head
-    left = brain & (np.arange(image.array.shape[2]) < np.median(np.nonzero(brain)[2]))
-    with pytest.raises(SimulationError, match="too little for a whole brain: it may be half a brain"):
-        find_brain(image.with_array(np.where(left, image.array, 0.0)))
-
-
 def test_a_body_is_refused_at_once():
     """Not searched for a brain, which takes longer the more there is."""
     k, j, i = np.indices((40, 30, 44))
@@ -307,9 +186,9 @@ def test_a_body_is_refused_at_once():
 
 @needs_nilearn
 @pytest.mark.slow
-def test_a_turned_head_is_refused_with_where_its_top_is(head):
+def test_a_turned_head_is_refused(head):
     turned = Volume(np.ascontiguousarray(np.swapaxes(head[0].array, 0, 1)), head[0].ijk_to_ras)
-    message = "its top is where the header says front.*correct the orientation in its header"
+    message = "no head or brain is recognised in this .* correct the orientation or the voxel size in its header"
     with pytest.raises(SimulationError, match=message) as caught:
         find_brain(turned)
     assert "--skull-strip none" not in str(caught.value)
@@ -334,39 +213,6 @@ def test_a_ct_head_whose_air_is_0_is_told_from_an_mri_by_its_flat_brain(head, fo
     recognition._head(mri, CoarseImage.of(mri), found.alignment)  # the MRI is taken
     with pytest.raises(SimulationError, match=r"brain in this head differ by \d%, as in CT, expected 10% or more"):
         recognition._head(ct, CoarseImage.of(ct), found.alignment)
-
-
-@needs_nilearn
-@pytest.mark.slow
-def test_a_windowed_ct_is_refused_if_its_brain_is_dark_else_a_warning(head, found):
-    """A brain was looked for in it, for two minutes."""
-    mri, inside = head
-    rng = np.random.default_rng(0)
-    skull = ndimage.binary_dilation(inside, iterations=5) & ~inside
-    for level, is_refused in ((30.0, True), (600.0, False)):
-        array = np.where(
-            inside, level * (1.0 + 0.002 * mri.array), np.where(skull, 3000.0, np.where(mri.array > 30, level, 0.0))
-        )
-        ct = mri.with_array(np.clip(array + rng.normal(0, 6, array.shape), 0, None).astype(np.float32))
-        if is_refused:
-            with pytest.raises(SimulationError, match=r"as dark as the air around it, as in a CT that .* with --ct"):
-                recognition._head(ct, CoarseImage.of(ct), found.alignment)
-        else:
-            (line,) = recognition._head(ct, CoarseImage.of(ct), found.alignment).warnings
-            assert line.startswith("what lies around the brain is brighter than the brain, as the bone of a CT is")
-    assert recognition._head(mri, CoarseImage.of(mri), found.alignment).warnings == ()
-
-
-def test_a_ct_whose_air_was_set_to_0_is_not_asked_for_a_dark_background():
-    axis = np.arange(-100.0, 100.0, 3.0)
-    z, y, x = np.meshgrid(axis, axis, axis, indexing="ij")
-    r = np.sqrt(x**2 + (0.8 * y) ** 2 + z**2)
-    array = np.select([r < 62, r < 70, r < 72, r < 78], [35.0, 1100.0, -600.0, -100.0], 0.0)
-    noisy = array + np.where(r < 78, np.random.default_rng(0).normal(0, 8, r.shape), 0.0)
-    with pytest.raises(
-        SimulationError, match=r"values from -\d+, as the fat and air of a CT .* with --ct \(contrast ct\)"
-    ):
-        find_brain(Volume(noisy.astype(np.float32), np.diag([3.0, 3.0, 3.0, 1.0])))
 
 
 # ---- extraction ------------------------------------------------------------------------------------------------------
@@ -542,7 +388,7 @@ def test_an_edited_kept_mask_is_checked_as_one_that_is_given(edit, head, found, 
         used = find_brain(head[0], keep_at=path)
         assert used.volume_ml == pytest.approx((mask > 0).sum() * head[0].voxel_ml, rel=0.05)
         return
-    with pytest.raises(SimulationError, match=r"head.brain-mask.nrrd covers.*or delete it"):
+    with pytest.raises(SimulationError, match=r"head.brain-mask.nrrd has .* covers 100% .*or delete it"):
         find_brain(head[0], keep_at=path)
 
 
@@ -622,52 +468,6 @@ def test_a_mask_that_cuts_the_vertex_is_reported_and_a_whole_one_is_not(head, fo
     cut[: (top + np.flatnonzero(whole.any(axis=(1, 2))).min()) // 2] = False
     (warning,) = cut_off(mri, cut)
     assert "at the bottom; check the cortex there" in warning
-
-
-@needs_nilearn
-@pytest.mark.long
-def test_masks_that_take_in_skull_or_lie_below_the_cortex_are_reported(head):
-    mri, brain = head
-    distance = refinement.signed_distance(brain, mri.spacing_mm, 25.0)
-
-    def doubts(from_mm):
-        return given_brain(mri.with_array((distance < from_mm).astype(np.uint8)), mri).warnings
-
-    assert doubts(0.0) == doubts(2.0) == ()
-    wide = doubts(8.0)
-    reach = [line for line in wide if "beyond the surface of the brain" in line]
-    (number,) = [int(line.split("reaches ")[1].split(" mm")[0]) for line in reach]
-    assert abs(number - 8) <= 1
-    assert not any("cortex" in line for line in wide)
-    below = [line for line in doubts(-5.0) if "ends in tissue as bright as the brain" in line]
-    assert len(below) == 1 and "all around; check the cortex" in below[0]
-
-
-@needs_nilearn
-@pytest.mark.long
-def test_a_shifted_or_turned_mask_is_called_so(head):
-    mri, brain = head
-    step = round(20.0 / mri.spacing_mm[0])
-    for moved in (np.roll(brain, step, axis=2), np.rot90(brain, axes=(0, 1))[: len(brain)]):
-        mask = np.zeros(brain.shape, np.uint8)
-        part = tuple(map(slice, np.minimum(moved.shape, brain.shape)))
-        mask[part] = moved[part]
-        given = given_brain(mri.with_array(mask), mri)
-        (line,) = [line for line in given.warnings if "of the mask lie outside the brain that the atlas finds" in line]
-        assert "shifted or turned" in line and not any("cortex" in line for line in given.warnings)
-        assert given.takes_in_more
-    tight = refinement.signed_distance(brain, mri.spacing_mm, 25.0) < -5.0
-    assert not given_brain(mri.with_array(tight.astype(np.uint8)), mri).takes_in_more
-
-
-@pytest.mark.slow
-@needs_nilearn
-def test_a_mask_without_the_ventricles_is_reported(head):
-    mri, brain = head
-    depth = refinement.signed_distance(brain, mri.spacing_mm, 25.0)
-    hollow = brain & (depth > -35.0)
-    lines = [line for line in given_brain(mri.with_array(hollow.astype(np.uint8)), mri).warnings if "deep" in line]
-    assert len(lines) == 1 and "a brain mask includes the CSF" in lines[0]
 
 
 @needs_nilearn
@@ -781,16 +581,6 @@ def test_a_program_that_is_not_installed_is_an_error_first(monkeypatch):
             find_brain(mri, method)
 
 
-def test_a_lesion_given_as_the_brain_is_refused():
-    """Else the simulation would show a lesion in water."""
-    mri = head_mri(4.0)
-    lesion = np.zeros(mri.array.shape, np.uint8)
-    lesion[tuple(slice(n // 2 - 2, n // 2 + 2) for n in lesion.shape)] = 1
-    message = r"mask has 4.1 ml, 0.\d% of what .* \(1000 to 1900 ml.*--add tumour=FILE"
-    with pytest.raises(SimulationError, match=message):
-        segment_mri(mri, mask=mri.with_array(lesion))
-
-
 def test_masks_of_an_infant_of_a_part_and_of_a_small_image_are_taken():
     def of(millilitres, box_mm):
         """A ball of so many ml in a noisy cube, without whole heads' surroundings."""
@@ -804,8 +594,7 @@ def test_masks_of_an_infant_of_a_part_and_of_a_small_image_are_taken():
         mri, mask = of(millilitres, box_mm)
         assert given_brain(mask, mri).volume_ml == pytest.approx(millilitres, rel=0.05)
     mri, mask = of(60.0, 160.0)
-    with pytest.raises(SimulationError, match=r"mask has \d+ ml, 1.5% of what the image shows"):
-        given_brain(mask, mri)
+    assert "the mask has 60" in given_brain(mask, mri).warnings[-1]
     stripped = mri.with_array(mri.array * mask.array)  # a small brain in a large empty box
     assert given_brain(mask, stripped).volume_ml == pytest.approx(60.0, rel=0.05)
 

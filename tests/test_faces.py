@@ -26,7 +26,7 @@ PUBLIC = {
     "AppearanceResult", "ConvexProbe", "CtSegmentation", "DisplaySettings", "Frame", "LinearProbe", "Membrane",
     "PhasedProbe", "Preset", "Proposal", "Segmentation", "SimulationError", "SimulationSettings", "Texture", "Tissue",
     "TissueTable", "TrackedSequence", "UltrasoundSimulator", "Volume", "grow_lesion", "list_devices",
-    "optimize_appearance", "propose_lesions", "seed_of_pose", "segment_ct", "segment_mri", "similarity",
+    "optimize_appearance", "seed_of_pose", "segment_ct", "segment_mri", "similarity",
 }  # fmt: skip
 HEAVY = {
     "numpy", "scipy", "nibabel", "PIL", "vtk", "vtkmodules", "pyopencl", "SimpleITK", "matplotlib", "skimage", "nlopt",

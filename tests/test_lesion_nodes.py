@@ -17,7 +17,6 @@ from SlicerUSSim.Logic.mrml.label_nodes import node_labels, read_labels, write_l
 from SlicerUSSim.Logic.mrml.lesion_nodes import add_lesion  # noqa: E402
 from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic  # noqa: E402
 from SlicerUSSim.Logic.mrml.nodes import write_volume  # noqa: E402
-from SlicerUSSim.Logic.tissue.label_advice import PAGE  # noqa: E402
 from SlicerUSSim.Widget.presenter import PanelPresenter  # noqa: E402
 from tests.conftest import rigid  # noqa: E402
 from tests.test_pathology import ball, empty, moved  # noqa: E402
@@ -186,22 +185,22 @@ def test_each_lesion_is_told_once_however_often_masks_are_added():
 
 
 def test_doubts_about_a_file_of_lesions_are_told_every_time():
-    """Of a BraTS map that was added as one tissue, in the words of the page, and not only when it was opened."""
+    """Of a BraTS map that was added as one tissue, and not only when it was opened."""
     bench = Scene()
     whole = replace(brats((1, 3, 2)), doubts=("brats3.nii.gz: 7 voxels are NaN",))
-    add_lesion(bench.lesions, whole, "tumour", "brats3.nii.gz", PAGE)
+    add_lesion(bench.lesions, whole, "tumour", "brats3.nii.gz")
     bench.logic.segment(bench.mri, bench.labels, lesions_node=bench.lesions)
     told = (
-        "brats3.nii.gz holds the labels 1, 2, 3; all of them are added as tumour ('labels by their names, or a BraTS "
-        "map' adds the tissues of a BraTS map)",
+        "brats3.nii.gz holds the labels 1, 2, 3; all of them are added as tumour (brats=FILE adds the tissues of "
+        "a BraTS map)",
         "brats3.nii.gz: 7 voxels are NaN",
     )
     assert set(told) <= set(bench.logic.warnings)
-    add_lesion(bench.lesions, whole, "tumour", "brats3.nii.gz", PAGE)  # again
+    add_lesion(bench.lesions, whole, "tumour", "brats3.nii.gz")  # again
     bench.logic.addTissues(bench.labels, bench.lesions)
     assert [bench.logic.warnings.count(line) for line in told] == [1, 1]
-    with pytest.raises(SimulationError, match=r"what it is: 'tumour', or 'necrosis' if it is BraTS's label 1$"):
-        add_lesion(bench.lesions, whole.with_array((whole.array == 1).astype(np.uint8)), "brats", "core", PAGE)
+    with pytest.raises(SimulationError, match=r"what it is: tumour=FILE, or necrosis=FILE if it is BraTS's label 1$"):
+        add_lesion(bench.lesions, whole.with_array((whole.array == 1).astype(np.uint8)), "brats", "core")
 
 
 # ---- labels that stay as they are ------------------------------------------------------------------------------------

@@ -12,7 +12,7 @@ from scipy import ndimage
 
 from SlicerUSSim.Command.cli import main
 from SlicerUSSim.Command.proposals import split_seeds, write_proposals
-from SlicerUSSim.Logic import Segmentation, SimulationError, Volume, grow_lesion, propose_lesions, segment_mri
+from SlicerUSSim.Logic import Segmentation, SimulationError, Volume, grow_lesion, segment_mri
 from SlicerUSSim.Logic.mri.atlas import mni152
 from SlicerUSSim.Logic.mri.lesions.growth import grow
 from SlicerUSSim.Logic.mri.lesions.proposal import Proposal
@@ -130,15 +130,6 @@ def test_a_point_in_a_ventricle_beside_what_enhances_is_refused():
     assert fluid.max() > 0.8
     with pytest.raises(SimulationError, match="fluid that looks like CSF"):
         grow_lesion(segmentation, beside)
-
-
-@needs_atlas
-@pytest.mark.slow
-def test_a_lesion_is_proposed_without_a_seed_and_none_in_a_healthy_brain():
-    segmentation, true = brain("low")
-    (proposal,) = propose_lesions(segmentation)
-    assert dice(core(proposal), true) >= 0.75
-    assert propose_lesions(brain("healthy")[0]) == ()
 
 
 @pytest.mark.slow

@@ -23,6 +23,7 @@ from SlicerUSSim.Logic.mrml.own_results import content_of  # noqa: E402
 from SlicerUSSim.Logic.mrml.share_nodes import read_shares  # noqa: E402
 from SlicerUSSim.Logic.mrml.taken_image import about_image, is_frozen, patient_of  # noqa: E402
 from SlicerUSSim.Logic.probe.arrays import PROBE_KINDS, PROBES, LinearProbe  # noqa: E402
+from SlicerUSSim.Logic.tissue.freesurfer import freesurfer_names  # noqa: E402
 from SlicerUSSim.Widget.interface import by_widget  # noqa: E402
 from SlicerUSSim.Widget.presenter import PanelPresenter  # noqa: E402
 from SlicerUSSim.Widget.sections import panel_sections  # noqa: E402
@@ -256,39 +257,43 @@ def test_only_values_of_the_chosen_transmission_are_offered(presenter):
 
 def test_the_notes_say_what_the_shown_labels_were_recognised_as(presenter):
     """They stayed those of the segmentation before; what labels are was in the log alone."""
-    from tests.test_label_places import kept, whole_head
+    from tests.test_label_maps import ASEG, freesurfer
 
     presenter.segmenting.segment()
     presenter.images.simulate()
     assert presenter.notes.text().startswith("Head:") and not presenter.view.errors
     scene = presenter.logic.scene
-    for name, volume in (("aseg", whole_head()), ("half", kept(whole_head(), 1, -80, 0))):
+    for name, volume in (("aseg", freesurfer(ASEG)), ("mirrored", freesurfer(ASEG, mirrored=True))):
         node = scene.AddNewNodeByClass("vtkMRMLLabelMapVolumeNode", name)
         write_volume(node, volume)
         presenter.logic.parameters.labels = node
         presenter.images.simulate()
         assert presenter.notes.text().startswith(f"{name}: FreeSurfer"), presenter.notes.text()
-    assert "cut off at the front" in presenter.notes.text() and not presenter.view.errors
+    assert "labels of the left side are on the right" in presenter.notes.text() and not presenter.view.errors
     presenter.images.simulate()
-    assert presenter.notes.text().startswith("half:")
+    assert presenter.notes.text().startswith("mirrored:")
 
 
 def test_lesions_leave_the_checks_of_the_tissues_under_them_in_the_notes(presenter):
-    """The line that half of the brain is missing was gone when a tumour had been laid over the tissues."""
-    from tests.test_label_places import kept, whole_head
+    """The line about the sides of the brain was gone when a tumour had been laid over the tissues."""
+    from tests.test_label_maps import head as head_of_freesurfer
 
     scene, parameters = presenter.logic.scene, presenter.logic.parameters
-    half = kept(whole_head(), 1, -80, 0)
-    parameters.labels = scene.AddNewNodeByClass("vtkMRMLLabelMapVolumeNode", "half")
-    write_volume(parameters.labels, half)
+    whole = head_of_freesurfer()
+    labels, numbers = np.unique(whole.array, return_inverse=True)
+    names = [freesurfer_names()[int(label)] for label in labels[1:]]
+    whole = whole.with_array(numbers.reshape(whole.array.shape).astype(np.uint8))
+    mirrored = whole.with_array(np.flip(whole.array, 2).copy())
+    parameters.labels = scene.AddNewNodeByClass("vtkMRMLLabelMapVolumeNode", "mirrored")
+    write_labels(parameters.labels, mirrored, names, parameters.mri)
     presenter.images.simulate()
-    checks = [line for line in presenter.notes.text().splitlines() if "cut off at the front" in line]
+    checks = [line for line in presenter.notes.text().splitlines() if "labels of the left side" in line]
     assert len(checks) == 1
-    mask = np.zeros(half.array.shape, np.uint8)
-    centre = np.argwhere(half.array > 0).mean(axis=0).astype(int)
+    mask = np.zeros(mirrored.array.shape, np.uint8)
+    centre = np.argwhere(mirrored.array > 0).mean(axis=0).astype(int)
     mask[tuple(slice(at - 3, at + 4) for at in centre)] = 1
     parameters.lesions = scene.AddNewNodeByClass("vtkMRMLSegmentationNode", "Lesions")
-    add_lesion(parameters.lesions, half.with_array(mask), "tumour", "tumour.nii.gz")
+    add_lesion(parameters.lesions, mirrored.with_array(mask), "tumour", "tumour.nii.gz")
     for _ in range(2):
         presenter.lesions.addTissues()
         lines = presenter.notes.text().splitlines()
@@ -296,7 +301,7 @@ def test_lesions_leave_the_checks_of_the_tissues_under_them_in_the_notes(present
         presenter.images.simulate()
         assert presenter.notes.text().splitlines() == lines
     parameters.labels = scene.AddNewNodeByClass("vtkMRMLLabelMapVolumeNode", "whole")
-    write_volume(parameters.labels, whole_head())
+    write_labels(parameters.labels, whole, names, parameters.mri)
     presenter.lesions.addTissues()  # over the tissues of another patient, which were not simulated yet
     assert "tumour: " in presenter.notes.text() and checks[0] not in presenter.notes.text()
 

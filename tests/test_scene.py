@@ -351,7 +351,7 @@ def test_segment_names_choose_tissues_and_those_nobody_knows_are_listed(bench):
     table = bench.logic.tissues(segmentation)
     assert [table[n].name for n in (1, 2)] == ["white matter", "tumour"]
     segmentation.GetSegmentation().GetNthSegment(1).SetName("Segment_2")
-    with pytest.raises(SimulationError, match=r"'painted': no tissue is called 'Segment_2'; rename to one of: speckle"):
+    with pytest.raises(SimulationError, match=r"'painted': no tissue is called 'Segment_2' .*to one of: speckle"):
         bench.logic.simulate(segmentation, bench.probe, bench.image)
     segmentation.GetSegmentation().GetNthSegment(1).SetName("Speckle")  # a tissue of the preset, before all others
     assert bench.logic.tissues(segmentation)[2].name == "speckle"
@@ -367,7 +367,7 @@ def test_label_maps_of_other_programs_are_recognised_and_masks_refused(bench):
     table = bench.logic.tissues(aseg)
     assert [table[n].name for n in (1, 2, 3)] == ["white matter", "grey matter", "csf"]
     write_volume(mask, Volume((array > 0).astype(np.uint8), np.eye(4)))
-    with pytest.raises(SimulationError, match=r"'mask': a binary mask .*; add it to a segmentation as a segment"):
+    with pytest.raises(SimulationError, match=r"'mask': a binary mask .*in 3D Slicer, add it as a segment"):
         bench.logic.tissues(mask)
     lesion = add(bench.scene, "Segmentation", "painted")
     write_labels(lesion, Volume((array > 0).astype(np.uint8), np.eye(4)), ("tumour",), bench.grid())
@@ -404,7 +404,7 @@ def test_labels_without_names_follow_the_tissues_that_have_their_numbers(bench):
     bench.logic.simulate(labels, bench.probe, bench.image)
     np.testing.assert_array_equal(pixels(bench.image), expected(ABOVE))
     bench.logic.preset = replace(PRESET, tissues=TissueTable({0: FLUID, 2: SPECKLE, 3: FLUID}))
-    with pytest.raises(SimulationError, match=r"label 1 fills 98% .*colours with the name of its tissue"):
+    with pytest.raises(SimulationError, match=r"no tissue is called label 1 .*names of segments, to one of"):
         bench.logic.tissues(labels)
     bench.logic.preset = replace(PRESET, tissues=TissueTable({0: FLUID, 1: FLUID, 2: SPECKLE}))
     assert [bench.logic.tissues(labels)[n].name for n in (1, 2)] == ["fluid", "speckle"]

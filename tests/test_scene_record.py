@@ -195,22 +195,22 @@ def test_a_file_of_values_calls_nothing():
         read_values(io.BytesIO(pickle.dumps(Bad())))
 
 
-def test_images_of_a_sequence_and_a_proposal_there_and_back():
+def test_images_of_a_sequence_and_lesions_there_and_back():
     logic = segmented()
     parameters, scene = logic.parameters, logic.scene
     images = simulated_sequence(logic)
     mri = head_mri(4.0)
     mask = np.zeros(mri.array.shape, np.uint8)
     mask[20:23, 20:25, 20:24] = 1
-    proposal = add(scene, "Segmentation", "Lesion proposal")
-    add_lesion(proposal, mri.with_array(mask), "tumour", "tumour")
-    parameters.proposal = proposal
+    lesions = add(scene, "Segmentation", "Lesions")
+    add_lesion(lesions, mri.with_array(mask), "tumour", "tumour")
+    parameters.lesions = lesions
     before = record_scene(scene)
     assert before.simulated is not None and before.size > sum(image.nbytes for image in before.simulated.images)
     record = written_and_read(before)
     other = UltrasoundSceneLogic(slicer.vtkMRMLScene())
     made = put_nodes(other.scene, record)
-    segmentation = made["proposal"].GetSegmentation()
+    segmentation = made["lesions"].GetSegmentation()
     assert segmentation.GetNumberOfSegments() == 1 and segmentation.GetNthSegment(0).GetName() == "tumour"
     sequence = put_taken(other.scene, record.simulated)
     for number in range(2):

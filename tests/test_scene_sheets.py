@@ -1,4 +1,4 @@
-"""Sheets, organs of a CT and proposals of lesions in a scene, as module and page have them."""
+"""Sheets, organs of a CT and grown lesions in a scene, as module and page have them."""
 
 from __future__ import annotations
 
@@ -186,10 +186,10 @@ def test_organs_without_names_are_read_by_totalsegmentators_numbers():
     assert "taken for the numbers of TotalSegmentator CT (2 kidney right" in found.taken_for
 
 
-# ---- lesions that are proposed ---------------------------------------------------------------------------------------
+# ---- lesions that are grown ------------------------------------------------------------------------------------------
 
 
-def proposing() -> tuple[Scene, object, np.ndarray]:
+def growing() -> tuple[Scene, object, np.ndarray]:
     """A scene whose MRI was segmented, with a tumour at CENTRE; its (k, j, i) voxels."""
     segmentation, true = brain("low")
     bench = Scene("LabelMapVolume")
@@ -201,37 +201,33 @@ def proposing() -> tuple[Scene, object, np.ndarray]:
 
 
 @needs_atlas
-def test_a_point_in_a_view_proposes_a_lesion_that_is_laid_on_when_accepted():
-    bench, presenter, true = proposing()
-    parameters = bench.logic.parameters
-    assert presenter.lesions.canPropose() == (False, "Segment this MRI first")
-    presenter.lesions.pickSeed()
+def test_a_point_in_a_view_grows_a_lesion_that_is_removed_or_laid_on():
+    bench, presenter, true = growing()
+    parameters, lesions = bench.logic.parameters, presenter.lesions
+    assert lesions.canGrow() == (False, "Segment this MRI first")
+    lesions.pickSeed()
     assert "segment this MRI first" in presenter.view.errors.pop()
-    bench.logic.proposals.segmented(bench.mri, brain("low")[0])
-    assert presenter.lesions.canPropose()[0] and presenter.lesions.canProposeAtPoint() == (
-        False,
-        "Choose a point in the lesion",
-    )
-    presenter.lesions.pickSeed()
+    bench.logic.growth.segmented(bench.mri, brain("low")[0])
+    assert lesions.canGrow()[0] and lesions.canGrowAtPoint() == (False, "Choose a point in the lesion")
+    lesions.pickSeed()
     node, picked = presenter.view.picking
-    assert node is parameters.seed and not presenter.lesions.canAccept()[0]
+    assert node is parameters.seed and not lesions.canRemove()[0]
     node.AddControlPointWorld(0.0, 0.0, 300.0)
     picked()
     assert "300" not in presenter.notes.text() and "mm outside the image" in presenter.view.errors.pop()
-    assert parameters.proposal is None
+    assert parameters.lesions is None
     node.AddControlPointWorld(*CENTRE)
     picked()
-    assert not presenter.view.errors and parameters.proposal is not None and presenter.lesions.canAccept()[0]
-    assert "proposal: tumour" in presenter.notes.text() and "accept or discard it" in presenter.notes.text()
-    assert parameters.proposal.GetDisplayNode().GetVisibility()
+    grown = parameters.lesions.GetSegmentation()
+    assert not presenter.view.errors and list(grown.GetSegmentIDs()) and lesions.canRemove()[0]
+    assert "grown: tumour" in presenter.notes.text() and "add it to the tissues" in presenter.notes.text()
+    assert parameters.lesions.GetDisplayNode().GetVisibility()
     with pytest.raises(ValueError, match="not in tuple"):  # nothing is laid over the tissues
         bench.voxels("tumour", parameters.labels)
-    first = parameters.proposal
-    presenter.lesions.discardProposal()
-    assert parameters.proposal is None and first.GetScene() is None and "proposal: " not in presenter.notes.text()
-    presenter.lesions.proposeAtPoint()
-    presenter.lesions.acceptProposal()
-    assert not presenter.view.errors and parameters.proposal is None and "proposal: " not in presenter.notes.text()
+    lesions.removeGrown()
+    assert not list(grown.GetSegmentIDs()) and not lesions.canRemove()[0] and "grown: " not in presenter.notes.text()
+    lesions.growAtPoint()
+    lesions.addTissues()
+    assert not presenter.view.errors and "grown: " not in presenter.notes.text()
     laid = bench.voxels("tumour", parameters.labels)
     assert 0.6 * true.sum() < laid < 1.4 * true.sum()
-    assert list(parameters.lesions.GetSegmentation().GetSegmentIDs())

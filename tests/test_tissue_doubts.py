@@ -13,13 +13,12 @@ from scipy import ndimage
 from SlicerUSSim.Logic import SimulationError, segment_mri
 from SlicerUSSim.Logic.mri.classification import Classes
 from SlicerUSSim.Logic.mri.plausibility import (
-    brighter_than_tissue,
     csf_is_doubtful,
     faint,
     require_order,
     require_several_tissues,
 )
-from validation.brain_phantoms import TissueMaps, phantom, tissue_maps, with_ring_tumour
+from validation.brain_phantoms import TissueMaps, phantom, tissue_maps
 from validation.brain_scores import scores
 
 
@@ -29,36 +28,6 @@ def brain() -> TissueMaps:
     if maps is None:
         pytest.skip("nilearn, which carries MNI152, is not installed")
     return maps.coarser(2)
-
-
-@pytest.mark.slow
-def test_a_rim_that_enhances_in_a_t1_without_contrast_agent_is_reported():
-    case = phantom(with_ring_tumour(brain()), "t1gd", bias=0.0)
-    told = segment_mri(case.mri, contrast="t1", mask=case.mask, thin_sulci=False).warnings
-    assert any("--contrast t1gd" in line for line in told)
-    assert not any(
-        "t1gd" in line for line in segment_mri(case.mri, contrast="t1gd", mask=case.mask, thin_sulci=False).warnings
-    )
-
-
-@pytest.mark.slow
-def test_a_t1_in_which_nothing_enhances_is_not_after_contrast_agent():
-    case = phantom(brain(), "t1")
-    told = segment_mri(case.mri, contrast="t1gd", mask=case.mask, thin_sulci=False).warnings
-    assert any("of the brain enhance, expected 0.05% or more" in line and "choose t1 instead" in line for line in told)
-
-
-@pytest.mark.slow
-def test_a_healthy_t1_is_not_taken_for_one_with_contrast_agent():
-    case = phantom(brain(), "t1", noise=0.07)
-    assert not segment_mri(case.mri, contrast="t1", mask=case.mask, thin_sulci=False).warnings
-
-
-def test_bright_pieces_smaller_than_2_ml_are_no_contrast_agent():
-    image, inside = np.full((20, 30, 30), 100.0), np.ones((20, 30, 30), bool)
-    image[2:12, 2:12, 2:12] = image[14:, 14:, 14:24] = 300.0  # 1.0 and 0.96 ml
-    assert not brighter_than_tissue(image, inside, 80.0, 100.0, voxel_ml=0.001, contrast="t1")
-    assert "2.0 ml" in brighter_than_tissue(image, inside, 80.0, 100.0, voxel_ml=0.002, contrast="t1")[0]
 
 
 @pytest.mark.slow

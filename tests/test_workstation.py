@@ -743,7 +743,7 @@ def test_a_craniotomy_is_opened_and_closed_in_the_page(browser, tmp_path):
 
 @needs_atlas
 @pytest.mark.long
-def test_a_click_proposes_a_lesion_and_accept_adds_it_to_the_tissues(browser, tmp_path):
+def test_a_click_grows_a_lesion_that_is_added_to_the_tissues(browser, tmp_path):
     maps = with_low_grade_tumour(required(tissue_maps("mni152"), "no atlas"), CENTRE, 14.0).coarser(2)
     image = phantom(maps, "flair", noise=0.03, bias=0.0)
     image.mri.write(tmp_path / "flair.nii.gz")
@@ -754,7 +754,7 @@ def test_a_click_proposes_a_lesion_and_accept_adds_it_to_the_tissues(browser, tm
         settled(page)
         open_section(page, "Lesions")
         before = shown(page, "notesLabel")
-        assert page.locator("#acceptProposalButton").is_disabled()
+        assert page.locator("#removeGrownButton").is_disabled()
         axial = views(page)[3]
         click(page, "#pickSeedButton")
         settled(page)  # the next live image may replace what the status says
@@ -763,22 +763,22 @@ def test_a_click_proposes_a_lesion_and_accept_adds_it_to_the_tissues(browser, tm
         eventually(page, lambda: bool(errors(page)))
         assert re.search(r"mm outside the (brain|image)", errors(page)[0]), errors(page)
         page.evaluate("window.trame.trigger('dismiss', [0])")
-        assert shown(page, "proposalSelector") is None and shown(page, "notesLabel") == before
+        assert shown(page, "lesionsSelector") is None and shown(page, "notesLabel") == before
         click(page, "#pickSeedButton")
         settled(page)  # the next live image may replace what the status says
         pose_before = pose(page)
         with heard(page):
             page.mouse.click(*in_view(axial, 0.352, 0.507))
-        eventually(page, lambda: "proposal: tumour" in shown(page, "notesLabel"))
+        eventually(page, lambda: "grown: tumour" in shown(page, "notesLabel"))
         settled(page)
-        assert not errors(page) and pose(page) == pose_before and shown(page, "lesionsSelector") is None
+        assert not errors(page) and pose(page) == pose_before
         drawn(page)
         seen = picture(page, required(axial.bounding_box(), "no view"))
         assert (seen[..., 1] - seen[..., 0] > 15).sum() > 500  # it is shown, green
-        click(page, "#acceptProposalButton")
+        click(page, "#addTissuesButton")
         eventually(page, lambda: "added over" in shown(page, "notesLabel"))
         settled(page)
-        assert not errors(page) and page.locator("#acceptProposalButton").is_disabled()
+        assert not errors(page)
         assert "tumour" in [row["name"] for row in state(page, NAMES.panel.tissues)]
         page.close()
 

@@ -90,12 +90,12 @@ class Craniotomy:
         if outside:
             return
         from SlicerUSSim.Logic.mri.outside import require_findable
-        from SlicerUSSim.Logic.mri.recognition import is_stripped
+        from SlicerUSSim.Logic.mri.recognition import stripped_brain
 
         given = f"--craniotomy is {self.text}"
         nothing = "a brain without its skull, which has nothing to open; leave --craniotomy out"
         require(mri is not None, f"{given}, and the demo is {nothing}")
-        require(mri is None or not is_stripped(mri), f"{given}, and the image shows {nothing}")
+        require(mri is None or stripped_brain(mri) is None, f"{given}, and the image shows {nothing}")
         try:
             require_findable(contrast, skull_strip, has_mask)
         except SimulationError as error:

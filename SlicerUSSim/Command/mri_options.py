@@ -123,15 +123,12 @@ def _read_organs(path: str, maps: Iterable[str]) -> LabelledTissues:
     import logging
 
     from SlicerUSSim.Logic.base.volume import Volume
-    from SlicerUSSim.Logic.tissue.label_advice import ORGANS_COMMAND
     from SlicerUSSim.Logic.tissue.label_mapping import LabelMapping
     from SlicerUSSim.Logic.tissue.label_sources import read_label_file
     from SlicerUSSim.Logic.tissue.table import TissueTable
 
     table = TissueTable({})
-    found = read_label_file(
-        Path(path), Volume.read(path), LabelMapping.of(maps, table), default=table, of_ct=True, advice=ORGANS_COMMAND
-    )
+    found = read_label_file(Path(path), Volume.read(path), LabelMapping.of(maps, table), default=table, of_ct=True)
     if not found.others:
         note(f"{path}: {found.message}")
     for warning in found.warnings:
@@ -154,8 +151,7 @@ def read_mri(
     from SlicerUSSim.Logic.base.errors import about_file
     from SlicerUSSim.Logic.base.volume import Volume
     from SlicerUSSim.Logic.mri.recognition import check_finite
-    from SlicerUSSim.Logic.tissue.label_advice import MRI_COMMAND, SERVE_COMMAND
-    from SlicerUSSim.Logic.tissue.label_findings import MOST_LABELS, NoPatientError
+    from SlicerUSSim.Logic.tissue.label_findings import NoPatientError
     from SlicerUSSim.Logic.tissue.label_sources import is_label_file, read_label_file
 
     require_no_sequence(path)
@@ -167,7 +163,7 @@ def read_mri(
     if is_label_file(Path(path), volume):
         used_by = f"--labels {path}" if is_served else f"ussim simulate {path} ..."
         try:
-            found = read_label_file(Path(path), volume, advice=SERVE_COMMAND if is_served else MRI_COMMAND)
+            found = read_label_file(Path(path), volume)
         except NoPatientError:  # says how to add it
             raise
         except SimulationError as error:
@@ -175,8 +171,6 @@ def read_mri(
                 raise
             count = np.unique(volume.array[volume.array != 0]).size
             remedy = f"use it as it is ({used_by}), which says what its labels need"
-            if count > MOST_LABELS:
-                remedy += "; if these are intensities of an MRI, its file may be incomplete"
             raise SimulationError(f"{path}: is a label map ({count} labels), expected an MRI; {remedy}") from error
         raise SimulationError(
             f"{path}: is a label map ({found.message}), expected an MRI; use it as it is ({used_by}), or segment it "

@@ -327,12 +327,12 @@ def _placed(
 
 def _say_bone(placed: _Placed, added: Added, tissues: TissueTable, preset: Preset, craniotomy: Craniotomy) -> None:
     """Say that the skull before the probe is closed, or that its face does not fit the opening."""
-    from SlicerUSSim.Logic.placement.bone_before_probe import COMMAND, about_bone
+    from SlicerUSSim.Logic.placement.bone_before_probe import about_bone
 
     if placed.probe_to_ras is not None:
         for line in about_bone(
             placed.labels, added.tissue_names, tissues.all_tissues(), preset.probe, placed.probe_to_ras,
-            is_open=craniotomy.is_wanted, words=COMMAND,
+            is_open=craniotomy.is_wanted,
         ):  # fmt: skip
             note(line)
 

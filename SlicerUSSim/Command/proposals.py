@@ -1,4 +1,4 @@
-"""--seed and --propose: lesions proposed from the MRI, written as masks for --add."""
+"""--seed: lesions grown from points of the MRI, written as masks for --add."""
 
 from __future__ import annotations
 
@@ -19,17 +19,12 @@ if TYPE_CHECKING:
 
 seed_option = click.option(
     "--seed", "seeds", multiple=True, metavar="R,A,S|FILE[=TISSUE]",
-    help="Propose the lesion around a point, RAS mm in the frame of the MRI, or around each point of a file of 3D "
+    help="Grow the lesion around a point, RAS mm in the frame of the MRI, or around each point of a file of 3D "
     "Slicer (.mrk.json, .fcsv): masks beside the labels, which stay as they are; --add lays them over. With a tissue "
     "(tumour, oedema, necrosis, cyst, haematoma, cavity, enhancing) it is proposed as that, also where it looks like "
     "a vessel, a ventricle or the other side; not where it has no border or looks as that tissue cannot. May be "
     "repeated.",
 )  # fmt: skip
-propose_option = click.option(
-    "--propose",
-    is_flag=True,
-    help="Propose what looks like a lesion in a whole brain in the same way, without a point.",
-)
 
 
 def split_seeds(texts: Iterable[str]) -> list[tuple[tuple[float, ...], str | None]]:
@@ -89,12 +84,11 @@ def require_seeds(seeds: Iterable[str], mri: Volume, labels_path: Path) -> None:
     check_outputs(*proposals_beside(labels_path))
 
 
-def find_proposals(segmentation: Segmentation, seeds: Iterable[str], propose: bool) -> tuple[list[Proposal], list[str]]:
-    """(the lesions around seeds, and with `propose` those that are found without one; a line for each refused seed).
+def grown_at(segmentation: Segmentation, seeds: Iterable[str]) -> tuple[list[Proposal], list[str]]:
+    """(the lesions around seeds, a line for each refused seed).
 
     Writes nothing. A refused seed is in what is no lesion.
     """
-    from SlicerUSSim.Logic.mri.lesions.detection import propose_lesions
     from SlicerUSSim.Logic.mri.lesions.seeded import grow_lesion
 
     proposals, refused = [], []
@@ -103,11 +97,6 @@ def find_proposals(segmentation: Segmentation, seeds: Iterable[str], propose: bo
             proposals.append(grow_lesion(segmentation, point, tissue))
         except SimulationError as error:
             refused.append(_with_how(str(error)))
-    if propose:
-        found = propose_lesions(segmentation)
-        proposals += [new for new in found if not any(new.is_mostly_in(old) for old in proposals)]
-        if not found:
-            note("no lesion proposed: nothing compact in this brain looks unlike the other hemisphere")
     return proposals, refused
 
 

@@ -14,8 +14,7 @@ from SlicerUSSim.Command.options import check_outputs, ct_option, device_option,
 from SlicerUSSim.Command.patient_options import map_option
 from SlicerUSSim.Command.progress import note
 from SlicerUSSim.Command.proposals import (
-    find_proposals,
-    propose_option,
+    grown_at,
     require_none_refused,
     require_seeds,
     seed_option,
@@ -44,14 +43,13 @@ from SlicerUSSim.Logic.mri.segmentation_settings import CT, SegmentationSettings
 @map_option
 @add_option
 @seed_option
-@propose_option
 @sheets_option
 @sheet_kind_option
 @overwrite_option
 @device_option
 def segment(
     mri: str, out: Path, settings: SegmentationSettings, mask: str | None, also: tuple[str, ...],
-    organs: str | None, maps: tuple[str, ...], additions: tuple[str, ...], seeds: tuple[str, ...], propose: bool,
+    organs: str | None, maps: tuple[str, ...], additions: tuple[str, ...], seeds: tuple[str, ...],
     sheets: Path | None, sheet_kinds: tuple[str, ...], device: str | None,
 ) -> None:  # fmt: skip
     """Segment an MRI of a head or a brain, or a CT (--ct), into tissues."""
@@ -70,8 +68,8 @@ def segment(
     split_seeds(seeds)
     masks = Additions.read(additions)
     volume = read_mri(mri, mask=mask, skull_strip=settings.skull_strip, contrast=settings.contrast)
-    if seeds or propose:
-        require(has_brain_mask(settings.contrast), "--seed and --propose look for lesions in an MRI, and this is a CT")
+    if seeds:
+        require(has_brain_mask(settings.contrast), "--seed grows lesions of an MRI, and this is a CT")
         require_seeds(seeds, volume, out)
     start = perf_counter()
     result = segmented_file(
@@ -79,7 +77,7 @@ def segment(
         tell_all=True,
     )  # fmt: skip
     seconds = perf_counter() - start
-    proposals, refused = find_proposals(result, seeds, propose) if isinstance(result, Segmentation) else ([], [])
+    proposals, refused = grown_at(result, seeds) if isinstance(result, Segmentation) else ([], [])
     labels, names = result.labels, result.tissue_names
     if sheets is not None and isinstance(result, Segmentation):
         labels, names = write_sheets(sheets, mri, volume, result, settings.contrast, sheet_kinds)

@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     from .imaging.preset import Preset as Preset
     from .imaging.simulator import UltrasoundSimulator as UltrasoundSimulator
     from .mri.ct import CtSegmentation as CtSegmentation, segment_ct as segment_ct
-    from .mri.lesions.detection import propose_lesions as propose_lesions
     from .mri.lesions.proposal import Proposal as Proposal
     from .mri.lesions.seeded import grow_lesion as grow_lesion
     from .mri.segmentation import Segmentation as Segmentation, segment_mri as segment_mri

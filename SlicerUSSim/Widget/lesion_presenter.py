@@ -1,4 +1,4 @@
-"""LesionPresenter: lesions over the tissues, and proposals of them, without Qt."""
+"""LesionPresenter: lesions over the tissues, and their growth from a point, without Qt."""
 
 from __future__ import annotations
 
@@ -11,15 +11,16 @@ from SlicerUSSim.Widget.interface import PanelHost
 from SlicerUSSim.Widget.notes import Notes, checks
 from SlicerUSSim.Widget.segment_presenter import SegmentPresenter
 
-#: Begin of the lines about a proposal
-_PROPOSED = "proposal: "
+#: Begin of the lines about what was grown last
+_GROWN = "grown: "
 
 
 class LesionPresenter:
-    """Lays lesions over the tissues; proposes, accepts and discards them."""
+    """Lays lesions over the tissues, and grows them from a point."""
 
     def __init__(self, panel: PanelHost, notes: Notes, segmenting: SegmentPresenter) -> None:
         self._panel, self._notes, self._segmenting = panel, notes, segmenting
+        self._grown: tuple[Any, list[str]] = (None, [])  # node and IDs of the segments that were grown last
 
     def canAddTissues(self) -> tuple[bool, str]:
         """(whether lesions can be laid over the tissues, the reason if not)"""
@@ -43,78 +44,63 @@ class LesionPresenter:
                 self._notes.checks = []
             with self._segmenting.replaceable(f"{before.GetName()} with lesions", before) as labels:
                 self._panel.logic.addTissues(before, parameters.lesions, labels)
+            self._notes.drop(_GROWN)
             self._notes.add(*self._notes.checks)
 
-    # ---- proposals ---------------------------------------------------------------------------------------------
+    # ---- growth from a point -----------------------------------------------------------------------------------
 
-    def canPropose(self) -> tuple[bool, str]:
-        """(whether lesions can be proposed on the MRI, the reason if not)"""
+    def canGrow(self) -> tuple[bool, str]:
+        """(whether a lesion can be grown on the MRI, the reason if not)"""
         can, why_not = self._segmenting.canSegment()
-        if can and not self._panel.logic.proposals.knows(self._panel.parameters.mri):
+        if can and not self._panel.logic.growth.knows(self._panel.parameters.mri):
             return False, "Segment this MRI first"
         return can, why_not
 
-    def canProposeAtPoint(self) -> tuple[bool, str]:
-        """(whether a lesion can be proposed at the point, the reason if not)"""
-        can, why_not = self.canPropose()
+    def canGrowAtPoint(self) -> tuple[bool, str]:
+        """(whether a lesion can be grown at the point, the reason if not)"""
+        can, why_not = self.canGrow()
         if can and self._panel.parameters.seed is None:
             return False, "Choose a point in the lesion"
         return can, why_not
 
-    def canAccept(self) -> tuple[bool, str]:
-        """(whether there is a proposal to accept or discard, the reason if not)"""
-        return self._panel.ready((self._panel.parameters.proposal, "There is no proposal"))
+    def canRemove(self) -> tuple[bool, str]:
+        """(whether the lesion that was grown last is there to be removed, the reason if not)"""
+        return self._panel.ready((bool(self._last_grown()), "No lesion was grown"))
 
     def pickSeed(self) -> None:
-        """Let the user show a point in the lesion in a view; then propose the lesion there."""
+        """Let the user show a point in the lesion in a view; then grow the lesion there."""
         parameters = self._panel.parameters
         with self._panel.acting():
             require(parameters.mri is not None, "no MRI chosen, expected the one with the lesion")
-            require(self._panel.logic.proposals.knows(parameters.mri), "segment this MRI first")
+            require(self._panel.logic.growth.knows(parameters.mri), "segment this MRI first")
             if parameters.seed is None:
                 parameters.seed = self._panel.add("MarkupsFiducial", "Lesion")
-            self._panel.view.pickPoint(parameters.seed, self.proposeAtPoint)
+            self._panel.view.pickPoint(parameters.seed, self.growAtPoint)
 
-    def proposeAtPoint(self) -> None:
-        """Propose the lesion around the last point of the chosen markups; nothing else is changed."""
-        parameters = self._panel.parameters
-        with self._panel.acting(), self._panel.working("Propose lesion"):
+    def growAtPoint(self) -> None:
+        """Add the lesion around the last point of the chosen markups to the lesions; the tissues stay as they are."""
+        parameters, growth = self._panel.parameters, self._panel.logic.growth
+        with self._panel.acting(), self._panel.working("Grow lesion"):
             tissue = None if parameters.panel.lesion_as == BY_LOOK else parameters.panel.lesion_as
             seed = required(parameters.seed, "no point chosen, expected one in the lesion")
-            self._show(self._panel.logic.proposals.growFrom(parameters.mri, seed, tissue))
-
-    def proposeLesions(self) -> None:
-        """Propose what looks like lesions in the MRI, without a point; nothing else is changed."""
-        with self._panel.acting(), self._panel.working("Propose lesions"):
-            self._show(self._panel.logic.proposals.propose(self._panel.parameters.mri))
-
-    def acceptProposal(self) -> None:
-        """Move what is proposed, as it was corrected, to the lesions, and lay these over the tissues."""
-        parameters = self._panel.parameters
-        with self._panel.acting():
-            proposal: Any = required(parameters.proposal, "there is no proposal")
             with self._panel.made(parameters.lesions, "Segmentation", "Lesions") as lesions:
-                self._panel.logic.proposals.confirm(proposal, lesions)
-            parameters.lesions, parameters.proposal = lesions, None
-            self._notes.drop(_PROPOSED)
-            if parameters.labels is not None:
-                self.layLesions()
+                self._grown = lesions, growth.growFrom(parameters.mri, seed, lesions, tissue)
+            parameters.lesions = lesions
+            if display_of(lesions) is not None:
+                display_of(lesions).SetVisibility(True)
+            after = f"look at {lesions.GetName()!r} over the MRI, and add it to the tissues, or remove it"
+            self._notes.say(_GROWN, *growth.notes, *checks(growth.warnings), after)
 
-    def discardProposal(self) -> None:
-        """Remove a proposal; nothing else is changed."""
+    def removeGrown(self) -> None:
+        """Take the segments that were grown last out of the lesions."""
         with self._panel.acting():
-            proposal = required(self._panel.parameters.proposal, "there is no proposal")
-            self._panel.parameters.proposal = None
-            self._panel.logic.scene.RemoveNode(proposal)
-            self._notes.drop(_PROPOSED)
+            for segment_id in self._last_grown():
+                self._grown[0].GetSegmentation().RemoveSegment(segment_id)
+            self._notes.drop(_GROWN)
 
-    def _show(self, node: Any) -> None:
-        """Choose a proposal, or none, and say what it is."""
-        proposals = self._panel.logic.proposals
-        self._panel.parameters.proposal = node
-        if node is not None and display_of(node) is not None:
-            display_of(node).SetVisibility(True)
-        lines = [*proposals.notes, *checks(proposals.warnings)]
-        if node is not None:
-            lines.append(f"look at {node.GetName()!r} over the MRI, correct it, and accept or discard it")
-        self._notes.say(_PROPOSED, *lines)
+    def _last_grown(self) -> list[str]:
+        """IDs of the segments that were grown last and are still among the chosen lesions."""
+        node, ids = self._grown
+        if node is None or node is not self._panel.parameters.lesions:
+            return []
+        return [segment_id for segment_id in ids if node.GetSegmentation().GetSegment(segment_id) is not None]

@@ -87,7 +87,7 @@ class Panel:
     def pickPoint(self, points_node, picked: Callable[[], None]) -> None:
         """Slicer's mouse mode for placing one control point; the next point ends it."""
         markups = getattr(getattr(slicer, "modules", None), "markups", None)  # missing without a main window
-        markups = required(markups, f"place a point of {points_node.GetName()!r}, and press Propose at point")
+        markups = required(markups, f"place a point of {points_node.GetName()!r}, and press Grow at point")
         self._stop_picking()
         tag = points_node.AddObserver(points_node.PointPositionDefinedEvent, lambda *_: self._picked(picked))
         self._picking = points_node, tag

@@ -112,29 +112,17 @@ def _lesions(panel: PanelPresenter) -> tuple[Row, ...]:
         (
             button(
                 "pickSeed", "Show the point",
-                "Then click in the lesion, in a slice view: the lesion around it is proposed",
-                panel.lesions.pickSeed, panel.lesions.canPropose,
+                "Then click in the lesion, in a slice view: the lesion around it is added to the lesions",
+                panel.lesions.pickSeed, panel.lesions.canGrow,
             ),
             button(
-                "proposeAtPoint", "Propose at point",
-                "Propose the lesion around the point; the tissues stay as they are",
-                panel.lesions.proposeAtPoint, panel.lesions.canProposeAtPoint,
+                "growAtPoint", "Grow at point",
+                "Add the lesion around the point to the lesions; Add to tissues lays them over the tissues",
+                panel.lesions.growAtPoint, panel.lesions.canGrowAtPoint,
             ),
             button(
-                "proposeLesions", "Propose all",
-                "Propose what looks like a lesion, without a point; the tissues stay as they are",
-                panel.lesions.proposeLesions, panel.lesions.canPropose,
-            ),
-        ),
-        node("proposal", "Proposal", "Segmentation with what is proposed; correct it as needed"),
-        (
-            button(
-                "acceptProposal", "Accept", "Move the proposal to the lesions, and lay them over the tissues",
-                panel.lesions.acceptProposal, panel.lesions.canAccept,
-            ),
-            button(
-                "discardProposal", "Discard", "Remove the proposal",
-                panel.lesions.discardProposal, panel.lesions.canAccept,
+                "removeGrown", "Remove", "Take the lesion that was grown last out of the lesions",
+                panel.lesions.removeGrown, panel.lesions.canRemove,
             ),
         ),
     )  # fmt: skip

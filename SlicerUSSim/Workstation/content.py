@@ -14,7 +14,7 @@ from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.imaging.preset import SECTIONS
 from SlicerUSSim.Logic.mri.ct_unit import looks_like_ct
 from SlicerUSSim.Logic.mri.markups import is_markup_name
-from SlicerUSSim.Logic.mri.recognition import is_head_sized, require_no_ultrasound, stripped_brain
+from SlicerUSSim.Logic.mri.recognition import is_head_sized, stripped_brain
 from SlicerUSSim.Logic.tissue.label_files import TABLE_SUFFIXES, names_of_file
 from SlicerUSSim.Logic.tissue.label_maps import as_whole
 from SlicerUSSim.Logic.tissue.label_sources import is_label_file
@@ -88,18 +88,10 @@ def of_volume(path: Path, volume: Volume) -> Content:
         return _of_labels(path, volume, size)
     if looks_like_ct(volume):
         return Content(Kind.CT, f"a CT by its numbers (air near -1000), {size}", volume)
-    try:
-        is_brain = stripped_brain(volume) is not None
-    except SimulationError:  # that Segment says, too, with what can be done
-        is_brain = False
-    if is_brain:
+    if stripped_brain(volume) is not None:
         return Content(Kind.MRI, f"an MRI of a brain without skull, {size}", volume)
     if is_head_sized(volume):
         return Content(Kind.MRI, f"an MRI of a whole head, {size}", volume)
-    try:
-        require_no_ultrasound(volume)
-    except SimulationError as error:
-        raise SimulationError(f"{path}: {error}") from None
     return Content(Kind.MRI, f"an image that has neither a brain's nor a head's size, taken for an MRI, {size}", volume)
 
 

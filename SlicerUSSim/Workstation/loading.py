@@ -31,7 +31,7 @@ from SlicerUSSim.Workstation.state import ORGANS
 
 #: Roles of nodes of a patient
 _OF_PATIENT = (
-    "mri", "labels", "mask", "second_mri", "lesions", "organs", "sheets", "seed", "proposal", "opening", "real",
+    "mri", "labels", "mask", "second_mri", "lesions", "organs", "sheets", "seed", "opening", "real",
     "transform_sequence", "image_sequence",
 )  # fmt: skip
 #: What is of a patient: images, labels, surfaces, points, recordings, the costs of a fit

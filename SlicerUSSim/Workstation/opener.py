@@ -37,7 +37,6 @@ from SlicerUSSim.Logic.mrml.sequence_nodes import KnownField, add_sequence, writ
 from SlicerUSSim.Logic.mrml.taken_image import PATIENT, patient_of
 from SlicerUSSim.Logic.placement.craniotomy import is_open, polygon_of_file
 from SlicerUSSim.Logic.probe.arrays import Probe
-from SlicerUSSim.Logic.tissue.label_advice import ORGANS_PAGE, PAGE
 from SlicerUSSim.Logic.tissue.label_mapping import LabelMapping
 from SlicerUSSim.Logic.tissue.label_maps import LabelledTissues, as_whole
 from SlicerUSSim.Logic.tissue.label_sources import read_label_file, table_beside
@@ -191,9 +190,7 @@ class Opener:
         """(label map node with the organs of a CT, what was recognised) of a file."""
         volume, table = self._volume(path), TissueTable({})
         mapping = LabelMapping.of(maps, table)
-        found = self._tasks.doAside(
-            lambda: read_label_file(Path(path), volume, mapping, default=table, of_ct=True, advice=ORGANS_PAGE)
-        )
+        found = self._tasks.doAside(lambda: read_label_file(Path(path), volume, mapping, default=table, of_ct=True))
         require(not found.others, found.ambiguity)  # a node has one name for each label
         return self._label_map(found.labels, path, found.names), replace(found, message=self.as_known(found.message))
 
@@ -241,7 +238,7 @@ class Opener:
         is_chosen = mine.names() not in (Preset().tissues.names(), self._names_of_table)
         found = self._tasks.doAside(
             lambda: read_label_file(
-                Path(path), volume, mapping, table=beside, preset=mine if is_chosen else None, default=mine, advice=PAGE
+                Path(path), volume, mapping, table=beside, preset=mine if is_chosen else None, default=mine
             )
         )  # fmt: skip
         if beside is not None:
@@ -295,7 +292,7 @@ class Opener:
 
         try:
             told = replace(mask, doubts=tuple(map(self.as_known, mask.doubts)))
-            ids = add_lesion(node, told, tissue, name, PAGE)
+            ids = add_lesion(node, told, tissue, name)
         except SimulationError:
             undo()
             raise

@@ -19,7 +19,6 @@ from trame_slicer.core import LayoutManager
 from trame_slicer.views import AbstractView
 
 from SlicerUSSim.Logic.mri.pathology import LESIONS
-from SlicerUSSim.Logic.tissue.label_advice import PAGE_SEVERAL
 from SlicerUSSim.Widget.image_presenter import FROZEN
 from SlicerUSSim.Widget.interface import Control, Section
 from SlicerUSSim.Widget.tissue_presenter import TISSUE_COLUMNS
@@ -53,7 +52,7 @@ _IN_PAGE = {
 }
 #: What is at the top of the drawer
 _FIRST_SECTION, _FIRST_CONTROLS = "Ultrasound", ("gainSlider", "depthSlider")
-_LESION_TEXTS = {"brats": PAGE_SEVERAL}
+_LESION_TEXTS = {"brats": "labels by their names, or a BraTS map"}
 #: Colours of the marks beside the slice views' planes.
 _STRIPES = {"Red": "red", "Yellow": "yellow", "Green": "green"}
 

@@ -177,8 +177,6 @@ class Restoring:
             self._registration.restore(record.sequence, record.landmarks)
             self._logic.preset = preset
         parameters.image_sequence = simulated
-        if parameters.proposal is not None and display_of(parameters.proposal) is not None:
-            display_of(parameters.proposal).SetVisibility(True)
         page = kept.get("page", {})
         self._show_page(page)
         if pose is not None:

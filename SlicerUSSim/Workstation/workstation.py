@@ -104,7 +104,6 @@ class Workstation:
             segmenting.segment: loading.segment,
             segmenting.undoSegment: loading.undo_segment,
             lesions.addTissues: partial(loading.lay, lesions.addTissues),
-            lesions.acceptProposal: partial(loading.lay, lesions.acceptProposal),
             placing.openCraniotomy: loading.open_craniotomy,
             placing.closeCraniotomy: loading.close_craniotomy,
             placing.placeProbe: partial(loading.place, placing.placeProbe),

@@ -11,7 +11,6 @@ if TYPE_CHECKING:
     from .addable import require_addable as require_addable
     from .ct import CtSegmentation as CtSegmentation, segment_ct as segment_ct
     from .filtering import guided_filter as guided_filter
-    from .lesions.detection import propose_lesions as propose_lesions
     from .lesions.proposal import Proposal as Proposal
     from .lesions.seeded import grow_lesion as grow_lesion
     from .masks import read_mask as read_mask

@@ -20,7 +20,6 @@ from SlicerUSSim.Logic.mri.pathology import (
     require_size,
 )
 from SlicerUSSim.Logic.mri.recognition import USUAL_ML
-from SlicerUSSim.Logic.tissue.label_advice import COMMAND, Advice
 
 #: Spacing at which the patient in an image is looked for; also how far its border may be off
 _COARSE_MM = 3.0
@@ -33,7 +32,6 @@ def require_addable(
     mask: Volume | None = None,
     skull_strip: str = "auto",
     also: Iterable[str] = (),
-    advice: Advice = COMMAND,
 ) -> None:
     """Raise SimulationError for what add_tissues would refuse after a segmentation of `mri`, as far as it is certain.
 
@@ -45,7 +43,6 @@ def require_addable(
     masks : (tissue, mask, source) as in add_tissues.
     mask, skull_strip : as in segment_mri.
     also : names of tissues besides those of the presets.
-    advice : remedies in messages.
 
     Raises SimulationError for an unknown tissue, for a mask that is none, is empty or too small for the voxels of the
     MRI, and for one outside the head in the image (outside `mask`, if it is given), or as large as a brain.
@@ -66,7 +63,7 @@ def require_addable(
     """
     patient = None
     for name, volume, source in masks:
-        masked = read_masks(volume, mask_tissue(name, also), source, advice)
+        masked = read_masks(volume, mask_tissue(name, also), source)
         if patient is None:
             patient, margin = (mask, 0.0) if mask is not None else (_patient_in(mri), _COARSE_MM)
             inside = patient.array > 0

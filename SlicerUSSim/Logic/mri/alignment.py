@@ -7,7 +7,7 @@ brain and a ring of 6 mm around it, where the skull is dark, and never over the 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
 from typing import cast
@@ -29,15 +29,13 @@ _EXPECTED_SIZE, _SIZE_SPREAD = -5.0, 12.0
 _SMALL_SIZE, _SMALL_SIZES = -28.0, (-34.0, -22.0)
 #: Brains of adults differ by less than this in size; relative to the template, in one direction.
 SIZES = (0.74, 1.15)
-#: Up to this agreement it is asked whether the head is small, or fits better in another orientation: back to front, a
-#: T1 had 0.23, and 0.31 with twice its height.
+#: Up to this agreement it is asked whether the head is small, and the position is doubtful: back to front, a T1 had
+#: 0.23, and 0.31 with twice its height.
 DOUBTFUL_AGREEMENT = 0.4
 #: Ratio of agreements from which a small head was found where an adult's was looked for: such had 1.8 to 4
 _CLEARLY_BETTER = 1.15
 #: Agreement of rigid fits below which no affine one is tried
 _HOPELESS = 0.11
-#: Size of the brain where many turns compete, and how many starts are then improved
-_TURNED_SIZES, _COMPETING = (-9.0,), 32
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,11 +52,7 @@ class Alignment:
     @property
     def turn_deg(self) -> float:
         """Angle by which the head is turned against the template, degrees."""
-        return self.turn_from(np.eye(3))
-
-    def turn_from(self, turn: np.ndarray) -> float:
-        """Angle between the head and the template after a (3, 3) turn, degrees."""
-        left, _, right = np.linalg.svd(turn.T @ self.template_to_ras[:3, :3])
+        left, _, right = np.linalg.svd(self.template_to_ras[:3, :3])
         return float(np.degrees(np.arccos(np.clip((np.trace(left @ right) - 1.0) / 2.0, -1.0, 1.0))))
 
     @property
@@ -94,7 +88,7 @@ def align_coarse(image: CoarseImage, progress: Callable[[float], None] | None = 
 
 def _aligned(image: CoarseImage, progress: Callable[[float], None], *, is_small: bool) -> Alignment:
     brain, report = template(), progress
-    search = _Search(image, np.eye(3), _SMALL_SIZE if is_small else _EXPECTED_SIZE)
+    search = _Search(image, _SMALL_SIZE if is_small else _EXPECTED_SIZE)
     blurred = search.of(image.smoothed(4.0))
     sizes = _SMALL_SIZES if is_small else _SIZES
     starts = [start for _, start in blurred.starts(_PITCHES, sizes, 14.0, 30)]
@@ -119,56 +113,14 @@ def _aligned(image: CoarseImage, progress: Callable[[float], None], *, is_small:
     return search.aligned(best)
 
 
-def align_turned(
-    image: CoarseImage, turns: Sequence[np.ndarray], progress: Callable[[float], None] | None = None
-) -> tuple[int, Alignment]:
-    """(number of the turn, alignment) that agrees best after one of the (3, 3) linear maps of the template.
-
-    It takes 2 s for 23 turns: the starts of all compete, and only the best are improved, rigidly.
-    """
-    brain, report = template(), progress or (lambda share: None)
-    searches = [_Search(image, turn) for turn in turns]
-    smooth = image.smoothed(4.0)  # one for all: it remembers its foreground
-    starts: list[tuple[float, int, np.ndarray]] = []
-    for number, search in enumerate(searches):
-        found = search.of(smooth).starts(_PITCHES, _TURNED_SIZES, 18.0, 5)
-        starts += [(score, number, start) for score, start in found]
-        report(0.6 * (number + 1) / len(searches))
-    starts.sort(key=lambda start: -start[0])
-    rough = []
-    for done, (_, number, start) in enumerate(starts[:_COMPETING]):
-        rough.append((number, *searches[number].of(smooth).improved(start, brain.coarse, 1.0, 1, 1e-2)))
-        report(0.6 + 0.25 * (done + 1) / _COMPETING)
-    rough.sort(key=lambda fit: fit[2])
-    fits = []
-    for number, start, _ in rough[:4]:
-        fits.append((number, searches[number].aligned(searches[number].improved(start, brain.coarse, 1.0, 2)[0])))
-        report(min(1.0, 0.85 + 0.04 * len(fits)))
-    return max(fits, key=lambda fit: fit[1].agreement)
-
-
-def agreement_by_moments(image: CoarseImage, inside: np.ndarray, turn: np.ndarray) -> float:
-    """Best agreement (0 to 1) of nodding templates turned by (3, 3) `turn`, at the centre and of the size of `inside`.
-
-    `inside` (k, j, i) is the brain of an image that shows nothing else.
-    """
-    brain, search = template(), _Search(image, turn)
-    centre = image.origin + image.spacing_mm * np.argwhere(inside).mean(axis=0)[::-1]
-    sizes = inside.sum() * image.spacing_mm**3, brain.is_brain.sum() * float(TEMPLATE_MM) ** 3
-    log_percent = 100.0 * np.log(sizes[0] / sizes[1]) / 3.0
-    places = (np.array([*centre, pitch, 0.0, 0.0, log_percent]) for pitch in _PITCHES[::2])
-    return max(agreement(image, search.matrix(place)) for place in places)
-
-
 @dataclass(frozen=True, eq=False)
 class _Search:
     image: CoarseImage
-    turn: np.ndarray
     #: Log percent of the template's size
     expected_size: float = _EXPECTED_SIZE
 
     def of(self, image: CoarseImage) -> _Search:
-        return _Search(image, self.turn, self.expected_size)
+        return _Search(image, self.expected_size)
 
     def aligned(self, p: np.ndarray) -> Alignment:
         """The alignment by parameters, with its agreement."""
@@ -185,7 +137,7 @@ class _Search:
             shear = np.eye(3)
             shear[[0, 0, 1], [1, 2, 2]] = p[9:12] / 100.0
             matrix = matrix @ stretch @ shear
-        return self.turn @ matrix
+        return matrix
 
     def matrix(self, p: np.ndarray) -> np.ndarray:
         """(4, 4) template_to_ras."""

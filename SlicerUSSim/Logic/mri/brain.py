@@ -26,9 +26,7 @@ from SlicerUSSim.Logic.mri.recognition import (
     USUAL_ML,
     Shown,
     above_noise,
-    check_position,
     recognise,
-    require_no_ultrasound,
     stripped_brain,
 )
 from SlicerUSSim.Logic.mri.refinement import on_grid, refined, signed_distance
@@ -55,8 +53,6 @@ class BrainMask:
     #: One line each, for what a user should check
     warnings: tuple[str, ...] = ()
     seconds: float = 0.0
-    #: Whether a given mask also holds skull or scalp, as far as it can be told
-    takes_in_more: bool = False
 
     @property
     def volume_ml(self) -> float:
@@ -74,7 +70,7 @@ def find_brain(
     mri : the image, with its orientation and voxel size as in the patient.
     method : how a brain is extracted from a whole head: "robex", "deepbet" or "atlas"; "auto" for the atlas, and for
         the programs that are installed if its result is doubtful; "none" takes everything brighter than the background,
-        whatever the image shows, but no ultrasound.
+        whatever the image shows.
     keep_at : file in which the mask of a whole head is kept and from which it is read again; see mask_beside.
     progress : called with the fraction done, 0 to 1; may raise errors.Cancelled, which ends the extraction at once.
 
@@ -83,7 +79,6 @@ def find_brain(
     method = parameter_of(SegmentationSettings, "skull_strip").checked("segmentation", method)
     start, report = perf_counter(), _forwards(progress)
     if method == "none":
-        require_no_ultrasound(mri)
         inside = above_noise(mri)
         mask, millilitres = mri.with_array(inside.astype(np.uint8)), _millilitres(inside, mri)
         message = f"everything brighter than the background, {millilitres:.0f} ml"
@@ -147,11 +142,8 @@ def given_brain(mask: Volume, mri: Volume) -> BrainMask:
     inside = checked_mask(mask, mri)
     millilitres = _millilitres(inside, mri)
     found = mri.with_array(inside.astype(np.uint8))
-    doubts = mask_doubts(mri, inside)
-    return BrainMask(
-        found, "given", f"brain mask as given, {millilitres:.0f} ml", (*label_doubts(mask), *doubts.lines),
-        takes_in_more=doubts.takes_in_more,
-    )  # fmt: skip
+    warnings = (*label_doubts(mask), *mask_doubts(mri, inside))
+    return BrainMask(found, "given", f"brain mask as given, {millilitres:.0f} ml", warnings)
 
 
 def left_out(mask: Volume, lesion: Volume) -> float:
@@ -203,8 +195,6 @@ def _extracted(mri: Volume, shown: Shown, method: str, robex: Program, report: R
         elif sureness is None or sureness >= _SURE:
             return replace(found, warnings=tuple(failures))
         else:
-            if not unsure and alignment is not None:
-                check_position(mri, alignment)
             unsure.append(found)
             failures.append(f"the mask by {_NAMES[name]} agrees with the atlas by {sureness:.2f} only; check it")
         if name != candidates[-1]:
@@ -303,8 +293,7 @@ def _kept(path: Path, mri: Volume, method: str) -> BrainMask | None:
     mask = mri.with_array(kept.inside.astype(np.uint8))
     if not kept.is_edited:
         return BrainMask(mask, kept.method, message, kept.warnings, 0.0)
-    doubts = mask_doubts(mri, kept.inside)
-    return BrainMask(mask, "given", message, doubts.lines, 0.0, doubts.takes_in_more)
+    return BrainMask(mask, "given", message, mask_doubts(mri, kept.inside))
 
 
 def _head_warnings(millilitres: float) -> tuple[str, ...]:

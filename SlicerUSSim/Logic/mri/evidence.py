@@ -107,10 +107,6 @@ class Evidence:
         """(3,) k, j, i in the box, with fractions."""
         return (np.linalg.inv(self.ijk_to_ras) @ [*np.asarray(ras_mm, float), 1.0])[2::-1]
 
-    def ras_of(self, index: np.ndarray) -> np.ndarray:
-        """(3,) RAS mm of k, j, i in the box."""
-        return (self.ijk_to_ras @ [*np.asarray(index, float)[::-1], 1.0])[:3]
-
     # ---- by the atlas ------------------------------------------------------------------------------------------
 
     @cached_property

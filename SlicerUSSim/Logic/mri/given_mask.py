@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import cast
 
 import numpy as np
@@ -10,7 +9,7 @@ from scipy import ndimage
 
 from SlicerUSSim.Logic.base.errors import require, require_kind
 from SlicerUSSim.Logic.base.volume import Volume
-from SlicerUSSim.Logic.mri.mask_check import MaskDoubts, border_doubts
+from SlicerUSSim.Logic.mri.mask_check import cut_off
 from SlicerUSSim.Logic.mri.masks import several_segments
 from SlicerUSSim.Logic.mri.plausibility import is_whole_brain
 from SlicerUSSim.Logic.mri.recognition import POSSIBLE_ML, USUAL_ML
@@ -21,9 +20,6 @@ _MOST_MASK_VALUES = 128
 _LISTED = 6
 
 
-#: What a brain mask holds at least, ml or as a share of what the image shows. Lesions are 0.1 to 100 ml in heads of
-#: 3000 ml and brains of 1200 ml, at most 0.08; the newborn's brain has 250 ml and more.
-_LEAST_ML, _LEAST_SHARE = 100.0, 0.3
 #: What a filter leaves beyond 0 and 1
 _ROUNDING = 1e-3
 #: Pieces of a mask smaller than this share of the largest are no part of a brain; and how much of them is said, ml
@@ -55,37 +51,13 @@ def checked_mask(mask: Volume, mri: Volume) -> np.ndarray:
     )
     inside = mask.array > 0
     require(bool(inside.any()), f"{name} is empty, expected at least one voxel inside")
-    _require_brain_and_not_lesion(name, inside, mri)
-    millilitres, share = float(inside.sum() * mri.voxel_ml), float(inside.mean())
-    require(
-        share < 0.98 or millilitres <= POSSIBLE_ML[1],
-        f"{name} covers {share:.0%} of the image, {millilitres:.0f} ml, expected the brain only; "
-        "to use the whole image, give --skull-strip none and no mask",
-    )
+    millilitres = float(inside.sum() * mri.voxel_ml)
     require(
         millilitres <= POSSIBLE_ML[1],
         f"{name} has {millilitres:.0f} ml, expected a brain ({USUAL_ML[0]:.0f} to {USUAL_ML[1]:.0f} ml) or a part of "
-        "one",
+        f"one; it covers {inside.mean():.0%} of the image: for all of that, give --skull-strip none and no mask",
     )
     return inside
-
-
-def _require_brain_and_not_lesion(name: str, inside: np.ndarray, mri: Volume) -> None:
-    """Raise SimulationError for a mask that is small in millilitres and in its image.
-
-    One of a small image, as of the field of an operation or a phantom, is most of what is shown there.
-    """
-    millilitres = float(inside.sum() * mri.voxel_ml)
-    if millilitres >= _LEAST_ML:
-        return
-    shown = mri.array > np.nanmin(mri.array)  # the background of an image without skull is one value
-    share = float((inside & shown).sum() / max(int(shown.sum()), 1))
-    require(
-        share >= _LEAST_SHARE,
-        f"{name} has {millilitres:.3g} ml, {share:.1%} of what the image shows, expected a brain "
-        f"({USUAL_ML[0]:.0f} to {USUAL_ML[1]:.0f} ml, an infant's less) or {_LEAST_ML:.0f} ml and more of one; a "
-        "lesion is added with --add tumour=FILE, and needs no mask",
-    )
 
 
 def _is_probability(array: np.ndarray) -> bool:
@@ -98,7 +70,7 @@ def _is_probability(array: np.ndarray) -> bool:
     return bool(some.size and (some > 0.95).mean() > 0.5)
 
 
-def mask_doubts(mri: Volume, inside: np.ndarray) -> MaskDoubts:
+def mask_doubts(mri: Volume, inside: np.ndarray) -> tuple[str, ...]:
     """What should be checked in a mask (k, j, i) that a user made."""
     millilitres = float(inside.sum() * mri.voxel_ml)
     if millilitres < POSSIBLE_ML[0]:
@@ -106,13 +78,12 @@ def mask_doubts(mri: Volume, inside: np.ndarray) -> MaskDoubts:
             f"the mask has {millilitres:.3g} ml, expected a brain of {USUAL_ML[0]:.0f} to {USUAL_ML[1]:.0f} ml or a "
             "large part of one; what is outside it has no tissue (a lesion is added with --add tumour=FILE)"
         )
-        return MaskDoubts((*_islands(mri, inside), small))
+        return (*_islands(mri, inside), small)
     reason = is_whole_brain(mri, inside)
     warnings = volume_warnings(millilitres)
     if reason and not warnings:
         warnings = (f"the mask is not that of a whole brain: {reason}",)
-    border = border_doubts(mri, inside)
-    return replace(border, lines=(*warnings, *_islands(mri, inside), *border.lines))
+    return (*warnings, *_islands(mri, inside), *cut_off(mri, inside))
 
 
 def label_doubts(mask: Volume) -> tuple[str, ...]:

@@ -1,4 +1,4 @@
-"""What a brain mask cuts off, and what it takes in."""
+"""What a brain mask cuts off."""
 
 from __future__ import annotations
 
@@ -10,10 +10,8 @@ import numpy as np
 from scipy import ndimage
 
 from SlicerUSSim.Logic.base.volume import Volume
-from SlicerUSSim.Logic.mri.alignment import align_template
-from SlicerUSSim.Logic.mri.atlas import mni152
 from SlicerUSSim.Logic.mri.coarse import resampled_to_ras
-from SlicerUSSim.Logic.mri.refinement import brightness_near, closed, on_grid, signed_distance
+from SlicerUSSim.Logic.mri.refinement import brightness_near, on_grid, signed_distance
 
 _SPACING_MM = 2.0
 #: Depth from which a voxel is surely brain, to compare with
@@ -26,21 +24,8 @@ _BELOW_MM, _ABOVE_MM, _WORTH_CM2, _WORTH_AT_BASE_CM2 = 3.0, 4.0, 6.0, 20.0
 _CM2_OF_VOXEL = _SPACING_MM**3 / _ABOVE_MM / 100.0
 #: Directions of a sector, by axis (k, j, i) and sign; from how many on it is said that the border is so all around
 _SECTORS, _ALL_AROUND = (("bottom", "top"), ("back", "front"), ("left", "right")), 4
-#: Depths of the profile through the upper half's border, from the core outwards, and sulci closed before, mm
-_DEPTHS_MM, _SULCI_MM = np.arange(14.0, -4.1, -0.5), 6.0
-#: How far a mask may reach beyond the brain's surface. Of masks of four heads it was -2.5 to 2.5 mm, and with the CSF
-#: of a T2, which is bright, less; masks 8 mm too wide had 8 to 9 mm, and 4.5 with bright CSF.
-_BEYOND_MM, _BEYOND_BRIGHT_CSF_MM, _BRIGHT_CSF = 5.5, 3.5, 1.1
-#: Depth below the surface, and volume, from which what a mask leaves out is said
-_HOLE_DEPTH_MM, _HOLE_ML = 24.0, 3.0
 #: Share of voxels with the value of the first one, from which they are a background that was set
 _STRIPPED = 0.15
-#: Agreement from which the atlas's brain is sure (see recognition.py), and share of a mask and of that brain outside
-#: each other from which the mask lies elsewhere: shifted by 10 mm 0.11 or turned by 20 degrees 0.12, 6 to 8 mm too wide
-#: or too tight 0.00 to 0.02
-_SURELY_ALIGNED, _ELSEWHERE = 0.4, 0.09
-#: Brightness, relative to the brain, of what is surely outside it
-_DARK = 0.7
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,65 +62,6 @@ def _depth(mask: np.ndarray) -> np.ndarray:
     return -signed_distance(mask, np.full(3, _SPACING_MM), 2.0 * _ABOVE_MM)
 
 
-@dataclass(frozen=True)
-class MaskDoubts:
-    """What a user should check in a mask."""
-
-    #: One line each
-    lines: tuple[str, ...] = ()
-    #: Whether skull or scalp are among what it holds
-    takes_in_more: bool = False
-
-
-def border_doubts(mri: Volume, inside: np.ndarray) -> MaskDoubts:
-    """Whether a mask that was made by others lies elsewhere, reaches beyond the brain, or cuts it off; see cut_off."""
-    checked = _Checked.of(mri, inside)
-    if checked is None:
-        return MaskDoubts()
-    smooth = closed(checked.mask, _SULCI_MM / _SPACING_MM)
-    # A mask that ends in the scalp ends in bright tissue, too; that it cuts the cortex off would be the wrong word.
-    beyond = _taken_in(checked, smooth)
-    border = beyond or _cut_off(checked)
-    misplaced = _misplaced(mri, inside) if border else ()
-    return MaskDoubts((*_holes(checked, smooth), *(misplaced or border)), bool(misplaced or beyond))
-
-
-def _misplaced(mri: Volume, inside: np.ndarray) -> tuple[str, ...]:
-    """One line if a mask leaves a part of the brain out and has as much elsewhere: shifted, turned, of another image.
-
-    It takes 4 s, so that it is asked about a doubtful mask only.
-    """
-    if mni152() is None:
-        return ()
-    alignment = align_template(mri)
-    if alignment.agreement < _SURELY_ALIGNED:
-        return ()
-    brain = alignment.brain_on(mri) < 0.0
-    elsewhere, left_out = float((inside & ~brain).sum() / inside.sum()), float((brain & ~inside).sum() / brain.sum())
-    if min(elsewhere, left_out) < _ELSEWHERE:
-        return ()
-    return (
-        f"{elsewhere:.0%} of the mask lie outside the brain that the atlas finds, and {left_out:.0%} of that brain "
-        "outside the mask: it is shifted or turned, or of another image",
-    )
-
-
-def _holes(checked: _Checked, smooth: np.ndarray) -> tuple[str, ...]:
-    """One line if the mask leaves out something deep in the brain, as one of grey and white matter does.
-
-    `smooth` (k, j, i) is the mask without sulci.
-    """
-    whole = cast(np.ndarray, ndimage.binary_fill_holes(smooth))
-    deep = cast(np.ndarray, ndimage.binary_erosion(whole, iterations=round(_HOLE_DEPTH_MM / _SPACING_MM)))
-    millilitres = float((deep & ~checked.mask).sum()) * _SPACING_MM**3 / 1000.0
-    if millilitres < _HOLE_ML:
-        return ()
-    return (
-        f"the mask leaves out {millilitres:.0f} ml deep in the brain, of ventricles, cisterns or fissures: "
-        "nothing there becomes tissue; a brain mask includes the CSF",
-    )
-
-
 def ends_at_edge(mri: Volume, inside: np.ndarray) -> tuple[str, ...]:
     """One line for each edge of the image that cuts the brain (k, j, i) off; at the bottom only over a larger area.
 
@@ -162,10 +88,8 @@ def cut_off(mri: Volume, inside: np.ndarray) -> tuple[str, ...]:
     larger area: whole masks of four heads had up to 5 cm2 there, without the lower 25 to 60 mm 25 to 155 cm2.
     """
     checked = _Checked.of(mri, inside)
-    return () if checked is None else _cut_off(checked)
-
-
-def _cut_off(checked: _Checked) -> tuple[str, ...]:
+    if checked is None:
+        return ()
     depth, bright = checked.depth, checked.brightness
     tissue = (bright > _TISSUE[0]) & (bright < _TISSUE[1]) & checked.is_shown
     # The border is cut where tissue goes on without a gap from below it to well above it.
@@ -202,41 +126,6 @@ def _pieces(across: np.ndarray, slices: slice, worth_cm2: float) -> np.ndarray:
     sizes = np.bincount(parts.ravel()) * _CM2_OF_VOXEL
     sizes[0] = 0.0
     return np.argwhere((sizes >= worth_cm2)[parts]) + [slices.start or 0, 0, 0]
-
-
-def _taken_in(checked: _Checked, smooth: np.ndarray) -> tuple[str, ...]:
-    """One line if the mask reaches beyond the brain's surface nearly everywhere, into skull or scalp.
-
-    The surface is where the median brightness along the normals of the border falls half-way from the brain to the
-    dark outside it: CSF and skull in T1 and FLAIR, the skull in T2. In the upper half of the head, where nothing but
-    skull and scalp lies outside.
-    """
-    depth = _depth(smooth)
-    border = (depth > 0.0) & (depth <= 1.01 * _SPACING_MM)
-    border[: int(np.argwhere(smooth)[:, 0].mean())] = False
-    # Not where the image ends
-    border &= cast(np.ndarray, ndimage.binary_erosion(checked.is_shown, iterations=3))
-    points = np.argwhere(border)
-    if len(points) < 100:
-        return ()
-    depth = ndimage.gaussian_filter(depth, 1.0)
-    outwards = -np.stack([np.asarray(slope)[border] for slope in np.gradient(depth, _SPACING_MM)])
-    outwards /= np.maximum(np.linalg.norm(outwards, axis=0), 1e-6)
-    steps = (depth[border] - _DEPTHS_MM[:, None]) / _SPACING_MM  # (depths, points) voxels outwards
-    places = points.T[:, None] + outwards[:, None] * steps
-    profile = np.median(ndimage.map_coordinates(checked.brightness, places, order=1, mode="nearest"), axis=1)
-    brain = float(profile[_DEPTHS_MM > 11.0].max())
-    if profile.min() > _DARK * brain:  # within the brain: see cut_off
-        return ()
-    is_outside = profile < (brain + profile.min()) / 2.0
-    beyond = float(_DEPTHS_MM[is_outside.argmax()])
-    bright_csf = profile[: is_outside.argmax()].max(initial=0.0) > _BRIGHT_CSF * brain
-    if beyond < (_BEYOND_BRIGHT_CSF_MM if bright_csf else _BEYOND_MM):
-        return ()
-    return (
-        f"the mask reaches {beyond:.0f} mm beyond the surface of the brain over most of it; check that it takes in no "
-        "skull or scalp",
-    )
 
 
 # ---- do labels and an MRI belong to one patient? Intensities then change where labels do -----------------------------

@@ -13,7 +13,6 @@ from scipy import ndimage
 from SlicerUSSim.Logic.base.errors import SimulationError, require
 from SlicerUSSim.Logic.base.label_numbers import whole_numbers
 from SlicerUSSim.Logic.base.volume import Volume
-from SlicerUSSim.Logic.tissue.label_advice import COMMAND, Advice
 from SlicerUSSim.Logic.tissue.label_files import names_of_file
 from SlicerUSSim.Logic.tissue.names import tissue_named
 
@@ -71,10 +70,9 @@ def with_label_names(volume: Volume, path: str | os.PathLike) -> Volume:
     return replace(volume, label_names=names_of_file(Path(path), volume)[0])
 
 
-def read_masks(volume: Volume, tissue: str, source: str, advice: Advice = COMMAND) -> Masks:
+def read_masks(volume: Volume, tissue: str, source: str) -> Masks:
     """What a volume holds: `tissue`, or with one of SEVERAL the tissues of its labels.
 
-    `advice` has the words of remedies.
     Raises SimulationError for an empty mask, for labels that have no tissue, and for an image that is neither a mask,
     nor a label map, nor probabilities.
     """
@@ -104,12 +102,12 @@ def read_masks(volume: Volume, tissue: str, source: str, advice: Advice = COMMAN
     names = {int(label): volume.label_names[label] for label in labels if label in volume.label_names}
     labelled = volume.with_array(whole)
     if is_several:
-        return _by_name(labelled, labels, names, source) if names else _brats(labelled, labels, tissue, source, advice)
+        return _by_name(labelled, labels, names, source) if names else _brats(labelled, labels, tissue, source)
     warnings = ()
     if len(labels) > 1:
         warnings = (
             f"{source} holds the labels {called(labels, names)}; all of them are added as {tissue}"
-            f"{_alternative(labels, names, advice.several_tissues)}",
+            f"{_alternative(labels, names)}",
         )
     return _masks(volume, {tissue: whole != 0}, source, warnings)
 
@@ -124,18 +122,15 @@ def several_segments(volume: Volume) -> str:
     return called(labels.astype(int), names) if names else ""
 
 
-def _alternative(labels: np.ndarray, names: Mapping[int, str], several: str) -> str:
-    """How several labels could be added as tissues of their own, in brackets; empty if it is not known.
-
-    `several` is what a user gives or chooses for that.
-    """
+def _alternative(labels: np.ndarray, names: Mapping[int, str]) -> str:
+    """How several labels could be added as tissues of their own, in brackets; empty if it is not known."""
     if not names:
-        return f" ({several} adds the tissues of a BraTS map)" if set(labels.tolist()) <= {1, 2, 3, 4} else ""
+        return " (brats=FILE adds the tissues of a BraTS map)" if set(labels.tolist()) <= {1, 2, 3, 4} else ""
     try:
         tissues = [tissue_named(names[label]).name for label in labels.tolist()]
     except (KeyError, SimulationError):
         return ""
-    return f" ({several} adds each by its name, as {', '.join(dict.fromkeys(tissues))})"
+    return f" (brats=FILE adds each by its name, as {', '.join(dict.fromkeys(tissues))})"
 
 
 def _masks(volume: Volume, shares: dict[str, np.ndarray], source: str, warnings: tuple[str, ...] = ()) -> Masks:
@@ -166,7 +161,7 @@ def _by_name(labelled: Volume, labels: np.ndarray, names: Mapping[int, str], sou
     return _masks(labelled, masks, source, (f"{source}: labels are added by their names, {pairs}",))
 
 
-def _brats(labelled: Volume, labels: np.ndarray, year: str, source: str, advice: Advice) -> Masks:
+def _brats(labelled: Volume, labels: np.ndarray, year: str, source: str) -> Masks:
     """The tissues of BraTS's numbers; `year` is one of SEVERAL."""
     there = set(labels.tolist())
     is_guessed = year == "brats" and 4 in there and 3 not in there
@@ -178,11 +173,10 @@ def _brats(labelled: Volume, labels: np.ndarray, year: str, source: str, advice:
         there <= {*numbers.values()},
         f"{source}: holds the labels {_listed(labels)}, expected those of BraTS: {expected}",
     )
-    tumour, necrosis = (advice.one_tissue.format(tissue=name) for name in ("tumour", "necrosis"))
     require(
         there != {1},
         f"{source}: holds the label 1 alone, as the mask of a whole tumour does, expected several labels of BraTS; add "
-        f"it as what it is: {tumour}, or {necrosis} if it is BraTS's label 1",
+        "it as what it is: tumour=FILE, or necrosis=FILE if it is BraTS's label 1",
     )
     warnings = (f"{source}: label 4 is read as enhancing, as until 2022, and not as a cavity, without a label 3",)
     masks = {name: labelled.array == label for name, label in numbers.items() if label in there}

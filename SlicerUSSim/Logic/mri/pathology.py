@@ -17,7 +17,6 @@ from scipy import ndimage
 from SlicerUSSim.Logic.base.errors import SimulationError, either, require
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.mri.masks import Masks, read_masks, resampled
-from SlicerUSSim.Logic.tissue.label_advice import COMMAND, Advice
 from SlicerUSSim.Logic.tissue.names import labels_of, same_name, similar_tissues, tissue_named
 from SlicerUSSim.Logic.tissue.presets import TISSUES
 from SlicerUSSim.Logic.tissue.table import MAX_LABEL, TissueTable
@@ -165,17 +164,15 @@ def add_tissues(
     *,
     also: Iterable[str] = (),
     has_brain_mask: bool = False,
-    advice: Advice = COMMAND,
 ) -> Added:
     """Lay several tissues over a label map, the last on top; each is (tissue, mask, source) as in add_tissue.
 
-    `also` are names of tissues besides those of the labels and the presets; `has_brain_mask` as in add_tissue;
-    `advice` has remedies in messages.
+    `also` are names of tissues besides those of the labels and the presets; `has_brain_mask` as in add_tissue.
     """
     result = Added(labels, tuple(tissue_names))
     for name, mask, source in masks:
         tissue = mask_tissue(name, (*result.tissue_names, *also))
-        more = _added(result.labels, result.tissue_names, read_masks(mask, tissue, source, advice), has_brain_mask)
+        more = _added(result.labels, result.tissue_names, read_masks(mask, tissue, source), has_brain_mask)
         result = replace(more, messages=result.messages + more.messages, warnings=result.warnings + more.warnings)
     return result
 

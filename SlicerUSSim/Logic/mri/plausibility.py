@@ -25,12 +25,6 @@ _LIKELY_CSF, _DEEP_MM = 0.3, 20.0
 #: Distance of grey and white matter's medians in the wrong order from which that is said, and from which it is refused,
 #: in units of the width of both together
 _APART, _FAR_APART = 0.25, 0.5
-#: Brightness above white matter in units of its contrast to grey matter, and least volume in one piece of what
-#: enhances. Largest pieces: 19.5 ml in a T1 with contrast agent (ReMIND-022), 0.65 ml in one with bright arteries, and
-#: 0.01 ml in the others
-_ENHANCED, _ENHANCED_ML, _LARGEST_ENHANCED_ML = 1.5, 2.0, 300.0
-#: Share of a brain that enhances at least after contrast agent: 2.1 % in ReMIND-022, 0.0 % in T1s without it
-_LEAST_ENHANCING = 0.0005
 #: Share of one tissue from which the rest is noise
 _ONE_TISSUE = 0.97
 #: Contrast of grey and white matter in units of the noise: 1.1 in a T2 whose labels are blobs, 3 and more in T1s
@@ -135,44 +129,6 @@ def faint(found: Classes, noise: float) -> list[str]:
     return [
         f"grey matter ({grey:.4g}) and white matter ({white:.4g}) differ by {abs(white - grey) / noise:.1f} times the "
         f"noise, expected {_LEAST_CONTRAST:g} or more: look at the labels, or add a T1 of the patient"
-    ]
-
-
-def brighter_than_tissue(
-    image: np.ndarray, inside: np.ndarray, grey: float, white: float, voxel_ml: float, contrast: str
-) -> list[str]:
-    """A warning where an image of three classes has something that is far brighter than all of them.
-
-    In a T1 that is what only contrast agent makes so bright: sinuses, plexus, a tumour's rim; in a FLAIR a lesion.
-    `image` and `inside` are (k, j, i); `grey` and `white` are the means of the tissues.
-    """
-    brightest, darker = (white, grey) if contrast == "t1" else (grey, white)
-    is_bright = (image > brightest + _ENHANCED * (brightest - darker)) & inside
-    labels, count = cast(tuple[np.ndarray, int], ndimage.label(is_bright))
-    largest = float(np.bincount(labels.ravel())[1:].max()) * voxel_ml if count else 0.0
-    if not _ENHANCED_ML <= largest <= _LARGEST_ENHANCED_ML or brightest <= darker:
-        return []
-    if contrast == "flair":
-        return [
-            f"{largest:.1f} ml in one piece are far brighter than grey matter, as lesions are in a FLAIR, and get one "
-            "of three tissues: choose four classes (--classes 4)"
-        ]
-    return [
-        f"contrast is t1, but {largest:.1f} ml in one piece are far brighter than white matter, as vessels and tumour "
-        "rims after contrast agent: if it was given, choose t1gd (--contrast t1gd)"
-    ]
-
-
-def without_enhancement(found: Classes, contrasts: tuple[str, ...]) -> list[str]:
-    """A warning where an image is said to be after contrast agent, and nothing enhances as veins and plexus do."""
-    if "t1gd" not in contrasts or "enhancing" not in found.names:
-        return []
-    share = float(found.shares[found.names.index("enhancing")])
-    if share >= _LEAST_ENHANCING:
-        return []
-    return [
-        f"{share:.2%} of the brain enhance, expected {_LEAST_ENHANCING:.2%} or more (veins, choroid plexus) after "
-        "contrast agent: if none was given, choose t1 instead of t1gd"
     ]
 
 

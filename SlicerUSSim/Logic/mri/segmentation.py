@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from SlicerUSSim.Logic.base.errors import SimulationError, about_other_file, require, require_kind
+from SlicerUSSim.Logic.base.errors import about_other_file, require, require_kind
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.mri.atlas_registration import AtlasFit
 from SlicerUSSim.Logic.mri.brain import BrainMask, find_brain, given_brain
@@ -18,10 +18,9 @@ from SlicerUSSim.Logic.mri.classification import FILTER_BLUR, class_names, class
 from SlicerUSSim.Logic.mri.coregistration import aligned
 from SlicerUSSim.Logic.mri.evidence import Evidence
 from SlicerUSSim.Logic.mri.filtering import denoised, estimate_noise as estimate_noise
-from SlicerUSSim.Logic.mri.not_a_head import if_probabilities
 from SlicerUSSim.Logic.mri.nuclei import with_nuclei
 from SlicerUSSim.Logic.mri.outside import find_outside, require_findable, watery
-from SlicerUSSim.Logic.mri.plausibility import brighter_than_tissue, require_contrast
+from SlicerUSSim.Logic.mri.plausibility import require_contrast
 from SlicerUSSim.Logic.mri.recognition import check_intensities, require_no_hounsfield
 from SlicerUSSim.Logic.mri.segmentation_settings import SegmentationSettings
 from SlicerUSSim.Logic.mri.segmentation_steps import (
@@ -261,10 +260,7 @@ def segment_mri(
     report(0.4)
     prior = atlas.prior(part.images[0], part.inside) if atlas else None
     if prior is not None:
-        try:
-            warnings += require_contrast(part.images[0], part.inside, prior, contrast)
-        except SimulationError as error:
-            raise SimulationError(f"{error}{if_probabilities(mri)}") from None
+        warnings += require_contrast(part.images[0], part.inside, prior, contrast)
         for (name, other), image in zip(others.items(), part.images[1:], strict=True):
             with about_other_file(_called(name, other)):
                 warnings += require_contrast(image, part.inside, prior, name)
@@ -293,9 +289,6 @@ def segment_mri(
     timed("neighbours")
     report(0.9)
     warnings += doubts(found, part, filtered[0][1], atlas, contrasts)
-    if contrasts in (("t1",), ("flair",)) and len(names) == 3 and not brain.takes_in_more:  # fat is as bright
-        voxel_ml = part.images[0].voxel_ml
-        warnings += brighter_than_tissue(filtered[0][0], part.inside, *found.grey_and_white, voxel_ml, contrast)
 
     labels = np.zeros(part.inside.shape, np.uint8)
     labels[part.inside] = found.posteriors.argmax(axis=0) + 1

@@ -24,7 +24,6 @@ from SlicerUSSim.Logic.mri.plausibility import (
     is_whole_brain,
     require_order,
     require_several_tissues,
-    without_enhancement,
 )
 from SlicerUSSim.Logic.mri.recognition import check_finite
 
@@ -163,8 +162,6 @@ def doubts(
     require_several_tissues(found)
     lines = require_order(found, contrasts[0], atlas is not None) if len(contrasts) == 1 else []
     lines += implausible(found, part.images[0], part.inside, atlas, contrasts[0])
-    if atlas is not None:  # a whole brain, or enough of one
-        lines += without_enhancement(found, contrasts)
     if len(contrasts) == 1:
         lines += csf_is_doubtful(found, contrasts[0])
         lines += faint(found, noise)

@@ -29,7 +29,7 @@ from SlicerUSSim.Logic.mrml.own_results import OUTLINE, mark_as_result, may_repl
 from SlicerUSSim.Logic.mrml.patient_logic import PatientLogic
 from SlicerUSSim.Logic.mrml.taken_image import TakenImage, freeze, patient_of, remove_image, write_image
 from SlicerUSSim.Logic.placement.aiming import opening_pose
-from SlicerUSSim.Logic.placement.bone_before_probe import SCENE, about_bone
+from SlicerUSSim.Logic.placement.bone_before_probe import about_bone
 from SlicerUSSim.Logic.placement.craniotomy import default_pose
 from SlicerUSSim.Logic.placement.views import opened_view_pose, view_pose
 from SlicerUSSim.Logic.probe.poses import pose_in_slice
@@ -201,7 +201,7 @@ class ImageLogic:
         patient, preset = self._patient.patient(labels_node), self._parameters.preset
         tissues = preset.tissues.for_names(patient.names).all_tissues()
         pose, is_open = patient.pose(probe_pose(probe_transform_node)), is_opened(labels_node)
-        return about_bone(patient.labels, patient.names, tissues, preset.probe, pose, is_open=is_open, words=SCENE)
+        return about_bone(patient.labels, patient.names, tissues, preset.probe, pose, is_open=is_open)
 
     def aboutContact(self, labels_node, probe_transform_node) -> tuple[str, ...]:
         """Lines about a probe whose face does not touch the patient at its pose, or with little of it.

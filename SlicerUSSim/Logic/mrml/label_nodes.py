@@ -25,7 +25,6 @@ from SlicerUSSim.Logic.mrml.nodes import (
     require_node,
     write_volume,
 )
-from SlicerUSSim.Logic.tissue.label_advice import SCENE
 from SlicerUSSim.Logic.tissue.label_maps import LabelledTissues, as_whole, read_label_map
 from SlicerUSSim.Logic.tissue.presets import colour_of
 from SlicerUSSim.Logic.tissue.table import TissueTable
@@ -96,7 +95,6 @@ def read_labels(labels_node, tissues: TissueTable, *, of_ct: bool = False) -> La
             by_number = tissues
     found = read_label_map(
         volume, names, source=named(labels_node), tissues=tissues, by_number=by_number, renumber=True, of_ct=of_ct,
-        advice=SCENE,
     )  # fmt: skip
     _log.info("%s: %s", named(labels_node), found.message)
     for warning in found.warnings:

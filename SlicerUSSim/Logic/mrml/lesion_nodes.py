@@ -15,7 +15,6 @@ from SlicerUSSim.Logic.base.vtk_data import matrix_array, vtk_matrix
 from SlicerUSSim.Logic.mri.masks import read_masks
 from SlicerUSSim.Logic.mri.pathology import Added, add_tissues, box_ras, tissue_to_add
 from SlicerUSSim.Logic.mrml.nodes import named, node_to_world, require_node
-from SlicerUSSim.Logic.tissue.label_advice import SCENE, Advice
 from SlicerUSSim.Logic.tissue.presets import TISSUES, colour_of
 from SlicerUSSim.Logic.tissue.table import TissueTable
 
@@ -71,13 +70,13 @@ def read_lesions(lesions_node, to_frame_of, tissues: TissueTable) -> tuple[list[
     return found, list(dict.fromkeys(warnings))  # a file may have been added twice
 
 
-def add_lesion(lesions_node, mask: Volume, tissue: str, name: str, advice: Advice = SCENE) -> list[str]:
+def add_lesion(lesions_node, mask: Volume, tissue: str, name: str) -> list[str]:
     """Append the segments of a mask, as add_tissue reads it, to a segmentation node; returns their IDs.
 
-    What should be checked about the mask is kept with the segments, in the words of `advice`: see read_lesions.
+    What should be checked about the mask is kept with the segments: see read_lesions.
     Raises SimulationError for what is not a mask; the node is then as it was.
     """
-    masks = read_masks(mask, tissue, name, advice)
+    masks = read_masks(mask, tissue, name)
     if lesions_node.GetSegmentation().GetNumberOfSegments() == 0:
         lesions_node.SetSourceRepresentationToBinaryLabelmap()
     ids = []

@@ -9,11 +9,11 @@ from SlicerUSSim.Logic.imaging.frame import Frame
 from SlicerUSSim.Logic.imaging.preset import Preset
 from SlicerUSSim.Logic.mrml.craniotomy_nodes import hide_flap
 from SlicerUSSim.Logic.mrml.fit_logic import FitLogic
+from SlicerUSSim.Logic.mrml.grown_nodes import LesionGrowth
 from SlicerUSSim.Logic.mrml.image_logic import ImageLogic
 from SlicerUSSim.Logic.mrml.live import LiveLogic
 from SlicerUSSim.Logic.mrml.own_results import may_replace_result
 from SlicerUSSim.Logic.mrml.patient_logic import AtOnce as AtOnce, PatientLogic
-from SlicerUSSim.Logic.mrml.proposal_nodes import LesionProposals
 from SlicerUSSim.Logic.mrml.segment_logic import SegmentLogic
 from SlicerUSSim.Logic.mrml.sequence_logic import SequenceLogic
 from SlicerUSSim.Logic.mrml.taken_image import TakenImage
@@ -96,9 +96,9 @@ class UltrasoundSceneLogic:
         self.parameters.preset = preset
 
     @property
-    def proposals(self) -> LesionProposals:
-        """Lesions proposed from the MRI that was segmented last."""
-        return self.labels.proposals
+    def growth(self) -> LesionGrowth:
+        """Grows lesions on the MRI that was segmented last."""
+        return self.labels.growth
 
     @property
     def notes(self) -> tuple[str, ...]:

@@ -190,9 +190,8 @@ class SceneParameters:
     organs = NodeParameter("vtkMRMLSegmentationNode", "vtkMRMLLabelMapVolumeNode")
     #: Thin sheets that images show
     sheets = NodeParameter("vtkMRMLModelNode")
-    #: Point in a lesion, and what is proposed as lesions
+    #: Point in a lesion
     seed = NodeParameter("vtkMRMLMarkupsFiducialNode")
-    proposal = NodeParameter("vtkMRMLSegmentationNode")
     #: Of a craniotomy; none: a disc under the probe
     opening = NodeParameter("vtkMRMLMarkupsNode", "vtkMRMLSegmentationNode", "vtkMRMLLabelMapVolumeNode")
     probe_transform = NodeParameter("vtkMRMLLinearTransformNode")

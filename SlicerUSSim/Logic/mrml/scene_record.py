@@ -52,7 +52,7 @@ _VOLUME, _LABELS, _SEGMENTS, _MODEL, _POINTS = (
     "vtkMRMLMarkupsNode",
 )  # fmt: skip
 #: Roles of nodes of a patient, and of their labels before an opening and the shares of both
-ROLES = ("mri", "second_mri", "labels", "mask", "lesions", "organs", "sheets", "seed", "proposal", "opening", "real")
+ROLES = ("mri", "second_mri", "labels", "mask", "lesions", "organs", "sheets", "seed", "opening", "real")
 _CLOSED = "closed"
 _SHARES_OF = {"labels": "shares", _CLOSED: "closed shares"}
 #: Begin of the attributes of nodes that are this package's

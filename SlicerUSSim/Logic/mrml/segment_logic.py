@@ -19,6 +19,7 @@ from SlicerUSSim.Logic.mri.segmentation import Segmentation
 from SlicerUSSim.Logic.mri.segmentation_settings import CT, SegmentationSettings
 from SlicerUSSim.Logic.mri.sheets.finding import find_sheets, require_findable
 from SlicerUSSim.Logic.mrml.craniotomy_nodes import closed_labels, is_opened, opening_of, set_closed_labels, show_flap
+from SlicerUSSim.Logic.mrml.grown_nodes import LesionGrowth
 from SlicerUSSim.Logic.mrml.label_nodes import LABEL_CLASSES, labels_version, read_labels, read_mask, write_labels
 from SlicerUSSim.Logic.mrml.lesion_nodes import Told, padded_for, read_lesions, with_lesions
 from SlicerUSSim.Logic.mrml.live import LiveLogic
@@ -33,7 +34,6 @@ from SlicerUSSim.Logic.mrml.nodes import (
 )
 from SlicerUSSim.Logic.mrml.own_results import mark_as_made, may_replace, require_result
 from SlicerUSSim.Logic.mrml.patient_logic import KnownLabels, PatientLogic
-from SlicerUSSim.Logic.mrml.proposal_nodes import LesionProposals
 from SlicerUSSim.Logic.mrml.share_nodes import read_shares, write_shares
 from SlicerUSSim.Logic.mrml.sheet_nodes import write_sheets
 from SlicerUSSim.Logic.mrml.taken_image import PATIENT, patient_of
@@ -59,8 +59,8 @@ class SegmentLogic:
         """Release what is kept in memory of the last patient."""
         #: Version of the labels over which lesions were laid last, and what was told about each of them
         self._laid: tuple[Hashable, Told] = (None, {})
-        #: Lesions proposed from the MRI that was segmented last
-        self.proposals = LesionProposals(self._patient.scene, self._work.do)
+        #: Grows lesions on the MRI that was segmented last
+        self.growth = LesionGrowth(self._work.do)
         #: What the last segment(), addTissues() or openCraniotomy() did, and what to check, one line each
         self.notes: tuple[str, ...] = ()
         self.warnings: tuple[str, ...] = ()
@@ -135,8 +135,8 @@ class SegmentLogic:
         self._patient.segmented = KnownLabels(
             labels_version(labels_node), added.labels, added.tissue_names, shares, mri, is_of_brain
         )
-        if isinstance(result, Segmentation):  # lesions are proposed on MRIs only
-            self.proposals.segmented(mri_node, result)
+        if isinstance(result, Segmentation):  # lesions are grown on MRIs only
+            self.growth.segmented(mri_node, result)
         if found is not None:
             write_sheets(sheets_node, found.surfels, mri_node)
         sheet_notes = () if found is None else found.notes

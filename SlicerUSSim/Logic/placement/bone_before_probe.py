@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -30,30 +29,13 @@ _LINES = 33
 _BONE, _BRAIN = 1, 2
 
 
-@dataclass(frozen=True)
-class Words:
-    """What to do about a closed skull, in the words of one door."""
-
-    #: To open it under the probe
-    to_open: str
-    #: To go to the opening that there is
-    to_go: str
-    #: To look through the bone
-    through: str
-
-
-COMMAND = Words(
-    "--craniotomy auto, disc:MM or a file", "--pose auto is in it", "--probe transcranial with --pose temporal"
-)
-SCENE = Words(
-    "Open skull in Craniotomy", "the model of the removed piece shows where",
-    "the probe transcranial, placed at the view temporal",
-)  # fmt: skip
+#: To open a skull under the probe
+_OPEN_IT = "--craniotomy auto, disc:MM or a file; Open skull in 3D Slicer and on the page"
 
 
 def about_bone(
     labels: Volume, names: Sequence[str], tissues: Iterable[Tissue], probe: Probe, probe_to_ras: np.ndarray, *,
-    is_open: bool, words: Words,
+    is_open: bool,
 ) -> tuple[str, ...]:  # fmt: skip
     """Lines about a probe at a pose (4, 4) on labels 1, 2, ... called `names`: bone before it, or a face that does not
     fit an opening. None where no skull is labelled, and of images that show the brain.
@@ -70,10 +52,13 @@ def about_bone(
             "of the brain: "
         )
         if not is_closed:
-            return (f"{line}expect a dark image; a craniotomy ({words.to_open}) lets them through",)
+            return (f"{line}expect a dark image; a craniotomy ({_OPEN_IT}) lets them through",)
         if is_open:
-            return (f"{line}the opening is elsewhere ({words.to_go})",)
-        return (f"{line}choose a craniotomy ({words.to_open}); for an image through the temple, {words.through}",)
+            return (
+                f"{line}the opening is elsewhere (--pose auto is in it; the model of the removed piece shows where)",
+            )
+        through = "for an image through the temple, the probe transcranial at the view temporal (--pose temporal)"
+        return (f"{line}choose a craniotomy ({_OPEN_IT}); {through}",)
     line = _misfit(labels, names, probe, probe_to_ras) if is_open else ""
     return (line,) if line else ()
 

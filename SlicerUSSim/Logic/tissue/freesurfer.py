@@ -8,8 +8,6 @@ brain whose tissue is known. Left out: 500 to 558, parts of the hippocampus, whi
 
 from __future__ import annotations
 
-import re
-from collections.abc import Iterable
 from functools import cache
 
 _STRUCTURES = """
@@ -103,27 +101,6 @@ _LEFT_AND_RIGHT = {
 }  # fmt: skip
 #: And others that are often there.
 _OFTEN = {14, 15, 16, 24, 30, 31, 62, 63, 72, *range(77, 83), 85, *range(251, 256)}
-
-
-#: What every whole brain has: words of names; the cerebellum is missed only together with others
-_PARTS = {
-    "cortex": re.compile(r"cerebral-cortex|ctx|cerebral_cortex", re.IGNORECASE),
-    "cerebral white matter": re.compile(r"cerebral[-_]w|^wm-|^wm_|unsegmentedwhite", re.IGNORECASE),
-    "ventricles": re.compile(r"ventricle", re.IGNORECASE),
-    "cerebellum": re.compile(r"cerebell|cbm", re.IGNORECASE),
-}
-
-
-def missing_structures(names: Iterable[str]) -> list[str]:
-    """What a whole brain has and structures with FreeSurfer's names lack; none if only the cerebellum is missing.
-
-    >>> from SlicerUSSim.Logic.tissue.freesurfer import missing_structures
-    >>> missing_structures(["Left-Thalamus", "Left-Cerebral-Cortex"])
-    ['cerebral white matter', 'ventricles', 'cerebellum']
-    """
-    names = list(names)
-    missing = [part for part, words in _PARTS.items() if not any(map(words.search, names))]
-    return [] if missing == ["cerebellum"] else missing
 
 
 @cache

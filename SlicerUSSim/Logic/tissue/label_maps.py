@@ -15,9 +15,7 @@ import numpy as np
 from SlicerUSSim.Logic.base.errors import SimulationError, either, require, require_kind
 from SlicerUSSim.Logic.base.label_numbers import whole_numbers
 from SlicerUSSim.Logic.base.volume import Volume
-from SlicerUSSim.Logic.tissue.body_orientation import has_exchanged_sides, places_of, wrong_body, wrong_way_up
-from SlicerUSSim.Logic.tissue.label_advice import COMMAND, Advice
-from SlicerUSSim.Logic.tissue.label_findings import UNNAMED, Findings, listed
+from SlicerUSSim.Logic.tissue.label_findings import MAP_THEM, SAY_WHICH, UNNAMED, Findings, listed, options
 from SlicerUSSim.Logic.tissue.label_mapping import LabelMapping
 from SlicerUSSim.Logic.tissue.names import nearest_tissue, plain_name, tissue_named
 from SlicerUSSim.Logic.tissue.presets import TISSUES
@@ -74,7 +72,6 @@ def read_label_map(
     by_number: TissueTable | None = None,
     renumber: bool = False,
     of_ct: bool = False,
-    advice: Advice = COMMAND,
 ) -> LabelledTissues:
     """The tissues of a label map: by the user's mapping, by names, by a table, or by the numbers of a known program.
 
@@ -90,10 +87,9 @@ def read_label_map(
     renumber : renumber them also then, from 1.
     of_ct : it has organs of a CT: programs for brains are not thought of, and a few numbers of TotalSegmentator are
         taken for its organs, with alternatives, since segment_ct checks them by the numbers of the CT.
-    advice : remedies in messages.
 
     Raises SimulationError for numbers that are no labels, labels without a tissue, which it lists, numbers that fit
-    several programs, a head that is upside down, and for a mask or lesion without a patient.
+    several programs, and for a mask or lesion without a patient.
 
     >>> import numpy as np
     >>> from SlicerUSSim.Logic import Volume
@@ -108,7 +104,7 @@ def read_label_map(
     require_kind("label map", volume, Volume, "Volume.read reads a file")
     reading = _Reading(
         as_whole(volume, source), names or {}, mapping or LabelMapping(), source,
-        tissues or by_number or TissueTable.brain(), by_number, advice, of_ct,
+        tissues or by_number or TissueTable.brain(), by_number, of_ct,
     )  # fmt: skip
     found = (None if renumber else reading.unchanged()) or reading.by_tissue()
     off = 0.0 if np.issubdtype(volume.array.dtype, np.integer) else _largest_fraction(volume.array)
@@ -146,17 +142,16 @@ class _Reading:
 
     def __init__(
         self, volume: Volume, names: Mapping[int, str], mapping: LabelMapping, source: str, tissues: TissueTable,
-        by_number: TissueTable | None, advice: Advice, of_ct: bool,
+        by_number: TissueTable | None, of_ct: bool,
     ) -> None:  # fmt: skip
         self._of_ct = of_ct
-        self._volume, self._mapping, self._source, self._advice = volume, mapping, source, advice
+        self._volume, self._mapping, self._source = volume, mapping, source
         self._tissues, self._by_number = tissues, by_number
         self._counts = np.bincount(volume.array.ravel())
         self._present = [int(label) for label in np.flatnonzero(self._counts) if label]
         require(self._present, f"{source}: is 0 everywhere, expected labels that are not 0")
         everything = {**names, **mapping.names}
         self._names = {label: everything[label] for label in self._present if label in everything}
-        self._warnings: list[str] = []
 
     def unchanged(self) -> LabelledTissues | None:
         """The labels as they are, if the table by number has all of them and nobody says anything else about them."""
@@ -170,7 +165,6 @@ class _Reading:
 
     def by_tissue(self) -> LabelledTissues:
         """Labels renumbered from 1, one for each tissue, in the order of their first labels."""
-        self._require_background()
         if self._of_ct:
             organs = self._organs()
             if organs is not None:
@@ -183,11 +177,10 @@ class _Reading:
         found = {label: self._tissue(label, name) for label, name in names.items()}
         findings = Findings(
             self._source, self._volume, self._counts, names, found,
-            scheme or scheme_with_names(self._names), self._mapping, self._tissues, self._advice, self._of_ct,
+            scheme or scheme_with_names(self._names), self._mapping, self._tissues, self._of_ct,
         )  # fmt: skip
         findings.require_patient()
         findings.require_known()
-        self._require_upright(names, is_whole=not findings.is_part_of_brain)
         coupling = (self._by_number or self._tissues)[0]
         order: list[Tissue] = []
         relabelled = {0: 0}
@@ -212,37 +205,7 @@ class _Reading:
         labels = self._volume.with_array(lookup[self._volume.array])
         tissues = f"{len(order)} tissue{'s' * (len(order) > 1)}"
         message = f"{self._title(findings)}: {findings.number()} to {tissues}"
-        return LabelledTissues(labels, table, relabelled, message, (*self._warnings, *findings.doubts()))
-
-    def _require_background(self) -> None:
-        """Raise SimulationError for a background that is not 0: a label without a name around everything else."""
-        array = self._volume.array
-        corner = int(array[0, 0, 0])
-        is_around = (
-            corner != 0 and (array[:: array.shape[0] - 1, :: array.shape[1] - 1, :: array.shape[2] - 1] == corner).all()
-        )
-        if not is_around or len(self._present) == 1 or self._counts[0]:
-            return
-        if corner in self._names or self._tissue(corner, None):
-            return
-        share = self._counts[corner] / self._counts.sum()
-        raise SimulationError(
-            f"{self._source}: label {corner} fills {share:.0%} of the volume and all its corners, as a background "
-            f"does, which is expected to be 0; {self._advice.background.format(label=corner)}"
-        )
-
-    def _require_upright(self, names: Mapping[int, str | None], *, is_whole: bool) -> None:
-        """Raise SimulationError for a head or body that is upside down by what its labels are called."""
-        own = {label: name for label, name in names.items() if self._mapping.tissue_of(label, name) is None}
-        places = places_of(self._volume, own)
-        wrong = wrong_way_up(self._volume, own, is_whole=is_whole) or wrong_body(places)
-        require(
-            wrong is None,
-            f"{self._source}: by its header, {wrong}; correct the orientation in its header, or export it again with "
-            "that of its image",
-        )
-        if has_exchanged_sides(places):
-            self._warn_of_sides()
+        return LabelledTissues(labels, table, relabelled, message, tuple(findings.doubts()))
 
     # ---- what it is --------------------------------------------------------------------------------------------
 
@@ -269,12 +232,11 @@ class _Reading:
             return None
         titles = either([self._with_names(scheme, unknown) for scheme in readings.values()])
         first = next(iter(readings.values()))
-        remedy = self._advice.ambiguous.format(key=first.key)
+        remedy = SAY_WHICH.format(key=first.key)
         ambiguity = f"{self._source}: labels {listed(unknown)} may be those of {titles}; {remedy}"
         tells = any(tissue in _TELLING for tissues in readings for tissue in tissues)
         if not is_sure and (len(unknown) < _FEWEST_ORGANS or not tells):
-            otherwise = self._advice.unknown.format(label=unknown[0])
-            raise SimulationError(f"{ambiguity}; or {otherwise}: {', '.join(TISSUES)}")
+            raise SimulationError(f"{ambiguity}; or {MAP_THEM.format(label=unknown[0])}: {', '.join(TISSUES)}")
         result = []
         for scheme in readings.values():
             of_scheme = self._by_scheme(scheme)
@@ -298,10 +260,10 @@ class _Reading:
         recognition = recognised(kept, unknown)
         if recognition.candidates:
             titles = " and ".join(scheme.title for scheme in recognition.candidates)
-            remedy = self._advice.ambiguous.format(key=recognition.candidates[0].key)
+            remedy = SAY_WHICH.format(key=recognition.candidates[0].key)
             raise SimulationError(f"{self._source}: labels {listed(self._present)} fit {titles}; {remedy}")
         if recognition.possible is not None:
-            remedy = self._advice.ambiguous.format(key=recognition.possible.key)
+            remedy = SAY_WHICH.format(key=recognition.possible.key)
             raise SimulationError(
                 f"{self._source}: labels {listed(self._present)} are all in {recognition.possible.title}'s table, but "
                 f"{recognition.doubt}; if they are {recognition.possible.title}'s, {remedy}"
@@ -309,10 +271,6 @@ class _Reading:
         if recognition.order:
             raise SimulationError(f"{self._source}: {self._likely(recognition.order)}")
         return recognition.scheme
-
-    def _warn_of_sides(self) -> None:
-        line = f"{self._source}: labels of the left side are on the right; check the orientation in its header"
-        self._warnings.append(line)
 
     def _likely(self, order: Mapping[int, str]) -> str:
         """What three labels of a brain probably are, and how to say so."""
@@ -324,7 +282,7 @@ class _Reading:
         maps += [f"{label}=TISSUE" for label in others]
         return (
             f"labels {listed(self._present)} are in no known program's order; by their amounts and places they are "
-            f"{listed(parts)}; {self._advice.likely.format(maps=self._advice.maps(maps))}"
+            f"{listed(parts)}; if that is right, say so with {options(maps)}"
         )
 
     def _tissue(self, label: int, name: str | None) -> Tissue | None:

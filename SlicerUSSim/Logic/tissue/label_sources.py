@@ -12,8 +12,6 @@ from SlicerUSSim.Logic.base.errors import require
 from SlicerUSSim.Logic.base.files import read_json
 from SlicerUSSim.Logic.base.label_numbers import has_uniform_fractions
 from SlicerUSSim.Logic.base.volume import Volume
-from SlicerUSSim.Logic.tissue.interpolated_labels import is_interpolated, is_smoothed
-from SlicerUSSim.Logic.tissue.label_advice import COMMAND, Advice
 from SlicerUSSim.Logic.tissue.label_files import names_of_file
 from SlicerUSSim.Logic.tissue.label_mapping import LabelMapping
 from SlicerUSSim.Logic.tissue.label_maps import LabelledTissues, as_whole, read_label_map
@@ -26,8 +24,7 @@ _log = logging.getLogger(__name__)
 def is_label_file(path: Path, volume: Volume) -> bool:
     """Whether a file is a label map or a tissue probability map, and no MRI.
 
-    Raises SimulationError for a probability map whose companions are missing, and for a label map that was resampled
-    with interpolation.
+    Raises SimulationError for a probability map whose companions are missing, and for labels with fractions.
     """
     if volume.looks_like_labels() or _without_labels(path, volume) is not None:
         return True
@@ -45,21 +42,10 @@ def not_intensities(volume: Volume) -> str | None:
             "is a partial volume map of three tissues, as CAT12's p0, or their label map resampled with interpolation, "
             "expected the intensities of an MRI; use it as a label map"
         )
-    if is_interpolated(volume.array):
-        return (
-            "is mostly uniform regions of whole numbers with fractions between them, as a label map that was "
-            "resampled with interpolation, expected an MRI or labels; resample the label map with nearest neighbours"
-        )
     if has_uniform_fractions(volume.array):
         return (
             "is uniform regions of few values with fractions, as a label map that was scaled or shifted, expected an "
             "MRI or labels; save the labels as whole numbers"
-        )
-    if is_smoothed(volume.array):
-        return (
-            "is uniform regions of whole numbers with smooth transitions, as a label map that was smoothed or "
-            "resampled with interpolation (or a phantom without noise), expected an MRI or labels; use the original "
-            "label map, and resample it with nearest neighbours"
         )
     return None
 
@@ -67,9 +53,7 @@ def not_intensities(volume: Volume) -> str | None:
 def _without_labels(path: Path, volume: Volume) -> CombinedMaps | None:
     """The label map of what holds probabilities or partial volumes, and no labels; None if it is neither."""
     maps = combined_probability_maps(path, volume)
-    if maps is not None or (is_interpolated(volume.array) and not is_as_cat12_writes(path, volume.array)):
-        return maps
-    return partial_volume_labels(path, volume)
+    return partial_volume_labels(path, volume) if maps is None else maps
 
 
 def read_label_file(
@@ -81,7 +65,6 @@ def read_label_file(
     preset: TissueTable | None = None,
     default: TissueTable | None = None,
     of_ct: bool = False,
-    advice: Advice = COMMAND,
 ) -> LabelledTissues:
     """The tissues of a label map that was read from a file.
 
@@ -101,10 +84,8 @@ def read_label_file(
     maps = _without_labels(path, volume)
     if maps is not None:
         if not any(mapping.tissue_of(label, name) for label, name in maps.names.items()):
-            maps.require_order(str(path), advice)
-        found = read_label_map(
-            maps.labels, maps.names, mapping, source=str(path), tissues=table or preset or default, advice=advice
-        )
+            maps.require_order(str(path))
+        found = read_label_map(maps.labels, maps.names, mapping, source=str(path), tissues=table or preset or default)
         return replace(found, message=maps.message.removeprefix(f"{path}: "))
     own = table
     if own is None and preset is None:
@@ -118,7 +99,6 @@ def read_label_file(
         by_number = preset
     found = read_label_map(
         volume, names, mapping, source=str(path), tissues=own or preset or default, by_number=by_number, of_ct=of_ct,
-        advice=advice,
     )  # fmt: skip
     return replace(found, message=f"{found.message}, named in {where}") if names else found
 
@@ -149,7 +129,6 @@ _NEAR, _PURE_SHARE = 0.03, 0.04
 _ABOVE_BETWEEN = 2.0
 #: Share of what is above zero that is at least between the peaks; a label map stored as floating point has none
 _FRACTIONS_SHARE = 0.02
-_BYTES = 256
 
 
 def partial_volume_labels(path: Path, volume: Volume) -> CombinedMaps | None:
@@ -159,11 +138,6 @@ def partial_volume_labels(path: Path, volume: Volume) -> CombinedMaps | None:
     labels = volume.with_array(np.rint(np.clip(volume.array, 0, 3)).astype(np.uint8))
     message = f"{path}: CAT12's partial volume map (p0), 3 tissues: 1 csf, 2 grey matter, 3 white matter, rounded"
     return CombinedMaps(labels, message, (path.name,) * 3)
-
-
-def is_as_cat12_writes(path: Path, array: np.ndarray) -> bool:
-    """Whether a file is called as CAT12 does, or stored in bytes as it does; no label map that was interpolated is."""
-    return path.name.startswith("p0") or len(np.unique(array)) <= _BYTES
 
 
 def is_partial_volume_map(array: np.ndarray) -> bool:

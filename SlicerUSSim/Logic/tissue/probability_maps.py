@@ -22,7 +22,7 @@ import numpy as np
 from SlicerUSSim.Logic.base.errors import SimulationError, require
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.tissue.brain_orders import BRAIN_TISSUES, BrainLabels
-from SlicerUSSim.Logic.tissue.label_advice import COMMAND, Advice
+from SlicerUSSim.Logic.tissue.label_findings import options
 
 #: (program, regular expression of a file name with the part that differs as group "part", {part: tissue})
 _PATTERNS: tuple[tuple[str, str, dict[str, str]], ...] = (
@@ -36,9 +36,6 @@ _PATTERNS: tuple[tuple[str, str, dict[str, str]], ...] = (
 )  # fmt: skip
 #: The program whose maps are in the order of brightness, which may be that of any contrast
 _BY_BRIGHTNESS = "FSL FAST"
-#: Modulated maps hold volumes and no probabilities, multiplied with the change of volume of a normalisation (SPM12
-#: manual, chapter "Segment"); an MRI has larger numbers than this
-_MODULATED, _LARGEST_MODULATED = re.compile(r"[rs]*m0?w[cp]([1-6])(?=[^0-9]).+"), 5.0
 #: Probabilities are nearly one in a share of what is above zero: 0.05 in the averaged grey matter of MNI152, more in
 #: one person's; an MRI scaled to one has 0.00001. Without one of these names, more is demanded.
 _CERTAIN, _CERTAIN_SHARE, _CERTAIN_SHARE_OF_NAMED = 0.95, 0.1, 0.01
@@ -74,7 +71,7 @@ class CombinedMaps:
         """{label: tissue}."""
         return dict(enumerate(BRAIN_TISSUES, 1))
 
-    def require_order(self, source: str, advice: Advice = COMMAND) -> None:
+    def require_order(self, source: str) -> None:
         """Raise SimulationError if amounts and places of the tissues show that they are exchanged.
 
         Maps by brightness have to fit, as FAST's of a T2 do not; those by tissue are believed unless one other order,
@@ -86,7 +83,7 @@ class CombinedMaps:
             return
         is_known = len(orders) == 1
         order = dict(sorted(orders[0].items())) if is_known else self.names
-        maps = advice.maps(f"{label}={tissue.split()[0]}" for label, tissue in order.items())
+        maps = options(f"{label}={tissue.split()[0]}" for label, tissue in order.items())
         numbered = ", ".join(f"{label} {file}" for label, file in enumerate(self.files, 1))
         found = ", ".join(f"{label} {tissue} ({brain.shares[label]:.0%})" for label, tissue in order.items())
         is_of_t2 = self.is_by_brightness and list(order.values()) == [*reversed(BRAIN_TISSUES)]
@@ -94,7 +91,7 @@ class CombinedMaps:
             f"{source}: a tissue probability map, but by amounts and places its maps (labels {numbered}) are not "
             + (f"CSF, grey and white matter but {found}" if is_known else f"surely {found}")
             + (", as of a T2" if is_of_t2 else "")
-            + f"; {advice.likely.format(maps=maps)}"
+            + f"; if that is right, say so with {maps}"
         )
 
 
@@ -105,7 +102,6 @@ def combined_probability_maps(path: Path, volume: Volume) -> CombinedMaps | None
 
     Raises SimulationError if it is a probability map but the others are missing, more than three or have another grid.
     """
-    _require_not_modulated(path, volume)
     scaled = None if _has_probabilities(volume) else _scaled(path, volume)
     if scaled is not None:
         return scaled
@@ -128,20 +124,6 @@ def combined_probability_maps(path: Path, volume: Volume) -> CombinedMaps | None
         f"{path}: a probability map (values from 0 to {volume.array.max():.3g}, most of them certain), not an MRI; the "
         "maps of the other tissues are not known from its name, expected c1, c2, c3 + NAME (SPM) or NAME_pve_0, _1, _2 "
         "(FSL FAST)"
-    )
-
-
-def _require_not_modulated(path: Path, volume: Volume) -> None:
-    """Raise SimulationError for a map of the volumes of a tissue, by its name and its values."""
-    found = _MODULATED.fullmatch(path.name)
-    array = volume.array
-    if found is None or not np.issubdtype(array.dtype, np.floating) or not _has_fractions(array):
-        return
-    require(
-        not (array.min() >= 0 and array.max() <= _LARGEST_MODULATED),
-        f"{path}: a modulated tissue map ({found[0][: found.end(1)]}, volumes of the tissue in a template's space), "
-        "not an MRI; give the probability maps of the patient (c1, c2, c3 of SPM; p1, p2, p3 of CAT12), or the "
-        "MRI",
     )
 
 

@@ -20,7 +20,7 @@ from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.tissue import freesurfer, totalsegmentator
 from SlicerUSSim.Logic.tissue.brain_orders import BRAIN_TISSUES, BrainLabels
 from SlicerUSSim.Logic.tissue.names import same_name
-from SlicerUSSim.Logic.tissue.thinning import centres_of, label_places, lie_apart, thinning
+from SlicerUSSim.Logic.tissue.thinning import centres_of, label_places, lie_apart
 
 #: At least this share of the positions of structures has to agree with a scheme, and this number of them.
 _AGREEING, _FEWEST = 0.85, 3
@@ -43,8 +43,6 @@ _OF_CONTRAST, _LARGEST_ENHANCING = {**dict(enumerate(BRAIN_TISSUES, 1)), 5: "lep
 _IN_WHITE = 0.4
 #: A brain with the fluid around it has up to 2 litres.
 _LARGEST_BRAIN_ML = 3000.0
-#: Depth of what is around others, by that of the others
-_SHALLOW = 0.7
 
 
 #: Schemes of organs in a CT
@@ -248,9 +246,6 @@ def _of_brain(labels: Volume, values: list[int]) -> Recognition:
     if volume_ml < _LARGEST_LESION_ML and filled < _LARGEST_LESION_SHARE * labels.array.size:
         return Recognition(known["brats"] if has_few else None)
     if volume_ml > _LARGEST_BRAIN_ML:
-        if set(values) == set(known["totalsegmentator-tissues"].names) and _is_outermost(labels, 1):
-            doubt = f"only amounts and places tell: {volume_ml / 1000:.1f} litres, label 1 around the others"
-            return Recognition(None, possible=known["totalsegmentator-tissues"], doubt=doubt)
         return Recognition(None)
     has_other_numbers = len(values) == 3 and not has_few
     tissues = BrainLabels.of(labels, tuple(value for value in values if value < 4 or has_other_numbers))
@@ -281,19 +276,6 @@ def _is_leptomeninges(labels: Volume, label: int, *, white: int) -> bool:
         return False
     beside = np.asarray(ndimage.binary_dilation(array)) & ~array
     return bool((labels.array[beside] == white).mean() <= _IN_WHITE)
-
-
-def _is_outermost(labels: Volume, label: int) -> bool:
-    """Whether a label is around the others, which may have holes."""
-    from scipy import ndimage
-
-    step = thinning(labels.array)
-    array = labels.array[::step, ::step, ::step]
-    solid = np.stack(
-        [np.asarray(ndimage.binary_fill_holes(one)) for one in array > 0]
-    )  # by slice: holes are open at the ends
-    depth = np.asarray(ndimage.distance_transform_edt(solid))
-    return bool(depth[array == label].mean() < _SHALLOW * depth[(array > 0) & (array != label)].mean())
 
 
 def _agreement(order: list[tuple[int, list[int]]], centres: Mapping[int, np.ndarray]) -> tuple[int, int, int]:

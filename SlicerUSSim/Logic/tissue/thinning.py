@@ -36,11 +36,6 @@ def label_places(labels: Volume) -> Places:
     return dict(zip(map(int, values), places, strict=True))
 
 
-def label_centres(labels: Volume) -> dict[int, np.ndarray]:
-    """{label: its centre in RAS mm} of all labels but 0."""
-    return centres_of(label_places(labels))
-
-
 def centres_of(places: Places) -> dict[int, np.ndarray]:
     """The centres alone."""
     return {label: centre for label, (centre, _) in places.items()}

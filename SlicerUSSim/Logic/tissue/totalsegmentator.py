@@ -57,8 +57,7 @@ iliopsoas_left iliopsoas_right brain
 #: Names in the order of the labels, from 1
 CT, CT_V1, MR = (text.split() for text in (_CT, _CT_V1, _MR))
 
-#: Structures from the feet to the head, from the patient's left to the right, and from the back to the front, as far as
-#: people agree.
+#: Structures from the feet to the head, and from the patient's left to the right, as far as people agree
 _SPINE = [
     f"vertebrae_{part}{n}" for part, last in (("S", 1), ("L", 5), ("T", 12), ("C", 7)) for n in range(last, 0, -1)
 ]
@@ -68,11 +67,6 @@ UPWARDS = (
     ["prostate", "sacrum", "aorta"],
 )  # fmt: skip
 RIGHTWARDS = (["spleen", "liver"], ["stomach", "gallbladder"])
-FORWARDS = (
-    ["autochthon_left", "vertebrae_L2", "inferior_vena_cava"], ["autochthon_right", "vertebrae_T12", "aorta"],
-    ["vertebrae_T8", "heart", "sternum"], ["spinal_cord", "esophagus"], ["sacrum", "urinary_bladder"],
-    ["gluteus_maximus_left", "iliopsoas_left"], ["gluteus_maximus_right", "iliopsoas_right"], ["brain", "face"],
-)  # fmt: skip
 
 
 def numbered(names: Sequence[str]) -> dict[int, str]:

@@ -46,7 +46,6 @@ from SlicerUSSim.Logic.mri.sheets.polydata import placed_surfels
 from SlicerUSSim.Logic.probe.arrays import Probe
 from SlicerUSSim.Logic.probe.image_grid import ImageGrid
 from SlicerUSSim.Logic.probe.shape import outline_polydata
-from SlicerUSSim.Logic.tissue.label_advice import MRI_SCRIPT, SCRIPT
 from SlicerUSSim.Logic.tissue.label_findings import NoPatientError
 from SlicerUSSim.Logic.tissue.label_maps import read_label_map
 from SlicerUSSim.Logic.tissue.surfels import KINDS, Surfels
@@ -250,14 +249,14 @@ class SegmentationFilter(_ImageFilter):
         settings, others = SegmentationSettings(**self._values), self._others.items()
         is_of_brain = has_brain_mask(settings.contrast)
         skull_strip = settings.skull_strip if is_of_brain else "none"
-        require_addable(image, masks, mask=mask, skull_strip=skull_strip, advice=MRI_SCRIPT)
+        require_addable(image, masks, mask=mask, skull_strip=skull_strip)
         found = segment_image(
             image, settings, others={name: Volume.from_vtk(other) for name, other in others}, mask=mask,
             device=self._device, progress=self._report,
         )  # fmt: skip
         output = vtkImageData.GetData(outInfo)
         output.CopyStructure(mri)
-        added = add_tissues(found.labels, found.tissue_names, masks, has_brain_mask=is_of_brain, advice=MRI_SCRIPT)
+        added = add_tissues(found.labels, found.tissue_names, masks, has_brain_mask=is_of_brain)
         set_scalars(output, added.labels.array)
         set_tissue_names(output, added.tissue_names)
         self._segmentation = found
@@ -273,7 +272,7 @@ class SegmentationFilter(_ImageFilter):
         if self._values["skull_strip"] == "none" or not image.looks_like_labels():
             return
         try:
-            read_label_map(image, source="the MRI", advice=MRI_SCRIPT)
+            read_label_map(image, source="the MRI")
         except NoPatientError:
             raise
         except SimulationError:  # the segmentation says what it is
@@ -468,7 +467,7 @@ class UltrasoundSimulationFilter(_ImageFilter):
         if is_numbered and all(int(label) in self._tissues for label in np.unique(volume.array)):
             return volume, self._tissues
         try:
-            found = read_label_map(volume, source="label image", tissues=self._tissues, advice=SCRIPT)
+            found = read_label_map(volume, source="label image", tissues=self._tissues)
         except SimulationError:
             if is_numbered:  # the simulator names the labels that the table lacks
                 return volume, self._tissues

@@ -1,1 +1,1 @@
-"""Lesions proposed from an MRI: grown from a point, or where a brain looks unlike a healthy one. Never applied here."""
+"""Lesions grown from a point of an MRI. Never laid over its labels here."""

@@ -37,7 +37,7 @@ def why_no_lesion(evidence: Evidence, look: Look, region: Region, window: Window
     if look.name == "enhancing":
         if region.radius_mm < _LEAST_ENHANCING_MM or balls > _MOST_ENHANCING_BALLS:
             return "like a vessel, long and thin"
-        if beside_no_tissue(evidence, region, window) > _MOST_BESIDE_NO_TISSUE:
+        if _beside_no_tissue(evidence, region, window) > _MOST_BESIDE_NO_TISSUE:
             return "in CSF or at the surface of the brain, as veins, choroid plexus and dura do"
         if _enhances_on_both_sides(evidence, region, window):
             return "on both sides, as vessels and choroid plexus do"
@@ -68,7 +68,7 @@ def _why_healthy_fluid(evidence: Evidence, region: Region, window: Window) -> st
     return None
 
 
-def beside_no_tissue(evidence: Evidence, region: Region, window: Window) -> float:
+def _beside_no_tissue(evidence: Evidence, region: Region, window: Window) -> float:
     """Share of the shell around a region that is fluid or outside the brain."""
     apart = cast(np.ndarray, ndimage.distance_transform_edt(~region.inside, sampling=evidence.spacing_mm.tolist()))
     shell = (apart > 0.0) & (apart <= _SHELL_MM)

@@ -37,11 +37,6 @@ class Proposal:
         numbers = labels_of(self.tissues, tissues or self.tissues)
         return float(np.isin(self.labels.array, numbers).sum() * self.labels.voxel_ml)
 
-    def is_mostly_in(self, other: Proposal) -> bool:
-        """Whether more than half of this proposal is in another one, or of the other in this one."""
-        mine, its = self.labels.array > 0, other.labels.array > 0
-        return bool((mine & its).sum() > 0.5 * min(mine.sum(), its.sum()))
-
     @property
     def centre_ras_mm(self) -> np.ndarray:
         """(3,) centroid, of the parts without oedema where there are others."""
