@@ -177,7 +177,7 @@ def test_several_series_are_listed_and_a_localiser_is_left_out(tmp_path, caplog)
     assert np.array_equal(Volume.read(tmp_path / "203.dcm").array, SERIES.array)
 
 
-def test_segments_and_other_volumes_of_a_series_in_a_folder_are_not_the_mri(tmp_path):
+def test_segments_and_other_echoes_in_a_folder_are_not_the_mri(tmp_path):
     """As archives keep segments beside their MRI, and scanners the echoes of a series in files with many frames."""
     save(tmp_path / "a", images())
     masks = np.ones((*SERIES.array.shape, 1), np.uint8)

@@ -151,6 +151,7 @@ class Volume:
 
         Raises SimulationError for a missing or unreadable file and for an image that is not 3D and scalar.
         """
+        require_path(path)
         path = Path(path)
         found = read_image_file(path)
         volume = cls.from_image_file(found, str(path))
@@ -326,7 +327,6 @@ def read_image_file(path: str | os.PathLike) -> ImageFile:
 
     Raises SimulationError for a missing or unreadable file.
     """
-    require_path(path)
     require_readable_name(path)
     path = Path(path)
     require(path.exists(), f"{path}: no such file or folder")
