@@ -29,6 +29,7 @@ from SlicerUSSim.Logic.tracked import TrackedImages, read_pose, write_pose
 from SlicerUSSim.Logic.tracked.sequence import SIMULATED
 from tests.conftest import SHARED, example, needs_shared
 from tests.test_label_maps import head_tissues
+from tests.test_sequence import linear_transforms, slicer_sequence
 
 
 def ussim(*arguments):
@@ -96,6 +97,22 @@ def test_a_probe_off_the_patient_is_said(folder, tmp_path, monkeypatch):
         "-o", "o.igs.mha", "--contact-gap", 3, "--to-mri", tmp_path / "off.json",
     )  # fmt: skip
     assert "in 3 of 3 images 0% of the probe's face touches the patient (contact gap: 3 mm)" in done.stderr
+
+
+def test_a_sweep_simulates_poses_of_slicer_without_images(folder, tmp_path):
+    tracked = TrackedSequence.read(folder / "tracked.igs.mha")
+    nodes = linear_transforms([tracked.pose(n, "ProbeToReference") for n in range(3)])
+    storage, node = slicer_sequence("LinearTransform", tmp_path / "poses.seq.mha", "ProbeToReference", nodes)
+    assert storage.WriteData(node) == 1
+    images = []
+    for sequence, out in ((folder / "tracked.igs.mha", "a.igs.mha"), (tmp_path / "poses.seq.mha", "b.igs.mha")):
+        options = ("--sequence", sequence, "--probe", folder / "probe.json", "-o", tmp_path / out)
+        done = ussim("sweep", folder / "labels.nii.gz", *options)
+        assert done.exit_code == 0, done.output
+        images.append(TrackedSequence.read(tmp_path / out).images.astype(int))
+    assert np.abs(images[0] - images[1]).mean() < 0.5  # Slicer writes poses with six digits
+    done = ussim("optimize", folder / "labels.nii.gz", "--sequence", sequence, "-o", tmp_path / "o.json")
+    assert done.exit_code == 2 and "has poses without images, expected images" in done.stderr
 
 
 @pytest.mark.parametrize("name", ["o.igs.mha", pytest.param("o.nrrd", marks=pytest.mark.slow)])

@@ -13,8 +13,7 @@ import SimpleITK as sitk
 from SlicerUSSim.Logic import SimulationError, Volume
 from SlicerUSSim.Logic.tissue import TissueTable
 from SlicerUSSim.Logic.tissue.label_files import read_names
-from SlicerUSSim.Logic.tracked.pose_files import read_pose, read_tags, read_transform
-from SlicerUSSim.Logic.tracked.sequence import read_coordinate_definitions
+from SlicerUSSim.Logic.tracked.pose_files import read_coordinate_definitions, read_pose, read_tags, read_transform
 
 ARRAY = (np.arange(6 * 5 * 4) % 200).reshape(6, 5, 4).astype(np.int16)
 

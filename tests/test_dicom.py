@@ -177,6 +177,20 @@ def test_several_series_are_listed_and_a_localiser_is_left_out(tmp_path, caplog)
     assert np.array_equal(Volume.read(tmp_path / "203.dcm").array, SERIES.array)
 
 
+def test_segments_and_other_echoes_in_a_folder_are_not_the_mri(tmp_path):
+    """As archives keep segments beside their MRI, and scanners the echoes of a series in files with many frames."""
+    save(tmp_path / "a", images())
+    masks = np.ones((*SERIES.array.shape, 1), np.uint8)
+    save(tmp_path / "a", [segmentation(masks, [("Brain", "Brain")])], [99])
+    assert np.array_equal(Volume.read(tmp_path / "a").array, SERIES.array)
+    first, second = enhanced(images()), enhanced(images(change=slopes))
+    second.SeriesInstanceUID = first.SeriesInstanceUID
+    save(tmp_path / "b", [first, second])
+    with pytest.raises(SimulationError, match="has 2 files with 12 frames each; give one of them"):
+        Volume.read(tmp_path / "b")
+    assert np.array_equal(Volume.read(tmp_path / "b" / "0.dcm").array, SERIES.array)
+
+
 def test_names_of_patients_stay_out_of_messages_logs_and_files(tmp_path, caplog):
     caplog.set_level("DEBUG")
     for patient in ("Doe^Jane", "Roe^Rick"):

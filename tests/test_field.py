@@ -471,7 +471,9 @@ def test_colours_are_left_out_and_said(tmp_path, caplog):
 def test_saturated_images_and_a_mirroring_calibration_are_said(caplog):
     sequence = recording(CONVEX, 2)
     bright = np.where(sequence.images > 150, 255, sequence.images).astype(np.uint8)
-    flipped = sequence.with_images([0, 1], bright).with_transforms({"ProbeToReference": np.diag([-1.0, 1.0, 1.0, 1.0])})
+    mirror = np.diag([-1.0, 1.0, 1.0, 1.0])
+    transforms = tuple({**entry, "ProbeToReference": mirror} for entry in sequence.transforms)
+    flipped = replace(sequence, images=bright, transforms=transforms)
     TrackedImages.of(flipped, probe=CONVEX)
     assert "of the field is at 255 grey levels: the images are saturated" in caplog.text
     assert "ImageToReference mirrors" in caplog.text

@@ -26,8 +26,15 @@ from SlicerUSSim.Logic.imaging.preset import Preset
 from SlicerUSSim.Logic.mri.sheets.polydata import read_surfels, write_surfels
 from SlicerUSSim.Logic.tissue import Surfels
 from SlicerUSSim.Logic.tissue.label_files import read_names
-from SlicerUSSim.Logic.tracked.pose_files import read_matrix, read_pose, read_tags, read_transform, write_pose
-from SlicerUSSim.Logic.tracked.sequence import TrackedSequence, read_coordinate_definitions
+from SlicerUSSim.Logic.tracked.pose_files import (
+    read_coordinate_definitions,
+    read_matrix,
+    read_pose,
+    read_tags,
+    read_transform,
+    write_pose,
+)
+from SlicerUSSim.Logic.tracked.sequence import TrackedSequence
 
 CORPUS = sorted((Path(__file__).parent / "corpus").iterdir())
 #: What stands in damaged headers for a number
@@ -75,7 +82,10 @@ def write_compressed_dicom(path: Path) -> None:
     writer.SetCompressor("JPEG2000")
     writer.SetFileName(str(path))
     # A small one corrupts the memory of its writer
-    writer.Execute(sitk.GetImageFromArray(np.add.outer(np.arange(64), np.arange(48)).astype(np.uint16)[None]))
+    image = sitk.GetImageFromArray(np.add.outer(np.arange(64), np.arange(48)).astype(np.uint16))
+    for tag, value in {"0020|0032": "0\\0\\0", "0020|0037": "1\\0\\0\\0\\1\\0", "0008|0060": "MR"}.items():
+        image.SetMetaData(tag, value)
+    writer.Execute(image)
 
 
 def write_dicom_series(path: Path) -> None:

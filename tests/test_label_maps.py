@@ -16,7 +16,7 @@ from SlicerUSSim.Command.cli import main
 from SlicerUSSim.Logic import SimulationError, TissueTable, Volume
 from SlicerUSSim.Logic.mri import segment_mri
 from SlicerUSSim.Logic.mri.samples import head_mri
-from SlicerUSSim.Logic.tissue import LabelMapping, names_of_file, read_label_file, read_label_map
+from SlicerUSSim.Logic.tissue import LabelMapping, names_of_file, read_label_file, read_label_map, read_names
 from SlicerUSSim.Logic.tissue.freesurfer import freesurfer_names
 from SlicerUSSim.Logic.tissue.label_sources import is_label_file
 from SlicerUSSim.Logic.tissue.names import nearest_tissue, tissue_named
@@ -504,6 +504,34 @@ def test_tables_of_names_of_every_program_are_read(suffix, text, tmp_path):
     volume.write(bare)
     mapped = read_label_file(bare, volume, LabelMapping.of([str(tmp_path / f"seg{suffix}")]))
     assert mapped.names == ("kidney", "tumour")
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "expected"),
+    [
+        ("snap.txt", '\ufeff1 255 0 0 1 1 1 "Grey \\"matter\\", left"\n', {1: 'Grey "matter", left'}),
+        ("excel.csv", "\ufeff1;Grey matter;1;2;3\n2;Tumour;1;2;3\n", {1: "Grey matter", 2: "Tumour"}),
+    ],
+)
+def test_names_have_quotes_and_files_marks_of_their_encoding(name, text, expected, tmp_path):
+    for encoding in ("utf-8", "utf-16-le"):  # as Windows writes them
+        (tmp_path / name).write_bytes(text.encode(encoding))
+        assert read_names(tmp_path / name) == expected
+
+
+def test_a_colour_table_of_slicer_with_terminology_gives_names_alone(tmp_path):
+    """Of "Leptomeninges" the terminology made bone."""
+    slicer = pytest.importorskip("slicer", reason="Slicer's MRML libraries: pip install '.[slicer]'")
+    table = slicer.vtkMRMLColorTableNode()
+    table.SetTypeToUser()
+    table.SetNumberOfColors(3)
+    for label, name in enumerate(("Background", "Leptomeninges", "Tumour, left")):
+        table.SetColor(label, name, 0.5, 0.25, 1.0, 1.0)
+    table.SetTerminology(1, "SCT", "123037004", "Anatomical Structure", "SCT", "113257007", "Structure of bone")
+    storage = slicer.vtkMRMLColorTableStorageNode()
+    storage.SetFileName(str(tmp_path / "labels.csv"))
+    assert storage.WriteData(table) == 1
+    assert read_names(tmp_path / "labels.csv") == {0: "Background", 1: "Leptomeninges", 2: "Tumour, left"}
 
 
 def test_segments_of_slicer_and_totalsegmentators_header_name_the_labels(tmp_path):

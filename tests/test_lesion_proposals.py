@@ -279,7 +279,7 @@ def test_seeds_are_points_of_a_list_of_slicer_before_5(named, sign, tmp_path):
         ("# CoordinateSystem = IJK\n1,2,3,4\n", "CoordinateSystem is 'IJK', expected one of RAS, LPS, 0, 1"),
         ("# CoordinateSystem = RAS\n1,2,3\n", "has a row without x, y and z"),
         ("# CoordinateSystem = RAS\n1,2,nan,3\n", "has a point that is not finite"),
-        ("\xff\xfe", "is no text"),
+        ("\xff\xff", "is no text"),
     ],
 )
 def test_a_list_of_points_that_is_none_is_refused(text, message, tmp_path):

@@ -5,10 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from hypothesis import given, strategies as st
+from scipy.io import savemat
 from scipy.spatial.transform import Rotation
 
 from SlicerUSSim.Logic import SimulationError
-from SlicerUSSim.Logic.base.transforms import angles_of_pose, pose_of_angles
+from SlicerUSSim.Logic.base.transforms import LPS_TO_RAS, angles_of_pose, pose_of_angles
 from SlicerUSSim.Logic.tracked.pose_files import pose_of_text, read_pose, write_pose
 
 degrees = st.floats(-179.0, 179.0)
@@ -36,6 +37,30 @@ def test_a_pose_is_read_as_it_was_written_in_every_format(suffix, tmp_path):
     write_pose(tmp_path / f"pose{suffix}", pose)
     np.testing.assert_allclose(read_pose(tmp_path / f"pose{suffix}"), pose, atol=1e-9)
     assert len(list(tmp_path.iterdir())) == 1
+
+
+@pytest.mark.parametrize("suffix", [".txt", ".mat"])
+@pytest.mark.parametrize("kind", ["double", "float"])
+def test_transforms_of_c3d_and_ants_are_read(suffix, kind, tmp_path):
+    """SimpleITK shows their class as a chain of itself, in which reading did not end."""
+    path, name = tmp_path / f"pose{suffix}", f"MatrixOffsetTransformBase_{kind}_3_3"
+    pose = pose_of_angles([10.0, -20.0, 30.0], [11.0, 22.0, 33.0])
+    to_probe = np.linalg.inv(LPS_TO_RAS @ pose @ LPS_TO_RAS)[:3]
+    numbers = np.concatenate([to_probe[:, :3].ravel(), to_probe[:, 3]]).astype(kind if kind == "double" else "float32")
+    if suffix == ".mat":
+        savemat(path, {name: numbers[:, None], "fixed": np.zeros((3, 1), numbers.dtype)}, format="4")
+    else:
+        text = f"Parameters: {' '.join(map(str, numbers))}\nFixedParameters: 0 0 0\n"
+        path.write_text(f"#Insight Transform File V1.0\n#Transform 0\nTransform: {name}\n{text}")
+    np.testing.assert_allclose(read_pose(path), pose, atol=1e-4)
+
+
+def test_a_matrix_of_flirt_is_no_pose(tmp_path):
+    for name in ("flirt.mat", "flirt.txt"):
+        np.savetxt(tmp_path / name, np.eye(4), "%.8f ")
+    with pytest.raises(SimulationError, match=r"FLIRT .* -src IMAGE flirt\.mat -fsl2ras -oitk pose\.tfm converts"):
+        read_pose(tmp_path / "flirt.mat")
+    assert np.array_equal(read_pose(tmp_path / "flirt.txt"), np.eye(4))  # as the user says
 
 
 def test_a_pose_is_read_from_a_bare_matrix_in_json(tmp_path):

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import SimpleITK as sitk
 from scipy.ndimage import uniform_filter
 from scipy.spatial.transform import Rotation
 
@@ -51,6 +52,21 @@ def truth(mni):
     labels = np.argmax(np.stack([np.clip(1 - g - w, 0, 1), g, w]), axis=0) + 1
     labels[t1.array == 0] = 0
     return labels
+
+
+def test_tissues_do_not_depend_on_the_order_of_voxels_in_a_file():
+    mri = head_mri(4.0)
+    turned = Volume.from_sitk(sitk.DICOMOrient(mri.to_sitk(), "SPL"))
+    found, other = segment_once(mri), segment_once(turned)
+    assert other.labels.array.shape == turned.array.shape != mri.array.shape
+    assert np.array_equal(other.labels.ijk_to_ras, turned.ijk_to_ras)
+    back = Volume.from_sitk(sitk.DICOMOrient(other.labels.to_sitk(), "RAS"))
+    assert np.array_equal(back.array, found.labels.array)
+    for one, same in zip(other.posteriors, found.posteriors, strict=True):
+        back = sitk.DICOMOrient(turned.with_array(one).to_sitk(), "RAS")
+        assert np.array_equal(sitk.GetArrayFromImage(back), same)
+    inside = other.evidence.to_whole(other.evidence.inside)
+    assert np.array_equal(inside, other.brain.mask.array > 0)
 
 
 @pytest.fixture(scope="module")

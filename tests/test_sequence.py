@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from itertools import pairwise
 from pathlib import Path
 
@@ -10,12 +11,21 @@ import pytest
 import SimpleITK as sitk
 from hypothesis import given, strategies as st
 from scipy.spatial.transform import Rotation
+from vtkmodules.util.numpy_support import numpy_to_vtk
+from vtkmodules.vtkCommonDataModel import vtkImageData
+from vtkmodules.vtkCommonMath import vtkMatrix4x4
 
 from SlicerUSSim.Logic import LinearProbe, SimulationError, TrackedSequence, Volume
 from SlicerUSSim.Logic.base.transforms import rigid_between
 from SlicerUSSim.Logic.tracked.images import TrackedImages
-from SlicerUSSim.Logic.tracked.pose_files import fit_landmarks, read_calibration, read_matrix, read_tags, read_transform
-from SlicerUSSim.Logic.tracked.sequence import read_coordinate_definitions
+from SlicerUSSim.Logic.tracked.pose_files import (
+    fit_landmarks,
+    read_calibration,
+    read_coordinate_definitions,
+    read_matrix,
+    read_tags,
+    read_transform,
+)
 from tests.conftest import SHARED, needs_shared
 
 names = st.sampled_from(["ImageToProbe", "ProbeToTracker", "ReferenceToTracker", "ReferenceToRas"])
@@ -50,14 +60,27 @@ def test_pose_is_composed_along_the_path_with_inverses():
     assert np.allclose(sequence.pose(2, "ProbeToProbe"), np.eye(4))
 
 
-@given(st.integers(0, 50), st.integers(0, 50), st.integers(0, 50))
-def test_any_path_and_its_reverse_are_inverses(a, b, c):
-    sequence = chain().with_transforms(
-        {"ReferenceToRas": rigid(a), "ProbeToTracker": rigid(b), "ImageToProbe": rigid(c)}
-    )
+@given(st.integers(0, 50), st.integers(0, 50))
+def test_any_path_and_its_reverse_are_inverses(a, c):
+    sequence = chain().with_transforms({"ReferenceToRas": rigid(a), "ImageToProbe": rigid(c)})
     there, back = sequence.pose(0, "ImageToRas"), sequence.pose(0, "RasToImage")
     assert np.allclose(there @ back, np.eye(4), atol=1e-9)
-    assert np.allclose(there, rigid(a) @ np.linalg.inv(rigid(20)) @ rigid(b) @ rigid(c))
+    assert np.allclose(there, rigid(a) @ np.linalg.inv(rigid(20)) @ rigid(10) @ rigid(c))
+
+
+@pytest.mark.parametrize("lost", ["nowhere", "in one image", "everywhere"])
+def test_measured_transforms_win_over_constants_of_a_configuration(tmp_path, caplog, lost):
+    """Where they were lost, too: an identity in a Plus configuration was taken for the pose."""
+    plus_file(tmp_path / "plus.mha", "MF", MARKED_FAR)  # whose image 1 was not tracked
+    content = (tmp_path / "plus.mha").read_bytes()
+    status = {"nowhere": (b"= INVALID", b"= OK"), "everywhere": (b"TransformStatus = OK", b"TransformStatus = INVALID")}
+    (tmp_path / "plus.mha").write_bytes(content.replace(*status.get(lost, (b"", b""))))
+    constant = {"ImageToProbe": rigid(3), "ProbeToTracker": np.eye(4), "TrackerToProbe": np.eye(4)}
+    sequence = TrackedSequence.read(tmp_path / "plus.mha").with_transforms(constant)
+    tracked = [n for n in range(2) if sequence.has_pose(n, "ImageToTracker")]
+    assert tracked == {"nowhere": [0, 1], "in one image": [0], "everywhere": []}[lost]
+    assert [sequence.pose(n, "ProbeToTracker")[0, 3] for n in tracked] == [float(n) for n in tracked]
+    assert "constant ProbeToTracker, TrackerToProbe" in caplog.text
 
 
 def test_a_missing_transform_is_named_with_what_there_is():
@@ -205,31 +228,79 @@ def test_colours_become_grey(tmp_path):
     assert np.abs(TrackedSequence.read(tmp_path / "colour.mha").images.astype(int) - grey).max() <= 1
 
 
-def test_slicer_reads_the_transforms_that_are_written(tmp_path):
+def slicer_sequence(kind: str, path: Path, name: str = "Image", nodes: Callable = lambda slicer: []):
+    """(storage node, sequence node) of 3D Slicer for a file, with these nodes at 0, 0.5, ... seconds."""
     slicer = pytest.importorskip("slicer", reason="Slicer's MRML libraries: pip install '.[slicer]'")
-    from vtkmodules.vtkCommonMath import vtkMatrix4x4
+    scene = slicer.vtkMRMLScene()
+    sequence = scene.AddNewNodeByClass("vtkMRMLSequenceNode", name)
+    for n, node in enumerate(nodes(slicer)):
+        sequence.SetDataNodeAtValue(node, str(0.5 * n))
+    storage = scene.AddNewNodeByClass(f"vtkMRML{kind}SequenceStorageNode")
+    storage.SetFileName(str(path))
+    return storage, sequence
 
+
+def linear_transforms(matrices) -> Callable:
+    """Nodes for slicer_sequence."""
+
+    def nodes(slicer):
+        for matrix in matrices:
+            to_parent, node = vtkMatrix4x4(), slicer.vtkMRMLLinearTransformNode()
+            to_parent.DeepCopy(matrix.ravel())
+            node.SetMatrixTransformToParent(to_parent)
+            yield node
+
+    return nodes
+
+
+def test_slicer_reads_the_transforms_that_are_written(tmp_path):
     tracked = tuple({"ProbeToTracker": rigid(n)} for n in range(3))
     TrackedSequence(chain().images, tracked, [0.0, 0.5, 1.0]).write(tmp_path / "sweep.seq.mha", compress=False)
-    scene = slicer.vtkMRMLScene()
-    storage = scene.AddNode(slicer.vtkMRMLLinearTransformSequenceStorageNode())
-    storage.SetFileName(str(tmp_path / "sweep.seq.mha"))
-    node = scene.AddNewNodeByClass("vtkMRMLSequenceNode")
+    storage, node = slicer_sequence("LinearTransform", tmp_path / "sweep.seq.mha")
     assert storage.ReadData(node) == 1 and node.GetNumberOfDataNodes() == 3
     matrix = vtkMatrix4x4()
     node.GetNthDataNode(1).GetMatrixTransformToParent(matrix)
-    found = np.array([[matrix.GetElement(r, c) for c in range(4)] for r in range(4)])
-    assert np.allclose(found, rigid(1), atol=1e-5)
+    assert np.allclose(np.reshape(matrix.GetData(), (4, 4)), rigid(1), atol=1e-5)
+
+
+@pytest.mark.parametrize("name", ["ProbeToReference-Sequence", "Needle pose"])  # the first as Slicer records it
+@pytest.mark.parametrize("suffix", [".seq.mha", ".seq.mhd", ".seq.nrrd"])
+def test_transforms_of_slicer_are_poses_without_images(tmp_path, suffix, name):
+    nodes = linear_transforms([rigid(n) for n in range(3)])
+    storage, sequence = slicer_sequence("LinearTransform", tmp_path / f"poses{suffix}", name, nodes)
+    assert storage.WriteData(sequence) == 1
+    found = TrackedSequence.read(tmp_path / f"poses{suffix}")
+    assert len(found) == 3 and not found.has_images and found.timestamps.tolist() == [0.0, 0.5, 1.0]
+    assert np.allclose(found.pose(2, "ProbeToReference"), rigid(2), atol=1e-3)  # Slicer writes six digits
+    with pytest.raises(SimulationError, match="poses without images"):
+        TrackedImages.of(found, path="ProbeToReference")
+
+
+@pytest.mark.parametrize("components, suffix", [(1, ".seq.nrrd"), (3, ".seq.nrrd"), (1, ".seq.mha"), (3, ".seq.mha")])
+def test_images_of_a_slicer_sequence_are_read(tmp_path, components, suffix):
+    def nodes(slicer):
+        for image in chain().images:
+            data = vtkImageData()
+            data.SetDimensions(30, 20, 1)
+            pixels = np.repeat(image.ravel()[:, None], components, axis=1)
+            data.GetPointData().SetScalars(numpy_to_vtk(pixels, deep=True))
+            node = slicer.vtkMRMLScalarVolumeNode() if components == 1 else slicer.vtkMRMLVectorVolumeNode()
+            node.SetAndObserveImageData(data)
+            yield node
+
+    storage, sequence = slicer_sequence("Volume", tmp_path / f"image{suffix}", nodes=nodes)
+    assert storage.WriteData(sequence) == 1
+    found = TrackedSequence.read(tmp_path / f"image{suffix}")
+    assert np.abs(found.images.astype(int) - chain().images).max() <= 1
 
 
 @pytest.mark.parametrize(
     "change, message",
     [
         (("UltrasoundImageOrientation = MF", "UltrasoundImageOrientation = QX"), "'QX', expected a code such as MF"),
-        (("1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1", "1 0 0"), "has 3 numbers, expected 16"),
         (("Timestamp = 10.5", "Timestamp = noon"), "'noon', expected seconds"),
         (("Seq_Frame0001_Timestamp", "Seq_Frame0007_Timestamp"), "has the field Seq_Frame0007_Timestamp"),
-        (("Seq_Frame0000_ProbeToTrackerTransform =", "Seq_Frame0000_ProbeTransform ="), "ProbeTo"),
+        (("Seq_Frame0000_ProbeToTrackerTransform =", "Seq_Frame0000_ProbeTransform ="), "no path from Probe"),
     ],
 )
 def test_a_damaged_field_is_one_clear_error(tmp_path, change, message):
@@ -249,6 +320,25 @@ def test_a_file_that_is_none_is_one_clear_error(tmp_path, name):
     with pytest.raises(SimulationError, match=name) as caught:
         TrackedSequence.read(tmp_path / name)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("name, value", [("Needle", "1 0 0"), ("NeedleToTracker", "1 0 0"), ("NeedleToTracker", "x")])
+def test_a_transform_that_is_not_needed_may_be_none(tmp_path, name, value):
+    plus_file(tmp_path / "plus.mha", "MF", MARKED_FAR)
+    content = (tmp_path / "plus.mha").read_bytes()
+    field = f"Seq_Frame0000_{name}Transform = {value}\n".encode()
+    (tmp_path / "plus.mha").write_bytes(content.replace(b"ElementDataFile", field + b"ElementDataFile"))
+    sequence = TrackedSequence.read(tmp_path / "plus.mha")
+    assert sequence.has_pose(0, "ProbeToTracker") and not sequence.has_pose(0, "NeedleToTracker")
+    sequence.write(tmp_path / "again.mha")
+    assert field in (tmp_path / "again.mha").read_bytes()  # nothing of a file is lost
+
+
+def test_values_that_slicers_igsio_writes_are_read_with_a_warning(tmp_path, caplog):
+    plus_file(tmp_path / "plus.mha", "??", MARKED_FAR, "BRIGHTNESSBRIGHTNESS")
+    found = TrackedSequence.read(tmp_path / "plus.mha")
+    assert np.array_equal(found.images, MARKED_FAR) and found.image_type == "BRIGHTNESS"
+    assert "UltrasoundImageOrientation is '??', which is unknown, taken for MF" in caplog.text
 
 
 # ---- the MNI's files -------------------------------------------------------------------------------------------------

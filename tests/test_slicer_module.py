@@ -220,7 +220,7 @@ def test_requirements_are_those_of_the_package_without_what_slicer_brings():
     module = {_distribution(line) for line in lines if line and not line.startswith("#")}
     in_slicer = {"numpy", "vtk", "simpleitk"}
     for_the_command = {"click", "tqdm", "pillow"}
-    for_files_that_slicer_reads_itself = {"nibabel", "pynrrd"}
+    for_files_that_slicer_reads_itself = {"nibabel", "pynrrd", "highdicom", "python-gdcm"}
     left_out = in_slicer | for_the_command | for_files_that_slicer_reads_itself
     assert module == {entry for entry in package if entry[0] not in left_out}
 

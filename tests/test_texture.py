@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import SimpleITK as sitk
 from click.testing import CliRunner
 from scipy import ndimage
 from scipy.spatial.transform import Rotation
@@ -22,6 +23,7 @@ from SlicerUSSim.Logic import (
     segment_mri,
 )
 from SlicerUSSim.Logic.mri.samples import head_mri
+from SlicerUSSim.Logic.probe import PROBES, craniotomy_pose
 from SlicerUSSim.Logic.tissue.texture import volume_shares
 from tests.conftest import SPECKLE, block, rigid
 from tests.remembered import segment_once
@@ -261,3 +263,20 @@ def test_the_command_takes_its_settings_for_an_mri_and_not_for_labels(tmp_path):
     result = CliRunner().invoke(main, [*arguments, "--partial-volume"])
     assert result.exit_code == 2
     assert "is a label map; --partial-volume and --mri-modulation need an MRI" in result.stderr
+
+
+def test_the_image_does_not_depend_on_the_order_of_voxels_in_a_file():
+    segmentation = segment_once(head_mri(4.0))
+    labels, known, table = segmentation.labels, segmentation.texture(), TissueTable.brain(segmentation.tissue_names)
+    turned = Volume.from_sitk(sitk.DICOMOrient(labels.to_sitk(), "SPL"))
+    arrays = [
+        sitk.GetArrayFromImage(sitk.DICOMOrient(labels.with_array(array).to_sitk(), "SPL"))
+        for array in vars(known).values()
+    ]
+    settings = SimulationSettings(partial_volume=True, mri_modulation_db=2.0)
+    probe, pose = PROBES["phased"], craniotomy_pose(labels, PROBES["phased"])
+    one, other = (
+        UltrasoundSimulator(where, table, settings, texture=texture).simulate(probe, pose).image
+        for where, texture in ((labels, known), (turned, Texture(*arrays)))
+    )
+    assert one.max() > 100 and np.mean(np.abs(one.astype(int) - other) > 1) < 0.001

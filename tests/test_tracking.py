@@ -128,6 +128,51 @@ def test_only_the_chosen_transform_moves_the_probe_where_it_is_rigid(link):
             assert len(poses) == 1 and np.allclose(poses[0], POSE, atol=1e-5)
 
 
+def test_damaged_and_invalid_poses_are_not_used_and_counted(link):
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        ours, poses = link(*listener.getsockname()[:2])
+        peer, _ = listener.accept()
+        with peer:
+            peer.sendall(transform().pack())
+            until(lambda: poses)
+            damaged = bytearray(transform(matrix=np.eye(4)).pack())
+            damaged[-1] ^= 1
+            peer.sendall(damaged)
+            until(lambda: ours.dropped == 1)
+            assert "transform 'ProbeToReference' is damaged: its CRC is " in ours.status
+            lost = ("TransformValid", "0"), ("TransformStatus", "OUT_OF_VIEW"), ("ProbeToReferenceStatus", "INVALID")
+            for number, (key, value) in enumerate(lost, 2):
+                message = transform(matrix=np.eye(4))
+                message.header_version, message.metadata = 2, {"Depth": "60", key: value}
+                peer.sendall(message.pack())
+                until(lambda number=number: ours.dropped == number)
+                words = f"has {key} {value}, expected OK: the last valid pose stays ({number} poses dropped)"
+                assert ours.status == f"transform 'ProbeToReference' {words}"
+            message.metadata = {"TransformValid": "1", "TransformStatus": "OK", "Status": "live"}  # as Plus
+            peer.sendall(message.pack())
+            until(lambda: len(poses) == 2)
+            assert np.allclose(poses[0], POSE, atol=1e-5) and np.array_equal(poses[1], np.eye(4))
+            assert "following ProbeToReference" in ours.status
+
+
+def test_a_tracker_that_sends_only_tracking_data_is_told_so_with_a_remedy(link):
+    class TrackingData(pyigtl.messages.MessageBase):
+        def _pack_content(self):
+            return struct.pack(">20sBB12f", b"Probe", 1, 0, *POSE[:3].T.ravel())
+
+    message = TrackingData(device_name="Tracker")
+    message._message_type = "TDATA"
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        ours, poses = link(*listener.getsockname()[:2])
+        peer, _ = listener.accept()
+        with peer:
+            peer.sendall(message.pack())
+            until(lambda: "sends TDATA messages, expected TRANSFORM: configure it" in ours.status)
+            peer.sendall(transform().pack() + message.pack() + transform().pack())
+            until(lambda: len(poses) == 2)
+            assert "following" in ours.status
+
+
 def test_who_does_not_speak_openigtlink_is_dropped_and_the_next_one_heard(link):
     nonsense = struct.pack(">H12s20sQQQ", 1, b"TRANSFORM", b"x", 0, 1 << 60, 0) + b"x" * 100
     port = free_port()

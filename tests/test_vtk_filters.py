@@ -35,6 +35,7 @@ from SlicerUSSim.Logic import (
     Volume,
     seed_of_pose,
 )
+from SlicerUSSim.Logic.base.volume import read_image_file
 from SlicerUSSim.Logic.base.vtk_data import vtk_matrix
 from SlicerUSSim.Logic.mri.samples import head_mri
 from SlicerUSSim.Logic.mri.segmentation_settings import SegmentationSettings
@@ -173,7 +174,7 @@ def test_a_writer_stores_image_and_place(tmp_path):
     writer.SetInputConnection(algorithm.GetOutputPort())
     writer.SetFileName(str(tmp_path / "image.vti"))
     writer.Write()
-    read = Volume.read(tmp_path / "image.vti")
+    read = read_image_file(tmp_path / "image.vti")
     np.testing.assert_array_equal(read.array[0], algorithm.GetFrame().image)
     np.testing.assert_allclose(read.ijk_to_ras, algorithm.GetFrame().to_volume().ijk_to_ras, atol=1e-6)
 

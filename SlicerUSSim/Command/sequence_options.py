@@ -11,13 +11,12 @@ import click
 from SlicerUSSim.Command.options import declared
 from SlicerUSSim.Command.patient_options import Examination, PatientOptions, open_examination, say_contact
 from SlicerUSSim.Command.progress import note
-from SlicerUSSim.Logic.base.errors import SimulationError
+from SlicerUSSim.Logic.base.errors import SimulationError, require
 
 if TYPE_CHECKING:
     import numpy as np
 
     from SlicerUSSim.Logic.base import Volume
-    from SlicerUSSim.Logic.probe import Probe
     from SlicerUSSim.Logic.tracked import TrackedImages, TrackedSequence
 
 transform_option = click.option(
@@ -41,8 +40,9 @@ class SequenceOptions:
     sequence: str = declared(
         click.option(
             "--sequence", type=click.Path(), required=True,
-            help="Tracked images: .igs.mha .seq.mha .mhd .nrrd (Plus, 3D Slicer), a folder of MINC slices, or with "
-            "--cut a 3D ultrasound volume. Without --probe or --preset, the geometry is estimated from the images.",
+            help="Tracked images: .igs.mha .seq.mha .mhd .nrrd (Plus, 3D Slicer; poses alone for a sweep), a folder of "
+            "MINC slices, or with --cut a 3D ultrasound volume. Without --probe or --preset, the geometry is estimated "
+            "from the images.",
         )
     )  # fmt: skip
     frames: str | None = declared(
@@ -106,29 +106,36 @@ def open_tracked(
     import numpy as np
 
     from SlicerUSSim.Logic.tracked.imaged_field import draw_field
-    from SlicerUSSim.Logic.tracked.images import TrackedImages
-    from SlicerUSSim.Logic.tracked.sequence import checked_apart, frame_numbers
+    from SlicerUSSim.Logic.tracked.images import TrackedImages, pixels_for_poses
+    from SlicerUSSim.Logic.tracked.sequence import TrackedSequence, checked_apart, frame_numbers
 
     to_ras = read_to_mri(recording.to_mri) if recording.to_mri else np.eye(4)
     if recording.cut:
-        cuts = _read_cuts(recording.cut, recording)
+        volume, poses = _read_cuts(recording.cut, recording)
         examination = open_examination(patient)
-        known_probe, sequence = examination.probe, cuts.seen_by(examination.probe)
+        known_probe = examination.probe
+        sequence = TrackedSequence.from_volume(volume, known_probe, poses)
     else:
         sequence = read_sequence(recording.sequence, recording.calibration)
         examination = open_examination(patient)
         known_probe = examination.probe if patient.gives_probe else None
+    path, field = recording.transform, None
+    if not sequence.has_images:
+        require(not finds_marks, f"{recording.sequence}: has poses without images, expected images to compare or draw")
+        known_probe = examination.probe
+        sequence, path, field = pixels_for_poses(sequence, path, known_probe)
     chosen = None if recording.frames is None else frame_numbers(recording.frames, len(sequence))
     beside = checked_apart(apart, chosen, len(sequence))
     images = TrackedImages.of(
         sequence,
         chosen,
-        path=recording.transform,
+        path=path,
         reference_to_ras=to_ras,
         probe=known_probe,
         beam=examination.probe,
         most=most,
         apart=beside,
+        field=field,
         finds_marks=finds_marks,
     )
     others = None
@@ -163,23 +170,8 @@ def read_to_mri(path: str) -> np.ndarray:
     return to_ras
 
 
-@dataclass(frozen=True, eq=False)
-class _Cuts:
-    """An ultrasound volume, and poses of a probe in it."""
-
-    volume: Volume
-    #: (4, 4) each, from the probe to the frame of the volume
-    poses: list[np.ndarray]
-
-    def seen_by(self, probe: Probe) -> TrackedSequence:
-        """The images in the planes of `probe` at these poses."""
-        from SlicerUSSim.Logic.tracked.sequence import TrackedSequence
-
-        return TrackedSequence.from_volume(self.volume, probe, self.poses)
-
-
-def _read_cuts(pose_file: str, recording: SequenceOptions) -> _Cuts:
-    """The volume of --sequence, with the pose of --cut and neighbouring poses."""
+def _read_cuts(pose_file: str, recording: SequenceOptions) -> tuple[Volume, list[np.ndarray]]:
+    """The volume of --sequence, and (4, 4) the pose of --cut and neighbouring poses in its frame."""
     from SlicerUSSim.Logic.base.volume import Volume
     from SlicerUSSim.Logic.probe.poses import slide_sweep, tilt_sweep
     from SlicerUSSim.Logic.tracked.pose_files import read_pose
@@ -192,4 +184,4 @@ def _read_cuts(pose_file: str, recording: SequenceOptions) -> _Cuts:
         poses = tilt_sweep(pose, recording.cut_tilt, recording.cuts)
     elif recording.cut_slide is not None:
         poses = slide_sweep(pose, recording.cut_slide, recording.cuts)
-    return _Cuts(Volume.read(recording.sequence), poses)
+    return Volume.read(recording.sequence), poses

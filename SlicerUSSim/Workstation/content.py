@@ -166,6 +166,6 @@ def _has_16_numbers(path: Path) -> bool:
     if start.startswith(b"#Insight"):
         return True
     try:
-        return len([float(word) for word in start.decode().replace(",", " ").split()]) == 16
+        return len([float(word) for word in start.decode("utf-8-sig").replace(",", " ").split()]) == 16
     except (UnicodeDecodeError, ValueError):
         return False

@@ -83,6 +83,7 @@ class Registration:
         """The recording of a file. Raises SimulationError if it cannot be read."""
         with self._presenter.view.progress(f"Open {Path(path).name}"):
             sequence = self._tasks.doAside(lambda: TrackedSequence.read(path))
+        require(sequence.has_images, f"{Path(path).name}: has poses without images, expected tracked images")
         return Recording(sequence, Path(path).name.split(".")[0])
 
     @property

@@ -45,6 +45,7 @@ _LONGEST_TITLE = 60
 _TAGS = (
     "SOPClassUID", "Modality", "PatientID", "PatientName", "SeriesInstanceUID", "SeriesNumber", "SeriesDescription",
     "Rows", "Columns", "NumberOfFrames", "ImageOrientationPatient",
+    "PerFrameFunctionalGroupsSequence",
 )  # fmt: skip
 
 
@@ -60,8 +61,9 @@ class Series:
     size: str
     #: PatientID and PatientName, only compared and never shown
     patient: tuple[str, str]
-    #: Whether it has enough images for a volume, or is one file with several
+    #: Whether it has enough images for a volume, or frames with places
     is_volume: bool
+    modality: str = ""
 
     def __str__(self) -> str:
         name = " ".join(part for part in (self.number, repr(self.description) if self.description else "") if part)
@@ -105,7 +107,9 @@ def read_dicom(path: Path) -> ImageFile:
         series = _only_volume(path)
     else:
         series = next((one for one in _series_of(path.parent)[0] if str(path) in one.files), None)
-        if series is not None and len(series.files) > 1:
+        if series is not None and "PerFrameFunctionalGroupsSequence" in _header(path):
+            series = None  # it is a volume of its own
+        elif series is not None and len(series.files) > 1:
             _log.warning("%s: is one image of a DICOM series, which is read: %s", path, series.size_text)
             _log.info("%s: %s", path, series)
     files = (str(path),) if series is None else series.files
@@ -176,7 +180,9 @@ def _series_of(folder: Path, recursive: bool = False) -> tuple[list[Series], lis
                 uid, tuple(str(file) for file, *_ in images), str(header.get("SeriesNumber") or ""),
                 str(header.get("SeriesDescription") or ""), f"{header.get('Columns')}x{header.Rows}",
                 (str(header.get("PatientID") or ""), str(header.get("PatientName") or "")),
-                frames > 1 or (len(images) >= _LEAST_IMAGES and is_parallel),
+                "PerFrameFunctionalGroupsSequence" in header
+                or (is_parallel and max(frames, len(images)) >= _LEAST_IMAGES),
+                str(header.get("Modality") or ""),
             )
         )  # fmt: skip
     return sorted(found, key=lambda series: (len(series.number), series.number)), damaged
@@ -196,6 +202,8 @@ def _only_volume(folder: Path) -> Series:
         _log.warning("%s: has no DICOM images itself; those below it are read, in %s", folder, many)
         _log.info("%s: in %s", folder, ", ".join(places[:4]))
     volumes = found if len(found) == 1 else [series for series in found if series.is_volume]
+    images = [series for series in volumes if series.modality != "SEG"]  # beside which archives keep their segments
+    volumes = images or volumes
     if len(volumes) != 1:
         many = "; ".join(map(str, found[:12])) + ("; ..." if len(found) > 12 else "")
         patients = len({series.patient for series in found})
@@ -252,6 +260,10 @@ def _read_files(path: Path, files: Sequence[str]) -> ImageFile:
             except Exception as error:  # decoders raise various exceptions
                 reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
                 raise SimulationError(f"{path}: {Path(file).name} cannot be read ({reason}); export it again") from None
+        require(
+            frames == 1 or len(files) == 1,
+            f"{path}: has {len(files)} files with {frames} frames each; give one of them",
+        )
         if "SegmentSequence" in first:
             return _segments(path, first)
         channels = int(first.get("SamplesPerPixel") or 1)

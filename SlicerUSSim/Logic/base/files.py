@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 import hashlib
 import json
 import os
@@ -322,6 +323,16 @@ def read_small(path: str | os.PathLike, most_bytes: int = 16 * 2**20) -> bytes:
     return content
 
 
+def read_text(path: str | os.PathLike, most_bytes: int = 16 * 2**20, errors: str = "strict") -> str:
+    """The text of a file in UTF-8, or in UTF-16 if it starts with the mark of that; no mark is left in it.
+
+    `errors` is that of bytes.decode. Raises UnicodeDecodeError, and SimulationError as read_small does.
+    """
+    content = read_small(path, most_bytes)
+    is_utf_16 = content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
+    return content.decode("utf-16" if is_utf_16 else "utf-8-sig", errors)
+
+
 def read_json(path: str | os.PathLike, most_bytes: int = 4 * 2**20):
     """The content of a JSON file.
 
@@ -330,7 +341,7 @@ def read_json(path: str | os.PathLike, most_bytes: int = 4 * 2**20):
     """
     require_path(path)
     try:
-        text = read_small(path, most_bytes).decode("utf-8")
+        text = read_text(path, most_bytes)
         _check_nesting(path, text)
         return json.loads(text, object_pairs_hook=_distinct, parse_constant=_refused)
     except OSError as error:

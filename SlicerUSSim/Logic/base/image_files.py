@@ -27,7 +27,7 @@ import numpy as np
 from SlicerUSSim.Logic.base.errors import SimulationError, require, require_package, shown_path
 from SlicerUSSim.Logic.base.reading import in_child, reader
 from SlicerUSSim.Logic.base.segments import segments_of
-from SlicerUSSim.Logic.base.transforms import LPS_TO_RAS
+from SlicerUSSim.Logic.base.transforms import LPS_TO_RAS, is_singular
 
 _log = logging.getLogger(__name__)
 
@@ -106,10 +106,11 @@ def _reader_of(path: Path) -> Callable[[Path], ImageFile]:
         return _read_nifti
     if name.endswith((".mgz", ".mgh")) and has_nibabel:
         return _read_mgh
-    if name.endswith((".nrrd", ".nhdr")) and importlib.util.find_spec("nrrd") is not None:
-        return _read_nrrd
     with path.open("rb") as file:
-        return _read_minc1 if name.endswith(".mnc") and file.read(3) == b"CDF" else _read_by_itk
+        start = file.read(4)
+    if (start == b"NRRD" or name.endswith((".nrrd", ".nhdr"))) and importlib.util.find_spec("nrrd") is not None:
+        return _read_nrrd
+    return _read_minc1 if name.endswith(".mnc") and start[:3] == b"CDF" else _read_by_itk
 
 
 def checked_image(path: Path, found: ImageFile) -> ImageFile:
@@ -262,9 +263,12 @@ def _read_nifti(path: Path) -> ImageFile:
         matrices["sform"] = scale @ raw.get_sform()
     if int(raw["qform_code"]) > 0 and pixdim.all():
         matrices["qform"] = scale @ qform
+    for name in [name for name, matrix in matrices.items() if is_singular(matrix)]:
+        del matrices[name]
+        doubts.append(f"its {name} has no three axes and is not used")
     if not matrices:  # as ITK and 3D Slicer read it
         matrices["size"] = LPS_TO_RAS @ np.diag([*np.abs(pixdim), 1.0])
-        doubts.append("has no orientation (sform and qform have code 0), read as LPS; check left and right")
+        doubts.append("has no orientation (no sform and no qform), read as LPS; check left and right")
     require(
         "sform" in matrices or pixdim.all(),
         f"{path}: pixdim is {_times(pixdim)} and there is no sform, expected the size of its voxels",

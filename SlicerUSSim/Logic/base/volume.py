@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -114,6 +114,23 @@ class Volume:
         require(np.shape(array) == self.array.shape, f"array has shape {np.shape(array)}, expected {self.array.shape}")
         return Volume(array, self.ijk_to_ras)
 
+    def along(self, like: Volume | None = None) -> Volume:
+        """The same voxels at the same places, stored along the axes nearest to those of `like`.
+
+        By default along R, A and S, so that results do not depend on the order of the voxels in a file.
+        """
+        from scipy.optimize import linear_sum_assignment
+
+        wanted = np.eye(3) if like is None else like.ijk_to_ras[:3, :3] / like.spacing_mm
+        cosines = wanted.T @ self.ijk_to_ras[:3, :3] / self.spacing_mm
+        _, own = linear_sum_assignment(-np.abs(cosines))
+        ways = np.sign(cosines[range(3), own])
+        array = self.array.T.transpose(own)
+        to_own = np.eye(4)[:, [*own, 3]] * [*ways, 1.0]
+        to_own[own, 3] = np.where(ways < 0, np.array(array.shape) - 1, 0)
+        array = np.ascontiguousarray(np.flip(array, np.flatnonzero(ways < 0).tolist()).T)
+        return replace(self, array=array, ijk_to_ras=self.ijk_to_ras @ to_own)
+
     def looks_like_labels(self) -> bool:
         """Whether the image has regions of equal whole numbers, as a label map has.
 
@@ -134,6 +151,7 @@ class Volume:
 
         Raises SimulationError for a missing or unreadable file and for an image that is not 3D and scalar.
         """
+        require_path(path)
         path = Path(path)
         found = read_image_file(path)
         volume = cls.from_image_file(found, str(path))
@@ -309,7 +327,6 @@ def read_image_file(path: str | os.PathLike) -> ImageFile:
 
     Raises SimulationError for a missing or unreadable file.
     """
-    require_path(path)
     require_readable_name(path)
     path = Path(path)
     require(path.exists(), f"{path}: no such file or folder")

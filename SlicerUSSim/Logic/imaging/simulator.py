@@ -119,8 +119,9 @@ class UltrasoundSimulator:
             f"settings are {self.settings!r:.80}, expected SimulationSettings",
         )
         self.device = Device.get(device)
-        #: As given, or None
-        self.texture = texture
+        #: As given, in the order of voxels of medium.labels; or None
+        self.texture = texture = None if texture is None else texture.along(labels)
+        labels = labels.along()  # kernels draw the tissues at borders along the axes of voxels
         packed = _packed_texture(texture, labels, self.settings)
         membership = None if texture is None else texture.membership()
         self.medium = Medium(labels, tissues, self.device, packed, membership, sheets)
@@ -583,11 +584,6 @@ class UltrasoundSimulator:
 
 def _packed_texture(texture: Texture | None, labels: Volume, settings: SimulationSettings) -> np.ndarray | None:
     """The texture in the device's format, or None if the settings do not require it."""
-    if texture is not None:
-        require(
-            texture.deviation.shape == labels.array.shape,
-            f"the texture has shape {texture.deviation.shape}, expected that of the labels, {labels.array.shape}",
-        )
     require(
         texture is not None or not settings.needs_texture,
         f"partial_volume {settings.partial_volume}, mri_modulation_db {settings.mri_modulation_db:g} need a texture; "

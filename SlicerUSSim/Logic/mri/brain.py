@@ -86,6 +86,7 @@ def find_brain(
     kept = _kept(keep_at, mri, method) if keep_at is not None else None
     if kept is not None:
         return kept
+    given, mri = mri, mri.along()
     size = mri.spacing_mm * mri.array.shape[::-1]
     require(
         float(size.max()) <= LARGEST_MM,
@@ -100,7 +101,7 @@ def find_brain(
         recognised_at = 0.05 if method == "robex" else 0.4  # the atlas takes about as long as the recognition
         shown = recognise(mri, lambda share: report(recognised_at * share))
         if shown.stripped is not None:
-            mask = mri.with_array(shown.stripped.astype(np.uint8))
+            mask = mri.with_array(shown.stripped.astype(np.uint8)).along(given)
             millilitres = _millilitres(shown.stripped, mri)
             warnings = (*shown.warnings, *volume_warnings(millilitres))
             message = f"skull-stripped brain, {millilitres:.0f} ml"
@@ -124,12 +125,13 @@ def find_brain(
     message = f"whole head: brain extracted by {_NAMES[found.method]} in {seconds:.0f} s, {millilitres:.0f} ml"
     if found.sureness is not None:
         message += f", overlap with the registered atlas {found.sureness:.2f}"
+    mask = mri.with_array(inside.astype(np.uint8)).along(given)
     if keep_at is not None:
-        note = keep(keep_at, mri, inside, found.method, seconds, warnings, method)
+        note = keep(keep_at, given, mask.array, found.method, seconds, warnings, method)
         _log.info("%s", note.text)
         warnings = warnings if note.is_beside else (*warnings, note.text)
     report(1.0)
-    return BrainMask(mri.with_array(inside.astype(np.uint8)), found.method, message, warnings, seconds)
+    return BrainMask(mask, found.method, message, warnings, seconds)
 
 
 def given_brain(mask: Volume, mri: Volume) -> BrainMask:

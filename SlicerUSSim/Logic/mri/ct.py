@@ -127,6 +127,7 @@ def segment_ct(
     report = progress or (lambda share: None)
     timed, notes, warnings = StepTimes(), [], []
     check_finite(ct, "CT", "by -1000, which is air")
+    given, ct, mask = ct, ct.along(), None if mask is None else mask.along()
     offset, note, doubt = _unit_of(ct)
     notes += [] if note is None else [note]
     warnings += [] if doubt is None else [doubt]
@@ -174,8 +175,9 @@ def segment_ct(
         _log.warning("%s", line)
     _log.debug("segmentation of a CT: %s", timed)
     report(1.0)
+    labels, hu, sharp = (ct.with_array(array).along(given).array for array in (labels, hu, sharp))
     return CtSegmentation(
-        ct.with_array(labels), names, means, deviations, noise, tuple(notes), tuple(warnings), hu, sharp
+        given.with_array(labels), names, means, deviations, noise, tuple(notes), tuple(warnings), hu, sharp
     )
 
 

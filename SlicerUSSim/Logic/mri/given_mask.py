@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import cast
 
 import numpy as np
@@ -31,7 +30,7 @@ def checked_mask(mask: Volume, mri: Volume) -> np.ndarray:
     """(k, j, i) True in the mask. Raises SimulationError as brain.given_brain."""
     require_kind("mask", mask, Volume, "Volume.read reads a file")
     name = f"mask {mask.name}" if mask.name else "mask"
-    mask = _reordered(mask, mri)
+    mask = mask.along(mri)
     require(
         mask.array.shape == mri.array.shape,
         f"{name} has {mask.size_text} voxels and the MRI {mri.size_text}, expected the same grid; resample the mask",
@@ -59,30 +58,6 @@ def checked_mask(mask: Volume, mri: Volume) -> np.ndarray:
         f"one; it covers {inside.mean():.0%} of the image: for all of that, give --skull-strip none and no mask",
     )
     return inside
-
-
-def _reordered(mask: Volume, mri: Volume) -> Volume:
-    """The mask with the MRI's order of voxels, if its voxels are the MRI's in another order; otherwise as it is.
-
-    Programs that bring files into a standard orientation exchange and reverse axes.
-    """
-    to_mask = mask.ras_to_ijk @ mri.ijk_to_ras
-    turn, first = np.rint(to_mask[:3, :3]), np.rint(to_mask[:3, 3])
-    is_order = np.array_equal(np.abs(turn).sum(axis=0), [1, 1, 1]) and np.array_equal(
-        np.abs(turn).sum(axis=1), [1, 1, 1]
-    )
-    if not (
-        is_order and np.allclose(to_mask[:3, :3], turn, atol=1e-5) and np.allclose(to_mask[:3, 3], first, atol=1e-2)
-    ):
-        return mask
-    axes = np.abs(turn).argmax(axis=0)  # of the mask, along i, j, k of the MRI
-    ways = turn[axes, range(3)]
-    array = mask.array.transpose([2 - axis for axis in axes[::-1]])
-    array = array[tuple(slice(None, None, int(way)) for way in ways[::-1])]
-    ends = np.where(ways > 0, 0, np.array(mask.array.shape[::-1])[axes] - 1)
-    if array.shape != mri.array.shape or not np.array_equal(first[axes], ends):
-        return mask
-    return replace(mask, array=array, ijk_to_ras=mri.ijk_to_ras)
 
 
 def _is_probability(array: np.ndarray) -> bool:

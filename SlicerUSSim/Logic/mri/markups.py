@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from SlicerUSSim.Logic.base.errors import SimulationError, require
-from SlicerUSSim.Logic.base.files import read_json, read_small
+from SlicerUSSim.Logic.base.files import read_json, read_text
 from SlicerUSSim.Logic.base.transforms import LPS_TO_RAS
 
 _LIST = ".fcsv"
@@ -56,7 +56,7 @@ def _listed_points(path: str) -> np.ndarray:
     """(points, 3) RAS mm of a list: comments with the frame and the columns, then id, x, y, z, ... of each point."""
     expected = "expected a list of points of 3D Slicer (.fcsv)"
     try:
-        text = read_small(path, _MOST_BYTES).decode("utf-8")
+        text = read_text(path, _MOST_BYTES)
     except OSError as error:
         raise SimulationError(f"{path}: cannot be read ({error.strerror})") from None
     except UnicodeDecodeError:

@@ -202,14 +202,13 @@ def segment_mri(
     if settings.outside:
         require_findable(contrast, settings.skull_strip, mask is not None)
     timed = StepTimes()
-    intensity = finite(mri)
+    image = mri.with_array(finite(mri))
     if mask is None and settings.skull_strip != "none":
         _require_intensities(mri, "MRI")
     if mask is None:
         brain = find_brain(
-            mri.with_array(intensity), settings.skull_strip, keep_at=keep_mask_at,
-            progress=lambda share: told(begin * share),
-        )  # fmt: skip
+            image, settings.skull_strip, keep_at=keep_mask_at, progress=lambda share: told(begin * share)
+        )
     else:
         require_no_hounsfield(mri)
         brain = given_brain(mask, mri)
@@ -223,16 +222,19 @@ def segment_mri(
         "image is a brain without its head (skull-stripped), and what is outside the brain (--outside) is found in a "
         "whole head",
     )
-    foreground = brain.mask.array > 0
+    # Blocks of coarse images begin at the first voxel: in any order of voxels but this, others would
+    foreground = brain.mask.along().array > 0
     timed("brain")
     report(0.05)
     notes, warnings = [brain.message], [*brain.warnings]
-    images = [mri.with_array(intensity)]
+    images = [image.along()]
     for name, other in others.items():
         named = _called(name, other)
         with about_other_file(named):
             _require_intensities(other, named)
-            image, message, doubts_of_it = aligned(other.with_array(finite(other)), images[0], foreground, named)
+            image, message, doubts_of_it = aligned(
+                other.with_array(finite(other)).along(), images[0], foreground, named
+            )
         images.append(image)
         notes.append(message)
         warnings += doubts_of_it
@@ -300,7 +302,7 @@ def segment_mri(
         tissue_names = (*names, "leptomeninges")
         timed("thin sulci")
         _log.info("thin sulci: %d voxels become leptomeninges", int(middles.sum()))
-    whole, brain_labels = mri.with_array(part.whole(labels)), len(tissue_names)
+    whole, brain_labels = images[0].with_array(part.whole(labels)), len(tissue_names)
     if settings.outside:
         t2 = images[contrasts.index("t2")].array if "t2" in contrasts else None
         fluid = None if t2 is None else watery(t2, names, whole.array)
@@ -315,8 +317,15 @@ def segment_mri(
         _log.warning("%s", line)
     _log.debug("segmentation: %s", timed)
     told(1.0)
+
+    def as_given(array: np.ndarray) -> Volume:
+        return images[0].with_array(part.whole(array)).along(mri)
+
+    known = BrainPart.of([as_given(image) for image, _, _ in filtered], brain.mask.array > 0)
+    number = np.zeros(part.inside.shape, np.int32)
+    number[part.inside] = np.arange(np.count_nonzero(part.inside))
     return Segmentation(
-        labels=whole,
+        labels=mri.with_array(whole.along(mri).array),
         tissue_names=tissue_names,
         means=found.means[:, 0] + above,
         standard_deviations=found.standard_deviations[:, 0],
@@ -329,19 +338,19 @@ def segment_mri(
         warnings=tuple(warnings),
         evidence=Evidence(
             contrasts,
-            np.stack([image for image, _, _ in filtered]),
-            part.inside,
-            part.images[0].ijk_to_ras,
-            part.start,
-            part.whole_shape,
+            np.stack([image.array for image in known.images]),
+            known.inside,
+            known.images[0].ijk_to_ras,
+            known.start,
+            known.whole_shape,
             found.mixture.means,
             np.sqrt(np.diag(found.mixture.covariance)),
             atlas,
             had_field=any(new is not old for new, old in zip(part.images, with_fields, strict=True)),
         ),
-        corrected=part.whole(np.where(part.inside, part.images[0].array + np.float32(above), np.float32(0.0))),
-        _filtered=part.whole(filtered[0][0]),
-        _shares=found.posteriors,
+        corrected=as_given(np.where(part.inside, part.images[0].array + np.float32(above), np.float32(0.0))).array,
+        _filtered=as_given(filtered[0][0]).array,
+        _shares=found.posteriors[:, as_given(number).array[brain.mask.array > 0]],
         _labels_outside=len(tissue_names) - brain_labels,
     )
 

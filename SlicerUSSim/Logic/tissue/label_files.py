@@ -1,17 +1,19 @@
 """Names of labels in files: in a label map's own header, or in a table beside it.
 
 Headers: segments of DICOM SEG and 3D Slicer's .seg.nrrd, and the label table that TotalSegmentator writes into NIfTI.
-Tables: ITK-SNAP's label descriptions, 3D Slicer's colour tables (.ctbl), FreeSurfer's colour look-up tables, and those
+Tables: ITK-SNAP's label descriptions, 3D Slicer's colour tables (.ctbl, .csv), FreeSurfer's look-up tables, and those
 of BIDS (.tsv with columns index and name).
 """
 
 from __future__ import annotations
 
+import csv
 import logging
 import re
 from pathlib import Path
 
 from SlicerUSSim.Logic.base.errors import SimulationError, require
+from SlicerUSSim.Logic.base.files import read_text
 from SlicerUSSim.Logic.base.reading import reader
 from SlicerUSSim.Logic.base.segments import is_meaningful
 from SlicerUSSim.Logic.base.volume import Volume
@@ -20,10 +22,12 @@ _log = logging.getLogger(__name__)
 
 _LARGEST_TABLE = 4 * 2**20
 TABLE_SUFFIXES = (".txt", ".ctbl", ".label", ".lut", ".tsv", ".csv")
-#: 1   255 0 0   1 1 1   "Left kidney"
-_SNAP = re.compile(r'\s*(\d+)\s[\d\s.]+"([^"]*)"\s*')
+#: 1   255 0 0   1 1 1   "Left kidney", with \ before a quote in a name
+_SNAP = re.compile(r'\s*(\d+)\s[\d\s.]+"((?:[^"\\]|\\.)*)"\s*')
+#: The number in front of a line of separated values
+_SEPARATED = re.compile(r'\s*"?\d+"?\s*([\t,;])')
 #: 24  CSF  60 60 60 0
-_PLAIN = re.compile(r"\s*(\d+)[\s,;]+(.*?)((?:[\s,;]+[\d.]+){3,8})?\s*")
+_PLAIN = re.compile(r"\s*(\d+)\s+(.*?)((?:\s+[\d.]+){3,8})?\s*")
 
 
 def names_of_file(path: Path, volume: Volume) -> tuple[dict[int, str], str]:
@@ -57,9 +61,7 @@ def read_names(path: Path) -> dict[int, str]:
     Raises SimulationError for a file that cannot be read and for a label with two names.
     """
     try:
-        size = path.stat().st_size
-        require(size <= _LARGEST_TABLE, f"{path}: has {size} bytes, expected at most {_LARGEST_TABLE} of a table")
-        text = path.read_text(encoding="utf-8", errors="replace")
+        text = read_text(path, _LARGEST_TABLE, errors="replace")
     except OSError as error:
         raise SimulationError(f"{path}: cannot be read ({error.strerror})") from None
     names: dict[int, str] = {}
@@ -76,10 +78,13 @@ def read_names(path: Path) -> dict[int, str]:
 
 def _entry(line: str) -> tuple[int | None, str]:
     """(label, name) of a line of a table; None without."""
-    columns = [column.strip() for column in line.split("\t") if column.strip()]
-    if len(columns) > 1 and columns[0].isdecimal():
-        return int(columns[0]), columns[1]
-    found = _SNAP.fullmatch(line) or _PLAIN.fullmatch(line)
-    if line.lstrip().startswith("#") or not found:
-        return None, ""
-    return int(found[1]), found[2].strip().strip('"').strip()
+    found = _SNAP.fullmatch(line)
+    if found:
+        return int(found[1]), re.sub(r"\\(.)", r"\1", found[2]).strip()
+    found = _SEPARATED.match(line)
+    if found:
+        columns = [column.strip() for column in next(csv.reader([line], delimiter=found[1], skipinitialspace=True))]
+        number, name, *_ = *filter(None, columns), "", ""
+        return (int(number), name.strip('"').strip()) if number.isdecimal() else (None, "")
+    found = _PLAIN.fullmatch(line)
+    return (int(found[1]), found[2].strip().strip('"').strip()) if found else (None, "")

@@ -85,7 +85,7 @@ _NEAREST: tuple[tuple[str, str], ...] = (
 
 
 def plain_name(name: str) -> str:
-    return " ".join(name.lower().replace("_", " ").replace("-", " ").split())
+    return " ".join(name.lower().translate(str.maketrans('_-"', "   ")).split())
 
 
 def same_name(a: str, b: str) -> bool:

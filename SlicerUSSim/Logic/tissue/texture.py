@@ -12,7 +12,7 @@ A third places borders between voxels, without a setting: the part of a voxel th
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -89,6 +89,15 @@ class Texture:
         part = tuple(slice(a, b) for a, b in zip(first, last, strict=True))
         share = None if self.volume_share is None else self.volume_share[part]
         return Texture(self.second_label[part], self.second_share[part], self.deviation[part], share)
+
+    def along(self, labels: Volume) -> Texture:
+        """Stored as `labels.along()`, of the label map that it is of. Raises SimulationError if the shapes differ."""
+        require(
+            self.deviation.shape == labels.array.shape,
+            f"the texture has shape {self.deviation.shape}, expected that of the labels, {labels.array.shape}",
+        )
+        arrays = {name: array for name, array in vars(self).items() if array is not None}
+        return replace(self, **{name: labels.with_array(array).along().array for name, array in arrays.items()})
 
     def membership(self) -> tuple[np.ndarray, np.ndarray] | None:
         """(second label, the part of the voxel that it fills in 1/255), (k, j, i) uint8 each; None if not known."""

@@ -8,13 +8,13 @@ from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
-from SlicerUSSim.Logic.base.errors import SimulationError, require
+from SlicerUSSim.Logic.base.errors import SimulationError, require, required
 from SlicerUSSim.Logic.base.transforms import check_rigid, nearest_rotation
 from SlicerUSSim.Logic.probe.arrays import Probe
 from SlicerUSSim.Logic.probe.image_grid import ImageGrid
 from SlicerUSSim.Logic.tracked.hidden import look_inverted, spread_images, visible_part
 from SlicerUSSim.Logic.tracked.imaged_field import ImagedField, bright_region, estimate_field, place_field
-from SlicerUSSim.Logic.tracked.sequence import TrackedSequence
+from SlicerUSSim.Logic.tracked.sequence import TrackedSequence, asked_ends
 
 _log = logging.getLogger(__name__)
 
@@ -101,31 +101,34 @@ class TrackedImages:
         if steps != [path]:
             _log.info("%s is composed of %s", path, ", ".join(steps))
         images = _as_uint8(chosen.images)
-        for number, image in zip(kept, images, strict=True):
-            require(int(image.max()) > 0, f"image {number} of the sequence is black")
-        spacing = _pixel_spacing(matrices[0], path)
-        # All images of the recording show more of the field than the few that are fitted
-        every = _as_uint8(spread_images(sequence.images))
-        is_inverted = look_inverted(every)
-        if field is None:
-            field = _located_field(sequence, images, every, spacing, probe, beam)
-            if probe is not None and not is_inverted:
-                _require_size(field, every, spacing, path)
-        finds_marks = finds_marks and sequence.is_recorded and not is_inverted
-        seen = visible_part(every, field.mask, sequence.coloured, finds_marks=finds_marks)
-        require(bool(seen.any()), "nothing of the probe's field is seen in the images")
-        for number, image in zip(kept, images, strict=True):
-            low, high = int(image[seen].min()), int(image[seen].max())
-            require(
-                low < high, f"image {number} has the grey level {low} in all of the probe's field, expected a patient"
-            )
-            shown = float((image[seen] > _BLACK).sum() / field.mask.sum())
-            require(
-                shown >= _LEAST_SHOWN,
-                f"image {number} shows something in {shown:.1%} of the probe's field only, where nothing hides it, "
-                f"expected at least {_LEAST_SHOWN:.0%}",
-            )
-        field = replace(field, mask=seen)
+        if sequence.has_images:
+            for number, image in zip(kept, images, strict=True):
+                require(int(image.max()) > 0, f"image {number} of the sequence is black")
+            spacing = _pixel_spacing(matrices[0], path)
+            # All images of the recording show more of the field than the few that are fitted
+            every = _as_uint8(spread_images(sequence.images))
+            is_inverted = look_inverted(every)
+            if field is None:
+                field = _located_field(sequence, images, every, spacing, probe, beam)
+                if probe is not None and not is_inverted:
+                    _require_size(field, every, spacing, path)
+            finds_marks = finds_marks and sequence.is_recorded and not is_inverted
+            seen = visible_part(every, field.mask, sequence.coloured, finds_marks=finds_marks)
+            require(bool(seen.any()), "nothing of the probe's field is seen in the images")
+            for number, image in zip(kept, images, strict=True):
+                low, high = int(image[seen].min()), int(image[seen].max())
+                require(
+                    low < high,
+                    f"image {number} has the grey level {low} in all of the probe's field, expected a patient",
+                )
+                shown = float((image[seen] > _BLACK).sum() / field.mask.sum())
+                require(
+                    shown >= _LEAST_SHOWN,
+                    f"image {number} shows something in {shown:.1%} of the probe's field only, where nothing hides it, "
+                    f"expected at least {_LEAST_SHOWN:.0%}",
+                )
+            field = replace(field, mask=seen)
+        field = required(field, "the sequence has poses without images, expected images")
         to_ras = np.eye(4) if reference_to_ras is None else check_rigid("reference_to_ras", reference_to_ras)
         poses = [to_ras @ _probe_pose(matrix, field, path) for matrix in matrices]
         window = rows, columns = field.window
@@ -154,6 +157,40 @@ class TrackedImages:
         return replace(
             self, poses=[self.poses[n] for n in places], images=[self.images[n] for n in places], numbers=list(numbers)
         )
+
+
+def pixels_for_poses(sequence: TrackedSequence, path: str, probe: Probe) -> tuple[TrackedSequence, str, ImagedField]:
+    """(sequence, path, field) for TrackedImages.of, with which poses without images are those of pixels of `probe`.
+
+    A path from Image is taken from Probe, which is the probe's own frame then. Raises SimulationError for a path that
+    no pose has, and for an ImageToProbe of another frame, as the place of the probe in images is not known.
+    """
+    source, target = asked_ends(path, sequence.frames_of_reference())
+    name = f"{'Probe' if source == 'Image' else source}To{target}"
+    tracked = [n for n in range(len(sequence)) if sequence.has_pose(n, name)]
+    first = tracked[0] if tracked else 0
+    sequence.pose(first, name)
+    if source == "Image" and sequence.has_pose(first, "ImageToProbe"):
+        matrix = sequence.pose(first, "ImageToProbe")
+        require(
+            _is_upright(matrix, _pixel_spacing(matrix, "ImageToProbe")),
+            "the sequence has no images that show the probe's place in them, and ImageToProbe is not in the probe's "
+            f"own frame; expected {name} of that frame, and no calibration",
+        )
+    grid = ImageGrid.for_probe(probe, None)
+    transforms = [{"ImageToProbe": grid.image_to_probe} for _ in range(len(sequence))]
+    for number in tracked:
+        transforms[number][f"ProbeTo{target}"] = sequence.pose(number, name)
+    field = ImagedField.of(probe, grid.image_to_probe, (grid.rows, grid.columns))
+    return replace(sequence, transforms=tuple(transforms)), f"ImageTo{target}", field
+
+
+def _is_upright(image_to_probe: np.ndarray, spacing: tuple[float, float]) -> bool:
+    """Whether the image is upright and in the plane z = 0, as in this package's probe frame, not in a marker's."""
+    upright = np.diag([*spacing, 1.0, 1.0])
+    upright[:, 3] = image_to_probe[:, 3]
+    upright[2, 2] = image_to_probe[2, 2]
+    return np.allclose(image_to_probe, upright, atol=1e-4) and abs(image_to_probe[2, 3]) < 1e-6
 
 
 def _listed(numbers: Sequence[int]) -> str:
@@ -215,11 +252,7 @@ def _located_field(
                 raise of_all from None
     if all("ImageToProbe" in entry for entry in sequence.transforms):
         image_to_probe = np.array(sequence.transforms[0]["ImageToProbe"])
-        # In this package's probe frame the image is upright and in the plane z = 0; a tracker's marker can be anywhere.
-        upright = np.diag([*spacing, 1.0, 1.0])
-        upright[:, 3] = image_to_probe[:, 3]
-        upright[2, 2] = image_to_probe[2, 2]
-        if np.allclose(image_to_probe, upright, atol=1e-4) and abs(image_to_probe[2, 3]) < 1e-6:
+        if _is_upright(image_to_probe, spacing):
             image_to_probe[2, 2] = 1.0
             _log.info("the probe's place in the images is that of ImageToProbe, which is in the probe's own frame")
             return ImagedField.of(probe, image_to_probe, images.shape[1:])

@@ -28,6 +28,10 @@ DEFAULT_PORT = 18944
 _RETRY_S, _STALLED_S = 0.25, 5.0
 #: Limit of the message size; a larger size in a header means that the data are not OpenIGTLink.
 _LARGEST_BYTES = 1 << 28
+#: Messages with poses that are not read
+_OTHER_POSES = ("TDATA", "QTDATA", "POSITION")
+#: In metadata, whether a pose is valid: 1 or 0, and OK or else what is wrong (Plus)
+_VALID = ("1", "TRUE", "OK", "VALID")
 
 #: A name or IPv4 address, or an IPv6 address in brackets.
 _HOST = r"\[[^\[\]]*:[^\[\]]*\]|[^\[\]:]+"
@@ -98,7 +102,7 @@ class TrackerLink:
         self._device, self._image_name = device, image_name
         #: State of the connection, for display
         self.status = ""
-        #: Numbers of poses used, of poses dropped because they are not rigid or farther than 100 m, and of images sent
+        #: Numbers of poses used, of poses dropped because they are damaged, not valid or not rigid, and of images sent
         self.received = self.dropped = self.sent = 0
         self._refused = 0  # poses since the last that was used
         self._passed_over: set[str] = set()
@@ -144,12 +148,10 @@ class TrackerLink:
                     continue
                 with peer:
                     self._serve(peer)
-            except (OSError, ValueError, SimulationError) as error:
+            except Exception as error:  # pyigtl raises various exceptions for a message that it cannot parse
                 self._say(f"connection to {self._peer_name} lost ({error}), reconnecting", logging.WARNING)
-                self._wait(_RETRY_S)
-            except Exception as error:  # a message that cannot be parsed: drop the connection
-                self._say(f"invalid OpenIGTLink data from {self._peer_name} ({error}), reconnecting", logging.WARNING)
-                self._wait(_RETRY_S)
+                select.select([self._wake_in], [], [], _RETRY_S)
+                self._awake()
 
     def _say(self, status: str, level: int = logging.INFO) -> None:
         """Another status, which the log has once."""
@@ -186,34 +188,37 @@ class TrackerLink:
                 self.sent += 1
 
     def _receive(self, peer: socket.socket) -> None:
-        from pyigtl.messages import MessageBase, TransformMessage
+        from pyigtl.messages import CRC64, MessageBase, TransformMessage
 
-        header = MessageBase.parse_header(_exactly(peer, MessageBase.IGTL_HEADER_SIZE))
-        size = header["body_size"]
+        packed = _exactly(peer, MessageBase.IGTL_HEADER_SIZE)
+        header = MessageBase.parse_header(packed)
+        size, kind, device = header["body_size"], header["message_type"], header["device_name"]
         require(size <= _LARGEST_BYTES, f"message size is {size} bytes, expected at most {_LARGEST_BYTES}")
         body = _exactly(peer, size)
-        if header["message_type"] != "TRANSFORM":
-            self._notice(f"messages of type {header['message_type']!s} are passed over")
+        if kind != "TRANSFORM":
+            self._notice(f"messages of type {kind} are passed over")
+            if kind in _OTHER_POSES and not self.received:
+                remedy = "expected TRANSFORM: configure it to send TRANSFORM messages of the probe's pose"
+                self._say(f"{self._peer_name} sends {kind} messages, {remedy}", logging.WARNING)
             return
-        message = TransformMessage()
-        message.unpack(header, body)
         if self._device is None:
-            self._device = message.device_name
-            _log.info("OpenIGTLink: no transform was chosen, the first that came is followed: %r", self._device)
-        if message.device_name != self._device:
-            self._notice(f"transform {message.device_name!r} is passed over, {self._device!r} is followed")
+            self._device = device
+            _log.info("OpenIGTLink: no transform was chosen, the first that came is followed: %r", device)
+        if device != self._device:
+            self._notice(f"transform {device!r} is passed over, {self._device!r} is followed")
             return
+        message, name, crc, expected = TransformMessage(), f"transform {device!r}", packed[-8:].hex(), CRC64(body)
         try:
-            pose = check_rigid(f"transform {message.device_name!r}", _orthonormal(message.matrix))
+            require(crc == f"{expected:016x}", f"{name} is damaged: its CRC is {crc}, expected {expected:016x}")
+            message.unpack(header, body)
+            _require_valid(name, device, message.metadata)
+            pose = check_rigid(name, message.matrix)
         except SimulationError as error:  # a tracker may send any matrix while it does not see its tool
             self._refuse(str(error))
             return
-        following = f"connected to {self._peer_name}, following {self._device}"
-        if self._refused:
-            _log.info("OpenIGTLink: poses are used again, %d were refused", self._refused)
-            self._refused = 0
-            self.status = following  # which is no news
-        self._say(following)
+        pose[:3, :3] = nearest_rotation(pose[:3, :3])  # without the rounding of single precision
+        self._refused = 0
+        self._say(f"connected to {self._peer_name}, following {self._device}")
         self.received += 1
         self._moved(pose)
 
@@ -240,12 +245,6 @@ class TrackerLink:
                 pass
         except BlockingIOError:
             pass
-
-    def _wait(self, seconds: float) -> None:
-        select.select([self._wake_in], [], [], seconds)
-        if self._stopping:
-            return
-        self._awake()
 
 
 def _require_pyigtl() -> None:
@@ -276,11 +275,9 @@ def _exactly(peer: socket.socket, count: int) -> bytes:
     return b"".join(parts)
 
 
-def _orthonormal(matrix: np.ndarray) -> np.ndarray:
-    """Correct rounding errors of a rotation in single precision; other matrices are returned unchanged."""
-    matrix = np.array(matrix, float)
-    if np.isfinite(matrix).all():
-        rotation = nearest_rotation(matrix[:3, :3])
-        if np.abs(matrix[:3, :3] - rotation).max() < 1e-3:
-            matrix[:3, :3] = rotation
-    return matrix
+def _require_valid(name: str, device: str, metadata: dict[str, str]) -> None:
+    """Raise SimulationError for a pose that the tracker itself calls invalid, as of a tool that it does not see."""
+    keys = {first + last for first in ("Transform", device, f"{device}Transform") for last in ("Valid", "Status")}
+    for key, value in metadata.items():
+        if key in keys:
+            require(value.upper() in _VALID, f"{name} has {key} {value}, expected OK: the last valid pose stays")

@@ -6,12 +6,13 @@ import io
 import logging
 import os
 import re
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
 from SlicerUSSim.Logic.base.errors import SimulationError, require, required
-from SlicerUSSim.Logic.base.files import read_json, read_small, write_json, written_whole
+from SlicerUSSim.Logic.base.files import read_json, read_small, read_text, write_json, written_whole
 from SlicerUSSim.Logic.base.reading import in_child, reader, starts_like_hdf5
 from SlicerUSSim.Logic.base.transforms import (
     LPS_TO_RAS,
@@ -39,49 +40,50 @@ def read_pose(path: str | os.PathLike) -> np.ndarray:
     file (.tfm, .h5, .mat, .txt) contains the map from world to probe in LPS, as Slicer writes a linear transform.
     Raises SimulationError for other files and for a matrix that is not rigid.
     """
-    path = Path(path)
-    require(path.is_file(), f"{path}: no such file")
-    if path.suffix.lower() == ".json":
-        values = read_json(path)
-        if isinstance(values, dict):
-            require("probe_to_ras" in values, f'{path}: has no "probe_to_ras", expected a 4x4 matrix under that name')
-            values = values["probe_to_ras"]
-        else:
-            _log.info("%s: a bare matrix, taken for probe_to_ras", path)
-        return check_rigid(f"{path}: probe_to_ras", values)
-    if path.suffix.lower() in _ITK_SUFFIXES or _starts_like_itk(path):
-        _log.info("%s: ITK transform, taken for the map from world to probe in LPS, as 3D Slicer saves it", path)
-        return _read_itk(path)
-    _log.info("%s: 16 numbers, taken for probe_to_ras by rows", path)
-    return check_rigid(f"{path}: probe_to_ras", _numbers(path))
+    return check_rigid(f"{path}: probe_to_ras", _matrix(Path(path)))
 
 
 @reader
 def read_matrix(path: str | os.PathLike) -> np.ndarray:
-    """(4, 4) affine matrix, such as a calibration, from a text file of sixteen numbers by rows or from JSON rows.
+    """(4, 4) affine matrix, such as a calibration, which may scale, in any format of read_pose.
 
-    An ITK file (.tfm, .h5, .mat, .txt) contains the inverse map in LPS, as Slicer writes a linear transform.
-    The matrix may scale. Raises SimulationError for other files.
+    Raises SimulationError for other files.
     """
-    path = Path(path)
+    return check_affine(str(path), _matrix(Path(path)))
+
+
+def _matrix(path: Path):
+    """What a file has for a matrix, which is to be checked."""
     require(path.is_file(), f"{path}: no such file")
-    if path.suffix.lower() in _ITK_SUFFIXES or _starts_like_itk(path):
-        return check_affine(f"{path}: transform", _itk_to_world(path))
-    try:
-        matrix = np.array(read_json(path), float) if path.suffix.lower() == ".json" else _numbers(path)
-    except (TypeError, ValueError):
-        raise SimulationError(f"{path}: is not a matrix, expected four rows of four numbers") from None
-    return check_affine(str(path), matrix)
+    suffix = path.suffix.lower()
+    if suffix == ".json":
+        values = read_json(path)
+        if isinstance(values, dict):
+            require("probe_to_ras" in values, f'{path}: has no "probe_to_ras", expected a 4x4 matrix under that name')
+            return values["probe_to_ras"]
+        _log.info("%s: a bare matrix, taken for probe_to_ras", path)
+        return values
+    if suffix in _ITK_SUFFIXES or _starts_like_itk(path):
+        require(
+            suffix != ".mat" or b"\0" in read_small(path),
+            f"{path}: is a text, as FSL's FLIRT writes a matrix relative to the voxels of two images; expected a map "
+            f"in millimetres: c3d_affine_tool -ref REFERENCE -src IMAGE {path.name} -fsl2ras -oitk pose.tfm converts "
+            "it; if it is one in RAS, name it .txt",
+        )
+        _log.info("%s: ITK transform, taken for the map from world to probe in LPS, as 3D Slicer saves it", path)
+        return _itk_to_world(path)
+    _log.info("%s: 16 numbers, taken for probe_to_ras by rows", path)
+    return matrix_of_text(f"{path}:", read_text(path))
 
 
-def _numbers(path: Path) -> np.ndarray:
-    """(4, 4) of sixteen numbers in a text file."""
+def matrix_of_text(name: str, text: str) -> np.ndarray:
+    """(4, 4) of a text of sixteen numbers by rows. Raises SimulationError for others, and if it is not affine."""
     try:
-        numbers = np.array(read_small(path).decode().replace(",", " ").split(), float)
-    except (ValueError, UnicodeDecodeError):
-        raise SimulationError(f"{path}: is not a pose, expected 16 numbers by rows, JSON or an ITK transform") from None
-    require(numbers.size == 16, f"{path}: has {numbers.size} numbers, expected 16 (a 4x4 matrix by rows)")
-    return numbers.reshape(4, 4)
+        numbers = np.array(text.replace(",", " ").split(), float)
+    except ValueError:
+        raise SimulationError(f"{name} is {text.strip()[:40]!r}, expected 16 numbers, a 4x4 matrix by rows") from None
+    require(numbers.size == 16, f"{name} has {numbers.size} numbers, expected 16, a 4x4 matrix by rows")
+    return check_affine(name, numbers.reshape(4, 4))
 
 
 def write_pose(path: str | os.PathLike, probe_to_ras: np.ndarray) -> None:
@@ -130,14 +132,13 @@ def _starts_like_itk(path: Path) -> bool:
         return file.read(8) == b"#Insight"
 
 
-def _read_itk(path: Path) -> np.ndarray:
-    return check_rigid(f"{path}: transform", _itk_to_world(path))
-
-
 def _itk_to_world(path: Path) -> np.ndarray:
     """(4, 4) in RAS of the inverse of an ITK file's linear map, which is in LPS."""
-    is_binary = path.suffix.lower() in _BINARY or starts_like_hdf5(path)
-    world_to_probe = _linear_map_of_binary(path) if is_binary else _linear_map(path)
+    if path.suffix.lower() in _BINARY or starts_like_hdf5(path):
+        world_to_probe = _linear_map_of_binary(path)
+    else:
+        require_sound_text(path)
+        world_to_probe = _linear_map(path)
     require(not is_singular(world_to_probe), f"{path}: the transform is singular, expected a rigid one")
     return LPS_TO_RAS @ np.linalg.inv(world_to_probe) @ LPS_TO_RAS
 
@@ -153,19 +154,18 @@ def _write_itk(path: Path, pose: np.ndarray) -> None:
         sitk.WriteTransform(transform, str(partial))
 
 
-def _linear_map(path: Path) -> np.ndarray:
+def _linear_map(path: Path, is_binary: bool = False) -> np.ndarray:
     """(4, 4) of a linear ITK transform, in LPS."""
     import SimpleITK as sitk
 
-    if path.suffix.lower() not in _BINARY and not starts_like_hdf5(path):
-        require_sound_text(path)
     try:
         transform = sitk.ReadTransform(str(path))
     except RuntimeError as error:
         raise SimulationError(
             f"{path}: cannot be read as a transform ({str(error).splitlines()[-1].strip()})"
         ) from None
-    require_sound(path, transform)
+    if is_binary:
+        require_sound(path, transform)
     # A linear map is determined by the images of the origin and the axes.
     origin = np.array(transform.TransformPoint((0.0, 0.0, 0.0)))
     world_to_probe = np.eye(4)
@@ -177,7 +177,7 @@ def _linear_map(path: Path) -> np.ndarray:
 
 @in_child  # ITK ends the process for some damaged files
 def _linear_map_of_binary(path: Path) -> np.ndarray:
-    return _linear_map(path)
+    return _linear_map(path, is_binary=True)
 
 
 @reader
@@ -225,11 +225,31 @@ def read_calibration(path: str | os.PathLike, name: str = "ImageToProbe") -> dic
     That is 16 numbers by rows, JSON rows, or a linear ITK transform as 3D Slicer saves it (.tfm, .h5); it may scale.
     Raises SimulationError for other files.
     """
-    from SlicerUSSim.Logic.tracked.sequence import read_coordinate_definitions
-
     if Path(path).suffix.lower() == ".xml":
         return read_coordinate_definitions(path)
     return {name: read_matrix(path)}
+
+
+@reader
+def read_coordinate_definitions(path: str | os.PathLike) -> dict[str, np.ndarray]:
+    """{"ImageToProbe": (4, 4), ...} from the <CoordinateDefinitions> of a Plus configuration file (XML).
+
+    Raises SimulationError for other files, and for a matrix that is not 4x4.
+    """
+    from xml.etree import ElementTree
+
+    path = Path(path)
+    try:
+        root = ElementTree.fromstring(read_small(path))
+    except ElementTree.ParseError as error:
+        raise SimulationError(f"{path}: is not XML ({error})") from None
+    transforms = {}
+    for entry in root.iter("Transform"):
+        start, end, text = entry.get("From"), entry.get("To"), entry.get("Matrix")
+        if start and end and text:
+            transforms[f"{start}To{end}"] = matrix_of_text(f"{path}: {start} to {end}", text)
+    require(bool(transforms), f"{path}: has no <Transform From= To= Matrix=>, expected a Plus configuration")
+    return transforms
 
 
 def read_registration(path: str | os.PathLike) -> tuple[np.ndarray, str]:
@@ -292,7 +312,7 @@ def _read_xfm(path: Path) -> np.ndarray:
 def _mni_text(path: Path, first_words: str) -> str:
     require(path.is_file(), f"{path}: no such file")
     try:
-        text = io.StringIO(read_small(path).decode(), newline=None).read()  # all kinds of line ends
+        text = io.StringIO(read_text(path), newline=None).read()  # all kinds of line ends
     except UnicodeDecodeError:
         text = ""
     require(text.lstrip().startswith(first_words), f"{path}: does not start with {first_words!r}")
@@ -303,6 +323,7 @@ def _mni_text(path: Path, first_words: str) -> str:
 # ITK takes fewer numbers than a kind needs, and reads beyond their end; a number that it cannot read, such as `inf`,
 # ends a list without a word (itkTxtTransformIO.hxx, SetParameters of itkEuler3DTransform.hxx).
 
+_COMPOSITE = "CompositeTransform"
 #: Parameters of the linear kinds in three dimensions
 _LINEAR = {
     "IdentityTransform": 0,
@@ -319,44 +340,37 @@ _LINEAR = {
     "MatrixOffsetTransformBase": 12,
     "ComposeScaleSkewVersor3DTransform": 12,
     "ScaleSkewVersor3DTransform": 15,
+    _COMPOSITE: 0,
 }
-_COMPOSITE = "CompositeTransform"
+#: Name, whether there are numbers, and these
+_BLOCK = r"(?m)^Transform: *(.*)\n(Parameters:(.*)\nFixedParameters:(.*)\n)?"
 _NUMBER = r"[-+]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][-+]?[0-9]{1,3})?"
 
 
 def require_sound_text(path: Path) -> None:
     """Raise SimulationError unless a text file holds one linear transform, or a chain of them, with all its numbers."""
-    content = read_small(path)
-    require(_is_text(content), f"{path}: is not a text, expected an ITK transform")
-    fields = [
-        (name.strip(), value.strip())
-        for name, colon, value in (line.partition(":") for line in content.decode("utf-8").split("\n"))
-        if colon and not name.lstrip().startswith("#")
-    ]
-    kinds = [value for name, value in fields if name == "Transform"]
-    require(bool(kinds), f"{path}: has no line Transform, expected an ITK transform")
-    is_chain = kinds[0].startswith(_COMPOSITE)
+    try:
+        text = read_text(path)
+    except UnicodeDecodeError:
+        text = "\0"
+    require("\0" not in text, f"{path}: is not a text, expected an ITK transform")
+    lines = [line.strip() for line in text.split("\n") if ":" in line and not line.lstrip().startswith("#")]
+    blocks = re.findall(_BLOCK, "".join(f"{line}\n" for line in lines))
+    require(bool(blocks), f"{path}: has no line Transform, expected an ITK transform")
     require(
-        is_chain or len(kinds) == 1, f"{path}: has {len(kinds)} transforms that are not chained, expected one transform"
-    )
-    expected = []
-    for kind in kinds:
-        name = _known(path, kind)
-        expected.append(("Transform", kind))
-        if name != _COMPOSITE:
-            expected += [("Parameters", name), ("FixedParameters", name)]
-    require(
-        [name for name, _ in fields] == [name for name, _ in expected],
-        f"{path}: has the lines {', '.join(name[:20] for name, _ in fields[:9])}, expected Transform, Parameters and "
+        len(lines) == sum(3 if parameters else 1 for _, parameters, *_ in blocks),
+        f"{path}: has the lines {', '.join(line[:20] for line in lines[:9])}, expected Transform, Parameters and "
         "FixedParameters of each",
     )
-    for (field, text), (_, kind) in zip(fields, expected, strict=True):
-        if field == "Transform":
-            continue
-        numbers = text.split()
-        wrong = next((part for part in numbers if not re.fullmatch(_NUMBER, part) or abs(float(part)) > 1e300), None)
-        require(wrong is None, f"{path}: {field} of {kind} has {wrong!r:.40}, expected numbers")
-        require(field != "Parameters" or len(numbers) == _LINEAR[kind], _counted(path, kind, len(numbers)))
+    is_chain = blocks[0][0].startswith(_COMPOSITE)
+    require(is_chain or len(blocks) == 1, f"{path}: has {len(blocks)} transforms that are not chained, expected one")
+    for whole, _, parameters, fixed in blocks:
+        kind = re.sub(r"_(double|float)_3_3$", "", whole)
+        for name, numbers in (("Parameters", parameters.split()), ("FixedParameters", fixed.split())):
+            for part in numbers:
+                is_number = re.fullmatch(_NUMBER, part) and abs(float(part)) <= 1e300
+                require(bool(is_number), f"{path}: {name} of {kind} has {part!r:.40}, expected numbers")
+        _require_parameters(path, kind, parameters.split())
 
 
 def require_sound(path: Path, transform) -> None:
@@ -364,33 +378,20 @@ def require_sound(path: Path, transform) -> None:
     import SimpleITK as sitk
 
     require(transform.IsLinear(), f"{path}: the transform is not linear, expected a rigid one")
+    parts = [transform]
     if transform.GetName() == _COMPOSITE:
         chain = sitk.CompositeTransform(transform)
-        for n in range(chain.GetNumberOfTransforms()):
-            require_sound(path, chain.GetNthTransform(n))
-        return
-    kind, found = transform.GetName(), len(transform.GetParameters())
-    require(kind in _LINEAR, f"{path}: {kind} is not read, expected one of {', '.join(_LINEAR)}")
-    require(found == _LINEAR[kind], _counted(path, kind, found))
+        parts = [chain.GetNthTransform(n) for n in range(chain.GetNumberOfTransforms())]
+    for part in parts:
+        kind, found = part.GetName(), part.GetParameters()
+        if kind == _COMPOSITE:  # SimpleITK has no class for ITK's base class, and shows it as a chain of itself
+            kind = "MatrixOffsetTransformBase"
+        _require_parameters(path, kind, found)
 
 
-def _known(path: Path, kind: str) -> str:
-    """The name of a kind that is read, as of "Euler3DTransform_double_3_3"."""
-    name, _, rest = kind.partition("_")
-    is_known = re.fullmatch(r"(double|float)_3_3", rest) is not None and (name in _LINEAR or name == _COMPOSITE)
+def _require_parameters(path: Path, kind: str, found: Sequence) -> None:
     require(
-        is_known,
+        kind in _LINEAR,
         f"{path}: the transform is {kind!r:.60}, expected a linear one in three dimensions: {', '.join(_LINEAR)}",
     )
-    return name
-
-
-def _counted(path: Path, kind: str, found: int) -> str:
-    return f"{path}: {kind} has {found} parameters, expected {_LINEAR[kind]}"
-
-
-def _is_text(content: bytes) -> bool:
-    try:
-        return "\0" not in content.decode("utf-8")
-    except UnicodeDecodeError:
-        return False
+    require(len(found) == _LINEAR[kind], f"{path}: {kind} has {len(found)} parameters, expected {_LINEAR[kind]}")

@@ -12,19 +12,19 @@ import logging
 import os
 import re
 from collections import deque
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
-from SlicerUSSim.Logic.base.errors import SimulationError, require, require_package, require_path
-from SlicerUSSim.Logic.base.files import read_small, written_whole
+from SlicerUSSim.Logic.base.errors import SimulationError, require, require_package, require_path, required
+from SlicerUSSim.Logic.base.files import read_text, written_whole
 from SlicerUSSim.Logic.base.image_files import read_image
 from SlicerUSSim.Logic.base.reading import reader
 from SlicerUSSim.Logic.base.transforms import check_affine, is_singular
 from SlicerUSSim.Logic.base.volume import Volume
+from SlicerUSSim.Logic.tracked.pose_files import matrix_of_text
 
 _log = logging.getLogger(__name__)
 
@@ -38,6 +38,11 @@ _SIMULATED_BEFORE = "ussim_made_by"
 #: Field of sequences whose images are slices of a 3D ultrasound volume
 _CUT = "SlicerUSSimCutFromVolume"
 _ORIENTATION, _TYPE = "UltrasoundImageOrientation", "UltrasoundImageType"
+_MOST_HEADER_BYTES = 2**26
+#: Name of a transform, split at the last To followed by a capital letter or digit
+_FROM_TO = re.compile(r"(.+)To([A-Z0-9].*)")
+#: Header of transforms without images: 3D Slicer writes images of 0 x 0 pixels, Plus of 1 x 1
+_NO_IMAGES = re.compile(rb"^(?:DimSize *=|sizes:) *(?:[01] +){2,}(\d{1,9}) *\r?$", re.MULTILINE)
 _OK = "OK"
 #: Fields of ITK and NRRD files that do not belong to a sequence.
 _NOT_OURS = (
@@ -75,7 +80,7 @@ class TrackedSequence:
     1
     """
 
-    #: [n, row, column], or [n, scan line, sample] for RF data
+    #: [n, row, column], or [n, scan line, sample] for RF data; [n, 0, 0] for poses without images
     images: np.ndarray
     #: {"ProbeToTracker": (4, 4), ...} for each image, without transforms that were not tracked
     transforms: tuple[Mapping[str, np.ndarray], ...]
@@ -92,7 +97,7 @@ class TrackedSequence:
 
     def __post_init__(self) -> None:
         images = np.asarray(self.images)
-        require(images.ndim == 3 and images.size > 0, f"images have shape {images.shape}, expected (n, rows, columns)")
+        require(images.ndim == 3 and len(images) > 0, f"images have shape {images.shape}, expected (n, rows, columns)")
         count = len(images)
         transforms = tuple(
             {name: _matrix(f"image {n}: {name}", m) for name, m in entry.items()}
@@ -110,6 +115,11 @@ class TrackedSequence:
 
     def __len__(self) -> int:
         return len(self.images)
+
+    @property
+    def has_images(self) -> bool:
+        """Whether it has images, and not only poses."""
+        return self.images.size > 0
 
     @property
     def is_simulated(self) -> bool:
@@ -141,10 +151,7 @@ class TrackedSequence:
         return self._composed(number, name)[1]
 
     def _composed(self, number: int, name: str) -> tuple[np.ndarray, list[str]]:
-        count = len(self)
-        require(
-            int(number) == number and 0 <= number < count, f"image {number} does not exist, expected 0 to {count - 1}"
-        )
+        self._require_images([number])
         entry = self.transforms[number]
         steps: dict[str, list[tuple[str, np.ndarray, str]]] = {}
         for known, matrix in entry.items():
@@ -152,7 +159,7 @@ class TrackedSequence:
             steps.setdefault(start, []).append((end, matrix, known))
             if not is_singular(matrix):
                 steps.setdefault(end, []).append((start, np.linalg.inv(matrix), f"inverse of {known}"))
-        source, target = self._asked_ends(name, set(steps))
+        source, target = asked_ends(name, set(steps))
         found: dict[str, tuple[np.ndarray, list[str]]] = {source: (np.eye(4), [])}
         waiting = deque([source])
         while waiting and target not in found:
@@ -162,9 +169,10 @@ class TrackedSequence:
                     found[there] = matrix @ found[here][0], [*found[here][1], step]
                     waiting.append(there)
         if target not in found:
+            hint = ", such as the calibration ImageToProbe" if source == "Image" and source not in steps else ""
             raise SimulationError(
                 f"image {number}: no path from {source} to {target}, the file has {', '.join(sorted(entry)) or 'no'} "
-                f"transforms; give the missing one{_calibration_hint(source, steps)}"
+                f"transforms; give the missing one{hint}"
             )
         return found[target]
 
@@ -177,23 +185,24 @@ class TrackedSequence:
         return True
 
     def with_transforms(self, constant: Mapping[str, np.ndarray]) -> TrackedSequence:
-        """The sequence with additional transforms that are constant over all images: a calibration, a registration."""
-        constant = {name: _matrix(name, matrix) for name, matrix in constant.items()}
-        for name in constant:
-            replaced = any(name in entry for entry in self.transforms)
-            _log.info(
-                "%s %s", name, "takes the place of the sequence's own" if replaced else "is added to the sequence"
-            )
-        return replace(self, transforms=tuple({**entry, **constant} for entry in self.transforms))
+        """The sequence with additional transforms that are constant over all images: a calibration, a registration.
+
+        A calibration of the image, ImageToProbe, takes the place of its own. Others between frames that the transforms
+        of the sequence connect are not used, even where these were lost: they were measured. A warning says so.
+        """
+        keys = set().union(*self.transforms, *self.frame_fields)
+        names = {re.sub(r"Transform(Status)?$", "", key) for key in keys}
+        known = {name: np.eye(4) for name in names if _FROM_TO.fullmatch(name)}
+        of_file = replace(self.select([0]), transforms=(known,))
+        measured = {name for name in constant if not name.startswith("ImageTo") and of_file.has_pose(0, name)}
+        if measured:
+            _log.warning("not used, as the sequence has measured it: constant %s", ", ".join(sorted(measured)))
+        added = {name: _matrix(name, matrix) for name, matrix in constant.items() if name not in measured}
+        return replace(self, transforms=tuple({**entry, **added} for entry in self.transforms))
 
     def select(self, numbers: Sequence[int]) -> TrackedSequence:
         """The sequence of only these images. Raises SimulationError for images that do not exist."""
-        count = len(self)
-        for number in numbers:
-            require(
-                int(number) == number and 0 <= number < count,
-                f"image {number} does not exist, expected 0 to {count - 1}",
-            )
+        self._require_images(numbers)
         require(len(numbers) > 0, "no image chosen, expected at least one")
         pick = list(numbers)
         return replace(
@@ -204,15 +213,15 @@ class TrackedSequence:
             frame_fields=tuple(self.frame_fields[n] for n in pick),
         )
 
+    def _require_images(self, numbers: Sequence[int]) -> None:
+        last = len(self) - 1
+        for number in numbers:
+            exists = int(number) == number and 0 <= number <= last
+            require(exists, f"image {number} does not exist, expected 0 to {last}")
+
     def with_images(self, numbers: Sequence[int], images: np.ndarray) -> TrackedSequence:
         """The images `numbers` with other pixels [n, row, column], and with their original transforms and times."""
         return replace(self.select(numbers), images=images)
-
-    def _asked_ends(self, name: str, known: set[str]) -> tuple[str, str]:
-        splits = [(name[: m.start()], name[m.end() :]) for m in re.finditer("To", name)]
-        splits = [(start, end) for start, end in splits if start and end]
-        require(bool(splits), f"transform is {name!r}, expected two frames joined by To, such as ImageToReference")
-        return max(splits, key=lambda ends: sum(end in known for end in ends))
 
     # ---- files -------------------------------------------------------------------------------------------------
 
@@ -221,14 +230,20 @@ class TrackedSequence:
     def read(cls, path: str | os.PathLike) -> TrackedSequence:
         """Read a sequence metafile (.igs.mha, .seq.mha, .mhd, .nrrd), compressed or not, in any image orientation.
 
-        Transforms whose status is not OK were not tracked and are omitted. Colours are converted to grey levels, those
-        of a colour map with a warning.
+        Transforms whose status is not OK were not tracked and are omitted, and so are those whose name or matrix is
+        none. Colours are converted to grey levels, those of a colour map with a warning. Transforms alone, as 3D Slicer
+        saves a sequence of them, are poses without images.
         Raises SimulationError for a file that is missing, unreadable or of another format.
         """
         require_path(path)
         path = Path(path)
         require(path.is_file(), f"{path}: no such file")
-        pixels, header = _read_images(path)
+        with path.open("rb") as file:
+            start = file.read(65536)
+        if (found := _NO_IMAGES.search(start)) is not None:
+            pixels, header = _read_poses(path, int(found[1]))
+        else:
+            pixels, header = _read_images(path)
         return _from_header(pixels, header, str(path))
 
     def write(self, path: str | os.PathLike, compress: bool = True) -> None:
@@ -251,13 +266,12 @@ class TrackedSequence:
         header = {**self.fields, _ORIENTATION: "FM" if is_rf else "MF", _TYPE: self.image_type}
         names = sorted({name for entry in self.transforms for name in entry})
         for n, (entry, extra) in enumerate(zip(self.transforms, self.frame_fields, strict=True)):
-            start = f"Seq_Frame{n:04d}_"
+            frame = {"ImageStatus": _OK, **extra, "Timestamp": f"{self.timestamps[n]:.6f}"}
             for name in names:
                 matrix = entry.get(name, np.eye(4))
-                header[f"{start}{name}Transform"] = " ".join(f"{value:.9g}" for value in matrix.ravel())
-                header[f"{start}{name}TransformStatus"] = _OK if name in entry else "INVALID"
-            header[f"{start}Timestamp"] = f"{self.timestamps[n]:.6f}"
-            header |= {f"{start}{name}": value for name, value in {"ImageStatus": _OK, **extra}.items()}
+                frame[f"{name}Transform"] = " ".join(f"{value:.9g}" for value in matrix.ravel())
+                frame[f"{name}TransformStatus"] = _OK if name in entry else "INVALID"
+            header |= {f"Seq_Frame{n:04d}_{key}": value for key, value in frame.items()}
         return header
 
     # ---- other sources -----------------------------------------------------------------------------------------
@@ -349,42 +363,22 @@ def checked_apart(text: str, fitted: Sequence[int] | None, count: int) -> list[i
     return numbers
 
 
-@reader
-def read_coordinate_definitions(path: str | os.PathLike) -> dict[str, np.ndarray]:
-    """{"ImageToProbe": (4, 4), ...} from the <CoordinateDefinitions> of a Plus configuration file (XML).
-
-    Raises SimulationError for other files, and for a matrix that is not 4x4.
-    """
-    from xml.etree import ElementTree
-
-    path = Path(path)
-    try:
-        root = ElementTree.fromstring(read_small(path))
-    except OSError as error:
-        raise SimulationError(f"{path}: cannot be read ({error.strerror})") from None
-    except ElementTree.ParseError as error:
-        raise SimulationError(f"{path}: is not XML ({error})") from None
-    transforms = {}
-    for entry in root.iter("Transform"):
-        start, end, text = entry.get("From"), entry.get("To"), entry.get("Matrix")
-        if start and end and text:
-            transforms[f"{start}To{end}"] = _numbers(f"{path}: {start} to {end}", text)
-    require(bool(transforms), f"{path}: has no <Transform From= To= Matrix=>, expected a Plus configuration")
-    return transforms
-
-
 # ---- fields ----------------------------------------------------------------------------------------------------------
 
 
 def _ends(name: str) -> tuple[str, str]:
-    """Frames of a transform in a file: the name is split at the last To followed by a capital letter or digit."""
-    splits = [m for m in re.finditer(r"To(?=[A-Z0-9])", name) if m.start() > 0]
-    require(bool(splits), f"transform is {name!r}, expected two frames joined by To, such as ProbeToTracker")
-    return name[: splits[-1].start()], name[splits[-1].end() :]
+    """Frames of a transform in a file."""
+    expected = f"transform is {name!r}, expected two frames joined by To, such as ProbeToTracker"
+    found = required(_FROM_TO.fullmatch(name), expected)
+    return found[1], found[2]
 
 
-def _calibration_hint(source: str, steps: Mapping) -> str:
-    return ", such as the calibration ImageToProbe" if source == "Image" and source not in steps else ""
+def asked_ends(name: str, known: Collection[str]) -> tuple[str, str]:
+    """Frames of a transform that is asked for, if possible `known` ones. Raises SimulationError for other names."""
+    splits = [(name[: m.start()], name[m.end() :]) for m in re.finditer("To", name)]
+    splits = [(start, end) for start, end in splits if start and end]
+    require(bool(splits), f"transform is {name!r}, expected two frames joined by To, such as ImageToReference")
+    return max(splits, key=lambda ends: sum(end in known for end in ends))
 
 
 def _matrix(name: str, matrix) -> np.ndarray:
@@ -393,22 +387,15 @@ def _matrix(name: str, matrix) -> np.ndarray:
     return array
 
 
-def _numbers(name: str, text: str) -> np.ndarray:
-    try:
-        values = np.array(text.split(), float)
-    except ValueError:
-        raise SimulationError(f"{name} is {text.strip()[:40]!r}, expected 16 numbers") from None
-    require(values.size == 16, f"{name} has {values.size} numbers, expected 16")
-    return _matrix(name, values.reshape(4, 4))
-
-
 def _from_header(pixels: _Pixels, header: Mapping[str, str], source: str) -> TrackedSequence:
     """A sequence from the pixels of a file and its header fields."""
-    count = len(pixels.grey)
+    grey, coloured = pixels
+    count = len(grey)
     transforms: list[dict] = [{} for _ in range(count)]
     others: list[dict] = [{} for _ in range(count)]
     timestamps = np.full(count, np.nan)
     fields = {}
+    lost, damaged = 0, {}
     for key, text in header.items():
         match = _FRAME_FIELD.fullmatch(key)
         if match is None:
@@ -417,48 +404,58 @@ def _from_header(pixels: _Pixels, header: Mapping[str, str], source: str) -> Tra
             continue
         number, name = int(match.group(1)), match.group(2)
         require(number < count, f"{source}: has the field {key}, expected numbers below {count}, the number of images")
-        if name.endswith("TransformStatus"):
-            continue
-        if name.endswith("Transform"):
-            if header.get(f"{key}Status", _OK).strip().upper() == _OK:
-                name = name.removesuffix("Transform")
-                transforms[number][name] = _numbers(f"{source}: {key}", text)
-        elif name == "Timestamp":
+        short = name.removesuffix("Transform")
+        if name == "Timestamp":
             try:
                 timestamps[number] = float(text)
             except ValueError:
                 raise SimulationError(f"{source}: {key} is {text!r}, expected seconds") from None
-        else:
-            others[number][name] = text
-    left_out = sum(
-        1 for key in header if key.endswith("Transform") and header.get(f"{key}Status", _OK).strip().upper() != _OK
-    )
+            continue
+        if short != name and _FROM_TO.fullmatch(short):
+            try:
+                if header.get(f"{key}Status", _OK).strip().upper() == _OK:
+                    transforms[number][short] = matrix_of_text(key, text)
+                    continue
+                lost += 1
+            except SimulationError as error:
+                damaged.setdefault(short, str(error))
+        others[number][name] = text
     _log.info("%s: %d images, transforms %s", source, count, ", ".join(sorted(set().union(*transforms))) or "none")
-    if left_out:
-        _log.info("%s: %d transforms were not tracked (their status is not OK) and are left out", source, left_out)
+    if lost:
+        _log.info("%s: %d transforms were not tracked (their status is not OK) and are left out", source, lost)
+    for why in damaged.values():
+        _log.warning("%s: %s; such transforms are left out", source, why)
     if not np.isfinite(timestamps).all():
         _log.info("%s: some images have no timestamp; their number is used instead", source)
     # Without timestamps the order of the images is used.
     timestamps = np.where(np.isfinite(timestamps), timestamps, np.arange(count))
-    for key, default in ((_TYPE, "BRIGHTNESS"), (_ORIENTATION, "rows away from the probe, columns to its mark")):
-        if key not in header:
-            _log.info("%s: has no %s, taken for %s", source, key, default)
-    image_type = header.get(_TYPE, "BRIGHTNESS").strip()
+    image_type = _value(header, _TYPE, "BRIGHTNESS", source)
     image_type = "BRIGHTNESS" if image_type == "RGB_COLOR" else image_type
     wanted = "MF" if image_type == "BRIGHTNESS" else "FM"
-    orientation = header.get(_ORIENTATION, wanted).strip().upper()
-    array = _oriented(pixels.grey, orientation, wanted, source)
-    coloured = None if pixels.coloured is None else _oriented(pixels.coloured[None], orientation, wanted, source)[0]
+    orientation = _value(header, _ORIENTATION, wanted, source)
+    array = _oriented(grey, orientation, wanted, source)
+    if coloured is not None:
+        coloured = _oriented(coloured[None], orientation, wanted, source)[0]
     return TrackedSequence(array, tuple(transforms), timestamps, image_type, fields, tuple(others), coloured)
+
+
+def _value(header: Mapping[str, str], key: str, default: str, source: str) -> str:
+    """A general field, `default` if it is missing or unknown (XX, ??), of which the latter is a warning."""
+    text = re.sub(r"^(?:US_IMG_)?(.*?)\1?$", r"\1", header.get(key, "").strip().upper())  # some write it twice
+    if set(text) - set("?X"):
+        return text
+    meaning = f"{default}, rows away from the probe and columns towards its mark" if default == "MF" else default
+    if key in header:
+        _log.warning("%s: its %s is %r, which is unknown, taken for %s", source, key, header[key], meaning)
+    else:
+        _log.info("%s: has no %s, taken for %s", source, key, meaning)
+    return default
 
 
 def _oriented(array: np.ndarray, orientation: str, wanted: str, source: str) -> np.ndarray:
     """[n, y, x] images, transposed and flipped from `orientation` of the axes x, y to `wanted`."""
     letters = orientation[:2]
     known = len(orientation) in (2, 3) and any(letters in (a + b, b + a) for a in "MU" for b in "FN")
-    if orientation in ("XX", "XXX"):
-        _log.info("%s: its orientation is unknown (%s), images stay as they are", source, orientation)
-        return array
     require(known, f"{source}: {_ORIENTATION} is {orientation!r}, expected a code such as MF, UF, MN or MFA")
     if letters != wanted:
         _log.info("%s: images are reoriented from %s to %s", source, letters, wanted)
@@ -471,13 +468,8 @@ def _oriented(array: np.ndarray, orientation: str, wanted: str, source: str) -> 
     return np.ascontiguousarray(array)
 
 
-class _Pixels(NamedTuple):
-    """The pixels of a file, and which of them have a colour."""
-
-    #: [n, y, x]
-    grey: np.ndarray
-    #: (y, x) bool, in any image; None without
-    coloured: np.ndarray | None
+#: ([n, y, x] grey levels of a file, (y, x) bool whether a pixel has a colour in any image; None without)
+_Pixels = tuple[np.ndarray, np.ndarray | None]
 
 
 def _as_images(array: np.ndarray, components: int, source: str) -> _Pixels:
@@ -497,7 +489,7 @@ def _as_images(array: np.ndarray, components: int, source: str) -> _Pixels:
     if array.ndim == 2:
         array = array[None]
     require(array.ndim == 3, f"{source}: has {array.ndim} dimensions, expected columns, rows and images")
-    return _Pixels(array, coloured)
+    return array, coloured
 
 
 def _are_coloured(colours: np.ndarray, grey: np.ndarray, source: str) -> np.ndarray:
@@ -555,6 +547,21 @@ def _read_images(path: Path) -> tuple[_Pixels, dict[str, str]]:
     components = found.array.shape[-1] if found.has_components else 1
     header = {names.get(key, key): value for key, value in found.header.items()}
     return _as_images(found.array, components, str(path)), header
+
+
+def _read_poses(path: Path, count: int) -> tuple[_Pixels, dict[str, str]]:
+    """What a file of `count` transforms without images has."""
+    text = read_text(path, _MOST_HEADER_BYTES, errors="replace")
+    text = re.sub(r"-Sequence(_\d+)?(?=Transform)", "", text)  # 3D Slicer adds it to the name of what it records
+    fields = dict(re.findall(r"^(Seq_Frame[^=:\n]+?) *:?= *(.*?)\s*$", text, re.MULTILINE))
+    require(
+        0 < count <= len(fields), f"{path}: promises {count} poses without images, has {len(fields)} fields of them"
+    )
+    names = {found[1] for key in fields if (found := re.fullmatch(r"Seq_Frame\d+_(.+)Transform", key))}
+    if len(names) == 1 and not _FROM_TO.fullmatch(only := names.pop()):
+        _log.warning("%s: its only transform is %s, taken for ProbeToReference", path, only)
+        fields = {key.replace(f"_{only}Transform", "_ProbeToReferenceTransform"): fields[key] for key in fields}
+    return (np.zeros((count, 0, 0), np.uint8), None), fields
 
 
 def _write_metaimage(path: Path, images: np.ndarray, header: Mapping[str, str], compress: bool) -> None:

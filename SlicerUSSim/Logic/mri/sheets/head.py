@@ -77,9 +77,10 @@ class Head:
             f"of {contrast}",
         )
         box = _box(segmentation.brain.mask, _MARGIN_MM)
-        part = _part(mri, box)
-        inside = segmentation.brain.mask.array[box] > 0
-        image = part.with_array(np.float32(sign) * _without_field(part, segmentation.corrected[box], inside))
+        images = (mri, segmentation.brain.mask, mri.with_array(segmentation.corrected))
+        part, mask, corrected = (_part(image, box).along() for image in images)
+        inside = mask.array > 0
+        image = part.with_array(np.float32(sign) * _without_field(part, corrected.array, inside))
         noise = float(segmentation.standard_deviations[names.index("white matter")])
         return replace(cls.of_part(image, inside, means, noise, contrast == "t1gd"), registered=segmentation.atlas)
 
