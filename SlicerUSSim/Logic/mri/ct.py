@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from scipy import ndimage
 
-from SlicerUSSim.Logic.base.errors import SimulationError, require, require_between, require_kind
+from SlicerUSSim.Logic.base.errors import require, require_between, require_kind
 from SlicerUSSim.Logic.base.neighbourhood import smallest_around
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.mri.ct_body import find_body
@@ -21,7 +21,6 @@ from SlicerUSSim.Logic.mri.recognition import check_finite
 from SlicerUSSim.Logic.mri.segmentation_settings import SegmentationSettings
 from SlicerUSSim.Logic.opencl.device import DeviceChoice
 from SlicerUSSim.Logic.tissue.label_maps import LabelledTissues
-from SlicerUSSim.Logic.tissue.label_sources import not_intensities
 from SlicerUSSim.Logic.tissue.texture import Texture, tissue_deviation
 
 _log = logging.getLogger(__name__)
@@ -136,24 +135,27 @@ def segment_ct(
     report = progress or (lambda share: None)
     check_finite(ct, "CT", "by -1000, which is air")
     given, ct, mask = ct, ct.along(), None if mask is None else mask.along()
-    offset, line = _unit_of(ct)
+    offset, line = hounsfield_offset(ct)
     notes, warnings = [], [] if line is None else [line]
+    require(
+        mask is None or (mask.size_text == ct.size_text and np.allclose(mask.ijk_to_ras, ct.ijk_to_ras, atol=1e-2)),
+        "the mask and the CT lie on different grids; resample one of them",
+    )
     report(0.05)
-    hu = np.empty(ct.array.shape, np.int16)
-    for part in _slabs(ct.array.shape):
-        np.rint(np.clip(ct.array[part] - np.float32(offset), LOWEST_HU, HIGHEST_HU), out=hu[part], casting="unsafe")
+    hu = np.rint(np.clip(ct.array - np.float32(offset), LOWEST_HU, HIGHEST_HU)).astype(np.int16)
     out_of_field = np.asarray(ct.array < FIELD_HU)
     if out_of_field.any():
         _extend_into(hu, out_of_field)
         notes.append(f"{out_of_field.mean():.0%} of the image is outside of the scanner's field of view, not labelled")
-    noise = left = _noise_of(hu)
+    middle = hu[_slabs(hu.shape)[(len(_slabs(hu.shape)) - 1) // 2]].astype(np.float32)
+    noise = left = estimate_noise(middle, (middle > -200.0) & (middle < 300.0))
     if settings.filter_radius:
         epsilon = (_EPSILON_PER_NOISE * noise) ** 2 if settings.filter_epsilon is None else settings.filter_epsilon
         hu = _filtered(hu, settings.filter_radius, epsilon, device, lambda share: report(0.05 + 0.45 * share))
         left = _NOISE_LEFT * noise
     sharp = sharpened(hu, left)
     report(0.6)
-    body = find_body(sharp, ct) if mask is None else _given_body(mask, ct)
+    body = find_body(sharp, ct) if mask is None else mask.array != 0
     body &= ~out_of_field
     millilitres = np.count_nonzero(body) * ct.voxel_ml
     require(
@@ -189,15 +191,6 @@ def segment_ct(
     )
 
 
-def _unit_of(ct: Volume) -> tuple[float, str | None]:
-    """As hounsfield_offset; label maps are called so."""
-    try:
-        return hounsfield_offset(ct)
-    except SimulationError as error:
-        why = not_intensities(ct)
-        raise SimulationError(f"CT: {error}" if why is None else f"CT {why}".replace("an MRI", "a CT")) from None
-
-
 def _slabs(shape: tuple[int, ...], margin: int = 0) -> list[slice]:
     """Slices along k of about _AT_ONCE voxels."""
     count = max(_AT_ONCE // max(int(np.prod(shape[1:])), 1), 2 * margin + 1)
@@ -212,14 +205,6 @@ def _extend_into(hu: np.ndarray, out_of_field: np.ndarray) -> None:
             values[outside] = values[tuple(indices[:, outside])]
 
 
-def _noise_of(hu: np.ndarray) -> float:
-    """Standard deviation of the noise in soft tissue, HU; from slices in the middle."""
-    count = max(_AT_ONCE // max(int(np.prod(hu.shape[1:])), 1), 8)
-    first = max((hu.shape[0] - count) // 2, 0)
-    middle = hu[first : first + count].astype(np.float32)
-    return estimate_noise(middle, (middle > -200.0) & (middle < 300.0))
-
-
 def _filtered(
     hu: np.ndarray, radius: int, epsilon: float, device: DeviceChoice, report: Callable[[float], None]
 ) -> np.ndarray:
@@ -232,14 +217,6 @@ def _filtered(
         np.rint(np.clip(found[: part.stop - part.start], LOWEST_HU, HIGHEST_HU), out=result[part], casting="unsafe")
         report(part.stop / hu.shape[0])
     return result
-
-
-def _given_body(mask: Volume, ct: Volume) -> np.ndarray:
-    require(
-        mask.array.shape == ct.array.shape and np.allclose(mask.ijk_to_ras, ct.ijk_to_ras, atol=1e-2),
-        f"the mask ({mask.size_text}) and the CT ({ct.size_text}) lie on different grids; resample one of them",
-    )
-    return np.asarray(mask.array != 0)
 
 
 def _lay_over(
@@ -309,21 +286,16 @@ def border_shares(
     """
     second, share = np.zeros(labels.shape, np.uint8), np.zeros(labels.shape, np.float32)
     step = np.zeros(labels.shape, np.int16)
+    forth, back = slice(None, -1), slice(1, None)
     for axis in range(3):
-        for towards in (1, -1):
-            here, there = (_side(axis, towards * sign) for sign in (1, -1))
-            differs = labels[here] != labels[there]
-            rise = sharp[there] - sharp[here]
-            larger = differs & (np.abs(rise) > np.abs(step[here])) & (np.abs(rise) > _CLEAR * noise)
-            np.copyto(step[here], rise, where=larger)
-            np.copyto(second[here], labels[there], where=larger)
+        label, number, other, most = (np.moveaxis(array, axis, 0) for array in (labels, sharp, second, step))
+        for here, there in ((forth, back), (back, forth)):
+            rise = number[there] - number[here]
+            differs = (label[here] != label[there]) & (np.abs(rise) > _CLEAR * noise)
+            larger = differs & (np.abs(rise) > np.abs(most[here]))
+            np.copyto(most[here], rise, where=larger)
+            np.copyto(other[here], label[there], where=larger)
     on_border = step != 0
     part = (filtered[on_border].astype(np.float32) - sharp[on_border]) / step[on_border]
     share[on_border] = np.clip((part - 0.5) / _INNER_RANGE + 0.5, 0.0, 0.5)
     return second, share
-
-
-def _side(axis: int, sign: int) -> tuple[slice, ...]:
-    parts = [slice(None)] * 3
-    parts[axis] = slice(None, -1) if sign > 0 else slice(1, None)
-    return tuple(parts)

@@ -6,6 +6,7 @@ from typing import cast
 
 import numpy as np
 from scipy import ndimage
+from skimage.measure import label
 
 from SlicerUSSim.Logic.base.volume import Volume
 
@@ -25,29 +26,23 @@ _SAME_IN_SLICES, _SEEN_MM, _MOST_OFF_MM = 0.8, 15.0, 1.5
 _BALL = ndimage.generate_binary_structure(3, 2)
 
 
-def cells(ct: Volume) -> tuple[int, int, int]:
-    """Voxels (k, j, i) of a cell."""
-    k, j, i = (max(round(CELL_MM / size), 1) for size in ct.spacing_mm[::-1])
-    return k, j, i
+def cells(ct: Volume) -> list[int]:
+    """Voxels along k, j, i of a cell."""
+    return [max(round(CELL_MM / size), 1) for size in ct.spacing_mm[::-1]]
 
 
-def pooled(array: np.ndarray, size: tuple[int, int, int], function: np.ufunc) -> np.ndarray:
+def pooled(array: np.ndarray, size: list[int], function: np.ufunc) -> np.ndarray:
     """(k, j, i) the result of np.maximum or the like over cells; those at the ends may have fewer voxels."""
     for axis, count in enumerate(size):
         array = function.reduceat(array, np.arange(0, array.shape[axis], count), axis=axis)
     return array
 
 
-def spread(array: np.ndarray, size: tuple[int, int, int], shape: tuple[int, ...]) -> np.ndarray:
+def spread(array: np.ndarray, size: list[int], shape: tuple[int, ...]) -> np.ndarray:
     """(k, j, i) of `shape`: the value of the cell of every voxel."""
     for axis, count in enumerate(size):
         array = np.repeat(array, count, axis=axis)
     return array[tuple(slice(0, n) for n in shape)]
-
-
-def components(mask: np.ndarray, structure: np.ndarray | None = None) -> tuple[np.ndarray, int]:
-    """(numbers of the connected parts from 1, how many)"""
-    return cast(tuple[np.ndarray, int], ndimage.label(mask, structure))
 
 
 def find_body(hu: np.ndarray, ct: Volume) -> np.ndarray:
@@ -59,16 +54,16 @@ def find_body(hu: np.ndarray, ct: Volume) -> np.ndarray:
     coarse = pooled(hu.astype(np.int32), size, np.add) / pooled(np.ones(hu.shape, np.int32), size, np.add)
     tissue = coarse > _TISSUE_HU
     core = ndimage.binary_dilation(_eroded(tissue, 2), _BALL, 2) & tissue  # pyright: ignore
-    parts, _ = components(core)
+    parts = np.asarray(label(core, connectivity=1))
     volumes = np.bincount(parts.ravel(), minlength=2)[1:]
     body = np.isin(parts, np.flatnonzero(volumes >= _LEAST_PART * volumes.max()) + 1)
     around = cast(np.ndarray, ndimage.binary_dilation(body, _BALL))
     for inside, values in zip(body, coarse, strict=True):  # what it encloses in a slice, and lung that a side cuts
-        spaces, count = components(~inside)
-        sides = np.concatenate([spaces[0], spaces[-1], spaces[:, 0], spaces[:, -1]])
-        is_air = np.asarray(ndimage.mean(values < _AIR_HU, spaces, np.arange(count + 1))) >= _OUTSIDE_AIR
+        spaces = np.asarray(label(~inside, connectivity=1))
+        sides = np.unique(np.concatenate([spaces[0], spaces[-1], spaces[:, 0], spaces[:, -1]]))
+        outside = [n for n in sides if n and np.mean(values[spaces == n] < _AIR_HU) >= _OUTSIDE_AIR]
         if inside.any():
-            inside |= ~np.isin(spaces, [n for n in np.unique(sides) if n and is_air[n]])
+            inside |= ~np.isin(spaces, outside)
     # Cells at the outside are judged voxel by voxel
     inside = spread(around | body, size, hu.shape) & (hu > _TISSUE_HU) | spread(_eroded(body, 1), size, hu.shape)
     for flipped in (slice(None), slice(None, None, -1)):  # supine and prone
@@ -91,7 +86,7 @@ def _cut_couch(inside: np.ndarray, hu: np.ndarray, ct: Volume) -> None:
     couch[len(couch) // 2 :] = False
     at, patient = np.flatnonzero(couch.any(axis=0)), np.flatnonzero(inside.any(axis=(0, 1)))
     width, height, _ = ct.spacing_mm
-    if min(np.sum(at < patient.mean()), np.sum(at > patient.mean())) * width < _SEEN_MM:
+    if not len(patient) or min(np.sum(at < patient.mean()), np.sum(at > patient.mean())) * width < _SEEN_MM:
         return
     top = len(couch) - 1 - couch[::-1, at].argmax(axis=0)
     surface = np.polynomial.Polynomial.fit(at, top, 2)

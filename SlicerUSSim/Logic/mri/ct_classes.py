@@ -10,10 +10,11 @@ from __future__ import annotations
 
 import numpy as np
 from scipy import ndimage
+from skimage.measure import label
 
 from SlicerUSSim.Logic.base.neighbourhood import distance_to, largest_around, smallest_around
 from SlicerUSSim.Logic.base.volume import Volume
-from SlicerUSSim.Logic.mri.ct_body import cells, components, pooled, spread
+from SlicerUSSim.Logic.mri.ct_body import cells, pooled, spread
 
 #: Classes in the order of their numbers, as indices from 1; the tissues that the presets have
 NAMES = ("skin", "fat", "muscle", "blood", "cancellous bone", "bone", "metal", "lung", "air")
@@ -89,13 +90,16 @@ def _settle_blood(classes: np.ndarray, hu: np.ndarray) -> None:
     both = (classes == SOFT) | (classes == BLOOD)
     mean = ndimage.uniform_filter(np.where(both, np.clip(hu, 0, 2 * _SOFT_BRIGHT) - _SOFT_BRIGHT, 0).astype(np.float32))
     classes[both] = np.where(mean[both] >= 0.0, BLOOD, SOFT)
+    blood = classes == BLOOD  # what is thin beside bone is the rest of its border
+    near = largest_around(largest_around(np.isin(classes, (SPONGY, BONE, METAL))))
+    classes[blood & near & ~largest_around(smallest_around(blood))] = SOFT
 
 
 def _mark_gas(classes: np.ndarray, ct: Volume) -> None:
     """Lung in small pieces is gas, as in bowel; so is the rim of a bubble, whose wall is often too thin to be seen."""
     size = cells(ct)
     lung = pooled(classes == LUNG, size, np.logical_and)
-    parts, _ = components(lung)
+    parts = np.asarray(label(lung, connectivity=1))
     large = np.bincount(parts.ravel()) * float(np.prod(size)) * ct.voxel_ml >= _LEAST_LUNG_ML
     large[0] = False
     near = np.asarray(ndimage.binary_dilation(large[parts], iterations=2))
@@ -113,7 +117,7 @@ def _mark_bone(classes: np.ndarray, hu: np.ndarray, filtered: np.ndarray, ct: Vo
     near = spread(largest_around(core), size, hu.shape)
     cortex = (classes == BLOOD) & ((near & (hu >= _CORTEX_HU)) | ((hu >= _SHEET_HU) & is_sheet))
     # Small vessels stand out, too: cortex hangs together with what only bone can be.
-    parts, _ = components(pooled(cortex, size, np.logical_or), np.ones((3, 3, 3)))
+    parts = np.asarray(label(pooled(cortex, size, np.logical_or)))
     cortex &= spread(np.isin(parts, np.unique(parts[core & (parts > 0)])), size, hu.shape)
     wall = pooled(cortex, size, np.logical_or)
     # The lower the crest of a sheet that is thinner than the blur, the nearer to it its border: at half for thick ones.
@@ -125,8 +129,10 @@ def _mark_bone(classes: np.ndarray, hu: np.ndarray, filtered: np.ndarray, ct: Vo
     is_gap = near & (ndimage.black_tophat(filtered, widths[1]) >= _GAP_DEPTH_HU)
     enclosed = spread(enclosed_share(wall, np.array(size) * ct.spacing_mm[::-1]) >= _ENCLOSED, size, hu.shape)
     bright = (classes == SOFT) | (classes == BLOOD)
-    classes[enclosed & bright & (hu >= _MARROW_HU)] = SPONGY
     classes[cortex] = BONE
+    classes[enclosed & bright & ~cortex & (hu >= _MARROW_HU)] = SPONGY
+    for _ in range(max(size)):  # into the cells of the cortex, of which only the inner part is enclosed
+        classes[ndimage.binary_dilation(classes == SPONGY) & (classes == BLOOD) & ~cortex] = SPONGY
     classes[is_gap & ((classes == BLOOD) | (classes == SPONGY))] = SOFT
 
 

@@ -35,7 +35,7 @@ def hounsfield_offset(ct: Volume) -> tuple[float, str | None]:
     require(
         float(np.mean(values < -50.0)) > 0.005 and float(np.mean(values == low)) < 0.01,
         f"values are from {low:g} to {high:g}, expected Hounsfield units (air -1000, water 0, bone 1000) that are not "
-        "cut off; for an MRI leave --ct out and choose its contrast, for a CT apply slope and intercept of its header",
+        "cut off; for an MRI or labels leave --ct out, for a CT apply slope and intercept of its header",
     )
     return 0.0, f"values are from {low:g} to {high:g} without air at -1000; they are taken for Hounsfield units"
 
