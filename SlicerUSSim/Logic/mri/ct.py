@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 from scipy import ndimage
+from skimage.segmentation import relabel_sequential
 
 from SlicerUSSim.Logic.base.errors import require, require_between, require_kind
 from SlicerUSSim.Logic.base.neighbourhood import smallest_around
@@ -18,6 +19,7 @@ from SlicerUSSim.Logic.mri.ct_classes import AIR, BLOOD, BONE, LUNG, NAMES, SKIN
 from SlicerUSSim.Logic.mri.ct_unit import FIELD_HU, hounsfield_offset
 from SlicerUSSim.Logic.mri.filtering import estimate_noise, guided_filter
 from SlicerUSSim.Logic.mri.recognition import check_finite
+from SlicerUSSim.Logic.mri.segmentation import label_table
 from SlicerUSSim.Logic.mri.segmentation_settings import SegmentationSettings
 from SlicerUSSim.Logic.opencl.device import DeviceChoice
 from SlicerUSSim.Logic.tissue.label_maps import LabelledTissues
@@ -27,16 +29,10 @@ _log = logging.getLogger(__name__)
 
 #: Numbers beyond these are cut off: padding below air, dense metal
 LOWEST_HU, HIGHEST_HU = -1024, 3500
-#: Strength of the guided filter, per deviation of the noise
-_EPSILON_PER_NOISE = 2.0
-#: Part of the noise that the filter leaves
-_NOISE_LEFT = 0.5
-#: Voxels that are filtered at once
-_AT_ONCE = 8_000_000
-#: Noise from which on fat and muscle cannot be told apart
-_NOISY_HU = 60.0
-#: The least patient, ml
-_LEAST_ML = 10.0
+#: Strength of the guided filter per deviation of the noise, the part of the noise that it leaves, and voxels at once
+_EPSILON_PER_NOISE, _NOISE_LEFT, _AT_ONCE = 2.0, 0.5, 8_000_000
+#: Noise from which on fat and muscle cannot be told apart; the least patient
+_NOISY_HU, _LEAST_ML = 60.0, 10.0
 #: Tissues of a label map of organs that the numbers know better, and those of bone
 _BY_NUMBER = {"lung", "air", "fat", "skin", "scalp", "metal", "muscle", "coupling"}
 _BONES = {"bone", "skull", "cancellous bone"}
@@ -76,17 +72,8 @@ class CtSegmentation:
         return Texture(second, share, tissue_deviation(self._filtered, self.labels.array), share)
 
     def table(self) -> str:
-        """Share, volume, mean and standard deviation of every label that occurs in HU, one per line."""
-        counts = np.bincount(self.labels.array.ravel(), minlength=len(self.tissue_names) + 1)[1:]
-        lines = [f"{'label':>5}  {'tissue':15} {'share':>6} {'ml':>8} {'HU':>6} {'sd':>5}"]
-        for n, name in enumerate(self.tissue_names):
-            if not counts[n]:
-                continue
-            lines.append(
-                f"{n + 1:5d}  {name:15} {counts[n] / counts.sum():6.1%} {counts[n] * self.labels.voxel_ml:8.1f} "
-                f"{self.means[n]:6.0f} {self.standard_deviations[n]:5.0f}"
-            )
-        return "\n".join(lines)
+        """Share, volume, mean and standard deviation in HU of every label that occurs, one per line."""
+        return label_table(self.labels, self.tissue_names, self.means, self.standard_deviations)
 
 
 def segment_ct(
@@ -116,8 +103,8 @@ def segment_ct(
     skin_mm : thickness of the skin, the outermost layer of the patient; 0: none.
     progress : called with the completed fraction, 0 to 1; it may raise errors.Cancelled.
 
-    Raises SimulationError for an image that is constant or not finite, a label map, an MRI, numbers in another unit,
-    an image without a patient, and organs that do not lie in what they are made of.
+    Raises SimulationError for an image that is constant or not finite, a label map, an MRI or a window of a CT, an image
+    without a patient, and organs that do not meet the CT.
 
     >>> import numpy as np
     >>> from SlicerUSSim.Logic import Volume, segment_ct
@@ -147,7 +134,8 @@ def segment_ct(
     if out_of_field.any():
         _extend_into(hu, out_of_field)
         notes.append(f"{out_of_field.mean():.0%} of the image is outside of the scanner's field of view, not labelled")
-    middle = hu[_slabs(hu.shape)[(len(_slabs(hu.shape)) - 1) // 2]].astype(np.float32)
+    slabs = _slabs(hu.shape)
+    middle = hu[slabs[(len(slabs) - 1) // 2]].astype(np.float32)
     noise = left = estimate_noise(middle, (middle > -200.0) & (middle < 300.0))
     if settings.filter_radius:
         epsilon = (_EPSILON_PER_NOISE * noise) ** 2 if settings.filter_epsilon is None else settings.filter_epsilon
@@ -165,7 +153,7 @@ def segment_ct(
     )
     notes.append(f"patient: {millilitres / 1000.0:.3g} litres, " + ("couch left out" if mask is None else "as given"))
     report(0.7)
-    labels, names = classified(sharp, hu, body, ct, skin_mm), NAMES
+    labels, names = classified(sharp, hu, left, body, ct, skin_mm), NAMES
     report(0.85)
     if not np.any(labels == BONE):
         warnings.append(f"no bone was found; the densest is {sharp[body].max()} HU, expected from 700 on in a whole CT")
@@ -177,13 +165,12 @@ def segment_ct(
         names, lines = _lay_over(labels, hu, organs, ct)
         warnings += lines
         notes.append(f"organs: {', '.join(names[len(NAMES) :]) or 'none'}; other soft tissue is muscle")
-    labels, names = _those_present(labels, names)
+    labels, _, present = relabel_sequential(labels)
+    names = tuple(names[label - 1] for label in np.asarray(present)[1:])
     of_label = [hu[labels == label] for label in range(1, len(names) + 1)]
     means, deviations = (np.array([f(values, dtype=np.float64) for values in of_label]) for f in (np.mean, np.std))
-    for line in notes:
-        _log.info("%s", line)
-    for line in warnings:
-        _log.warning("%s", line)
+    for level, line in [(logging.INFO, line) for line in notes] + [(logging.WARNING, line) for line in warnings]:
+        _log.log(level, "%s", line)
     report(1.0)
     labels, hu, sharp = (ct.with_array(array).along(given).array for array in (labels, hu, sharp))
     return CtSegmentation(
@@ -225,8 +212,8 @@ def _lay_over(
     """(names of the (k, j, i) classes and of the organs that become some, lines about what should be checked).
 
     Soft organs replace muscle and blood; vessels in them that stand out stay. Bones of the label map are cancellous
-    where the numbers have soft tissue in them, one voxel below their surface. Raises SimulationError for organs that do
-    not lie in this CT.
+    where the numbers have soft tissue in them, one voxel below their surface.
+    Raises SimulationError for organs that do not meet the CT.
     """
     require(not organs.others, organs.ambiguity)
     volume = organs.labels
@@ -240,13 +227,12 @@ def _lay_over(
         where = on_ct == label
         if not where.any():
             continue
-        share, of_what = float(np.mean(of_ct[where] > 0)), "in the patient"
-        if name in _MADE_OF:
-            share, of_what = float(np.isin(of_ct[where], _MADE_OF[name][1]).mean()), f"{_MADE_OF[name][0]} in the CT"
+        what, made_of = _MADE_OF.get(name, ("tissue", range(1, len(NAMES) + 1)))
+        share = float(np.isin(of_ct[where], made_of).mean())
         if share < _LEAST_IN_PLACE:
             lines.append(
-                f"organs: {name}: {share:.0%} of it is {of_what}, expected {_LEAST_IN_PLACE:.0%} or more: is the label "
-                "map of this CT, and in its frame?"
+                f"organs: {name}: {share:.0%} of it is {what} in the CT, expected {_LEAST_IN_PLACE:.0%} or more: is the "
+                "label map of this CT, and in its frame?"
             )
         soft = where & ((of_ct == SOFT) | (of_ct == BLOOD))
         if name in _BONES:
@@ -258,15 +244,6 @@ def _lay_over(
             is_vessel = (of_ct == BLOOD) & (hu > float(np.median(hu[soft])) + _ABOVE_ORGAN_HU)
             classes[soft & ~is_vessel] = names.index(name) + 1
     return names, lines
-
-
-def _those_present(classes: np.ndarray, names: tuple[str, ...]) -> tuple[np.ndarray, tuple[str, ...]]:
-    """Labels renumbered without those that do not occur."""
-    counts = np.bincount(classes.ravel(), minlength=len(names) + 1)
-    present = [n for n in range(1, len(names) + 1) if counts[n]]
-    lookup = np.zeros(256, np.uint8)
-    lookup[present] = np.arange(1, len(present) + 1)
-    return lookup[classes], tuple(names[n - 1] for n in present)
 
 
 # ---- partial volumes: the part of a voxel on a border that the tissue beside it fills --------------------------------

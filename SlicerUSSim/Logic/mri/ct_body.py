@@ -18,8 +18,6 @@ _TISSUE_HU, _AIR_HU = -250.0, -930.0
 _LEAST_PART = 0.02
 #: Share of air, from which on a space at the side of the image is outside; of lung that is cut by it 0.0
 _OUTSIDE_AIR = 0.3
-#: Lung and bowel are never as near to a couch
-_GAP_MM = 8.0
 #: Share of slices in which a couch is at the same place; how much of it is seen at least on either side of the patient,
 #: and how far from a parabola
 _SAME_IN_SLICES, _SEEN_MM, _MOST_OFF_MM = 0.8, 15.0, 1.5
@@ -94,5 +92,3 @@ def _cut_couch(inside: np.ndarray, hu: np.ndarray, ct: Volume) -> None:
         return
     above = np.arange(len(couch))[:, None] - surface(np.arange(couch.shape[1]))
     inside[:, above <= 0.5] = False
-    near = (above > 0.5) & (above <= _GAP_MM / height)  # gaps between the skin and the couch
-    inside[:, near] &= hu[:, near] > _TISSUE_HU

@@ -24,18 +24,18 @@ SKIN, FAT, SOFT, BLOOD, SPONGY, BONE, METAL, LUNG, AIR = range(1, len(NAMES) + 1
 #: 2011): lung -950 to -500, fat -120 to -80, muscle and organs 20 to 80, 100 to 130 with contrast agent, vessels with
 #: contrast agent 140 to 400, bone from 150 (cancellous) to 2000
 _AIR_LUNG, _LUNG_FAT, _FAT_SOFT, _SOFT_BRIGHT, _METAL = -930, -250, -25, 135, 2900
-#: Only bone is as dense as the first number, or as the second in a sheet; around it cortex goes down to the third
-_DENSE_HU, _CORE_HU, _CORTEX_HU = 700, 450, 300
+#: Only bone is as dense as the first number, or as the second in a sheet; around it cortex goes down to the third,
+#: and has the last where it is thicker than the blur
+_DENSE_HU, _CORE_HU, _CORTEX_HU, _WHOLE_CORTEX_HU = 700, 450, 300, 1600.0
 #: Thin cortex has less: from this number on, if it stands out so much from what is wider than this, mm
 _SHEET_HU, _STANDS_OUT, _SHEET_MM = 220, 90, 6.0
 #: A gap between bones that is narrower than the first number, mm, and so much darker than both
 _GAP_MM, _GAP_DEPTH_HU = 3.5, 150
 #: Marrow with trabeculae from this number on, where bone lies in such a share of 26 directions within so many mm
 _MARROW_HU, _ENCLOSED, _REACH_MM = 100, 0.84, 30.0
-#: Cortex that is thicker than the blur
-_WHOLE_CORTEX_HU = 1600.0
-#: A difference across a voxel from which on it is on a step (more with noise): less than from fat to muscle
-_LEAST_STEP, _STEP_PER_NOISE, _SHARPENINGS = 90, 5.0, 3
+#: A difference across a voxel from which on it is on a step: less than from fat to muscle, or so many deviations of the
+#: noise; and those within which a number alone does not tell contrast agent
+_LEAST_STEP, _STEP_PER_NOISE, _MARGIN_PER_NOISE = 90, 5.0, 2.0
 #: Gas in a smaller space than this is no lung, ml
 _LEAST_LUNG_ML = 10.0
 #: Thickness of the skin (1.6 to 2.3 mm; Laurent et al., Vaccine 25(34), 2007)
@@ -56,7 +56,7 @@ def sharpened(hu: np.ndarray, noise: float) -> np.ndarray:
         steepness = np.abs(ndimage.convolve1d(hu, [1, 0, -1], axis, mode="nearest"))
         known &= steepness < max(_LEAST_STEP, round(_STEP_PER_NOISE * noise))
     result = hu.copy()
-    for _ in range(_SHARPENINGS):
+    for _ in range(2):
         for side, around, none in ((is_upper, smallest_around, _ABOVE_ALL), (~is_upper, largest_around, -_ABOVE_ALL)):
             nearest = around(np.where(known & side, result, none))
             found = side & ~known & (nearest != none)
@@ -68,15 +68,15 @@ def sharpened(hu: np.ndarray, noise: float) -> np.ndarray:
 
 
 def classified(
-    hu: np.ndarray, filtered: np.ndarray, body: np.ndarray, ct: Volume, skin_mm: float = SKIN_MM
+    hu: np.ndarray, filtered: np.ndarray, noise: float, body: np.ndarray, ct: Volume, skin_mm: float = SKIN_MM
 ) -> np.ndarray:
-    """(k, j, i) uint8 classes, 0 outside the body; `hu` is `filtered` with sharp borders."""
+    """(k, j, i) uint8 classes, 0 outside the body; `hu` is `filtered`, of this noise, with sharp borders."""
     limits = np.array([_AIR_LUNG, _LUNG_FAT, _FAT_SOFT, _SOFT_BRIGHT, _METAL])
     table = np.array([AIR, LUNG, FAT, SOFT, BLOOD, METAL], np.uint8)
     classes = np.where(body, table[np.searchsorted(limits, np.arange(-1024, 3501), side="right")][hu + 1024], 0)
     _mark_gas(classes, ct)
     _mark_bone(classes, hu, filtered, ct)
-    _settle_blood(classes, hu)
+    _settle_blood(classes, hu, noise)
     if skin_mm > 0.0:  # the outermost layer; the ends of the image are no surface
         is_skin = body & (distance_to(~body, ct.spacing_mm) < skin_mm + 0.5 * ct.spacing_mm.min())
         classes[is_skin & ~np.isin(classes, (SPONGY, BONE, METAL))] = SKIN
@@ -85,10 +85,11 @@ def classified(
     return classes
 
 
-def _settle_blood(classes: np.ndarray, hu: np.ndarray) -> None:
-    """Contrast agent and soft tissue by the mean of both around, since the number alone is within the noise."""
+def _settle_blood(classes: np.ndarray, hu: np.ndarray, noise: float) -> None:
+    """Contrast agent and soft tissue by the mean of both around, where the number alone is within the noise."""
     both = (classes == SOFT) | (classes == BLOOD)
     mean = ndimage.uniform_filter(np.where(both, np.clip(hu, 0, 2 * _SOFT_BRIGHT) - _SOFT_BRIGHT, 0).astype(np.float32))
+    both &= np.abs(hu - _SOFT_BRIGHT) < _MARGIN_PER_NOISE * noise
     classes[both] = np.where(mean[both] >= 0.0, BLOOD, SOFT)
     blood = classes == BLOOD  # what is thin beside bone is the rest of its border
     near = largest_around(largest_around(np.isin(classes, (SPONGY, BONE, METAL))))
@@ -111,7 +112,7 @@ def _mark_bone(classes: np.ndarray, hu: np.ndarray, filtered: np.ndarray, ct: Vo
     """Cortex where the numbers are high, trabeculae where bone encloses what is brighter than muscle."""
     size = cells(ct)
     widths = [[2 * int(0.5 * mm / size) + 1 for size in ct.spacing_mm[::-1]] for mm in (_SHEET_MM, _GAP_MM)]
-    is_sheet = ndimage.white_tophat(hu, widths[0]) >= _STANDS_OUT
+    is_sheet = hu - np.asarray(ndimage.grey_opening(hu, widths[0])) >= _STANDS_OUT
     is_core = (classes > 0) & ((hu >= _DENSE_HU) | ((hu >= _CORE_HU) & is_sheet))
     core = pooled(is_core, size, np.logical_or)
     near = spread(largest_around(core), size, hu.shape)
@@ -126,13 +127,12 @@ def _mark_bone(classes: np.ndarray, hu: np.ndarray, filtered: np.ndarray, ct: Vo
     part = np.minimum(crest / np.maximum(_WHOLE_CORTEX_HU - base, 1.0), 1.0)
     cortex[cortex] = (base >= _CORTEX_HU) | (filtered[cortex] >= base + crest * (1.0 - 0.5 * part))
     # The space of a joint is bright, too, between two cortices, but a gap; marrow is wider.
-    is_gap = near & (ndimage.black_tophat(filtered, widths[1]) >= _GAP_DEPTH_HU)
+    is_gap = near & (np.asarray(ndimage.grey_closing(filtered, widths[1])) - filtered >= _GAP_DEPTH_HU)
     enclosed = spread(enclosed_share(wall, np.array(size) * ct.spacing_mm[::-1]) >= _ENCLOSED, size, hu.shape)
-    bright = (classes == SOFT) | (classes == BLOOD)
     classes[cortex] = BONE
-    classes[enclosed & bright & ~cortex & (hu >= _MARROW_HU)] = SPONGY
+    classes[enclosed & np.isin(classes, (SOFT, BLOOD)) & (hu >= _MARROW_HU)] = SPONGY
     for _ in range(max(size)):  # into the cells of the cortex, of which only the inner part is enclosed
-        classes[ndimage.binary_dilation(classes == SPONGY) & (classes == BLOOD) & ~cortex] = SPONGY
+        classes[ndimage.binary_dilation(classes == SPONGY) & (classes == BLOOD)] = SPONGY
     classes[is_gap & ((classes == BLOOD) | (classes == SPONGY))] = SOFT
 
 

@@ -9,8 +9,7 @@ from SlicerUSSim.Logic.base.volume import Volume
 
 #: Voxels that are looked at, about
 _SAMPLE = 2_000_000
-#: Offsets of CTs that are stored without a sign, and whose intercept was not applied
-_OFFSETS = (1024.0, 1000.0)
+_OFFSETS = (1024.0, 1000.0)  #: of CTs that are stored without a sign, and whose intercept was not applied
 #: Numbers of air, of what is neither air nor lung, of fat and soft tissue among it, and between lung and fat, where a
 #: body has only partial volumes; with the least and largest shares
 _AIR_HU, _NOT_LUNG_HU, _TISSUE_HU, _BETWEEN_HU = (-1060.0, -940.0), -500.0, (-160.0, 300.0), (-700.0, -250.0)
