@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 from scipy import ndimage
-from skimage.segmentation import relabel_sequential
 
 from SlicerUSSim.Logic.base.errors import require, require_between, require_kind
 from SlicerUSSim.Logic.base.neighbourhood import smallest_around
@@ -103,7 +102,7 @@ def segment_ct(
     skin_mm : thickness of the skin, the outermost layer of the patient; 0: none.
     progress : called with the completed fraction, 0 to 1; it may raise errors.Cancelled.
 
-    Raises SimulationError for an image that is constant or not finite, a label map, an MRI or a window of a CT, an image
+    Raises SimulationError for an image that is constant or not finite, a label map, an MRI, a window of a CT, an image
     without a patient, and organs that do not meet the CT.
 
     >>> import numpy as np
@@ -128,7 +127,6 @@ def segment_ct(
         mask is None or (mask.size_text == ct.size_text and np.allclose(mask.ijk_to_ras, ct.ijk_to_ras, atol=1e-2)),
         "the mask and the CT lie on different grids; resample one of them",
     )
-    report(0.05)
     hu = np.rint(np.clip(ct.array - np.float32(offset), LOWEST_HU, HIGHEST_HU)).astype(np.int16)
     out_of_field = np.asarray(ct.array < FIELD_HU)
     if out_of_field.any():
@@ -152,7 +150,6 @@ def segment_ct(
         "thicker than 1 cm; give the patient's mask (--mask), or check the voxel size",
     )
     notes.append(f"patient: {millilitres / 1000.0:.3g} litres, " + ("couch left out" if mask is None else "as given"))
-    report(0.7)
     labels, names = classified(sharp, hu, left, body, ct, skin_mm), NAMES
     report(0.85)
     if not np.any(labels == BONE):
@@ -165,8 +162,8 @@ def segment_ct(
         names, lines = _lay_over(labels, hu, organs, ct)
         warnings += lines
         notes.append(f"organs: {', '.join(names[len(NAMES) :]) or 'none'}; other soft tissue is muscle")
-    labels, _, present = relabel_sequential(labels)
-    names = tuple(names[label - 1] for label in np.asarray(present)[1:])
+    present = [0, *(label for label in np.unique(labels) if label)]
+    labels, names = np.searchsorted(present, labels).astype(np.uint8), tuple(names[n - 1] for n in present[1:])
     of_label = [hu[labels == label] for label in range(1, len(names) + 1)]
     means, deviations = (np.array([f(values, dtype=np.float64) for values in of_label]) for f in (np.mean, np.std))
     for level, line in [(logging.INFO, line) for line in notes] + [(logging.WARNING, line) for line in warnings]:
@@ -231,8 +228,8 @@ def _lay_over(
         share = float(np.isin(of_ct[where], made_of).mean())
         if share < _LEAST_IN_PLACE:
             lines.append(
-                f"organs: {name}: {share:.0%} of it is {what} in the CT, expected {_LEAST_IN_PLACE:.0%} or more: is the "
-                "label map of this CT, and in its frame?"
+                f"organs: {name}: {share:.0%} of it is {what} in the CT, expected {_LEAST_IN_PLACE:.0%} or more: is "
+                "the label map of this CT, and in its frame?"
             )
         soft = where & ((of_ct == SOFT) | (of_ct == BLOOD))
         if name in _BONES:

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 from scipy import ndimage
-from skimage.measure import label
 
 from SlicerUSSim.Logic.base.volume import Volume
 
@@ -52,12 +51,12 @@ def find_body(hu: np.ndarray, ct: Volume) -> np.ndarray:
     coarse = pooled(hu.astype(np.int32), size, np.add) / pooled(np.ones(hu.shape, np.int32), size, np.add)
     tissue = coarse > _TISSUE_HU
     core = ndimage.binary_dilation(_eroded(tissue, 2), _BALL, 2) & tissue  # pyright: ignore
-    parts = np.asarray(label(core, connectivity=1))
+    parts: Any = ndimage.label(core)[0]  # pyright: ignore
     volumes = np.bincount(parts.ravel(), minlength=2)[1:]
     body = np.isin(parts, np.flatnonzero(volumes >= _LEAST_PART * volumes.max()) + 1)
     around = cast(np.ndarray, ndimage.binary_dilation(body, _BALL))
     for inside, values in zip(body, coarse, strict=True):  # what it encloses in a slice, and lung that a side cuts
-        spaces = np.asarray(label(~inside, connectivity=1))
+        spaces: Any = ndimage.label(~inside)[0]  # pyright: ignore
         sides = np.unique(np.concatenate([spaces[0], spaces[-1], spaces[:, 0], spaces[:, -1]]))
         outside = [n for n in sides if n and np.mean(values[spaces == n] < _AIR_HU) >= _OUTSIDE_AIR]
         if inside.any():

@@ -8,11 +8,12 @@ Kramer and Bruckner, Pattern Recognition 7, 1975). What is in between afterwards
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from scipy import ndimage
-from skimage.measure import label
 
-from SlicerUSSim.Logic.base.neighbourhood import distance_to, largest_around, smallest_around
+from SlicerUSSim.Logic.base.neighbourhood import largest_around, smallest_around
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.mri.ct_body import cells, pooled, spread
 
@@ -40,7 +41,6 @@ _LEAST_STEP, _STEP_PER_NOISE, _MARGIN_PER_NOISE = 90, 5.0, 2.0
 _LEAST_LUNG_ML = 10.0
 #: Thickness of the skin (1.6 to 2.3 mm; Laurent et al., Vaccine 25(34), 2007)
 SKIN_MM = 1.8
-_ABOVE_ALL = np.int16(32000)
 
 
 def sharpened(hu: np.ndarray, noise: float) -> np.ndarray:
@@ -57,7 +57,10 @@ def sharpened(hu: np.ndarray, noise: float) -> np.ndarray:
         known &= steepness < max(_LEAST_STEP, round(_STEP_PER_NOISE * noise))
     result = hu.copy()
     for _ in range(2):
-        for side, around, none in ((is_upper, smallest_around, _ABOVE_ALL), (~is_upper, largest_around, -_ABOVE_ALL)):
+        for side, around, none in (
+            (is_upper, smallest_around, np.int16(32000)),
+            (~is_upper, largest_around, np.int16(-32000)),
+        ):
             nearest = around(np.where(known & side, result, none))
             found = side & ~known & (nearest != none)
             np.copyto(result, nearest, where=found)
@@ -78,8 +81,11 @@ def classified(
     _mark_bone(classes, hu, filtered, ct)
     _settle_blood(classes, hu, noise)
     if skin_mm > 0.0:  # the outermost layer; the ends of the image are no surface
-        is_skin = body & (distance_to(~body, ct.spacing_mm) < skin_mm + 0.5 * ct.spacing_mm.min())
-        classes[is_skin & ~np.isin(classes, (SPONGY, BONE, METAL))] = SKIN
+        import SimpleITK as sitk
+
+        outside, radius = sitk.GetImageFromArray((~body).astype(np.uint8)), np.rint(skin_mm / ct.spacing_mm)
+        near = sitk.GetArrayFromImage(sitk.BinaryDilate(outside, radius.astype(int).tolist(), sitk.sitkBall)) > 0
+        classes[body & near & ~np.isin(classes, (SPONGY, BONE, METAL))] = SKIN
         soft = classes == SOFT  # what is left of thicker skin
         classes[soft & largest_around(classes == SKIN) & ~largest_around(smallest_around(soft))] = SKIN
     return classes
@@ -100,7 +106,7 @@ def _mark_gas(classes: np.ndarray, ct: Volume) -> None:
     """Lung in small pieces is gas, as in bowel; so is the rim of a bubble, whose wall is often too thin to be seen."""
     size = cells(ct)
     lung = pooled(classes == LUNG, size, np.logical_and)
-    parts = np.asarray(label(lung, connectivity=1))
+    parts: Any = ndimage.label(lung)[0]  # pyright: ignore
     large = np.bincount(parts.ravel()) * float(np.prod(size)) * ct.voxel_ml >= _LEAST_LUNG_ML
     large[0] = False
     near = np.asarray(ndimage.binary_dilation(large[parts], iterations=2))
@@ -118,7 +124,7 @@ def _mark_bone(classes: np.ndarray, hu: np.ndarray, filtered: np.ndarray, ct: Vo
     near = spread(largest_around(core), size, hu.shape)
     cortex = (classes == BLOOD) & ((near & (hu >= _CORTEX_HU)) | ((hu >= _SHEET_HU) & is_sheet))
     # Small vessels stand out, too: cortex hangs together with what only bone can be.
-    parts = np.asarray(label(pooled(cortex, size, np.logical_or)))
+    parts: Any = ndimage.label(pooled(cortex, size, np.logical_or), np.ones((3, 3, 3)))[0]  # pyright: ignore
     cortex &= spread(np.isin(parts, np.unique(parts[core & (parts > 0)])), size, hu.shape)
     wall = pooled(cortex, size, np.logical_or)
     # The lower the crest of a sheet that is thinner than the blur, the nearer to it its border: at half for thick ones.
