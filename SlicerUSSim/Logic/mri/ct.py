@@ -10,35 +10,38 @@ from typing import Any
 import numpy as np
 from scipy import ndimage
 
-from SlicerUSSim.Logic.base.errors import SimulationError, require, require_between, require_kind
+from SlicerUSSim.Logic.base.errors import require, require_between, require_kind
+from SlicerUSSim.Logic.base.neighbourhood import smallest_around
 from SlicerUSSim.Logic.base.volume import Volume
-from SlicerUSSim.Logic.mri.ct_body import axis_of_slices, cells, extend_into, find_body, pooled
-from SlicerUSSim.Logic.mri.ct_classes import BLOOD, NAMES, SKIN_MM, classified, sharpened
-from SlicerUSSim.Logic.mri.ct_organs import laid_over, organs_of_ct
-from SlicerUSSim.Logic.mri.ct_unit import hounsfield_offset, padding_of
+from SlicerUSSim.Logic.mri.ct_body import find_body
+from SlicerUSSim.Logic.mri.ct_classes import AIR, BLOOD, BONE, LUNG, NAMES, SKIN_MM, SOFT, SPONGY, classified, sharpened
+from SlicerUSSim.Logic.mri.ct_unit import FIELD_HU, hounsfield_offset
 from SlicerUSSim.Logic.mri.filtering import estimate_noise, guided_filter
 from SlicerUSSim.Logic.mri.recognition import check_finite
+from SlicerUSSim.Logic.mri.segmentation import label_table
 from SlicerUSSim.Logic.mri.segmentation_settings import SegmentationSettings
-from SlicerUSSim.Logic.mri.segmentation_steps import StepTimes
 from SlicerUSSim.Logic.opencl.device import DeviceChoice
 from SlicerUSSim.Logic.tissue.label_maps import LabelledTissues
-from SlicerUSSim.Logic.tissue.label_sources import not_intensities
 from SlicerUSSim.Logic.tissue.texture import Texture, tissue_deviation
 
 _log = logging.getLogger(__name__)
 
 #: Numbers beyond these are cut off: padding below air, dense metal
 LOWEST_HU, HIGHEST_HU = -1024, 3500
-#: Strength of the guided filter, per deviation of the noise
-_EPSILON_PER_NOISE = 2.0
-#: Part of the noise that the filter leaves
-_NOISE_LEFT = 0.5
-#: Voxels that are filtered at once
-_AT_ONCE = 8_000_000
-#: Noise from which on, and voxels from which on, a result is doubtful
-_NOISY_HU, _COARSE_MM = 60.0, 3.5
-#: Contrast agent that is thicker than a vessel, mm; the heart is, and kidneys
-_THICK_MM = 32.0
+#: Strength of the guided filter per deviation of the noise, the part of the noise that it leaves, and voxels at once
+_EPSILON_PER_NOISE, _NOISE_LEFT, _AT_ONCE = 2.0, 0.5, 8_000_000
+#: Noise from which on fat and muscle cannot be told apart; the least patient
+_NOISY_HU, _LEAST_ML = 60.0, 10.0
+#: Tissues of a label map of organs that the numbers know better, and those of bone
+_BY_NUMBER = {"lung", "air", "fat", "skin", "scalp", "metal", "muscle", "coupling"}
+_BONES = {"bone", "skull", "cancellous bone"}
+#: Vessels stay blood in an organ from this far above its median on, HU
+_ABOVE_ORGAN_HU = 45.0
+#: What organs are made of, whose contents do not vary; the share from which on they are taken for this patient's
+_MADE_OF = {"lung": ("lung or gas", (LUNG, AIR))} | dict.fromkeys(
+    ("liver", "spleen", "kidney", "heart"), ("soft tissue", (SOFT, BLOOD))
+)
+_LEAST_IN_PLACE = 0.85
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,17 +71,8 @@ class CtSegmentation:
         return Texture(second, share, tissue_deviation(self._filtered, self.labels.array), share)
 
     def table(self) -> str:
-        """Share, volume, mean and standard deviation of every label that occurs in HU, one per line."""
-        counts = np.bincount(self.labels.array.ravel(), minlength=len(self.tissue_names) + 1)[1:]
-        lines = [f"{'label':>5}  {'tissue':15} {'share':>6} {'ml':>8} {'HU':>6} {'sd':>5}"]
-        for n, name in enumerate(self.tissue_names):
-            if not counts[n]:
-                continue
-            lines.append(
-                f"{n + 1:5d}  {name:15} {counts[n] / counts.sum():6.1%} {counts[n] * self.labels.voxel_ml:8.1f} "
-                f"{self.means[n]:6.0f} {self.standard_deviations[n]:5.0f}"
-            )
-        return "\n".join(lines)
+        """Share, volume, mean and standard deviation in HU of every label that occurs, one per line."""
+        return label_table(self.labels, self.tissue_names, self.means, self.standard_deviations)
 
 
 def segment_ct(
@@ -108,8 +102,8 @@ def segment_ct(
     skin_mm : thickness of the skin, the outermost layer of the patient; 0: none.
     progress : called with the completed fraction, 0 to 1; it may raise errors.Cancelled.
 
-    Raises SimulationError for an image that is constant or not finite, a label map, an MRI, numbers in another unit,
-    an image without a patient, and organs that do not lie in what they are made of.
+    Raises SimulationError for an image that is constant or not finite, a label map, an MRI, a window of a CT, an image
+    without a patient, and organs that do not meet the CT.
 
     >>> import numpy as np
     >>> from SlicerUSSim.Logic import Volume, segment_ct
@@ -125,69 +119,60 @@ def segment_ct(
     settings = SegmentationSettings.of(settings, **values)
     require_between("segmentation", "skin_mm", skin_mm, 0.0, 10.0)
     report = progress or (lambda share: None)
-    timed, notes, warnings = StepTimes(), [], []
     check_finite(ct, "CT", "by -1000, which is air")
     given, ct, mask = ct, ct.along(), None if mask is None else mask.along()
-    offset, note, doubt = _unit_of(ct)
-    notes += [] if note is None else [note]
-    warnings += [] if doubt is None else [doubt]
-    timed("unit")
-    report(0.05)
-    hu = np.empty(ct.array.shape, np.int16)
-    for part in _slabs(ct.array.shape):
-        np.rint(np.clip(ct.array[part] - np.float32(offset), LOWEST_HU, HIGHEST_HU), out=hu[part], casting="unsafe")
-    padding = _padding(ct, notes)
-    if padding is not None:
-        extend_into(hu, padding, axis_of_slices(ct))
-    noise = _noise_of(hu)
+    offset, line = hounsfield_offset(ct)
+    notes, warnings = [], [] if line is None else [line]
+    require(
+        mask is None or (mask.size_text == ct.size_text and np.allclose(mask.ijk_to_ras, ct.ijk_to_ras, atol=1e-2)),
+        "the mask and the CT lie on different grids; resample one of them",
+    )
+    hu = np.rint(np.clip(ct.array - np.float32(offset), LOWEST_HU, HIGHEST_HU)).astype(np.int16)
+    out_of_field = np.asarray(ct.array < FIELD_HU)
+    if out_of_field.any():
+        _extend_into(hu, out_of_field)
+        notes.append(f"{out_of_field.mean():.0%} of the image is outside of the scanner's field of view, not labelled")
+    slabs = _slabs(hu.shape)
+    middle = hu[slabs[(len(slabs) - 1) // 2]].astype(np.float32)
+    noise = left = estimate_noise(middle, (middle > -200.0) & (middle < 300.0))
     if settings.filter_radius:
         epsilon = (_EPSILON_PER_NOISE * noise) ** 2 if settings.filter_epsilon is None else settings.filter_epsilon
         hu = _filtered(hu, settings.filter_radius, epsilon, device, lambda share: report(0.05 + 0.45 * share))
-    timed("filter")
-    left = _NOISE_LEFT * noise if settings.filter_radius else noise
+        left = _NOISE_LEFT * noise
     sharp = sharpened(hu, left)
-    timed("borders")
     report(0.6)
-    body = _body(sharp, ct, mask, padding, notes)
-    timed("body")
-    report(0.7)
-    classes = classified(sharp, hu, left, body, ct, skin_mm)
-    if padding is not None:
-        classes[padding] = 0
-    timed("classes")
-    report(0.85)
-    names = NAMES
-    if organs is not None:
-        on_ct, lines = organs_of_ct(organs, classes, ct)
-        warnings += lines
-        classes, names, lines = laid_over(on_ct, classes, hu, names)
-        notes += lines
-        timed("organs")
-    warnings += _doubts(classes, ct, noise, organs is not None)
-    labels, names = _those_present(classes, names)
-    means, deviations = _moments(hu, labels, len(names))
-    notes.append(
-        "all soft tissue but skin and fat is muscle" if organs is None else "soft tissue without an organ is muscle"
+    body = find_body(sharp, ct) if mask is None else mask.array != 0
+    body &= ~out_of_field
+    millilitres = np.count_nonzero(body) * ct.voxel_ml
+    require(
+        millilitres >= _LEAST_ML,
+        f"the patient in the CT has {millilitres:.3g} ml, expected at least {_LEAST_ML:g} ml denser than -250 HU and "
+        "thicker than 1 cm; give the patient's mask (--mask), or check the voxel size",
     )
-    for line in notes:
-        _log.info("%s", line)
-    for line in warnings:
-        _log.warning("%s", line)
-    _log.debug("segmentation of a CT: %s", timed)
+    notes.append(f"patient: {millilitres / 1000.0:.3g} litres, " + ("couch left out" if mask is None else "as given"))
+    labels, names = classified(sharp, hu, left, body, ct, skin_mm), NAMES
+    report(0.85)
+    if not np.any(labels == BONE):
+        warnings.append(f"no bone was found; the densest is {sharp[body].max()} HU, expected from 700 on in a whole CT")
+    if noise > _NOISY_HU:
+        warnings.append(f"noise is {noise:.0f} HU, expected less than {_NOISY_HU:.0f} to tell fat and muscle apart")
+    if organs is None:
+        notes.append("soft tissue is muscle, and blood where contrast agent brightens it; --organs tells organs apart")
+    else:
+        names, lines = _lay_over(labels, hu, organs, ct)
+        warnings += lines
+        notes.append(f"organs: {', '.join(names[len(NAMES) :]) or 'none'}; other soft tissue is muscle")
+    present = [0, *(label for label in np.unique(labels) if label)]
+    labels, names = np.searchsorted(present, labels).astype(np.uint8), tuple(names[n - 1] for n in present[1:])
+    of_label = [hu[labels == label] for label in range(1, len(names) + 1)]
+    means, deviations = (np.array([f(values, dtype=np.float64) for values in of_label]) for f in (np.mean, np.std))
+    for level, line in [(logging.INFO, line) for line in notes] + [(logging.WARNING, line) for line in warnings]:
+        _log.log(level, "%s", line)
     report(1.0)
     labels, hu, sharp = (ct.with_array(array).along(given).array for array in (labels, hu, sharp))
     return CtSegmentation(
         given.with_array(labels), names, means, deviations, noise, tuple(notes), tuple(warnings), hu, sharp
     )
-
-
-def _unit_of(ct: Volume) -> tuple[float, str | None, str | None]:
-    """As hounsfield_offset; label maps are called so."""
-    try:
-        return hounsfield_offset(ct)
-    except SimulationError as error:
-        why = not_intensities(ct)
-        raise SimulationError(f"CT: {error}" if why is None else f"CT {why}".replace("an MRI", "a CT")) from None
 
 
 def _slabs(shape: tuple[int, ...], margin: int = 0) -> list[slice]:
@@ -196,12 +181,12 @@ def _slabs(shape: tuple[int, ...], margin: int = 0) -> list[slice]:
     return [slice(start, min(start + count, shape[0])) for start in range(0, shape[0], count)]
 
 
-def _noise_of(hu: np.ndarray) -> float:
-    """Standard deviation of the noise in soft tissue, HU; from slices in the middle."""
-    count = max(_AT_ONCE // max(int(np.prod(hu.shape[1:])), 1), 8)
-    first = max((hu.shape[0] - count) // 2, 0)
-    middle = hu[first : first + count].astype(np.float32)
-    return estimate_noise(middle, (middle > -200.0) & (middle < 300.0))
+def _extend_into(hu: np.ndarray, out_of_field: np.ndarray) -> None:
+    """Fill what is out of a round field of view in every slice with the nearest number in it: no surface is there."""
+    for values, outside in zip(hu, out_of_field, strict=True):
+        if outside.any() and not outside.all():
+            indices: Any = ndimage.distance_transform_edt(outside, return_distances=False, return_indices=True)
+            values[outside] = values[tuple(indices[:, outside])]
 
 
 def _filtered(
@@ -218,88 +203,44 @@ def _filtered(
     return result
 
 
-def _padding(ct: Volume, notes: list[str]) -> np.ndarray | None:
-    """(k, j, i) bool, what lies outside of a round field of view; None where the whole image is in it."""
-    number = padding_of(ct)
-    if number is None:
-        return None
-    found = np.asarray(ct.array == number)
-    notes.append(
-        f"{found.mean():.0%} of the image is {number:g}, outside of the scanner's field of view, and is not labelled"
+def _lay_over(
+    classes: np.ndarray, hu: np.ndarray, organs: LabelledTissues, ct: Volume
+) -> tuple[tuple[str, ...], list[str]]:
+    """(names of the (k, j, i) classes and of the organs that become some, lines about what should be checked).
+
+    Soft organs replace muscle and blood; vessels in them that stand out stay. Bones of the label map are cancellous
+    where the numbers have soft tissue in them, one voxel below their surface.
+    Raises SimulationError for organs that do not meet the CT.
+    """
+    require(not organs.others, organs.ambiguity)
+    volume = organs.labels
+    to_organs = (volume.ras_to_ijk @ ct.ijk_to_ras)[[2, 1, 0, 3]][:, [2, 1, 0, 3]]
+    on_ct: Any = ndimage.affine_transform(
+        volume.array.astype(np.uint8), to_organs[:3, :3], to_organs[:3, 3].tolist(), ct.array.shape, order=0
     )
-    return found
-
-
-def _body(
-    sharp: np.ndarray, ct: Volume, mask: Volume | None, padding: np.ndarray | None, notes: list[str]
-) -> np.ndarray:
-    if mask is not None:
-        require(
-            mask.array.shape == ct.array.shape and np.allclose(mask.ijk_to_ras, ct.ijk_to_ras, atol=1e-2),
-            f"the mask ({mask.size_text}) and the CT ({ct.size_text}) lie on different grids; resample one of them",
-        )
-        inside = np.asarray(mask.array != 0)
-        require(inside.any(), "the mask is empty, expected the patient's voxels not to be 0")
-        notes.append(f"patient: the given mask, {inside.sum() * ct.voxel_ml:.0f} ml")
-        return inside
-    inside, parts = find_body(sharp, ct)
-    if inside is None:
-        share = float(np.mean(sharp > -250))
-        require(
-            False,
-            f"CT shows no body: {share * 100:.2g} % of it is denser than -250 HU, and no piece of it is 1 cm thick and "
-            "has 10 ml; give the patient's mask (--mask), or check the voxel size",
-        )
-        raise AssertionError
-    seen = np.count_nonzero(inside if padding is None else inside & ~padding)
-    text = f"patient: {seen * ct.voxel_ml / 1000.0:.3g} litres"
-    notes.append(text + (f" in {parts} parts" if parts > 1 else "") + "; couch and clothes are left out")
-    return inside
-
-
-def _doubts(classes: np.ndarray, ct: Volume, noise: float, has_organs: bool) -> list[str]:
-    lines = []
-    if noise > _NOISY_HU:
-        lines.append(
-            f"noise is {noise:.0f} HU, expected less than {_NOISY_HU:.0f}: fat and muscle cannot be told apart"
-        )
-    if ct.spacing_mm.max() > _COARSE_MM:
-        lines.append(
-            f"slices are {ct.spacing_mm.max():.2g} mm apart, expected up to {_COARSE_MM:g}: borders across them are "
-            "coarse"
-        )
-    if not has_organs:
-        size = cells(ct)
-        blood = np.pad(pooled((classes == BLOOD).view(np.uint8), size, np.minimum), 1)
-        spacing = np.array(size) * ct.spacing_mm[::-1]
-        thick = 2.0 * float(np.max(ndimage.distance_transform_edt(blood, sampling=spacing.tolist())))  # type: ignore
-        if thick > _THICK_MM:
+    require(on_ct.any(), "the label map of organs does not meet the CT, expected one of this patient in its frame")
+    names, lines, of_ct = NAMES, [organs.taken_for] if organs.taken_for else [], classes.copy()
+    for label, name in enumerate(organs.names, 1):
+        where = on_ct == label
+        if not where.any():
+            continue
+        what, made_of = _MADE_OF.get(name, ("tissue", range(1, len(NAMES) + 1)))
+        share = float(np.isin(of_ct[where], made_of).mean())
+        if share < _LEAST_IN_PLACE:
             lines.append(
-                f"what contrast agent brightens is blood, also where it is {thick:.0f} mm thick, as the heart and "
-                "kidneys are; a label map of organs (--organs) tells them apart"
+                f"organs: {name}: {share:.0%} of it is {what} in the CT, expected {_LEAST_IN_PLACE:.0%} or more: is "
+                "the label map of this CT, and in its frame?"
             )
-    return lines
-
-
-def _those_present(classes: np.ndarray, names: tuple[str, ...]) -> tuple[np.ndarray, tuple[str, ...]]:
-    """Labels renumbered without those that do not occur."""
-    counts = np.bincount(classes.ravel(), minlength=len(names) + 1)
-    present = [n for n in range(1, len(names) + 1) if counts[n]]
-    lookup = np.zeros(256, np.uint8)
-    lookup[present] = np.arange(1, len(present) + 1)
-    return lookup[classes], tuple(names[n - 1] for n in present)
-
-
-def _moments(hu: np.ndarray, labels: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """(tissues,) mean and standard deviation."""
-    numbers, first, second = (np.zeros(count + 1) for _ in range(3))
-    for part in _slabs(hu.shape):
-        label, value = labels[part].ravel(), hu[part].ravel().astype(np.float64)
-        numbers += np.bincount(label, minlength=count + 1)
-        first += np.bincount(label, value, count + 1)
-        second += np.bincount(label, value**2, count + 1)
-    mean = first / np.maximum(numbers, 1)
-    return mean[1:], np.sqrt(np.maximum(second / np.maximum(numbers, 1) - mean**2, 0.0))[1:]
+        soft = where & ((of_ct == SOFT) | (of_ct == BLOOD))
+        if name in _BONES:
+            classes[smallest_around(where) & soft] = SPONGY
+        elif name == "blood":
+            classes[soft] = BLOOD
+        elif name not in _BY_NUMBER and soft.any():
+            names = names if name in names else (*names, name)
+            is_vessel = (of_ct == BLOOD) & (hu > float(np.median(hu[soft])) + _ABOVE_ORGAN_HU)
+            classes[soft & ~is_vessel] = names.index(name) + 1
+    return names, lines
 
 
 # ---- partial volumes: the part of a voxel on a border that the tissue beside it fills --------------------------------
@@ -319,21 +260,16 @@ def border_shares(
     """
     second, share = np.zeros(labels.shape, np.uint8), np.zeros(labels.shape, np.float32)
     step = np.zeros(labels.shape, np.int16)
+    forth, back = slice(None, -1), slice(1, None)
     for axis in range(3):
-        for towards in (1, -1):
-            here, there = (_side(axis, towards * sign) for sign in (1, -1))
-            differs = labels[here] != labels[there]
-            rise = sharp[there] - sharp[here]
-            larger = differs & (np.abs(rise) > np.abs(step[here])) & (np.abs(rise) > _CLEAR * noise)
-            np.copyto(step[here], rise, where=larger)
-            np.copyto(second[here], labels[there], where=larger)
+        label, number, other, most = (np.moveaxis(array, axis, 0) for array in (labels, sharp, second, step))
+        for here, there in ((forth, back), (back, forth)):
+            rise = number[there] - number[here]
+            differs = (label[here] != label[there]) & (np.abs(rise) > _CLEAR * noise)
+            larger = differs & (np.abs(rise) > np.abs(most[here]))
+            np.copyto(most[here], rise, where=larger)
+            np.copyto(other[here], label[there], where=larger)
     on_border = step != 0
     part = (filtered[on_border].astype(np.float32) - sharp[on_border]) / step[on_border]
     share[on_border] = np.clip((part - 0.5) / _INNER_RANGE + 0.5, 0.0, 0.5)
     return second, share
-
-
-def _side(axis: int, sign: int) -> tuple[slice, ...]:
-    parts = [slice(None)] * 3
-    parts[axis] = slice(None, -1) if sign > 0 else slice(1, None)
-    return tuple(parts)

@@ -124,20 +124,21 @@ class Segmentation:
 
     def table(self) -> str:
         """Share, volume, mean intensity and standard deviation of every label that occurs, one per line."""
-        counts = np.bincount(self.labels.array.ravel(), minlength=len(self.tissue_names) + 1)[1:]
-        millilitres = counts * self.labels.voxel_ml
-        digits = ".2f" if np.abs(self.means).max() >= _LARGE else ".3g"  # of images from 0 to 1, or 1e-6
-        lines = [f"{'label':>5}  {'tissue':14} {'share':>6} {'ml':>7} {'mean':>9} {'sd':>8}"]
-        for n, name in enumerate(self.tissue_names):
-            if not counts[n]:  # of a part of a brain, or under what was added
-                continue
-            numbers = ""
-            if n < len(self.means):
-                numbers = f" {self.means[n]:9{digits}} {self.standard_deviations[n]:8{digits}}"
-            lines.append(
-                f"{n + 1:5d}  {name:14} {counts[n] / max(counts.sum(), 1):6.1%} {millilitres[n]:7.1f}{numbers}"
-            )
-        return "\n".join(lines)
+        return label_table(self.labels, self.tissue_names, self.means, self.standard_deviations)
+
+
+def label_table(labels: Volume, names: tuple[str, ...], means: np.ndarray, deviations: np.ndarray) -> str:
+    """A line for every label that occurs: share, volume, and mean and deviation of those that have them."""
+    counts = np.bincount(labels.array.ravel(), minlength=len(names) + 1)[1:]
+    digits = ".2f" if np.abs(means).max() >= _LARGE else ".3g"  # of images from 0 to 1, or 1e-6
+    lines = [f"{'label':>5}  {'tissue':15} {'share':>6} {'ml':>8} {'mean':>9} {'sd':>8}"]
+    for n, name in enumerate(names):
+        if not counts[n]:  # of a part of a brain, or under what was added
+            continue
+        numbers = f" {means[n]:9{digits}} {deviations[n]:8{digits}}" if n < len(means) else ""
+        share = counts[n] / max(counts.sum(), 1)
+        lines.append(f"{n + 1:5d}  {name:15} {share:6.1%} {counts[n] * labels.voxel_ml:8.1f}{numbers}")
+    return "\n".join(lines)
 
 
 def segment_mri(
