@@ -45,7 +45,7 @@ def labels(head):
 def test_demo_writes_everything_it_promises(head, tmp_path):
     pytest.importorskip("matplotlib", reason="pictures need matplotlib: pip install '.[demo]'")
     out = tmp_path / "out"
-    result = ussim("demo", "--mri", head, "--out", out, "--probe", "convex", "--seed", 3)
+    result = ussim("demo", "--mri", head, "-o", out, "--probe", "convex", "--seed", 3)
     assert result.exit_code == 0, result.output
     assert "skull-stripped" in result.stderr and "grey matter" in result.stderr  # how, and the table of shares
     pictures = {"mri.png", "labels.png", "bmode.png", "figure.png"}
@@ -237,13 +237,13 @@ def test_values_that_are_no_text_and_sweeps_without_end_are_refused(labels, tmp_
         ("o.png", "simulate none.mha --pose auto -o o.png"),
         ("o.mnc", "volume none.mha --pose auto --tilt 5 -o o.mnc"),
         ("o.mhd", "sweep none.mha --sequence none.mha -o o.mhd"),
-        ("f.png", "sweep none.mha --sequence none.mha -o o.mhd --field f.png"),
+        ("f.png", "sweep none.mha --sequence none.mha -o o.mhd --set recording.field=f.png"),
         ("o.mha", "segment none.mha -o o.mha"),
         ("o.json", "segment none.mha -o o.mha"),
         ("s.vtp", "segment none.mha -o o.mha --sheets s.vtp"),
-        *((name, f"optimize none.mha --sequence none.mha -o o.json {option} {name}") for option, name in (
-            ("-o", "r.json"), ("--report", "r.html"), ("--save-preset", "p.json"), ("--save-transform", "t.json"),
-            ("--field", "f.png"),
+        *((name, f"optimize none.mha --sequence none.mha -o o.json {option}{name}") for option, name in (
+            ("-o ", "r.json"), ("--report ", "r.html"), ("--save-preset ", "p.json"),
+            ("--set results.save_transform=", "t.json"), ("--set recording.field=", "f.png"),
         )),
     ],
 )  # fmt: skip
@@ -274,7 +274,7 @@ _MASK, _ALSO = ["--mask", "{labels}"], ["--also", "t2={labels}", "--contrast", "
         ("simulate", _MASK, "--mask is for an MRI"),
         ("simulate", ["--contrast", "t1"], "--contrast is for an MRI"),
         ("simulate", ["--skull-strip", "none"], "--skull-strip is for an MRI"),
-        ("simulate", ["--no-thin-sulci"], "--thin-sulci is for an MRI"),
+        ("simulate", ["--set", "segmentation.thin_sulci=false"], "--set segmentation.thin_sulci is for an MRI"),
         ("volume", _MASK, "--mask is for an MRI"),
         ("sweep", _ALSO, "--also are for an MRI"),
         ("optimize", _ALSO, "--also are for an MRI"),
@@ -390,12 +390,12 @@ def test_the_demo_replaces_only_files_that_it_wrote_itself(head, tmp_path):
     mine = out / "figure.png"
     mine.write_bytes(b"my figure")
     (out / "notes.txt").write_text("mine")
-    result = ussim("demo", "--mri", head, "--out", out)
+    result = ussim("demo", "--mri", head, "-o", out)
     assert result.exit_code == 2 and f"{mine}: exists, and without demo.json the folder is" in result.stderr
     assert mine.read_bytes() == b"my figure"
     mine.unlink()
-    assert ussim("demo", "--mri", head, "--out", out).exit_code == 0
-    assert ussim("demo", "--mri", head, "--out", out).exit_code == 0  # its own files are replaced
+    assert ussim("demo", "--mri", head, "-o", out).exit_code == 0
+    assert ussim("demo", "--mri", head, "-o", out).exit_code == 0  # its own files are replaced
     assert not list(out.glob(".results-*")) and (out / "notes.txt").read_text() == "mine"
     result = ussim("demo", "--mri", out / "labels.nii.gz", "--out", out)
     assert result.exit_code == 2 and "labels.nii.gz is an input, which it would replace" in result.stderr

@@ -3,82 +3,56 @@
 from __future__ import annotations
 
 import os
-from functools import cached_property
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any
 
 import click
 
-from SlicerUSSim.Command.additions import Additions, add_option
-from SlicerUSSim.Command.mri_options import also_option, read_also, read_mri
-from SlicerUSSim.Command.options import check_results, device_option, mask_option, parameter_option
+from SlicerUSSim.Command.additions import Additions
+from SlicerUSSim.Command.mri_options import MriOptions, read_mri
+from SlicerUSSim.Command.options import check_results, declared, declared_parameters, gathered, out_option
+from SlicerUSSim.Command.patient_options import RARE, named_probe
 from SlicerUSSim.Command.progress import Steps, note
-from SlicerUSSim.Logic.base.settings import DisplaySettings, SimulationSettings
-from SlicerUSSim.Logic.mri.segmentation_settings import SegmentationSettings
-
-if TYPE_CHECKING:
-    from SlicerUSSim.Logic.mri import Segmentation
+from SlicerUSSim.Command.set_option import Changes
+from SlicerUSSim.Logic.base.settings import SimulationSettings
 
 
-class ProbeName(click.Choice):
-    """A name of probe.PROBES, which imports numpy and therefore waits until a choice is made or --help asks for it."""
+@dataclass(frozen=True)
+class DemoOptions(MriOptions):
+    """Patient and probe of the demo."""
 
-    def __init__(self) -> None:
-        self.case_sensitive = True
-
-    @cached_property
-    def choices(self) -> tuple[str, ...]:
-        from SlicerUSSim.Logic.probe.arrays import PROBES
-
-        return tuple(PROBES)
-
-
-def _tell(segmentation: Segmentation) -> None:
-    """Say how the MRI was segmented, and into what."""
-    for line in (*segmentation.notes, *segmentation.table().splitlines()):
-        note(line)
+    mri: str | None = declared(
+        "--mri", type=click.Path(), help="MRI of a head or a brain (default: the MNI152 brain of nilearn)."
+    )
+    probe: str = declared(
+        "--probe", default="phased", show_default=True, metavar="NAME|PATH", help="Name of a probe, or one as JSON."
+    )
+    settings: Mapping[str, Any] = declared_parameters(SimulationSettings, of_preset=True)
 
 
 @click.command()
-@click.option(
-    "--out", type=click.Path(path_type=Path), default="ussim-demo", show_default=True, help="Folder for the results."
-)
-@click.option("--mri", type=click.Path(), help="MRI of a head or a brain (default: the MNI152 brain of nilearn).")
-@parameter_option(SegmentationSettings, "contrast")
-@parameter_option(SegmentationSettings, "skull_strip")
-@mask_option
-@click.option("--probe", "kind", type=ProbeName(), default="phased", show_default=True, help="Preset of the probe.")
-@parameter_option(SimulationSettings, "seed")
-@also_option
-@add_option
-@device_option
-def demo(
-    out: Path, mri: str | None, contrast: str, skull_strip: str, mask: str | None, kind: str, seed: int,
-    also: tuple[str, ...], additions: tuple[str, ...], device: str | None,
-) -> None:  # fmt: skip
+@out_option("Folder for the results.", default="ussim-demo", show_default=True)
+@gathered(f"{RARE} outside maps organs", patient=DemoOptions)
+def demo(out: Path, patient: DemoOptions) -> None:
     """Segment a brain MRI, simulate a view through a craniotomy, and write figures."""
     from SlicerUSSim.Command.whole_line import RESULTS, SUMMARY, run_whole_line
-    from SlicerUSSim.Logic.mri.kept_mask import mask_beside
-    from SlicerUSSim.Logic.mri.masks import read_mask
+    from SlicerUSSim.Logic.imaging.preset import Preset
     from SlicerUSSim.Logic.mri.samples import demo_mri
-    from SlicerUSSim.Logic.probe.arrays import PROBES
 
     check_results(out, RESULTS, SUMMARY)
-    settings = SimulationSettings(seed=seed)
-    masks = Additions.read(additions)
-    volume, source = demo_mri() if mri is None else (
-        read_mri(mri, mask=mask, skull_strip=skull_strip), os.path.abspath(mri),
-    )  # fmt: skip
+    preset = Preset(named_probe(patient.probe)).changed("settings", **patient.settings)
+    preset = Changes.of(patient.changes).to_preset(preset)
+    masks = Additions.read(patient.additions)
+    if patient.mri is None:
+        volume, source = demo_mri()
+    else:
+        volume = read_mri(patient.mri, mask=patient.mask, skull_strip=patient.segmentation.skull_strip)
+        source = os.path.abspath(patient.mri)
     note(f"MRI: {source}, {volume.size_text} voxels")
-    brain = {
-        "contrast": contrast, "skull_strip": skull_strip, "mask": read_mask(mask) if mask else None,
-        "others": read_also(also, mri), "keep_mask_at": mask_beside(mri) if mri else None,
-    }  # fmt: skip
     with Steps(5) as step:
-        summary = run_whole_line(
-            out, volume, source, PROBES[kind], settings, DisplaySettings(), device, step,
-            segmentation_options=brain, found=_tell, additions=masks,
-        )  # fmt: skip
+        summary = run_whole_line(out, volume, source, preset, patient, masks, step)
     times = summary["milliseconds"]
     note(f"device: {summary['device']}")
     note(f"segmentation {times['segmentation']:.0f} ms, one frame {times['frame']:.1f} ms")

@@ -10,30 +10,21 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from SlicerUSSim.Command.additions import Additions, add_option
-from SlicerUSSim.Command.craniotomy_options import GEL_MM, Craniotomy, craniotomy_option
+from SlicerUSSim.Command.additions import Additions
+from SlicerUSSim.Command.craniotomy_options import GEL_MM, Craniotomy
 from SlicerUSSim.Command.mri_options import (
-    also_option,
-    organs_option,
+    ImageOptions,
     require_no_map,
     require_no_sequence,
     segmented_file,
     split_also,
 )
-from SlicerUSSim.Command.options import (
-    ct_option,
-    declared,
-    declared_parameters,
-    device_option,
-    mask_option,
-    require_no_mri_options,
-)
+from SlicerUSSim.Command.options import declared, declared_parameters, require_no_mri_options
 from SlicerUSSim.Command.progress import note
-from SlicerUSSim.Command.set_option import Changes, set_option
-from SlicerUSSim.Command.sheet_options import DrawnSheets, drawn_sheets_option, no_sheet_option
+from SlicerUSSim.Command.set_option import Changes
+from SlicerUSSim.Command.sheet_options import DrawnSheets
 from SlicerUSSim.Logic.base.errors import SimulationError, require, required
 from SlicerUSSim.Logic.base.settings import DisplaySettings, SimulationSettings
-from SlicerUSSim.Logic.mri.segmentation_settings import CT, SegmentationSettings
 
 if TYPE_CHECKING:
     import numpy as np
@@ -43,13 +34,6 @@ if TYPE_CHECKING:
     from SlicerUSSim.Logic.mri import Added
     from SlicerUSSim.Logic.probe import Probe
     from SlicerUSSim.Logic.tissue import TissueTable
-
-map_option = click.option(
-    "--map", "maps", multiple=True, metavar="LABEL=TISSUE",
-    help="Tissue of a label of the label map, by its number or its name: 24=csf; 0 removes a label. Or a .json file "
-    'with {"24": "csf"}, a table of names (.txt, .ctbl, .tsv), or the numbering: freesurfer, totalsegmentator, '
-    "totalsegmentator-v1, totalsegmentator-mr, totalsegmentator-tissues, ussim, brats-2022, brats. May be repeated.",
-)  # fmt: skip
 
 #: A pose that is chosen; and those of mri.views.VIEWS
 AUTO = "auto"
@@ -63,63 +47,35 @@ pose_option = click.option(
 )  # fmt: skip
 
 
+#: Parameters that no command has an option for, and those that a command with further options has none for
+RARE = (
+    "classes thin_sulci bias_correction filter_radius no_sheets tgc_db_cm_mhz tgc_reach near_gain_db noise_db grey_map "
+    "contact_gap_mm partial_volume mri_modulation_db"
+)
+RARE_BESIDE = "skull_strip outside organs tissues seed"
+
+
 @dataclass(frozen=True)
-class PatientOptions:
+class PatientOptions(ImageOptions):
     """Patient, probe and display. Files are given by their paths."""
 
-    mri_or_labels: str = declared(click.argument("mri_or_labels", type=click.Path()))
+    mri_or_labels: str = declared(type=click.Path())
     #: None: determined from the input
     is_labels: bool | None = declared(
-        click.option(
-            "--labels/--mri", "is_labels", default=None,
-            help="Type of the input (default: labels if it has few different whole numbers).",
-        )
-    )  # fmt: skip
-    preset: str | None = declared(
-        click.option(
-            "--preset", type=click.Path(),
-            help="Probe, display, settings and tissues as JSON, from `ussim demo` or the Slicer module; the options "
-            "below override it.",
-        )
+        "--labels/--mri", default=None, help="Type of the input (default: labels if it has few different whole "
+        "numbers).",
     )  # fmt: skip
     probe: str | None = declared(
-        click.option(
-            "--probe",
-            metavar="NAME|PATH",
-            help="Name of a probe (docs/probes.md), as neonatal, or a probe as JSON "
-            "(default: the preset's, a phased array).",
-        )
-    )
-    tissues: str | None = declared(
-        click.option(
-            "--tissues", type=click.Path(),
-            help="Tissue table as JSON (default: the preset's, the file beside the labels, or brain).",
-        )
+        "--probe", metavar="NAME|PATH", help="Name of a probe (docs/probes.md), as neonatal, or a probe as JSON "
+        "(default: the preset's, a phased array).",
     )  # fmt: skip
-    #: LABEL=TISSUE, NAME=TISSUE, files and numbering schemes
-    maps: tuple[str, ...] = declared(map_option)
-    segmentation: SegmentationSettings = declared_parameters(  # noqa: RUF009
-        SegmentationSettings, ("contrast", "skull_strip", "thin_sulci", "outside"), also=(ct_option,)
-    )
-    #: Label map of organs of a CT
-    organs: str | None = declared(organs_option)
-    mask: str | None = declared(mask_option)
-    #: CONTRAST=FILE
-    also: tuple[str, ...] = declared(also_option)
-    #: TISSUE=FILE
-    additions: tuple[str, ...] = declared(add_option)
-    #: none, auto, disc:MM or a file
-    craniotomy: str = declared(craniotomy_option)
-    #: A file, auto or none
-    sheets: str = declared(drawn_sheets_option)
-    #: Kinds that are not drawn
-    no_sheets: tuple[str, ...] = declared(no_sheet_option)
+    tissues: str | None = declared(
+        "--tissues", type=click.Path(),
+        help="Tissue table as JSON (default: the preset's, the file beside the labels, or brain).",
+    )  # fmt: skip
     #: {parameter: value} of the options that were given
     display: Mapping[str, Any] = declared_parameters(DisplaySettings, of_preset=True)
     settings: Mapping[str, Any] = declared_parameters(SimulationSettings, of_preset=True)
-    #: NAME=VALUE
-    changes: tuple[str, ...] = declared(set_option)
-    device: str | None = declared(device_option)
 
     @property
     def gives_probe(self) -> bool:
@@ -207,7 +163,7 @@ def open_examination(patient: PatientOptions, pose: np.ndarray | str | None = No
     require_no_sequence(patient.mri_or_labels)
     volume = Volume.read(patient.mri_or_labels)
     chosen = patient.segmentation
-    is_ct = chosen.contrast == CT
+    is_ct = patient.is_ct
     is_labels = patient.is_labels
     craniotomy = Craniotomy.of(patient.craniotomy)
     require(not (is_ct and is_labels), f"{patient.mri_or_labels}: --labels and --ct are given, expected one of them")
@@ -219,7 +175,7 @@ def open_examination(patient: PatientOptions, pose: np.ndarray | str | None = No
         log.info("%s is read as %s; use %s if it is not", patient.mri_or_labels, *kinds)
     if is_labels and preset.settings.needs_texture:
         raise SimulationError(
-            f"{patient.mri_or_labels}: is a label map; --partial-volume and --mri-modulation need an MRI"
+            f"{patient.mri_or_labels}: is a label map; partial_volume and mri_modulation_db need an MRI"
         )
     if not is_labels:
         require_no_map(patient.mri_or_labels, patient.maps, patient.organs)
@@ -252,13 +208,10 @@ def open_examination(patient: PatientOptions, pose: np.ndarray | str | None = No
         changes.check_tissues((*(tissue.name for tissue in tissues.all_tissues()), *TISSUES))
     else:
         changes.to_tissues(additions.with_presets(tissues))
-    segmentation = segmented_file(
-        patient.mri_or_labels, volume, patient.segmentation, mask=patient.mask, also=patient.also,
-        organs=patient.organs, maps=patient.maps, device=patient.device, additions=additions,
-    )  # fmt: skip
+    segmentation = segmented_file(patient.mri_or_labels, volume, patient, additions=additions)
     labels, names, surfels = segmentation.labels, segmentation.tissue_names, sheets.read
     if isinstance(segmentation, Segmentation):
-        drawn = sheets.found(patient.mri_or_labels, volume, segmentation, patient.segmentation.contrast)
+        drawn = sheets.found(patient.mri_or_labels, volume, segmentation, patient.contrast)
         labels, names, surfels = drawn.labels, drawn.names, drawn.surfels
     if table is not None:
         of_brain = segmentation.brain_names if isinstance(segmentation, Segmentation) else segmentation.tissue_names
@@ -320,7 +273,7 @@ def _placed(
     if at is None:
         labels = craniotomy.on(labels, names, preset.probe, pose)
     if "skin" in names and not craniotomy.is_wanted and not patient.gives_contact:
-        note(f"gel fills gaps of up to {GEL_MM:g} mm between skin and probe (--contact-gap)")
+        note(f"gel fills gaps of up to {GEL_MM:g} mm between skin and probe (--set settings.contact_gap_mm)")
         settings = replace(settings, contact_gap_mm=GEL_MM)
     return _Placed(labels, pose, settings)
 
@@ -355,7 +308,7 @@ def open_examination_at(patient: PatientOptions, pose: str) -> tuple[Examination
 
     is_chosen = pose == AUTO or pose in STANDARD_VIEWS
     require(
-        not is_chosen or patient.segmentation.contrast != CT,
+        not is_chosen or not patient.is_ct,
         f"--pose is {pose}, which is on a head, and the image is a CT (--ct), expected a file with the pose",
     )
     require(

@@ -7,21 +7,12 @@ from dataclasses import dataclass, field, replace
 from difflib import get_close_matches
 from typing import TYPE_CHECKING, Any
 
-import click
-
 from SlicerUSSim.Logic.base.errors import SimulationError, either, require
 
 if TYPE_CHECKING:
     from SlicerUSSim.Logic.base.declaration import Parameter
     from SlicerUSSim.Logic.imaging import Preset
     from SlicerUSSim.Logic.tissue import TissueTable
-
-set_option = click.option(
-    "--set", "changes", multiple=True, metavar="NAME=VALUE",
-    help="Any parameter of probe, display, settings, membrane and tissues, such as settings.max_ray_depth=4, "
-    'probe.depth_mm=70 or "white matter.mu0=0.5"; overrides other options; may be repeated. docs/parameters.md '
-    "lists them.",
-)  # fmt: skip
 
 _MEMBRANE = "membrane"
 
@@ -70,6 +61,11 @@ class Changes:
             return of_tissue[attribute], self.tissues.setdefault(section, {})
         of_preset |= {f"{_MEMBRANE}.{known}": entry for known, entry in of_membrane.items()}
         raise SimulationError(f"--set: no parameter {name!r}, expected {_hint(name, section, of_preset, of_tissue)}")
+
+    def require_none(self) -> None:
+        """Raise SimulationError for a command that only segments, and has no use for them."""
+        name = next(iter((*self.sections, *self.tissues, *("membrane" for _ in self.membrane))), None)
+        require(name is None, f"--set {name}: no image is simulated, expected a key of segmentation")
 
     @property
     def gives_geometry(self) -> bool:

@@ -28,16 +28,6 @@ sheet_kind_option = click.option(
 )  # fmt: skip
 #: Values of --sheets that are no file
 AUTO, NONE = "auto", "none"
-drawn_sheets_option = click.option(
-    "--sheets", default=NONE, metavar="FILE|auto|none", show_default=True,
-    help="Draw sulci, falx, tentorium and walls of ventricles as thin sheets: those in FILE, a .vtp of `ussim segment "
-    "--sheets`; auto: found in the MRI and kept beside it, with corpus callosum, choroid plexus and vessels as labels.",
-)  # fmt: skip
-no_sheet_option = click.option(
-    "--no-sheet", "no_sheets", multiple=True, metavar="KIND",
-    help="What --sheets leaves as the labels have it: sulcus, falx, tentorium, ependyma, corpus callosum, choroid "
-    "plexus or vessels; may be repeated.",
-)  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)

@@ -2,34 +2,36 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, replace
 from pathlib import Path
 from time import perf_counter
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from SlicerUSSim.Command.additions import Additions
-from SlicerUSSim.Logic.base.errors import SimulationError, about_file
+from SlicerUSSim.Command.mri_options import segmented_file
+from SlicerUSSim.Command.progress import note
+from SlicerUSSim.Logic.base.errors import SimulationError
 from SlicerUSSim.Logic.base.files import (
     make_folder,
     move_into,
     partial_folder,
     write_json,
 )
-from SlicerUSSim.Logic.base.settings import DisplaySettings, SimulationSettings
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.imaging.figures import draw_views, require_matplotlib, write_png
 from SlicerUSSim.Logic.imaging.preset import Preset
 from SlicerUSSim.Logic.imaging.simulator import UltrasoundSimulator
-from SlicerUSSim.Logic.mri.segmentation import Segmentation, segment_mri
-from SlicerUSSim.Logic.mri.segmentation_settings import SegmentationSettings
-from SlicerUSSim.Logic.probe.arrays import Probe
+from SlicerUSSim.Logic.mri.segmentation import Segmentation
 from SlicerUSSim.Logic.probe.poses import craniotomy_pose, slice_under_probe
 from SlicerUSSim.Logic.tissue.table import TissueTable, write_label_files
 from SlicerUSSim.Logic.tracked.pose_files import write_pose
+
+if TYPE_CHECKING:
+    from SlicerUSSim.Command.demo import DemoOptions
 
 #: Files of the results, and the one that says what was done
 RESULTS = (
@@ -40,44 +42,36 @@ SUMMARY = "demo.json"
 
 
 def run_whole_line(
-    out: Path,
-    mri: Volume,
-    source: str,
-    probe: Probe,
-    settings: SimulationSettings,
-    display: DisplaySettings,
-    device: str | None = None,
+    out: Path, mri: Volume, source: str, preset: Preset, patient: DemoOptions, additions: Additions,
     progress: Callable[[str], None] = lambda stage: None,
-    *,
-    segmentation_options: Mapping[str, Any] | None = None,
-    found: Callable[[Segmentation], None] = lambda segmentation: None,
-    additions: Additions | None = None,
-) -> dict:
+) -> dict:  # fmt: skip
     """Segment, place the probe, simulate, and write figures, volumes and a summary to the folder `out`.
 
-    `progress` is called with the name of every step at its start, `found` with the segmentation and what was added;
-    `segmentation_options` are further arguments of segment_mri. Returns the content of demo.json.
+    `progress` is called with the name of every step at its start. Returns the content of demo.json.
     Raises SimulationError for errors that the caller can correct.
     """
     require_matplotlib()  # before the computation, not after it
     timings: dict[str, float] = {}
+    probe, display, settings = preset.probe, preset.display, preset.settings
 
     progress("segment the MRI")
     start = perf_counter()
-    options = dict(segmentation_options or {})
-    additions = additions or Additions()
-    additions.require_addable(mri, options.get("mask"), options.get("skull_strip", SegmentationSettings.skull_strip))
-    with about_file(mri.name):
-        segmentation = segment_mri(mri, device=device, **options)
+    path = patient.mri or mri.name
+    segmentation = segmented_file(
+        path, mri, patient, additions=additions, tell_all=True, is_file=patient.mri is not None
+    )
+    if not isinstance(segmentation, Segmentation):
+        raise SimulationError(f"{path}: is a CT, expected an MRI; use ussim simulate")
     timings["segmentation"] = (perf_counter() - start) * 1e3
 
     progress("build the acoustic medium")
     start = perf_counter()
     added = additions.on(segmentation.labels, segmentation.tissue_names, has_brain_mask=True)
     labels, names = added.labels, added.tissue_names
-    found(replace(segmentation, labels=labels, tissue_names=names))
+    for line in replace(segmentation, labels=labels, tissue_names=names).table().splitlines():
+        note(line)
     tissues = TissueTable.brain(names)
-    simulator = UltrasoundSimulator(labels, tissues, settings, device)
+    simulator = UltrasoundSimulator(labels, tissues, settings, patient.device)
     pose = craniotomy_pose(labels, probe, target_ras=added.centre_ras(segmentation.labels))
     timings["medium"] = (perf_counter() - start) * 1e3
 
