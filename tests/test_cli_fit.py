@@ -61,8 +61,8 @@ def test_optimize_writes_result_report_preset_and_state(folder):
     pytest.importorskip("matplotlib", reason="reports need matplotlib: pip install '.[demo]'")
     done = optimize(
         folder, "--set", "fit.evaluations=30", "--set", "fit.restarts=1", "--report", folder / "report.html",
-        "--save-preset", folder / "preset.json", "--set", f"results.state={folder / 'state.json'}", "--free", "display", "--free",
-        "white matter.mu0=0.1:0.9",
+        "--save-preset", folder / "preset.json", "--set", f"results.state={folder / 'state.json'}", "--free", "display",
+        "--free", "white matter.mu0=0.1:0.9",
     )  # fmt: skip
     assert done.exit_code == 0, done.output
     result = json.loads((folder / "result.json").read_text())

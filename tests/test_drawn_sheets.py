@@ -296,7 +296,7 @@ def test_options_of_the_command(tmp_path):
         images[name] = (tmp_path / f"{name}.png").read_bytes()
     assert images["none"] == images["off"] != images["file"]
     for given, without, message in (
-        ("none", ("falx",), "give --sheets, too"), ("auto", ("dura",), "--no-sheet is 'dura'"),
+        ("none", ("falx",), "give --sheets, too"), ("auto", ("dura",), "no_sheets is 'dura'"),
         ("auto", (), "a label map has no sheets"), ("nowhere.vtp", (), "no such file"),
         ("all", (), "expected a .vtp file, auto or none"),
     ):  # fmt: skip

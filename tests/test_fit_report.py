@@ -77,7 +77,7 @@ def rows_of(report: str) -> list[list[str]]:
 def test_the_report_has_the_costs_of_the_controls(folder):
     pytest.importorskip("matplotlib", reason="reports need matplotlib: pip install '.[demo]'")
     places = [folder / name for name in ("report.html", "preset.json", "field.png")]
-    done = optimize(folder, "--report", places[0], "--save-preset", places[1], "--field", places[2])
+    done = optimize(folder, "--report", places[0], "--save-preset", places[1], "--set", f"recording.field={places[2]}")
     assert done.exit_code == 0, done.output
     assert all(str(place) in done.stderr.splitlines()[-1] for place in places)
     report = places[0].read_text("utf-8")

@@ -262,7 +262,7 @@ def test_the_command_takes_its_settings_for_an_mri_and_not_for_labels(tmp_path):
     arguments[1] = str(tmp_path / "labels.nii.gz")
     result = CliRunner().invoke(main, [*arguments, "--set", "settings.partial_volume=true"])
     assert result.exit_code == 2
-    assert "is a label map; --partial-volume and --mri-modulation need an MRI" in result.stderr
+    assert "is a label map; partial_volume and mri_modulation_db need an MRI" in result.stderr
 
 
 def test_the_image_does_not_depend_on_the_order_of_voxels_in_a_file():

@@ -1,4 +1,4 @@
-"""Options of declared parameters, keys of --set and the preset, and dataclasses of options as one parameter of a command.
+"""Options of declared parameters, keys of --set, and dataclasses of options as one parameter of a command.
 
 Name, help, default and checks of a parameter's option are derived from its declaration (base/declaration.py).
 """
@@ -62,7 +62,7 @@ def _set_verbosity(ctx: click.Context, _: click.Parameter, count: int) -> None:
 
 
 def untrusted_option(command: click.Command, *, hidden: bool = False) -> click.Command:
-    """The command with --untrusted, which may be before the subcommand, whose --help does not repeat it, or after it."""
+    """The command with --untrusted, before the subcommand or, `hidden` in its --help, after it."""
     command.params.append(
         click.Option(
             ["--untrusted"], is_flag=True, expose_value=False, callback=_trust_nothing, hidden=hidden,
@@ -151,6 +151,7 @@ class Key(NamedTuple):
     option: click.Parameter
     #: Its declaration, if it has one
     entry: Parameter | None
+    default: Any
     #: Whether the preset has it for what the option says, so that it is read there
     of_preset: bool = False
 
@@ -199,7 +200,7 @@ def rare_keys(command: click.Command) -> dict[str, Key]:
 def about_key(error: click.NoSuchOption) -> str | None:
     """What to give instead of an unknown option, if it is a key of the command."""
     option = error.option_name
-    for key, (known, _, _) in rare_keys(error.ctx.command).items() if error.ctx else ():
+    for key, (known, *_) in rare_keys(error.ctx.command).items() if error.ctx else ():
         if option in (*known.opts, *known.secondary_opts):
             value = str(option in known.opts).lower() if known.secondary_opts else "VALUE"
             return f"{option} is a key of the preset now: --set {key}={value}"
@@ -210,7 +211,8 @@ def _keys_of(section: str, kind: type, of_preset: bool = False) -> Iterator[tupl
     if issubclass(kind, Declared):
         for entry in parameters_of(kind):
             if entry.option:
-                yield f"{section}.{entry.name}", Key(_option(entry, of_preset), entry, of_preset)
+                default = None if of_preset else entry.default
+                yield f"{section}.{entry.name}", Key(_option(entry, of_preset), entry, default, of_preset)
         return
     for place in fields(kind):  # type: ignore[arg-type]
         if "kind" in place.metadata:
@@ -218,7 +220,8 @@ def _keys_of(section: str, kind: type, of_preset: bool = False) -> Iterator[tupl
             continue
         names, about = place.metadata["option"]
         option = click.Option([*names, place.name], **about) if names else click.Argument([place.name], **about)
-        yield f"{section}.{place.name}", Key(option, None)
+        default = about.get("default", () if "multiple" in about else None)
+        yield f"{section}.{place.name}", Key(option, None, default)
 
 
 def _further_of(kind: type) -> Iterator[click.Option]:
@@ -244,7 +247,7 @@ def _read_keys(context: click.Context, known: Mapping[str, Key]) -> None:
             of_file.discard(key)
         else:
             rest.append(text)
-    for key, (option, _, _) in own.items():
+    for key, (option, _, default, _) in known.items():
         name = option.name or ""
         if key in found:
             value = found[key] if getattr(option, "multiple", False) else found[key][-1]
@@ -254,10 +257,7 @@ def _read_keys(context: click.Context, known: Mapping[str, Key]) -> None:
                 raise SimulationError(f"--set {key}: {error.message}") from None
             if key in of_file:
                 context.set_parameter_source(name, ParameterSource.DEFAULT_MAP)
-        elif name not in context.params:
-            option.handle_parse_result(context, {}, [])
-    for option in (entry.option for entry in known.values() if entry.of_preset):
-        context.params.setdefault(option.name or "", None)
+        context.params.setdefault(name, default)
     if "changes" in context.params:
         context.params["changes"] = tuple(rest)
 

@@ -1,4 +1,4 @@
-"""--sheets, --sheet and --no-sheet: thin sheets and small structures found after a segmentation, and in images."""
+"""--sheets, --sheet and no_sheets: thin sheets and small structures found after a segmentation, and in images."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ AUTO, NONE = "auto", "none"
 
 @dataclass(frozen=True, eq=False)
 class DrawnSheets:
-    """What --sheets and --no-sheet ask for in images."""
+    """What --sheets and no_sheets ask for in images."""
 
     #: AUTO, NONE, or a file
     source: str
@@ -44,7 +44,7 @@ class DrawnSheets:
     @classmethod
     def of(cls, source: str, without: tuple[str, ...], *, is_labels: bool, contrast: str) -> DrawnSheets:
         """Reads and checks, before anything slow. Raises SimulationError for what cannot be met."""
-        require(source != NONE or not without, "--no-sheet leaves out some of --sheets; give --sheets, too")
+        require(source != NONE or not without, "no_sheets leaves out some of --sheets; give --sheets, too")
         if source == NONE:
             return cls(source, ())
         from SlicerUSSim.Logic.mri.sheets.finding import ALL_KINDS, require_findable
@@ -52,16 +52,14 @@ class DrawnSheets:
         from SlicerUSSim.Logic.tissue.surfels import KINDS
 
         for kind in without:
-            require(kind in ALL_KINDS, f"--no-sheet is {kind!r}, expected one of: {', '.join(ALL_KINDS)}")
+            require(kind in ALL_KINDS, f"no_sheets is {kind!r}, expected one of: {', '.join(ALL_KINDS)}")
         kinds = tuple(kind for kind in ALL_KINDS if kind not in without)
         if source != AUTO:
             require(
                 Path(source).is_file(), f"--sheets is {source!r} (no such file), expected a .vtp file, {AUTO} or {NONE}"
             )
             for kind in dict.fromkeys(kind for kind in without if kind not in KINDS):
-                note(
-                    f"--no-sheet {kind} leaves nothing out: it is no sheet of {source} but a label, where there is one"
-                )
+                note(f"no_sheets {kind} leaves nothing out: it is no sheet of {source} but a label, where there is one")
             whole = read_surfels(source)
             if kinds and len(whole) and "sulcus" not in whole.kinds():
                 note(f"{source} has no sulci, by which sheets of another patient are known: look whether they fit")
