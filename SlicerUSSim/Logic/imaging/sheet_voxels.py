@@ -8,7 +8,6 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from SlicerUSSim.Logic.base.errors import require
-from SlicerUSSim.Logic.base.neighbourhood import distance_to
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.tissue.surfels import Surfels
 
@@ -78,7 +77,9 @@ def on_voxels(surfels: Surfels, grid: Volume, *, reach_mm: float = 2.0, finer: i
     entry = np.full(grid.array.shape, -1, np.int32)
     if not len(surfels):
         return SheetVoxels(grid.with_array(entry), np.zeros((0, 2), np.uint32), np.zeros(0, np.uint8), reach_mm)
-    near = np.argwhere(_near(surfels, grid, reach_mm))
+    # A plane's foot lies this far from its surfel at most
+    farthest = float(np.hypot(reach_mm, max(_RIM * np.sqrt(surfels.area.max() / np.pi), _RIM_MM))) + 1e-3
+    near = np.argwhere(_near(surfels, grid, farthest))
     if not len(near):
         return SheetVoxels(grid.with_array(entry), np.zeros((0, 2), np.uint32), np.zeros(0, np.uint8), reach_mm)
     tree = KDTree(surfels.place)
@@ -86,6 +87,8 @@ def on_voxels(surfels: Surfels, grid: Volume, *, reach_mm: float = 2.0, finer: i
     for start in range(0, len(near), _CHUNK):
         voxels = near[start : start + _CHUNK]
         centres = (voxels[:, ::-1] @ grid.ijk_to_ras[:3, :3].T + grid.ijk_to_ras[:3, 3]).astype(np.float32)
+        is_near = np.isfinite(tree.query(centres, distance_upper_bound=farthest, workers=-1)[0])
+        voxels, centres = voxels[is_near], centres[is_near]
         inside, words, kind = _planes(surfels, tree, centres, reach_mm)
         kept.append(voxels[inside])
         packed.append(words)
@@ -170,15 +173,18 @@ def _from_octahedron(u: np.ndarray, v: np.ndarray) -> np.ndarray:
 
 def _near(surfels: Surfels, grid: Volume, reach_mm: float) -> np.ndarray:
     """(k, j, i) True at least where a centre is within reach of a surfel."""
-    matrix = grid.ras_to_ijk
-    index = np.rint(surfels.place @ matrix[:3, :3].T + matrix[:3, 3]).astype(int)[:, ::-1]
-    index = index[((index >= 0) & (index < grid.array.shape)).all(axis=1)]
-    seeds = np.zeros(grid.array.shape, bool)
-    seeds[tuple(index.T)] = True
-    if not seeds.any():
-        return seeds
-    more = 0.5 * float(np.linalg.norm(grid.spacing_mm)) + float(np.sqrt(surfels.area.max() / np.pi))
-    return distance_to(seeds, grid.spacing_mm) <= reach_mm + more
+    matrix, spacing, shape = grid.ras_to_ijk, grid.spacing_mm, np.array(grid.array.shape)
+    reach_mm += 0.5 * float(np.linalg.norm(spacing))
+    around = np.ceil(reach_mm / spacing[::-1]).astype(int)
+    wide = np.zeros(shape + 4 * around, bool)
+    index = np.rint(surfels.place @ matrix[:3, :3].T + matrix[:3, 3]).astype(int)[:, ::-1] + 2 * around
+    index = index[((index >= around) & (index < wide.shape - around)).all(axis=1)]
+    flat = np.unique(np.ravel_multi_index(tuple(index.T), wide.shape))
+    for offset in np.ndindex(*(2 * around + 1)):
+        step = np.array(offset) - around
+        if np.linalg.norm(step * spacing[::-1]) <= reach_mm:
+            wide.ravel()[flat + step @ (wide.shape[1] * wide.shape[2], wide.shape[2], 1)] = True
+    return wide[tuple(slice(2 * n, -2 * n) for n in around)]
 
 
 def _finer(grid: Volume, finer: int) -> Volume:
