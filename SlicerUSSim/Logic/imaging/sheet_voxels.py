@@ -23,7 +23,7 @@ _SAME_COSINE = 0.7
 #: 1 mm, no place is farther from a surfel, however the sheet is tilted
 _RIM, _RIM_MM = 1.5, 0.9
 #: Voxels at a time
-_CHUNK = 200_000
+_CHUNK = 50_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,8 +87,6 @@ def on_voxels(surfels: Surfels, grid: Volume, *, reach_mm: float = 2.0, finer: i
     for start in range(0, len(near), _CHUNK):
         voxels = near[start : start + _CHUNK]
         centres = (voxels[:, ::-1] @ grid.ijk_to_ras[:3, :3].T + grid.ijk_to_ras[:3, 3]).astype(np.float32)
-        is_near = np.isfinite(tree.query(centres, distance_upper_bound=farthest, workers=-1)[0])
-        voxels, centres = voxels[is_near], centres[is_near]
         inside, words, kind = _planes(surfels, tree, centres, reach_mm)
         kept.append(voxels[inside])
         packed.append(words)
@@ -108,8 +106,8 @@ def _planes(
     # The sheet is that of the surfel whose disc is nearest; its neighbours smooth it.
     apart = surfels.place[nearest] - centres[:, None]
     normals = surfels.normal[nearest]
-    across = (apart * normals).sum(axis=2)
-    aside = np.sqrt(np.maximum((apart**2).sum(axis=2) - across**2, 0.0))
+    across = np.einsum("nkx,nkx->nk", apart, normals)
+    aside = np.sqrt(np.maximum(np.einsum("nkx,nkx->nk", apart, apart) - across**2, 0.0))
     radius = np.sqrt(surfels.area[nearest] / np.pi)
     first = np.hypot(across, np.maximum(aside - radius, 0.0)).argmin(axis=1)
     row = np.arange(len(centres))
@@ -118,10 +116,11 @@ def _planes(
     same = (np.abs(cosine) > _SAME_COSINE) & (surfels.kind[nearest] == surfels.kind[lead][:, None])
     # Nearness to the foot on the leading plane
     foot = across[row, first][:, None] * lead_normal
-    from_foot = ((apart - foot[:, None]) ** 2).sum(axis=2)
+    off = apart - foot[:, None]
+    from_foot = np.einsum("nkx,nkx->nk", off, off)
     weight = np.where(same, np.exp(-0.5 * from_foot / _SIGMA_MM**2), 0.0) + 1e-12
     weight /= weight.sum(axis=1, keepdims=True)
-    normal = (weight[..., None] * normals * np.sign(cosine)[..., None]).sum(axis=1)
+    normal = np.einsum("nk,nkx->nx", weight * np.sign(cosine), normals)
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-9)
     distance = np.einsum("nk,nkx,nx->n", weight, apart, normal)
     # How far the foot lies outside the leading surfel; a sheet ends where its surfels do.
@@ -172,19 +171,24 @@ def _from_octahedron(u: np.ndarray, v: np.ndarray) -> np.ndarray:
 
 
 def _near(surfels: Surfels, grid: Volume, reach_mm: float) -> np.ndarray:
-    """(k, j, i) True at least where a centre is within reach of a surfel."""
-    matrix, spacing, shape = grid.ras_to_ijk, grid.spacing_mm, np.array(grid.array.shape)
-    reach_mm += 0.5 * float(np.linalg.norm(spacing))
-    around = np.ceil(reach_mm / spacing[::-1]).astype(int)
-    wide = np.zeros(shape + 4 * around, bool)
-    index = np.rint(surfels.place @ matrix[:3, :3].T + matrix[:3, 3]).astype(int)[:, ::-1] + 2 * around
-    index = index[((index >= around) & (index < wide.shape - around)).all(axis=1)]
-    flat = np.unique(np.ravel_multi_index(tuple(index.T), wide.shape))
+    """(k, j, i) True where a centre is within reach of a surfel."""
+    matrix, spacing = grid.ras_to_ijk, grid.spacing_mm
+    around = np.ceil(reach_mm / spacing + 0.5).astype(int)
+    shape = np.array(grid.array.shape[::-1]) + 4 * around
+    strides = np.array([1, shape[0], shape[0] * shape[1]])
+    at = surfels.place @ matrix[:3, :3].T + matrix[:3, 3] + 2 * around
+    at = at[((at >= around) & (at <= shape - around - 1)).all(axis=1)]
+    nearest = np.rint(at)
+    flat, apart = nearest.astype(int) @ strides, (nearest - at) @ grid.ijk_to_ras[:3, :3].T
+    square = (apart**2).sum(axis=1)
+    result = np.zeros(shape[::-1], bool)
     for offset in np.ndindex(*(2 * around + 1)):
         step = np.array(offset) - around
-        if np.linalg.norm(step * spacing[::-1]) <= reach_mm:
-            wide.ravel()[flat + step @ (wide.shape[1] * wide.shape[2], wide.shape[2], 1)] = True
-    return wide[tuple(slice(2 * n, -2 * n) for n in around)]
+        step_mm = grid.ijk_to_ras[:3, :3] @ step
+        if np.linalg.norm(step_mm) <= reach_mm + 0.5 * np.linalg.norm(spacing):
+            is_near = square + apart @ (2.0 * step_mm) <= reach_mm**2 - step_mm @ step_mm
+            result.ravel()[flat[is_near] + step @ strides] = True
+    return result[tuple(slice(2 * n, -2 * n) for n in around[::-1])]
 
 
 def _finer(grid: Volume, finer: int) -> Volume:
