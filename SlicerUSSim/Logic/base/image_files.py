@@ -13,6 +13,7 @@ import logging
 import math
 import os
 import re
+import sys
 import warnings
 import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -232,12 +233,22 @@ def _native(array: np.ndarray) -> np.ndarray:
 # ---- nibabel ---------------------------------------------------------------------------------------------------------
 
 
-def _read_nifti(path: Path) -> ImageFile:
-    import nibabel
+def _nibabel() -> Any:
+    """nibabel without pydicom, which it would load (0.4 s) for extensions of headers that nothing here reads."""
+    withheld = sys.modules.setdefault("pydicom", None) is None  # type: ignore[arg-type]
+    try:
+        import nibabel
+    finally:
+        if withheld:
+            del sys.modules["pydicom"]
+    return nibabel
 
+
+def _read_nifti(path: Path) -> ImageFile:
+    nibabel = _nibabel()
     with remarks_withheld():  # what nibabel corrects in a header is compared below
         if path.suffix.lower() in (".hdr", ".img"):
-            image: Any = nibabel.load(path)  # type: ignore[attr-defined]
+            image = nibabel.load(path)
             if not isinstance(image, nibabel.Nifti1Pair):  # Analyze 7.5, which has no orientation
                 return replace(_read_by_itk(path), doubts=("has no orientation; check left and right",))
             raw = image.header
@@ -307,9 +318,7 @@ def _label_table(image) -> dict[int, str]:
 
 def _read_mgh(path: Path) -> ImageFile:
     """FreeSurfer's MGH and MGZ, whose millimetres are RAS of the scanner."""
-    import nibabel
-
-    image: Any = nibabel.MGHImage.from_bytes(content_of(path))
+    image = _nibabel().MGHImage.from_bytes(content_of(path))
     array = np.asanyarray(image.dataobj)
     if array.ndim == 4 and array.shape[3] == 1:
         array = array[..., 0]

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.spatial import KDTree
 
 from SlicerUSSim.Logic.base.errors import require
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.tissue.surfels import Surfels
+
+if TYPE_CHECKING:
+    from scipy.spatial import KDTree
 
 #: Bits of an entry: distance, normal (two coordinates of its octahedron), thickness, confidence
 _DISTANCE_BITS, _NORMAL_BITS, _THICKNESS_BITS, _CONFIDENCE_BITS = 12, 10, 8, 6
@@ -70,6 +73,8 @@ def on_voxels(surfels: Surfels, grid: Volume, *, reach_mm: float = 2.0, finer: i
 
     Raises SimulationError for a reach that is shorter than voxels need, and a `finer` below 1.
     """
+    from scipy.spatial import KDTree  # images of labels alone do not wait for it
+
     require(finer >= 1, f"finer is {finer}, expected 1 or more")
     grid = _finer(grid, finer)
     least = 0.9 * 0.5 * float(np.linalg.norm(grid.spacing_mm))
