@@ -8,6 +8,7 @@ from __future__ import annotations
 import logging
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from dataclasses import Field, field, fields
 from functools import wraps
 from pathlib import Path
@@ -369,6 +370,34 @@ def check_results(folder: Path, names: Iterable[str], summary: str) -> None:
             is_own or not path.exists(),
             f"{path}: exists, and without {summary} the folder is not one of this command; give another folder (--out)",
         )
+
+
+@contextmanager
+def results_of(folder: Path, summary: str) -> Iterator[tuple[Path, dict]]:
+    """(a temporary folder for files, the summary to be filled): both are moved to `folder` if the block succeeds.
+
+    So a run that fails or is interrupted changes nothing. Raises SimulationError if the folder cannot be created or a
+    file cannot be written, naming it by its later place.
+    """
+    from SlicerUSSim.Logic.base.files import make_folder, move_into, partial_folder, write_json
+
+    is_new = not folder.exists()
+    make_folder(folder)
+    content: dict = {}
+    try:
+        with partial_folder(folder, "cannot be written to") as partial:
+            try:
+                yield partial, content
+                files = sorted(file for file in partial.iterdir() if file.name != summary)
+                write_json(partial / summary, content)
+            except SimulationError as error:  # the user knows no temporary folder
+                raise SimulationError(str(error).replace(str(partial), str(folder))) from None
+            move_into(folder, [*files, partial / summary])
+    except BaseException:
+        if is_new:
+            with suppress(OSError):  # not empty
+                folder.rmdir()
+        raise
 
 
 def require_no_input(out: Path) -> None:

@@ -211,8 +211,7 @@ def open_examination(patient: PatientOptions, pose: np.ndarray | str | None = No
     segmentation = segmented_file(patient.mri_or_labels, volume, patient, additions=additions)
     labels, names, surfels = segmentation.labels, segmentation.tissue_names, sheets.read
     if isinstance(segmentation, Segmentation):
-        drawn = sheets.found(patient.mri_or_labels, volume, segmentation, patient.contrast)
-        labels, names, surfels = drawn.labels, drawn.names, drawn.surfels
+        surfels, labels, names = sheets.found(patient.mri_or_labels, volume, segmentation, patient.contrast)
     if table is not None:
         of_brain = segmentation.brain_names if isinstance(segmentation, Segmentation) else segmentation.tissue_names
         labels, names = _numbered_as(tissues, labels, names, len(of_brain), patient.tissues or "tissues")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -68,37 +69,13 @@ class DrawnSheets:
         require_findable(kinds, contrast)
         return cls(source, kinds)
 
-    def found(self, mri_path: str, mri: Volume, segmentation: Segmentation, contrast: str) -> _Drawn:
-        """The sheets of an MRI, and its labels with the structures on top. Looked for once: everything is kept."""
+    def found(
+        self, mri_path: str, mri: Volume, segmentation: Segmentation, contrast: str
+    ) -> tuple[Surfels | None, Volume, tuple[str, ...]]:
+        """(Sheets of an MRI, its labels, their names with the structures on top). Looked for once, all are kept."""
         if self.source != AUTO or not self.kinds:
-            return _Drawn(self.read, segmentation.labels, segmentation.tissue_names)
-        from SlicerUSSim.Logic.base.errors import about_file
-        from SlicerUSSim.Logic.mri.pathology import add_tissues
-        from SlicerUSSim.Logic.mri.sheets.finding import ALL_KINDS, STRUCTURES, find_sheets
-        from SlicerUSSim.Logic.mri.sheets.kept import sheets_beside
-        from SlicerUSSim.Logic.tissue.surfels import KINDS
-
-        with Share("sheets") as progress, about_file(mri_path):
-            sheets = find_sheets(
-                mri, segmentation, contrast=contrast, keep_at=sheets_beside(mri_path), progress=progress
-            )
-        without = tuple(f"{kind}:" for kind in ALL_KINDS if kind not in self.kinds)
-        for line in sheets.notes:
-            if not line.startswith(without):
-                note(line)
-        labels, names = segmentation.labels, segmentation.tissue_names
-        masks = [mask for mask in sheets.masks() if mask[2] in set(STRUCTURES) & set(self.kinds)]
-        if masks:
-            added = add_tissues(labels, names, masks, has_brain_mask=True)
-            labels, names = added.labels, added.tissue_names
-        return _Drawn(sheets.surfels.of_kind(*(set(KINDS) & set(self.kinds))), labels, names)
-
-
-@dataclass(frozen=True, eq=False)
-class _Drawn:
-    surfels: Surfels | None
-    labels: Volume
-    names: tuple[str, ...]
+            return self.read, segmentation.labels, segmentation.tissue_names
+        return _searched(mri_path, mri, segmentation, contrast, self.kinds)
 
 
 def require_sheets(path: Path | None, kinds: tuple[str, ...], contrast: str) -> None:
@@ -119,22 +96,36 @@ def write_sheets(
     path: Path, mri_path: str, mri: Volume, found: Segmentation, contrast: str, kinds: tuple[str, ...]
 ) -> tuple[Volume, tuple[str, ...]]:
     """Find the sheets of a segmented MRI and write them; returns the labels and names with the structures on top."""
+    from SlicerUSSim.Logic.mri.sheets.finding import ALL_KINDS
+    from SlicerUSSim.Logic.mri.sheets.polydata import write_surfels
+
+    wanted = kinds or ALL_KINDS
+    surfels, labels, names = _searched(mri_path, mri, found, contrast, wanted, wanted)
+    write_surfels(path, surfels)
+    note(f"wrote {path}")
+    return labels, names
+
+
+def _searched(
+    mri_path: str, mri: Volume, found: Segmentation, contrast: str, shown: Sequence[str], wanted: Sequence[str] = ()
+) -> tuple[Surfels, Volume, tuple[str, ...]]:
+    """(Sheets, labels, names) of the kinds `shown` of those that are `wanted`, all by default; with notes on them."""
     from SlicerUSSim.Logic.base.errors import about_file
     from SlicerUSSim.Logic.mri.pathology import add_tissues
     from SlicerUSSim.Logic.mri.sheets.finding import ALL_KINDS, find_sheets
     from SlicerUSSim.Logic.mri.sheets.kept import sheets_beside
-    from SlicerUSSim.Logic.mri.sheets.polydata import write_surfels
+    from SlicerUSSim.Logic.tissue.surfels import KINDS
 
     with Share("sheets") as progress, about_file(mri_path):
         sheets = find_sheets(
-            mri, found, contrast=contrast, kinds=kinds or ALL_KINDS, keep_at=sheets_beside(mri_path), progress=progress
+            mri, found, contrast=contrast, kinds=wanted or ALL_KINDS, keep_at=sheets_beside(mri_path), progress=progress
         )
-    write_surfels(path, sheets.surfels)
     for line in sheets.notes:
-        note(line)
-    note(f"wrote {path}")
-    masks = sheets.masks()
-    if not masks:
-        return found.labels, found.tissue_names
-    added = add_tissues(found.labels, found.tissue_names, masks, has_brain_mask=True)
-    return added.labels, added.tissue_names
+        if not line.startswith(tuple(f"{kind}:" for kind in ALL_KINDS if kind not in shown)):
+            note(line)
+    labels, names = found.labels, found.tissue_names
+    masks = [mask for mask in sheets.masks() if mask[2] in shown]
+    if masks:
+        added = add_tissues(labels, names, masks, has_brain_mask=True)
+        labels, names = added.labels, added.tissue_names
+    return sheets.surfels.of_kind(*(set(KINDS) & set(shown))), labels, names
