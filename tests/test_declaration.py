@@ -381,7 +381,7 @@ def test_a_rare_parameter_is_a_key_of_set_and_preset(tmp_path):
     found = patient_of("--preset", tmp_path / "p.json", "--craniotomy", "none", "--set", "segmentation.classes=4")
     assert (found.segmentation.classes, found.craniotomy) == (4, "none")
     (tmp_path / "p.json").write_text('{"segmentation": {"clases": 3}}')
-    assert "p.json: segmentation: 'clases' is unknown, expected contrast, classes" in options_of(
+    assert "p.json: no parameter 'segmentation.clases', expected segmentation.classes" in options_of(
         "--preset", tmp_path / "p.json"
     )
 
@@ -440,6 +440,7 @@ def test_options_go_before_the_preset_and_set_before_them(tmp_path):
         (["--set", "gain_db"], "--set is 'gain_db', expected NAME=VALUE, such as display.gain_db=3"),
         (["--set", "display.gian_db=3"], "--set: no parameter 'display.gian_db', expected display.gain_db"),
         (["--set", "white matter.mu=3"], "--set: no parameter 'white matter.mu', expected white matter.mu1"),
+        (["--set", "segmentation.clases=3"], "--set: no parameter 'segmentation.clases', expected segmentation.cl"),
         (["--set", "foo.bar=3"], "--set: no parameter 'foo.bar', expected probe, display, settings, membrane or"),
         (["--set", "membrane.thickness_mm=11"], "--set membrane.thickness_mm: thickness_mm is 11.0, expected a number"),
         (["--set", "probe.radius_mm=30"], "probe: radius_mm is not a parameter of a phased probe"),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -111,35 +111,24 @@ class ImageOptions(MriOptions):
     )  # fmt: skip
 
 
-def split_also(texts: Iterable[str]) -> dict[str, str]:
-    """{contrast: file} of the values of --also. Raises SimulationError for another text or contrast, or one twice."""
-    contrasts, found = MRI_CONTRASTS, {}
+def also_files(texts: Iterable[str], mri: str | None = None) -> dict[str, str]:
+    """{contrast: file} of the values of --also.
+
+    Raises SimulationError for another text or contrast, one twice, and one file for two, of which `mri` may be one.
+    """
+    found: dict[str, str] = {}
     for text in texts:
         contrast, _, file = text.partition("=")
         require(file, f"--also is {text!r}, expected CONTRAST=FILE, such as t2=t2.nii.gz")
-        require(contrast in contrasts, f"--also: contrast is {contrast!r}, expected one of {', '.join(contrasts)}")
+        expected = f"expected one of {', '.join(MRI_CONTRASTS)}"
+        require(contrast in MRI_CONTRASTS, f"--also: contrast is {contrast!r}, {expected}")
         require(contrast not in found, f"--also: {contrast} is given twice, expected one volume per contrast")
+        others = {"the MRI": mri} if mri else {}
+        for name, other in (others | {f"--also {name}": at for name, at in found.items()}).items():
+            is_same = Path(file).exists() and Path(other).exists() and Path(other).samefile(file)
+            require(not is_same, f"--also {contrast}={file}: is the file of {name} again, expected another image")
         found[contrast] = file
     return found
-
-
-def read_also(texts: Iterable[str], mri: str | None = None) -> dict[str, Volume]:
-    """{contrast: volume} of the values of --also. Raises SimulationError for the file of the first `mri` again."""
-    from SlicerUSSim.Logic.base.volume import Volume  # imported here to keep --help fast
-
-    files = split_also(texts)
-    require_other_files(mri, files)
-    return {contrast: Volume.read(file) for contrast, file in files.items()}
-
-
-def require_other_files(mri: str | None, also: Mapping[str, str]) -> None:
-    """Raise SimulationError if two of an MRI and {contrast: file} of --also are one file."""
-    known = [] if mri is None else [("the MRI", Path(mri))]
-    for contrast, file in also.items():
-        for name, other in known:
-            is_same = Path(file).exists() and other.exists() and other.samefile(file)
-            require(not is_same, f"--also {contrast}={file}: is the file of {name} again, expected another image")
-        known.append((f"--also {contrast}", Path(file)))
 
 
 def require_no_map(path: str, maps: Iterable[str], organs: str | None) -> None:
@@ -156,6 +145,7 @@ def segmented_file(
     Raises SimulationError before the segmentation for `additions` that could not be added after it.
     """
     from SlicerUSSim.Logic.base.errors import about_file
+    from SlicerUSSim.Logic.base.volume import Volume
     from SlicerUSSim.Logic.mri.kept_mask import mask_beside
     from SlicerUSSim.Logic.mri.masks import read_mask
     from SlicerUSSim.Logic.mri.modality import has_brain_mask, segment_image
@@ -167,15 +157,14 @@ def segmented_file(
         require_no_options_beside_ct(path)
     require_no_map(path, maps, organs)
     require(organs is None or not is_of_brain, f"--organs is for a CT, expected --ct; {path} is read as an MRI")
-    others = read_also(patient.also, path)
+    others = {contrast: Volume.read(file) for contrast, file in also_files(patient.also, path).items()}
     brain = read_mask(patient.mask) if patient.mask else None
     additions.require_addable(mri, brain, settings.skull_strip if is_of_brain else "none")
     found = None if organs is None else _read_organs(organs, maps)
     with Share("segment") as progress, about_file(path):
         result = segment_image(
-            mri, settings, others=others, mask=brain, organs=found,
-            keep_mask_at=mask_beside(path) if is_file else None, device=patient.device,
-            progress=progress,
+            mri, settings, others=others, mask=brain, organs=found, progress=progress, device=patient.device,
+            keep_mask_at=mask_beside(path) if is_file else None,
         )  # fmt: skip
     lines = result.notes
     if isinstance(result, Segmentation) and not tell_all:

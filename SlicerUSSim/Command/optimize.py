@@ -77,22 +77,20 @@ def optimize(
     from SlicerUSSim.Logic.imaging.figures import require_matplotlib
     from SlicerUSSim.Logic.imaging.preset import Preset
 
-    report, save_preset, state, save_transform = (
-        results.report, results.save_preset, results.state, results.save_transform,
-    )  # fmt: skip
-    places = [place for place in (out, report, save_preset, save_transform, state, recording.field) if place]
-    check_outputs(out, report, save_preset, save_transform, recording.field)
+    report, state, save_transform = results.report, results.state, results.save_transform
+    outputs = (out, report, results.save_preset, save_transform, recording.field)
+    places = [place for place in (*outputs, state) if place]
+    check_outputs(*outputs)
     check_outputs(state, may_replace=True)  # which is read before it is written
     for place in places:
         same = [other for other in places if other.resolve() == place.resolve()]
         require(len(same) == 1, f"{place}: given for {len(same)} outputs, expected a separate file for each")
     if save_transform:
-        is_json = save_transform.suffix.lower() == ".json"
-        require(is_json, f"results.save_transform is {save_transform}, expected a name ending in .json")
+        expected = f"results.save_transform is {save_transform}, expected a name ending in .json"
+        require(save_transform.suffix.lower() == ".json", expected)
+        require(fit.register, "results.save_transform needs --register")
     if report:
         require_matplotlib()
-    if save_transform and not fit.register:
-        raise SimulationError("results.save_transform needs --register")
     names = dict(_free_parameter(text) for text in free) or dict.fromkeys(fit.free_names)
     tracked = open_tracked(patient, recording, most=_MOST_IMAGES, apart=fit.validate)
     simulator = tracked.examination.simulator
@@ -113,10 +111,10 @@ def optimize(
             )  # fmt: skip
             found = replace(found, prediction=prediction)
     write_json(out, found.to_dict())
-    if save_preset:
+    if results.save_preset:
         result = found.appearance
         preset = Preset(found.tracked.probe, result.display, simulator.settings, result.tissues)
-        preset.write(save_preset)
+        preset.write(results.save_preset)
     if save_transform and found.registration:
         to_mri = found.registration.correction @ tracked.reference_to_ras
         write_json(save_transform, {"probe_to_ras": to_mri.tolist()})
@@ -193,14 +191,10 @@ def _tell(found: Fit) -> None:
     click.echo(f"texture T1 {before[0]:.3f} -> {after[0]:.3f}, T2 {before[1]:.2f} -> {after[1]:.2f}")
     if found.speckle is not None:
         shown = found.speckle.display
+        slopes = f"{shown.map_black:.2f} {shown.map_dark:.2f} {shown.map_white:.2f}"
         click.echo(
             f"speckle: smoothing {shown.smoothing_axial_mm:.3f} mm, {shown.smoothing_lateral_deg:.2f} degrees; texture "
-            f"x {found.speckle.texture_factor:g}; grey map "
-            + (
-                f"{shown.map_black:.2f} {shown.map_dark:.2f} {shown.map_white:.2f}"
-                if found.speckle.has_map
-                else "as given"
-            )
+            f"x {found.speckle.texture_factor:g}; grey map {slopes if found.speckle.has_map else 'as given'}"
         )
     if found.prediction is not None:
         for line in found.prediction.lines():
@@ -209,10 +203,8 @@ def _tell(found: Fit) -> None:
         click.echo(found.speckle.spread.in_words())
     for parameter in result.parameters:
         spread = result.identifiability[parameter.name]
-        note = ""
-        if parameter.name in result.at_bounds:
-            note = "  at its bound"
-        elif spread.is_determined is False:
+        note = "  at its bound" if parameter.name in result.at_bounds else ""
+        if not note and spread.is_determined is False:
             note = f"  not determined: {spread.low:.3g} to {spread.high:.3g} fit as well"
         before, after = result.before[parameter.name], result.after[parameter.name]
         click.echo(f"{parameter.name:42s} {before:8.3f} -> {after:8.3f}{note}")

@@ -10,6 +10,7 @@ import os
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import Field, field, fields
+from difflib import get_close_matches
 from functools import wraps
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -238,11 +239,11 @@ def _read_keys(context: click.Context, known: Mapping[str, Key]) -> None:
     for key, value in _of_file(context.params.get("preset"), own):
         if context.get_parameter_source(own[key].option.name or "") is not ParameterSource.COMMANDLINE:
             found[key] = value if isinstance(value, list) else [value]
-    of_file, rest = set(found), []
+    of_file, rest, sections = set(found), [], {key.partition(".")[0] for key in own}
     for text in context.params.get("changes", ()):
         key, equals, value = (part.strip() for part in text.partition("="))
-        if key in own and equals:
-            entry = own[key].entry
+        if equals and key.partition(".")[0] in sections:
+            entry = _known("--set: ", key, own).entry
             value = value if entry is None else entry.from_text(f"--set {key}", value)
             found[key] = [*(found[key] if key in found and key not in of_file else ()), value]
             of_file.discard(key)
@@ -270,21 +271,25 @@ def _of_file(preset: str | None, own: Mapping[str, Key]) -> Iterator[tuple[str, 
     from SlicerUSSim.Logic.base.files import read_json
 
     content = read_json(preset)
-    sections = dict.fromkeys(key.partition(".")[0] for key in own)
-    for section in sections if isinstance(content, dict) else ():
+    for section in dict.fromkeys(key.partition(".")[0] for key in own) if isinstance(content, dict) else ():
         values = content.get(section, {})
         require(isinstance(values, dict), f"{preset}: {section} is {values!r}, expected an object")
         for name, value in values.items():
-            key = f"{section}.{name}"
-            names = [other.partition(".")[2] for other in own if other.startswith(f"{section}.")]
-            require(key in own, f"{preset}: {section}: {name!r} is unknown, expected {either(names)}")
-            entry = own[key].entry
+            entry = _known(f"{preset}: ", f"{section}.{name}", own).entry
+            is_plain = entry is None and not isinstance(value, list)
             yield (
-                key,
-                str(value)
-                if entry is None and not isinstance(value, list)
-                else (value if entry is None else entry.checked(f"{preset}: {section}", value)),
+                f"{section}.{name}",
+                (str(value) if is_plain else value if entry is None else entry.checked(f"{preset}: {section}", value)),
             )
+
+
+def _known(where: str, key: str, own: Mapping[str, Key]) -> Key:
+    """The Key with a name. Raises SimulationError with similar ones, or those of its section, for an unknown name."""
+    of_section = [other for other in own if other.partition(".")[0] == key.partition(".")[0]]
+    require(
+        key in own, f"{where}no parameter {key!r}, expected {either(get_close_matches(key, of_section) or of_section)}"
+    )
+    return own[key]
 
 
 def _filled(kind: type, given: dict[str, Any]) -> Any:

@@ -9,7 +9,7 @@ from time import perf_counter
 import click
 
 from SlicerUSSim.Command.additions import Additions
-from SlicerUSSim.Command.mri_options import MriOptions, read_mri, segmented_file, split_also
+from SlicerUSSim.Command.mri_options import MriOptions, also_files, read_mri, segmented_file
 from SlicerUSSim.Command.options import check_outputs, gathered, out_option, overwrite_option
 from SlicerUSSim.Command.progress import note
 from SlicerUSSim.Command.proposals import (
@@ -20,9 +20,8 @@ from SlicerUSSim.Command.proposals import (
     split_seeds,
     write_proposals,
 )
-from SlicerUSSim.Command.set_option import Changes
 from SlicerUSSim.Command.sheet_options import require_sheets, sheet_kind_option, sheets_option, write_sheets
-from SlicerUSSim.Logic.base.errors import require
+from SlicerUSSim.Logic.base.errors import SimulationError, require
 
 
 @click.command()
@@ -44,13 +43,14 @@ def segment(
     from SlicerUSSim.Logic.tissue.table import TissueTable, tissues_beside, write_label_files
 
     settings, mask = patient.segmentation, patient.mask
-    Changes.of(patient.changes).require_none()
+    for change in patient.changes:
+        raise SimulationError(f"--set {change}: no image is simulated, expected a key of segmentation")
     require_image_name(out)
     check_outputs(out, tissues_beside(out))
     if settings.outside and not patient.is_ct:
         require_findable(settings.contrast, settings.skull_strip, mask is not None)
     require_sheets(sheets, sheet_kinds, settings.contrast)
-    split_also(patient.also)
+    also_files(patient.also)
     split_seeds(seeds)
     masks = Additions.read(patient.additions)
     volume = read_mri(mri, mask=mask, skull_strip=settings.skull_strip, contrast=settings.contrast)

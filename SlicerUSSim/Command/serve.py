@@ -15,7 +15,7 @@ import click
 from SlicerUSSim.Command.additions import Additions, split_additions
 from SlicerUSSim.Command.craniotomy_options import NONE, Craniotomy
 from SlicerUSSim.Command.interrupts import end_at_once
-from SlicerUSSim.Command.mri_options import ImageOptions, read_mri, require_other_files, split_also
+from SlicerUSSim.Command.mri_options import ImageOptions, also_files, read_mri
 from SlicerUSSim.Command.options import declared, gathered, given_options, require_no_mri_options
 from SlicerUSSim.Command.patient_options import RARE
 from SlicerUSSim.Command.progress import note
@@ -89,9 +89,8 @@ def serve(patient: ServeOptions, recording: TrackingOptions) -> None:
     if mri is not None and _is_no_image(mri):
         (scene, scene_name), also_open, mri = _opened_first(mri, given_options(*_OF_PATIENT))
     added = split_additions(patient.additions)
-    others = split_also(patient.also)
+    others = also_files(patient.also, mri)
     require(len(others) < 2, f"--also is given {len(others)} times, expected one further MRI in the workstation")
-    require_other_files(mri, others)
     own = (mri, patient.labels, patient.mask, patient.organs)
     files = [file for file in (*own, *(file for _, file in added), *others.values()) if file is not None]
     # Checked here, so that the error is reported in the terminal and not on the page.
@@ -119,13 +118,8 @@ def serve(patient: ServeOptions, recording: TrackingOptions) -> None:
     drawn = DrawnSheets.of(
         patient.sheets, patient.no_sheets, is_labels=patient.labels is not None, contrast=patient.contrast
     )
-    read_head = partial(
-        read_mri,
-        mask=patient.mask,
-        skull_strip=chosen.skull_strip,
-        contrast=patient.contrast,
-        is_served=True,
-    )
+    more = {"mask": patient.mask, "skull_strip": chosen.skull_strip, "contrast": patient.contrast}
+    read_head = partial(read_mri, is_served=True, **more)
     opening = Craniotomy.of(patient.craniotomy)
     if opening.is_wanted and patient.labels is None:
         require(
@@ -143,8 +137,6 @@ def serve(patient: ServeOptions, recording: TrackingOptions) -> None:
         from SlicerUSSim.Logic.tracked.openigtlink import parse_address, require_usable
 
         require_usable(parse_address(patient.igtl))
-    has_both = (patient.cert is None) == (patient.key is None)
-    require(has_both, "--cert and --key are for each other, expected both or none")
     tls = _tls(patient.cert, patient.key)
     port = _usable_port(patient.host, patient.port)
 
@@ -159,11 +151,8 @@ def serve(patient: ServeOptions, recording: TrackingOptions) -> None:
         volumes[mri] = read_head(mri)
     checked = Additions.of((tissue, with_label_names(volumes[file], file), file) for tissue, file in added)
     if mri is not None and patient.labels is None:
-        checked.require_addable(
-            volumes[mri],
-            None if patient.mask is None else volumes[patient.mask],
-            "none" if is_ct else chosen.skull_strip,
-        )
+        mask = None if patient.mask is None else volumes[patient.mask]
+        checked.require_addable(volumes[mri], mask, "none" if is_ct else chosen.skull_strip)
     if patient.labels is not None and mri is not None and (has_mask or others):
         what = " and ".join([*["--mask"] * has_mask, *["--also"] * bool(others)])
         note(f"{what}: for Segment in the page; the labels shown are those of {patient.labels}")
@@ -249,6 +238,7 @@ def _require_workstation() -> None:
 
 
 def _tls(cert: str | None, key: str | None) -> ssl.SSLContext | None:
+    require((cert is None) == (key is None), "--cert and --key are for each other, expected both or none")
     if cert is None or key is None:
         return None
     from SlicerUSSim.Workstation.access import tls_context

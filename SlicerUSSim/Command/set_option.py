@@ -62,11 +62,6 @@ class Changes:
         of_preset |= {f"{_MEMBRANE}.{known}": entry for known, entry in of_membrane.items()}
         raise SimulationError(f"--set: no parameter {name!r}, expected {_hint(name, section, of_preset, of_tissue)}")
 
-    def require_none(self) -> None:
-        """Raise SimulationError for a command that only segments, and has no use for them."""
-        name = next(iter((*self.sections, *self.tissues, *("membrane" for _ in self.membrane))), None)
-        require(name is None, f"--set {name}: no image is simulated, expected a key of segmentation")
-
     @property
     def gives_geometry(self) -> bool:
         """Whether the geometry of the probe was set, and not only its beam."""

@@ -40,8 +40,7 @@ def simulate(patient: PatientOptions, pose: str, out: Path) -> None:
         write_png(out, frame.image)
     else:
         frame.to_volume().write(out)
-    kind = "labels" if examination.is_labels else "CT" if patient.is_ct else "MRI"
-    note(f"wrote {out} ({frame.image.shape[1]}x{frame.image.shape[0]}, from {kind})")
+    note(f"wrote {out} ({frame.image.shape[1]}x{frame.image.shape[0]})")
 
 
 @click.command()
