@@ -237,11 +237,10 @@ def _nibabel() -> Any:
     """nibabel without pydicom, which it would load (0.4 s) for extensions of headers that nothing here reads."""
     withheld = sys.modules.setdefault("pydicom", None) is None  # type: ignore[arg-type]
     try:
-        import nibabel
+        return importlib.import_module("nibabel")
     finally:
         if withheld:
             del sys.modules["pydicom"]
-    return nibabel
 
 
 def _read_nifti(path: Path) -> ImageFile:
@@ -328,9 +327,7 @@ def _read_mgh(path: Path) -> ImageFile:
 def _read_minc1(path: Path) -> ImageFile:
     """MINC 1, which is NetCDF; MINC 2 is HDF5, which ITK reads."""
     require_package("nibabel", "nibabel", f"{path}: reading MINC 1")
-    import nibabel
-
-    image: Any = nibabel.Minc1Image.from_filename(path)
+    image = _nibabel().Minc1Image.from_filename(path)
     values = np.asarray(image.dataobj)
     whole = values.round()
     if np.issubdtype(image.get_data_dtype(), np.integer) and np.abs(values - whole).max() < 1e-3:
