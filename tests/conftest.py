@@ -119,8 +119,7 @@ def _unchanged_locale():
 def segmented_once():
     """Commands and scenes segment the same image with the same arguments once for all tests (tests.remembered)."""
     with pytest.MonkeyPatch.context() as patch:
-        for module in ("Logic.mri.modality", "Command.whole_line"):
-            patch.setattr(f"SlicerUSSim.{module}.segment_mri", segment_once)
+        patch.setattr("SlicerUSSim.Logic.mri.modality.segment_mri", segment_once)
         yield
 
 

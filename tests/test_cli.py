@@ -13,7 +13,7 @@ from click.testing import CliRunner
 from PIL import Image
 
 from SlicerUSSim.Command.cli import main
-from SlicerUSSim.Logic import Preset, UltrasoundSimulator, Volume
+from SlicerUSSim.Logic import UltrasoundSimulator, Volume
 from SlicerUSSim.Logic.mri.samples import head_mri
 from SlicerUSSim.Logic.probe.arrays import PROBES
 from SlicerUSSim.Logic.tracked.pose_files import read_pose, write_pose
@@ -96,20 +96,6 @@ def test_a_probe_that_places_itself_looks_at_what_was_added(head, tmp_path):
     assert sitk.GetArrayFromImage(image)[0, round(j), round(i)] > 0
 
 
-@pytest.mark.slow
-def test_the_demo_without_nilearn_says_that_it_uses_a_phantom(monkeypatch):
-    import importlib.util
-
-    from SlicerUSSim.Logic.mri.samples import demo_mri
-
-    find = importlib.util.find_spec
-    monkeypatch.setattr(
-        importlib.util, "find_spec", lambda name, *rest: None if name == "nilearn" else find(name, *rest)
-    )
-    volume, source = demo_mri()
-    assert "synthetic head phantom" in source and volume.array.max() > 0
-
-
 def test_segment_writes_labels_and_their_tissues(labels, head):
     volume = Volume.read(labels)
     assert set(np.unique(volume.array)) == {0, 1, 2, 3, 4}
@@ -150,6 +136,8 @@ def bad_inputs(folder):
     (folder / "broken.nii.gz").write_text("broken")
     Volume(np.full((8, 8, 8), 5.0), np.eye(4)).write(folder / "constant.nrrd")
     Volume(np.full((8, 8, 8), 9, np.uint8), np.eye(4)).write(folder / "nine.nrrd")
+    images = np.random.default_rng(0).integers(0, 255, (2, 40, 30)).astype(np.uint8)
+    TrackedSequence(images, [{"ImageToReference": np.eye(4)}] * 2, [0.0, 0.1]).write(folder / "sweep.igs.mha")
     segment, out = ["segment", folder / "head.nii.gz", "-o"], folder / "out.png"
     simulate = ["simulate", folder / "head.nii.gz", "-o", out, "--pose"]
     return [
@@ -162,10 +150,19 @@ def bad_inputs(folder):
         ([*segment, folder / "l.nii.gz", "--classes", 9], "classes is 9"),
         ([*segment, folder / "l.nii.gz", "--map", "24=csf"], "--map is for a label map"),
         ([*segment, folder / "l.nii.gz", "--mask", folder / "nine.nrrd"], "same grid"),
+        ([*segment, folder / "l.nii.gz", "--also", f"t2={folder / 'head.nii.gz'}"], "is the file of the MRI again"),
+        (
+            ["segment", folder / "sweep.igs.mha", "-o", folder / "l.nii.gz"],
+            "is a sequence of tracked ultrasound images",
+        ),
         ([*simulate, folder / "none.txt"], "none.txt' (no such file)"),
         ([*simulate, folder / "scaled.txt"], "last row"),
         ([*simulate, folder / "nokey.json"], 'no "probe_to_ras"'),
         ([*simulate, "auto", "--probe", folder / "probe.json"], "width_mm is -4"),
+        (
+            [*simulate, "auto", "--probe", "neonatel"],
+            f"which is no file, expected a JSON file or one of {', '.join(PROBES)}",
+        ),
         ([*simulate, "auto", "--device", "abacus"], "no OpenCL device fits 'abacus'"),
         ([*simulate, "auto", "--seed", -1], "seed is -1"),
         (["demo", "--mri", folder / "head.nii.gz", "--out", folder / "probe.json" / "x"], "cannot be created"),
@@ -237,13 +234,13 @@ def test_values_that_are_no_text_and_sweeps_without_end_are_refused(labels, tmp_
         ("o.png", "simulate none.mha --pose auto -o o.png"),
         ("o.mnc", "volume none.mha --pose auto --tilt 5 -o o.mnc"),
         ("o.mhd", "sweep none.mha --sequence none.mha -o o.mhd"),
-        ("f.png", "sweep none.mha --sequence none.mha -o o.mhd --field f.png"),
+        ("f.png", "sweep none.mha --sequence none.mha -o o.mhd --set recording.field=f.png"),
         ("o.mha", "segment none.mha -o o.mha"),
         ("o.json", "segment none.mha -o o.mha"),
         ("s.vtp", "segment none.mha -o o.mha --sheets s.vtp"),
-        *((name, f"optimize none.mha --sequence none.mha -o o.json {option} {name}") for option, name in (
-            ("-o", "r.json"), ("--report", "r.html"), ("--save-preset", "p.json"), ("--save-transform", "t.json"),
-            ("--field", "f.png"),
+        *((name, f"optimize none.mha --sequence none.mha -o o.json {option}{name}") for option, name in (
+            ("-o ", "r.json"), ("--report ", "r.html"), ("--save-preset ", "p.json"),
+            ("--set results.save_transform=", "t.json"), ("--set recording.field=", "f.png"),
         )),
     ],
 )  # fmt: skip
@@ -274,7 +271,7 @@ _MASK, _ALSO = ["--mask", "{labels}"], ["--also", "t2={labels}", "--contrast", "
         ("simulate", _MASK, "--mask is for an MRI"),
         ("simulate", ["--contrast", "t1"], "--contrast is for an MRI"),
         ("simulate", ["--skull-strip", "none"], "--skull-strip is for an MRI"),
-        ("simulate", ["--no-thin-sulci"], "--thin-sulci is for an MRI"),
+        ("simulate", ["--set", "segmentation.thin_sulci=false"], "--set segmentation.thin_sulci is for an MRI"),
         ("volume", _MASK, "--mask is for an MRI"),
         ("sweep", _ALSO, "--also are for an MRI"),
         ("optimize", _ALSO, "--also are for an MRI"),
@@ -293,18 +290,6 @@ def test_options_for_an_mri_are_refused_with_labels(command, given, named, label
     assert f"{labels}: is a label map, and " in result.stderr and "use --mri if it is one" in result.stderr
 
 
-@pytest.mark.slow
-def test_errors_about_another_mri_name_its_file_alone(head, labels, tmp_path):
-    constant = tmp_path / "constant.nii.gz"
-    mri = Volume.read(head)
-    mri.with_array(np.full(mri.array.shape, 7.0, np.float32)).write(constant)
-    for other in (constant, labels):
-        result = ussim("segment", head, "--also", f"t2={other}", "-o", tmp_path / "o.nii.gz")
-        assert result.exit_code == 2 and str(other) in result.stderr and str(head) not in result.stderr
-    result = ussim("segment", head, "--also", f"t2={head}", "-o", tmp_path / "o.nii.gz")
-    assert result.exit_code == 2 and f"--also t2={head}: is the file of the MRI again, expected" in result.stderr
-
-
 def test_a_pose_past_the_volume_is_a_warning_and_a_black_image(labels, tmp_path):
     pose = np.eye(4)
     pose[:3, 3] = [500, 0, 0]
@@ -314,25 +299,6 @@ def test_a_pose_past_the_volume_is_a_warning_and_a_black_image(labels, tmp_path)
     assert "ussim: warning: the probe looks past the volume" in result.stderr
     # Below the ring-down at the face there is amplifier noise only.
     assert np.asarray(Image.open(tmp_path / "o.png"))[128:].max() < 40
-
-
-def test_a_preset_gives_the_same_image_and_options_go_before_it(head, labels, tmp_path):
-    preset = Preset(PROBES["microconvex"]).changed("display", gain_db=6.0).changed("settings", seed=5)
-    preset.write(tmp_path / "preset.json")
-    probe = tmp_path / "probe.json"
-    probe.write_text(json.dumps(preset.probe.to_dict()))
-
-    def image(*options):
-        out = tmp_path / "image.png"
-        result = ussim("simulate", labels, "--pose", "auto", "-o", out, "--overwrite", *options)
-        assert result.exit_code == 0, result.output
-        return np.asarray(Image.open(out))
-
-    whole = image("--preset", tmp_path / "preset.json")
-    np.testing.assert_array_equal(whole, image("--probe", probe, "--gain", 6, "--seed", 5))
-    quieter = image("--preset", tmp_path / "preset.json", "--gain", -6)
-    np.testing.assert_array_equal(quieter, image("--probe", probe, "--gain", -6, "--seed", 5))
-    assert quieter.mean() < whole.mean()
 
 
 def test_an_mri_gives_its_simulator_shares_of_voxels_and_labels_none(head, labels, tmp_path, monkeypatch):
@@ -371,17 +337,6 @@ def test_set_changes_the_tissues_of_labels_and_of_an_mri(of, head, labels, tmp_p
         assert not (tmp_path / "o.png").exists()
 
 
-def test_a_tracked_sweep_given_as_an_mri_is_called_what_it_is(tmp_path):
-    """Formerly it "goes through the image from the bottom to the top, as a limb or a body does"."""
-    rng = np.random.default_rng(0)
-    sweep = TrackedSequence(
-        rng.integers(0, 255, (4, 40, 30)).astype(np.uint8), [{"ImageToReference": np.eye(4)}] * 4, [0.0, 0.1, 0.2, 0.3]
-    )
-    sweep.write(tmp_path / "sweep.igs.mha")
-    result = ussim("segment", tmp_path / "sweep.igs.mha", "-o", tmp_path / "out.nii.gz")
-    assert result.exit_code == 2 and "is a sequence of tracked ultrasound images, expected an MRI" in result.stderr
-
-
 @pytest.mark.long
 def test_the_demo_replaces_only_files_that_it_wrote_itself(head, tmp_path):
     pytest.importorskip("matplotlib", reason="pictures need matplotlib: pip install '.[demo]'")
@@ -390,31 +345,15 @@ def test_the_demo_replaces_only_files_that_it_wrote_itself(head, tmp_path):
     mine = out / "figure.png"
     mine.write_bytes(b"my figure")
     (out / "notes.txt").write_text("mine")
-    result = ussim("demo", "--mri", head, "--out", out)
+    result = ussim("demo", "--mri", head, "-o", out)
     assert result.exit_code == 2 and f"{mine}: exists, and without demo.json the folder is" in result.stderr
     assert mine.read_bytes() == b"my figure"
     mine.unlink()
-    assert ussim("demo", "--mri", head, "--out", out).exit_code == 0
-    assert ussim("demo", "--mri", head, "--out", out).exit_code == 0  # its own files are replaced
+    assert ussim("demo", "--mri", head, "-o", out).exit_code == 0
+    assert ussim("demo", "--mri", head, "-o", out).exit_code == 0  # its own files are replaced
     assert not list(out.glob(".results-*")) and (out / "notes.txt").read_text() == "mine"
     result = ussim("demo", "--mri", out / "labels.nii.gz", "--out", out)
     assert result.exit_code == 2 and "labels.nii.gz is an input, which it would replace" in result.stderr
-
-
-def test_simulate_takes_probes_by_name(labels, tmp_path):
-    """`--probe neonatal` was read as a file."""
-    named, from_file = tmp_path / "named.png", tmp_path / "file.png"
-    (tmp_path / "probe.json").write_text(json.dumps(PROBES["neonatal"].to_dict()))
-    for probe, out in (("neonatal", named), (tmp_path / "probe.json", from_file)):
-        result = ussim(
-            "simulate", labels, "--pose", "auto", "--probe", probe, "--set", "probe.scan_lines=32", "-o", out
-        )
-        assert result.exit_code == 0, result.output
-    np.testing.assert_array_equal(np.asarray(Image.open(named)), np.asarray(Image.open(from_file)))
-    result = ussim("simulate", labels, "--pose", "auto", "--probe", "neonatel", "-o", tmp_path / "none.png")
-    assert result.exit_code == 2 and len(result.stderr.splitlines()) == 1
-    assert "neonatel" in result.stderr and ", ".join(PROBES) in result.stderr
-    assert not (tmp_path / "none.png").exists()
 
 
 @pytest.mark.skipif(not os.path.exists("/dev/full"), reason="a file on a full disk is made by Linux")

@@ -60,9 +60,9 @@ def optimize(folder, *options):
 def test_optimize_writes_result_report_preset_and_state(folder):
     pytest.importorskip("matplotlib", reason="reports need matplotlib: pip install '.[demo]'")
     done = optimize(
-        folder, "--evaluations", 30, "--restarts", 1, "--report", folder / "report.html", "--save-preset",
-        folder / "preset.json", "--state", folder / "state.json", "--free", "display", "--free",
-        "white matter.mu0=0.1:0.9",
+        folder, "--set", "fit.evaluations=30", "--set", "fit.restarts=1", "--report", folder / "report.html",
+        "--save-preset", folder / "preset.json", "--set", f"results.state={folder / 'state.json'}", "--free", "display",
+        "--free", "white matter.mu0=0.1:0.9",
     )  # fmt: skip
     assert done.exit_code == 0, done.output
     result = json.loads((folder / "result.json").read_text())
@@ -83,8 +83,8 @@ def test_optimize_writes_result_report_preset_and_state(folder):
         assert words in report
 
     again = optimize(
-        folder, "--evaluations", 30, "--restarts", 1, "--state", folder / "state.json", "--free", "display", "--free",
-        "white matter.mu0=0.1:0.9",
+        folder, "--set", "fit.evaluations=30", "--set", "fit.restarts=1", "--set",
+        f"results.state={folder / 'state.json'}", "--free", "display", "--free", "white matter.mu0=0.1:0.9",
     )  # fmt: skip
     assert "(0 evaluations)" in again.output
 
@@ -94,7 +94,7 @@ def test_a_probe_off_the_patient_is_said(folder, tmp_path, monkeypatch):
     write_json(tmp_path / "off.json", rigid_from([300.0, 0.0, 0.0, 0.0, 0.0, 0.0]).tolist())
     done = ussim(
         "sweep", folder / "labels.nii.gz", "--sequence", folder / "tracked.igs.mha", "--probe", folder / "probe.json",
-        "-o", "o.igs.mha", "--contact-gap", 3, "--to-mri", tmp_path / "off.json",
+        "-o", "o.igs.mha", "--set", "settings.contact_gap_mm=3", "--to-mri", tmp_path / "off.json",
     )  # fmt: skip
     assert "in 3 of 3 images 0% of the probe's face touches the patient (contact gap: 3 mm)" in done.stderr
 
@@ -129,7 +129,7 @@ def test_a_sweep_is_never_taken_for_a_recording(name, folder, tmp_path):
 def test_sweep_draws_the_same_images_on_the_same_pixels(folder):
     done = ussim(
         "sweep", folder / "labels.nii.gz", "--sequence", folder / "tracked.igs.mha", "--probe", folder / "probe.json",
-        "--frames", "2,0", "-o", folder / "simulated.seq.nrrd", "--field", folder / "field.png",
+        "--frames", "2,0", "-o", folder / "simulated.seq.nrrd", "--set", f"recording.field={folder / 'field.png'}",
     )  # fmt: skip
     assert done.exit_code == 0, done.output
     assert (folder / "field.png").stat().st_size > 1000
@@ -170,8 +170,8 @@ def test_the_saved_transform_puts_the_images_where_the_fit_found_them(folder, tm
     given_map = rigid_from([1.5, -1.0, 2.0, 2.0, -1.0, 1.5])
     write_pose(tmp_path / "given.json", given_map)
     done = optimize(
-        folder, "--register", "--evaluations", 12, "--restarts", 0, "--free", "display", "--save-transform",
-        tmp_path / "saved.json", "--to-mri", tmp_path / "given.json",
+        folder, "--register", "--set", "fit.evaluations=12", "--set", "fit.restarts=0", "--free", "display", "--set",
+        f"results.save_transform={tmp_path / 'saved.json'}", "--to-mri", tmp_path / "given.json",
     )  # fmt: skip
     assert done.exit_code == 0, done.output
     assert re.search(r"moved by [\d.]+ mm and [\d.]+ degrees", done.output)
@@ -206,14 +206,15 @@ def test_a_volume_with_landmarks_is_cut_where_the_probe_looked(folder, tmp_path)
     rows = "\n".join(" ".join(map(str, [*p, *(np.array(p) + shift)])) + ' "x"' for p in points)
     (tmp_path / "case.tag").write_text(f"MNI Tag Point File\nVolumes = 2;\n\nPoints =\n{rows};\n")
     common = (
-        folder / "labels.nii.gz", "--sequence", tmp_path / "us.nii.gz", "--cut", tmp_path / "probe-pose.json",
+        folder / "labels.nii.gz", "--sequence", tmp_path / "us.nii.gz", "--set",
+        f"recording.cut={tmp_path / 'probe-pose.json'}",
         "--probe", folder / "probe.json", "--to-mri", tmp_path / "case.tag",
     )  # fmt: skip
     costs = []
     for where in (common, common[:-2]):  # with the landmarks, and without them somewhere else in the brain
         done = ussim(
-            "optimize", *where, "--cut-tilt", 12, "--cuts", 2, "--free", "display", "--evaluations", 60, "--restarts",
-            0, "-o", tmp_path / "result.json", "--overwrite",
+            "optimize", *where, "--set", "recording.cut_tilt=12", "--set", "recording.cuts=2", "--free", "display",
+            "--set", "fit.evaluations=60", "--set", "fit.restarts=0", "-o", tmp_path / "result.json", "--overwrite",
         )  # fmt: skip
         assert done.exit_code == 0, done.output
         assert ("4 landmarks agree to 0.00 mm" in done.output) == (where is common)
@@ -227,22 +228,25 @@ def test_a_volume_with_landmarks_is_cut_where_the_probe_looked(folder, tmp_path)
 @pytest.mark.parametrize(
     "options, message",
     [
-        (["--frames", "0,1", "--validate", "1:"], "images 1 are fitted and predicted, expected others to predict"),
-        (["--validate", "9"], "image 9 does not exist, expected 0 to 2"),
+        (
+            ["--frames", "0,1", "--set", "fit.validate=1:"],
+            "images 1 are fitted and predicted, expected others to predict",
+        ),
+        (["--set", "fit.validate=9"], "image 9 does not exist, expected 0 to 2"),
         (["--frames", "one"], "frames are 'one', expected numbers such as 0,5,10 or 0:20:5"),
         (["--free", "gain_db=5:1"], "bounds of gain_db are 5.0 to 1.0, expected two numbers, the smaller one first"),
         (["--free", "liver.mu0"], "no free parameter 'liver.mu0'"),
-        (["--save-transform", "there.json"], "--save-transform needs --register"),
-        (["--register", "--save-transform", "there.tfm"], "there.tfm, expected a name ending in .json"),
-        (["--state", "result.json"], "given for 2 outputs, expected a separate file for each"),
-        (["--state", "probe.json"], "probe.json is an input, which it would replace"),
+        (["--set", "results.save_transform=there.json"], "results.save_transform needs --register"),
+        (["--register", "--set", "results.save_transform=there.tfm"], "there.tfm, expected a name ending in .json"),
+        (["--set", "results.state=result.json"], "given for 2 outputs, expected a separate file for each"),
+        (["--set", "results.state=probe.json"], "probe.json is an input, which it would replace"),
     ],
 )
 def test_mistakes_are_one_line_and_write_nothing(folder, options, message, monkeypatch):
     monkeypatch.chdir(folder)
     (folder / "result.json").unlink(missing_ok=True)
     before = sorted(path.name for path in folder.iterdir())
-    done = optimize(folder, "--evaluations", 5, *options)
+    done = optimize(folder, "--set", "fit.evaluations=5", *options)
     assert done.exit_code == 2
     lines = [line for line in done.output.splitlines() if line.startswith("ussim:")]
     assert len(lines) == 1 and message in lines[0]
@@ -256,8 +260,8 @@ def test_the_example_writes_a_twin_that_optimize_reads(mni, tmp_path, monkeypatc
     assert "tracked.igs.mha" in capsys.readouterr().err
     done = ussim(
         "optimize", tmp_path / "labels.nii.gz", "--sequence", tmp_path / "tracked.igs.mha", "--probe",
-        tmp_path / "probe.json", "--frames", "1", "--free", "display", "--evaluations", 30, "--restarts", 0, "-o",
-        tmp_path / "result.json",
+        tmp_path / "probe.json", "--frames", "1", "--free", "display", "--set", "fit.evaluations=30",
+        "--set", "fit.restarts=0", "-o", tmp_path / "result.json",
     )  # fmt: skip
     assert done.exit_code == 0, done.output
     truth, result = (json.loads((tmp_path / f"{name}.json").read_text()) for name in ("truth", "result"))

@@ -18,7 +18,7 @@ from SlicerUSSim.Logic import (
     UltrasoundSimulator,
     optimize_appearance,
 )
-from SlicerUSSim.Logic.fitting import AppearanceModel, FreeParameters, speckle_widths
+from SlicerUSSim.Logic.fitting import AppearanceModel, speckle_widths
 from SlicerUSSim.Logic.imaging.console import gains_across, gains_along
 from SlicerUSSim.Logic.imaging.grey_map import GREY_MAPS, TABLE_SIZE, estimate_grey_map, grey_table, slope_at
 from SlicerUSSim.Logic.probe import PROBES, ImageGrid, probe_from_dict
@@ -93,16 +93,6 @@ def test_smoothing_widens_speckle_by_its_sigma(solid):
         (plain.lateral_mm, smooth.lateral_mm, np.deg2rad(0.6) * probe.focus_mm),
     ):
         assert 0.9 * np.hypot(before, np.sqrt(2) * sigma) < after < 1.6 * np.hypot(before, np.sqrt(2) * sigma)
-
-
-def test_smoothing_fills_the_black_between_grains(solid):
-    probe, pose = LinearProbe(30, 40, scan_lines=181), rigid(np.eye(3), [0, -30, 0])
-    plain, smooth = (
-        solid.simulate(probe, pose, even_display(smoothing_axial_mm=a, smoothing_lateral_deg=b)).image[60:-60, 60:-60]
-        for a, b in ((0.0, 0.0), (0.1, 0.34))
-    )
-    below = [float(np.median(i) - np.percentile(i, 1)) for i in (plain.astype(float), smooth.astype(float))]
-    assert below[1] < 0.75 * below[0]
 
 
 @pytest.mark.parametrize("number", [5, *(pytest.param(n, marks=pytest.mark.slow) for n in (1, 8))])
@@ -224,18 +214,6 @@ def test_fits_find_what_the_console_does(solid):
     assert result.cost_after < 0.25 * result.cost_before
     assert result.display.depth_gain_6_db == pytest.approx(8.0, abs=1.5)
     assert result.display.smoothing_axial_mm == pytest.approx(0.12, abs=0.04)
-
-
-def test_names_stand_for_what_is_not_on_request(solid):
-    names = FreeParameters.of(["display"], TissueTable({1: EVEN}), even_display()).names
-    assert names == ["gain_db", "dynamic_range_db", "tgc_db_cm_mhz", "near_gain_db", "noise_db"]
-    sliders = FreeParameters.of(["sliders"], TissueTable({1: EVEN}), even_display()).names
-    assert sliders == [f"depth_gain_{n}_db" for n in range(1, 9)]
-    assert FreeParameters.of(["map"], TissueTable({1: EVEN}), even_display()).names == [
-        "map_black",
-        "map_dark",
-        "map_white",
-    ]
 
 
 def test_bases_of_a_fit_have_the_console(small):

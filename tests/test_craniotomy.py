@@ -240,7 +240,7 @@ def test_the_beam_reaches_the_brain_through_the_opening_alone(head, tmp_path):
     (tmp_path / "pose.json").write_text(json.dumps(TOP.tolist()))
     on_skin, told = image(tmp_path, "--pose", "auto")
     assert "gel fills gaps of up to 3 mm between skin and probe" in told
-    _, told = image(tmp_path, "--pose", "auto", "--contact-gap", "5")  # was replaced by 3 mm
+    _, told = image(tmp_path, "--pose", "auto", "--set", "settings.contact_gap_mm=5")  # was replaced by 3 mm
     assert "gel" not in told
     through, told = image(tmp_path, "--pose", "auto", "--craniotomy", "auto")
     assert "craniotomy: a disc of" in told and "gel" not in told

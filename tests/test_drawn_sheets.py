@@ -290,13 +290,13 @@ def test_options_of_the_command(tmp_path):
     write_surfels(tmp_path / "s.vtp", surfels)
     call = ["simulate", str(tmp_path / "labels.nii.gz"), "--labels", "--pose", str(tmp_path / "pose.txt")]
     sheets, images = ["--sheets", str(tmp_path / "s.vtp")], {}
-    for name, more in (("none", []), ("file", sheets), ("off", [*sheets, "--no-sheet", "sulcus"])):
+    for name, more in (("none", []), ("file", sheets), ("off", [*sheets, "--set", "patient.no_sheets=sulcus"])):
         result = CliRunner().invoke(main, [*call, "-o", str(tmp_path / f"{name}.png"), *more])
         assert result.exit_code == 0, result.output
         images[name] = (tmp_path / f"{name}.png").read_bytes()
     assert images["none"] == images["off"] != images["file"]
     for given, without, message in (
-        ("none", ("falx",), "give --sheets, too"), ("auto", ("dura",), "--no-sheet is 'dura'"),
+        ("none", ("falx",), "give --sheets, too"), ("auto", ("dura",), "no_sheets is 'dura'"),
         ("auto", (), "a label map has no sheets"), ("nowhere.vtp", (), "no such file"),
         ("all", (), "expected a .vtp file, auto or none"),
     ):  # fmt: skip

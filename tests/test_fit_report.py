@@ -59,7 +59,8 @@ def folder(tmp_path_factory):
 def optimize(folder, *options):
     arguments = [
         "optimize", folder / "labels.nii.gz", "--sequence", folder / "tracked.igs.mha", "--probe",
-        folder / "probe.json", "--frames", "1", "--free", "gain_db", "--evaluations", 6, "--restarts", 0, "-o",
+        folder / "probe.json", "--frames", "1", "--free", "gain_db", "--set", "fit.evaluations=6",
+        "--set", "fit.restarts=0", "-o",
         folder / "result.json", "--overwrite", *options,
     ]  # fmt: skip
     return CliRunner().invoke(main, list(map(str, arguments)))
@@ -76,7 +77,7 @@ def rows_of(report: str) -> list[list[str]]:
 def test_the_report_has_the_costs_of_the_controls(folder):
     pytest.importorskip("matplotlib", reason="reports need matplotlib: pip install '.[demo]'")
     places = [folder / name for name in ("report.html", "preset.json", "field.png")]
-    done = optimize(folder, "--report", places[0], "--save-preset", places[1], "--field", places[2])
+    done = optimize(folder, "--report", places[0], "--save-preset", places[1], "--set", f"recording.field={places[2]}")
     assert done.exit_code == 0, done.output
     assert all(str(place) in done.stderr.splitlines()[-1] for place in places)
     report = places[0].read_text("utf-8")
@@ -97,7 +98,7 @@ def test_the_report_has_the_costs_of_the_controls(folder):
 def test_the_report_says_what_the_fit_of_the_speckle_found(folder):
     pytest.importorskip("matplotlib", reason="reports need matplotlib: pip install '.[demo]'")
     report = folder / "predicted.html"
-    done = optimize(folder, "--speckle", "--validate", 2, "--report", report)
+    done = optimize(folder, "--set", "fit.speckle=true", "--set", "fit.validate=2", "--report", report)
     assert done.exit_code == 0, done.output
     said = {row[0]: row[1] for row in rows_of(report.read_text("utf-8")) if len(row) == 2}
     assert (

@@ -35,8 +35,8 @@ def test_an_interrupted_fit_leaves_its_state_and_nothing_half_done(tmp_path):
     write_json(tmp_path / "probe.json", probe.to_dict())
     inputs = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
     command = (
-        "optimize labels.nii.gz --sequence tracked.igs.mha --probe probe.json --free gain_db --restarts 0 "
-        "--evaluations 1000 --state state.json -o out.json"
+        "optimize labels.nii.gz --sequence tracked.igs.mha --probe probe.json --free gain_db "
+        "--set fit.restarts=0 --set fit.evaluations=1000 --set results.state=state.json -o out.json"
     )
     process = subprocess.Popen(
         [sys.executable, "-m", "SlicerUSSim.Command", *command.split()], cwd=tmp_path, text=True,

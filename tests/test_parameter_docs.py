@@ -12,6 +12,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import get_args, get_origin
 
+import click
+
+from SlicerUSSim.Command.cli import main
+from SlicerUSSim.Command.options import rare_keys
 from SlicerUSSim.Logic.base.declaration import Declared, Parameter, parameters_of
 from SlicerUSSim.Logic.base.settings import DisplaySettings, SimulationSettings
 from SlicerUSSim.Logic.fitting.fit_settings import FitSettings
@@ -26,8 +30,8 @@ PAGE = Path(__file__).parents[1] / "docs" / "parameters.md"
 INTRODUCTION = """# Parameters
 
 All parameters, generated from their declarations in the code by `python -m tests.test_parameter_docs`. The declaration
-of a parameter also defines its checks, its name in a preset, its option, its field in the panel and on the page, and
-the bounds of its fit.
+of a parameter also defines its checks, its name in a preset, its field in the panel and on the page, and the bounds of
+its fit.
 
 A preset is a JSON file with the objects `probe`, `display`, `settings`, `tissues` (by label, `"1"` to `"62"`, and `"0"`
 for the coupling medium) and `membrane`, and `probe_to_ras`, four rows of four numbers, if it has a pose of the probe
@@ -35,10 +39,12 @@ for the coupling medium) and `membrane`, and `probe_to_ras`, four rows of four n
 panels read them. Types are strict: `true` and `"5"` are not accepted as numbers, nor 3.0 as a whole number, and names
 that are not in these tables are refused. *None* is `null` in JSON.
 
-In the command, `--set` changes any parameter of probe, display, settings, membrane and tissues. Its value is the name
-of the section or tissue, a dot, the name of the parameter, and the new value: `--set settings.max_ray_depth=4`,
-`--set probe.depth_mm=70`, `--set "white matter.mu0=0.5"`. The last column lists the parameters that also have an
-option. `--set` overrides these options, and they override `--preset`.
+In the command, `--set` changes any parameter of probe, display, settings, membrane, tissues, segmentation and fit. Its
+value is the name of the section or tissue, a dot, the name of the parameter, and the new value: `--set
+settings.max_ray_depth=4`, `--set probe.depth_mm=70`, `--set "white matter.mu0=0.5"`, `--set fit.restarts=0`. Parameters
+that are often changed also have an option, which `--help` lists. `--set` overrides options, and they override
+`--preset`. A preset of the command may have the objects `segmentation`, `fit`, `patient`, `recording` and `results`,
+too; the last three have what the [command](#command) alone takes.
 """
 #: (heading, declared class, description)
 SECTIONS: list[tuple[str, type[Declared], str]] = [
@@ -52,12 +58,12 @@ SECTIONS: list[tuple[str, type[Declared], str]] = [
      "every value."),
     ("Membrane", Membrane, "A thin rough sheet along the border between fluid and brain; `membrane` in a preset. "
      "Its `tissue` is an object as in [Tissues](#tissues)."),
-    ("Segmentation", SegmentationSettings, "Segmentation of an MRI into tissues, by `ussim segment`, `segment_mri` "
-     "and the VTK filter."),
+    ("Segmentation", SegmentationSettings, "Segmentation of an MRI into tissues, by commands (`segmentation` in their "
+     "preset), `segment_mri` and the VTK filter."),
     ("Sheets", SheetSettings, "Sheets and vessels of a scene, in Slicer and on the page; commands have `--sheets` "
-     "and `--no-sheet` ([sheets.md](sheets.md))."),
-    ("Fit", FitSettings, "Fit of simulated to real images ([optimization.md](optimization.md)). For `frames` and "
-     "`free`, `ussim optimize` has options of the same names."),
+     "([sheets.md](sheets.md))."),
+    ("Fit", FitSettings, "Fit of simulated to real images ([optimization.md](optimization.md)). `fit` in the "
+     "preset of `ussim optimize`, which has the options `--frames` and `--free`, too."),
     ("Similarity", SimilaritySettings, "The cost of a fit ([optimization.md](optimization.md#cost-function)); set in "
      "Python only."),
     ("Panel", PanelSettings, "Further values of the panel that are saved with a scene ([slicer.md](slicer.md))."),
@@ -75,6 +81,13 @@ def page() -> str:
             shared = {entry.name for entry in parameters_of(Probe)}
             entries = [entry for entry in entries if entry.name not in shared]
         parts.append(f"## {heading}\n\n{text}\n\n{table(entries)}")
+    keys: dict[str, str] = {}
+    shown = {option.name for command in main.commands.values() for option in command.params}
+    for command in main.commands.values():
+        for key, known in rare_keys(command).items():
+            if known.entry is None and known.option.name not in shown and isinstance(known.option, click.Option):
+                keys[key] = f"| `{key}` | {(known.option.help or '').replace('|', chr(92) + '|')} |\n"
+    parts.append(f"## Command\n\nFor `--set`.\n\n| Key | Description |\n| --- | --- |\n{''.join(keys.values())}")
     return "\n".join(parts)
 
 
@@ -88,7 +101,6 @@ def table(entries: list[Parameter]) -> str:
         "Default": default,
         "Fit: bounds": fit_bounds,
         "Fit: tolerance": lambda entry: f"± {entry.fit.tolerance:g}" if entry.fit else "",
-        "Option": lambda entry: " ".join(f"`--{name}`" for name in (entry.option or "").split("/") if name),
     }
     cells = {name: [column(entry).replace("|", r"\|") for entry in entries] for name, column in columns.items()}
     cells = {name: column for name, column in cells.items() if any(column)}

@@ -253,16 +253,16 @@ def test_the_command_takes_its_settings_for_an_mri_and_not_for_labels(tmp_path):
     arguments = ["simulate", str(tmp_path / "mri.nii.gz"), "--pose", "auto", "--overwrite"]
     arguments += ["-o", str(tmp_path / "a.png")]
     images = []
-    for extra in ([], ["--hard-labels"], ["--mri-modulation", "3"]):
+    for extra in ([], ["--set", "settings.partial_volume=false"], ["--set", "settings.mri_modulation_db=3"]):
         result = CliRunner().invoke(main, [*arguments, *extra])
         assert result.exit_code == 0, result.output
         images.append(np.asarray(Image.open(tmp_path / "a.png")).astype(int))
     assert np.abs(images[1] - images[0]).max() > 0 and np.abs(images[2] - images[0]).max() > 0
     SOLID.write(tmp_path / "labels.nii.gz")
     arguments[1] = str(tmp_path / "labels.nii.gz")
-    result = CliRunner().invoke(main, [*arguments, "--partial-volume"])
+    result = CliRunner().invoke(main, [*arguments, "--set", "settings.partial_volume=true"])
     assert result.exit_code == 2
-    assert "is a label map; --partial-volume and --mri-modulation need an MRI" in result.stderr
+    assert "is a label map; partial_volume and mri_modulation_db need an MRI" in result.stderr
 
 
 def test_the_image_does_not_depend_on_the_order_of_voxels_in_a_file():

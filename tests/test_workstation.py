@@ -786,7 +786,7 @@ def test_a_click_grows_a_lesion_that_is_added_to_the_tissues(browser, tmp_path):
 @pytest.mark.long
 def test_the_workstation_finds_sheets_and_its_script_has_them(browser, tmp_path):
     head_mri(2.0).write(tmp_path / "head.nii.gz")
-    with serving(str(tmp_path / "head.nii.gz"), "--sheets", "auto", "--no-sheet", "ependyma") as address:
+    with serving(str(tmp_path / "head.nii.gz"), "--sheets", "auto", "--set", "patient.no_sheets=ependyma") as address:
         page = opened(browser, address)
         settled(page)
         notes = shown(page, "notesLabel")
@@ -971,7 +971,7 @@ def test_an_opened_patient_takes_the_place_of_title_notes_and_warnings(page, tmp
         (["--host", "203.0.113.7"], "cannot listen at 203.0.113.7"),
         (["{head}", "--add", "tumour={far}"], "far.nii.gz: lies "),
         (["--labels", "{head}", "--contrast", "t2"], "head.nii.gz: is a label map, and --contrast is for an MRI"),
-        (["{head}", "--no-sheet", "falx"], "--no-sheet leaves out some of --sheets; give --sheets, too"),
+        (["{head}", "--set", "patient.no_sheets=falx"], "no_sheets leaves out some of --sheets; give --sheets, too"),
     ],
 )
 def test_what_cannot_be_served_is_said_in_one_line(files, arguments, message):

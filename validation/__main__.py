@@ -10,9 +10,8 @@ from pathlib import Path
 import click
 
 from SlicerUSSim.Command.cli import ToolCommand
-from SlicerUSSim.Command.options import check_results, device_option
+from SlicerUSSim.Command.options import check_results, device_option, results_of
 from SlicerUSSim.Command.progress import Steps, note
-from SlicerUSSim.Command.whole_line import results_of
 from validation.run import chosen_checks, validate
 
 _TABLES, _SUMMARY = "report.md", "report.json"

@@ -7,8 +7,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import click
-
 from SlicerUSSim.Command.progress import note
 from SlicerUSSim.Logic.base.errors import require
 
@@ -16,13 +14,6 @@ if TYPE_CHECKING:
     from SlicerUSSim.Logic.base import Volume
     from SlicerUSSim.Logic.mri import Added
     from SlicerUSSim.Logic.tissue import TissueTable
-
-add_option = click.option(
-    "--add", "additions", multiple=True, metavar="TISSUE=FILE",
-    help="Lay a tissue over the labels where the mask in FILE is not 0 (any grid) or above 0.5: tumour, oedema, "
-    "necrosis, cyst, haematoma, cavity or another of the presets; brats=FILE for labels with names, or the tissues "
-    "of a BraTS map; may be repeated, the last is on top.",
-)  # fmt: skip
 
 
 def split_additions(texts: Iterable[str]) -> list[tuple[str, str]]:

@@ -19,7 +19,7 @@ import click
 from SlicerUSSim.Command.demo import demo
 from SlicerUSSim.Command.interrupts import end_at_signals
 from SlicerUSSim.Command.optimize import optimize
-from SlicerUSSim.Command.options import device_option, untrusted_option, verbose_option
+from SlicerUSSim.Command.options import about_key, device_option, rare_keys, untrusted_option, verbose_option
 from SlicerUSSim.Command.progress import Share, note
 from SlicerUSSim.Command.segment import segment
 from SlicerUSSim.Command.serve import serve
@@ -55,7 +55,7 @@ class _OneLineErrors(click.Command):
             click.echo("ussim: interrupted", err=True)
             ctx.exit(128 + signal.SIGINT)
         except Exception as error:
-            message = user_message(error)
+            message = about_key(error) if isinstance(error, click.NoSuchOption) else user_message(error)
             if message is None:
                 raise
             click.echo(f"ussim: {message}", err=True)
@@ -122,7 +122,9 @@ def check(ctx: click.Context, device: str | None) -> None:
 
 
 for command in (check, demo, devices, optimize, segment, serve, simulate, sweep, volume):
-    main.add_command(untrusted_option(verbose_option(command)))
+    main.add_command(untrusted_option(verbose_option(command), hidden=True))
+    if rare_keys(command):
+        command.epilog = f"Further keys of --set: {', '.join(rare_keys(command))}."
 untrusted_option(verbose_option(main))
 
 if __name__ == "__main__":

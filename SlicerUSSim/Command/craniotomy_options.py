@@ -7,8 +7,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-import click
-
 from SlicerUSSim.Command.progress import note
 from SlicerUSSim.Logic.base.errors import SimulationError, require
 from SlicerUSSim.Logic.mri.segmentation_settings import CT, GEL_MM as GEL_MM
@@ -20,13 +18,6 @@ if TYPE_CHECKING:
     from SlicerUSSim.Logic.probe import Probe
 
 NONE, AUTO, DISC = "none", "auto", "disc:"
-
-craniotomy_option = click.option(
-    "--craniotomy", default=NONE, show_default=True, metavar="none|auto|disc:MM|FILE",
-    help="Opening in skin and skull of a whole head (--outside, or a label map with them), filled with the coupling "
-    "medium: a disc of this diameter under the probe, auto (as wide as the probe's face needs), the mask in FILE, or "
-    "the polygon through points of 3D Slicer (.mrk.json, .fcsv). With --pose auto the probe then stands on the brain.",
-)  # fmt: skip
 
 
 @dataclass(frozen=True)

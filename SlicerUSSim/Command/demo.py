@@ -3,84 +3,125 @@
 from __future__ import annotations
 
 import os
-from functools import cached_property
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from time import perf_counter
+from typing import Any
 
 import click
 
-from SlicerUSSim.Command.additions import Additions, add_option
-from SlicerUSSim.Command.mri_options import also_option, read_also, read_mri
-from SlicerUSSim.Command.options import check_results, device_option, mask_option, parameter_option
+from SlicerUSSim.Command.additions import Additions
+from SlicerUSSim.Command.mri_options import MriOptions, read_mri, segmented_file
+from SlicerUSSim.Command.options import (
+    check_results,
+    declared,
+    declared_parameters,
+    gathered,
+    out_option,
+    results_of,
+)
+from SlicerUSSim.Command.patient_options import RARE, named_probe
 from SlicerUSSim.Command.progress import Steps, note
-from SlicerUSSim.Logic.base.settings import DisplaySettings, SimulationSettings
-from SlicerUSSim.Logic.mri.segmentation_settings import SegmentationSettings
-
-if TYPE_CHECKING:
-    from SlicerUSSim.Logic.mri import Segmentation
+from SlicerUSSim.Command.set_option import Changes
+from SlicerUSSim.Logic.base.errors import SimulationError
+from SlicerUSSim.Logic.base.settings import SimulationSettings
 
 
-class ProbeName(click.Choice):
-    """A name of probe.PROBES, which imports numpy and therefore waits until a choice is made or --help asks for it."""
+@dataclass(frozen=True)
+class DemoOptions(MriOptions):
+    """Patient and probe of the demo."""
 
-    def __init__(self) -> None:
-        self.case_sensitive = True
+    mri: str | None = declared(
+        "--mri", type=click.Path(), help="MRI of a head or a brain (default: the MNI152 brain of nilearn)."
+    )
+    probe: str = declared(
+        "--probe", default="phased", show_default=True, metavar="NAME|PATH", help="Name of a probe, or one as JSON."
+    )
+    settings: Mapping[str, Any] = declared_parameters(SimulationSettings, of_preset=True)
 
-    @cached_property
-    def choices(self) -> tuple[str, ...]:
-        from SlicerUSSim.Logic.probe.arrays import PROBES
 
-        return tuple(PROBES)
-
-
-def _tell(segmentation: Segmentation) -> None:
-    """Say how the MRI was segmented, and into what."""
-    for line in (*segmentation.notes, *segmentation.table().splitlines()):
-        note(line)
+#: Files of the results, and the one that says what was done
+_RESULTS = (
+    "figure.png", "mri.png", "labels.png", "bmode.png", "bmode.mha", "labels.nii.gz", "labels.json", "pose.json",
+    "preset.json",
+)  # fmt: skip
+_SUMMARY = "demo.json"
 
 
 @click.command()
-@click.option(
-    "--out", type=click.Path(path_type=Path), default="ussim-demo", show_default=True, help="Folder for the results."
-)
-@click.option("--mri", type=click.Path(), help="MRI of a head or a brain (default: the MNI152 brain of nilearn).")
-@parameter_option(SegmentationSettings, "contrast")
-@parameter_option(SegmentationSettings, "skull_strip")
-@mask_option
-@click.option("--probe", "kind", type=ProbeName(), default="phased", show_default=True, help="Preset of the probe.")
-@parameter_option(SimulationSettings, "seed")
-@also_option
-@add_option
-@device_option
-def demo(
-    out: Path, mri: str | None, contrast: str, skull_strip: str, mask: str | None, kind: str, seed: int,
-    also: tuple[str, ...], additions: tuple[str, ...], device: str | None,
-) -> None:  # fmt: skip
+@out_option("Folder for the results.", default="ussim-demo", show_default=True)
+@gathered(f"{RARE} outside maps organs", patient=DemoOptions)
+def demo(out: Path, patient: DemoOptions) -> None:
     """Segment a brain MRI, simulate a view through a craniotomy, and write figures."""
-    from SlicerUSSim.Command.whole_line import RESULTS, SUMMARY, run_whole_line
-    from SlicerUSSim.Logic.mri.kept_mask import mask_beside
-    from SlicerUSSim.Logic.mri.masks import read_mask
+    from SlicerUSSim.Logic.imaging.figures import draw_views, require_matplotlib, write_png
+    from SlicerUSSim.Logic.imaging.preset import Preset
+    from SlicerUSSim.Logic.imaging.simulator import UltrasoundSimulator
     from SlicerUSSim.Logic.mri.samples import demo_mri
-    from SlicerUSSim.Logic.probe.arrays import PROBES
+    from SlicerUSSim.Logic.mri.segmentation import Segmentation
+    from SlicerUSSim.Logic.probe.poses import craniotomy_pose, slice_under_probe
+    from SlicerUSSim.Logic.tissue.table import TissueTable, write_label_files
+    from SlicerUSSim.Logic.tracked.pose_files import write_pose
 
-    check_results(out, RESULTS, SUMMARY)
-    settings = SimulationSettings(seed=seed)
-    masks = Additions.read(additions)
-    volume, source = demo_mri() if mri is None else (
-        read_mri(mri, mask=mask, skull_strip=skull_strip), os.path.abspath(mri),
-    )  # fmt: skip
-    note(f"MRI: {source}, {volume.size_text} voxels")
-    brain = {
-        "contrast": contrast, "skull_strip": skull_strip, "mask": read_mask(mask) if mask else None,
-        "others": read_also(also, mri), "keep_mask_at": mask_beside(mri) if mri else None,
-    }  # fmt: skip
+    check_results(out, _RESULTS, _SUMMARY)
+    require_matplotlib()  # before the computation, not after it
+    changes = Changes.of(patient.changes)
+    preset = changes.to_preset(Preset(named_probe(patient.probe)).changed("settings", **patient.settings))
+    masks, probe, path = Additions.read(patient.additions), preset.probe, patient.mri
+    if path is None:
+        mri, source = demo_mri()
+    else:
+        mri = read_mri(path, mask=patient.mask, skull_strip=patient.segmentation.skull_strip)
+        source = os.path.abspath(path)
+    note(f"MRI: {source}, {mri.size_text} voxels")
     with Steps(5) as step:
-        summary = run_whole_line(
-            out, volume, source, PROBES[kind], settings, DisplaySettings(), device, step,
-            segmentation_options=brain, found=_tell, additions=masks,
-        )  # fmt: skip
-    times = summary["milliseconds"]
-    note(f"device: {summary['device']}")
-    note(f"segmentation {times['segmentation']:.0f} ms, one frame {times['frame']:.1f} ms")
+        step("segment the MRI")
+        start = perf_counter()
+        found = segmented_file(path or mri.name, mri, patient, additions=masks, tell_all=True, is_file=path is not None)
+        if not isinstance(found, Segmentation):
+            raise SimulationError(f"{source}: is read as a CT, expected an MRI; use ussim simulate")
+        seconds = perf_counter() - start
+
+        step("build the acoustic medium")
+        added = masks.on(found.labels, found.tissue_names, has_brain_mask=True)
+        labels, names = added.labels, added.tissue_names
+        table = replace(found, labels=labels, tissue_names=names).table().splitlines()
+        for line in table:
+            note(line)
+        tissues = changes.to_tissues(TissueTable.brain(names))
+        simulator = UltrasoundSimulator(labels, tissues, preset.settings, patient.device)
+        pose = craniotomy_pose(labels, probe, target_ras=added.centre_ras(found.labels))
+
+        step("simulate")
+        simulator.profiling = True
+        simulator.simulate(probe, pose, preset.display)  # builds kernels
+        frames = [simulator.simulate(probe, pose, preset.display) for _ in range(3)]
+        frame = frames[-1]
+        stages = {stage: round(min(f.timings_ms[stage] for f in frames), 3) for stage in frame.timings_ms}
+
+        with results_of(out, _SUMMARY) as (folder, summary):
+            step("draw")
+            bounds = probe.image_bounds_mm()
+            seen = ("MRI under the probe", slice_under_probe(mri, frame.grid, pose), "mri")
+            labelled = ("Tissues", slice_under_probe(labels, frame.grid, pose, order=0), "labels")
+            simulated = ("Simulated B-mode", frame.image, "bmode")
+            draw_views(folder / "figure.png", [seen, labelled, simulated], probe, bounds, names)
+            draw_views(folder / "mri.png", [seen], probe, bounds, names)
+            draw_views(folder / "labels.png", [labelled], probe, bounds, names)
+
+            step("write")
+            write_png(folder / "bmode.png", frame.image)
+            frame.to_volume().write(folder / "bmode.mha")
+            write_label_files(folder / "labels.nii.gz", labels, tissues)
+            write_pose(folder / "pose.json", pose)
+            preset = replace(preset, tissues=tissues)
+            preset.write(folder / "preset.json")
+            summary |= {
+                "mri": source, "device": str(simulator.device.info), "probe_to_ras": pose.tolist(), **preset.to_dict(),
+                "segmentation": [*found.notes, *added.messages, *table], "segmentation_seconds": round(seconds, 3),
+                "milliseconds_per_stage": stages,
+            }  # fmt: skip
+    note(f"device: {simulator.device.info}")
+    note(f"segmentation {1e3 * seconds:.0f} ms, one frame {sum(stages.values()):.1f} ms")
     note(f"wrote {out / 'figure.png'} and nine more files in this folder")
     click.echo(out / "figure.png")

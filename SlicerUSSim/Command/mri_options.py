@@ -1,14 +1,16 @@
-"""--also, and the segmentation of an MRI file with a progress bar, notes and warnings, for all commands."""
+"""Options for the image of a patient, and its segmentation with a progress bar, notes and warnings."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
-from SlicerUSSim.Command.options import require_no_options_beside_ct
+from SlicerUSSim.Command.craniotomy_options import NONE
+from SlicerUSSim.Command.options import declared, declared_parameters, require_no_options_beside_ct
 from SlicerUSSim.Command.progress import Share, note
 from SlicerUSSim.Logic.base.errors import SimulationError, require
 from SlicerUSSim.Logic.mri.segmentation_settings import CT, MRI_CONTRASTS, SegmentationSettings
@@ -20,48 +22,113 @@ if TYPE_CHECKING:
     from SlicerUSSim.Logic.tissue import LabelledTissues
 
 
-also_option = click.option(
-    "--also", multiple=True, metavar="CONTRAST=FILE",
-    help="Another MRI of the same patient, on any grid, registered to the first and classified together with it: "
-    "t2=FILE, flair=FILE, t1=FILE or t1gd=FILE; may be repeated.",
-)  # fmt: skip
+@dataclass(frozen=True)
+class MriOptions:
+    """How the image of a patient is read and segmented, and what is laid over its labels. Files by their paths."""
+
+    #: LABEL=TISSUE, NAME=TISSUE, files and numbering schemes
+    maps: tuple[str, ...] = declared(
+        "--map", multiple=True, metavar="LABEL=TISSUE",
+        help="Tissue of a label of the label map, by its number or its name: 24=csf; 0 removes a label. Or a .json "
+        'file with {"24": "csf"}, a table of names (.txt, .ctbl, .tsv), or the numbering: freesurfer, '
+        "totalsegmentator, totalsegmentator-v1, totalsegmentator-mr, totalsegmentator-tissues, ussim, brats-2022, "
+        "brats. May be repeated.",
+    )  # fmt: skip
+    segmentation: SegmentationSettings = declared_parameters(  # noqa: RUF009, a dataclasses.field like the others
+        SegmentationSettings,
+        also=(click.Option(["--ct", "contrast"], flag_value=CT, default=MRI_CONTRASTS[0], hidden=True),),
+    )
+    organs: str | None = declared(
+        "--organs", type=click.Path(), help="Label map of organs of a CT (--ct), such as TotalSegmentator's, whose "
+        "soft tissues replace muscle and blood.",
+    )  # fmt: skip
+    mask: str | None = declared(
+        "--mask", type=click.Path(), help="Brain mask on the MRI's grid (default: found in the MRI); of a CT: the "
+        "patient.",
+    )  # fmt: skip
+    #: CONTRAST=FILE
+    also: tuple[str, ...] = declared(
+        "--also", multiple=True, metavar="CONTRAST=FILE",
+        help="Another MRI of the same patient, on any grid, registered to the first and classified together with it: "
+        "t2=FILE, flair=FILE, t1=FILE or t1gd=FILE; may be repeated.",
+    )  # fmt: skip
+    #: TISSUE=FILE
+    additions: tuple[str, ...] = declared(
+        "--add", multiple=True, metavar="TISSUE=FILE",
+        help="Lay a tissue over the labels where the mask in FILE is not 0 (any grid) or above 0.5: tumour, oedema, "
+        "necrosis, cyst, haematoma, cavity or another of the presets; brats=FILE for labels with names, or the "
+        "tissues of a BraTS map; may be repeated, the last is on top.",
+    )  # fmt: skip
+    #: NAME=VALUE
+    changes: tuple[str, ...] = declared(
+        "--set", multiple=True, metavar="NAME=VALUE",
+        help="Any key of a preset (docs/parameters.md), such as settings.max_ray_depth=4, probe.depth_mm=70, "
+        '"white matter.mu0=0.5" or segmentation.classes=4; overrides other options; may be repeated.',
+    )  # fmt: skip
+    device: str | None = declared(
+        "--device", help='OpenCL device: "platform:device" or part of its name (see `ussim devices`).'
+    )
+
+    @property
+    def contrast(self) -> str:
+        """Of the image; CT for a CT."""
+        return self.segmentation.contrast
+
+    @property
+    def is_ct(self) -> bool:
+        """Whether the image is said to be a CT."""
+        return self.contrast == CT
 
 
-organs_option = click.option(
-    "--organs", type=click.Path(), help="Label map of organs of a CT (--ct), such as TotalSegmentator's, whose soft "
-    "tissues replace muscle and blood.",
-)  # fmt: skip
+@dataclass(frozen=True)
+class ImageOptions(MriOptions):
+    """Further, what is drawn: of every command that makes images of a patient."""
+
+    preset: str | None = declared(
+        "--preset", type=click.Path(), help="Probe, display, settings and tissues as JSON, from `ussim demo` or the "
+        "Slicer module, and other keys of --set; options override it.",
+    )  # fmt: skip
+    #: none, auto, disc:MM or a file
+    craniotomy: str = declared(
+        "--craniotomy", default=NONE, show_default=True, metavar="none|auto|disc:MM|FILE",
+        help="Opening in skin and skull of a whole head (a label map with them, or an MRI with segmentation.outside), "
+        "filled with the coupling medium: a disc of this diameter under the probe, auto (as wide as the probe's face "
+        "needs), the mask in FILE, or the polygon through points of 3D Slicer (.mrk.json, .fcsv). With --pose auto the "
+        "probe then stands on the brain.",
+    )  # fmt: skip
+    #: A file, auto or none
+    sheets: str = declared(
+        "--sheets", default=NONE, metavar="FILE|auto|none", show_default=True,
+        help="Draw sulci, falx, tentorium and walls of ventricles as thin sheets: those in FILE, a .vtp of `ussim "
+        "segment --sheets`; auto: found in the MRI and kept beside it, with corpus callosum, choroid plexus and "
+        "vessels as labels.",
+    )  # fmt: skip
+    #: Kinds that are not drawn
+    no_sheets: tuple[str, ...] = declared(
+        "--no-sheet", multiple=True, metavar="KIND",
+        help="What --sheets leaves as the labels have it: sulcus, falx, tentorium, ependyma, corpus callosum, choroid "
+        "plexus or vessels; may be repeated.",
+    )  # fmt: skip
 
 
-def split_also(texts: Iterable[str]) -> dict[str, str]:
-    """{contrast: file} of the values of --also. Raises SimulationError for another text or contrast, or one twice."""
-    contrasts, found = MRI_CONTRASTS, {}
+def also_files(texts: Iterable[str], mri: str | None = None) -> dict[str, str]:
+    """{contrast: file} of the values of --also.
+
+    Raises SimulationError for another text or contrast, one twice, and one file for two, of which `mri` may be one.
+    """
+    found: dict[str, str] = {}
     for text in texts:
         contrast, _, file = text.partition("=")
         require(file, f"--also is {text!r}, expected CONTRAST=FILE, such as t2=t2.nii.gz")
-        require(contrast in contrasts, f"--also: contrast is {contrast!r}, expected one of {', '.join(contrasts)}")
+        expected = f"expected one of {', '.join(MRI_CONTRASTS)}"
+        require(contrast in MRI_CONTRASTS, f"--also: contrast is {contrast!r}, {expected}")
         require(contrast not in found, f"--also: {contrast} is given twice, expected one volume per contrast")
+        others = {"the MRI": mri} if mri else {}
+        for name, other in (others | {f"--also {name}": at for name, at in found.items()}).items():
+            is_same = Path(file).exists() and Path(other).exists() and Path(other).samefile(file)
+            require(not is_same, f"--also {contrast}={file}: is the file of {name} again, expected another image")
         found[contrast] = file
     return found
-
-
-def read_also(texts: Iterable[str], mri: str | None = None) -> dict[str, Volume]:
-    """{contrast: volume} of the values of --also. Raises SimulationError for the file of the first `mri` again."""
-    from SlicerUSSim.Logic.base.volume import Volume  # imported here to keep --help fast
-
-    files = split_also(texts)
-    require_other_files(mri, files)
-    return {contrast: Volume.read(file) for contrast, file in files.items()}
-
-
-def require_other_files(mri: str | None, also: Mapping[str, str]) -> None:
-    """Raise SimulationError if two of an MRI and {contrast: file} of --also are one file."""
-    known = [] if mri is None else [("the MRI", Path(mri))]
-    for contrast, file in also.items():
-        for name, other in known:
-            is_same = Path(file).exists() and other.exists() and other.samefile(file)
-            require(not is_same, f"--also {contrast}={file}: is the file of {name} again, expected another image")
-        known.append((f"--also {contrast}", Path(file)))
 
 
 def require_no_map(path: str, maps: Iterable[str], organs: str | None) -> None:
@@ -70,45 +137,34 @@ def require_no_map(path: str, maps: Iterable[str], organs: str | None) -> None:
 
 
 def segmented_file(
-    path: str,
-    mri: Volume,
-    settings: SegmentationSettings,
-    *,
-    mask: str | None = None,
-    also: Iterable[str] = (),
-    organs: str | None = None,
-    maps: Iterable[str] = (),
-    device: str | None = None,
-    additions: Additions | None = None,
-    tell_all: bool = False,
+    path: str, mri: Volume, patient: MriOptions, *, additions: Additions, tell_all: bool = False, is_file: bool = True
 ) -> Segmentation | CtSegmentation:
-    """Segment the MRI or CT of a file; the brain mask of an MRI is kept beside it.
-
-    `organs` is the file of --organs, `maps` the values of --map for it.
+    """Segment the MRI or CT of a file; the brain mask of an MRI is kept beside it, unless it is none (`is_file`).
 
     Says how the brain was found, with `tell_all` also what else; what should be checked is logged as warnings.
     Raises SimulationError before the segmentation for `additions` that could not be added after it.
     """
     from SlicerUSSim.Logic.base.errors import about_file
+    from SlicerUSSim.Logic.base.volume import Volume
     from SlicerUSSim.Logic.mri.kept_mask import mask_beside
     from SlicerUSSim.Logic.mri.masks import read_mask
     from SlicerUSSim.Logic.mri.modality import has_brain_mask, segment_image
     from SlicerUSSim.Logic.mri.segmentation import Segmentation
 
+    settings, organs, maps = patient.segmentation, patient.organs, patient.maps
     is_of_brain = has_brain_mask(settings.contrast)
     if not is_of_brain:
         require_no_options_beside_ct(path)
     require_no_map(path, maps, organs)
     require(organs is None or not is_of_brain, f"--organs is for a CT, expected --ct; {path} is read as an MRI")
-    others = read_also(also, path)
-    brain = read_mask(mask) if mask else None
-    if additions is not None:
-        additions.require_addable(mri, brain, settings.skull_strip if is_of_brain else "none")
+    others = {contrast: Volume.read(file) for contrast, file in also_files(patient.also, path).items()}
+    brain = read_mask(patient.mask) if patient.mask else None
+    additions.require_addable(mri, brain, settings.skull_strip if is_of_brain else "none")
     found = None if organs is None else _read_organs(organs, maps)
     with Share("segment") as progress, about_file(path):
         result = segment_image(
-            mri, settings, others=others, mask=brain, organs=found, keep_mask_at=mask_beside(path), device=device,
-            progress=progress,
+            mri, settings, others=others, mask=brain, organs=found, progress=progress, device=patient.device,
+            keep_mask_at=mask_beside(path) if is_file else None,
         )  # fmt: skip
     lines = result.notes
     if isinstance(result, Segmentation) and not tell_all:

@@ -3,16 +3,21 @@
 from __future__ import annotations
 
 import logging
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
-from SlicerUSSim.Command.options import check_outputs, gathered, overwrite_option
-from SlicerUSSim.Command.patient_options import PatientOptions
+from SlicerUSSim.Command.options import check_outputs, declared, gathered, out_option, overwrite_option
+from SlicerUSSim.Command.patient_options import RARE, RARE_BESIDE, PatientOptions
 from SlicerUSSim.Command.progress import Curve, note
-from SlicerUSSim.Command.sequence_options import SequenceOptions, TrackedExamination, open_tracked
+from SlicerUSSim.Command.sequence_options import (
+    RARE_OF_SEQUENCE,
+    SequenceOptions,
+    TrackedExamination,
+    open_tracked,
+)
 from SlicerUSSim.Logic.base.errors import SimulationError, require
 from SlicerUSSim.Logic.base.version import __version__
 from SlicerUSSim.Logic.fitting.fit_settings import FitSettings
@@ -26,73 +31,69 @@ _MOST_IMAGES = 6
 _STATE_BYTES = 2**30
 
 
+@dataclass(frozen=True)
+class Results:
+    """Files that a fit writes beside its result."""
+
+    report: Path | None = declared(  # noqa: RUF009, a dataclasses.field like the others
+        "--report", type=click.Path(path_type=Path), help="Self-contained HTML report: .html"
+    )
+    save_preset: Path | None = declared(  # noqa: RUF009
+        "--save-preset", type=click.Path(path_type=Path), help="Preset with the fitted values: .json"
+    )
+    state: Path | None = declared(  # noqa: RUF009
+        "--state", type=click.Path(path_type=Path), help="Save all evaluations in this file and resume from it in the "
+        "next run (with --register only if registration gives the same poses): .json",
+    )  # fmt: skip
+    save_transform: Path | None = declared(  # noqa: RUF009
+        "--save-transform", type=click.Path(path_type=Path), help="With --register: the refined map from the "
+        "ultrasound's reference frame to the MRI, whole, as --to-mri takes it: .json",
+    )  # fmt: skip
+
+
 @click.command()
-@gathered(patient=PatientOptions, recording=SequenceOptions)
-@click.option("-o", "--out", type=click.Path(path_type=Path), required=True, help="Result: .json")
+@gathered(
+    f"{RARE} {RARE_BESIDE} {RARE_OF_SEQUENCE} craniotomy look evaluations restarts speckle deform validate state "
+    "save_transform",
+    patient=PatientOptions, recording=SequenceOptions, fit=FitSettings, results=Results,
+)  # fmt: skip
+@out_option("Result: .json")
 @click.option(
-    "--free",
-    multiple=True,
-    metavar="NAME[=LOW:HIGH]",
+    "--free", multiple=True, metavar="NAME[=LOW:HIGH]",
     help='Free parameters: "display", "tissues" (echogenicity and attenuation of each tissue that the images show), a '
     'tissue, a group of the display ("smoothing", "map", "sliders", "line gains"), or a parameter ("gain_db", "white '
-    'matter.mu0"), optionally with bounds; may be repeated (default: display '
-    "and tissues).",
-)
-@gathered(settings=FitSettings)
-@click.option(
-    "--report",
-    type=click.Path(path_type=Path),
-    help="Self-contained HTML report: .html",
-)
-@click.option("--save-preset", type=click.Path(path_type=Path), help="Preset with the fitted values: .json")
-@click.option(
-    "--state",
-    type=click.Path(path_type=Path),
-    help="Save all evaluations in this file and resume from it in the next run (with --register only if registration "
-    "gives the same poses): .json",
-)
-@click.option(
-    "--save-transform",
-    type=click.Path(path_type=Path),
-    help="With --register: the refined map from the ultrasound's reference frame to the MRI, whole, as --to-mri takes "
-    "it: .json",
-)
+    'matter.mu0"), optionally with bounds; may be repeated (default: display and tissues).',
+)  # fmt: skip
 @overwrite_option
 def optimize(
-    patient: PatientOptions,
-    recording: SequenceOptions,
-    out: Path,
+    patient: PatientOptions, recording: SequenceOptions, fit: FitSettings, results: Results, out: Path,
     free: tuple[str, ...],
-    settings: FitSettings,
-    report: Path | None,
-    save_preset: Path | None,
-    state: Path | None,
-    save_transform: Path | None,
-) -> None:
+) -> None:  # fmt: skip
     """Fit display and tissue parameters to tracked real ultrasound."""
     from SlicerUSSim.Logic.base.files import read_json, write_json
     from SlicerUSSim.Logic.fitting.control_costs import neighbours_of
     from SlicerUSSim.Logic.fitting.held_out import predict
-    from SlicerUSSim.Logic.fitting.tracked_fit import fit
+    from SlicerUSSim.Logic.fitting.tracked_fit import fit as fitted_to
     from SlicerUSSim.Logic.imaging.figures import require_matplotlib
     from SlicerUSSim.Logic.imaging.preset import Preset
 
-    check_outputs(out, report, save_preset, save_transform, recording.field, state=state)
+    report, state, save_transform = results.report, results.state, results.save_transform
+    places = (out, report, results.save_preset, save_transform, recording.field, state)
+    check_outputs(*places[:-1], state=state)
     if save_transform:
-        is_json = save_transform.suffix.lower() == ".json"
-        require(is_json, f"--save-transform is {save_transform}, expected a name ending in .json")
+        expected = f"results.save_transform is {save_transform}, expected a name ending in .json"
+        require(save_transform.suffix.lower() == ".json", expected)
+        require(fit.register, "results.save_transform needs --register")
     if report:
         require_matplotlib()
-    if save_transform and not settings.register:
-        raise SimulationError("--save-transform needs --register")
-    names = dict(_free_parameter(text) for text in free) or dict.fromkeys(settings.free_names)
-    tracked = open_tracked(patient, recording, most=_MOST_IMAGES, apart=settings.validate)
+    names = dict(_free_parameter(text) for text in free) or dict.fromkeys(fit.free_names)
+    tracked = open_tracked(patient, recording, most=_MOST_IMAGES, apart=fit.validate)
     simulator = tracked.examination.simulator
     with Curve("optimize") as curve:
-        found = fit(
+        found = fitted_to(
             simulator, tracked.images, free=names, display=tracked.examination.display,
-            register=settings.register, deform=settings.deform, speckle=settings.speckle,
-            max_evaluations=settings.evaluations, restarts=settings.restarts, progress=curve,
+            register=fit.register, deform=fit.deform, speckle=fit.speckle,
+            max_evaluations=fit.evaluations, restarts=fit.restarts, progress=curve,
             resume=read_json(state, _STATE_BYTES) if state and state.exists() else None,
             checkpoint=(lambda reached: write_json(state, reached)) if state else None,
         )  # fmt: skip
@@ -100,22 +101,21 @@ def optimize(
             near = [neighbours_of(tracked.sequence, images) for images in (tracked.others, tracked.images)]
             prediction = predict(
                 found, simulator, tracked.others, free=names, display=tracked.examination.display,
-                speckle=settings.speckle, neighbours=near[0], fitted_neighbours=near[1],
-                max_evaluations=settings.evaluations, restarts=settings.restarts, progress=curve,
+                speckle=fit.speckle, neighbours=near[0], fitted_neighbours=near[1],
+                max_evaluations=fit.evaluations, restarts=fit.restarts, progress=curve,
             )  # fmt: skip
             found = replace(found, prediction=prediction)
     write_json(out, found.to_dict())
-    if save_preset:
+    if results.save_preset:
         result = found.appearance
         preset = Preset(found.tracked.probe, result.display, simulator.settings, result.tissues)
-        preset.write(save_preset)
+        preset.write(results.save_preset)
     if save_transform and found.registration:
         to_mri = found.registration.correction @ tracked.reference_to_ras
         write_json(save_transform, {"probe_to_ras": to_mri.tolist()})
     if report:
         _write_report(report, found, tracked, patient, recording)
     _tell(found)
-    places = (out, report, save_preset, save_transform, state, recording.field)
     note("wrote " + ", ".join(str(place) for place in places if place))
 
 
@@ -186,14 +186,10 @@ def _tell(found: Fit) -> None:
     click.echo(f"texture T1 {before[0]:.3f} -> {after[0]:.3f}, T2 {before[1]:.2f} -> {after[1]:.2f}")
     if found.speckle is not None:
         shown = found.speckle.display
+        slopes = f"{shown.map_black:.2f} {shown.map_dark:.2f} {shown.map_white:.2f}"
         click.echo(
             f"speckle: smoothing {shown.smoothing_axial_mm:.3f} mm, {shown.smoothing_lateral_deg:.2f} degrees; texture "
-            f"x {found.speckle.texture_factor:g}; grey map "
-            + (
-                f"{shown.map_black:.2f} {shown.map_dark:.2f} {shown.map_white:.2f}"
-                if found.speckle.has_map
-                else "as given"
-            )
+            f"x {found.speckle.texture_factor:g}; grey map {slopes if found.speckle.has_map else 'as given'}"
         )
     if found.prediction is not None:
         for line in found.prediction.lines():
@@ -202,10 +198,8 @@ def _tell(found: Fit) -> None:
         click.echo(found.speckle.spread.in_words())
     for parameter in result.parameters:
         spread = result.identifiability[parameter.name]
-        note = ""
-        if parameter.name in result.at_bounds:
-            note = "  at its bound"
-        elif spread.is_determined is False:
+        note = "  at its bound" if parameter.name in result.at_bounds else ""
+        if not note and spread.is_determined is False:
             note = f"  not determined: {spread.low:.3g} to {spread.high:.3g} fit as well"
         before, after = result.before[parameter.name], result.after[parameter.name]
         click.echo(f"{parameter.name:42s} {before:8.3f} -> {after:8.3f}{note}")

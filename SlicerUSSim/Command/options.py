@@ -1,4 +1,4 @@
-"""Shared options, options of declared parameters, and dataclasses of options as one parameter of a command.
+"""Options of declared parameters, keys of --set, and dataclasses of options as one parameter of a command.
 
 Name, help, default and checks of a parameter's option are derived from its declaration (base/declaration.py).
 """
@@ -7,27 +7,26 @@ from __future__ import annotations
 
 import logging
 import os
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from dataclasses import Field, field, fields
+from difflib import get_close_matches
 from functools import wraps
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import click
 from click.core import ParameterSource
 from click.shell_completion import CompletionItem
 
 from SlicerUSSim.Command.progress import note
-from SlicerUSSim.Logic.base.declaration import Declared, Parameter, parameter_of, parameters_of
-from SlicerUSSim.Logic.base.errors import require
+from SlicerUSSim.Logic.base.declaration import Declared, Parameter, parameters_of
+from SlicerUSSim.Logic.base.errors import SimulationError, either, require
 from SlicerUSSim.Logic.base.reading import UNTRUSTED
-from SlicerUSSim.Logic.mri.segmentation_settings import CT, SegmentationSettings
+from SlicerUSSim.Logic.mri.segmentation_settings import SegmentationSettings
 
 Command = Callable[..., None]
 Decorator = Callable[[Command], Command]
-
-#: Value of an option that was not given, where None is a valid value.
-_NOT_GIVEN = object()
 
 #: Key in click.Context for the number of --verbose options, before and after the subcommand
 _VERBOSITY = "SlicerUSSim.verbosity"
@@ -35,14 +34,14 @@ _VERBOSITY = "SlicerUSSim.verbosity"
 device_option = click.option(
     "--device", help='OpenCL device: "platform:device" or part of its name (see `ussim devices`).'
 )
-mask_option = click.option(
-    "--mask", type=click.Path(), help="Brain mask on the MRI's grid (default: found in the MRI, see --skull-strip); "
-    "of a CT: the patient."
-)  # fmt: skip
-ct_option = click.option(
-    "--ct", "contrast", flag_value=CT, default=parameter_of(SegmentationSettings, "contrast").default,
-    help="The image is a CT in Hounsfield units: short for --contrast ct.",
-)  # fmt: skip
+overwrite_option = click.option(
+    "--overwrite", is_flag=True, expose_value=False, help="Replace outputs that exist; an input is never replaced."
+)
+
+
+def out_option(about: str, **more: Any) -> Decorator:
+    """-o/--out: where a command writes."""
+    return click.option("-o", "--out", type=click.Path(path_type=Path), help=about, **(more or {"required": True}))
 
 
 def verbose_option(command: click.Command) -> click.Command:
@@ -64,11 +63,11 @@ def _set_verbosity(ctx: click.Context, _: click.Parameter, count: int) -> None:
     show_log(ctx, ctx.meta[_VERBOSITY])
 
 
-def untrusted_option(command: click.Command) -> click.Command:
-    """The command with --untrusted, which may be before the subcommand or after it."""
+def untrusted_option(command: click.Command, *, hidden: bool = False) -> click.Command:
+    """The command with --untrusted, before the subcommand or, `hidden` in its --help, after it."""
     command.params.append(
         click.Option(
-            ["--untrusted"], is_flag=True, expose_value=False, callback=_trust_nothing,
+            ["--untrusted"], is_flag=True, expose_value=False, callback=_trust_nothing, hidden=hidden,
             help="Read every file in a process of its own, with limits on time and memory: for files of strangers.",
         )
     )  # fmt: skip
@@ -99,24 +98,15 @@ class ParameterType(click.ParamType):
         return [CompletionItem(choice) for choice in self.entry.choices if choice.startswith(incomplete)]
 
 
-def parameter_option(kind: type, name: str) -> Decorator:
-    """The option of one parameter of `kind`, with the parameter's name in the command and its default."""
-    return _option(parameter_of(kind, name))
-
-
-def _option(entry: Parameter, of_preset: bool = False) -> Decorator:
-    """With `of_preset`, an option that was not given is None for a flag and _NOT_GIVEN otherwise."""
-    assert entry.option is not None, f"{entry.name} has no option"
-    names = "/".join(f"--{name}" for name in entry.option.split("/"))
+def _option(entry: Parameter, of_preset: bool) -> click.Option:
+    """The option of a parameter; with `of_preset`, one that was not given is None."""
+    names = "/".join(f"--{name}" for name in str(entry.option).split("/"))
+    default, about = None if of_preset else entry.default, help_text(entry, of_preset)
     if entry.type is bool:
-        return click.option(
-            names, entry.name, default=None if of_preset else entry.default, help=help_text(entry, of_preset)
-        )
+        return click.Option([names, entry.name], default=default, help=about)
     kind = ParameterType(entry)
-    return click.option(
-        names, entry.name, type=kind, default=_NOT_GIVEN if of_preset else entry.default,
-        metavar=f"[{kind.name}]" if entry.choices else kind.name.upper(), help=help_text(entry, of_preset),
-    )  # fmt: skip
+    metavar = f"[{kind.name}]" if entry.choices else kind.name.upper()
+    return click.Option([names, entry.name], type=kind, default=default, metavar=metavar, help=about)
 
 
 def help_text(entry: Parameter, of_preset: bool = False) -> str:
@@ -143,72 +133,179 @@ def written(value: Any) -> str:
 # ---- dataclasses of options as one parameter of a command ------------------------------------------------------------
 
 
-def declared(option: Decorator) -> Any:
-    """A field of a dataclass of options, with its click.option or click.argument of the same name."""
-    return field(metadata={"options": (option,)})
+def declared(*names: str, **about: Any) -> Any:
+    """A field of a dataclass of options, with its option of these names; without names it is an argument."""
+    return field(metadata={"option": (names, about)})
 
 
-def declared_parameters(
-    kind: type, names: Iterable[str] | None = None, *, of_preset: bool = False, also: Iterable[Decorator] = ()
-) -> Any:
-    """A field of a dataclass of options: a `kind` with those of its parameters that have an option.
+def declared_parameters(kind: type, *, of_preset: bool = False, also: Iterable[click.Option] = ()) -> Any:
+    """A field of a dataclass of options: a `kind` with its parameters that have an option.
 
-    `names` selects some of them; `also` are further options for the same values. With `of_preset` it is {name: value}
-    of the options that were given, and --help refers to the preset for the default.
+    `also` are further options for the same values. With `of_preset` it is {name: value} of those that were given, and
+    --help refers to the preset for the default.
     """
-    entries = [entry for entry in parameters_of(kind) if entry.option and (names is None or entry.name in names)]
-    return field(
-        metadata={
-            "options": (*(_option(entry, of_preset) for entry in entries), *also),
-            "names": tuple(entry.name for entry in entries),
-            "flags": {entry.name for entry in entries if entry.type is bool},
-            "made": dict if of_preset else kind,
-        }
-    )
+    return field(metadata={"kind": kind, "of_preset": of_preset, "also": tuple(also)})
 
 
-def gathered(**kinds: type) -> Callable[[Command], Command]:
+class Key(NamedTuple):
+    """A name of --set and the preset: a parameter of a command, whether --help shows its option or not."""
+
+    option: click.Parameter
+    #: Its declaration, if it has one
+    entry: Parameter | None
+    default: Any
+    #: Whether the preset has it for what the option says, so that it is read there
+    of_preset: bool = False
+
+
+def gathered(keys: str = "", **kinds: type) -> Callable[[Command], Command]:
     """Decorator: adds the options of these dataclasses to a command, which gets one parameter for each dataclass.
 
     With gathered(patient=PatientOptions) the command's parameter `patient` is a PatientOptions; with
-    gathered(settings=FitSettings) `settings` is a FitSettings, whose parameters without an option have their defaults.
+    gathered(fit=FitSettings) `fit` is a FitSettings, whose parameters without an option have their defaults.
+    Each can also be given by --set and, in an object of its name, in the preset: fit.restarts. Those of `keys`, by
+    their names with blanks between them, have no option.
     """
 
     def decorate(command: Command) -> Command:
+        known = {key: entry for name, kind in kinds.items() for key, entry in _keys_of(name, kind)}
+        rare = keys.split()
+
         @wraps(command)
-        def with_options(**given: Any) -> None:
+        def with_options(**_: Any) -> None:
+            context = click.get_current_context()
+            _read_keys(context, known)
+            given = dict(context.params)
             options = {name: _filled(kind, given) for name, kind in kinds.items()}
             command(**options, **given)
 
-        decorated: Command = with_options
-        for option in reversed([option for kind in kinds.values() for option in _options_of(kind)]):
-            decorated = option(decorated)  # --help lists the last one applied first
-        return decorated
+        shown = [entry.option for entry in known.values() if entry.option.name not in rare]
+        more = [option for kind in kinds.values() for option in _further_of(kind)]
+        below = getattr(command, "__click_params__", [])
+        with_options.__click_params__ = [*below, *reversed(shown + more)]  # type: ignore[attr-defined]
+        with_options.keys = known  # type: ignore[attr-defined]
+        return with_options
 
     return decorate
 
 
-def _options_of(kind: type) -> list[Decorator]:
+def keys_of(command: click.Command) -> dict[str, Key]:
+    """{"section.name": Key} of a command's parameters."""
+    return getattr(command.callback, "keys", {})
+
+
+def rare_keys(command: click.Command) -> dict[str, Key]:
+    """Those of its keys that --help has no option for."""
+    return {key: entry for key, entry in keys_of(command).items() if entry.option not in command.params}
+
+
+def about_key(error: click.NoSuchOption) -> str | None:
+    """What to give instead of an unknown option, if it is a key of the command."""
+    option = error.option_name
+    for key, (known, *_) in rare_keys(error.ctx.command).items() if error.ctx else ():
+        if option in (*known.opts, *known.secondary_opts):
+            value = str(option in known.opts).lower() if known.secondary_opts else "VALUE"
+            return f"{option} is a key of the preset now: --set {key}={value}"
+    return None
+
+
+def _keys_of(section: str, kind: type, of_preset: bool = False) -> Iterator[tuple[str, Key]]:
     if issubclass(kind, Declared):
-        return [_option(entry) for entry in parameters_of(kind) if entry.option]
-    return [option for entry in fields(kind) for option in entry.metadata["options"]]  # type: ignore[arg-type]
+        for entry in parameters_of(kind):
+            if entry.option:
+                default = None if of_preset else entry.default
+                yield f"{section}.{entry.name}", Key(_option(entry, of_preset), entry, default, of_preset)
+        return
+    for place in fields(kind):  # type: ignore[arg-type]
+        if "kind" in place.metadata:
+            yield from _keys_of(place.name, place.metadata["kind"], place.metadata["of_preset"])
+            continue
+        names, about = place.metadata["option"]
+        option = click.Option([*names, place.name], **about) if names else click.Argument([place.name], **about)
+        default = about.get("default", () if "multiple" in about else None)
+        yield f"{section}.{place.name}", Key(option, None, default)
+
+
+def _further_of(kind: type) -> Iterator[click.Option]:
+    if not issubclass(kind, Declared):
+        for place in fields(kind):  # type: ignore[arg-type]
+            yield from place.metadata.get("also", ())
+
+
+def _read_keys(context: click.Context, known: Mapping[str, Key]) -> None:
+    """Add the values of keys to the context: those of --set before options, and options before the preset."""
+    own = {key: entry for key, entry in known.items() if not entry.of_preset}
+    found: dict[str, list] = {}
+    for key, value in _of_file(context.params.get("preset"), own):
+        if context.get_parameter_source(own[key].option.name or "") is not ParameterSource.COMMANDLINE:
+            found[key] = value if isinstance(value, list) else [value]
+    of_file, rest, sections = set(found), [], {key.partition(".")[0] for key in own}
+    for text in context.params.get("changes", ()):
+        key, equals, value = (part.strip() for part in text.partition("="))
+        if equals and key.partition(".")[0] in sections:
+            entry = _known("--set: ", key, own).entry
+            value = value if entry is None else entry.from_text(f"--set {key}", value)
+            found[key] = [*(found[key] if key in found and key not in of_file else ()), value]
+            of_file.discard(key)
+        else:
+            rest.append(text)
+    for key, (option, _, default, _) in known.items():
+        name = option.name or ""
+        if key in found:
+            value = found[key] if getattr(option, "multiple", False) else found[key][-1]
+            try:
+                option.handle_parse_result(context, {name: value}, [])
+            except click.BadParameter as error:
+                raise SimulationError(f"--set {key}: {error.message}") from None
+            if key in of_file:
+                context.set_parameter_source(name, ParameterSource.DEFAULT_MAP)
+        context.params.setdefault(name, default)
+    if "changes" in context.params:
+        context.params["changes"] = tuple(rest)
+
+
+def _of_file(preset: str | None, own: Mapping[str, Key]) -> Iterator[tuple[str, Any]]:
+    """(key, value) of what a preset has for a command alone. Raises SimulationError for unknown names."""
+    if not preset:
+        return
+    from SlicerUSSim.Logic.base.files import read_json
+
+    content = read_json(preset)
+    for section in dict.fromkeys(key.partition(".")[0] for key in own) if isinstance(content, dict) else ():
+        values = content.get(section, {})
+        require(isinstance(values, dict), f"{preset}: {section} is {values!r}, expected an object")
+        for name, value in values.items():
+            entry = _known(f"{preset}: ", f"{section}.{name}", own).entry
+            is_plain = entry is None and not isinstance(value, list)
+            yield (
+                f"{section}.{name}",
+                (str(value) if is_plain else value if entry is None else entry.checked(f"{preset}: {section}", value)),
+            )
+
+
+def _known(where: str, key: str, own: Mapping[str, Key]) -> Key:
+    """The Key with a name. Raises SimulationError with similar ones, or those of its section, for an unknown name."""
+    of_section = [other for other in own if other.partition(".")[0] == key.partition(".")[0]]
+    require(
+        key in own, f"{where}no parameter {key!r}, expected {either(get_close_matches(key, of_section) or of_section)}"
+    )
+    return own[key]
 
 
 def _filled(kind: type, given: dict[str, Any]) -> Any:
     """A `kind` from click's values, which are removed from them."""
     if issubclass(kind, Declared):
         return kind(**{entry.name: given.pop(entry.name) for entry in parameters_of(kind) if entry.option})
-    return kind(**{entry.name: _value(entry, given) for entry in fields(kind)})  # type: ignore[arg-type]
+    return kind(**{place.name: _value(place, given) for place in fields(kind)})  # type: ignore[arg-type]
 
 
-def _value(entry: Field, given: dict[str, Any]) -> Any:
-    names = entry.metadata.get("names")
-    if names is None:
-        return given.pop(entry.name)
-    values = {name: given.pop(name) for name in names}
-    flags = entry.metadata["flags"]
-    was_given = {name: value for name, value in values.items() if value is not (None if name in flags else _NOT_GIVEN)}
-    return entry.metadata["made"](**was_given)
+def _value(place: Field, given: dict[str, Any]) -> Any:
+    if "kind" not in place.metadata:
+        return given.pop(place.name)
+    if not place.metadata["of_preset"]:
+        return _filled(place.metadata["kind"], given)
+    values = {entry.name: given.pop(entry.name) for entry in parameters_of(place.metadata["kind"]) if entry.option}
+    return {name: value for name, value in values.items() if value is not None}
 
 
 def given_options(*names: str) -> list[str]:
@@ -217,14 +314,15 @@ def given_options(*names: str) -> list[str]:
     Of several options of one parameter, as --contrast and --ct, it is the one that stands for the value.
     """
     context = click.get_current_context()
+    rare = {entry.option: f"--set {key}" for key, entry in rare_keys(context.command).items()}
     given = dict[str, str]()
-    for parameter in context.command.params:
+    for parameter in (*context.command.params, *rare):
         name = parameter.name or ""
         if name not in names or context.get_parameter_source(name) is not ParameterSource.COMMANDLINE:
             continue
         stands_for = getattr(parameter, "flag_value", None) if getattr(parameter, "is_flag", False) else None
         if name not in given or (isinstance(stands_for, str) and stands_for == context.params.get(name)):
-            given[name] = parameter.opts[0]
+            given[name] = rare.get(parameter, parameter.opts[0])
     return list(given.values())
 
 
@@ -245,11 +343,6 @@ def _require_not_given(what: str, remedy: str, *names: str) -> None:
     kind = "a CT" if given == ["--ct"] else "an MRI"
     verb = "is" if len(given) == 1 else "are"
     require(not given, f"{what}, and {' and '.join(given)} {verb} for {kind}; {remedy}")
-
-
-overwrite_option = click.option(
-    "--overwrite", is_flag=True, expose_value=False, help="Replace outputs that exist; an input is never replaced."
-)
 
 
 def check_outputs(*outputs: Path | None, state: Path | None = None) -> None:
@@ -287,6 +380,34 @@ def check_results(folder: Path, names: Iterable[str], summary: str) -> None:
             is_own or not path.exists(),
             f"{path}: exists, and without {summary} the folder is not one of this command; give another folder (--out)",
         )
+
+
+@contextmanager
+def results_of(folder: Path, summary: str) -> Iterator[tuple[Path, dict]]:
+    """(a temporary folder for files, the summary to be filled): both are moved to `folder` if the block succeeds.
+
+    So a run that fails or is interrupted changes nothing. Raises SimulationError if the folder cannot be created or a
+    file cannot be written, naming it by its later place.
+    """
+    from SlicerUSSim.Logic.base.files import make_folder, move_into, partial_folder, write_json
+
+    is_new = not folder.exists()
+    make_folder(folder)
+    content: dict = {}
+    try:
+        with partial_folder(folder, "cannot be written to") as partial:
+            try:
+                yield partial, content
+                files = sorted(file for file in partial.iterdir() if file.name != summary)
+                write_json(partial / summary, content)
+            except SimulationError as error:  # the user knows no temporary folder
+                raise SimulationError(str(error).replace(str(partial), str(folder))) from None
+            move_into(folder, [*files, partial / summary])
+    except BaseException:
+        if is_new:
+            with suppress(OSError):  # not empty
+                folder.rmdir()
+        raise
 
 
 def require_no_input(out: Path) -> None:

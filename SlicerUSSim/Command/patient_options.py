@@ -10,30 +10,21 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from SlicerUSSim.Command.additions import Additions, add_option
-from SlicerUSSim.Command.craniotomy_options import GEL_MM, Craniotomy, craniotomy_option
+from SlicerUSSim.Command.additions import Additions
+from SlicerUSSim.Command.craniotomy_options import GEL_MM, Craniotomy
 from SlicerUSSim.Command.mri_options import (
-    also_option,
-    organs_option,
+    ImageOptions,
+    also_files,
     require_no_map,
     require_no_sequence,
     segmented_file,
-    split_also,
 )
-from SlicerUSSim.Command.options import (
-    ct_option,
-    declared,
-    declared_parameters,
-    device_option,
-    mask_option,
-    require_no_mri_options,
-)
+from SlicerUSSim.Command.options import declared, declared_parameters, require_no_mri_options
 from SlicerUSSim.Command.progress import note
-from SlicerUSSim.Command.set_option import Changes, set_option
-from SlicerUSSim.Command.sheet_options import DrawnSheets, drawn_sheets_option, no_sheet_option
-from SlicerUSSim.Logic.base.errors import SimulationError, require, required
+from SlicerUSSim.Command.set_option import Changes
+from SlicerUSSim.Command.sheet_options import DrawnSheets
+from SlicerUSSim.Logic.base.errors import require, required
 from SlicerUSSim.Logic.base.settings import DisplaySettings, SimulationSettings
-from SlicerUSSim.Logic.mri.segmentation_settings import CT, SegmentationSettings
 
 if TYPE_CHECKING:
     import numpy as np
@@ -42,14 +33,7 @@ if TYPE_CHECKING:
     from SlicerUSSim.Logic.imaging import Preset, UltrasoundSimulator
     from SlicerUSSim.Logic.mri import Added
     from SlicerUSSim.Logic.probe import Probe
-    from SlicerUSSim.Logic.tissue import TissueTable
-
-map_option = click.option(
-    "--map", "maps", multiple=True, metavar="LABEL=TISSUE",
-    help="Tissue of a label of the label map, by its number or its name: 24=csf; 0 removes a label. Or a .json file "
-    'with {"24": "csf"}, a table of names (.txt, .ctbl, .tsv), or the numbering: freesurfer, totalsegmentator, '
-    "totalsegmentator-v1, totalsegmentator-mr, totalsegmentator-tissues, ussim, brats-2022, brats. May be repeated.",
-)  # fmt: skip
+    from SlicerUSSim.Logic.tissue import Surfels, Texture, TissueTable
 
 #: A pose that is chosen; and those of mri.views.VIEWS
 AUTO = "auto"
@@ -63,63 +47,35 @@ pose_option = click.option(
 )  # fmt: skip
 
 
+#: Parameters that no command has an option for, and those that a command with further options has none for
+RARE = (
+    "classes thin_sulci bias_correction filter_radius no_sheets tgc_db_cm_mhz tgc_reach near_gain_db noise_db grey_map "
+    "contact_gap_mm partial_volume mri_modulation_db"
+)
+RARE_BESIDE = "skull_strip outside organs tissues seed"
+
+
 @dataclass(frozen=True)
-class PatientOptions:
+class PatientOptions(ImageOptions):
     """Patient, probe and display. Files are given by their paths."""
 
-    mri_or_labels: str = declared(click.argument("mri_or_labels", type=click.Path()))
+    mri_or_labels: str = declared(type=click.Path())
     #: None: determined from the input
     is_labels: bool | None = declared(
-        click.option(
-            "--labels/--mri", "is_labels", default=None,
-            help="Type of the input (default: labels if it has few different whole numbers).",
-        )
-    )  # fmt: skip
-    preset: str | None = declared(
-        click.option(
-            "--preset", type=click.Path(),
-            help="Probe, display, settings and tissues as JSON, from `ussim demo` or the Slicer module; the options "
-            "below override it.",
-        )
+        "--labels/--mri", default=None, help="Type of the input (default: labels if it has few different whole "
+        "numbers).",
     )  # fmt: skip
     probe: str | None = declared(
-        click.option(
-            "--probe",
-            metavar="NAME|PATH",
-            help="Name of a probe (docs/probes.md), as neonatal, or a probe as JSON "
-            "(default: the preset's, a phased array).",
-        )
-    )
-    tissues: str | None = declared(
-        click.option(
-            "--tissues", type=click.Path(),
-            help="Tissue table as JSON (default: the preset's, the file beside the labels, or brain).",
-        )
+        "--probe", metavar="NAME|PATH", help="Name of a probe (docs/probes.md), as neonatal, or a probe as JSON "
+        "(default: the preset's, a phased array).",
     )  # fmt: skip
-    #: LABEL=TISSUE, NAME=TISSUE, files and numbering schemes
-    maps: tuple[str, ...] = declared(map_option)
-    segmentation: SegmentationSettings = declared_parameters(  # noqa: RUF009
-        SegmentationSettings, ("contrast", "skull_strip", "thin_sulci", "outside"), also=(ct_option,)
-    )
-    #: Label map of organs of a CT
-    organs: str | None = declared(organs_option)
-    mask: str | None = declared(mask_option)
-    #: CONTRAST=FILE
-    also: tuple[str, ...] = declared(also_option)
-    #: TISSUE=FILE
-    additions: tuple[str, ...] = declared(add_option)
-    #: none, auto, disc:MM or a file
-    craniotomy: str = declared(craniotomy_option)
-    #: A file, auto or none
-    sheets: str = declared(drawn_sheets_option)
-    #: Kinds that are not drawn
-    no_sheets: tuple[str, ...] = declared(no_sheet_option)
+    tissues: str | None = declared(
+        "--tissues", type=click.Path(),
+        help="Tissue table as JSON (default: the preset's, the file beside the labels, or brain).",
+    )  # fmt: skip
     #: {parameter: value} of the options that were given
     display: Mapping[str, Any] = declared_parameters(DisplaySettings, of_preset=True)
     settings: Mapping[str, Any] = declared_parameters(SimulationSettings, of_preset=True)
-    #: NAME=VALUE
-    changes: tuple[str, ...] = declared(set_option)
-    device: str | None = declared(device_option)
 
     @property
     def gives_probe(self) -> bool:
@@ -177,8 +133,6 @@ class Examination:
     simulator: UltrasoundSimulator
     probe: Probe
     display: DisplaySettings
-    #: Whether the input was a label map, and not an MRI
-    is_labels: bool
     #: (4, 4) probe_to_ras, if open_examination was given one
     probe_to_ras: np.ndarray | None = None
 
@@ -194,7 +148,6 @@ def open_examination(patient: PatientOptions, pose: np.ndarray | str | None = No
 
     from SlicerUSSim.Logic.base.volume import Volume
     from SlicerUSSim.Logic.imaging.found_sheets import with_their_tissue
-    from SlicerUSSim.Logic.imaging.simulator import UltrasoundSimulator
     from SlicerUSSim.Logic.mri.outside import require_findable
     from SlicerUSSim.Logic.mri.pathology import texture_below
     from SlicerUSSim.Logic.mri.segmentation import Segmentation
@@ -207,29 +160,25 @@ def open_examination(patient: PatientOptions, pose: np.ndarray | str | None = No
     require_no_sequence(patient.mri_or_labels)
     volume = Volume.read(patient.mri_or_labels)
     chosen = patient.segmentation
-    is_ct = chosen.contrast == CT
-    is_labels = patient.is_labels
+    is_ct = patient.is_ct
     craniotomy = Craniotomy.of(patient.craniotomy)
-    require(not (is_ct and is_labels), f"{patient.mri_or_labels}: --labels and --ct are given, expected one of them")
-    if is_labels is None and is_ct:
-        is_labels = False
+    path, is_labels = patient.mri_or_labels, False if is_ct else patient.is_labels
+    require(not (is_ct and patient.is_labels), f"{path}: --labels and --ct are given, expected one of them")
     if is_labels is None:
-        is_labels = is_label_file(Path(patient.mri_or_labels), volume)
+        is_labels = is_label_file(Path(path), volume)
         kinds = ("a label map", "--mri") if is_labels else ("an MRI, to be segmented", "--labels")
-        log.info("%s is read as %s; use %s if it is not", patient.mri_or_labels, *kinds)
-    if is_labels and preset.settings.needs_texture:
-        raise SimulationError(
-            f"{patient.mri_or_labels}: is a label map; --partial-volume and --mri-modulation need an MRI"
-        )
-    if not is_labels:
-        require_no_map(patient.mri_or_labels, patient.maps, patient.organs)
+        log.info("%s is read as %s; use %s if it is not", path, *kinds)
+    if is_labels:
+        need = f"{path}: is a label map; partial_volume and mri_modulation_db need an MRI"
+        require(not preset.settings.needs_texture, need)
+        require_no_mri_options(path, "leave it out, or use --mri if it is one")
+    else:
+        require_no_map(path, patient.maps, patient.organs)
         craniotomy.require_head(
             volume, outside=chosen.outside, contrast=chosen.contrast, skull_strip=chosen.skull_strip,
             has_mask=patient.mask is not None,
         )  # fmt: skip
-    if is_labels:
-        require_no_mri_options(patient.mri_or_labels, "leave it out, or use --mri if it is one")
-    split_also(patient.also)
+    also_files(patient.also)
     if chosen.outside and not is_ct:
         require_findable(chosen.contrast, chosen.skull_strip, patient.mask is not None)
     sheets = DrawnSheets.of(patient.sheets, patient.no_sheets, is_labels=is_labels, contrast=chosen.contrast)
@@ -241,10 +190,7 @@ def open_examination(patient: PatientOptions, pose: np.ndarray | str | None = No
             labels, tissues.names_by_label(), has_brain_mask=False
         )
         tissues = changes.to_tissues(with_their_tissue(added.table(tissues), sheets.read))
-        placed = _placed(patient, craniotomy, preset, added, labels, pose)
-        _say_bone(placed, added, tissues, preset, craniotomy)
-        simulator = UltrasoundSimulator(placed.labels, tissues, placed.settings, patient.device, sheets=sheets.read)
-        return Examination(simulator, preset.probe, preset.display, is_labels, placed.probe_to_ras)
+        return _placed(patient, craniotomy, preset, added, labels, pose, tissues, None, sheets.read)
     log.info("tissues: %s", patient.tissues or ("the preset's" if patient.preset else "presets of the brain"))
     tissues = preset.tissues if table is None else table
     additions = Additions.read(patient.additions, (tissue.name for tissue in tissues.all_tissues()))
@@ -252,14 +198,10 @@ def open_examination(patient: PatientOptions, pose: np.ndarray | str | None = No
         changes.check_tissues((*(tissue.name for tissue in tissues.all_tissues()), *TISSUES))
     else:
         changes.to_tissues(additions.with_presets(tissues))
-    segmentation = segmented_file(
-        patient.mri_or_labels, volume, patient.segmentation, mask=patient.mask, also=patient.also,
-        organs=patient.organs, maps=patient.maps, device=patient.device, additions=additions,
-    )  # fmt: skip
+    segmentation = segmented_file(path, volume, patient, additions=additions)
     labels, names, surfels = segmentation.labels, segmentation.tissue_names, sheets.read
     if isinstance(segmentation, Segmentation):
-        drawn = sheets.found(patient.mri_or_labels, volume, segmentation, patient.segmentation.contrast)
-        labels, names, surfels = drawn.labels, drawn.names, drawn.surfels
+        surfels, labels, names = sheets.found(path, volume, segmentation, patient.contrast)
     if table is not None:
         of_brain = segmentation.brain_names if isinstance(segmentation, Segmentation) else segmentation.tissue_names
         labels, names = _numbered_as(tissues, labels, names, len(of_brain), patient.tissues or "tissues")
@@ -269,72 +211,53 @@ def open_examination(patient: PatientOptions, pose: np.ndarray | str | None = No
     tissues = with_their_tissue(tissues, surfels, known)
     texture = texture_below(segmentation.texture(), volume, segmentation.labels, added.labels)
     tissues = changes.to_tissues(tissues)
-    placed = _placed(patient, craniotomy, preset, added, labels, pose)
-    _say_bone(placed, added, tissues, preset, craniotomy)
-    simulator = UltrasoundSimulator(placed.labels, tissues, placed.settings, patient.device, texture, surfels)
-    return Examination(simulator, preset.probe, preset.display, is_labels, placed.probe_to_ras)
-
-
-@dataclass(frozen=True, eq=False)
-class _Placed:
-    """Labels with the craniotomy, the probe's pose, and the settings with the gel between them."""
-
-    labels: Volume
-    probe_to_ras: np.ndarray | None
-    settings: SimulationSettings
+    return _placed(patient, craniotomy, preset, added, labels, pose, tissues, texture, surfels)
 
 
 def _placed(
     patient: PatientOptions, craniotomy: Craniotomy, preset: Preset, added: Added, before: Volume,
-    pose: np.ndarray | str | None,
-) -> _Placed:  # fmt: skip
-    """The probe at its pose on a patient; `before` are the labels without what --add laid over them."""
+    pose: np.ndarray | str | None, tissues: TissueTable, texture: Texture | None, sheets: Surfels | None,
+) -> Examination:  # fmt: skip
+    """A patient with the craniotomy, and the probe at its pose with gel between them; says what bone is before it.
+
+    `before` are the labels without what --add laid over them.
+    """
+    from SlicerUSSim.Logic.imaging.simulator import UltrasoundSimulator
     from SlicerUSSim.Logic.placement.aiming import opening_pose
+    from SlicerUSSim.Logic.placement.bone_before_probe import about_bone
     from SlicerUSSim.Logic.placement.craniotomy import default_pose, middle_of
     from SlicerUSSim.Logic.placement.views import opened_view_pose, view_pose
     from SlicerUSSim.Logic.tissue.brain_orders import BRAIN_TISSUES
 
-    labels, names, settings = added.labels, added.tissue_names, preset.settings
-    whole, at = labels, None
-    if isinstance(pose, str) and craniotomy.is_wanted and not craniotomy.needs_pose:
-        labels = craniotomy.on(whole, names, preset.probe, None)
-        at = middle_of(whole, labels)
+    labels, names, settings, probe = added.labels, added.tissue_names, preset.settings, preset.probe
+    at, is_open, line = None, craniotomy.is_wanted, ""
     if isinstance(pose, str):
+        if craniotomy.is_file:
+            labels = craniotomy.on(added.labels, names, probe, None)
+            at = middle_of(added.labels, labels)
         target = added.centre_ras(before)
-        if pose == AUTO:
-            if not set(names) & {*BRAIN_TISSUES, "brain"}:
-                note("--pose is auto, and no tissue of a brain is labelled: the probe stands on top of what is")
-            if at is None:
-                pose = default_pose(labels, names, preset.probe, is_open=craniotomy.is_wanted, target_ras=target)
-            else:
-                pose, line = opening_pose(labels, names, preset.probe, at, target)
-                if line:
-                    note(f"probe: {line}")
+        if pose == AUTO and not set(names) & {*BRAIN_TISSUES, "brain"}:
+            note("--pose is auto, and no tissue of a brain is labelled: the probe stands on top of what is")
+        if at is not None and pose == AUTO:
+            pose, line = opening_pose(labels, names, probe, at, target)
+        elif at is not None:
+            pose, line = opened_view_pose(labels, names, pose)
+        elif pose == AUTO:
+            pose = default_pose(labels, names, probe, is_open=is_open, target_ras=target)
         else:
-            if at is None:
-                pose, line = view_pose(labels, names, pose, is_open=craniotomy.is_wanted)
-            else:
-                pose, line = opened_view_pose(labels, names, pose)
-            if line:
-                note(f"probe: {line}")
+            pose, line = view_pose(labels, names, pose, is_open=is_open)
+        if line:
+            note(f"probe: {line}")
     if at is None:
-        labels = craniotomy.on(labels, names, preset.probe, pose)
-    if "skin" in names and not craniotomy.is_wanted and not patient.gives_contact:
-        note(f"gel fills gaps of up to {GEL_MM:g} mm between skin and probe (--contact-gap)")
+        labels = craniotomy.on(labels, names, probe, pose)
+    if "skin" in names and not is_open and not patient.gives_contact:
+        note(f"gel fills gaps of up to {GEL_MM:g} mm between skin and probe (--set settings.contact_gap_mm)")
         settings = replace(settings, contact_gap_mm=GEL_MM)
-    return _Placed(labels, pose, settings)
-
-
-def _say_bone(placed: _Placed, added: Added, tissues: TissueTable, preset: Preset, craniotomy: Craniotomy) -> None:
-    """Say that the skull before the probe is closed, or that its face does not fit the opening."""
-    from SlicerUSSim.Logic.placement.bone_before_probe import about_bone
-
-    if placed.probe_to_ras is not None:
-        for line in about_bone(
-            placed.labels, added.tissue_names, tissues.all_tissues(), preset.probe, placed.probe_to_ras,
-            is_open=craniotomy.is_wanted,
-        ):  # fmt: skip
+    if pose is not None:
+        for line in about_bone(labels, names, tissues.all_tissues(), probe, pose, is_open=is_open):
             note(line)
+    simulator = UltrasoundSimulator(labels, tissues, settings, patient.device, texture, sheets)
+    return Examination(simulator, probe, preset.display, pose)
 
 
 def say_contact(examination: Examination, probe: Probe, poses: Sequence[np.ndarray]) -> None:
@@ -355,7 +278,7 @@ def open_examination_at(patient: PatientOptions, pose: str) -> tuple[Examination
 
     is_chosen = pose == AUTO or pose in STANDARD_VIEWS
     require(
-        not is_chosen or patient.segmentation.contrast != CT,
+        not is_chosen or not patient.is_ct,
         f"--pose is {pose}, which is on a head, and the image is a CT (--ct), expected a file with the pose",
     )
     require(

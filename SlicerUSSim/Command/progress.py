@@ -96,12 +96,9 @@ class Share(_Bar):
         self._reach(share)
 
 
-class Curve(_Bar):
+class Curve(Share):
     """A progress bar of an optimisation, with its stage and the best cost so far."""
 
-    def __init__(self, name: str) -> None:
-        super().__init__(100, name)
-
-    def __call__(self, progress: Progress) -> None:
+    def __call__(self, progress: Progress) -> None:  # type: ignore[override]
         self._show(progress.in_words())
         self._reach(progress.share)

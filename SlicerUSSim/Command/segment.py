@@ -8,10 +8,9 @@ from time import perf_counter
 
 import click
 
-from SlicerUSSim.Command.additions import Additions, add_option
-from SlicerUSSim.Command.mri_options import also_option, organs_option, read_mri, segmented_file, split_also
-from SlicerUSSim.Command.options import check_outputs, ct_option, device_option, gathered, mask_option, overwrite_option
-from SlicerUSSim.Command.patient_options import map_option
+from SlicerUSSim.Command.additions import Additions
+from SlicerUSSim.Command.mri_options import MriOptions, also_files, read_mri, segmented_file
+from SlicerUSSim.Command.options import check_outputs, gathered, out_option, overwrite_option
 from SlicerUSSim.Command.progress import note
 from SlicerUSSim.Command.proposals import (
     grown_at,
@@ -22,36 +21,20 @@ from SlicerUSSim.Command.proposals import (
     write_proposals,
 )
 from SlicerUSSim.Command.sheet_options import require_sheets, sheet_kind_option, sheets_option, write_sheets
-from SlicerUSSim.Logic.base.errors import require
-from SlicerUSSim.Logic.mri.segmentation_settings import CT, SegmentationSettings
+from SlicerUSSim.Logic.base.errors import SimulationError, require
 
 
 @click.command()
 @click.argument("mri", type=click.Path())
-@click.option(
-    "-o",
-    "--out",
-    type=click.Path(path_type=Path),
-    required=True,
-    help="Label map; the tissue table is written to a .json file of the same name.",
-)
-@gathered(settings=SegmentationSettings)
-@ct_option
-@mask_option
-@also_option
-@organs_option
-@map_option
-@add_option
+@gathered(patient=MriOptions)
+@out_option("Label map; the tissue table is written to a .json file of the same name.")
 @seed_option
 @sheets_option
 @sheet_kind_option
 @overwrite_option
-@device_option
 def segment(
-    mri: str, out: Path, settings: SegmentationSettings, mask: str | None, also: tuple[str, ...],
-    organs: str | None, maps: tuple[str, ...], additions: tuple[str, ...], seeds: tuple[str, ...],
-    sheets: Path | None, sheet_kinds: tuple[str, ...], device: str | None,
-) -> None:  # fmt: skip
+    mri: str, patient: MriOptions, out: Path, seeds: tuple[str, ...], sheets: Path | None, sheet_kinds: tuple[str, ...]
+) -> None:
     """Segment an MRI of a head or a brain, or a CT (--ct), into tissues."""
     from SlicerUSSim.Logic.base.volume import require_image_name
     from SlicerUSSim.Logic.mri.modality import has_brain_mask
@@ -59,23 +42,23 @@ def segment(
     from SlicerUSSim.Logic.mri.segmentation import Segmentation
     from SlicerUSSim.Logic.tissue.table import TissueTable, tissues_beside, write_label_files
 
+    settings, mask = patient.segmentation, patient.mask
+    for change in patient.changes:
+        raise SimulationError(f"--set {change}: no image is simulated, expected a key of segmentation")
     require_image_name(out)
     check_outputs(out, tissues_beside(out))
-    if settings.outside and settings.contrast != CT:
+    if settings.outside and not patient.is_ct:
         require_findable(settings.contrast, settings.skull_strip, mask is not None)
     require_sheets(sheets, sheet_kinds, settings.contrast)
-    split_also(also)
+    also_files(patient.also)
     split_seeds(seeds)
-    masks = Additions.read(additions)
+    masks = Additions.read(patient.additions)
     volume = read_mri(mri, mask=mask, skull_strip=settings.skull_strip, contrast=settings.contrast)
     if seeds:
         require(has_brain_mask(settings.contrast), "--seed grows lesions of an MRI, and this is a CT")
         require_seeds(seeds, volume, out)
     start = perf_counter()
-    result = segmented_file(
-        mri, volume, settings, mask=mask, also=also, organs=organs, maps=maps, device=device, additions=masks,
-        tell_all=True,
-    )  # fmt: skip
+    result = segmented_file(mri, volume, patient, additions=masks, tell_all=True)
     seconds = perf_counter() - start
     proposals, refused = grown_at(result, seeds) if isinstance(result, Segmentation) else ([], [])
     labels, names = result.labels, result.tissue_names

@@ -19,59 +19,56 @@ if TYPE_CHECKING:
     from SlicerUSSim.Logic.base import Volume
     from SlicerUSSim.Logic.tracked import TrackedImages, TrackedSequence
 
-transform_option = click.option(
-    "--transform", default="ImageToReference", show_default=True,
-    help="Transform from pixels to the patient's frame; composed of the transforms in the sequence.",
-)  # fmt: skip
-calibration_option = click.option(
-    "--calibration", type=click.Path(),
-    help="ImageToProbe, if the sequence lacks it: a Plus configuration (XML), or a file with the 4x4 matrix.",
-)  # fmt: skip
-to_mri_option = click.option(
-    "--to-mri", type=click.Path(),
-    help="Transform from the patient's frame to the MRI: a pose file, .xfm, or .tag with landmarks in both.",
-)  # fmt: skip
+
+@dataclass(frozen=True)
+class TrackingOptions:
+    """Where tracked images lie in the MRI."""
+
+    transform: str = declared(
+        "--transform", default="ImageToReference", show_default=True,
+        help="Transform from pixels to the patient's frame; composed of the transforms in the sequence.",
+    )  # fmt: skip
+    calibration: str | None = declared(
+        "--calibration", type=click.Path(),
+        help="ImageToProbe, if the sequence lacks it: a Plus configuration (XML), or a file with the 4x4 matrix.",
+    )  # fmt: skip
+    to_mri: str | None = declared(
+        "--to-mri", type=click.Path(),
+        help="Transform from the patient's frame to the MRI: a pose file, .xfm, or .tag with landmarks in both.",
+    )  # fmt: skip
+
+
+#: Parameters of a sequence that no command has an option for
+RARE_OF_SEQUENCE = "transform cut cut_tilt cut_slide cuts field"
 
 
 @dataclass(frozen=True)
-class SequenceOptions:
+class SequenceOptions(TrackingOptions):
     """Tracked images and their position in the MRI. Files are given by their paths."""
 
     sequence: str = declared(
-        click.option(
-            "--sequence", type=click.Path(), required=True,
-            help="Tracked images: .igs.mha .seq.mha .mhd .nrrd (Plus, 3D Slicer; poses alone for a sweep), a folder of "
-            "MINC slices, or with --cut a 3D ultrasound volume. Without --probe or --preset, the geometry is estimated "
-            "from the images.",
-        )
+        "--sequence", type=click.Path(), required=True,
+        help="Tracked images: .igs.mha .seq.mha .mhd .nrrd (Plus, 3D Slicer; poses alone for a sweep), a folder of "
+        "MINC slices, or with recording.cut a 3D ultrasound volume. Without --probe or --preset, the geometry is "
+        "estimated from the images.",
     )  # fmt: skip
     frames: str | None = declared(
-        click.option(
-            "--frames",
-            help="Images to use, such as 0,5,10 or 0:20:5 (default: all tracked images; for a fit, six of them).",
-        )
-    )
-    transform: str = declared(transform_option)
-    calibration: str | None = declared(calibration_option)
-    to_mri: str | None = declared(to_mri_option)
+        "--frames", help="Images to use, such as 0,5,10 or 0:20:5 (default: all tracked images; for a fit, six of "
+        "them).",
+    )  # fmt: skip
     cut: str | None = declared(
-        click.option(
-            "--cut",
-            type=click.Path(),
-            help="For a volume: extract the image plane of a probe at this pose, and neighbouring planes:",
-        )
-    )
+        "--cut", type=click.Path(), help="For a volume: file with the pose at which the image plane of a probe is "
+        "extracted, and neighbouring planes",
+    )  # fmt: skip
     cut_tilt: float | None = declared(
-        click.option("--cut-tilt", type=float, help="tilted over this total angle in degrees,")
+        "--cut-tilt", type=float, help="These are tilted over this total angle in degrees"
     )
     cut_slide: float | None = declared(
-        click.option("--cut-slide", type=float, help="or slid over this total distance in millimetres,")
+        "--cut-slide", type=float, help="They are slid over this total distance in millimetres"
     )
-    cuts: int = declared(
-        click.option("--cuts", type=click.IntRange(1), default=3, show_default=True, help="in this number of images.")
-    )
+    cuts: int = declared("--cuts", type=click.IntRange(1), default=3, help="Number of these planes (default: 3)")
     field: Path | None = declared(  # noqa: RUF009, a dataclasses.field like the others
-        click.option("--field", type=click.Path(path_type=Path), help="Figure of the imaged field, for checking: .png")
+        "--field", type=click.Path(path_type=Path), help="Figure of the imaged field, for checking: .png"
     )
 
 
@@ -177,7 +174,7 @@ def _read_cuts(pose_file: str, recording: SequenceOptions) -> tuple[Volume, list
     from SlicerUSSim.Logic.tracked.pose_files import read_pose
 
     if recording.cut_tilt is not None and recording.cut_slide is not None:
-        raise SimulationError("--cut-tilt and --cut-slide are both given, expected only one")
+        raise SimulationError("recording.cut_tilt and recording.cut_slide are both given, expected only one")
     pose = read_pose(pose_file)
     poses = [pose]
     if recording.cut_tilt is not None:

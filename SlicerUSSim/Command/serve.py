@@ -5,38 +5,24 @@ from __future__ import annotations
 import importlib.util
 import os
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from SlicerUSSim.Command.additions import Additions, add_option, split_additions
-from SlicerUSSim.Command.craniotomy_options import Craniotomy, craniotomy_option
+from SlicerUSSim.Command.additions import Additions, split_additions
+from SlicerUSSim.Command.craniotomy_options import NONE, Craniotomy
 from SlicerUSSim.Command.interrupts import end_at_once
-from SlicerUSSim.Command.mri_options import also_option, organs_option, read_mri, require_other_files, split_also
-from SlicerUSSim.Command.options import (
-    ct_option,
-    declared,
-    device_option,
-    gathered,
-    mask_option,
-    parameter_option,
-    require_no_mri_options,
-)
-from SlicerUSSim.Command.patient_options import map_option
+from SlicerUSSim.Command.mri_options import ImageOptions, also_files, read_mri
+from SlicerUSSim.Command.options import declared, gathered, given_options, require_no_mri_options
+from SlicerUSSim.Command.patient_options import RARE
 from SlicerUSSim.Command.progress import note
-from SlicerUSSim.Command.sequence_options import (
-    calibration_option,
-    read_sequence,
-    read_to_mri,
-    to_mri_option,
-    transform_option,
-)
-from SlicerUSSim.Command.sheet_options import AUTO, NONE, DrawnSheets, drawn_sheets_option, no_sheet_option
+from SlicerUSSim.Command.sequence_options import TrackingOptions, read_sequence, read_to_mri
+from SlicerUSSim.Command.set_option import Changes
+from SlicerUSSim.Command.sheet_options import AUTO, DrawnSheets
 from SlicerUSSim.Logic.base.errors import SimulationError, require
-from SlicerUSSim.Logic.mri.segmentation_settings import CT, SegmentationSettings
 
 if TYPE_CHECKING:
     import ssl
@@ -45,165 +31,138 @@ if TYPE_CHECKING:
     from SlicerUSSim.Workstation.workstation import Workstation
 
 _PORT = 8080
-#: Names of options that are about a patient, his ultrasound or settings; and their values when they are not given
+#: Parameters that are about a patient, his ultrasound or settings
 _OF_PATIENT = (
     "labels", "maps", "sequence", "calibration", "to_mri", "preset", "outside", "mask", "also", "additions", "organs",
 )  # fmt: skip
-_NOT_GIVEN = (None, False, ())
 #: Suffixes of files that are no images, and that the page opens
 _TEXTS = (".json", ".vtp", ".tfm", ".h5", ".hdf5", ".mat", ".xfm", ".xml", ".tag", ".txt")
 
 
-def _option(*names: str, **about: Any) -> Any:
-    return declared(click.option(*names, **about))
-
-
 @dataclass(frozen=True)
-class ServeOptions:
+class ServeOptions(ImageOptions):
     """Arguments and options of `ussim serve`."""
 
-    mri: str | None = declared(click.argument("mri", type=click.Path(), required=False))
-    labels: str | None = _option(
+    mri: str | None = declared(type=click.Path(), required=False)
+    labels: str | None = declared(
         "--labels", type=click.Path(), help="Label map, used instead of a segmentation of the MRI."
     )
-    maps: tuple[str, ...] = declared(map_option)
-    sequence: str | None = _option(
+    sequence: str | None = declared(
         "--sequence", type=click.Path(), help="Tracked ultrasound for replay and comparison."
     )
-    transform: str = declared(transform_option)
-    calibration: str | None = declared(calibration_option)
-    to_mri: str | None = declared(to_mri_option)
-    preset: str | None = _option("--preset", type=click.Path(), help="Probe, display, settings and tissues as JSON.")
-    contrast: str = declared(lambda command: parameter_option(SegmentationSettings, "contrast")(ct_option(command)))
-    skull_strip: str = declared(parameter_option(SegmentationSettings, "skull_strip"))
-    outside: bool = declared(parameter_option(SegmentationSettings, "outside"))
-    mask: str | None = declared(mask_option)
-    also: tuple[str, ...] = declared(also_option)
-    additions: tuple[str, ...] = declared(add_option)
-    organs: str | None = declared(organs_option)
-    craniotomy: str = declared(craniotomy_option)
-    sheets: str = declared(drawn_sheets_option)
-    no_sheets: tuple[str, ...] = declared(no_sheet_option)
-    port: int | None = _option(
+    port: int | None = declared(
         "--port", type=click.IntRange(0, 65535), help=f"Port (default: {_PORT}, or a free one if it is taken)."
     )
-    host: str = _option(
+    host: str = declared(
         "--host", default="127.0.0.1", show_default=True,
         help="Address to listen at. Access requires the token in the printed URL.",
     )  # fmt: skip
-    cert: str | None = _option(
+    cert: str | None = declared(
         "--cert", type=click.Path(), help="TLS certificate (PEM) for https; with --key. For --host."
     )
-    key: str | None = _option("--key", type=click.Path(), help="Its private key (PEM), without a password.")
-    igtl: str | None = _option(
+    key: str | None = declared("--key", type=click.Path(), help="Its private key (PEM), without a password.")
+    igtl: str | None = declared(
         "--igtl",
         help="HOST:PORT of a tracker that sends TRANSFORM messages over OpenIGTLink and receives the images. :PORT "
         "waits for a client on this computer, listen:HOST:PORT for one on another computer (listen:0.0.0.0:18944). "
         "OpenIGTLink has no authentication: anyone who can reach the port can move the probe and receive the images.",
     )
-    autosave: bool = _option(
+    autosave: bool = declared(
         "--autosave/--no-autosave", default=True, show_default=True, envvar="USSIM_AUTOSAVE", show_envvar=True,
         help="Keep patient, probe and settings in a folder of yours, to be restored after a crash; see "
         "docs/security.md.",
     )  # fmt: skip
-    igtl_device: str | None = _option(
+    igtl_device: str | None = declared(
         "--igtl-device", help="Name of the transform to follow (default: the first one received)."
     )
-    device: str | None = declared(device_option)
 
 
 @click.command()
-@gathered(options=ServeOptions)
-def serve(options: ServeOptions) -> None:
+@gathered(f"{RARE} transform igtl_device", patient=ServeOptions, recording=TrackingOptions)
+def serve(patient: ServeOptions, recording: TrackingOptions) -> None:
     """The workstation in the browser, with live images. Without a file it shows the demo brain.
 
     The file is an MRI, or what the page opens, by its content: a scene (.mrb), tracked ultrasound, a preset, ...
     """
     _require_workstation()
-    scene, scene_name, also_open, mri = None, "", None, options.mri
+    scene, scene_name, also_open, mri = None, "", None, patient.mri
     if mri is not None and _is_no_image(mri):
-        given = click.get_current_context().params
-        patient = [name for name in _OF_PATIENT if given[name] not in _NOT_GIVEN]
-        (scene, scene_name), also_open, mri = _opened_first(mri, [f"--{name.replace('_', '-')}" for name in patient])
-    added = split_additions(options.additions)
-    others = split_also(options.also)
+        (scene, scene_name), also_open, mri = _opened_first(mri, given_options(*_OF_PATIENT))
+    added = split_additions(patient.additions)
+    others = also_files(patient.also, mri)
     require(len(others) < 2, f"--also is given {len(others)} times, expected one further MRI in the workstation")
-    require_other_files(mri, others)
-    own = (mri, options.labels, options.mask, options.organs)
+    own = (mri, patient.labels, patient.mask, patient.organs)
     files = [file for file in (*own, *(file for _, file in added), *others.values()) if file is not None]
     # Checked here, so that the error is reported in the terminal and not on the page.
     for file in files:
         require(Path(file).exists(), f"{file}: no such file")
-    if options.maps:
+    if patient.maps:
         from SlicerUSSim.Logic.tissue.label_mapping import LabelMapping
 
-        is_for_one = options.labels is not None or options.organs is not None
+        is_for_one = patient.labels is not None or patient.organs is not None
         require(is_for_one, "--map is for a label map, expected --labels too")
-        LabelMapping.of(options.maps)
-    if options.labels is not None and mri is None:
-        require_no_mri_options(options.labels, "give an MRI, too, to segment it")
-    is_ct, has_mask = options.contrast == CT, options.mask is not None
+        LabelMapping.of(patient.maps)
+    if patient.labels is not None and mri is None:
+        require_no_mri_options(patient.labels, "give an MRI, too, to segment it")
+    chosen, is_ct, has_mask = patient.segmentation, patient.is_ct, patient.mask is not None
     require(
         mri is not None or not is_ct,
         "the contrast is ct (--ct), expected a CT; without a file the demo brain is shown, an MRI",
     )
-    if options.outside and not is_ct:
+    if chosen.outside and not is_ct:
         from SlicerUSSim.Logic.mri.outside import require_findable
 
-        require_findable(options.contrast, options.skull_strip, has_mask)
+        require_findable(patient.contrast, chosen.skull_strip, has_mask)
         require(mri is not None, "--outside is for a whole head, expected an MRI of one; the demo brain has no head")
-    require(options.organs is None or is_ct, "--organs is for a CT, expected --ct too")
+    require(patient.organs is None or is_ct, "--organs is for a CT, expected --ct too")
     drawn = DrawnSheets.of(
-        options.sheets, options.no_sheets, is_labels=options.labels is not None, contrast=options.contrast
+        patient.sheets, patient.no_sheets, is_labels=patient.labels is not None, contrast=patient.contrast
     )
-    read_head = partial(
-        read_mri, mask=options.mask, skull_strip=options.skull_strip, contrast=options.contrast, is_served=True
-    )
-    opening = Craniotomy.of(options.craniotomy)
-    if opening.is_wanted and options.labels is None:
+    more = {"mask": patient.mask, "skull_strip": chosen.skull_strip, "contrast": patient.contrast}
+    read_head = partial(read_mri, is_served=True, **more)
+    opening = Craniotomy.of(patient.craniotomy)
+    if opening.is_wanted and patient.labels is None:
         require(
             scene is None and also_open is None,
-            f"--craniotomy is {options.craniotomy}, which opens the skull in the MRI of a head, and the file is none",
+            f"--craniotomy is {patient.craniotomy}, which opens the skull in the MRI of a head, and the file is none",
         )
         opening.require_head(
-            None if mri is None or options.outside else read_head(mri),
-            outside=options.outside, contrast=options.contrast, skull_strip=options.skull_strip, has_mask=has_mask,
+            None if mri is None or chosen.outside else read_head(mri),
+            outside=chosen.outside, contrast=patient.contrast, skull_strip=chosen.skull_strip, has_mask=has_mask,
         )  # fmt: skip
     if opening.is_file:
         _require_opening(opening.source)
     require(not (is_ct and others), "--also is for an MRI, and the contrast is ct (--ct); leave it out")
-    if options.igtl is not None:
+    if patient.igtl is not None:
         from SlicerUSSim.Logic.tracked.openigtlink import parse_address, require_usable
 
-        require_usable(parse_address(options.igtl))
-    has_both = (options.cert is None) == (options.key is None)
-    require(has_both, "--cert and --key are for each other, expected both or none")
-    tls = _tls(options.cert, options.key)
-    port = _usable_port(options.host, options.port)
+        require_usable(parse_address(patient.igtl))
+    tls = _tls(patient.cert, patient.key)
+    port = _usable_port(patient.host, patient.port)
 
     from SlicerUSSim.Logic.base.volume import Volume
     from SlicerUSSim.Logic.imaging.preset import Preset
     from SlicerUSSim.Logic.mri.masks import with_label_names
     from SlicerUSSim.Logic.opencl.devices import choose_device
 
-    choose_device(options.device)
-    volumes = {file: Volume.read(file) for file in files if file != mri or options.labels is not None}
-    if mri is not None and options.labels is None:
+    choose_device(patient.device)
+    volumes = {file: Volume.read(file) for file in files if file != mri or patient.labels is not None}
+    if mri is not None and patient.labels is None:
         volumes[mri] = read_head(mri)
     checked = Additions.of((tissue, with_label_names(volumes[file], file), file) for tissue, file in added)
-    if mri is not None and options.labels is None:
-        checked.require_addable(
-            volumes[mri],
-            None if options.mask is None else volumes[options.mask],
-            "none" if is_ct else options.skull_strip,
-        )
-    if options.labels is not None and mri is not None and (has_mask or others):
+    if mri is not None and patient.labels is None:
+        mask = None if patient.mask is None else volumes[patient.mask]
+        checked.require_addable(volumes[mri], mask, "none" if is_ct else chosen.skull_strip)
+    if patient.labels is not None and mri is not None and (has_mask or others):
         what = " and ".join([*["--mask"] * has_mask, *["--also"] * bool(others)])
-        note(f"{what}: for Segment in the page; the labels shown are those of {options.labels}")
+        note(f"{what}: for Segment in the page; the labels shown are those of {patient.labels}")
     masks = tuple((tissue, file) for (tissue, _, _), (_, file) in zip(checked.masks, added, strict=True))
-    chosen_preset = Preset.read(options.preset) if options.preset else None
-    tracked = read_sequence(options.sequence, options.calibration) if options.sequence else None
-    to_ras = read_to_mri(options.to_mri) if options.to_mri else None
+    chosen_preset = Preset.read(patient.preset) if patient.preset else None
+    if patient.changes:
+        changes, preset = Changes.of(patient.changes), chosen_preset or Preset()
+        chosen_preset = replace(changes.to_preset(preset), tissues=changes.to_tissues(preset.tissues))
+    tracked = read_sequence(patient.sequence, recording.calibration) if patient.sequence else None
+    to_ras = read_to_mri(recording.to_mri) if recording.to_mri else None
 
     _prepare_libraries()
     from SlicerUSSim.Logic.mri.segmentation_settings import SheetSettings
@@ -212,22 +171,22 @@ def serve(options: ServeOptions) -> None:
     from SlicerUSSim.Workstation.workstation import Workstation
 
     sheet_settings = SheetSettings()
-    if options.sheets != NONE:
-        sheet_settings = SheetSettings.of_kinds(drawn.kinds, find=options.sheets == AUTO)
+    if patient.sheets != NONE:
+        sheet_settings = SheetSettings.of_kinds(drawn.kinds, find=patient.sheets == AUTO)
     workstation = Workstation(
         Files(
-            mri=mri, labels=options.labels, maps=options.maps, contrast=options.contrast, mask=options.mask,
-            skull_strip=options.skull_strip, outside=options.outside, also=others, additions=masks,
-            organs=options.organs, sheets=None if drawn.read is None else options.sheets,
+            mri=mri, labels=patient.labels, maps=patient.maps, contrast=patient.contrast, mask=patient.mask,
+            skull_strip=chosen.skull_strip, outside=chosen.outside, also=others, additions=masks,
+            organs=patient.organs, sheets=None if drawn.read is None else patient.sheets,
             sheet_settings=sheet_settings, craniotomy=opening.source, craniotomy_mm=opening.diameter_mm,
-            preset=chosen_preset, sequence=tracked, sequence_name=Path(options.sequence or "").name.split(".")[0],
-            transform=options.transform, to_ras=to_ras, scene=scene, scene_name=scene_name, also_open=also_open,
-            tracker=options.igtl, tracker_device=options.igtl_device, volumes=volumes,
+            preset=chosen_preset, sequence=tracked, sequence_name=Path(patient.sequence or "").name.split(".")[0],
+            transform=recording.transform, to_ras=to_ras, scene=scene, scene_name=scene_name, also_open=also_open,
+            tracker=patient.igtl, tracker_device=patient.igtl_device, volumes=volumes,
         ),
-        options.device,
-        SessionStore(sessions_folder()) if options.autosave else None,
+        patient.device,
+        SessionStore(sessions_folder()) if patient.autosave else None,
     )  # fmt: skip
-    _run(workstation, options.host, port, tls)
+    _run(workstation, patient.host, port, tls)
 
 
 def _is_no_image(path: str) -> bool:
@@ -247,7 +206,7 @@ def _is_zip(path: str) -> bool:
 def _opened_first(path: str, options: list[str]) -> tuple[tuple[SceneRecord | None, str], str | None, None]:
     """((scene, its name), file that is opened as in the page, None); `options` are those about a patient.
 
-    Raises SimulationError for a file that cannot be opened, and for a scene with such options.
+    Raises SimulationError for a file that cannot be opened, and for a scene with such patient.
     """
     from SlicerUSSim.Workstation.content import Kind, content_of
     from SlicerUSSim.Workstation.scene_files import read_scene
@@ -279,6 +238,7 @@ def _require_workstation() -> None:
 
 
 def _tls(cert: str | None, key: str | None) -> ssl.SSLContext | None:
+    require((cert is None) == (key is None), "--cert and --key are for each other, expected both or none")
     if cert is None or key is None:
         return None
     from SlicerUSSim.Workstation.access import tls_context

@@ -7,21 +7,12 @@ from dataclasses import dataclass, field, replace
 from difflib import get_close_matches
 from typing import TYPE_CHECKING, Any
 
-import click
-
 from SlicerUSSim.Logic.base.errors import SimulationError, either, require
 
 if TYPE_CHECKING:
     from SlicerUSSim.Logic.base.declaration import Parameter
     from SlicerUSSim.Logic.imaging import Preset
     from SlicerUSSim.Logic.tissue import TissueTable
-
-set_option = click.option(
-    "--set", "changes", multiple=True, metavar="NAME=VALUE",
-    help="Any parameter of probe, display, settings, membrane and tissues, such as settings.max_ray_depth=4, "
-    'probe.depth_mm=70 or "white matter.mu0=0.5"; overrides other options; may be repeated. docs/parameters.md '
-    "lists them.",
-)  # fmt: skip
 
 _MEMBRANE = "membrane"
 
@@ -128,16 +119,11 @@ def _hint(name: str, section: str, of_preset: dict[str, Parameter], of_tissue: d
     """Similar names for an unknown parameter."""
     from SlicerUSSim.Logic.tissue.presets import TISSUES
 
-    sections = list(dict.fromkeys(known.partition(".")[0] for known in of_preset))
-    own = [known for known in of_preset if known.partition(".")[0] == section]
-    by_tissue = [f"{tissue}.{attribute}" for tissue in TISSUES for attribute in of_tissue]
     attribute = name.rpartition(".")[2]
+    own = [known for known in of_preset if known.startswith(f"{section}.")]
     if own:
-        attributes = [known.partition(".")[2] for known in own]
-        return either([f"{section}.{known}" for known in get_close_matches(attribute, attributes, n=3) or attributes])
-    everything = [*of_preset, *by_tissue]
+        return either(get_close_matches(name, own, n=3) or own)
+    everything = [*of_preset, *(f"{tissue}.{known}" for tissue in TISSUES for known in of_tissue)]
     same = [known for known in everything if known.rpartition(".")[2] == attribute]
-    near = same[:3] or get_close_matches(name, everything, n=3)
-    if near:
-        return either(near)
-    return f"{either([*sections, 'a tissue'])}, a dot and one of its parameters, such as display.gain_db"
+    sections = list(dict.fromkeys(known.partition(".")[0] for known in of_preset))
+    return either(same[:3] or get_close_matches(name, everything, n=3) or [*sections, "a tissue"])

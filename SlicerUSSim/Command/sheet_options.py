@@ -1,7 +1,8 @@
-"""--sheets, --sheet and --no-sheet: thin sheets and small structures found after a segmentation, and in images."""
+"""--sheets, --sheet and no_sheets: thin sheets and small structures found after a segmentation, and in images."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -28,21 +29,11 @@ sheet_kind_option = click.option(
 )  # fmt: skip
 #: Values of --sheets that are no file
 AUTO, NONE = "auto", "none"
-drawn_sheets_option = click.option(
-    "--sheets", default=NONE, metavar="FILE|auto|none", show_default=True,
-    help="Draw sulci, falx, tentorium and walls of ventricles as thin sheets: those in FILE, a .vtp of `ussim segment "
-    "--sheets`; auto: found in the MRI and kept beside it, with corpus callosum, choroid plexus and vessels as labels.",
-)  # fmt: skip
-no_sheet_option = click.option(
-    "--no-sheet", "no_sheets", multiple=True, metavar="KIND",
-    help="What --sheets leaves as the labels have it: sulcus, falx, tentorium, ependyma, corpus callosum, choroid "
-    "plexus or vessels; may be repeated.",
-)  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
 class DrawnSheets:
-    """What --sheets and --no-sheet ask for in images."""
+    """What --sheets and no_sheets ask for in images."""
 
     #: AUTO, NONE, or a file
     source: str
@@ -54,7 +45,7 @@ class DrawnSheets:
     @classmethod
     def of(cls, source: str, without: tuple[str, ...], *, is_labels: bool, contrast: str) -> DrawnSheets:
         """Reads and checks, before anything slow. Raises SimulationError for what cannot be met."""
-        require(source != NONE or not without, "--no-sheet leaves out some of --sheets; give --sheets, too")
+        require(source != NONE or not without, "no_sheets leaves out some of --sheets; give --sheets, too")
         if source == NONE:
             return cls(source, ())
         from SlicerUSSim.Logic.mri.sheets.finding import ALL_KINDS, require_findable
@@ -62,16 +53,14 @@ class DrawnSheets:
         from SlicerUSSim.Logic.tissue.surfels import KINDS
 
         for kind in without:
-            require(kind in ALL_KINDS, f"--no-sheet is {kind!r}, expected one of: {', '.join(ALL_KINDS)}")
+            require(kind in ALL_KINDS, f"no_sheets is {kind!r}, expected one of: {', '.join(ALL_KINDS)}")
         kinds = tuple(kind for kind in ALL_KINDS if kind not in without)
         if source != AUTO:
             require(
                 Path(source).is_file(), f"--sheets is {source!r} (no such file), expected a .vtp file, {AUTO} or {NONE}"
             )
             for kind in dict.fromkeys(kind for kind in without if kind not in KINDS):
-                note(
-                    f"--no-sheet {kind} leaves nothing out: it is no sheet of {source} but a label, where there is one"
-                )
+                note(f"no_sheets {kind} leaves nothing out: it is no sheet of {source} but a label, where there is one")
             whole = read_surfels(source)
             if kinds and len(whole) and "sulcus" not in whole.kinds():
                 note(f"{source} has no sulci, by which sheets of another patient are known: look whether they fit")
@@ -80,37 +69,13 @@ class DrawnSheets:
         require_findable(kinds, contrast)
         return cls(source, kinds)
 
-    def found(self, mri_path: str, mri: Volume, segmentation: Segmentation, contrast: str) -> _Drawn:
-        """The sheets of an MRI, and its labels with the structures on top. Looked for once: everything is kept."""
+    def found(
+        self, mri_path: str, mri: Volume, segmentation: Segmentation, contrast: str
+    ) -> tuple[Surfels | None, Volume, tuple[str, ...]]:
+        """(Sheets of an MRI, its labels, their names with the structures on top). Looked for once, all are kept."""
         if self.source != AUTO or not self.kinds:
-            return _Drawn(self.read, segmentation.labels, segmentation.tissue_names)
-        from SlicerUSSim.Logic.base.errors import about_file
-        from SlicerUSSim.Logic.mri.pathology import add_tissues
-        from SlicerUSSim.Logic.mri.sheets.finding import ALL_KINDS, STRUCTURES, find_sheets
-        from SlicerUSSim.Logic.mri.sheets.kept import sheets_beside
-        from SlicerUSSim.Logic.tissue.surfels import KINDS
-
-        with Share("sheets") as progress, about_file(mri_path):
-            sheets = find_sheets(
-                mri, segmentation, contrast=contrast, keep_at=sheets_beside(mri_path), progress=progress
-            )
-        without = tuple(f"{kind}:" for kind in ALL_KINDS if kind not in self.kinds)
-        for line in sheets.notes:
-            if not line.startswith(without):
-                note(line)
-        labels, names = segmentation.labels, segmentation.tissue_names
-        masks = [mask for mask in sheets.masks() if mask[2] in set(STRUCTURES) & set(self.kinds)]
-        if masks:
-            added = add_tissues(labels, names, masks, has_brain_mask=True)
-            labels, names = added.labels, added.tissue_names
-        return _Drawn(sheets.surfels.of_kind(*(set(KINDS) & set(self.kinds))), labels, names)
-
-
-@dataclass(frozen=True, eq=False)
-class _Drawn:
-    surfels: Surfels | None
-    labels: Volume
-    names: tuple[str, ...]
+            return self.read, segmentation.labels, segmentation.tissue_names
+        return _searched(mri_path, mri, segmentation, contrast, self.kinds)
 
 
 def require_sheets(path: Path | None, kinds: tuple[str, ...], contrast: str) -> None:
@@ -131,22 +96,36 @@ def write_sheets(
     path: Path, mri_path: str, mri: Volume, found: Segmentation, contrast: str, kinds: tuple[str, ...]
 ) -> tuple[Volume, tuple[str, ...]]:
     """Find the sheets of a segmented MRI and write them; returns the labels and names with the structures on top."""
+    from SlicerUSSim.Logic.mri.sheets.finding import ALL_KINDS
+    from SlicerUSSim.Logic.mri.sheets.polydata import write_surfels
+
+    wanted = kinds or ALL_KINDS
+    surfels, labels, names = _searched(mri_path, mri, found, contrast, wanted, wanted)
+    write_surfels(path, surfels)
+    note(f"wrote {path}")
+    return labels, names
+
+
+def _searched(
+    mri_path: str, mri: Volume, found: Segmentation, contrast: str, shown: Sequence[str], wanted: Sequence[str] = ()
+) -> tuple[Surfels, Volume, tuple[str, ...]]:
+    """(Sheets, labels, names) of the kinds `shown` of those that are `wanted`, all by default; with notes on them."""
     from SlicerUSSim.Logic.base.errors import about_file
     from SlicerUSSim.Logic.mri.pathology import add_tissues
     from SlicerUSSim.Logic.mri.sheets.finding import ALL_KINDS, find_sheets
     from SlicerUSSim.Logic.mri.sheets.kept import sheets_beside
-    from SlicerUSSim.Logic.mri.sheets.polydata import write_surfels
+    from SlicerUSSim.Logic.tissue.surfels import KINDS
 
     with Share("sheets") as progress, about_file(mri_path):
         sheets = find_sheets(
-            mri, found, contrast=contrast, kinds=kinds or ALL_KINDS, keep_at=sheets_beside(mri_path), progress=progress
+            mri, found, contrast=contrast, kinds=wanted or ALL_KINDS, keep_at=sheets_beside(mri_path), progress=progress
         )
-    write_surfels(path, sheets.surfels)
     for line in sheets.notes:
-        note(line)
-    note(f"wrote {path}")
-    masks = sheets.masks()
-    if not masks:
-        return found.labels, found.tissue_names
-    added = add_tissues(found.labels, found.tissue_names, masks, has_brain_mask=True)
-    return added.labels, added.tissue_names
+        if not line.startswith(tuple(f"{kind}:" for kind in ALL_KINDS if kind not in shown)):
+            note(line)
+    labels, names = found.labels, found.tissue_names
+    masks = [mask for mask in sheets.masks() if mask[2] in shown]
+    if masks:
+        added = add_tissues(labels, names, masks, has_brain_mask=True)
+        labels, names = added.labels, added.tissue_names
+    return sheets.surfels.of_kind(*(set(KINDS) & set(shown))), labels, names

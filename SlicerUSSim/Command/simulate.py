@@ -7,20 +7,24 @@ from pathlib import Path
 
 import click
 
-from SlicerUSSim.Command.options import check_outputs, gathered, overwrite_option
-from SlicerUSSim.Command.patient_options import PatientOptions, open_examination_at, pose_option, say_contact
+from SlicerUSSim.Command.options import check_outputs, gathered, out_option, overwrite_option
+from SlicerUSSim.Command.patient_options import (
+    RARE,
+    RARE_BESIDE,
+    PatientOptions,
+    open_examination_at,
+    pose_option,
+    say_contact,
+)
 from SlicerUSSim.Command.progress import Share, note
-from SlicerUSSim.Command.sequence_options import SequenceOptions, open_tracked
+from SlicerUSSim.Command.sequence_options import RARE_OF_SEQUENCE, SequenceOptions, open_tracked
 from SlicerUSSim.Logic.base.errors import SimulationError
-from SlicerUSSim.Logic.mri.segmentation_settings import CT
 
 
 @click.command()
-@gathered(patient=PatientOptions)
+@gathered(RARE, patient=PatientOptions)
 @pose_option
-@click.option(
-    "-o", "--out", type=click.Path(path_type=Path), required=True, help="Image: .png .mha .nrrd .nii.gz or .vti"
-)
+@out_option("Image: .png .mha .nrrd .nii.gz or .vti")
 @overwrite_option
 def simulate(patient: PatientOptions, pose: str, out: Path) -> None:
     """Simulate one B-mode image from an MRI or a label map at a given pose."""
@@ -36,15 +40,12 @@ def simulate(patient: PatientOptions, pose: str, out: Path) -> None:
         write_png(out, frame.image)
     else:
         frame.to_volume().write(out)
-    kind = "labels" if examination.is_labels else "CT" if patient.segmentation.contrast == CT else "MRI"
-    note(f"wrote {out} ({frame.image.shape[1]}x{frame.image.shape[0]}, from {kind})")
+    note(f"wrote {out} ({frame.image.shape[1]}x{frame.image.shape[0]})")
 
 
 @click.command()
-@gathered(patient=PatientOptions, recording=SequenceOptions)
-@click.option(
-    "-o", "--out", type=click.Path(path_type=Path), required=True, help="Sequence: .igs.mha .seq.mha .mhd or .nrrd"
-)
+@gathered(f"{RARE} {RARE_OF_SEQUENCE} skull_strip tissues seed", patient=PatientOptions, recording=SequenceOptions)
+@out_option("Sequence: .igs.mha .seq.mha .mhd or .nrrd")
 @overwrite_option
 def sweep(patient: PatientOptions, recording: SequenceOptions, out: Path) -> None:
     """Simulate the images of a tracked sequence, at its poses and on its pixels."""
@@ -72,9 +73,9 @@ def sweep(patient: PatientOptions, recording: SequenceOptions, out: Path) -> Non
 
 
 @click.command()
-@gathered(patient=PatientOptions)
+@gathered(f"{RARE} {RARE_BESIDE}", patient=PatientOptions)
 @pose_option
-@click.option("-o", "--out", type=click.Path(path_type=Path), required=True, help="Volume: .nrrd .nii.gz .mha or .vti")
+@out_option("Volume: .nrrd .nii.gz .mha or .vti")
 @click.option("--tilt", type=float, help="Tilt the image plane about the probe face over this total angle in degrees.")
 @click.option(
     "--slide", type=float, help="Slide the probe across its image plane over this total distance in millimetres."

@@ -5,6 +5,7 @@ A plane has two words (kernels/sheets.clh): that of sheets.cl, and its look: dis
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -102,13 +103,13 @@ def _hangs(surfels: Surfels, padded: np.ndarray, grid: Volume) -> np.ndarray:
     """
     labels = padded.ravel()
     found = np.isin(surfels.kind, [KINDS.index("falx"), KINDS.index("tentorium")])
-    found &= labels[_index(grid, surfels.place, padded.shape)] == 0
+    found &= labels[_along(surfels, grid, padded.shape)(0.0)] == 0
     some = np.flatnonzero(found)
+    index = _along(surfels.chosen(some), grid, padded.shape)
     has_tissue = np.zeros((2, len(some)), bool)
     for side, sign in enumerate((-1.0, 1.0)):
         for step in np.arange(1.0, _BETWEEN_MM + 0.5):
-            place = surfels.place[some] + sign * step * surfels.normal[some]
-            has_tissue[side] |= labels[_index(grid, place, padded.shape)] != 0
+            has_tissue[side] |= labels[index(sign * step)] != 0
     found[some] = ~has_tissue.all(axis=0)
     return found
 
@@ -135,8 +136,9 @@ def _require_of_patient(
     near = max(_NEAR_MM, float(grid.spacing_mm.max()))
     fluid, tissue, labelled, brain = np.zeros((4, len(inside)), bool)
     of_brain = [label for label, tissue in tissues.items() if label and tissue.name in (_GREY, _WHITE)]
+    index = _along(inside, grid, padded.shape)
     for step in np.arange(-near, near + 1e-6, _STEP_MM):
-        label = padded.ravel()[_index(grid, inside.place + step * inside.normal, padded.shape)]
+        label = padded.ravel()[index(step)]
         is_outside = np.isin(label, (0, *fluids))
         fluid |= is_outside
         tissue |= ~is_outside
@@ -179,13 +181,14 @@ def _change_beside_sulci(
     if not np.isin(padded, np.flatnonzero(steps == 2)).any():
         return 0.0, 0
     sulci = surfels.of_kind("sulcus")
+    index = _along(sulci, grid, padded.shape)
     first, last = _BESIDE_SULCUS_MM
     outwards = np.arange(first, last + 1e-6, _STEP_MM)
     means, of_brain = [], np.ones(len(sulci), bool)
     for places in ([-_IN_SULCUS_MM, 0.0, _IN_SULCUS_MM], [*-outwards, *outwards]):
         total = np.zeros(len(sulci))
         for place in places:
-            found = steps[padded.ravel()[_index(grid, sulci.place + place * sulci.normal, padded.shape)]]
+            found = steps[padded.ravel()[index(place)]]
             of_brain &= found >= 0
             total += found
         means.append(total / len(places))
@@ -203,24 +206,25 @@ def _fluid_beside(surfels: Surfels, padded: np.ndarray, grid: Volume, fluids: tu
     """(n, 2) mm along and against the normals, up to _WIDE_MM, to which fluid goes on; -1 where there is none."""
     extent = np.full((len(surfels), 2), -1.0)
     steps = np.arange(0.0, _WIDE_MM + 1e-6, _STEP_MM)
+    index = _along(surfels, grid, padded.shape)
     for side, sign in enumerate((1.0, -1.0)):
         goes_on = np.ones(len(surfels), bool)
         for step in steps:
-            index = _index(grid, surfels.place + sign * step * surfels.normal, padded.shape)
-            is_fluid = np.isin(padded.ravel()[index], fluids)
+            is_fluid = np.isin(padded.ravel()[index(sign * step)], fluids)
             extent[goes_on & is_fluid, side] = step
             # Labels may have the gap beside the sheet.
             goes_on &= is_fluid | ((step <= _BESIDE_MM) & (extent[:, side] < 0.0))
     return extent
 
 
-def _index(grid: Volume, places: np.ndarray, shape: tuple[int, ...], corner: np.ndarray | None = None) -> np.ndarray:
-    """(n,) flat indices of the voxels nearest to places, or of one corner (3,) of the cells around them."""
-    matrix = grid.ras_to_ijk
-    at = places @ matrix[:3, :3].T + matrix[:3, 3]
-    whole = np.rint(at) if corner is None else np.floor(at) + corner
-    inside = np.clip(whole.astype(np.int64), 0, np.array(shape[::-1]) - 1)
-    return (inside[:, 2] * shape[1] + inside[:, 1]) * shape[2] + inside[:, 0]
+def _along(
+    surfels: Surfels, grid: Volume, shape: tuple[int, ...], rounded: Callable[[np.ndarray], np.ndarray] = np.rint
+) -> Callable[[float], np.ndarray]:
+    """A function of a distance, mm: (n,) flat indices of the voxels nearest to places so far along the normals."""
+    matrix, strides = grid.ras_to_ijk, np.array([1.0, shape[2], shape[1] * shape[2]])
+    at = surfels.place @ matrix[:3, :3].T + matrix[:3, 3]
+    along, last = surfels.normal @ matrix[:3, :3].T, np.array(shape[::-1]) - 1.0
+    return lambda mm: (np.clip(rounded(at + mm * along), 0.0, last) @ strides).astype(np.int64)
 
 
 def _closed(
@@ -228,12 +232,13 @@ def _closed(
 ) -> tuple[np.ndarray, np.ndarray]:
     """((k, j, i) labels with the tissue beside in narrow gaps around these sheets, (k, j, i) True there)."""
     gap = np.zeros(padded.shape, bool)
+    index = _along(surfels, grid, padded.shape, np.floor)
     for side, sign in enumerate((1.0, -1.0)):
         for step in np.arange(0.0, _WIDE_MM + 1e-6, _STEP_MM):
-            here = surfels.chosen(extent[:, side] >= step - 1e-6)
-            places = here.place + sign * step * here.normal
-            for corner in np.ndindex(2, 2, 2):
-                gap.ravel()[_index(grid, places, padded.shape, np.array(corner))] = True
+            gap.ravel()[index(sign * step)[extent[:, side] >= step - 1e-6]] = True
+    for axis in range(3):  # all corners of these cells; what is clipped is in the margin, which is no fluid
+        wide = np.moveaxis(gap, axis, 0)
+        wide[1:] |= wide[:-1].copy()
     gap &= np.isin(padded, fluids)
     voxels = np.flatnonzero(gap)
     result = padded.copy()

@@ -31,6 +31,8 @@ _POSE = "probe_to_ras"
 _KIND = "probe.kind"
 #: Name of a text that presets of earlier fits have
 _MADE_BY = "made_by"
+#: Objects of keys that the command alone has (Command/options.py)
+_OF_COMMAND = ("segmentation", "fit", "patient", "recording", "results")
 #: Name in Preset.from_texts of the whole as JSON, as scenes had it
 AS_ONE = "preset"
 #: A display with all of these and without a look was written by a version whose displays were even
@@ -107,7 +109,9 @@ class Preset:
             f"{source}: is the result of a fit, expected a preset, as ussim optimize --save-preset writes it",
         )
         for name in values:
-            require(name in (*known, _MADE_BY), f"{source}: has {short(name)}, expected {', '.join(known)}")
+            require(
+                name in (*known, *_OF_COMMAND, _MADE_BY), f"{source}: has {short(name)}, expected {', '.join(known)}"
+            )
         sections: dict[str, Any] = {}
         if "probe" in values:
             sections["probe"] = probe_from_dict(values["probe"], f"{source}: probe")

@@ -7,7 +7,6 @@ from functools import cache
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.integrate import trapezoid
 
 from SlicerUSSim.Logic.imaging.diffraction import lobes_of
 from SlicerUSSim.Logic.imaging.raytracing import ray_centres
@@ -233,6 +232,11 @@ def sites_per_mm3(settings: SimulationSettings, probe: Probe) -> float:
     return float(np.clip(_SITES_PER_CELL / probe.smallest_cell_mm3(), _LEAST_PER_MM3, PAPER_SITES_PER_MM3))
 
 
+def _integral(values: np.ndarray, places: np.ndarray) -> np.ndarray:
+    """Along the first axis, by trapezoids; scipy.integrate would take 0.3 s to import."""
+    return (0.5 * (values[1:] + values[:-1]) * np.diff(places, axis=0)).sum(axis=0)
+
+
 def cells_in_view(
     settings: SimulationSettings, probe: Probe, traced_lines: int, lateral_rays: int, chunk_mm: float
 ) -> float:
@@ -246,7 +250,7 @@ def cells_in_view(
     depth = np.linspace(0.0, probe.depth_mm, 65)
     height = 2.0 * settings.beam_cutoff * probe.beam_sigma_mm(depth)[1] + slack
     width = probe.line_distance_mm(depth) / lateral_rays + slack
-    return density * traced_lines * (1.0 + slack / chunk_mm) * float(trapezoid(height * width, depth))
+    return density * traced_lines * (1.0 + slack / chunk_mm) * float(_integral(height * width, depth))
 
 
 def lattice_sites(tissues: np.ndarray, acquisition: np.ndarray) -> np.ndarray:
@@ -290,8 +294,8 @@ def scatterer_counts(
     length = chunk * float(acquisition["sample_mm"]) / segments["depth_per_mm"]
     along = 1.0 + deep / np.minimum(length, np.maximum(segments["length_mm"], 1e-3))
     density = float(acquisition["cell_mm"]) ** -3
-    inside = trapezoid(width * height, path, axis=0)
-    looked_at = along * trapezoid((width + slack["lateral"]) * (height + slack["elevational"]), path, axis=0)
+    inside = _integral(width * height, path)
+    looked_at = along * _integral((width + slack["lateral"]) * (height + slack["elevational"]), path)
     return float(density * inside.sum() / (together or 1)), float(density * looked_at.sum() / (together or 1))
 
 

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.spatial import KDTree
 
 from SlicerUSSim.Logic.base.errors import require
-from SlicerUSSim.Logic.base.neighbourhood import distance_to
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.tissue.surfels import Surfels
+
+if TYPE_CHECKING:
+    from scipy.spatial import KDTree
 
 #: Bits of an entry: distance, normal (two coordinates of its octahedron), thickness, confidence
 _DISTANCE_BITS, _NORMAL_BITS, _THICKNESS_BITS, _CONFIDENCE_BITS = 12, 10, 8, 6
@@ -24,7 +26,7 @@ _SAME_COSINE = 0.7
 #: 1 mm, no place is farther from a surfel, however the sheet is tilted
 _RIM, _RIM_MM = 1.5, 0.9
 #: Voxels at a time
-_CHUNK = 200_000
+_CHUNK = 50_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,6 +73,8 @@ def on_voxels(surfels: Surfels, grid: Volume, *, reach_mm: float = 2.0, finer: i
 
     Raises SimulationError for a reach that is shorter than voxels need, and a `finer` below 1.
     """
+    from scipy.spatial import KDTree  # images of labels alone do not wait for it
+
     require(finer >= 1, f"finer is {finer}, expected 1 or more")
     grid = _finer(grid, finer)
     least = 0.9 * 0.5 * float(np.linalg.norm(grid.spacing_mm))
@@ -78,7 +82,9 @@ def on_voxels(surfels: Surfels, grid: Volume, *, reach_mm: float = 2.0, finer: i
     entry = np.full(grid.array.shape, -1, np.int32)
     if not len(surfels):
         return SheetVoxels(grid.with_array(entry), np.zeros((0, 2), np.uint32), np.zeros(0, np.uint8), reach_mm)
-    near = np.argwhere(_near(surfels, grid, reach_mm))
+    # A plane's foot lies this far from its surfel at most
+    farthest = float(np.hypot(reach_mm, max(_RIM * np.sqrt(surfels.area.max() / np.pi), _RIM_MM))) + 1e-3
+    near = np.argwhere(_near(surfels, grid, farthest))
     if not len(near):
         return SheetVoxels(grid.with_array(entry), np.zeros((0, 2), np.uint32), np.zeros(0, np.uint8), reach_mm)
     tree = KDTree(surfels.place)
@@ -105,8 +111,8 @@ def _planes(
     # The sheet is that of the surfel whose disc is nearest; its neighbours smooth it.
     apart = surfels.place[nearest] - centres[:, None]
     normals = surfels.normal[nearest]
-    across = (apart * normals).sum(axis=2)
-    aside = np.sqrt(np.maximum((apart**2).sum(axis=2) - across**2, 0.0))
+    across = np.einsum("nkx,nkx->nk", apart, normals)
+    aside = np.sqrt(np.maximum(np.einsum("nkx,nkx->nk", apart, apart) - across**2, 0.0))
     radius = np.sqrt(surfels.area[nearest] / np.pi)
     first = np.hypot(across, np.maximum(aside - radius, 0.0)).argmin(axis=1)
     row = np.arange(len(centres))
@@ -115,10 +121,11 @@ def _planes(
     same = (np.abs(cosine) > _SAME_COSINE) & (surfels.kind[nearest] == surfels.kind[lead][:, None])
     # Nearness to the foot on the leading plane
     foot = across[row, first][:, None] * lead_normal
-    from_foot = ((apart - foot[:, None]) ** 2).sum(axis=2)
+    off = apart - foot[:, None]
+    from_foot = np.einsum("nkx,nkx->nk", off, off)
     weight = np.where(same, np.exp(-0.5 * from_foot / _SIGMA_MM**2), 0.0) + 1e-12
     weight /= weight.sum(axis=1, keepdims=True)
-    normal = (weight[..., None] * normals * np.sign(cosine)[..., None]).sum(axis=1)
+    normal = np.einsum("nk,nkx->nx", weight * np.sign(cosine), normals)
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-9)
     distance = np.einsum("nk,nkx,nx->n", weight, apart, normal)
     # How far the foot lies outside the leading surfel; a sheet ends where its surfels do.
@@ -169,16 +176,24 @@ def _from_octahedron(u: np.ndarray, v: np.ndarray) -> np.ndarray:
 
 
 def _near(surfels: Surfels, grid: Volume, reach_mm: float) -> np.ndarray:
-    """(k, j, i) True at least where a centre is within reach of a surfel."""
-    matrix = grid.ras_to_ijk
-    index = np.rint(surfels.place @ matrix[:3, :3].T + matrix[:3, 3]).astype(int)[:, ::-1]
-    index = index[((index >= 0) & (index < grid.array.shape)).all(axis=1)]
-    seeds = np.zeros(grid.array.shape, bool)
-    seeds[tuple(index.T)] = True
-    if not seeds.any():
-        return seeds
-    more = 0.5 * float(np.linalg.norm(grid.spacing_mm)) + float(np.sqrt(surfels.area.max() / np.pi))
-    return distance_to(seeds, grid.spacing_mm) <= reach_mm + more
+    """(k, j, i) True where a centre is within reach of a surfel."""
+    matrix, spacing = grid.ras_to_ijk, grid.spacing_mm
+    around = np.ceil(reach_mm / spacing + 0.5).astype(int)
+    shape = np.array(grid.array.shape[::-1]) + 4 * around
+    strides = np.array([1, shape[0], shape[0] * shape[1]])
+    at = surfels.place @ matrix[:3, :3].T + matrix[:3, 3] + 2 * around
+    at = at[((at >= around) & (at <= shape - around - 1)).all(axis=1)]
+    nearest = np.rint(at)
+    flat, apart = nearest.astype(int) @ strides, (nearest - at) @ grid.ijk_to_ras[:3, :3].T
+    square = (apart**2).sum(axis=1)
+    result = np.zeros(shape[::-1], bool)
+    for offset in np.ndindex(*(2 * around + 1)):
+        step = np.array(offset) - around
+        step_mm = grid.ijk_to_ras[:3, :3] @ step
+        if np.linalg.norm(step_mm) <= reach_mm + 0.5 * np.linalg.norm(spacing):
+            is_near = square + apart @ (2.0 * step_mm) <= reach_mm**2 - step_mm @ step_mm
+            result.ravel()[flat[is_near] + step @ strides] = True
+    return result[tuple(slice(2 * n, -2 * n) for n in around[::-1])]
 
 
 def _finer(grid: Volume, finer: int) -> Volume:
