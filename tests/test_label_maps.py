@@ -17,7 +17,6 @@ from SlicerUSSim.Logic import SimulationError, TissueTable, Volume
 from SlicerUSSim.Logic.mri import segment_mri
 from SlicerUSSim.Logic.mri.samples import head_mri
 from SlicerUSSim.Logic.tissue import LabelMapping, names_of_file, read_label_file, read_label_map, read_names
-from SlicerUSSim.Logic.tissue.freesurfer import freesurfer_names
 from SlicerUSSim.Logic.tissue.label_sources import is_label_file
 from SlicerUSSim.Logic.tissue.names import nearest_tissue, tissue_named
 from SlicerUSSim.Logic.tissue.presets import TISSUES
@@ -83,7 +82,7 @@ def made(labels: dict[int, str], *, mirrored: bool = False, dtype=np.int16) -> V
 
 
 def freesurfer(labels, **options) -> Volume:
-    names = freesurfer_names()
+    names = schemes()["freesurfer"].names
     return made({label: names[label] for label in labels}, **options)
 
 
@@ -123,13 +122,13 @@ def refused(*arguments) -> str:
 
 
 def test_every_structure_of_the_programs_has_a_tissue():
-    names = [*freesurfer_names().values(), *CT, *CT_V1, *MR]
+    names = [*schemes()["freesurfer"].names.values(), *CT, *CT_V1, *MR]
     for name in names:
         try:
             assert tissue_named(name)
         except SimulationError:
             assert nearest_tissue(name) in TISSUES, name
-    assert len(freesurfer_names()) > 600 and (len(CT), len(CT_V1), len(MR)) == (117, 104, 50)
+    assert len(schemes()["freesurfer"].names) > 600 and (len(CT), len(CT_V1), len(MR)) == (117, 104, 50)
 
 
 @pytest.mark.parametrize(
@@ -180,7 +179,7 @@ def test_freesurfers_segmentations_are_recognised_in_every_file(labels, title, t
     assert found.labels.array.dtype == np.uint8 and found.labels.array.max() == tissues == len(found.names)
     for label in labels:
         tissue = found.names[found.relabelled[label] - 1]
-        assert tissue == tissue_named(freesurfer_names()[label]).name
+        assert tissue == tissue_named(schemes()["freesurfer"].names[label]).name
         assert (found.labels.array[volume.array == label] == found.relabelled[label]).all()
     assert not found.labels.array[volume.array == 0].any()
 
@@ -241,7 +240,7 @@ def test_numbers_alone_do_not_make_a_program():
     aal = {n: ("left" if n % 2 else "right") for n in range(1, 117)}  # AAL: odd numbers left, even ones right
     with pytest.raises(SimulationError, match="no program's numbers are recognised"):
         read_label_map(made(aal))
-    shuffled = dict(zip(ASEG, rng.permutation([freesurfer_names()[n] for n in ASEG]), strict=True))
+    shuffled = dict(zip(ASEG, rng.permutation([schemes()["freesurfer"].names[n] for n in ASEG]), strict=True))
     with pytest.raises(SimulationError, match="in FreeSurfer's table, but structures of the left do not lie"):
         read_label_map(made(shuffled))
 

@@ -23,7 +23,7 @@ from SlicerUSSim.Logic.mrml.own_results import content_of  # noqa: E402
 from SlicerUSSim.Logic.mrml.share_nodes import read_shares  # noqa: E402
 from SlicerUSSim.Logic.mrml.taken_image import about_image, is_frozen, patient_of  # noqa: E402
 from SlicerUSSim.Logic.probe.arrays import PROBE_KINDS, PROBES, LinearProbe  # noqa: E402
-from SlicerUSSim.Logic.tissue.freesurfer import freesurfer_names  # noqa: E402
+from SlicerUSSim.Logic.tissue.schemes import schemes  # noqa: E402
 from SlicerUSSim.Widget.interface import by_widget  # noqa: E402
 from SlicerUSSim.Widget.presenter import PanelPresenter  # noqa: E402
 from SlicerUSSim.Widget.sections import panel_sections  # noqa: E402
@@ -281,7 +281,7 @@ def test_lesions_leave_the_checks_of_the_tissues_under_them_in_the_notes(present
     scene, parameters = presenter.logic.scene, presenter.logic.parameters
     whole = head_of_freesurfer()
     labels, numbers = np.unique(whole.array, return_inverse=True)
-    names = [freesurfer_names()[int(label)] for label in labels[1:]]
+    names = [schemes()["freesurfer"].names[int(label)] for label in labels[1:]]
     whole = whole.with_array(numbers.reshape(whole.array.shape).astype(np.uint8))
     mirrored = whole.with_array(np.flip(whole.array, 2).copy())
     parameters.labels = scene.AddNewNodeByClass("vtkMRMLLabelMapVolumeNode", "mirrored")

@@ -129,8 +129,7 @@ def _read_organs(path: str, maps: Iterable[str]) -> LabelledTissues:
 
     table = TissueTable({})
     found = read_label_file(Path(path), Volume.read(path), LabelMapping.of(maps, table), default=table, of_ct=True)
-    if not found.others:
-        note(f"{path}: {found.message}")
+    note(f"{path}: {found.message}")
     for warning in found.warnings:
         if "--map 0=" in warning:  # between organs the CT says what is there
             continue

@@ -47,8 +47,8 @@ if TYPE_CHECKING:
 map_option = click.option(
     "--map", "maps", multiple=True, metavar="LABEL=TISSUE",
     help="Tissue of a label of the label map, by its number or its name: 24=csf; 0 removes a label. Or a .json file "
-    'with {"24": "csf"}, a table of names (.txt, .ctbl, .tsv), or the numbering: freesurfer, totalsegmentator, '
-    "totalsegmentator-v1, totalsegmentator-mr, totalsegmentator-tissues, ussim, brats-2022, brats. May be repeated.",
+    'with {"24": "csf"}, a table of names (.txt, .ctbl, .tsv), or the numbering: ussim, ussim-t1gd, spm, synthseg, '
+    "fastsurfer, fsl-first, freesurfer, totalsegmentator (also -v1, -mr, -tissues), brats, brats-2022. May be repeated.",
 )  # fmt: skip
 
 #: A pose that is chosen; and those of mri.views.VIEWS
@@ -292,7 +292,7 @@ def _placed(
     from SlicerUSSim.Logic.placement.aiming import opening_pose
     from SlicerUSSim.Logic.placement.craniotomy import default_pose, middle_of
     from SlicerUSSim.Logic.placement.views import opened_view_pose, view_pose
-    from SlicerUSSim.Logic.tissue.brain_orders import BRAIN_TISSUES
+    from SlicerUSSim.Logic.tissue.names import BRAIN_TISSUES
 
     labels, names, settings = added.labels, added.tissue_names, preset.settings
     whole, at = labels, None

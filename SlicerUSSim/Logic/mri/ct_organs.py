@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import ndimage
 
-from SlicerUSSim.Logic.base.errors import SimulationError, require
+from SlicerUSSim.Logic.base.errors import require
 from SlicerUSSim.Logic.base.neighbourhood import largest_around, smallest_around
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.mri.ct_classes import AIR, BLOOD, BONE, LUNG, METAL, NAMES, SOFT, SPONGY
@@ -68,25 +68,10 @@ class Organs:
 def organs_of_ct(organs: LabelledTissues, classes: np.ndarray, ct: Volume) -> tuple[Organs, list[str]]:
     """(Organs on the grid of a CT of these (k, j, i) classes, lines about what is doubtful).
 
-    Of several readings of the same numbers it is the one that the numbers of the CT agree with.
-    Raises SimulationError as Organs.on and require_of_ct do, and where they agree with several readings.
+    Raises SimulationError as Organs.on and require_of_ct do.
     """
-    fits, refused = [], []
-    for reading in (organs, *organs.others):
-        on_ct = Organs.on(reading, ct)
-        taken_for = [reading.taken_for] if reading.taken_for else []
-        try:
-            doubts = require_of_ct(on_ct, classes, ct.voxel_ml)
-        except SimulationError as error:
-            refused.append(error)
-            continue
-        fits.append((len(doubts), on_ct, [*taken_for, *doubts]))
-    if not fits:
-        raise refused[0]
-    fewest = min(doubts for doubts, _, _ in fits)
-    best = [(on_ct, lines) for doubts, on_ct, lines in fits if doubts == fewest]
-    require(len(best) == 1, f"{organs.ambiguity}; the numbers of the CT do not tell")
-    return best[0]
+    on_ct = Organs.on(organs, ct)
+    return on_ct, require_of_ct(on_ct, classes, ct.voxel_ml)
 
 
 def require_of_ct(organs: Organs, classes: np.ndarray, voxel_ml: float) -> list[str]:
