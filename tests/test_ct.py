@@ -181,38 +181,6 @@ def test_organs_of_another_patient_are_refused_by_the_numbers_of_the_ct():
     assert not any("of this CT" in line for line in segment_ct(chest.ct, organs=in_chest).warnings)
 
 
-@pytest.mark.long
-def test_a_few_organs_are_read_by_totalsegmentators_numbers():
-    chest, spine = lower_chest((2.0, 2.0, 2.0)), lumbar_spine((2.0, 2.0, 2.0))
-    organs = read_label_map(chest.organs, of_ct=True)
-    found = segment_ct(chest.ct, organs=organs)
-    (line,) = (line for line in found.warnings if "taken for" in line)
-    assert "TotalSegmentator CT (2 kidney right, 5 liver, 14 lung lower lobe right); check" in line
-    assert {"liver", "kidney"} <= set(found.tissue_names) and "white matter" not in found.tissue_names
-    with pytest.raises(SimulationError, match=r"organs: liver: .* whose numbers are what they are taken for"):
-        segment_ct(spine.ct, organs=organs)
-
-    def renumbered(**labels: int) -> Volume:
-        numbers = np.zeros(200, np.int16)
-        for name, label in labels.items():
-            numbers[{"kidney": 2, "liver": 5, "lung": 14}[name]] = label
-        return chest.organs.with_array(numbers[chest.organs.array])
-
-    # 10 is a part of the lung in version 2, and the pancreas in version 1; 13 of the lung in version 1 and 2
-    two = read_label_map(renumbered(kidney=2, liver=5, lung=10), of_ct=True)
-    assert len(two.others) == 1
-    found = segment_ct(chest.ct, organs=two)
-    assert any("taken for the numbers of TotalSegmentator CT (2 kidney" in line for line in found.warnings)
-    two = read_label_map(renumbered(kidney=2, liver=10, lung=16), of_ct=True)  # pancreas and lung of version 1
-    found = segment_ct(chest.ct, organs=two)
-    assert any("taken for the numbers of TotalSegmentator CT, version 1 (" in line for line in found.warnings)
-    # Numbers that nothing of the CT can tell are not guessed.
-    with pytest.raises(SimulationError, match=r"may be those of TotalSegmentator CT .* --map totalseg"):
-        read_label_map(renumbered(kidney=2, liver=5), of_ct=True)
-    with pytest.raises(SimulationError, match="no program's numbers are recognised"):
-        read_label_map(renumbered(kidney=150, liver=151, lung=152), of_ct=True)
-
-
 # ---- units and bad input ---------------------------------------------------------------------------------------------
 
 

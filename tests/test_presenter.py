@@ -257,13 +257,13 @@ def test_only_values_of_the_chosen_transmission_are_offered(presenter):
 
 def test_the_notes_say_what_the_shown_labels_were_recognised_as(presenter):
     """They stayed those of the segmentation before; what labels are was in the log alone."""
-    from tests.test_label_maps import ASEG, freesurfer
+    from tests.test_label_maps import ASEG, numbered
 
     presenter.segmenting.segment()
     presenter.images.simulate()
     assert presenter.notes.text().startswith("Head:") and not presenter.view.errors
     scene = presenter.logic.scene
-    for name, volume in (("aseg", freesurfer(ASEG)), ("mirrored", freesurfer(ASEG, mirrored=True))):
+    for name, volume in (("aseg", numbered(ASEG)), ("mirrored", numbered(ASEG, mirrored=True))):
         node = scene.AddNewNodeByClass("vtkMRMLLabelMapVolumeNode", name)
         write_volume(node, volume)
         presenter.logic.parameters.labels = node

@@ -361,7 +361,7 @@ def test_label_maps_of_other_programs_are_recognised_and_masks_refused(bench):
     bench.logic.preset = Preset()
     aseg, mask = add(bench.scene, "LabelMapVolume", "aseg"), add(bench.scene, "LabelMapVolume", "mask")
     array = np.zeros((20, 20, 40), np.int16)
-    for label, i in ((2, 4), (3, 8), (4, 12), (43, 26), (42, 30), (41, 34)):
+    for label, i in ((2, 4), (3, 8), (4, 12), (251, 20), (43, 26), (42, 30), (41, 34)):
         array[4:16, 4:16, i : i + 3] = label
     write_volume(aseg, Volume(array, np.eye(4)))
     table = bench.logic.tissues(aseg)

@@ -167,7 +167,7 @@ def test_a_label_map_is_of_this_patient_or_of_a_new_one(page, files, tmp_path):
     assert page.locator("#mriSelector option:checked").inner_text().strip() == "head.nii.gz"
     head().write(tmp_path / "aseg.nii.gz")
     said = answered(page, tmp_path / "aseg.nii.gz", "New patient")
-    assert "a label map: FreeSurfer aseg, 8 labels" in said and said.endswith("a new patient; own.nii.gz is closed")
+    assert "a label map: FreeSurfer, 8 labels" in said and said.endswith("a new patient; own.nii.gz is closed")
     assert state(page, NAMES.title) == "aseg.nii.gz" and shown(page, "mriSelector") is None
     assert shown(page, "lesionsSelector") is None
 

@@ -48,7 +48,7 @@ map_option = click.option(
     "--map", "maps", multiple=True, metavar="LABEL=TISSUE",
     help="Tissue of a label of the label map, by its number or its name: 24=csf; 0 removes a label. Or a .json file "
     'with {"24": "csf"}, a table of names (.txt, .ctbl, .tsv), or the numbering: ussim, ussim-t1gd, spm, synthseg, '
-    "fastsurfer, fsl-first, freesurfer, totalsegmentator (also -v1, -mr, -tissues), brats, brats-2022. May be repeated.",
+    "fastsurfer, fsl-first, freesurfer, totalsegmentator (also -v1, -mr, -tissues), brats, brats-2022; may be repeated",
 )  # fmt: skip
 
 #: A pose that is chosen; and those of mri.views.VIEWS

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
+from itertools import islice
 from typing import Any
 
 from SlicerUSSim.Logic.base.dicom import Series
@@ -196,7 +197,7 @@ class Opening:
         if upload.table is not None or not schemes:
             return upload.table
         choices = [
-            Choice(key, scheme.title, listed([f"{label} {name}" for label, name in scheme.names.items()]))
+            Choice(key, scheme.title, ", ".join(f"{n} {name}" for n, name in islice(scheme.names.items(), 4)))
             for key, scheme in schemes.items()
         ]
         key = self._ask(f"Numbers of {upload.name}?", f"{upload.name} is {upload.content.what}.", choices)

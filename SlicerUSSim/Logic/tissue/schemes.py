@@ -2,8 +2,8 @@
 
 Numbers and names are those of FreeSurfer's FreeSurferColorLUT.txt
 (https://surfer.nmr.mgh.harvard.edu/fswiki/FsTutorial/AnatomicalROI/FreeSurferColorLUT), without 500 to 558, parts of
-the hippocampus that other programs use for bone and skin; of SynthSeg's and FastSurfer's tables, which are parts of it; of
-TotalSegmentator's class details (https://github.com/wasserth/TotalSegmentator); of FSL
+the hippocampus that other programs use for bone and skin; of SynthSeg's and FastSurfer's tables, which are parts of
+it; of TotalSegmentator's class details (https://github.com/wasserth/TotalSegmentator); of FSL
 (https://fsl.fmrib.ox.ac.uk/fsl/docs/structural/fast); and of BraTS (Menze et al., IEEE Trans. Med. Imaging 34, 2015;
 since 2024 with a resection cavity: de Verdier et al., arXiv:2405.18368).
 
