@@ -174,11 +174,10 @@ class Opening:
     def _labels(self, upload: Upload, beside: list[Upload]) -> tuple[str, Callable[[], object]]:
         parameters: Any = self._logic.parameters
         patient = self._opener.patient()
-        table = self._table_of(upload)
         reading = self._loading.reading_labels
         came_along = any(other.kind in (Kind.MRI, Kind.CT) for other in beside)
         if not self._loading.has_users_patient or (came_along and self._loading.are_of_mri(upload.path)):
-            return "tissues to simulate", reading(upload.path, table, None)
+            return "tissues to simulate", reading(upload.path, self._table_of(upload), None)
         choices = [Choice(_NEW, "New patient", f"{patient} is closed, with all that belongs to it")]
         if parameters.mri is not None:
             choices.append(Choice(_OWN, f"Tissues of {patient}", "In place of its tissues; the MRI stays"))
@@ -188,8 +187,8 @@ class Opening:
         if key == _ORGANS:
             return self._organs(upload, patient)
         if key == _OWN:
-            return f"tissues of {patient}", reading(upload.path, table, True)
-        return f"a new patient; {patient} is closed", reading(upload.path, table, False)
+            return f"tissues of {patient}", reading(upload.path, self._table_of(upload), True)
+        return f"a new patient; {patient} is closed", reading(upload.path, self._table_of(upload), False)
 
     def _table_of(self, upload: Upload) -> LabelTable | None:
         """Its table, or the numbering that the user says where several fit."""
@@ -228,7 +227,8 @@ class Opening:
         choices.append(Choice(_NEW, "Label map of a new patient", f"{patient} is closed"))
         key = self._ask_what(upload, choices)
         if key == _NEW:
-            return f"a new patient; {patient} is closed", self._loading.reading_labels(upload.path, upload.table, False)
+            take = self._loading.reading_labels(upload.path, self._table_of(upload), False)
+            return f"a new patient; {patient} is closed", take
         if key == _ORGANS:
             return self._organs(upload, patient)
         if key == _BRAIN:

@@ -109,7 +109,7 @@ class Findings:
         nearest = nearest_scheme(unknown) if nothing else None
         if nearest is not None:
             lacking = [label for label in unknown if label not in nearest.names]
-            nothing, unknown = f"but for some labels its numbers are {nearest.title}'s, and ", lacking or unknown
+            nothing, unknown = f"most of its numbers are {nearest.title}'s, and ", lacking or unknown
         known = ", ".join(dict.fromkeys([*self.tissues.names()[1:], *TISSUES]))
         called = listed(map(self._described, unknown))
         unused = self.mapping.unused(self.names)

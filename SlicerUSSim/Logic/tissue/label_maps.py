@@ -15,7 +15,7 @@ import numpy as np
 from SlicerUSSim.Logic.base.errors import SimulationError, require, require_kind
 from SlicerUSSim.Logic.base.label_numbers import whole_numbers
 from SlicerUSSim.Logic.base.volume import Volume
-from SlicerUSSim.Logic.tissue.label_findings import MAP_THEM, UNNAMED, Findings, listed
+from SlicerUSSim.Logic.tissue.label_findings import UNNAMED, Findings, listed
 from SlicerUSSim.Logic.tissue.label_mapping import LabelMapping
 from SlicerUSSim.Logic.tissue.names import nearest_tissue, plain_name, tissue_named
 from SlicerUSSim.Logic.tissue.presets import TISSUES
@@ -206,16 +206,16 @@ class _Reading:
         scheme, choices = recognised(unknown, of_ct=self._of_ct)
         if scheme is None and choices:
             raise SimulationError(
-                f"{self._source}: labels {listed(unknown)} have no names, and may be those of "
-                f"{'; '.join(self._offered(choice, unknown) for choice in choices)}; say which, or "
-                f"{MAP_THEM.format(label=unknown[0])}: {', '.join(TISSUES)}"
+                f"{self._source}: labels {listed(unknown)} have no names; say whose numbers they are: "
+                f"{', '.join(self._offered(choice, unknown) for choice in choices)}; or give each its tissue: --map "
+                f"{unknown[0]}=TISSUE"
             )
         return scheme
 
     def _offered(self, scheme: Scheme, labels: list[int]) -> str:
-        """--map spm: SPM's order (1 grey matter, 2 white matter, 3 csf)"""
+        """--map spm (SPM and fMRIPrep: 1 grey matter, 2 white matter, 3 csf)"""
         called = listed([f"{label} {plain_name(scheme.names[label])}" for label in labels], _SHOWN)
-        return f"--map {scheme.key}: {scheme.title} ({called})"
+        return f"--map {scheme.key} ({scheme.title}: {called})"
 
     def _tissue(self, label: int, name: str | None, scheme: Scheme | None = None) -> Tissue | None:
         given = self._mapping.tissue_of(label, name)

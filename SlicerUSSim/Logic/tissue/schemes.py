@@ -20,9 +20,9 @@ from functools import cache
 from SlicerUSSim.Logic.tissue.names import label_table
 
 _TITLES = {
-    "ussim": "numbers of ussim segment and FSL FAST", "ussim-t1gd": "ussim segment of a T1 with contrast agent",
-    "spm": "SPM's and fMRIPrep's order", "synthseg": "SynthSeg", "fastsurfer": "FastSurfer", "fsl-first": "FSL FIRST",
-    "freesurfer": "FreeSurfer", "totalsegmentator": "TotalSegmentator CT",
+    "ussim": "ussim segment and FSL FAST", "ussim-t1gd": "ussim segment of a T1 with contrast agent",
+    "spm": "SPM and fMRIPrep", "freesurfer": "FreeSurfer", "synthseg": "SynthSeg", "fastsurfer": "FastSurfer",
+    "fsl-first": "FSL FIRST", "totalsegmentator": "TotalSegmentator CT",
     "totalsegmentator-v1": "TotalSegmentator CT, version 1", "totalsegmentator-mr": "TotalSegmentator MR",
     "totalsegmentator-tissues": "TotalSegmentator tissue_types", "brats-2022": "BraTS 2017 to 2022",
     "brats": "BraTS since 2023",
