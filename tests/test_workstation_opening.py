@@ -159,8 +159,9 @@ def test_a_label_map_is_of_this_patient_or_of_a_new_one(page, files, tmp_path):
     answered(page, tmp_path / "mask.nii.gz", "Add as cyst")
     lesions = shown(page, "lesionsSelector")
     page.set_input_files("#open-file", tmp_path / "own.nii.gz")
-    assert "the labels 1, 2, 3, 4 that may be ussim segment and FSL FAST or BraTS since 2023" in question(page)
+    assert "a label map with the labels 1, 2, 3, 4 of ussim segment and FSL FAST or BraTS since 2023" in question(page)
     answer(page, "Tissues of head.nii.gz")
+    question(page)
     with new_image(page):
         answer(page, "ussim segment and FSL FAST")
     assert page.locator("#labelsSelector option:checked").inner_text().strip() == "own.nii.gz" and not errors(page)

@@ -109,10 +109,9 @@ def _of_labels(path: Path, volume: Volume, size: str) -> Content:
         return Content(Kind.LABELS, f"tissue probabilities, {size}", volume, files)
     values = np.flatnonzero(np.bincount(labels.array.ravel())).tolist()
     values = [value for value in values if value]
-    names = names_of_file(path, volume)[0]
+    names, millilitres = names_of_file(path, volume)[0], float((labels.array > 0).sum() * labels.voxel_ml)
     if len(values) <= 1:
         of_what = f" called {names[values[0]]!r}" if values and values[0] in names else ""
-        millilitres = float((labels.array > 0).sum() * labels.voxel_ml)
         return Content(Kind.MASK, f"a mask of one region{of_what}, {millilitres:.3g} ml, {size}", volume)
     if any(value in names for value in values):
         called = ", ".join(names[value] for value in values[:4] if value in names)
@@ -124,12 +123,10 @@ def _of_labels(path: Path, volume: Volume, size: str) -> Content:
     if scheme is not None:
         return Content(Kind.LABELS, f"a label map: {scheme.title}, {len(values)} labels, {size}", volume)
     listed = ", ".join(map(str, values[:6])) + (", ..." if len(values) > 6 else "")
-    millilitres = float((labels.array > 0).sum() * labels.voxel_ml)
     may_be_lesion = len(values) <= _MOST_OF_LESION and millilitres <= _MOST_LESION_ML
     kind = Kind.LESIONS if may_be_lesion else Kind.LABELS
-    which = " or ".join(choice.title for choice in choices)
-    fits = f" that may be {which}" if which else " of no known program"
-    return Content(kind, f"a label map with the labels {listed}{fits}, {size}", volume, schemes=tuple(choices))
+    which = " or ".join(choice.title for choice in choices) or "no known program"
+    return Content(kind, f"a label map with the labels {listed} of {which}, {size}", volume, schemes=tuple(choices))
 
 
 # ---- texts -----------------------------------------------------------------------------------------------------------
