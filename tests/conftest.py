@@ -6,6 +6,7 @@ import importlib.util
 import locale
 import os
 import sys
+from collections.abc import Iterable
 from dataclasses import replace
 from functools import cache, partial
 from pathlib import Path
@@ -133,6 +134,17 @@ def mni():
     )
 
 
+def name_labels(path: Path, names: Iterable[str]) -> None:
+    """Write the names of labels 1, 2, ... into the header of a NIfTI file, as TotalSegmentator does."""
+    import nibabel
+
+    image = nibabel.load(path)
+    labels = "".join(f'<Label Key="{number}"><![CDATA[{name}]]></Label>' for number, name in enumerate(names, 1))
+    extension = nibabel.nifti1.Nifti1Extension(0, f"<LabelTable>{labels}</LabelTable>".encode())
+    image.header.extensions.append(extension)
+    nibabel.save(nibabel.Nifti1Image(np.asarray(image.dataobj), image.affine, image.header), path)
+
+
 @pytest.fixture(scope="session")
 def files(tmp_path_factory) -> Path:
     """A head, its labels, and a sequence of images of it with more gain; tests write into folders of their own."""
@@ -141,6 +153,7 @@ def files(tmp_path_factory) -> Path:
     mri.write(folder / "head.nii.gz")
     segmentation = segment_mri(mri, thin_sulci=True)
     segmentation.labels.write(folder / "labels.nii.gz")
+    name_labels(folder / "labels.nii.gz", segmentation.tissue_names)
     tissues = TissueTable.brain(segmentation.tissue_names)
     tissues.write(folder / "labels.json")
     probe = PhasedProbe(field_of_view_deg=75.0, depth_mm=70.0, scan_lines=96)

@@ -87,7 +87,7 @@ def test_what_images_are(tmp_path):
     for name, volume, kind, words in (
         ("mri", mri, Kind.MRI, "an MRI of a brain without skull, "),
         ("mask", mask, Kind.MASK, "a mask of one region, "),
-        ("aseg", head(), Kind.LABELS, "a label map: FreeSurfer aseg, 8 labels, "),
+        ("aseg", head(), Kind.LABELS, "a label map: FreeSurfer, 8 labels, "),
     ):
         volume.write(tmp_path / f"{name}.nii.gz")
         found = content.content_of(tmp_path / f"{name}.nii.gz")

@@ -23,7 +23,7 @@ from SlicerUSSim.Logic.mrml.own_results import content_of  # noqa: E402
 from SlicerUSSim.Logic.mrml.share_nodes import read_shares  # noqa: E402
 from SlicerUSSim.Logic.mrml.taken_image import about_image, is_frozen, patient_of  # noqa: E402
 from SlicerUSSim.Logic.probe.arrays import PROBE_KINDS, PROBES, LinearProbe  # noqa: E402
-from SlicerUSSim.Logic.tissue.freesurfer import freesurfer_names  # noqa: E402
+from SlicerUSSim.Logic.tissue.schemes import schemes  # noqa: E402
 from SlicerUSSim.Widget.interface import by_widget  # noqa: E402
 from SlicerUSSim.Widget.presenter import PanelPresenter  # noqa: E402
 from SlicerUSSim.Widget.sections import panel_sections  # noqa: E402
@@ -257,13 +257,13 @@ def test_only_values_of_the_chosen_transmission_are_offered(presenter):
 
 def test_the_notes_say_what_the_shown_labels_were_recognised_as(presenter):
     """They stayed those of the segmentation before; what labels are was in the log alone."""
-    from tests.test_label_maps import ASEG, freesurfer
+    from tests.test_label_maps import ASEG, numbered
 
     presenter.segmenting.segment()
     presenter.images.simulate()
     assert presenter.notes.text().startswith("Head:") and not presenter.view.errors
     scene = presenter.logic.scene
-    for name, volume in (("aseg", freesurfer(ASEG)), ("mirrored", freesurfer(ASEG, mirrored=True))):
+    for name, volume in (("aseg", numbered(ASEG)), ("mirrored", numbered(ASEG, mirrored=True))):
         node = scene.AddNewNodeByClass("vtkMRMLLabelMapVolumeNode", name)
         write_volume(node, volume)
         presenter.logic.parameters.labels = node
@@ -281,7 +281,7 @@ def test_lesions_leave_the_checks_of_the_tissues_under_them_in_the_notes(present
     scene, parameters = presenter.logic.scene, presenter.logic.parameters
     whole = head_of_freesurfer()
     labels, numbers = np.unique(whole.array, return_inverse=True)
-    names = [freesurfer_names()[int(label)] for label in labels[1:]]
+    names = [schemes()["freesurfer"].names[int(label)] for label in labels[1:]]
     whole = whole.with_array(numbers.reshape(whole.array.shape).astype(np.uint8))
     mirrored = whole.with_array(np.flip(whole.array, 2).copy())
     parameters.labels = scene.AddNewNodeByClass("vtkMRMLLabelMapVolumeNode", "mirrored")

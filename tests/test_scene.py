@@ -36,7 +36,7 @@ from SlicerUSSim.Logic.base.vtk_data import vtk_matrix  # noqa: E402
 from SlicerUSSim.Logic.fitting.fit_settings import FitSettings  # noqa: E402
 from SlicerUSSim.Logic.mri.samples import head_mri  # noqa: E402
 from SlicerUSSim.Logic.mri.segmentation_settings import SegmentationSettings  # noqa: E402
-from SlicerUSSim.Logic.mrml.label_nodes import write_labels  # noqa: E402
+from SlicerUSSim.Logic.mrml.label_nodes import read_labels, write_labels  # noqa: E402
 from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic  # noqa: E402
 from SlicerUSSim.Logic.mrml.nodes import ijk_to_ras, node_to_world, pose_in_labels, set_node_to_world, write_volume  # noqa: E402
 from SlicerUSSim.Logic.mrml.taken_image import about_image, is_frozen, patient_of  # noqa: E402
@@ -361,7 +361,7 @@ def test_label_maps_of_other_programs_are_recognised_and_masks_refused(bench):
     bench.logic.preset = Preset()
     aseg, mask = add(bench.scene, "LabelMapVolume", "aseg"), add(bench.scene, "LabelMapVolume", "mask")
     array = np.zeros((20, 20, 40), np.int16)
-    for label, i in ((2, 4), (3, 8), (4, 12), (43, 26), (42, 30), (41, 34)):
+    for label, i in ((2, 4), (3, 8), (4, 12), (251, 20), (43, 26), (42, 30), (41, 34)):
         array[4:16, 4:16, i : i + 3] = label
     write_volume(aseg, Volume(array, np.eye(4)))
     table = bench.logic.tissues(aseg)
@@ -373,6 +373,24 @@ def test_label_maps_of_other_programs_are_recognised_and_masks_refused(bench):
     write_labels(lesion, Volume((array > 0).astype(np.uint8), np.eye(4)), ("tumour",), bench.grid())
     with pytest.raises(SimulationError, match="'painted': a lesion"):
         bench.logic.tissues(lesion)
+
+
+def test_codes_of_slicers_terminologies_are_written_and_read(bench):
+    values = np.repeat(np.arange(4, dtype=np.uint8), 16).reshape(4, 4, 4)
+    for kind in ("Segmentation", "LabelMapVolume"):
+        node = add(bench.scene, kind, "tissues")
+        write_labels(node, Volume(values, np.eye(4)), ("white matter", "liver", "gel"), bench.grid())
+        if kind == "Segmentation":
+            segments = [node.GetSegmentation().GetNthSegment(n) for n in range(3)]
+            entries = [segment.GetTerminology() for segment in segments]
+            for segment in segments[:2]:
+                segment.SetName("Segment_1")
+        else:
+            colours = node.GetDisplayNode().GetColorNode()
+            entries = [colours.GetTerminologyAsString(label) for label in (1, 2, 3)]
+            colours.SetColorName(1, "Gewebe")
+        assert "^389080008^" in entries[0] and "^10200004^" in entries[1] and "^389080008^" not in entries[2]
+        assert read_labels(node, TissueTable.brain()).names == ("white matter", "liver", "gel")
 
 
 def test_slicers_default_colours_do_not_make_bone_of_grey_matter(bench):

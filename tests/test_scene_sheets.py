@@ -183,7 +183,7 @@ def test_organs_without_names_are_read_by_totalsegmentators_numbers():
     write_volume(organs, phantom.organs)
     found = read_labels(organs, TissueTable.named(("skin", "fat", "muscle", "blood", "bone")), of_ct=True)
     assert found.names == ("kidney", "liver", "lung")
-    assert "taken for the numbers of TotalSegmentator CT (2 kidney right" in found.taken_for
+    assert found.message.startswith("TotalSegmentator CT: 3 labels")
 
 
 # ---- lesions that are grown ------------------------------------------------------------------------------------------

@@ -412,7 +412,7 @@ def test_another_mri_is_registered_and_classified_with_the_first():
 
 def test_labels_without_names_are_recognised_or_refused():
     """A lesion's mask was simulated as CSF, SPM's grey matter as CSF."""
-    from tests.test_label_places import in_order
+    from tests.test_label_maps import head
 
     def output(labels: Volume) -> UltrasoundSimulationFilter:
         algorithm = UltrasoundSimulationFilter()
@@ -429,7 +429,7 @@ def test_labels_without_names_are_recognised_or_refused():
     algorithm.Update()
     message = algorithm.GetErrorMessage()
     assert algorithm.GetFrame() is None and "a binary mask" in message
-    found = output(in_order((1, 2, 3)))
+    found = output(head())
     found.Update()
     assert found.GetFrame() is not None
     known = output(Volume(mask, np.eye(4)))

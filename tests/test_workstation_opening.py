@@ -154,20 +154,22 @@ def test_a_mask_is_a_tumour_or_a_brain_mask_as_the_user_says(page, files, tmp_pa
 
 @pytest.mark.long
 def test_a_label_map_is_of_this_patient_or_of_a_new_one(page, files, tmp_path):
-    shutil.copy(files / "labels.nii.gz", tmp_path / "own.nii.gz")
+    Volume.read(files / "labels.nii.gz").write(tmp_path / "own.nii.gz")  # without the names in its header
     ball(Volume.read(files / "head.nii.gz")).write(tmp_path / "mask.nii.gz")
     answered(page, tmp_path / "mask.nii.gz", "Add as cyst")
     lesions = shown(page, "lesionsSelector")
     page.set_input_files("#open-file", tmp_path / "own.nii.gz")
-    assert "own.nii.gz is a label map: numbers of ussim segment and FSL FAST" in question(page)
+    assert "a label map with the labels 1, 2, 3, 4 of ussim segment and FSL FAST or BraTS since 2023" in question(page)
+    answer(page, "Tissues of head.nii.gz")
+    question(page)
     with new_image(page):
-        answer(page, "Tissues of head.nii.gz")
+        answer(page, "ussim segment and FSL FAST")
     assert page.locator("#labelsSelector option:checked").inner_text().strip() == "own.nii.gz" and not errors(page)
     assert shown(page, "lesionsSelector") == lesions is not None  # what is the patient's stays
     assert page.locator("#mriSelector option:checked").inner_text().strip() == "head.nii.gz"
     head().write(tmp_path / "aseg.nii.gz")
     said = answered(page, tmp_path / "aseg.nii.gz", "New patient")
-    assert "a label map: FreeSurfer aseg, 8 labels" in said and said.endswith("a new patient; own.nii.gz is closed")
+    assert "a label map: FreeSurfer, 8 labels" in said and said.endswith("a new patient; own.nii.gz is closed")
     assert state(page, NAMES.title) == "aseg.nii.gz" and shown(page, "mriSelector") is None
     assert shown(page, "lesionsSelector") is None
 

@@ -247,8 +247,9 @@ def _phantom(
 
 
 def _organ_labels(truth: Volume, organs: Mapping[str, tuple[float, float] | None]) -> np.ndarray:
-    from SlicerUSSim.Logic.tissue import totalsegmentator
+    from SlicerUSSim.Logic.tissue.schemes import schemes
 
+    numbers = {name: number for number, name in schemes()["totalsegmentator"].names.items()}
     tissues = {"vertebrae": ("bone", "cancellous bone"), "lung": ("lung",), "liver": ("liver",), "kidney": ("kidney",)}
     labels = np.zeros(truth.array.shape, np.int16)
     k = np.arange(truth.array.shape[0]) * truth.spacing_mm[2] + truth.ijk_to_ras[2, 3]
@@ -256,5 +257,5 @@ def _organ_labels(truth: Volume, organs: Mapping[str, tuple[float, float] | None
         inside = np.isin(truth.array, [NAMES.index(tissue) + 1 for tissue in tissues[name.split("_")[0]]])
         if between is not None:
             inside &= ((k >= between[0]) & (k < between[1]))[:, None, None]
-        labels[inside] = list[str](totalsegmentator.CT).index(name) + 1
+        labels[inside] = numbers[name]
     return labels

@@ -30,9 +30,9 @@ class MriOptions:
     maps: tuple[str, ...] = declared(
         "--map", multiple=True, metavar="LABEL=TISSUE",
         help="Tissue of a label of the label map, by its number or its name: 24=csf; 0 removes a label. Or a .json "
-        'file with {"24": "csf"}, a table of names (.txt, .ctbl, .tsv), or the numbering: freesurfer, '
-        "totalsegmentator, totalsegmentator-v1, totalsegmentator-mr, totalsegmentator-tissues, ussim, brats-2022, "
-        "brats. May be repeated.",
+        'file with {"24": "csf"}, a table of names (.txt, .ctbl, .tsv), or the numbering: ussim, '
+        "ussim-t1gd, spm, synthseg, fastsurfer, fsl-first, freesurfer, totalsegmentator (also -v1, -mr, -tissues), "
+        "brats, brats-2022. May be repeated.",
     )  # fmt: skip
     segmentation: SegmentationSettings = declared_parameters(  # noqa: RUF009, a dataclasses.field like the others
         SegmentationSettings,
@@ -185,8 +185,7 @@ def _read_organs(path: str, maps: Iterable[str]) -> LabelledTissues:
 
     table = TissueTable({})
     found = read_label_file(Path(path), Volume.read(path), LabelMapping.of(maps, table), default=table, of_ct=True)
-    if not found.others:
-        note(f"{path}: {found.message}")
+    note(f"{path}: {found.message}")
     for warning in found.warnings:
         if "--map 0=" in warning:  # between organs the CT says what is there
             continue

@@ -227,7 +227,7 @@ def _placed(
     from SlicerUSSim.Logic.placement.bone_before_probe import about_bone
     from SlicerUSSim.Logic.placement.craniotomy import default_pose, middle_of
     from SlicerUSSim.Logic.placement.views import opened_view_pose, view_pose
-    from SlicerUSSim.Logic.tissue.brain_orders import BRAIN_TISSUES
+    from SlicerUSSim.Logic.tissue.names import BRAIN_TISSUES
 
     labels, names, settings, probe = added.labels, added.tissue_names, preset.settings, preset.probe
     at, is_open, line = None, craniotomy.is_wanted, ""

@@ -19,7 +19,7 @@ from SlicerUSSim.Logic.tissue.label_files import TABLE_SUFFIXES, names_of_file
 from SlicerUSSim.Logic.tissue.label_maps import as_whole
 from SlicerUSSim.Logic.tissue.label_sources import is_label_file
 from SlicerUSSim.Logic.tissue.probability_maps import combined_probability_maps
-from SlicerUSSim.Logic.tissue.schemes import recognised, title_of
+from SlicerUSSim.Logic.tissue.schemes import Scheme, recognised
 from SlicerUSSim.Logic.tracked.sequence import is_tracked_sequence
 
 #: More numbers, or more millilitres, are the labels of a brain or a body, and not of a lesion and what is around it
@@ -56,6 +56,8 @@ class Content:
     volume: Volume | None = None
     #: Names of the files of which it consists, if they are several: those of the three tissues; the first is this one
     files: tuple[str, ...] = ()
+    #: Numberings that a label map may have, if they are several
+    schemes: tuple[Scheme, ...] = ()
 
 
 def content_of(path: Path) -> Content:
@@ -107,28 +109,24 @@ def _of_labels(path: Path, volume: Volume, size: str) -> Content:
         return Content(Kind.LABELS, f"tissue probabilities, {size}", volume, files)
     values = np.flatnonzero(np.bincount(labels.array.ravel())).tolist()
     values = [value for value in values if value]
-    names = names_of_file(path, volume)[0]
+    names, millilitres = names_of_file(path, volume)[0], float((labels.array > 0).sum() * labels.voxel_ml)
     if len(values) <= 1:
         of_what = f" called {names[values[0]]!r}" if values and values[0] in names else ""
-        millilitres = float((labels.array > 0).sum() * labels.voxel_ml)
         return Content(Kind.MASK, f"a mask of one region{of_what}, {millilitres:.3g} ml, {size}", volume)
     if any(value in names for value in values):
         called = ", ".join(names[value] for value in values[:4] if value in names)
         more = ", ..." if len(values) > 4 else ""
         return Content(Kind.LABELS, f"a label map of {len(values)} labels by name ({called}{more}), {size}", volume)
-    recognition = recognised(labels, values)
-    scheme = recognition.scheme
+    scheme, choices = recognised(values)
     if scheme is not None and scheme.is_lesion:
         return Content(Kind.LESIONS, f"lesions as {scheme.title} numbers them, {size}", volume)
     if scheme is not None:
-        return Content(Kind.LABELS, f"a label map: {title_of(scheme, values)}, {len(values)} labels, {size}", volume)
+        return Content(Kind.LABELS, f"a label map: {scheme.title}, {len(values)} labels, {size}", volume)
     listed = ", ".join(map(str, values[:6])) + (", ..." if len(values) > 6 else "")
-    millilitres = float((labels.array > 0).sum() * labels.voxel_ml)
-    may_be_lesion = len(values) <= _MOST_OF_LESION and millilitres <= _MOST_LESION_ML and not recognition.order
+    may_be_lesion = len(values) <= _MOST_OF_LESION and millilitres <= _MOST_LESION_ML
     kind = Kind.LESIONS if may_be_lesion else Kind.LABELS
-    which = " and ".join(candidate.title for candidate in recognition.candidates)
-    fits = f" that fit {which}" if which else " of no known program"
-    return Content(kind, f"a label map with the labels {listed}{'' if recognition.order else fits}, {size}", volume)
+    which = " or ".join(choice.title for choice in choices) or "no known program"
+    return Content(kind, f"a label map with the labels {listed} of {which}, {size}", volume, schemes=tuple(choices))
 
 
 # ---- texts -----------------------------------------------------------------------------------------------------------

@@ -395,8 +395,7 @@ class Loading:
     def _take_organs(self, node: Any, found: LabelledTissues) -> None:
         """Choose the label map of organs of a CT, which Segment uses."""
         self._logic.parameters.organs = node
-        lines = [f"{node.GetName()}: {found.message}; Segment uses it with the contrast ct", found.taken_for]
-        self._presenter.notes.set("\n".join(filter(None, lines)))
+        self._presenter.notes.set(f"{node.GetName()}: {found.message}; Segment uses it with the contrast ct")
 
     def close_patient(self) -> None:
         """Close the patient: nothing of him stays on the page, in the scene or in memory; settings stay."""

@@ -191,7 +191,6 @@ class Opener:
         volume, table = self._volume(path), TissueTable({})
         mapping = LabelMapping.of(maps, table)
         found = self._tasks.doAside(lambda: read_label_file(Path(path), volume, mapping, default=table, of_ct=True))
-        require(not found.others, found.ambiguity)  # a node has one name for each label
         return self._label_map(found.labels, path, found.names), replace(found, message=self.as_known(found.message))
 
     def second_mri(self, path: str):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
+from itertools import islice
 from typing import Any
 
 from SlicerUSSim.Logic.base.dicom import Series
@@ -14,11 +15,12 @@ from SlicerUSSim.Logic.mri.modality import has_brain_mask
 from SlicerUSSim.Logic.mri.pathology import LESIONS
 from SlicerUSSim.Logic.mri.segmentation_settings import CT, MRI_CONTRASTS
 from SlicerUSSim.Logic.placement.craniotomy import POLYGONS
+from SlicerUSSim.Logic.tissue.label_mapping import LabelMapping
 from SlicerUSSim.Logic.tracked.pose_files import read_pose
 from SlicerUSSim.Workstation.browser_panel import BrowserPanel
 from SlicerUSSim.Workstation.content import Kind
 from SlicerUSSim.Workstation.loading import Loading
-from SlicerUSSim.Workstation.opener import Opener, Upload
+from SlicerUSSim.Workstation.opener import LabelTable, Opener, Upload
 from SlicerUSSim.Workstation.parcel import Parcel
 from SlicerUSSim.Workstation.pose_entry import PoseEntry
 from SlicerUSSim.Workstation.pose_registration import Registration
@@ -175,7 +177,7 @@ class Opening:
         reading = self._loading.reading_labels
         came_along = any(other.kind in (Kind.MRI, Kind.CT) for other in beside)
         if not self._loading.has_users_patient or (came_along and self._loading.are_of_mri(upload.path)):
-            return "tissues to simulate", reading(upload.path, upload.table, None)
+            return "tissues to simulate", reading(upload.path, self._table_of(upload), None)
         choices = [Choice(_NEW, "New patient", f"{patient} is closed, with all that belongs to it")]
         if parameters.mri is not None:
             choices.append(Choice(_OWN, f"Tissues of {patient}", "In place of its tissues; the MRI stays"))
@@ -185,8 +187,20 @@ class Opening:
         if key == _ORGANS:
             return self._organs(upload, patient)
         if key == _OWN:
-            return f"tissues of {patient}", reading(upload.path, upload.table, True)
-        return f"a new patient; {patient} is closed", reading(upload.path, upload.table, False)
+            return f"tissues of {patient}", reading(upload.path, self._table_of(upload), True)
+        return f"a new patient; {patient} is closed", reading(upload.path, self._table_of(upload), False)
+
+    def _table_of(self, upload: Upload) -> LabelTable | None:
+        """Its table, or the numbering that the user says where several fit."""
+        schemes = {scheme.key: scheme for scheme in upload.content.schemes}
+        if upload.table is not None or not schemes:
+            return upload.table
+        choices = [
+            Choice(key, scheme.title, ", ".join(f"{n} {name}" for n, name in islice(scheme.names.items(), 4)))
+            for key, scheme in schemes.items()
+        ]
+        key = self._ask(f"Numbers of {upload.name}?", f"{upload.name} is {upload.content.what}.", choices)
+        return LabelTable(schemes[key].title, mapping=LabelMapping(scheme=key))
 
     def _organs(self, upload: Upload, patient: str) -> tuple[str, Callable[[], object]]:
         return f"organs of the CT {patient}; Segment uses them", self._loading.reading_organs(upload.path)
@@ -213,7 +227,8 @@ class Opening:
         choices.append(Choice(_NEW, "Label map of a new patient", f"{patient} is closed"))
         key = self._ask_what(upload, choices)
         if key == _NEW:
-            return f"a new patient; {patient} is closed", self._loading.reading_labels(upload.path, upload.table, False)
+            take = self._loading.reading_labels(upload.path, self._table_of(upload), False)
+            return f"a new patient; {patient} is closed", take
         if key == _ORGANS:
             return self._organs(upload, patient)
         if key == _BRAIN:

@@ -390,22 +390,24 @@ def _segments(path: Path, dataset: Any) -> ImageFile:
     layers, volume, found = [], None, []
     for place, number in enumerate(image.segment_numbers):
         described = image.get_segment_description(number)
-        kind = described.segmented_property_type.meaning
+        kind = described.segmented_property_type
         name = str(described.segment_label or "")
         volume = image.get_volume(
             segment_numbers=[number], combine_segments=False, allow_missing_positions=True, dtype=np.float32
         )
         layers.append((np.asarray(volume.array)[..., 0] > 0.5).astype(np.uint8))
-        found.append(Segment(name if is_meaningful(name) else kind, place, 1, int(number)))
+        found.append(Segment(name if is_meaningful(name) else kind.meaning, place, 1, int(number), (kind.value,)))
     require(volume is not None, f"{path}: has no segments")
     voxel_ml = float(abs(np.linalg.det(volume.affine[:3, :3])) / 1000.0)  # type: ignore[union-attr]
     if len(layers[0]) == 1:  # the slice beside it has no segment
         layers = [np.pad(layer, ((0, 1), (0, 0), (0, 0))) for layer in layers]
     labels = flattened(np.stack(layers, axis=-1), found, voxel_ml, str(path))
-    return _image(labels, volume.affine, {one.label: one.name for one in found})  # type: ignore[union-attr]
+    codes = {one.label: one.codes for one in found}
+    names = {one.label: one.name for one in found}
+    return replace(_image(labels, volume.affine), label_names=names, label_codes=codes)  # type: ignore[union-attr]
 
 
-def _image(array: np.ndarray, affine: np.ndarray, names: Mapping[int, str] | None = None) -> ImageFile:
+def _image(array: np.ndarray, affine: np.ndarray) -> ImageFile:
     """Slices, rows and columns in highdicom's LPS, with slices in the order of their normal, as ITK has them."""
     matrix = LPS_TO_RAS @ np.asarray(affine)[:, [2, 1, 0, 3]]
     if np.linalg.det(matrix[:3, :3]) < 0:
@@ -416,7 +418,7 @@ def _image(array: np.ndarray, affine: np.ndarray, names: Mapping[int, str] | Non
     if np.array_equal(whole, array):
         is_short = whole.min() >= -(2**15) and whole.max() < 2**15
         array = whole.astype(np.int16 if is_short else np.int32)
-    return ImageFile(np.ascontiguousarray(array), matrix, label_names=names or {})
+    return ImageFile(np.ascontiguousarray(array), matrix)
 
 
 def _numbers(dataset: Any, keyword: str, count: int, name: str) -> np.ndarray:

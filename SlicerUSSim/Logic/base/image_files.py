@@ -78,6 +78,8 @@ class ImageFile:
     #: The first of these is used
     matrices: Mapping[str, np.ndarray] = field(default_factory=dict)
     label_names: Mapping[int, str] = field(default_factory=dict)
+    #: {label: SNOMED CT codes, the most special first}
+    label_codes: Mapping[int, tuple[str, ...]] = field(default_factory=dict)
     #: One line each, without the name of the file
     doubts: tuple[str, ...] = ()
 
@@ -412,7 +414,8 @@ def _read_nrrd(path: Path) -> ImageFile:
     matrix[:3] *= scale
     return ImageFile(
         _native(array), np.diag([*(signs or (-1, -1, 1)), 1.0]) @ matrix, bool(fast), header, spacings=spacings,
-        label_names={segment.label: segment.name for segment in segments}, doubts=tuple(doubts),
+        label_names={segment.label: segment.name for segment in segments},
+        label_codes={segment.label: segment.codes for segment in segments}, doubts=tuple(doubts),
     )  # fmt: skip
 
 

@@ -33,6 +33,8 @@ class Segment:
     value: int
     #: Its label in one label map of all segments
     label: int
+    #: Its SNOMED CT codes, as codes_of_entry returns them
+    codes: tuple[str, ...] = ()
 
 
 def segments_of(header: Mapping[str, object], name: str = "segments") -> list[Segment]:
@@ -51,7 +53,9 @@ def segments_of(header: Mapping[str, object], name: str = "segments") -> list[Se
     segments = []
     for number in numbers:
         layer, value = whole(f"Segment{number}_Layer", 0), whole(f"Segment{number}_LabelValue", number + 1)
-        segments.append(Segment(str(header[f"Segment{number}_Name"]), layer, value, value))
+        entry = re.search(r"TerminologyEntry:([^|]*)", str(header.get(f"Segment{number}_Tags", "")))
+        codes = codes_of_entry(entry[1]) if entry else ()
+        segments.append(Segment(str(header[f"Segment{number}_Name"]), layer, value, value, codes))
     has_layers = len({segment.layer for segment in segments}) > 1
     if has_layers and len({segment.value for segment in segments}) < len(segments):
         return [replace(segment, label=place) for place, segment in enumerate(segments, 1)]
@@ -78,6 +82,15 @@ def flattened(layers: np.ndarray, segments: list[Segment], voxel_ml: float, name
     if overlaps:
         _log.warning("%s: segments overlap, the last is taken: %s", name, "; ".join(overlaps))
     return labels
+
+
+def codes_of_entry(entry: str) -> tuple[str, ...]:
+    """The SNOMED CT codes of an entry of 3D Slicer's terminologies: of the type's modifier, and of the type.
+
+    An entry is context~category~type~modifier~..., each of them a scheme^code^meaning.
+    """
+    found = re.findall(r"SCT\^(\w+)\^", "~".join(entry.split("~")[2:4]))
+    return tuple(found[::-1])
 
 
 def is_meaningful(name: str | None) -> bool:

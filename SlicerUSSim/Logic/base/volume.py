@@ -46,6 +46,7 @@ class Volume:
     ijk_to_ras : (4, 4) from homogeneous voxel indices (i, j, k, 1) of voxel *centres* to RAS millimetres.
     name : of its file or node, for messages.
     label_names : {label: name} of masks and label maps, where their file gives them; see mri.read_mask.
+    label_codes : {label: SNOMED CT codes, the most special first}, likewise.
     doubts : what a user should check about its file, one line each, which read() has also logged.
 
     Raises SimulationError for an array that is not 3D or not numeric, and for a singular or non-affine matrix.
@@ -67,6 +68,7 @@ class Volume:
     name: str = field(default="", compare=False)  # of no meaning for the image
     label_names: Mapping[int, str] = field(default_factory=dict, compare=False)
     doubts: tuple[str, ...] = field(default=(), compare=False)
+    label_codes: Mapping[int, tuple[str, ...]] = field(default_factory=dict, compare=False)
 
     def __post_init__(self) -> None:
         array = np.asarray(self.array)
@@ -175,7 +177,7 @@ class Volume:
                 f"{name}: has {array.shape[-1]} components per voxel, expected 1; save one of them, or a label map",
             )
             array = flattened(array, segments, float(abs(np.linalg.det(found.ijk_to_ras[:3, :3])) / 1000.0), name)
-        return cls(array, found.ijk_to_ras, name, found.label_names, found.doubts)
+        return cls(array, found.ijk_to_ras, name, found.label_names, found.doubts, found.label_codes)
 
     @classmethod
     def from_sitk(cls, image, name: str = "image") -> Volume:

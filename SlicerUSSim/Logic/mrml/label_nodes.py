@@ -12,7 +12,7 @@ from vtkmodules.vtkCommonCore import vtkIntArray, vtkStringArray
 from vtkmodules.vtkCommonMath import vtkMatrix4x4
 
 from SlicerUSSim.Logic.base.errors import require
-from SlicerUSSim.Logic.base.segments import is_meaningful
+from SlicerUSSim.Logic.base.segments import codes_of_entry, is_meaningful
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.base.vtk_data import matrix_array, vtk_matrix
 from SlicerUSSim.Logic.imaging.preset import Preset
@@ -26,6 +26,7 @@ from SlicerUSSim.Logic.mrml.nodes import (
     write_volume,
 )
 from SlicerUSSim.Logic.tissue.label_maps import LabelledTissues, as_whole, read_label_map
+from SlicerUSSim.Logic.tissue.names import name_or_term, terminology_entry
 from SlicerUSSim.Logic.tissue.presets import colour_of
 from SlicerUSSim.Logic.tissue.table import TissueTable
 
@@ -88,6 +89,12 @@ def read_labels(labels_node, tissues: TissueTable, *, of_ct: bool = False) -> La
     by_number = None
     if labels_node.IsA("vtkMRMLSegmentationNode"):
         volume, names = _read_segmentation(labels_node)
+        segmentation = labels_node.GetSegmentation()
+        segments = map(segmentation.GetSegment, segmentation.GetSegmentIDs())
+        names = {
+            number: name_or_term(segment.GetName(), codes_of_entry(segment.GetTerminology()))
+            for number, segment in enumerate(segments, 1)
+        }
     else:
         volume = read_volume(labels_node, "label map")
         names = _colour_names(labels_node, volume)
@@ -227,6 +234,8 @@ def _colour_names(labels_node, volume: Volume) -> dict[int, str]:
         return {}
     for label in present:
         name = colours.GetColorName(label) if label < colours.GetNumberOfColors() else None
+        if name is not None:
+            name = name_or_term(name, codes_of_entry(colours.GetTerminologyAsString(label)))
         if is_meaningful(name):
             names[label] = name
     return names
@@ -268,6 +277,8 @@ def _write_label_map(labels_node, labels: Volume, names: tuple[str, ...]) -> Non
     colours.SetColor(0, "coupling", 0.0, 0.0, 0.0, 0.0)
     for label, name in enumerate(names, 1):
         colours.SetColor(label, name, *kept.get(name, (*colour_of(name), 1.0)))
+        if entry := terminology_entry(name):
+            colours.SetTerminologyFromString(label, entry)
     _show_in_colours(labels_node, colours)
 
 
@@ -334,8 +345,10 @@ def _write_segmentation(segmentation_node, labels: Volume, names: tuple[str, ...
         mask = slicer.vtkOrientedImageData()
         mask.ShallowCopy(Volume(labels.array == label, np.eye(4)).to_vtk())
         mask.SetImageToWorldMatrix(vtk_matrix(labels.ijk_to_ras))
-        segmentation_node.AddSegmentFromBinaryLabelmapRepresentation(
+        segment_id = segmentation_node.AddSegmentFromBinaryLabelmapRepresentation(
             mask, name, kept.get(name) or colour_of(name), name
         )  # fmt: skip
+        if entry := terminology_entry(name):
+            segmentation.GetSegment(segment_id).SetTerminology(entry)
     segmentation_node.EndModify(was_modifying)
     display_of(segmentation_node)

@@ -305,12 +305,8 @@ class SegmentLogic:
         )
         require_node(organs_node, *LABEL_CLASSES, use="organs")
         to_mri = np.linalg.inv(node_to_world(mri_node)) @ node_to_world(organs_node)
-
-        def in_frame_of_mri(found: LabelledTissues) -> LabelledTissues:
-            labels = Volume(found.labels.array, to_mri @ found.labels.ijk_to_ras)
-            return replace(found, labels=labels, others=tuple(map(in_frame_of_mri, found.others)))
-
-        return in_frame_of_mri(read_labels(organs_node, self._tissues, of_ct=True))
+        found = read_labels(organs_node, self._tissues, of_ct=True)
+        return replace(found, labels=Volume(found.labels.array, to_mri @ found.labels.ijk_to_ras))
 
     def _write(self, labels_node, added: Added, like_node, texture: Texture | None) -> None:
         """Write labels and what is known of their shares."""

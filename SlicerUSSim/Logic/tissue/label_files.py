@@ -2,7 +2,7 @@
 
 Headers: segments of DICOM SEG and 3D Slicer's .seg.nrrd, and the label table that TotalSegmentator writes into NIfTI.
 Tables: ITK-SNAP's label descriptions, 3D Slicer's colour tables (.ctbl, .csv), FreeSurfer's look-up tables, and those
-of BIDS (.tsv with columns index and name).
+of BIDS (.tsv with columns index and name). A name that is of no tissue gives way to the label's SNOMED CT code.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from SlicerUSSim.Logic.base.files import read_text
 from SlicerUSSim.Logic.base.reading import reader
 from SlicerUSSim.Logic.base.segments import is_meaningful
 from SlicerUSSim.Logic.base.volume import Volume
+from SlicerUSSim.Logic.tissue.names import name_or_term
 
 _log = logging.getLogger(__name__)
 
@@ -28,6 +29,8 @@ _SNAP = re.compile(r'\s*(\d+)\s[\d\s.]+"((?:[^"\\]|\\.)*)"\s*')
 _SEPARATED = re.compile(r'\s*"?\d+"?\s*([\t,;])')
 #: 24  CSF  60 60 60 0
 _PLAIN = re.compile(r"\s*(\d+)\s+(.*?)((?:\s+[\d.]+){3,8})?\s*")
+#: Columns of 3D Slicer's tables with codes, the most special first
+_CODES = ("TypeModifier_CodeValue", "Type_CodeValue")
 
 
 def names_of_file(path: Path, volume: Volume) -> tuple[dict[int, str], str]:
@@ -35,7 +38,8 @@ def names_of_file(path: Path, volume: Volume) -> tuple[dict[int, str], str]:
 
     Raises SimulationError for a table beside it that cannot be read.
     """
-    names = {label: name for label, name in volume.label_names.items() if is_meaningful(name)}
+    given = {label: name_or_term(name, volume.label_codes.get(label, ())) for label, name in volume.label_names.items()}
+    names = {label: name for label, name in given.items() if is_meaningful(name)}
     if names:
         return names, "its header"
     stem = path.name
@@ -65,8 +69,12 @@ def read_names(path: Path) -> dict[int, str]:
     except OSError as error:
         raise SimulationError(f"{path}: cannot be read ({error.strerror})") from None
     names: dict[int, str] = {}
+    header: list[str] = []
     for line in text.splitlines():
-        label, name = _entry(line)
+        label, name, columns = _entry(line)
+        if label is None and "CodeValue" in line:
+            header = next(csv.reader([line]))
+        name = name_or_term(name, [columns[header.index(c)] for c in _CODES if c in header[: len(columns)]])
         if label is None or not is_meaningful(name):
             continue
         require(
@@ -76,15 +84,15 @@ def read_names(path: Path) -> dict[int, str]:
     return names
 
 
-def _entry(line: str) -> tuple[int | None, str]:
-    """(label, name) of a line of a table; None without."""
+def _entry(line: str) -> tuple[int | None, str, list[str]]:
+    """(label, name, all columns of separated values) of a line of a table; None without."""
     found = _SNAP.fullmatch(line)
     if found:
-        return int(found[1]), re.sub(r"\\(.)", r"\1", found[2]).strip()
+        return int(found[1]), re.sub(r"\\(.)", r"\1", found[2]).strip(), []
     found = _SEPARATED.match(line)
     if found:
         columns = [column.strip() for column in next(csv.reader([line], delimiter=found[1], skipinitialspace=True))]
         number, name, *_ = *filter(None, columns), "", ""
-        return (int(number), name.strip('"').strip()) if number.isdecimal() else (None, "")
+        return (int(number) if number.isdecimal() else None), name.strip('"').strip(), columns
     found = _PLAIN.fullmatch(line)
-    return (int(found[1]), found[2].strip().strip('"').strip()) if found else (None, "")
+    return (int(found[1]), found[2].strip().strip('"').strip(), []) if found else (None, "", [])

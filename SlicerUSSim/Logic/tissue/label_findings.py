@@ -14,9 +14,8 @@ from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.tissue.label_mapping import LabelMapping
 from SlicerUSSim.Logic.tissue.names import nearest_tissue, plain_name, same_name, tissue_named
 from SlicerUSSim.Logic.tissue.presets import TISSUES
-from SlicerUSSim.Logic.tissue.schemes import Scheme, schemes
+from SlicerUSSim.Logic.tissue.schemes import OF_BODY, Scheme, nearest_scheme, schemes
 from SlicerUSSim.Logic.tissue.table import TissueTable
-from SlicerUSSim.Logic.tissue.thinning import centres_of, label_places
 from SlicerUSSim.Logic.tissue.tissue import Tissue
 
 _LONGEST_LIST = 12
@@ -25,8 +24,6 @@ MAP_THEM = (
     "map them with --map {label}=TISSUE (0 removes a label), a .json file, a table of names or the names of segments, "
     "to one of"
 )
-#: About numbers that several programs use
-SAY_WHICH = "say which with --map {key}"
 #: About a mask or lesion without a patient
 _NO_PATIENT = (
     "add it to a segmentation with --add {added}, or simulate it alone with {maps} (ussim simulate); in 3D Slicer, add "
@@ -38,6 +35,8 @@ UNNAMED = "label map"
 _LESIONS = ("tumour", "oedema", "necrosis", "cyst", "cavity", "enhancing")
 #: Centres nearer to each other tell nothing of sides, and share of structures whose sides are exchanged
 _APART_MM, _MOST_EXCHANGED = 2.0, 0.8
+#: Voxels from which on places of structures are known well enough
+_VOXELS = 2_000_000
 
 
 class NoPatientError(SimulationError):
@@ -99,8 +98,6 @@ class Findings:
         remedy = _NO_PATIENT.format(added=shlex.quote(f"{tissue}={self._file}"), maps=maps)
         if self.of_ct:
             remedy = f"say which organ it is with {maps}"
-        if self.scheme is not None and is_brats and set(self.names) <= set(schemes()["ussim"].names):
-            remedy += f"; if it is a brain, {SAY_WHICH.format(key='ussim')}"
         raise NoPatientError(f"{self.source}: {what}, not a patient's tissues; {remedy}")
 
     def require_known(self) -> None:
@@ -109,6 +106,10 @@ class Findings:
         if not unknown:
             return
         nothing = "no program's numbers are recognised, and " if len(unknown) == len(self.names) else ""
+        nearest = nearest_scheme(unknown) if nothing else None
+        if nearest is not None:
+            lacking = [label for label in unknown if label not in nearest.names]
+            nothing, unknown = f"most of its numbers are {nearest.title}'s, and ", lacking or unknown
         known = ", ".join(dict.fromkeys([*self.tissues.names()[1:], *TISSUES]))
         called = listed(map(self._described, unknown))
         unused = self.mapping.unused(self.names)
@@ -135,7 +136,8 @@ class Findings:
             doubts.append(
                 f"{self.source}: labels of the left side are on the right; check the orientation in its header"
             )
-        is_body = self.scheme is not None and self.scheme.key.startswith("totalsegmentator")
+        organs = {plain_name(name) for key in OF_BODY for name in schemes()[key].names.values()}
+        is_body = organs.issuperset(plain_name(str(name)) for name in self.names.values())
         if is_body and 0 not in self.mapping.by_label and self.counts[0]:
             share = self.counts[0] / self.counts.sum()
             doubts.append(
@@ -146,7 +148,7 @@ class Findings:
 
     def _has_exchanged_sides(self) -> bool:
         """Whether what is called left is on the right, of structures with a name for both sides."""
-        centres = centres_of(label_places(self.labels))
+        centres = self._centres()
         own = {label: name for label, name in self.names.items() if self.mapping.tissue_of(label, name) is None}
         places = {_words(name): centres[label][0] for label, name in own.items() if name}
         pairs = [
@@ -155,6 +157,16 @@ class Findings:
         steps = np.array([right - left for left, right in pairs if right is not None])
         told = steps[np.abs(steps) > _APART_MM]
         return bool(len(told)) and float(np.mean(told < 0)) >= _MOST_EXCHANGED
+
+    def _centres(self) -> dict[int, np.ndarray]:
+        """{label: its centre, RAS mm} of the labels that are seen in every so-manieth voxel."""
+        step = max(1, int(np.ceil((self.labels.array.size / _VOXELS) ** (1 / 3))))
+        array = self.labels.array[::step, ::step, ::step]
+        where = np.nonzero(array)
+        values, inverse, counts = np.unique(array[where], return_inverse=True, return_counts=True)
+        ijk = [np.bincount(inverse, axis) * step / counts for axis in where[::-1]]
+        ras = self.labels.ijk_to_ras @ [*ijk, np.ones(len(values))]
+        return dict(zip(map(int, values), ras[:3].T, strict=True))
 
     def _described(self, label: int) -> str:
         """'Left-Lesion' (25, 3.1 ml)"""

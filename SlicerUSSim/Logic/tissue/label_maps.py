@@ -1,4 +1,4 @@
-"""read_label_map: label maps of other programs as labels of tissues, recognised by their content.
+"""read_label_map: label maps of other programs as labels of tissues, by the user's words, names or known numbers.
 
 Every door (command, Slicer, workstation) uses it. What was recognised and done is said in `message`, what is doubtful
 in `warnings`; what cannot be known is an error with its remedy, and never a guess.
@@ -12,14 +12,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from SlicerUSSim.Logic.base.errors import SimulationError, either, require, require_kind
+from SlicerUSSim.Logic.base.errors import SimulationError, require, require_kind
 from SlicerUSSim.Logic.base.label_numbers import whole_numbers
 from SlicerUSSim.Logic.base.volume import Volume
-from SlicerUSSim.Logic.tissue.label_findings import MAP_THEM, SAY_WHICH, UNNAMED, Findings, listed, options
+from SlicerUSSim.Logic.tissue.label_findings import UNNAMED, Findings, listed
 from SlicerUSSim.Logic.tissue.label_mapping import LabelMapping
 from SlicerUSSim.Logic.tissue.names import nearest_tissue, plain_name, tissue_named
 from SlicerUSSim.Logic.tissue.presets import TISSUES
-from SlicerUSSim.Logic.tissue.schemes import Scheme, recognised, recognised_in_ct, scheme_with_names, schemes, title_of
+from SlicerUSSim.Logic.tissue.schemes import Scheme, recognised, schemes
 from SlicerUSSim.Logic.tissue.table import MAX_LABEL, TissueTable
 from SlicerUSSim.Logic.tissue.tissue import Tissue
 
@@ -28,8 +28,8 @@ _log = logging.getLogger(__name__)
 LARGEST_LABEL = 99_999
 #: Smallest distance of a label from a whole number that is said
 _WORTH_ROUNDING = 0.01
-#: Fewer labels are not taken for a program's organs; and tissues that the numbers of a CT can tell from most others
-_FEWEST_ORGANS, _TELLING = 2, ("lung", "bone")
+#: Labels of each numbering that is offered
+_SHOWN = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,12 +48,6 @@ class LabelledTissues:
     warnings: tuple[str, ...] = ()
     #: Whether the labels are as they were, with a tissue table that was made for them
     has_own_table: bool = False
-    #: By which numbers organs of a CT were read, if too few are known by their places; segment_ct checks it
-    taken_for: str = ""
-    #: The same numbers as other programs' organs, of which the CT's numbers have to tell the right ones, and how a user
-    #: says which they are
-    others: tuple[LabelledTissues, ...] = ()
-    ambiguity: str = ""
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -73,7 +67,8 @@ def read_label_map(
     renumber: bool = False,
     of_ct: bool = False,
 ) -> LabelledTissues:
-    """The tissues of a label map: by the user's mapping, by names, by a table, or by the numbers of a known program.
+    """The tissues of a label map: by the user's mapping, by names, by a table, or by the numbers of the only program
+    that can have written it.
 
     Parameters
     ----------
@@ -85,8 +80,7 @@ def read_label_map(
     by_number : a table made for this label map; used for labels without a name. If it has every label, and there are
         no names, labels are not renumbered.
     renumber : renumber them also then, from 1.
-    of_ct : it has organs of a CT: programs for brains are not thought of, and a few numbers of TotalSegmentator are
-        taken for its organs, with alternatives, since segment_ct checks them by the numbers of the CT.
+    of_ct : it has organs of a CT: only programs that label these are thought of.
 
     Raises SimulationError for numbers that are no labels, labels without a tissue, which it lists, numbers that fit
     several programs, and for a mask or lesion without a patient.
@@ -95,11 +89,11 @@ def read_label_map(
     >>> from SlicerUSSim.Logic import Volume
     >>> from SlicerUSSim.Logic.tissue import read_label_map
     >>> aseg = Volume(np.zeros((20, 20, 20), np.float32), np.eye(4))
-    >>> for label, i in ((2, 4), (41, 14), (4, 8), (43, 11), (10, 7), (49, 12)):
+    >>> for label, i in ((2, 4), (41, 14), (4, 8), (43, 11), (10, 7), (251, 12)):
     ...     aseg.array[5:15, 5:15, i] = label
     >>> found = read_label_map(aseg)
     >>> found.message, found.names
-    ('FreeSurfer aseg: 6 labels to 3 tissues', ('white matter', 'csf', 'grey matter'))
+    ('FreeSurfer: 6 labels to 3 tissues', ('white matter', 'csf', 'grey matter'))
     """
     require_kind("label map", volume, Volume, "Volume.read reads a file")
     reading = _Reading(
@@ -165,19 +159,11 @@ class _Reading:
 
     def by_tissue(self) -> LabelledTissues:
         """Labels renumbered from 1, one for each tissue, in the order of their first labels."""
-        if self._of_ct:
-            organs = self._organs()
-            if organs is not None:
-                return organs
-        return self._by_scheme(self._scheme())
-
-    def _by_scheme(self, scheme: Scheme | None) -> LabelledTissues:
-        """By the numbers of a program, for labels that have no name."""
+        scheme = self._scheme()
         names = {label: self._names.get(label, scheme.names.get(label) if scheme else None) for label in self._present}
-        found = {label: self._tissue(label, name) for label, name in names.items()}
+        found = {label: self._tissue(label, name, scheme) for label, name in names.items()}
         findings = Findings(
-            self._source, self._volume, self._counts, names, found,
-            scheme or scheme_with_names(self._names), self._mapping, self._tissues, self._of_ct,
+            self._source, self._volume, self._counts, names, found, scheme, self._mapping, self._tissues, self._of_ct
         )  # fmt: skip
         findings.require_patient()
         findings.require_known()
@@ -207,100 +193,44 @@ class _Reading:
         message = f"{self._title(findings)}: {findings.number()} to {tissues}"
         return LabelledTissues(labels, table, relabelled, message, tuple(findings.doubts()))
 
-    # ---- what it is --------------------------------------------------------------------------------------------
-
-    def _without_meaning(self) -> tuple[list[int], Volume]:
-        """(labels that neither a name nor the user says anything about, the label map without those left out)"""
-        unknown = [label for label in self._present if self._tissue(label, self._names.get(label)) is None]
-        left_out = [label for label, name in self._mapping.by_label.items() if name == "coupling"]
-        kept = self._volume.with_array(np.where(np.isin(self._volume.array, left_out), 0, self._volume.array))
-        return unknown, kept
-
-    def _organs(self) -> LabelledTissues | None:
-        """Organs of a CT by their numbers alone; None if the user or names say what they are, or nothing is known."""
-        unknown, kept = self._without_meaning()
-        if self._mapping.scheme or not unknown or (self._names and len(unknown) < len(self._present)):
-            return None
-        if unknown == [1]:  # no number, but the mask of any organ: the spleen's is one of many that are 1
-            return None
-        found, is_sure = recognised_in_ct(kept, unknown)
-        readings: dict[tuple[str | None, ...], Scheme] = {}
-        for scheme in found:
-            tissues = (self._named(scheme.names[label]) if label in scheme.names else None for label in unknown)
-            readings.setdefault(tuple(None if tissue is None else tissue.name for tissue in tissues), scheme)
-        if not readings:
-            return None
-        titles = either([self._with_names(scheme, unknown) for scheme in readings.values()])
-        first = next(iter(readings.values()))
-        remedy = SAY_WHICH.format(key=first.key)
-        ambiguity = f"{self._source}: labels {listed(unknown)} may be those of {titles}; {remedy}"
-        tells = any(tissue in _TELLING for tissues in readings for tissue in tissues)
-        if not is_sure and (len(unknown) < _FEWEST_ORGANS or not tells):
-            raise SimulationError(f"{ambiguity}; or {MAP_THEM.format(label=unknown[0])}: {', '.join(TISSUES)}")
-        result = []
-        for scheme in readings.values():
-            of_scheme = self._by_scheme(scheme)
-            if not is_sure or len(readings) > 1:
-                line = f"{self._source}: taken for the numbers of {self._with_names(scheme, unknown)}; check them"
-                of_scheme = replace(of_scheme, taken_for=line)
-            result.append(of_scheme)
-        return replace(result[0], others=tuple(result[1:]), ambiguity=ambiguity if len(result) > 1 else "")
-
-    def _with_names(self, scheme: Scheme, labels: list[int]) -> str:
-        called = listed([f"{label} {plain_name(scheme.names.get(label, 'unknown'))}" for label in labels], 6)
-        return f"{scheme.title} ({called})"
-
     def _scheme(self) -> Scheme | None:
-        """The numbering scheme, if some labels have neither a name nor a tissue of the user's."""
+        """The numbering that the user said, or, if neither names nor the user tell of any label, the recognised one.
+
+        Raises SimulationError that lists the numberings which the labels may have.
+        """
         if self._mapping.scheme:
             return schemes()[self._mapping.scheme]
-        unknown, kept = self._without_meaning()
-        if not unknown or self._of_ct or (self._names and len(unknown) < len(self._present)):
+        unknown = [label for label in self._present if self._tissue(label, self._names.get(label)) is None]
+        if len(unknown) < 2 or (self._names and len(unknown) < len(self._present)):
             return None
-        recognition = recognised(kept, unknown)
-        if recognition.candidates:
-            titles = " and ".join(scheme.title for scheme in recognition.candidates)
-            remedy = SAY_WHICH.format(key=recognition.candidates[0].key)
-            raise SimulationError(f"{self._source}: labels {listed(self._present)} fit {titles}; {remedy}")
-        if recognition.possible is not None:
-            remedy = SAY_WHICH.format(key=recognition.possible.key)
+        scheme, choices = recognised(unknown, of_ct=self._of_ct)
+        if scheme is None and choices:
             raise SimulationError(
-                f"{self._source}: labels {listed(self._present)} are all in {recognition.possible.title}'s table, but "
-                f"{recognition.doubt}; if they are {recognition.possible.title}'s, {remedy}"
+                f"{self._source}: labels {listed(unknown)} have no names; say whose numbers they are: "
+                f"{', '.join(self._offered(choice, unknown) for choice in choices)}; or give each its tissue: --map "
+                f"{unknown[0]}=TISSUE"
             )
-        if recognition.order:
-            raise SimulationError(f"{self._source}: {self._likely(recognition.order)}")
-        return recognition.scheme
+        return scheme
 
-    def _likely(self, order: Mapping[int, str]) -> str:
-        """What three labels of a brain probably are, and how to say so."""
-        total = self._counts[list(order)].sum()
-        others = [label for label in self._present if label not in order]
-        parts = [f"{label} {tissue} ({self._counts[label] / total:.0%})" for label, tissue in sorted(order.items())]
-        parts += [f"{label} something else ({self._counts[label] * self._volume.voxel_ml:.3g} ml)" for label in others]
-        maps = [f"{label}={tissue.split()[0]}" for label, tissue in sorted(order.items())]
-        maps += [f"{label}=TISSUE" for label in others]
-        return (
-            f"labels {listed(self._present)} are in no known program's order; by their amounts and places they are "
-            f"{listed(parts)}; if that is right, say so with {options(maps)}"
-        )
+    def _offered(self, scheme: Scheme, labels: list[int]) -> str:
+        """--map spm (SPM and fMRIPrep: 1 grey matter, 2 white matter, 3 csf)"""
+        called = listed([f"{label} {plain_name(scheme.names[label])}" for label in labels], _SHOWN)
+        return f"--map {scheme.key} ({scheme.title}: {called})"
 
-    def _tissue(self, label: int, name: str | None) -> Tissue | None:
+    def _tissue(self, label: int, name: str | None, scheme: Scheme | None = None) -> Tissue | None:
         given = self._mapping.tissue_of(label, name)
         if given is not None:
             return self._named(given)
-        if name is not None:
-            named = self._named(name)
-            if named is not None:
-                return named
-        if self._by_number is not None and not self._mapping.scheme:
-            return self._by_number.get(label)
-        return None
+        preset = scheme.tissues.get(label) if scheme is not None and label not in self._names else None
+        named = None if name is None else self._named(name, preset)
+        if named is not None or self._by_number is None or self._mapping.scheme:
+            return named
+        return self._by_number.get(label)
 
-    def _named(self, name: str) -> Tissue | None:
-        """The tissue with a name among the user's tissues, among the presets, or the nearest."""
+    def _named(self, name: str, preset: str | None = None) -> Tissue | None:
+        """The tissue with a name among the user's tissues, or else `preset`, by default of that name or the nearest."""
         try:
-            preset = tissue_named(name).name
+            preset = preset or tissue_named(name).name
         except SimulationError:
             preset = nearest_tissue(name)
         mine = self._tissues.all_tissues()[::-1]
@@ -315,7 +245,5 @@ class _Reading:
         if findings.is_mapped:
             return "mapped"
         if findings.scheme is not None:
-            if findings.scheme.key == self._mapping.scheme != "freesurfer":  # not one of several, as the user said
-                return findings.scheme.title
-            return title_of(findings.scheme, self._present)
+            return findings.scheme.title
         return "labels with names" if self._names else "labels by number"

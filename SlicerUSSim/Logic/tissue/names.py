@@ -1,87 +1,35 @@
-"""Names of tissues, as label maps and segmentations of other programs use them."""
+"""Names and codes of tissues, as label maps and segmentations of other programs use them: labels/*.csv."""
 
 from __future__ import annotations
 
+import csv
 import re
 from collections.abc import Collection, Iterable
 from difflib import get_close_matches
 from functools import cache
+from pathlib import Path
 
 from SlicerUSSim.Logic.base.errors import require
+from SlicerUSSim.Logic.base.segments import is_meaningful
 from SlicerUSSim.Logic.tissue.presets import TISSUES
 from SlicerUSSim.Logic.tissue.tissue import Tissue
 
-#: Synonyms in label maps and segmentations.
-_ALIASES = {
-    "background": "coupling", "cerebrospinal fluid": "csf", "ventricles": "csf", "edema": "oedema",
-    "hematoma": "haematoma", "clot": "haematoma",
-    "gray matter": "grey matter", "grey": "grey matter", "gray": "grey matter", "white": "white matter",
-    "gm": "grey matter", "wm": "white matter", "gtv": "tumour", "gbm": "tumour",
-    "ncr": "necrosis", "ed": "oedema", "et": "enhancing",  # of BraTS
-    "tumor": "tumour", "dura": "falx", "vessels": "blood",
-    "vessel": "blood", "cortical bone": "bone", "choroid plexus": "enhancing",
-}  # fmt: skip
-
-
-#: Words by which a longer name, such as one of FreeSurfer's or TotalSegmentator's, has a tissue. The first line with a
-#: word in the name is used, so that what is special comes before what is general: a cyst of the kidney is no kidney,
-#: and the ventricle of the heart is not the brain's.
-_WORDS: tuple[tuple[str, str], ...] = (
-    ("necrosis", "necrosis, necrotic"),
-    ("oedema", "oedema, edema"),
-    ("cyst", "cyst, cystic"),
-    ("cavity", "resection, surgical cavity"),
-    ("tumour", "non enhancing, nonenhancing"),
-    ("enhancing", "enhancing, enhancement"),
-    ("tumour", "tumor, tumour, glioma, glioblastoma, astrocytoma, metastasis, metastases, meningioma, cancer"),
-    ("blood", "heart atrium, heart ventricle, atrial appendage, left atrium, right atrium"),
-    ("haematoma", "haematoma, hematoma, haemorrhage, hemorrhage, bleeding, clot"),
-    ("enhancing", "choroid plexus"),
-    ("grey matter", "non wm, cortical dysplasia, hippocampal fissure"),
-    ("white matter", "white matter, whitematter, wm, wmsa, corpus callosum, corpuscallosum, cc, cbmwm"),
-    ("white matter", "unsegmentedwhitematter"),
-    ("csf", "ventricle, vent, csf"),
-    ("kidney", "kidney, renal"),
-    ("grey matter", "grey matter, gray matter, graymatter, cortex, ctx, thalamus, caudate, putamen, pallidum"),
-    ("grey matter", "hippocampus, amygdala, accumbens, ventraldc, ventral dc, vdc, claustrum, insula, operculum"),
-    ("grey matter", "hypothalamus, cbm, cblumnodulus, floculus, vermis, basal ganglia, substancia nigra"),
-    ("grey matter", "substantia nigra, subiculum, presubiculum, parasubiculum, ca1, ca2, ca3, ca4, gc dg, hata"),
-    ("grey matter", "molecular layer hp, molecular layer subiculum, hp tail, cadg head, dcg, perirhinal, ectorhinal"),
-    ("grey matter", "olfactory bulb, mammilare, tuberal region"),
-    ("white matter", "brain stem, brainstem, midbrain, pons, medulla, scp, optic chiasm, chiasma, optic tract"),
-    ("white matter", "optic nerve, opticus, fornix, fimbria, alveus, intcapsule, perforant pathway, commisure"),
-    ("white matter", "commissure, spinal cord"),
-    ("falx", "falx, tentorium, dura"),
-    ("blood", "artery, arteries, arterie, vein, vena, vessel, aorta, sinus, brachiocephalic, blood"),
-    ("skull", "skull, cranium, diploe, outer table, inner table"),
-    ("scalp", "scalp"),
-    ("skin", "skin, epidermis"),
-    ("cancellous bone", "cancellous, trabecular, spongiosa"),
-    ("metal", "metal, implant, screw, titanium"),
-    ("bone", "bone, vertebra, vertebrae, rib, sternum, sacrum, humerus, scapula, clavicula, clavicle, femur, hip"),
-    ("bone", "pelvis, tibia, fibula, patella, tarsal, metatarsal, carpal, metacarpal, phalanges, radius, ulna"),
-    ("bone", "mandible, teeth"),
-    ("muscle", "muscle, gluteus, autochthon, iliopsoas, psoas, tongue, diaphragm"),
-    ("heart", "heart, myocardium"),
-    ("liver", "liver"),
-    ("spleen", "spleen"),
-    ("lung", "lung"),
-    ("fat", "fat, adipose"),
-    ("air", "air, aircavity, trachea"),
+_LABELS = Path(__file__).with_name("labels")
+BRAIN_TISSUES = ("csf", "grey matter", "white matter")
+#: A word after one of these is not what the name means: "non-tumor tissue", "brain without lesion"
+_NOT = "".join(rf"(?<!\b{word} )" for word in ("non", "no", "not", "without"))
+#: Context of codes in 3D Slicer's terminologies, and a coded entry with a category and a type
+_ENTRY = (
+    "Segmentation category and type - DICOM master list~SCT^{category_code}^{category}~SCT^{code}^{meaning}~^^~"
+    "Anatomic codes - DICOM master list~^^~^^"
 )
 
-#: The same for what has no preset of its own: the nearest tissue is used, and label_maps.py says so.
-_NEAREST: tuple[tuple[str, str], ...] = (
-    ("csf", "cerebral exterior, cerebellum exterior"),
-    ("tumour", "lesion"),
-    ("grey matter", "undetermined, epiphysis, hypophysis, infundibulum"),
-    ("white matter", "brain"),
-    ("water", "gallbladder, bladder, effusion, eye fluid, vitreous humor, globe, eyeball"),
-    ("liver", "pancreas, gland, thyroid, prostate"),
-    ("muscle", "esophagus, oesophagus, stomach, duodenum, bowel, colon, intestine, rectum, uterus, cartilage, disc"),
-    ("muscle", "face"),
-    ("fat", "breast"),
-)
+
+@cache
+def label_table(name: str) -> list[dict[str, str]]:
+    """The rows of a table in labels/, without the .csv."""
+    with (_LABELS / f"{name}.csv").open(encoding="utf-8", newline="") as file:
+        return list(csv.DictReader(file))
 
 
 def plain_name(name: str) -> str:
@@ -103,9 +51,14 @@ def tissue_named(name: str) -> Tissue:
 
     Raises SimulationError for a name that matches no preset.
     """
-    found = _by_words(name, _WORDS)
+    found = _by_words(name, "word")
     require(found is not None, f"no preset for tissue {name!r}, expected one of: {', '.join(TISSUES)}")
     return TISSUES[str(found)]
+
+
+def nearest_tissue(name: str) -> str | None:
+    """The preset nearest to a structure that has none, such as muscle for the wall of the stomach; None if unknown."""
+    return _by_words(name, "nearest")
 
 
 def similar_tissues(name: str, tissue_names: Iterable[str] = ()) -> list[str]:
@@ -113,23 +66,46 @@ def similar_tissues(name: str, tissue_names: Iterable[str] = ()) -> list[str]:
     key = plain_name(name)
     if re.search(r"\b(lesion|pathology|mass|mask|roi|segment|label)s?\b", key):
         return ["tumour", "oedema", "necrosis", "cyst", "haematoma", "cavity"]
-    spellings = {plain_name(known): known for known in (*tissue_names, *TISSUES) if known} | _ALIASES
+    spellings = {plain_name(known): known for known in (*tissue_names, *TISSUES) if known} | _synonyms()
     near = get_close_matches(key, spellings, n=3, cutoff=0.7)
     return list(dict.fromkeys(spellings[word] for word in near))
 
 
-def nearest_tissue(name: str) -> str | None:
-    """The preset nearest to a structure that has none, such as muscle for the wall of the stomach; None if unknown."""
-    return _by_words(name, _NEAREST)
+def name_or_term(name: str | None, codes: Iterable[str]) -> str:
+    """A label's name; the tissue of its SNOMED CT codes instead, the first known, if the name is of no tissue."""
+    text = str(name or "")
+    if is_meaningful(name) and _by_words(text, "word"):
+        return text
+    return next((_tissues_by_code()[code] for code in codes if code in _tissues_by_code()), text)
+
+
+def terminology_entry(tissue_name: str) -> str:
+    """The entry of a tissue in 3D Slicer's terminologies; "" for one that these lack."""
+    terms = (row for row in label_table("terms") if row["tissue"] == tissue_name)
+    return next((_ENTRY.format(**row) for row in terms), "")
 
 
 @cache
-def _by_words(name: str, lines: tuple[tuple[str, str], ...]) -> str | None:
+def _tissues_by_code() -> dict[str, str]:
+    tables = [label_table(path.stem) for path in sorted(_LABELS.glob("*.csv"))]
+    return {row["code"]: row["tissue"] for table in tables for row in table if row.get("code")}
+
+
+@cache
+def _synonyms() -> dict[str, str]:
+    return {row["words"]: row["tissue"] for row in label_table("words") if row["kind"] == "synonym"}
+
+
+@cache
+def _by_words(name: str, kind: str) -> str | None:
+    """By the first row of words.csv with a word in the name, so that what is special comes before what is general: a
+    cyst of the kidney is no kidney, and the ventricle of the heart is not the brain's."""
     key = plain_name(name)
-    key = _ALIASES.get(key, key)
+    key = _synonyms().get(key, key)
     if key in TISSUES:
         return key
-    for tissue, words in lines:
-        if re.search(rf"\b(?:{words.replace(', ', '|')})s?\b", key):  # also in the plural: "kidneys"
-            return tissue
+    for row in label_table("words"):
+        words = row["words"].replace(", ", "|")
+        if row["kind"] == kind and re.search(rf"\b{_NOT}(?:{words})s?\b", key):  # also in the plural: "kidneys"
+            return row["tissue"]
     return None
