@@ -24,7 +24,7 @@ FACES = {
 }
 PUBLIC = {
     "AppearanceResult", "ConvexProbe", "CtSegmentation", "DisplaySettings", "Frame", "LinearProbe", "Membrane",
-    "PhasedProbe", "Preset", "Proposal", "Segmentation", "SimulationError", "SimulationSettings", "Texture", "Tissue",
+    "PhasedProbe", "Preset", "Segmentation", "SimulationError", "SimulationSettings", "Texture", "Tissue",
     "TissueTable", "TrackedSequence", "UltrasoundSimulator", "Volume", "grow_lesion", "list_devices",
     "optimize_appearance", "seed_of_pose", "segment_ct", "segment_mri", "similarity",
 }  # fmt: skip

@@ -11,7 +11,7 @@ from click.testing import CliRunner
 from scipy import ndimage
 
 from SlicerUSSim.Command.cli import main
-from SlicerUSSim.Command.proposals import split_seeds, write_proposals
+from SlicerUSSim.Command.seeds import split_seeds, write_proposals
 from SlicerUSSim.Logic import Segmentation, SimulationError, Volume, grow_lesion, segment_mri
 from SlicerUSSim.Logic.mri.atlas import mni152
 from SlicerUSSim.Logic.mri.lesions.growth import grow

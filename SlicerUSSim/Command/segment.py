@@ -13,13 +13,13 @@ from SlicerUSSim.Command.mri_options import also_option, organs_option, read_mri
 from SlicerUSSim.Command.options import check_outputs, ct_option, device_option, gathered, mask_option, overwrite_option
 from SlicerUSSim.Command.patient_options import map_option
 from SlicerUSSim.Command.progress import note
-from SlicerUSSim.Command.proposals import (
+from SlicerUSSim.Command.seeds import (
     grown_at,
     require_none_refused,
     require_seeds,
     seed_option,
     split_seeds,
-    write_proposals,
+    write_lesions,
 )
 from SlicerUSSim.Command.sheet_options import require_sheets, sheet_kind_option, sheets_option, write_sheets
 from SlicerUSSim.Logic.base.errors import require
@@ -77,7 +77,7 @@ def segment(
         tell_all=True,
     )  # fmt: skip
     seconds = perf_counter() - start
-    proposals, refused = grown_at(result, seeds) if isinstance(result, Segmentation) else ([], [])
+    lesions, refused = grown_at(result, seeds) if isinstance(result, Segmentation) else ([], [])
     labels, names = result.labels, result.tissue_names
     if sheets is not None and isinstance(result, Segmentation):
         labels, names = write_sheets(sheets, mri, volume, result, settings.contrast, sheet_kinds)
@@ -85,5 +85,5 @@ def segment(
     beside = write_label_files(out, added.labels, TissueTable.brain().for_names(added.tissue_names))
     click.echo(replace(result, labels=added.labels, tissue_names=added.tissue_names).table())
     note(f"segmented in {seconds:.1f} s; wrote {out} and {beside}")
-    write_proposals(proposals, out)
+    write_lesions(lesions, out)
     require_none_refused(refused, out)  # at last: a wrong seed does not cost a segmentation

@@ -52,20 +52,20 @@ class GrownLesion:
         other = "" if self.larger is None else f" (larger version {millilitres(self.larger.volume_ml())})"
         return f"{parts}{other} at {place(self.centre_ras_mm)}, {self.look}"
 
-    def write(self, labels_path: str | os.PathLike, number: int = 1) -> dict[str, Path]:
-        """Write a mask for each part beside a label map; {tissue: file}.
+    def write(self, labels_path: str | os.PathLike, number: int = 1) -> dict[str, tuple[Path, Path]]:
+        """Write two masks for each part beside a label map; {tissue: (file, that of the larger version)}.
 
-        `number` is that of the lesion: the first is labels_grown_tumour.nii.gz, the second labels_grown_2_tumour.nii.gz.
-        The larger version, too: labels_grown_tumour_larger.nii.gz.
+        Those of the first lesion are labels_grown_tumour.nii.gz and labels_grown_tumour_larger.nii.gz, those of the
+        second labels_grown_2_tumour.nii.gz and so on.
         """
         stem, suffix = _split(Path(labels_path))
-        which = f"{number}_" if number > 1 else ""
+        stem += f"{number}_" if number > 1 else ""
         files = {}
         for tissue in self.tissues:
-            files[tissue] = Path(labels_path).with_name(f"{stem}{which}{tissue}{suffix}")
-            self.mask(tissue).write(files[tissue])
-            if self.larger is not None and tissue in self.larger.tissues:
-                self.larger.mask(tissue).write(files[tissue].with_name(f"{stem}{which}{tissue}_larger{suffix}"))
+            smaller, larger = (Path(labels_path).with_name(f"{stem}{tissue}{end}{suffix}") for end in ("", "_larger"))
+            self.mask(tissue).write(smaller)
+            (self.larger or self).mask(tissue).write(larger)
+            files[tissue] = smaller, larger
         return files
 
 

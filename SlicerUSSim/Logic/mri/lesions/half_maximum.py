@@ -111,7 +111,7 @@ def grow(image: np.ndarray, allowed: np.ndarray, window: Window, own: float, bas
             outside = _distance_to(inside, window.mm)
             shell = allowed & (outside > _SHELL_MM[0]) & (outside <= _SHELL_MM[1])
             its = float(np.median(image[inside]))
-            around = float(np.median(image[shell])) if shell.any() else around
+            around = min(float(np.median(image[shell])), base) if shell.any() else around
         if inside is not None:
             radius = float(_depth(inside, window.mm).max())
             return Region(inside, _to_foot(inside, image, allowed, its, around, window.mm), its, around, radius)

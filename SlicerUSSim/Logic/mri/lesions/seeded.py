@@ -28,7 +28,7 @@ _NEVER_ENHANCING = ("cyst", "necrosis", "cavity", "oedema")
 #: Ball at a seed whose median is the lesion's intensity, and shell around it that is its surroundings, to begin with
 _BALL_MM, _AROUND_MM = 3.0, (8.0, 16.0)
 #: Least enhancement: above white matter in deviations of the noise, and above the surroundings in theirs
-_ABOVE_WHITE, _ABOVE_AROUND = 2.0, 3.0
+_ABOVE_WHITE, _ABOVE_AROUND = 1.5, 3.0
 #: Share of the contrast of the brightest place near a seed that its lesion has at least, to begin with
 _LEAST_OF_PEAK = 0.6
 #: Least contrast of what does not enhance, in deviations of the brain
@@ -159,7 +159,8 @@ def _enhancing(window: Window) -> _Grown | None:
         return None
     inside, distance = window.of(evidence.inside) > 0.5, window.distance
     image = smoothed(window.of(evidence.images[channel]), inside, window.mm)
-    near, shell = inside & (distance <= SNAP_MM), inside & (distance >= _AROUND_MM[0]) & (distance <= _AROUND_MM[1])
+    near, tissue = inside & (distance <= SNAP_MM), inside & (window.of(evidence.fluid) < 0.5)
+    shell = tissue & (distance >= _AROUND_MM[0]) & (distance <= _AROUND_MM[1])
     if not near.any() or not shell.any():
         return None
     around, peak = float(np.median(image[shell])), float(image[near].max())
@@ -276,7 +277,8 @@ def _is_on_both_sides(evidence: Evidence, grown: _Grown) -> bool:
     inside = window.to_box(bright) & (np.abs(evidence.sideways_mm) > _MIDLINE_MM)
     if not inside.any():
         return False
-    other = [cast(np.ndarray, evidence.mirrored(image))[inside].mean() for image in evidence.images]
+    box = cast("tuple[slice, slice, slice]", ndimage.find_objects(inside.astype(np.uint8))[0])
+    other = [cast(np.ndarray, evidence.mirrored(image, box))[inside[box]].mean() for image in evidence.images]
     own = [image[inside].mean() for image in evidence.images]
     difference = float(grown.weights @ (np.array(own) - np.array(other)))
     return difference < _ALIKE * (region.own - region.base)
