@@ -19,8 +19,8 @@ from SlicerUSSim.Logic.tissue import KINDS, Surfels  # noqa: E402
 from tests.conftest import coarse_chest  # noqa: E402
 from tests.remembered import segment_once  # noqa: E402
 from tests.test_craniotomy_nodes import TURN  # noqa: E402
+from tests.test_grown_lesions import CENTRE, brain, needs_atlas  # noqa: E402
 from tests.test_lesion_nodes import Scene  # noqa: E402
-from tests.test_lesion_proposals import CENTRE, brain, needs_atlas  # noqa: E402
 
 pytestmark = pytest.mark.usefixtures("segmented_once")
 

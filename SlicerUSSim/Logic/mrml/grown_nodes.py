@@ -40,7 +40,9 @@ class LesionGrowth:
             mri_node.GetID(), _version(mri_node),
         )  # fmt: skip
 
-    def growFrom(self, mri_node, points_node, lesions_node, tissue: str | None = None, larger: bool = False) -> list[str]:
+    def growFrom(
+        self, mri_node, points_node, lesions_node, tissue: str | None = None, larger: bool = False
+    ) -> list[str]:
         """Add the lesion around the last placed control point of a markups node to a segmentation node.
 
         See seeded.grow_lesion; `larger`: its larger version. Returns the IDs of the segments, one for each part.

@@ -40,6 +40,8 @@ class Window:
     centre: np.ndarray
     reach_mm: float
     mm: float
+    #: Whether there is no larger one: the last region before one that does not end is then taken, too
+    is_last: bool = True
 
     @property
     def size(self) -> int:
@@ -103,7 +105,7 @@ def grow(image: np.ndarray, allowed: np.ndarray, window: Window, own: float, bas
         for _ in range(_MOST_STEPS):
             found = _connected(allowed & (image > around + share * (its - around)), distance, window.mm)
             if its <= around or found is None or distance[found].max() >= window.reach_mm:
-                inside = None
+                inside = inside if window.is_last else None
                 break
             before, inside = inside, found
             if before is not None and (before ^ inside).sum() <= _STAYS * inside.sum():

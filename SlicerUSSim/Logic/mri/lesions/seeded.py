@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, cast
 
 import numpy as np
@@ -15,6 +15,8 @@ from SlicerUSSim.Logic.mri.evidence import Evidence
 from SlicerUSSim.Logic.mri.lesions.grown_lesion import GrownLesion, place
 from SlicerUSSim.Logic.mri.lesions.half_maximum import SNAP_MM, Region, Window, closed, grow, smoothed
 from SlicerUSSim.Logic.mri.pathology import LESIONS, tissue_to_add
+from SlicerUSSim.Logic.mri.sheets.falx_of_part import fissure_of_part
+from SlicerUSSim.Logic.mri.sheets.head import LEAST_VOXELS, Head
 
 if TYPE_CHECKING:
     from SlicerUSSim.Logic.mri.segmentation import Segmentation
@@ -39,6 +41,8 @@ _GAP_MM, _RIM_MM, _LEAST_ENCLOSED = 4.0, 4.0, 0.5
 _LEAST_DEPTH_MM, _LEAST_NECROSIS_ML, _DARK = 2.0, 0.1, 0.3
 #: Radius of the largest ball in a lesion: vessels and the cortex are thinner
 _THIN_MM = 2.0
+#: From the fissure, whose points are 1 mm apart, to its sides
+_SIDE_MM = 1.0
 #: What is nearer to the midline has no counterpart; the likeness there from which on both sides look the same
 _MIDLINE_MM, _ALIKE = 5.0, 0.5
 
@@ -140,14 +144,14 @@ def _require_in_brain(evidence: Evidence, seed: np.ndarray) -> np.ndarray:
 def _regions_at(evidence: Evidence, index: np.ndarray, named: str | None) -> Iterator[_Grown]:
     """The regions around a place (k, j, i in the box), the likeliest for a tissue first."""
     for reach, mm in _WINDOWS_MM:
-        window = Window(evidence, index, reach, mm)
+        window = Window(evidence, index, reach, mm, mm == _WINDOWS_MM[-1][1])
         if named not in _NEVER_ENHANCING and (grown := _enhancing(window)) is not None:
             yield grown
         if (grown := _unlike_brain(window)) is None:
             continue
         rim = _rim_of(grown) if named not in _NEVER_ENHANCING else None
         if rim is not None:
-            yield from (around for around in [_enhancing(Window(evidence, rim, reach, mm))] if around is not None)
+            yield from (around for around in [_enhancing(replace(window, centre=rim))] if around is not None)
         yield grown
 
 
@@ -211,8 +215,29 @@ def _unlike_brain(window: Window) -> _Grown | None:
 
 
 def _between_hemispheres(evidence: Evidence) -> np.ndarray:
-    whole = tuple(slice(0, size) for size in evidence.inside.shape)
-    return evidence.is_between_hemispheres(cast("tuple[slice, slice, slice]", whole))
+    """(k, j, i) bool: the fissure; without an atlas as sheets/falx_of_part.py finds it, where it does."""
+    channel = evidence.channel("t1", "t1gd", "t2")
+    if evidence.atlas is not None or channel is None:
+        return evidence.between_hemispheres
+    result = np.zeros(evidence.inside.shape, bool)
+    contrast = evidence.contrasts[channel]
+    sign = np.float32(-1.0 if contrast == "t2" else 1.0)
+    means = sign * evidence.means[:, channel]
+    image = Volume(sign * evidence.images[channel], evidence.ijk_to_ras)
+    if not means[0] < means[1] < means[2]:
+        return result
+    head = Head.of_part(image, evidence.inside, means.tolist(), float(evidence.deviations[channel]), contrast == "t1gd")
+    if min(head.brain.shape) < LEAST_VOXELS:
+        return result
+    places = fissure_of_part(head)
+    index = np.rint((places @ image.ras_to_ijk[:3, :3].T + image.ras_to_ijk[:3, 3])[:, ::-1]).astype(int)
+    index = index[((index >= 0) & (index < result.shape)).all(axis=1)]
+    if not len(index):
+        return result
+    result[tuple(index.T)] = True
+    spacing = evidence.spacing_mm
+    away = np.asarray(ndimage.distance_transform_edt(~result, sampling=spacing.tolist()))
+    return away < _SIDE_MM + 0.5 * float(spacing.max())
 
 
 def _rim_of(grown: _Grown) -> np.ndarray | None:
