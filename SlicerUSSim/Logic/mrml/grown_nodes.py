@@ -46,8 +46,8 @@ class LesionGrowth:
         """Add the lesion around the last placed control point of a markups node to a segmentation node.
 
         See seeded.grow_lesion; `larger`: its larger version. Returns the IDs of the segments, one for each part.
-        UltrasoundSceneLogic.addTissues lays them over labels. Raises SimulationError, and changes nothing, if the MRI was not segmented or has changed
-        since, and for a point in what is no lesion.
+        UltrasoundSceneLogic.addTissues lays them over labels. Raises SimulationError, and changes nothing, if the MRI
+        was not segmented or has changed since, and where nothing grows.
         """
         require_node(points_node, "vtkMRMLMarkupsFiducialNode", use="point in the lesion")
         require_node(lesions_node, "vtkMRMLSegmentationNode", use="lesions")

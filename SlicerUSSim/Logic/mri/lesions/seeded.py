@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import TYPE_CHECKING, cast
 
 import numpy as np
@@ -33,7 +34,7 @@ _BALL_MM, _AROUND_MM = 3.0, (8.0, 16.0)
 _ABOVE_WHITE, _ABOVE_AROUND = 1.5, 3.0
 #: Share of the contrast of the brightest place near a seed that its lesion has at least, to begin with
 _LEAST_OF_PEAK = 0.6
-#: Least contrast of what does not enhance, in deviations of the brain
+#: Least contrast of what does not enhance, in that of grey to white matter
 _LEAST_CONTRAST = 0.5
 #: Widest gap of a rim; its greatest distance from what it encloses, and the share of the way around that it covers
 _GAP_MM, _RIM_MM, _LEAST_ENCLOSED = 4.0, 4.0, 0.5
@@ -147,7 +148,7 @@ def _regions_at(evidence: Evidence, index: np.ndarray, named: str | None) -> Ite
         window = Window(evidence, index, reach, mm, mm == _WINDOWS_MM[-1][1])
         if named not in _NEVER_ENHANCING and (grown := _enhancing(window)) is not None:
             yield grown
-        if (grown := _unlike_brain(window)) is None:
+        if (grown := _unlike_white(window)) is None:
             continue
         rim = _rim_of(grown) if named not in _NEVER_ENHANCING else None
         if rim is not None:
@@ -184,10 +185,11 @@ def _bright(evidence: Evidence, channel: int) -> float:
     return float(evidence.white[channel]) + _ABOVE_WHITE * float(evidence.deviations[channel])
 
 
-def _unlike_brain(window: Window) -> _Grown | None:
-    """The region at the centre of a window that is unlike the brain in all images: dark or bright.
+def _unlike_white(window: Window) -> _Grown | None:
+    """The region at the centre of a window that is unlike white matter, dark or bright.
 
-    The images are weighted as by Fisher's discriminant of the brain and the seed, with independent channels.
+    Unlike white matter, since lesions that hold more water are as dark in T1 as grey matter (Bakshi et al., NeuroRx
+    2(2), 2005). The images are weighted as by Fisher's discriminant of white matter and the seed.
     """
     evidence, distance = window.evidence, window.distance
     inside, fluid = window.of(evidence.inside) > 0.5, window.of(evidence.fluid) > 0.5
@@ -197,14 +199,13 @@ def _unlike_brain(window: Window) -> _Grown | None:
     is_fluid = fluid[ball].mean() >= 0.5
     allowed = inside if is_fluid else inside & ~fluid & (window.of(_between_hemispheres(evidence)) < 0.5)
     images = np.stack([window.of(image) for image in evidence.images])
-    brain = evidence.images[:, evidence.inside]
-    healthy = np.median(brain, axis=1)
-    spread = 1.4826 * np.median(np.abs(brain - healthy[:, None]), axis=1)
+    healthy = evidence.white
+    spread = np.maximum(np.abs(evidence.grey - healthy), 2.0 * evidence.deviations)
     step = np.median(images[:, ball], axis=1) - healthy
-    contrast = step / np.maximum(spread, 1e-6)
+    contrast = step / spread
     if np.abs(contrast).max() < _LEAST_CONTRAST:
         return None
-    weights = contrast / np.maximum(spread, 1e-6)
+    weights = contrast / spread
     image = smoothed(np.tensordot(weights, images - healthy[:, None, None, None], 1), allowed, window.mm)
     region = grow(image, allowed, window, float(weights @ step), 0.0)
     if region is None:
@@ -214,6 +215,7 @@ def _unlike_brain(window: Window) -> _Grown | None:
     return _Grown(window, region, image, weights, "fluid" if is_fluid else shown)
 
 
+@lru_cache(maxsize=1)
 def _between_hemispheres(evidence: Evidence) -> np.ndarray:
     """(k, j, i) bool: the fissure; without an atlas as sheets/falx_of_part.py finds it, where it does."""
     channel = evidence.channel("t1", "t1gd", "t2")
