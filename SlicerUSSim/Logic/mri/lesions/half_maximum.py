@@ -57,18 +57,12 @@ class Window:
     def of(self, array: np.ndarray) -> np.ndarray:
         """(k, j, i) float32 array of the box in this window, interpolated; 0 beyond the box."""
         step = self.mm / self.evidence.spacing_mm
-        first = self.centre - (self.size // 2) * step
-        return cast(
-            np.ndarray,
-            ndimage.affine_transform(array.astype(np.float32), step, first, (self.size,) * 3, order=1, mode="constant"),
-        )
+        return _resampled(array, step, self.centre - (self.size // 2) * step, (self.size,) * 3)
 
     def to_box(self, inside: np.ndarray) -> np.ndarray:
         """(k, j, i) bool on the box of the brain, of a region of this window."""
         step = self.evidence.spacing_mm / self.mm
-        first = self.size // 2 - self.centre * step
-        shape = self.evidence.inside.shape
-        return cast(np.ndarray, ndimage.affine_transform(inside.astype(np.float32), step, first, shape, order=1)) > 0.5
+        return _resampled(inside, step, self.size // 2 - self.centre * step, self.evidence.inside.shape) > 0.5
 
     def index_of(self, place: np.ndarray) -> np.ndarray:
         """(3,) k, j, i in the box of a voxel of this window."""
@@ -167,6 +161,11 @@ def _connected(above: np.ndarray, distance: np.ndarray, mm: float) -> np.ndarray
     result = np.zeros(above.shape, bool)
     result[box] = ndimage.binary_fill_holes(part & (_distance_to(chosen, mm) <= bridge + mm))
     return result
+
+
+def _resampled(array: np.ndarray, step: np.ndarray, first: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    moved = ndimage.affine_transform(array.astype(np.float32), step, first, shape, order=1)  # pyright: ignore
+    return cast(np.ndarray, moved)
 
 
 def _depth(inside: np.ndarray, mm: float) -> np.ndarray:

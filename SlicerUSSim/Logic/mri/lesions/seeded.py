@@ -171,7 +171,7 @@ def _enhancing(window: Window) -> _Grown | None:
     around, peak = float(np.median(image[shell])), float(image[near].max())
     deviation = 1.4826 * float(np.median(np.abs(image[shell] - around)))
     # Of a large lesion the shell is a part
-    base = min(around, float(evidence.white[channel]))
+    base = min(around, _white(evidence, channel))
     if peak < max(_bright(evidence, channel), base + _ABOVE_AROUND * min(deviation, peak - base)):
         return None
     ball = near & (distance <= _BALL_MM)
@@ -182,7 +182,13 @@ def _enhancing(window: Window) -> _Grown | None:
 
 def _bright(evidence: Evidence, channel: int) -> float:
     """Intensity from which on a channel is brighter than white matter and its noise."""
-    return float(evidence.white[channel]) + _ABOVE_WHITE * float(evidence.deviations[channel])
+    return _white(evidence, channel) + _ABOVE_WHITE * float(evidence.deviations[channel])
+
+
+@lru_cache(maxsize=8)
+def _white(evidence: Evidence, channel: int) -> float:
+    """Intensity of white matter: of its class, unless that is brighter than three quarters of the brain."""
+    return min(float(evidence.white[channel]), float(np.percentile(evidence.images[channel][evidence.inside], 75)))
 
 
 def _unlike_white(window: Window) -> _Grown | None:
