@@ -53,11 +53,8 @@ def main() -> None:
         thin_sulci=False,
     )
     middle = truth.ijk_to_ras[:3] @ np.append(np.argwhere(truth.array > 0).mean(axis=0)[::-1], 1.0)
-    masks = []
-    for seed, tissue in ((_OEDEMA_RAS, "oedema"), (middle.tolist(), "tumour")):
-        lesion = grow_lesion(found, seed, tissue)
-        print(lesion.message)
-        masks.append((tissue, lesion.mask(tissue), "grown"))
+    seeds = {"oedema": _OEDEMA_RAS, "tumour": middle.tolist()}
+    masks = [(tissue, grow_lesion(found, seed, tissue).mask(tissue), "grown") for tissue, seed in seeds.items()]
     with_tumour = add_tissues(found.labels, found.tissue_names, masks, has_brain_mask=True)
     brain, probe = without_outside(found.labels, found.tissue_names), PROBES["microconvex"]
     figure, axes = plt.subplots(3, len(_OPENINGS), figsize=(13.0, 8.6), facecolor="black")

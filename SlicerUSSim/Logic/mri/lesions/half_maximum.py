@@ -15,8 +15,8 @@ from scipy import ndimage
 
 from SlicerUSSim.Logic.mri.evidence import Evidence
 
-#: Shares of the contrast at the border that are tried, until a region ends within the window
-_SHARES = (0.5, 0.6, 0.7)
+#: Shares of the contrast at the border that are tried until a region ends within the window; one for the last window
+_SHARES, _LAST_SHARE = (0.5, 0.6, 0.7), 0.85
 #: Most repetitions, and share of the voxels that may still change
 _MOST_STEPS, _STAYS = 8, 0.02
 #: A point means the region that is this near, or else this near: clicks miss, and rims are thin
@@ -93,7 +93,7 @@ def grow(image: np.ndarray, allowed: np.ndarray, window: Window, own: float, bas
     own, base : intensity of it and of its surroundings, to begin with.
     """
     distance = window.distance
-    for share in _SHARES:
+    for share in (*_SHARES, _LAST_SHARE) if window.is_last else _SHARES:
         inside: np.ndarray | None = None
         its, around = own, base
         for _ in range(_MOST_STEPS):
