@@ -1,8 +1,8 @@
-"""ReMIND-022's tumour, grown from one seed, in ultrasound through three craniotomies.
+"""ReMIND-022's tumour and oedema, grown from a seed each, in ultrasound through three craniotomies.
 
     python -m benchmarks.tumour_pictures PICTURE [--mask FILE]
 
-Above by the labels alone, in the middle with the tumour from the seed, below the MRI in the plane of the image with the
+Above by the labels alone, in the middle with both, below the MRI in the plane of the image with the
 published segmentation as a line. Needs ../shared; --mask is its brain mask, found if there is none.
 """
 
@@ -32,6 +32,8 @@ from SlicerUSSim.Logic.probe.poses import slice_under_probe, surface_point
 #: From the tumour to the opening: left-right, front-back, up
 _OPENINGS = {"from above": (0.35, 0.0, 0.95), "from the side": (0.95, 0.0, 0.35), "from the front": (0.45, 0.6, 0.65)}
 _DIAMETER_MM = 55.0
+#: A point in the oedema
+_OEDEMA_RAS = (940.3, 820.7, 471.4)
 
 
 def main() -> None:
@@ -51,9 +53,8 @@ def main() -> None:
         thin_sulci=False,
     )
     middle = truth.ijk_to_ras[:3] @ np.append(np.argwhere(truth.array > 0).mean(axis=0)[::-1], 1.0)
-    proposal = grow_lesion(found, middle.tolist())
-    print(proposal.message)
-    masks = [(name, proposal.mask(name), "proposal") for name in proposal.tissues]
+    seeds = {"oedema": _OEDEMA_RAS, "tumour": middle.tolist()}
+    masks = [(tissue, grow_lesion(found, seed, tissue).mask(tissue), "grown") for tissue, seed in seeds.items()]
     with_tumour = add_tissues(found.labels, found.tissue_names, masks, has_brain_mask=True)
     brain, probe = without_outside(found.labels, found.tissue_names), PROBES["microconvex"]
     figure, axes = plt.subplots(3, len(_OPENINGS), figsize=(13.0, 8.6), facecolor="black")

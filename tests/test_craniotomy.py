@@ -12,7 +12,7 @@ from click.testing import CliRunner
 from PIL import Image
 
 from SlicerUSSim.Command.cli import main
-from SlicerUSSim.Command.proposals import split_seeds
+from SlicerUSSim.Command.seeds import split_seeds
 from SlicerUSSim.Command.serve import _require_opening
 from SlicerUSSim.Logic import SimulationError, Volume
 from SlicerUSSim.Logic.mri.outside import OUTSIDE

@@ -23,8 +23,8 @@ FACES = {
     if "lazy_exports(globals())" in path.read_text(encoding="utf-8")
 }
 PUBLIC = {
-    "AppearanceResult", "ConvexProbe", "CtSegmentation", "DisplaySettings", "Frame", "LinearProbe", "Membrane",
-    "PhasedProbe", "Preset", "Proposal", "Segmentation", "SimulationError", "SimulationSettings", "Texture", "Tissue",
+    "AppearanceResult", "ConvexProbe", "CtSegmentation", "DisplaySettings", "Frame", "GrownLesion", "LinearProbe",
+    "Membrane", "PhasedProbe", "Preset", "Segmentation", "SimulationError", "SimulationSettings", "Texture", "Tissue",
     "TissueTable", "TrackedSequence", "UltrasoundSimulator", "Volume", "grow_lesion", "list_devices",
     "optimize_appearance", "seed_of_pose", "segment_ct", "segment_mri", "similarity",
 }  # fmt: skip

@@ -154,36 +154,6 @@ def test_lesions_that_cannot_be_added_are_one_line_and_change_nothing(paint, mes
         assert "\n" not in str(caught.value) and bench.labels.GetImageData().GetMTime() == before
 
 
-def test_a_brats_map_is_three_segments_each_within_the_one_before():
-    bench = Scene()
-    ids = add_lesion(bench.lesions, brats((1, 4, 2)), "brats", "map")
-    segmentation = bench.lesions.GetSegmentation()
-    assert [segmentation.GetSegment(name).GetName() for name in ids] == ["oedema", "necrosis", "enhancing"]
-    bench.logic.segment(bench.mri, bench.labels, lesions_node=bench.lesions)
-    assert {"oedema", "necrosis", "enhancing"} <= {note.split(":")[0] for note in bench.logic.notes}
-
-
-def test_each_lesion_is_told_once_however_often_masks_are_added():
-    """The second time it was told as "added over tumour 100 %", and what to check about it was forgotten."""
-    bench = Scene()
-    bench.paint(moved(lesion(10.0), 30, 0, 0), "tumour")  # reaches out of the brain
-    bench.logic.segment(bench.mri, bench.labels, lesions_node=bench.lesions)
-    (first,) = (note for note in bench.logic.notes if note.startswith("tumour: "))
-    check = [line for line in bench.logic.warnings if "the brain mask leaves out" in line]
-    assert len(check) == 1
-    bench.paint(moved(lesion(6.0), 0, -30, 0), "cyst")
-    for _ in range(2):
-        bench.logic.addTissues(bench.labels, bench.lesions)
-        tumour, cyst = bench.logic.notes
-        assert tumour == first and cyst.startswith("cyst: ") and "cyst 100 %" not in cyst
-        assert [line for line in bench.logic.warnings if "the brain mask leaves out" in line] == check
-    segmentation = bench.lesions.GetSegmentation()
-    segmentation.RemoveSegment(segmentation.GetSegmentIDs()[0])
-    bench.paint(moved(lesion(6.0), 30, 0, 0), "tumour")  # corrected: told anew
-    bench.logic.addTissues(bench.labels, bench.lesions)
-    assert bench.logic.notes[0] == cyst and "added over tumour 100 %" in bench.logic.notes[1]
-
-
 def test_doubts_about_a_file_of_lesions_are_told_every_time():
     """Of a BraTS map that was added as one tissue, and not only when it was opened."""
     bench = Scene()
@@ -279,18 +249,6 @@ def test_tissues_keep_the_colours_that_a_user_gave_them(kind):
     assert colours() == expected
     bench.logic.addTissues(bench.labels, bench.lesions)
     assert {name: colour for name, colour in colours().items() if name != "tumour"} == expected
-
-
-def test_notes_say_whose_they_are_and_do_not_stay_for_another_patient():
-    bench = Scene()
-    presenter, parameters = bench.presenter(), bench.logic.parameters
-    presenter.segmenting.segment()
-    assert presenter.notes.text().splitlines()[0] == "Head:" and "white matter" in presenter.notes.text()
-    other = bench.add("ScalarVolume", "Zeros")
-    write_volume(other, HEAD.with_array(np.zeros(HEAD.array.shape, np.float32)))
-    parameters.mri = other
-    presenter.segmenting.segment()
-    assert len(presenter.view.errors) == 1 and presenter.notes.text() == ""
 
 
 def test_a_segmentation_that_was_saved_and_loaded_is_still_segments_own(tmp_path):

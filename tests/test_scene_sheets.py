@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -19,8 +21,8 @@ from SlicerUSSim.Logic.tissue import KINDS, Surfels  # noqa: E402
 from tests.conftest import coarse_chest  # noqa: E402
 from tests.remembered import segment_once  # noqa: E402
 from tests.test_craniotomy_nodes import TURN  # noqa: E402
+from tests.test_grown_lesions import CENTRE, brain, needs_atlas  # noqa: E402
 from tests.test_lesion_nodes import Scene  # noqa: E402
-from tests.test_lesion_proposals import CENTRE, brain, needs_atlas  # noqa: E402
 
 pytestmark = pytest.mark.usefixtures("segmented_once")
 
@@ -231,3 +233,8 @@ def test_a_point_in_a_view_grows_a_lesion_that_is_removed_or_laid_on():
     assert not presenter.view.errors and "grown: " not in presenter.notes.text()
     laid = bench.voxels("tumour", parameters.labels)
     assert 0.6 * true.sum() < laid < 1.4 * true.sum()
+    parameters.panel = replace(parameters.panel, lesion_size="larger")
+    lesions.growAtPoint()  # beside the smaller one, which stays
+    assert not presenter.view.errors and len(list(grown.GetSegmentIDs())) == 2
+    lesions.addTissues()
+    assert bench.voxels("tumour", parameters.labels) > 1.02 * laid

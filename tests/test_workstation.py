@@ -30,8 +30,8 @@ from SlicerUSSim.Logic.mri.samples import head_mri  # noqa: E402
 from SlicerUSSim.Logic.probe.poses import pose_looking_at  # noqa: E402
 from SlicerUSSim.Workstation.state import NAMES, value_of  # noqa: E402
 from tests.served import Served, refused, run_script  # noqa: E402
+from tests.test_grown_lesions import CENTRE, needs_atlas  # noqa: E402
 from tests.test_label_maps import head  # noqa: E402
-from tests.test_lesion_proposals import CENTRE, needs_atlas  # noqa: E402
 from validation.brain_phantoms import phantom, tissue_maps, with_low_grade_tumour  # noqa: E402
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)

@@ -12,13 +12,13 @@ from SlicerUSSim.Command.additions import Additions
 from SlicerUSSim.Command.mri_options import MriOptions, also_files, read_mri, segmented_file
 from SlicerUSSim.Command.options import check_outputs, gathered, out_option, overwrite_option
 from SlicerUSSim.Command.progress import note
-from SlicerUSSim.Command.proposals import (
+from SlicerUSSim.Command.seeds import (
     grown_at,
     require_none_refused,
     require_seeds,
     seed_option,
     split_seeds,
-    write_proposals,
+    write_lesions,
 )
 from SlicerUSSim.Command.sheet_options import require_sheets, sheet_kind_option, sheets_option, write_sheets
 from SlicerUSSim.Logic.base.errors import SimulationError, require
@@ -60,7 +60,7 @@ def segment(
     start = perf_counter()
     result = segmented_file(mri, volume, patient, additions=masks, tell_all=True)
     seconds = perf_counter() - start
-    proposals, refused = grown_at(result, seeds) if isinstance(result, Segmentation) else ([], [])
+    lesions, refused = grown_at(result, seeds) if isinstance(result, Segmentation) else ([], [])
     labels, names = result.labels, result.tissue_names
     if sheets is not None and isinstance(result, Segmentation):
         labels, names = write_sheets(sheets, mri, volume, result, settings.contrast, sheet_kinds)
@@ -68,5 +68,5 @@ def segment(
     beside = write_label_files(out, added.labels, TissueTable.brain().for_names(added.tissue_names))
     click.echo(replace(result, labels=added.labels, tissue_names=added.tissue_names).table())
     note(f"segmented in {seconds:.1f} s; wrote {out} and {beside}")
-    write_proposals(proposals, out)
+    write_lesions(lesions, out)
     require_none_refused(refused, out)  # at last: a wrong seed does not cost a segmentation

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from .imaging.preset import Preset as Preset
     from .imaging.simulator import UltrasoundSimulator as UltrasoundSimulator
     from .mri.ct import CtSegmentation as CtSegmentation, segment_ct as segment_ct
-    from .mri.lesions.proposal import Proposal as Proposal
+    from .mri.lesions.grown_lesion import GrownLesion as GrownLesion
     from .mri.lesions.seeded import grow_lesion as grow_lesion
     from .mri.segmentation import Segmentation as Segmentation, segment_mri as segment_mri
     from .opencl.devices import list_devices as list_devices

@@ -6,7 +6,7 @@ from typing import Any
 
 from SlicerUSSim.Logic.base.errors import require, required
 from SlicerUSSim.Logic.mrml.nodes import display_of
-from SlicerUSSim.Logic.mrml.parameter_node import BY_LOOK
+from SlicerUSSim.Logic.mrml.parameter_node import BY_LOOK, LARGER
 from SlicerUSSim.Widget.interface import PanelHost
 from SlicerUSSim.Widget.notes import Notes, checks
 from SlicerUSSim.Widget.segment_presenter import SegmentPresenter
@@ -81,10 +81,11 @@ class LesionPresenter:
         """Add the lesion around the last point of the chosen markups to the lesions; the tissues stay as they are."""
         parameters, growth = self._panel.parameters, self._panel.logic.growth
         with self._panel.acting(), self._panel.working("Grow lesion"):
-            tissue = None if parameters.panel.lesion_as == BY_LOOK else parameters.panel.lesion_as
+            chosen = parameters.panel
+            tissue, larger = None if chosen.lesion_as == BY_LOOK else chosen.lesion_as, chosen.lesion_size == LARGER
             seed = required(parameters.seed, "no point chosen, expected one in the lesion")
             with self._panel.made(parameters.lesions, "Segmentation", "Lesions") as lesions:
-                self._grown = lesions, growth.growFrom(parameters.mri, seed, lesions, tissue)
+                self._grown = lesions, growth.growFrom(parameters.mri, seed, lesions, tissue, larger)
             parameters.lesions = lesions
             if display_of(lesions) is not None:
                 display_of(lesions).SetVisibility(True)

@@ -109,6 +109,7 @@ def _lesions(panel: PanelPresenter) -> tuple[Row, ...]:
     return (
         node("seed", "Point", "Markups whose last point lies in the lesion", new_node="Lesion"),
         value("scene.lesion_as"),
+        value("scene.lesion_size"),
         (
             button(
                 "pickSeed", "Show the point",

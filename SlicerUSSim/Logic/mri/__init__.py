@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from .addable import require_addable as require_addable
     from .ct import CtSegmentation as CtSegmentation, segment_ct as segment_ct
     from .filtering import guided_filter as guided_filter
-    from .lesions.proposal import Proposal as Proposal
+    from .lesions.grown_lesion import GrownLesion as GrownLesion
     from .lesions.seeded import grow_lesion as grow_lesion
     from .masks import read_mask as read_mask
     from .pathology import Added as Added, add_tissue as add_tissue, add_tissues as add_tissues

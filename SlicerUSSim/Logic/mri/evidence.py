@@ -41,10 +41,6 @@ class Evidence:
     deviations: np.ndarray
     #: The registered atlas; None without one
     atlas: AtlasFit | None
-    #: Whether a bias field was found, and removed
-    had_field: bool = False
-    #: (k, j, i) bool: around the fissure between the hemispheres, as found without an atlas; None: not looked for
-    fissure: np.ndarray | None = None
 
     @property
     def grid(self) -> Volume:
@@ -149,14 +145,13 @@ class Evidence:
         size = tuple(part.stop - part.start for part in window)
         return ndimage.affine_transform(array, linear, offset, size, order=1, output=np.float32)  # pyright: ignore
 
-    def is_between_hemispheres(self, window: tuple[slice, slice, slice]) -> np.ndarray:
-        """(k, j, i) bool in a window: at the midline, where the atlas expects no white matter: fissure and falx.
+    @cached_property
+    def between_hemispheres(self) -> np.ndarray:
+        """(k, j, i) bool: at the midline, where the atlas expects no white matter: fissure and falx.
 
-        Without an atlas, where the fissure was found.
+        Nowhere without an atlas.
         """
         if self.sideways_mm is None or self.expected is None:
-            if self.fissure is not None:
-                return self.fissure[window]
-            return np.zeros([part.stop - part.start for part in window], bool)
-        near = np.abs(self.sideways_mm[window]) < max(0.75 * float(self.spacing_mm.max()), 1.0)
-        return near & (self.expected[_WHITE][window] < _MIDDLE)
+            return np.zeros(self.inside.shape, bool)
+        near = np.abs(self.sideways_mm) < max(0.75 * float(self.spacing_mm.max()), 1.0)
+        return near & (self.expected[_WHITE] < _MIDDLE)

@@ -266,7 +266,6 @@ def segment_mri(
             with about_other_file(_called(name, other)):
                 warnings += require_contrast(image, part.inside, prior, name)
 
-    with_fields = tuple(part.images)
     if settings.bias_correction is not False:
         share = lambda done: report(0.4 + 0.3 * done)  # noqa: E731
         notes += remove_fields(part, contrasts, atlas, prior, settings.bias_correction, share)
@@ -349,7 +348,6 @@ def segment_mri(
             found.mixture.means,
             np.sqrt(np.diag(found.mixture.covariance)),
             atlas,
-            had_field=any(new is not old for new, old in zip(part.images, with_fields, strict=True)),
         ),
         corrected=as_given(np.where(part.inside, part.images[0].array + np.float32(above), np.float32(0.0))).array,
         _filtered=as_given(filtered[0][0]).array,

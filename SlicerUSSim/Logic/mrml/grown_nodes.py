@@ -40,12 +40,14 @@ class LesionGrowth:
             mri_node.GetID(), _version(mri_node),
         )  # fmt: skip
 
-    def growFrom(self, mri_node, points_node, lesions_node, tissue: str | None = None) -> list[str]:
+    def growFrom(
+        self, mri_node, points_node, lesions_node, tissue: str | None = None, larger: bool = False
+    ) -> list[str]:
         """Add the lesion around the last placed control point of a markups node to a segmentation node.
 
-        See seeded.grow_lesion. Returns the IDs of the segments, one for each part. UltrasoundSceneLogic.addTissues lays
-        them over labels. Raises SimulationError, and changes nothing, if the MRI was not segmented or has changed
-        since, and for a point in what is no lesion.
+        See seeded.grow_lesion; `larger`: its larger version. Returns the IDs of the segments, one for each part.
+        UltrasoundSceneLogic.addTissues lays them over labels. Raises SimulationError, and changes nothing, if the MRI
+        was not segmented or has changed since, and where nothing grows.
         """
         require_node(points_node, "vtkMRMLMarkupsFiducialNode", use="point in the lesion")
         require_node(lesions_node, "vtkMRMLSegmentationNode", use="lesions")
@@ -59,8 +61,9 @@ class LesionGrowth:
         grown = self._work(lambda: grow_lesion(result, seed[:3].tolist(), tissue))
         moved = np.linalg.inv(node_to_world(lesions_node)) @ node_to_world(mri_node)
         ids = []
-        for part in grown.tissues:
-            mask = grown.mask(part)
+        lesion = grown.larger if larger and grown.larger is not None else grown
+        for part in lesion.tissues:
+            mask = lesion.mask(part)
             ids += add_lesion(lesions_node, Volume(mask.array, moved @ mask.ijk_to_ras), part, part)
         self.notes, self.warnings = (grown.message,), grown.warnings
         return ids

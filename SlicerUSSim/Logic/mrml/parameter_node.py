@@ -20,7 +20,8 @@ from SlicerUSSim.Logic.mri.segmentation_settings import MRI_CONTRASTS, Segmentat
 from SlicerUSSim.Logic.placement.views import VIEWS
 
 MODULE_NAME = "USSim"
-#: Choice of PanelSettings.lesion_as
+#: Choices of PanelSettings.lesion_size, and one of lesion_as
+SMALLER, LARGER = "smaller", "larger"
 BY_LOOK = "by its look"
 _OWNER = "scene"
 S = TypeVar("S", bound=Declared)
@@ -50,6 +51,10 @@ class PanelSettings(Declared):
     lesion_as: str = parameter(
         BY_LOOK, "As", "What the lesion at the point is; by its look: what the MRI shows there",
         choices=(BY_LOOK, *LESION_TISSUES), shown=True,
+    )  # fmt: skip
+    lesion_size: str = parameter(
+        SMALLER, "Size", "smaller: to half of its contrast; larger: to the foot of its border, up to 3 mm farther out",
+        choices=(SMALLER, LARGER), shown=True,
     )  # fmt: skip
     view: str = parameter(
         next(iter(VIEWS)), "View", "; ".join(f"{name}: {view.tip}" for name, view in VIEWS.items()),

@@ -15,15 +15,14 @@ from SlicerUSSim.Logic.base.errors import SimulationError, require
 if TYPE_CHECKING:
     from SlicerUSSim.Logic.base import Volume
     from SlicerUSSim.Logic.mri import Segmentation
-    from SlicerUSSim.Logic.mri.lesions.proposal import Proposal
+    from SlicerUSSim.Logic.mri.lesions.grown_lesion import GrownLesion
 
 seed_option = click.option(
     "--seed", "seeds", multiple=True, metavar="R,A,S|FILE[=TISSUE]",
     help="Grow the lesion around a point, RAS mm in the frame of the MRI, or around each point of a file of 3D "
-    "Slicer (.mrk.json, .fcsv): masks beside the labels, which stay as they are; --add lays them over. With a tissue "
-    "(tumour, oedema, necrosis, cyst, haematoma, cavity, enhancing) it is proposed as that, also where it looks like "
-    "a vessel, a ventricle or the other side; not where it has no border or looks as that tissue cannot. May be "
-    "repeated.",
+    "Slicer (.mrk.json, .fcsv): masks beside the labels, which stay as they are, each in a smaller and a larger "
+    "version; --add lays them over. With a tissue (tumour, oedema, necrosis, cyst, haematoma, cavity, enhancing) it "
+    "is called that. May be repeated.",
 )  # fmt: skip
 
 
@@ -75,29 +74,26 @@ def _points_of(place: str) -> list[tuple[float, ...]]:
 
 
 def require_seeds(seeds: Iterable[str], mri: Volume, labels_path: Path) -> None:
-    """Raise SimulationError, before a segmentation, for seeds outside the image and for proposals that exist."""
-    from SlicerUSSim.Logic.mri.lesions.proposal import proposals_beside
+    """Raise SimulationError, before a segmentation, for seeds outside the image and for masks that exist."""
+    from SlicerUSSim.Logic.mri.lesions.grown_lesion import grown_beside
     from SlicerUSSim.Logic.mri.lesions.seeded import require_in_image
 
     for point, _ in split_seeds(seeds):
         require_in_image(mri, point)
-    check_outputs(*proposals_beside(labels_path))
+    check_outputs(*grown_beside(labels_path))
 
 
-def grown_at(segmentation: Segmentation, seeds: Iterable[str]) -> tuple[list[Proposal], list[str]]:
-    """(the lesions around seeds, a line for each refused seed).
-
-    Writes nothing. A refused seed is in what is no lesion.
-    """
+def grown_at(segmentation: Segmentation, seeds: Iterable[str]) -> tuple[list[GrownLesion], list[str]]:
+    """(the lesions around seeds, a line for each seed at which nothing grows). Writes nothing."""
     from SlicerUSSim.Logic.mri.lesions.seeded import grow_lesion
 
-    proposals, refused = [], []
+    lesions, refused = [], []
     for point, tissue in split_seeds(seeds):
         try:
-            proposals.append(grow_lesion(segmentation, point, tissue))
+            lesions.append(grow_lesion(segmentation, point, tissue))
         except SimulationError as error:
-            refused.append(_with_how(str(error)))
-    return proposals, refused
+            refused.append(str(error))
+    return lesions, refused
 
 
 def require_none_refused(refused: Iterable[str], labels_path: Path) -> None:
@@ -106,29 +102,23 @@ def require_none_refused(refused: Iterable[str], labels_path: Path) -> None:
     require(not lines, f"{lines}; {labels_path} is written, with all that was not refused")
 
 
-def _with_how(line: str) -> str:
-    """A line about a seed; with how the command is told what a lesion is, where the line asks for it."""
-    from SlicerUSSim.Logic.mri.lesions.seeded import SAY_WHAT
-
-    return line + (" (as --seed R,A,S=TISSUE)" if SAY_WHAT in line else "")
-
-
-def write_proposals(proposals: Iterable[Proposal], labels_path: Path) -> None:
-    """Write the masks of what is proposed beside the labels, and say what they are and how to apply them.
+def write_lesions(lesions: Iterable[GrownLesion], labels_path: Path) -> None:
+    """Write the masks of lesions beside the labels, and say what they are and how to apply them.
 
     Those of an earlier run that stay beside the labels are named.
     """
-    from SlicerUSSim.Logic.mri.lesions.proposal import proposals_beside
+    from SlicerUSSim.Logic.mri.lesions.grown_lesion import grown_beside
 
     written: set[Path] = set()
-    for number, proposal in enumerate(proposals, 1):
-        note(proposal.message)
-        for line in proposal.warnings:
-            note(f"  {_with_how(line)}")
-        files = proposal.write(labels_path, number)
-        written |= set(files.values())
-        additions = " ".join(f"--add {tissue}={path}" for tissue, path in files.items())
-        note(f"  look at it over the MRI, correct it, and apply it with {additions}")
-    for path in proposals_beside(labels_path):
+    for number, lesion in enumerate(lesions, 1):
+        note(f"{lesion.message}; not applied")
+        for line in lesion.warnings:
+            note(f"  {line}")
+        files = lesion.write(labels_path, number)
+        written |= {path for tissue in files for path in files[tissue]}
+        additions = " ".join(f"--add {tissue}={smaller}" for tissue, (smaller, _) in files.items())
+        larger = ", ".join(str(path) for _, path in files.values())
+        note(f"  look at it over the MRI, correct it, and apply it with {additions}; larger: {larger}")
+    for path in grown_beside(labels_path):
         if path not in written:
             note(f"{path} of an earlier run stays: delete it if it is not needed")
