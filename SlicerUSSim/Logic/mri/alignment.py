@@ -19,7 +19,7 @@ from SlicerUSSim.Logic.base.errors import required
 from SlicerUSSim.Logic.base.neighbourhood import distance_to
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.mri.atlas import mni152
-from SlicerUSSim.Logic.mri.coarse import CoarseImage
+from SlicerUSSim.Logic.mri.coarse import CoarseImage, resampled_to_ras
 
 #: Nodding of the head in degrees and size of the brain in log percent of the template, at which the search starts
 _PITCHES, _SIZES = (-30.0, -15.0, 0.0, 15.0, 30.0), (-10.0, 4.0)
@@ -36,6 +36,9 @@ DOUBTFUL_AGREEMENT = 0.4
 _CLEARLY_BETTER = 1.15
 #: Agreement of rigid fits below which no affine one is tried
 _HOPELESS = 0.11
+#: Brighter than so many times the inner brain is fat, which drags the fit outwards; depth of that brain, mm; and its
+#: least brightness as a share of the image's range, below which (CT, half a head) it is no measure of fat
+_FAT, _INNER_MM, _LEAST_INNER = 1.5, 15.0, 0.05
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,23 +70,35 @@ class Alignment:
 
 
 def align_template(mri: Volume, progress: Callable[[float], None] | None = None) -> Alignment:
-    """The template's brain in the MRI of a head. Raises SimulationError if nilearn is not installed."""
-    return align_coarse(CoarseImage.of(mri), progress)
+    """The template's brain in the MRI of a head. Raises SimulationError if nilearn is not installed.
 
-
-def align_coarse(image: CoarseImage, progress: Callable[[float], None] | None = None) -> Alignment:
-    """See align_template. Where the best rigid fit is hopeless, it is returned without the affine one.
-
-    An adult's head is looked for, and where none is found, one of 0.65 to 0.85 times its size.
+    Where the best rigid fit is hopeless, it is returned without the affine one. If a fit is doubtful, fat is set to air
+    and the fit repeated; if it still is, a head of 0.65 to 0.85 times an adult's size is looked for.
     """
     report = progress or (lambda share: None)
-    found = _aligned(image, lambda share: report(0.75 * share), is_small=False)
+    image = CoarseImage.of(mri)
+    found = _aligned(image, lambda share: report(0.5 * share), is_small=False)
+    if found.agreement < DOUBTFUL_AGREEMENT:
+        image = CoarseImage.of(_without_fat(mri, found.template_to_ras))
+        again = _aligned(image, lambda share: report(0.5 + 0.25 * share), is_small=False)
+        found = max(found, again, key=lambda fit: fit.agreement)
     if found.agreement < DOUBTFUL_AGREEMENT or not SIZES[0] <= found.size <= SIZES[1]:
         small = _aligned(image, lambda share: report(0.75 + 0.25 * share), is_small=True)
         if small.agreement > _CLEARLY_BETTER * found.agreement:
             found = small
     report(1.0)
     return found
+
+
+def _without_fat(mri: Volume, template_to_ras: np.ndarray) -> Volume:
+    """The image with everything much brighter than the inner brain set to air, at full resolution."""
+    values = mri.array.astype(np.float32)
+    air, high = np.percentile(values[::2, ::2, ::2], (1.0, 99.5))
+    inner = values[template().distance_on(mri, template_to_ras) < -_INNER_MM]
+    brain = float(np.median(inner)) - air if inner.size else 0.0
+    if brain < _LEAST_INNER * (high - air):
+        return mri
+    return mri.with_array(np.where(values - air > _FAT * brain, air, values).astype(np.float32))
 
 
 def _aligned(image: CoarseImage, progress: Callable[[float], None], *, is_small: bool) -> Alignment:
@@ -296,3 +311,40 @@ def agreement(image: CoarseImage, template_to_ras: np.ndarray) -> float:
     covariance = model.local_mean(model.model * patient) - mean_model * mean_patient
     variances = variance_model * (model.local_mean(patient**2) - mean_patient**2)
     return float(np.mean(covariance**2 / np.maximum(variances, 1e-10)))
+
+
+# ---- how sure a fit is: the share of the image that the template's tissues explain ----------------------------------
+
+#: Voxels in which it is measured, and the width of the windows whose means are left out, as a bias field's, mm
+_SCORE_MM, _WINDOW_MM = 3, 20.0
+
+
+@cache
+def _tissues() -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """(inside (k, j, i), (n, 3) RAS points in it, weight (k, j, i), (n, 2) maps of CSF and white matter)."""
+    step = slice(None, None, _SCORE_MM)
+    atlas = required(mni152(), "the brain atlas needs nilearn; install it with: pip install nilearn")
+    inside = template().distance.array[step, step, step] < -2.0
+    points = _SCORE_MM * np.argwhere(inside)[:, ::-1] @ atlas.t1.ijk_to_ras[:3, :3].T + atlas.t1.ijk_to_ras[:3, 3]
+    weight = np.maximum(ndimage.gaussian_filter(inside.astype(np.float32), _WINDOW_MM / _SCORE_MM), 1e-3)
+    maps = (ndimage.gaussian_filter(volume.array, 1.5)[step, step, step][inside] for volume in (atlas.csf, atlas.white))
+    return inside, points, weight, np.stack([_detail(values, inside, weight) for values in maps], axis=1)
+
+
+def _detail(values: np.ndarray, inside: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    """(n,) values without their means in Gaussian windows."""
+    whole = np.zeros(inside.shape, np.float32)
+    whole[inside] = values
+    return values - (ndimage.gaussian_filter(whole, _WINDOW_MM / _SCORE_MM) / weight)[inside]
+
+
+def explained(mri: Volume, template_to_ras: np.ndarray) -> float:
+    """Share of the image's variance, without a bias field, that the template's CSF and white matter explain, 0 to 1."""
+    inside, points, weight, maps = _tissues()
+    image, origin = resampled_to_ras(_without_fat(mri, template_to_ras), 2.0)
+    index = (points @ template_to_ras[:3, :3].T + template_to_ras[:3, 3] - origin) / 2.0
+    values = ndimage.map_coordinates(ndimage.gaussian_filter(image, 0.7), index[:, ::-1].T, order=1, cval=0.0)
+    values = _detail(np.clip(values, *np.percentile(values, (1.0, 95.0))), inside, weight)
+    total = float((values**2).sum())
+    change = np.linalg.lstsq(maps, values, rcond=None)[0]
+    return 1.0 - float(((values - maps @ change) ** 2).sum()) / total if total > 0.0 else 0.0

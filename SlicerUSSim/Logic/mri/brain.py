@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
 from time import perf_counter
@@ -14,9 +13,9 @@ from SlicerUSSim.Logic.base.declaration import parameter_of
 from SlicerUSSim.Logic.base.errors import Cancelled, SimulationError, require
 from SlicerUSSim.Logic.base.volume import LARGEST_MM, Volume
 from SlicerUSSim.Logic.mri import extractors
-from SlicerUSSim.Logic.mri.alignment import align_template
+from SlicerUSSim.Logic.mri.alignment import Alignment
 from SlicerUSSim.Logic.mri.atlas import mni152
-from SlicerUSSim.Logic.mri.extractors import Program, Report
+from SlicerUSSim.Logic.mri.extractors import Report
 from SlicerUSSim.Logic.mri.given_mask import checked_mask, label_doubts, mask_doubts, volume_warnings
 from SlicerUSSim.Logic.mri.kept_mask import keep, read_kept
 from SlicerUSSim.Logic.mri.mask_check import cut_off, ends_at_edge
@@ -24,7 +23,6 @@ from SlicerUSSim.Logic.mri.no_data import without_blank
 from SlicerUSSim.Logic.mri.recognition import (
     POSSIBLE_ML,
     USUAL_ML,
-    Shown,
     above_noise,
     recognise,
     stripped_brain,
@@ -35,9 +33,8 @@ from SlicerUSSim.Logic.mri.segmentation_settings import SegmentationSettings
 _log = logging.getLogger(__name__)
 
 _NAMES = {"robex": "ROBEX", "deepbet": "deepbet", "atlas": "the atlas"}
-#: Overlap with the registered atlas above which a mask is taken without asking another method, and below which it is
-#: refused
-_SURE, _LEAST_SURE = 0.915, 0.85
+#: Overlap with the aligned atlas above which a mask is taken without asking another method
+_SURE = 0.915
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,28 +90,19 @@ def find_brain(
         f"the image is {'x'.join(f'{mm:g}' for mm in size)} mm large, expected a head of 100 to 400 mm; correct its "
         "voxel size, or the unit of length in its header",
     )
-    with ExitStack() as ahead:
-        robex = extractors.robex
-        _require_program(method, mri)
-        if method == "robex":  # takes more than a minute, on one core: the image is recognised meanwhile
-            robex = ahead.enter_context(extractors.Ahead(robex, mri))
-        recognised_at = 0.05 if method == "robex" else 0.4  # the atlas takes about as long as the recognition
-        shown = recognise(mri, lambda share: report(recognised_at * share))
-        if shown.stripped is not None:
-            mask = mri.with_array(shown.stripped.astype(np.uint8)).along(given)
-            millilitres = _millilitres(shown.stripped, mri)
-            warnings = (*shown.warnings, *volume_warnings(millilitres))
-            message = f"skull-stripped brain, {millilitres:.0f} ml"
-            if method != "auto":
-                message += f"; {_NAMES[method]} is not asked, as there is no skull to strip"
-            return BrainMask(mask, "stripped", message, warnings, perf_counter() - start)
-        found = _extracted(
-            mri, shown, method, robex, lambda share: report(recognised_at + (0.95 - recognised_at) * share)
-        )
+    _require_program(method, mri)
+    shown = recognise(mri, lambda share: report(0.6 * share))
+    if shown.stripped is not None:
+        mask = mri.with_array(shown.stripped.astype(np.uint8)).along(given)
+        millilitres = _millilitres(shown.stripped, mri)
+        message = f"skull-stripped brain, {millilitres:.0f} ml"
+        if method != "auto":
+            message += f"; {_NAMES[method]} is not asked, as there is no skull to strip"
+        return BrainMask(mask, "stripped", message, volume_warnings(millilitres), perf_counter() - start)
+    found = _extracted(mri, shown.alignment, method, lambda share: report(0.6 + 0.35 * share))
     inside, blank = without_blank(mri, found.inside)
     millilitres = _millilitres(inside, mri)
     warnings = (
-        *shown.warnings,
         *found.warnings,
         *blank,
         *volume_warnings(millilitres),
@@ -165,20 +153,15 @@ class _Extracted:
     warnings: tuple[str, ...] = ()
 
 
-def _extracted(mri: Volume, shown: Shown, method: str, robex: Program, report: Report) -> _Extracted:
+def _extracted(mri: Volume, alignment: Alignment | None, method: str, report: Report) -> _Extracted:
     """The brain by `method`, or by the first of the available ones whose result is plausible."""
     failures: list[str] = []
     unsure: list[_Extracted] = []
-    alignment = shown.alignment
     expected = None if alignment is None else alignment.brain_on(mri)
     candidates = _candidates(method)
     for name in candidates:
         try:
-            if name == "atlas" and expected is None:
-                require(mni152() is not None, "the brain atlas needs nilearn; install it with: pip install nilearn")
-                alignment = align_template(mri, lambda share: report(0.5 * share))
-                expected = alignment.brain_on(mri)
-            inside = _by(name, mri, expected, robex, report)
+            inside = _by(name, mri, expected, report)
         except Cancelled:
             raise
         except SimulationError as error:
@@ -201,7 +184,7 @@ def _extracted(mri: Volume, shown: Shown, method: str, robex: Program, report: R
             following = candidates[candidates.index(name) + 1]
             _log.warning("%s; %s is asked, which takes up to two minutes", failures[-1], _NAMES[following])
     best = max(unsure, key=lambda found: found.sureness or 0.0, default=None)
-    if best is not None and (best.sureness or 0.0) >= _LEAST_SURE:
+    if best is not None:
         return replace(best, warnings=tuple(failures))
     raise SimulationError(f"no brain was found in this head: {'; '.join(failures)}; give a brain mask (--mask)")
 
@@ -241,15 +224,16 @@ def _installed() -> list[str]:
     return [name for name, is_available in available.items() if is_available]
 
 
-def _by(name: str, mri: Volume, expected: np.ndarray | None, robex: Program, report: Report) -> np.ndarray:
+def _by(name: str, mri: Volume, expected: np.ndarray | None, report: Report) -> np.ndarray:
     """(k, j, i) the brain by one method, with its border moved to the dark valley outside the cortex.
 
     `expected` (k, j, i) is the distance to the aligned template's brain, which the atlas needs.
     """
-    if name == "atlas" and expected is not None:
-        report(0.5)
+    if name == "atlas":
+        if expected is None:
+            raise SimulationError("the brain atlas needs nilearn; install it with: pip install nilearn")
         return refined(mri, expected, core_mm=8.0, reach_mm=12.0, keep_mm=3.0)
-    program = robex if name == "robex" else extractors.deepbet
+    program = extractors.robex if name == "robex" else extractors.deepbet
     inside = program(mri, lambda share: report(0.9 * share))
     require(bool(inside.any()), f"{_NAMES[name]} found no brain")
     distance = signed_distance(inside, mri.spacing_mm, 20.0)

@@ -19,8 +19,9 @@ ORDERS = {"t1": (0, 1, 2), "t1gd": (0, 1, 2), "t2": (2, 1, 0), "flair": (0, 2, 1
 _BRIGHT_NAMES = {"t1gd": "enhancing", "flair": "tumour"}
 #: Contrasts from the one that tells grey from white matter best
 _PREFERENCE = ("t1", "t1gd", "flair", "t2")
-#: The spatial prior's exponent: the affine transform leaves the cortex some millimetres off
-_PRIOR_EXPONENT = 0.3
+#: The spatial prior's exponent: the affine transform leaves the cortex some millimetres off. Where the fitted grey and
+#: white matter differ by up to the first number of the noise's deviations, the atlas has to decide; by the second on not
+_PRIOR_EXPONENT, _STRONG_EXPONENT, _FAINT = 0.3, 1.0, (2.5, 4.0)
 #: Noise of posteriors per that of the fit, for filtered images: filters leave more error at borders than within tissues
 FILTER_BLUR = 1.5
 _START_ITERATIONS = 12
@@ -53,6 +54,12 @@ class Classes:
         """Means of grey and white matter in the first channel."""
         grey, white = (float(self.means[self.names.index(name), 0]) for name in ("grey matter", "white matter"))
         return grey, white
+
+    @property
+    def grey_white_contrast(self) -> float:
+        """Difference of grey and white matter in standard deviations of the fitted noise, over all channels."""
+        apart = self.mixture.means[2] - self.mixture.means[1]
+        return float(np.sqrt(apart @ np.linalg.solve(self.mixture.covariance, apart)))
 
     @property
     def shares(self) -> np.ndarray:
@@ -95,8 +102,25 @@ def classify(
 
     Posteriors assume `blur` times the noise of the fit.
     """
+    found = _classified(values, contrasts, names, prior, _PRIOR_EXPONENT, blur, voxel_mm)
+    exponent = float(np.interp(found.grey_white_contrast, _FAINT, (_STRONG_EXPONENT, _PRIOR_EXPONENT)))
+    if prior is None or exponent == _PRIOR_EXPONENT:
+        return found
+    return _classified(values, contrasts, names, prior, exponent, blur, voxel_mm)
+
+
+def _classified(
+    values: np.ndarray,
+    contrasts: tuple[str, ...],
+    names: tuple[str, ...],
+    prior: np.ndarray | None,
+    exponent: float,
+    blur: float,
+    voxel_mm: float,
+) -> Classes:
+    """See classify; with the prior to the power of `exponent`."""
     if prior is not None:
-        prior = prior**_PRIOR_EXPONENT
+        prior = prior**exponent
         prior /= prior.sum(axis=0)
     first = _best_channel(contrasts)
     histogram = Histogram.of(values[first : first + 1], contrasts[first : first + 1], prior, voxel_mm=voxel_mm)

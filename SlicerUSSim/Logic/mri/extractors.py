@@ -12,14 +12,12 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor, wait
 from pathlib import Path
-from types import TracebackType
 
 import numpy as np
 from scipy.linalg import polar
 
-from SlicerUSSim.Logic.base.errors import Cancelled, SimulationError, require
+from SlicerUSSim.Logic.base.errors import SimulationError, require
 from SlicerUSSim.Logic.base.volume import Volume
 
 #: Both are trained on and work at voxels of about 1 mm.
@@ -38,7 +36,6 @@ run_bet([files["image"]], mask_paths=[files["mask"]], threshold=0.5, n_dilate=0,
 """
 
 Report = Callable[[float], None]
-Program = Callable[[Volume, Report], np.ndarray]
 
 
 def robex_folder() -> Path | None:
@@ -110,35 +107,6 @@ def deepbet(mri: Volume, report: Report) -> np.ndarray:
             lambda text, seconds: report(1.0 - np.exp(-seconds / _DEEPBET_SECONDS)),
         )  # fmt: skip
         return _mask_from(folder / "mask.nii", "deepbet", log, image, mri)
-
-
-class Ahead:
-    """A program that works on an image while its caller does something else; with-statement: what is not used ends."""
-
-    def __init__(self, program: Program, mri: Volume) -> None:
-        self._share, self._is_unused = 0.0, False
-        self._pool = ThreadPoolExecutor(1)
-        self._result = self._pool.submit(program, mri, self._report)
-
-    def __enter__(self) -> Ahead:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._is_unused = True
-        self._pool.shutdown()
-
-    def __call__(self, mri: Volume, report: Report) -> np.ndarray:
-        """The program's result for the image it was started with, and its errors; raises what `report` raises."""
-        while wait([self._result], _POLL_S).not_done:
-            report(self._share)
-        return self._result.result()
-
-    def _report(self, share: float) -> None:
-        self._share = share
-        if self._is_unused:
-            raise Cancelled
 
 
 def _package_folder(name: str) -> Path | None:

@@ -13,17 +13,16 @@ from scipy import ndimage
 
 from SlicerUSSim.Logic.base.errors import require
 from SlicerUSSim.Logic.base.volume import Volume
+from SlicerUSSim.Logic.mri.alignment import explained
 from SlicerUSSim.Logic.mri.atlas import mni152
 from SlicerUSSim.Logic.mri.atlas_registration import AtlasFit, register_atlas
 from SlicerUSSim.Logic.mri.bias import corrected
 from SlicerUSSim.Logic.mri.classification import Classes
 from SlicerUSSim.Logic.mri.plausibility import (
-    csf_is_doubtful,
-    faint,
     implausible,
     is_whole_brain,
     require_order,
-    require_several_tissues,
+    unsure,
 )
 from SlicerUSSim.Logic.mri.recognition import check_finite
 
@@ -157,15 +156,12 @@ def doubts(
 ) -> list[str]:
     """What the user should check; `noise` is that of the first image before the filter.
 
-    Raises SimulationError where the result is none: one tissue only, or tissues in the order of another contrast.
+    Raises SimulationError for tissues in the order of another contrast.
     """
-    require_several_tissues(found)
     lines = require_order(found, contrasts[0], atlas is not None) if len(contrasts) == 1 else []
-    lines += implausible(found, part.images[0], part.inside, atlas, contrasts[0])
-    if len(contrasts) == 1:
-        lines += csf_is_doubtful(found, contrasts[0])
-        lines += faint(found, noise)
-    return lines
+    lines += implausible(found, float(part.inside.sum()) * part.images[0].voxel_ml, contrasts[0])
+    fits = None if atlas is None else explained(part.images[0], np.linalg.inv(atlas.patient_to_atlas))
+    return lines + unsure(found, noise, fits)
 
 
 def narrow_sulci(labels: np.ndarray, found: Classes, filtered: np.ndarray, noise: float) -> np.ndarray:
