@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from time import perf_counter
 
@@ -18,8 +18,7 @@ from SlicerUSSim.Logic.mri.atlas import mni152
 from SlicerUSSim.Logic.mri.extractors import Report
 from SlicerUSSim.Logic.mri.given_mask import checked_mask, label_doubts, mask_doubts, volume_warnings
 from SlicerUSSim.Logic.mri.kept_mask import keep, read_kept
-from SlicerUSSim.Logic.mri.mask_check import cut_off, ends_at_edge
-from SlicerUSSim.Logic.mri.no_data import without_blank
+from SlicerUSSim.Logic.mri.no_data import ends_at_edge, without_blank
 from SlicerUSSim.Logic.mri.recognition import (
     POSSIBLE_ML,
     USUAL_ML,
@@ -33,8 +32,6 @@ from SlicerUSSim.Logic.mri.segmentation_settings import SegmentationSettings
 _log = logging.getLogger(__name__)
 
 _NAMES = {"robex": "ROBEX", "deepbet": "deepbet", "atlas": "the atlas"}
-#: Overlap with the aligned atlas above which a mask is taken without asking another method
-_SURE = 0.915
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,8 +62,8 @@ def find_brain(
     Parameters
     ----------
     mri : the image, with its orientation and voxel size as in the patient.
-    method : how a brain is extracted from a whole head: "robex", "deepbet" or "atlas"; "auto" for the atlas, and for
-        the programs that are installed if its result is doubtful; "none" takes everything brighter than the background,
+    method : how a brain is extracted from a whole head: "robex", "deepbet" or "atlas"; "auto" for the first of the
+        atlas and the programs that are installed that finds one; "none" takes everything brighter than the background,
         whatever the image shows.
     keep_at : file in which the mask of a whole head is kept and from which it is read again; see mask_beside.
     progress : called with the fraction done, 0 to 1; may raise errors.Cancelled, which ends the extraction at once.
@@ -107,15 +104,14 @@ def find_brain(
         *blank,
         *volume_warnings(millilitres),
         *ends_at_edge(mri, inside),
-        *cut_off(mri, inside),
     )
     seconds = perf_counter() - start
     message = f"whole head: brain extracted by {_NAMES[found.method]} in {seconds:.0f} s, {millilitres:.0f} ml"
-    if found.sureness is not None:
-        message += f", overlap with the registered atlas {found.sureness:.2f}"
+    if found.overlap is not None:
+        message += f", overlap with the registered atlas {found.overlap:.2f}"
     mask = mri.with_array(inside.astype(np.uint8)).along(given)
     if keep_at is not None:
-        note = keep(keep_at, given, mask.array, found.method, seconds, warnings, method)
+        note = keep(keep_at, given, mask.array, found.method, seconds, warnings)
         _log.info("%s", note.text)
         warnings = warnings if note.is_beside else (*warnings, note.text)
     report(1.0)
@@ -149,43 +145,30 @@ class _Extracted:
     inside: np.ndarray
     method: str
     #: Dice of the mask with the aligned template's, 0 to 1; None if there is no alignment
-    sureness: float | None
+    overlap: float | None
     warnings: tuple[str, ...] = ()
 
 
 def _extracted(mri: Volume, alignment: Alignment | None, method: str, report: Report) -> _Extracted:
-    """The brain by `method`, or by the first of the available ones whose result is plausible."""
+    """The brain by `method`, or by the first of the available ones whose result has the volume of one."""
     failures: list[str] = []
-    unsure: list[_Extracted] = []
     expected = None if alignment is None else alignment.brain_on(mri)
-    candidates = _candidates(method)
-    for name in candidates:
+    for name in _candidates(method):
         try:
             inside = _by(name, mri, expected, report)
+            millilitres = _millilitres(inside, mri)
+            require(
+                POSSIBLE_ML[0] <= millilitres <= POSSIBLE_ML[1],
+                f"{_NAMES[name]} found {millilitres:.0f} ml, expected {USUAL_ML[0]:.0f} to {USUAL_ML[1]:.0f} ml",
+            )
         except Cancelled:
             raise
         except SimulationError as error:
-            if method != "auto":
-                raise
             failures.append(str(error))
+            _log.warning("%s", error)
             continue
-        millilitres = _millilitres(inside, mri)
-        sureness = None if expected is None else _dice(inside, expected < 0.0)
-        found = _Extracted(inside, name, sureness)
-        if not POSSIBLE_ML[0] <= millilitres <= POSSIBLE_ML[1]:
-            usual = f"{USUAL_ML[0]:.0f} to {USUAL_ML[1]:.0f} ml"
-            failures.append(f"{_NAMES[name]} found {millilitres:.0f} ml, expected {usual}")
-        elif sureness is None or sureness >= _SURE:
-            return replace(found, warnings=tuple(failures))
-        else:
-            unsure.append(found)
-            failures.append(f"the mask by {_NAMES[name]} agrees with the atlas by {sureness:.2f} only; check it")
-        if name != candidates[-1]:
-            following = candidates[candidates.index(name) + 1]
-            _log.warning("%s; %s is asked, which takes up to two minutes", failures[-1], _NAMES[following])
-    best = max(unsure, key=lambda found: found.sureness or 0.0, default=None)
-    if best is not None:
-        return replace(best, warnings=tuple(failures))
+        overlap = None if expected is None else _dice(inside, expected < 0.0)
+        return _Extracted(inside, name, overlap, tuple(failures))
     raise SimulationError(f"no brain was found in this head: {'; '.join(failures)}; give a brain mask (--mask)")
 
 
@@ -206,22 +189,18 @@ def _candidates(method: str) -> list[str]:
     """Methods to try, in the order of their measured quality (docs/brain.md)."""
     if method != "auto":
         return [method]
-    found = _installed()
+    available = {
+        "atlas": mni152() is not None,
+        "deepbet": extractors.has_deepbet(),
+        "robex": extractors.robex_folder() is not None,
+    }
+    found = [name for name, is_available in available.items() if is_available]
     require(
         bool(found),
         "image shows a whole head, and no program for brain extraction is installed; install one with: "
         'pip install "SlicerUSSim[head]", or give a brain mask (--mask)',
     )
     return found
-
-
-def _installed() -> list[str]:
-    available = {
-        "atlas": mni152() is not None,
-        "deepbet": extractors.has_deepbet(),
-        "robex": extractors.robex_folder() is not None,
-    }
-    return [name for name, is_available in available.items() if is_available]
 
 
 def _by(name: str, mri: Volume, expected: np.ndarray | None, report: Report) -> np.ndarray:
@@ -270,10 +249,6 @@ def _kept(path: Path, mri: Volume, method: str) -> BrainMask | None:
     else:
         by = _NAMES.get(kept.method, kept.method)
         message = f"whole head: brain mask kept in {kept.path}, by {by} in {kept.seconds:.0f} s, {millilitres:.0f} ml"
-        if method == "auto" and kept.asked == "atlas":  # auto would have asked them, had it doubted that mask
-            others = [name for name in _installed() if name != "atlas"]
-            options = " or ".join(f"--skull-strip {name}" for name in others)
-            message += f"; it was asked for by name ({options} may be better)" if others else ""
     mask = mri.with_array(kept.inside.astype(np.uint8))
     if not kept.is_edited:
         return BrainMask(mask, kept.method, message, kept.warnings, 0.0)

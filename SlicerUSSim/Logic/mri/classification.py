@@ -19,9 +19,9 @@ ORDERS = {"t1": (0, 1, 2), "t1gd": (0, 1, 2), "t2": (2, 1, 0), "flair": (0, 2, 1
 _BRIGHT_NAMES = {"t1gd": "enhancing", "flair": "tumour"}
 #: Contrasts from the one that tells grey from white matter best
 _PREFERENCE = ("t1", "t1gd", "flair", "t2")
-#: The spatial prior's exponent: the affine transform leaves the cortex some millimetres off. Where the fitted grey and
-#: white matter differ by up to the first number of the noise's deviations, the atlas has to decide; by the second on not
-_PRIOR_EXPONENT, _STRONG_EXPONENT, _FAINT = 0.3, 1.0, (2.5, 4.0)
+#: The spatial prior's exponent: the affine transform leaves the cortex some millimetres off. The second where fitted
+#: grey and white matter differ by less than the first of these deviations of the noise: there the atlas has to decide
+_PRIOR_EXPONENT, _STRONG_EXPONENT, FAINT = 0.3, 1.0, (2.5, 4.0)
 #: Noise of posteriors per that of the fit, for filtered images: filters leave more error at borders than within tissues
 FILTER_BLUR = 1.5
 _START_ITERATIONS = 12
@@ -103,7 +103,7 @@ def classify(
     Posteriors assume `blur` times the noise of the fit.
     """
     found = _classified(values, contrasts, names, prior, _PRIOR_EXPONENT, blur, voxel_mm)
-    exponent = float(np.interp(found.grey_white_contrast, _FAINT, (_STRONG_EXPONENT, _PRIOR_EXPONENT)))
+    exponent = float(np.interp(found.grey_white_contrast, FAINT, (_STRONG_EXPONENT, _PRIOR_EXPONENT)))
     if prior is None or exponent == _PRIOR_EXPONENT:
         return found
     return _classified(values, contrasts, names, prior, exponent, blur, voxel_mm)
@@ -195,10 +195,10 @@ def _has_collapsed(fit: TissueMixture) -> bool:
 def _csf_is_grey(fit: TissueMixture, contrast: str) -> bool:
     """Whether CSF is too close to grey matter, as where the mask holds little CSF and two classes share the cortex."""
     csf, grey, white = fit.means[:, 0]
-    return is_csf_near_grey(csf, grey, white, contrast)
+    return _is_csf_near_grey(csf, grey, white, contrast)
 
 
-def is_csf_near_grey(csf: float, grey: float, white: float, contrast: str) -> bool:
+def _is_csf_near_grey(csf: float, grey: float, white: float, contrast: str) -> bool:
     """Whether these intensities are closer to each other in CSF and grey matter than in grey and white matter."""
     way = np.sign(white - csf)
     return bool(contrast != "flair" and way * (grey - csf) < _LEAST_CONTRAST * way * (white - grey))

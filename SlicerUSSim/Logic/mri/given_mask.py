@@ -9,9 +9,7 @@ from scipy import ndimage
 
 from SlicerUSSim.Logic.base.errors import require, require_kind
 from SlicerUSSim.Logic.base.volume import Volume
-from SlicerUSSim.Logic.mri.mask_check import cut_off
 from SlicerUSSim.Logic.mri.masks import several_segments
-from SlicerUSSim.Logic.mri.plausibility import is_whole_brain
 from SlicerUSSim.Logic.mri.recognition import POSSIBLE_ML, USUAL_ML
 
 #: Labels of a segmentation count as inside too; an image has more values
@@ -79,11 +77,7 @@ def mask_doubts(mri: Volume, inside: np.ndarray) -> tuple[str, ...]:
             "large part of one; what is outside it has no tissue (a lesion is added with --add tumour=FILE)"
         )
         return (*_islands(mri, inside), small)
-    reason = is_whole_brain(mri, inside)
-    warnings = volume_warnings(millilitres)
-    if reason and not warnings:
-        warnings = (f"the mask is not that of a whole brain: {reason}",)
-    return (*warnings, *_islands(mri, inside), *cut_off(mri, inside))
+    return (*volume_warnings(millilitres), *_islands(mri, inside))
 
 
 def label_doubts(mask: Volume) -> tuple[str, ...]:

@@ -1,4 +1,4 @@
-"""What a user should check: shares of the tissues, the sides of the brain, and the contrast."""
+"""What a user should check: how sure labels are, shares of the tissues, and the contrast."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from scipy import ndimage
 from SlicerUSSim.Logic.base.errors import SimulationError, require
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.mri.atlas_registration import WHOLE_BRAIN_ML
-from SlicerUSSim.Logic.mri.classification import EXPECTED_SHARES, ORDERS, Classes
+from SlicerUSSim.Logic.mri.classification import EXPECTED_SHARES, FAINT, ORDERS, Classes
 from SlicerUSSim.Logic.mri.mixture import TISSUES
 
 #: Smallest extent of a whole brain along any axis of the image, mm
@@ -25,9 +25,7 @@ _LIKELY_CSF, _DEEP_MM = 0.3, 20.0
 _APART, _FAR_APART = 0.25, 0.5
 #: Share of an image that the atlas explains, below which a user should look: heads and brains had 0.32 (T2) to 0.95,
 #: clinical scans in 6.5 mm slices 0.11, brains that lie the wrong way round 0.11
-_USUALLY_EXPLAINED = 0.2
-#: Contrast of grey and white matter in units of the noise: 1.1 in a T2 whose labels are blobs, 3 and more in T1s
-_LEAST_CONTRAST = 2.0
+_USUALLY_EXPLAINED = 0.25
 
 
 def is_whole_brain(image: Volume, inside: np.ndarray) -> str:
@@ -97,18 +95,16 @@ def require_order(found: Classes, contrast: str, is_led: bool) -> list[str]:
     return [message]
 
 
-def unsure(found: Classes, noise: float, explained: float | None) -> list[str]:
-    """The warning that says how sure the labels are; `explained` is that of alignment.explained, None without an atlas."""
-    grey, white = found.grey_and_white
-    apart = abs(white - grey) / max(noise, 1e-9)
-    faint = f"grey matter ({grey:.4g}) and white matter ({white:.4g}) differ by {apart:.1f} times the noise only"
+def unsure(found: Classes, explained: float | None) -> list[str]:
+    """The warning that says how sure labels are; `explained` is alignment.explained, None without an atlas."""
+    apart = found.grey_white_contrast
+    faint = f"grey and white matter differ by {apart:.1f} times the noise only, expected {FAINT[0]:g} or more"
+    faint += "" if explained is None else ", so that the atlas decides between them"
+    lines = [faint] if apart < FAINT[0] else []
     if explained is not None and explained < _USUALLY_EXPLAINED:
-        line = (
-            f"the atlas explains {explained:.0%} of this image, expected {_USUALLY_EXPLAINED:.0%} or more: look at the "
-            "labels, and check the orientation and the voxel size in its header"
-        )
-        return [line + (f"; {faint}, and the atlas decides between them" if apart < _LEAST_CONTRAST else "")]
-    return [f"{faint}, expected {_LEAST_CONTRAST:g} or more: look at the labels"] if apart < _LEAST_CONTRAST else []
+        found_share = f"the atlas explains {explained:.0%} of this image, expected {_USUALLY_EXPLAINED:.0%} or more"
+        lines = [f"{found_share}: check the orientation and the voxel size in its header", *lines]
+    return ["; ".join([*lines, "look at the labels"])] if lines else []
 
 
 def _deep(image: Volume, inside: np.ndarray) -> np.ndarray:
@@ -126,8 +122,8 @@ def implausible(found: Classes, millilitres: float, contrast: str) -> list[str]:
     """One line for each share that a healthy brain does not have, or a part of a brain of _LEAST_PART_ML."""
     shares = [float(found.shares[found.names.index(name)]) for name in TISSUES]
     return [
-        f"{name} is {share:.0%} of the brain, expected {low:.0%} to {high:.0%}: check the contrast ({contrast}) and the "
-        "brain mask"
+        f"{name} is {share:.0%} of the brain, expected {low:.0%} to {high:.0%}: check the contrast ({contrast}) and "
+        "the brain mask"
         for name, share, (low, high) in zip(TISSUES, shares, EXPECTED_SHARES, strict=True)
         if not low <= share <= high and millilitres >= _LEAST_PART_ML
     ]

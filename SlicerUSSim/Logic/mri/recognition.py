@@ -23,8 +23,8 @@ USUAL_ML, POSSIBLE_ML = (1000.0, 1900.0), (500.0, 2600.0)
 #: Share of an image that the atlas's tissues have to explain (alignment.explained). Heads had 0.10 (6.5 mm slices) to
 #: 0.60; phantoms, bodies, noise, ultrasound and heads upside down 0.01 to 0.07
 LEAST_EXPLAINED = 0.07
-#: Overlap (Dice) of the foreground with the aligned brain from which nothing else is shown: brains on a noisy background
-#: had 0.94 to 0.96, small whole heads, over which the template was spread, 0.85 to 0.90
+#: Overlap (Dice) of the foreground with the aligned brain from which nothing else is shown: brains on noise had 0.94 to
+#: 0.96, small whole heads, over which the template was spread, 0.85 to 0.90
 _STRIPPED_OVERLAP = 0.915
 #: Volume of what may be a head
 _HEAD_ML = (900.0, 9000.0)
@@ -43,7 +43,7 @@ class Shown:
 
 
 def recognise(mri: Volume, progress: Callable[[float], None] | None = None) -> Shown:
-    """What the image shows. Raises SimulationError, with how well the atlas fits, if it is neither a brain nor a head."""
+    """What the image shows. Raises SimulationError, with how well the atlas fits, for neither a brain nor a head."""
     check_finite(mri)
     check_intensities(mri)
     require_no_hounsfield(mri)

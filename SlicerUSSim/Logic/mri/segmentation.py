@@ -293,7 +293,7 @@ def segment_mri(
     found = replace(found, posteriors=less_sure(smoothed_posteriors(found.posteriors, part.inside)))
     timed("neighbours")
     report(0.9)
-    warnings += doubts(found, part, filtered[0][1], atlas, contrasts)
+    warnings += doubts(found, part, atlas, contrasts)
 
     labels = np.zeros(part.inside.shape, np.uint8)
     labels[part.inside] = found.posteriors.argmax(axis=0) + 1

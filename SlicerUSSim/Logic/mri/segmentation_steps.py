@@ -150,18 +150,17 @@ def require_different(values: np.ndarray, contrasts: tuple[str, ...]) -> None:
 def doubts(
     found: Classes,
     part: BrainPart,
-    noise: float,
     atlas: AtlasFit | None,
     contrasts: tuple[str, ...],
 ) -> list[str]:
-    """What the user should check; `noise` is that of the first image before the filter.
+    """What the user should check.
 
     Raises SimulationError for tissues in the order of another contrast.
     """
     lines = require_order(found, contrasts[0], atlas is not None) if len(contrasts) == 1 else []
     lines += implausible(found, float(part.inside.sum()) * part.images[0].voxel_ml, contrasts[0])
     fits = None if atlas is None else explained(part.images[0], np.linalg.inv(atlas.patient_to_atlas))
-    return lines + unsure(found, noise, fits)
+    return lines + unsure(found, fits)
 
 
 def narrow_sulci(labels: np.ndarray, found: Classes, filtered: np.ndarray, noise: float) -> np.ndarray:
