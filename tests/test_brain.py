@@ -18,14 +18,12 @@ from SlicerUSSim.Command.cli import main
 from SlicerUSSim.Logic import SimulationError, Volume
 from SlicerUSSim.Logic.base.errors import Cancelled
 from SlicerUSSim.Logic.mri import brain as brain_module, extractors, recognition, refinement
-from SlicerUSSim.Logic.mri.alignment import Alignment, align_coarse
+from SlicerUSSim.Logic.mri.alignment import Alignment, align_template
 from SlicerUSSim.Logic.mri.atlas import mni152
 from SlicerUSSim.Logic.mri.brain import BrainMask, find_brain, given_brain, left_out
-from SlicerUSSim.Logic.mri.coarse import CoarseImage
 from SlicerUSSim.Logic.mri.kept_mask import mask_beside
-from SlicerUSSim.Logic.mri.mask_check import cut_off, ends_at_edge
-from SlicerUSSim.Logic.mri.no_data import no_data, without_blank
-from SlicerUSSim.Logic.mri.recognition import recognise, stripped_brain
+from SlicerUSSim.Logic.mri.no_data import ends_at_edge, no_data, without_blank
+from SlicerUSSim.Logic.mri.recognition import recognise
 from SlicerUSSim.Logic.mri.samples import head_mri
 from tests.conftest import SHARED, needs_shared
 
@@ -95,11 +93,11 @@ def found(head, tmp_path_factory):
     shares, alignments = [], []
 
     def recorded(*args, **options):
-        alignments.append(align_coarse(*args, **options))
+        alignments.append(align_template(*args, **options))
         return alignments[-1]
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(recognition, "align_coarse", recorded)
+        patch.setattr(recognition, "align_template", recorded)
         result = find_brain(head[0], "atlas", keep_at=place, progress=shares.append)
     (alignment,) = alignments
     return Found(result, place, shares, alignment)
@@ -157,38 +155,11 @@ def test_a_blank_within_the_image_has_data():
     assert blank[radius > 1.1].all() and not blank[radius < 0.9].any()
 
 
-def test_a_tiny_object_is_too_small_for_a_head():
-    mri = head_mri(3.0)
-    with pytest.raises(SimulationError, match="too little for a head; correct the voxel size"):
-        find_brain(Volume(mri.array, mri.ijk_to_ras @ np.diag([0.3, 0.3, 0.3, 1.0])))
-
-
-@pytest.mark.slow
-def test_a_small_head_on_zeros_is_not_taken_for_a_stripped_brain(head):
-    """Shrunk, a head with its scalp and skull has the size and the shape of a brain."""
-    image = head[0]
-    shown = np.asarray(ndimage.binary_closing(image.array > 20.0, iterations=4))
-    empty = Volume(np.where(shown, image.array, 0.0), image.ijk_to_ras @ np.diag([0.8, 0.8, 0.8, 1.0]))
-    assert stripped_brain(empty) is None
-    brain = Volume(np.where(head[1], image.array, 0.0), image.ijk_to_ras)
-    assert stripped_brain(brain) is not None
-
-
-def test_a_body_is_refused_at_once():
-    """Not searched for a brain, which takes longer the more there is."""
-    k, j, i = np.indices((40, 30, 44))
-    torso = ((i - 21.5) / 20.0) ** 2 + ((j - 14.5) / 13.0) ** 2 < 1
-    noise = np.random.default_rng(2).normal(0.0, 3.0, torso.shape)
-    image = np.abs(np.where(torso, 100.0 + 30.0 * np.sin(0.5 * k) * np.cos(0.4 * j), 0.0) + noise)
-    with pytest.raises(SimulationError, match=r"2\d litres of tissue in .* too much for a head, as a body has"):
-        find_brain(Volume(image.astype(np.float32), np.diag([9.0, 9.0, 9.0, 1.0])))
-
-
 @needs_nilearn
 @pytest.mark.slow
 def test_a_turned_head_is_refused(head):
     turned = Volume(np.ascontiguousarray(np.swapaxes(head[0].array, 0, 1)), head[0].ijk_to_ras)
-    message = "no head or brain is recognised in this .* correct the orientation or the voxel size in its header"
+    message = "the atlas explains .* expected 7% or more; correct the orientation or the voxel size in its header"
     with pytest.raises(SimulationError, match=message) as caught:
         find_brain(turned)
     assert "--skull-strip none" not in str(caught.value)
@@ -199,20 +170,6 @@ def test_none_takes_everything_brighter_than_the_background():
     values = np.where(radius < 1, 100.0, 0.0) + np.random.default_rng(0).normal(0, 3, radius.shape)
     result = find_brain(empty.with_array(np.maximum(values, 0.0).astype(np.float32)), "none")
     assert result.method == "none" and result.volume_ml == pytest.approx(1307, rel=0.05)
-
-
-@needs_nilearn
-@pytest.mark.slow
-def test_a_ct_head_whose_air_is_0_is_told_from_an_mri_by_its_flat_brain(head, found):
-    mri, inside = head
-    rng = np.random.default_rng(0)
-    skull = ndimage.binary_dilation(inside, iterations=4) & ~ndimage.binary_dilation(inside, iterations=2)
-    array = np.where(mri.array > 30, 1024.0, 0.0) + 0.1 * np.where(inside, mri.array, 0.0)  # 20 HU between tissues
-    array[skull] = 2000.0
-    ct = mri.with_array((array + rng.normal(0, 8, array.shape)).astype(np.float32))
-    recognition._head(mri, CoarseImage.of(mri), found.alignment)  # the MRI is taken
-    with pytest.raises(SimulationError, match=r"brain in this head differ by \d%, as in CT, expected 10% or more"):
-        recognition._head(ct, CoarseImage.of(ct), found.alignment)
 
 
 # ---- extraction ------------------------------------------------------------------------------------------------------
@@ -340,18 +297,6 @@ def test_a_kept_mask_is_read_instead_of_extracted_again(head, found):
     assert np.array_equal(again.mask.array, result.mask.array)
 
 
-@needs_nilearn
-def test_a_mask_that_was_asked_for_by_name_is_reported(head, found, monkeypatch):
-    """Auto took a doubtful mask of the atlas, for which it would itself have asked the other programs."""
-    monkeypatch.setattr(extractors, "robex_folder", lambda: Path("robex"))
-    monkeypatch.setattr(extractors, "has_deepbet", lambda: False)
-    said = "asked for by name (--skull-strip robex may be better)"
-    assert said in find_brain(head[0], keep_at=found.place).message
-    assert said not in find_brain(head[0], "atlas", keep_at=found.place).message
-    monkeypatch.setattr(extractors, "robex_folder", lambda: None)
-    assert "by name" not in find_brain(head[0], keep_at=found.place).message
-
-
 def save_edited(place, array, path):
     """Save other voxels with the notes of the kept mask at `place`, as an editor does."""
     image = sitk.ReadImage(str(place))
@@ -454,24 +399,6 @@ def test_the_share_of_a_lesion_outside_the_mask_is_found_on_another_grid():
 
 @needs_nilearn
 @pytest.mark.slow
-def test_a_mask_that_cuts_the_vertex_is_reported_and_a_whole_one_is_not(head, found):
-    mri = head[0]
-    whole = found.result.mask.array > 0
-    assert cut_off(mri, whole) == ()
-    cut = whole.copy()
-    top = np.flatnonzero(whole.any(axis=(1, 2))).max()
-    cut[top - 6 :] = False
-    (warning,) = cut_off(mri, cut)
-    assert "at the top; check the cortex there" in warning
-    assert given_brain(mri.with_array(cut.astype(np.uint8)), mri).warnings == (warning,)
-    cut = whole.copy()
-    cut[: (top + np.flatnonzero(whole.any(axis=(1, 2))).min()) // 2] = False
-    (warning,) = cut_off(mri, cut)
-    assert "at the bottom; check the cortex there" in warning
-
-
-@needs_nilearn
-@pytest.mark.slow
 def test_false_voxels_off_the_brain_and_labels_in_a_mask_are_reported(head):
     mri, brain = head
     rng = np.random.default_rng(0)
@@ -531,14 +458,6 @@ def test_a_mask_may_be_a_probability_and_an_image_is_none():
     image = inside * np.clip(mri.array / 150.0, 0.0, 1.0)  # as intensities scaled from 0 to 1
     with pytest.raises(SimulationError, match="is it an image"):
         given_brain(mri.with_array(image.astype(np.float32)), mri)
-
-
-@needs_nilearn
-def test_inverted_intensities_are_refused_at_once(head):
-    mri = head[0]
-    refusal = "the intensities are inverted, or it has a bright border; expected an MRI with a dark background"
-    with pytest.raises(SimulationError, match=refusal):
-        find_brain(mri.with_array(mri.array.max() - np.maximum(mri.array, 5.0)))
 
 
 def test_a_head_segmented_whole_by_the_users_wish_is_reported():

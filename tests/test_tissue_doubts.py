@@ -12,12 +12,7 @@ from scipy import ndimage
 
 from SlicerUSSim.Logic import SimulationError, segment_mri
 from SlicerUSSim.Logic.mri.classification import Classes
-from SlicerUSSim.Logic.mri.plausibility import (
-    csf_is_doubtful,
-    faint,
-    require_order,
-    require_several_tissues,
-)
+from SlicerUSSim.Logic.mri.plausibility import require_order, unsure
 from validation.brain_phantoms import TissueMaps, phantom, tissue_maps
 from validation.brain_scores import scores
 
@@ -67,19 +62,16 @@ def test_tissues_in_the_order_of_another_contrast_are_refused():
     assert require_order(classes_of([10.6, 130.4, 277.5]), "t1", True) == []
 
 
-def test_one_tissue_alone_is_no_brain():
-    posteriors = np.zeros((3, 1000))
-    posteriors[1] = 1.0
-    posteriors[:, :12] = [[1.0], [0.0], [0.0]]
-    with pytest.raises(SimulationError, match=r"98.8% of the voxels are grey matter, expected several tissues"):
-        require_several_tissues(classes_of([1, 2, 3], posteriors))
-    require_several_tissues(classes_of([1, 2, 3]))
+def test_one_warning_says_how_sure_labels_are_and_why():
+    class Found:
+        grey_white_contrast = 1.4
 
-
-def test_grey_and_white_matter_that_noise_hides_are_reported():
-    (line,) = faint(classes_of([10, 136, 125]), noise=10.0)
-    assert "differ by 1.1 times the noise" in line
-    assert faint(classes_of([10, 160, 220]), noise=10.0) == []
+    (line,) = unsure(Found, 0.11)
+    assert "the atlas explains 11% of this image" in line and "differ by 1.4 times the noise only" in line
+    (line,) = unsure(Found, None)  # without an atlas
+    assert "the atlas" not in line
+    Found.grey_white_contrast = 4.0
+    assert unsure(Found, 0.5) == []
 
 
 @pytest.mark.long
@@ -99,10 +91,3 @@ def test_an_mri_as_z_scores_gets_the_labels_of_the_mri():
     assert any("values below 0 in the brain" in line for line in scored.notes)
     assert not any("below 0" in line for line in raw.notes)
     assert scored.means[0] < 0.0 < scored.means[2]  # in the unit of the image
-
-
-def test_csf_that_is_nearly_as_bright_as_grey_matter_is_reported():
-    near, far = classes_of([124.0, 142.0, 176.0]), classes_of([27.0, 136.0, 174.0])
-    (line,) = csf_is_doubtful(near, "t1gd")
-    assert line.startswith("csf (124) is nearer to grey matter (142) than that to white matter (176)")
-    assert csf_is_doubtful(far, "t1gd") == []
