@@ -66,7 +66,8 @@ def test_the_atlas_decides_between_grey_and_white_that_hardly_differ():
     found = segment_mri(mri, contrast="t1", mask=mask)
     assert found.labels.spacing_mm.max() == 2.0
     truth, labels = np.where(maps.mask, maps.shares.argmax(axis=0) + 1, 0), on(grid, found.labels)
-    for label, least in ((2, 0.8), (3, 0.75)):
+    # 0.70 and 0.73 with the atlas as weak as elsewhere
+    for label, least in ((2, 0.78), (3, 0.78)):
         assert overlap(labels == label, truth == label) > least
     assert any("the atlas decides between them" in line for line in found.warnings)
 

@@ -25,15 +25,8 @@ from SlicerUSSim.Logic.mri.coarse import CoarseImage, resampled_to_ras
 _PITCHES, _SIZES = (-30.0, -15.0, 0.0, 15.0, 30.0), (-10.0, 4.0)
 #: Expected size: brains of adults have 1000 to 1900 ml, the template (with its CSF) 1886 ml.
 _EXPECTED_SIZE, _SIZE_SPREAD = -5.0, 12.0
-#: The same of small heads, as of children and of wrong voxel sizes, and where the search for them starts
-_SMALL_SIZE, _SMALL_SIZES = -28.0, (-34.0, -22.0)
-#: Brains of adults differ by less than this in size; relative to the template, in one direction.
-SIZES = (0.74, 1.15)
-#: Up to this agreement it is asked whether the head is small, and the position is doubtful: back to front, a T1 had
-#: 0.23, and 0.31 with twice its height.
-DOUBTFUL_AGREEMENT = 0.4
-#: Ratio of agreements from which a small head was found where an adult's was looked for: such had 1.8 to 4
-_CLEARLY_BETTER = 1.15
+#: Up to this agreement a fit is repeated without fat. Plain T1s have 0.4 to 0.88, T2s and thick slices 0.1 to 0.4
+_DOUBTFUL_AGREEMENT = 0.4
 #: Agreement of rigid fits below which no affine one is tried
 _HOPELESS = 0.11
 #: Brighter than so many times the inner brain is fat, which drags the fit outwards; depth of that brain, mm; and its
@@ -73,19 +66,14 @@ def align_template(mri: Volume, progress: Callable[[float], None] | None = None)
     """The template's brain in the MRI of a head. Raises SimulationError if nilearn is not installed.
 
     Where the best rigid fit is hopeless, it is returned without the affine one. If a fit is doubtful, fat is set to air
-    and the fit repeated; if it still is, a head of 0.65 to 0.85 times an adult's size is looked for.
+    and the fit repeated.
     """
     report = progress or (lambda share: None)
-    image = CoarseImage.of(mri)
-    found = _aligned(image, lambda share: report(0.5 * share), is_small=False)
-    if found.agreement < DOUBTFUL_AGREEMENT:
-        image = CoarseImage.of(_without_fat(mri, found.template_to_ras))
-        again = _aligned(image, lambda share: report(0.5 + 0.25 * share), is_small=False)
+    found = _aligned(CoarseImage.of(mri), lambda share: report(0.5 * share))
+    if found.agreement < _DOUBTFUL_AGREEMENT:
+        folded = CoarseImage.of(_without_fat(mri, found.template_to_ras))
+        again = _aligned(folded, lambda share: report(0.5 + 0.5 * share))
         found = max(found, again, key=lambda fit: fit.agreement)
-    if found.agreement < DOUBTFUL_AGREEMENT or not SIZES[0] <= found.size <= SIZES[1]:
-        small = _aligned(image, lambda share: report(0.75 + 0.25 * share), is_small=True)
-        if small.agreement > _CLEARLY_BETTER * found.agreement:
-            found = small
     report(1.0)
     return found
 
@@ -101,12 +89,9 @@ def _without_fat(mri: Volume, template_to_ras: np.ndarray) -> Volume:
     return mri.with_array(np.where(values - air > _FAT * brain, air, values).astype(np.float32))
 
 
-def _aligned(image: CoarseImage, progress: Callable[[float], None], *, is_small: bool) -> Alignment:
-    brain, report = template(), progress
-    search = _Search(image, _SMALL_SIZE if is_small else _EXPECTED_SIZE)
-    blurred = search.of(image.smoothed(4.0))
-    sizes = _SMALL_SIZES if is_small else _SIZES
-    starts = [start for _, start in blurred.starts(_PITCHES, sizes, 14.0, 30)]
+def _aligned(image: CoarseImage, report: Callable[[float], None]) -> Alignment:
+    brain, search, blurred = template(), _Search(image), _Search(image.smoothed(4.0))
+    starts = [start for _, start in blurred.starts(_PITCHES, _SIZES, 14.0, 30)]
     report(0.15)
     found = []
     for number, start in enumerate(starts):
@@ -131,11 +116,6 @@ def _aligned(image: CoarseImage, progress: Callable[[float], None], *, is_small:
 @dataclass(frozen=True, eq=False)
 class _Search:
     image: CoarseImage
-    #: Log percent of the template's size
-    expected_size: float = _EXPECTED_SIZE
-
-    def of(self, image: CoarseImage) -> _Search:
-        return _Search(image, self.expected_size)
 
     def aligned(self, p: np.ndarray) -> Alignment:
         """The alignment by parameters, with its agreement."""
@@ -163,7 +143,7 @@ class _Search:
 
     def cost(self, p: np.ndarray, points: Points) -> float:
         values = self.image.at(points.from_centre @ self.linear(p).T + p[:3])
-        return 0.01 * ((p[6] - self.expected_size) / _SIZE_SPREAD) ** 2 - points.information(values)
+        return 0.01 * ((p[6] - _EXPECTED_SIZE) / _SIZE_SPREAD) ** 2 - points.information(values)
 
     def improved(self, start, points: Points, scale: float, iterations: int, ftol=1e-4) -> tuple[np.ndarray, float]:
         from scipy.optimize import minimize

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -48,18 +48,14 @@ class Classes:
     means: np.ndarray
     standard_deviations: np.ndarray
     mixture: TissueMixture
+    #: Difference of grey and white matter in deviations of the noise, over all channels, before the atlas decides
+    grey_white_contrast: float = np.inf
 
     @property
     def grey_and_white(self) -> tuple[float, float]:
         """Means of grey and white matter in the first channel."""
         grey, white = (float(self.means[self.names.index(name), 0]) for name in ("grey matter", "white matter"))
         return grey, white
-
-    @property
-    def grey_white_contrast(self) -> float:
-        """Difference of grey and white matter in standard deviations of the fitted noise, over all channels."""
-        apart = self.mixture.means[2] - self.mixture.means[1]
-        return float(np.sqrt(apart @ np.linalg.solve(self.mixture.covariance, apart)))
 
     @property
     def shares(self) -> np.ndarray:
@@ -103,10 +99,12 @@ def classify(
     Posteriors assume `blur` times the noise of the fit.
     """
     found = _classified(values, contrasts, names, prior, _PRIOR_EXPONENT, blur, voxel_mm)
-    exponent = float(np.interp(found.grey_white_contrast, FAINT, (_STRONG_EXPONENT, _PRIOR_EXPONENT)))
-    if prior is None or exponent == _PRIOR_EXPONENT:
-        return found
-    return _classified(values, contrasts, names, prior, exponent, blur, voxel_mm)
+    apart = found.mixture.means[2] - found.mixture.means[1]
+    contrast = float(np.sqrt(apart @ np.linalg.solve(found.mixture.covariance, apart)))
+    exponent = float(np.interp(contrast, FAINT, (_STRONG_EXPONENT, _PRIOR_EXPONENT)))
+    if prior is not None and exponent > _PRIOR_EXPONENT:
+        found = _classified(values, contrasts, names, prior, exponent, blur, voxel_mm)
+    return replace(found, grey_white_contrast=contrast)
 
 
 def _classified(

@@ -14,7 +14,7 @@ from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.mri.alignment import Alignment, align_template, explained
 from SlicerUSSim.Logic.mri.atlas import mni152
 from SlicerUSSim.Logic.mri.atlas_registration import WHOLE_BRAIN_ML
-from SlicerUSSim.Logic.mri.coarse import CoarseImage, largest_component
+from SlicerUSSim.Logic.mri.coarse import largest_component
 from SlicerUSSim.Logic.mri.ct_unit import looks_like_ct
 from SlicerUSSim.Logic.mri.no_data import edge_value
 
@@ -23,11 +23,8 @@ USUAL_ML, POSSIBLE_ML = (1000.0, 1900.0), (500.0, 2600.0)
 #: Share of an image that the atlas's tissues have to explain (alignment.explained). Heads had 0.10 (6.5 mm slices) to
 #: 0.60; phantoms, bodies, noise, ultrasound and heads upside down 0.01 to 0.07
 LEAST_EXPLAINED = 0.07
-#: Overlap (Dice) of the foreground with the aligned brain from which nothing else is shown: brains on noise had 0.94 to
-#: 0.96, small whole heads, over which the template was spread, 0.85 to 0.90
-_STRIPPED_OVERLAP = 0.915
-#: Volume of what may be a head
-_HEAD_ML = (900.0, 9000.0)
+#: Brighter than this part of the brain is tissue; a head has it in more than that share of what is 8 to 24 mm around
+_BRIGHT, _LEAST_AROUND = 0.25, 0.06
 #: More different values are an image.
 _MOST_LABELS = 12
 
@@ -46,45 +43,32 @@ def recognise(mri: Volume, progress: Callable[[float], None] | None = None) -> S
     """What the image shows. Raises SimulationError, with how well the atlas fits, for neither a brain nor a head."""
     check_finite(mri)
     check_intensities(mri)
-    require_no_hounsfield(mri)
+    require_no_ct(mri)
     stripped = stripped_brain(mri)
     if stripped is not None or mni152() is None:
         return Shown(stripped)
     alignment = align_template(mri, progress)
     share = explained(mri, alignment.template_to_ras)
     if share < LEAST_EXPLAINED:
-        is_ct = looks_like_ct(mri)
         size = " x ".join(f"{n * mm:.0f}" for n, mm in zip(mri.array.shape[::-1], mri.spacing_mm, strict=True))
         raise SimulationError(
             f"no head or brain is recognised in this {size} mm image: the atlas explains {share:.0%} of it, expected "
-            f"{LEAST_EXPLAINED:.0%} or more; "
-            + (
-                "its values are those of a CT, which is segmented with --ct (contrast ct)"
-                if is_ct
-                else "correct the orientation or the voxel size in its header, or give a brain mask (--mask)"
-            )
+            f"{LEAST_EXPLAINED:.0%} or more; correct the orientation or the voxel size in its header, or give a brain "
+            "mask (--mask)"
         )
-    inside, brain = above_noise(mri), alignment.brain_on(mri) < 0.0
-    overlap = float(2.0 * (inside & brain).sum() / max(int(inside.sum() + brain.sum()), 1))
-    return Shown(inside if overlap >= _STRIPPED_OVERLAP else None, alignment)
+    distance, air = alignment.brain_on(mri), float(np.percentile(mri.array, 1.0))
+    level = air + _BRIGHT * (float(np.median(mri.array[distance < -8.0])) - air)
+    around = mri.array[(distance > 8.0) & (distance < 24.0)]
+    return Shown(None if np.mean(around > level) > _LEAST_AROUND else above_noise(mri), alignment)
 
 
-def is_head_sized(mri: Volume) -> bool:
-    """Whether what is brighter than air has the volume of a head, as a fast guess before `recognise`."""
-    image = CoarseImage.of(mri)
-    millilitres = image.foreground.sum() * image.spacing_mm**3 / 1000.0
-    return bool(_HEAD_ML[0] <= millilitres <= _HEAD_ML[1])
-
-
-def require_no_hounsfield(mri: Volume) -> None:
-    """Raise SimulationError for an image with air at -1000, as a CT has."""
-    values = mri.array
-    low, high = float(values.min()), float(values.max())
-    air = float(np.percentile(values[::3, ::3, ::3], 5.0))
+def require_no_ct(mri: Volume) -> None:
+    """Raise SimulationError for an image with the numbers of a CT, also with an offset."""
+    low, high = float(mri.array.min()), float(mri.array.max())
     require(
-        not (low <= -900.0 and air < -500.0),
-        f"image has values from {low:g} to {high:g}, as CT has (Hounsfield units; air is -1000), expected an MRI; "
-        "segment a CT with --ct (contrast ct); if it is an MRI, set its background to 0",
+        not looks_like_ct(mri),
+        f"image has values from {low:g} to {high:g}, as CT has (Hounsfield units, air and soft tissue 1000 apart), "
+        "expected an MRI; segment a CT with --ct (contrast ct)",
     )
 
 

@@ -22,7 +22,7 @@ from SlicerUSSim.Logic.mri.filtering import denoised, estimate_noise as estimate
 from SlicerUSSim.Logic.mri.nuclei import with_nuclei
 from SlicerUSSim.Logic.mri.outside import find_outside, require_findable, watery
 from SlicerUSSim.Logic.mri.plausibility import require_contrast
-from SlicerUSSim.Logic.mri.recognition import check_intensities, require_no_hounsfield
+from SlicerUSSim.Logic.mri.recognition import check_intensities, require_no_ct
 from SlicerUSSim.Logic.mri.segmentation_settings import SegmentationSettings
 from SlicerUSSim.Logic.mri.segmentation_steps import (
     BrainPart,
@@ -215,7 +215,7 @@ def segment_mri(
             image, settings.skull_strip, keep_at=keep_mask_at, progress=lambda share: told(begin * share)
         )
     else:
-        require_no_hounsfield(mri)
+        require_no_ct(mri)
         brain = given_brain(mask, mri)
         require(
             not others or brain.volume_ml >= _LEAST_TO_REGISTER_ML,
