@@ -12,7 +12,7 @@ from scipy import ndimage
 
 from SlicerUSSim.Logic import SimulationError, segment_mri
 from SlicerUSSim.Logic.mri.classification import Classes
-from SlicerUSSim.Logic.mri.plausibility import require_order, unsure
+from SlicerUSSim.Logic.mri.plausibility import in_other_order, unsure
 from validation.brain_phantoms import TissueMaps, phantom, tissue_maps
 from validation.brain_scores import scores
 
@@ -54,12 +54,10 @@ def classes_of(means, posteriors=None, names=("csf", "grey matter", "white matte
     return Classes(names, posteriors, means, np.ones_like(means), None)
 
 
-def test_tissues_in_the_order_of_another_contrast_are_refused():
-    t2_as_t1 = classes_of([10.6, 277.5, 130.4])
-    with pytest.raises(SimulationError, match=r"grey matter 277.5, white matter 130.4\): choose t2 or flair"):
-        require_order(t2_as_t1, "t1", True)
-    assert len(require_order(t2_as_t1, "t1", False)) == 1
-    assert require_order(classes_of([10.6, 130.4, 277.5]), "t1", True) == []
+def test_tissues_in_the_order_of_another_contrast_are_reported():
+    (line,) = in_other_order(classes_of([10.6, 277.5, 130.4]), "t1")
+    assert "(csf 10.6, grey matter 277.5, white matter 130.4): check the contrast" in line
+    assert in_other_order(classes_of([10.6, 130.4, 277.5]), "t1") == []
 
 
 def test_one_warning_says_how_sure_labels_are_and_why():

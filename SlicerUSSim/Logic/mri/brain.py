@@ -24,7 +24,6 @@ from SlicerUSSim.Logic.mri.recognition import (
     USUAL_ML,
     above_noise,
     recognise,
-    stripped_brain,
 )
 from SlicerUSSim.Logic.mri.refinement import on_grid, refined, signed_distance
 from SlicerUSSim.Logic.mri.segmentation_settings import SegmentationSettings
@@ -76,7 +75,7 @@ def find_brain(
         inside = above_noise(mri)
         mask, millilitres = mri.with_array(inside.astype(np.uint8)), _millilitres(inside, mri)
         message = f"everything brighter than the background, {millilitres:.0f} ml"
-        return BrainMask(mask, "none", message, _head_warnings(millilitres), perf_counter() - start)
+        return BrainMask(mask, "none", message, volume_warnings(millilitres), perf_counter() - start)
     kept = _kept(keep_at, mri, method) if keep_at is not None else None
     if kept is not None:
         return kept
@@ -87,16 +86,15 @@ def find_brain(
         f"the image is {'x'.join(f'{mm:g}' for mm in size)} mm large, expected a head of 100 to 400 mm; correct its "
         "voxel size, or the unit of length in its header",
     )
-    _require_program(method, mri)
-    shown = recognise(mri, lambda share: report(0.6 * share))
-    if shown.stripped is not None:
-        mask = mri.with_array(shown.stripped.astype(np.uint8)).along(given)
-        millilitres = _millilitres(shown.stripped, mri)
+    stripped, alignment = recognise(mri, lambda share: report(0.6 * share))
+    if stripped is not None:
+        mask = mri.with_array(stripped.astype(np.uint8)).along(given)
+        millilitres = _millilitres(stripped, mri)
         message = f"skull-stripped brain, {millilitres:.0f} ml"
         if method != "auto":
             message += f"; {_NAMES[method]} is not asked, as there is no skull to strip"
         return BrainMask(mask, "stripped", message, volume_warnings(millilitres), perf_counter() - start)
-    found = _extracted(mri, shown.alignment, method, lambda share: report(0.6 + 0.35 * share))
+    found = _extracted(mri, alignment, method, lambda share: report(0.6 + 0.35 * share))
     inside, blank = without_blank(mri, found.inside)
     millilitres = _millilitres(inside, mri)
     warnings = (
@@ -219,18 +217,6 @@ def _by(name: str, mri: Volume, expected: np.ndarray | None, report: Report) -> 
     return refined(mri, distance, core_mm=6.0, reach_mm=12.0, keep_mm=2.0)
 
 
-def _require_program(method: str, mri: Volume) -> None:
-    """Raise SimulationError for a program that is not installed, before the seconds of recognising the image.
-
-    A skull-stripped brain does not need one.
-    """
-    is_missing = (method == "deepbet" and not extractors.has_deepbet()) or (
-        method == "robex" and extractors.robex_folder() is None
-    )
-    if is_missing and stripped_brain(mri) is None:
-        extractors.require_deepbet() if method == "deepbet" else extractors.require_robex()
-
-
 def _dice(one: np.ndarray, other: np.ndarray) -> float:
     return float(2.0 * (one & other).sum() / max(int(one.sum()) + int(other.sum()), 1))
 
@@ -253,15 +239,6 @@ def _kept(path: Path, mri: Volume, method: str) -> BrainMask | None:
     if not kept.is_edited:
         return BrainMask(mask, kept.method, message, kept.warnings, 0.0)
     return BrainMask(mask, "given", message, mask_doubts(mri, kept.inside))
-
-
-def _head_warnings(millilitres: float) -> tuple[str, ...]:
-    if millilitres <= USUAL_ML[1]:
-        return ()
-    return (
-        f"{millilitres:.0f} ml are segmented, more than a brain has ({USUAL_ML[0]:.0f} to {USUAL_ML[1]:.0f} ml): if "
-        "this is a whole head, its skull and scalp become brain tissues; --skull-strip auto finds the brain",
-    )
 
 
 def _millilitres(inside: np.ndarray, grid: Volume) -> float:

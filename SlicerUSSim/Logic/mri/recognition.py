@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import cast
 
 import numpy as np
@@ -29,24 +28,19 @@ _BRIGHT, _LEAST_AROUND = 0.25, 0.06
 _MOST_LABELS = 12
 
 
-@dataclass(frozen=True, eq=False)
-class Shown:
-    """What an image shows."""
+def recognise(
+    mri: Volume, progress: Callable[[float], None] | None = None
+) -> tuple[np.ndarray | None, Alignment | None]:
+    """((k, j, i) True in the brain of a skull-stripped image, None for a head; the fitted atlas where it was needed).
 
-    #: (k, j, i) True in the brain of a skull-stripped image; None for a whole head
-    stripped: np.ndarray | None
-    #: None without the atlas, or where it was not needed
-    alignment: Alignment | None = None
-
-
-def recognise(mri: Volume, progress: Callable[[float], None] | None = None) -> Shown:
-    """What the image shows. Raises SimulationError, with how well the atlas fits, for neither a brain nor a head."""
+    Raises SimulationError, with how well the atlas fits, if the image shows neither a brain nor a head.
+    """
     check_finite(mri)
     check_intensities(mri)
     require_no_ct(mri)
     stripped = stripped_brain(mri)
     if stripped is not None or mni152() is None:
-        return Shown(stripped)
+        return stripped, None
     alignment = align_template(mri, progress)
     share = explained(mri, alignment.template_to_ras)
     if share < LEAST_EXPLAINED:
@@ -59,7 +53,7 @@ def recognise(mri: Volume, progress: Callable[[float], None] | None = None) -> S
     distance, air = alignment.brain_on(mri), float(np.percentile(mri.array, 1.0))
     level = air + _BRIGHT * (float(np.median(mri.array[distance < -8.0])) - air)
     around = mri.array[(distance > 8.0) & (distance < 24.0)]
-    return Shown(None if np.mean(around > level) > _LEAST_AROUND else above_noise(mri), alignment)
+    return None if np.mean(around > level) > _LEAST_AROUND else above_noise(mri), alignment
 
 
 def require_no_ct(mri: Volume) -> None:

@@ -20,8 +20,8 @@ from SlicerUSSim.Logic.mri.bias import corrected
 from SlicerUSSim.Logic.mri.classification import Classes
 from SlicerUSSim.Logic.mri.plausibility import (
     implausible,
+    in_other_order,
     is_whole_brain,
-    require_order,
     unsure,
 )
 from SlicerUSSim.Logic.mri.recognition import check_finite
@@ -153,11 +153,8 @@ def doubts(
     atlas: AtlasFit | None,
     contrasts: tuple[str, ...],
 ) -> list[str]:
-    """What the user should check.
-
-    Raises SimulationError for tissues in the order of another contrast.
-    """
-    lines = require_order(found, contrasts[0], atlas is not None) if len(contrasts) == 1 else []
+    """What the user should check."""
+    lines = in_other_order(found, contrasts[0]) if len(contrasts) == 1 else []
     lines += implausible(found, float(part.inside.sum()) * part.images[0].voxel_ml, contrasts[0])
     fits = None if atlas is None else explained(part.images[0], np.linalg.inv(atlas.patient_to_atlas))
     return lines + unsure(found, fits)
