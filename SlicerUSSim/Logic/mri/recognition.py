@@ -10,7 +10,7 @@ from scipy import ndimage
 
 from SlicerUSSim.Logic.base.errors import SimulationError, require, require_kind
 from SlicerUSSim.Logic.base.volume import Volume
-from SlicerUSSim.Logic.mri.alignment import Alignment, align_template, explained
+from SlicerUSSim.Logic.mri.alignment import Alignment, align_template
 from SlicerUSSim.Logic.mri.atlas import mni152
 from SlicerUSSim.Logic.mri.atlas_registration import WHOLE_BRAIN_ML
 from SlicerUSSim.Logic.mri.coarse import largest_component
@@ -42,7 +42,7 @@ def recognise(
     if stripped is not None or mni152() is None:
         return stripped, None
     alignment = align_template(mri, progress)
-    share = explained(mri, alignment.template_to_ras)
+    share = alignment.explained
     if share < LEAST_EXPLAINED:
         size = " x ".join(f"{n * mm:.0f}" for n, mm in zip(mri.array.shape[::-1], mri.spacing_mm, strict=True))
         raise SimulationError(
