@@ -72,12 +72,12 @@ def test_one_warning_says_how_sure_labels_are_and_why():
     class Found:
         grey_white_contrast = 1.4
 
-    (line,) = unsure(Found, 0.11)
+    (line,) = unsure(Found, 0.11, True)
     assert "the atlas explains 11% of this image" in line and "differ by 1.4 times the noise only" in line
-    (line,) = unsure(Found, None)  # without an atlas
+    (line,) = unsure(Found, None, False)  # without an atlas
     assert "the atlas" not in line
     Found.grey_white_contrast = 4.0
-    assert unsure(Found, 0.5) == []
+    assert unsure(Found, 0.5, True) == []
 
 
 @pytest.mark.long

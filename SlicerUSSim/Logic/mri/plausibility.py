@@ -75,11 +75,11 @@ def in_other_order(found: Classes, contrast: str) -> list[str]:
     ]
 
 
-def unsure(found: Classes, explained: float | None) -> list[str]:
-    """The warning that says how sure labels are; `explained` is alignment.explained, None without an atlas."""
+def unsure(found: Classes, explained: float | None, is_led: bool) -> list[str]:
+    """The warning that says how sure labels are; `explained` is alignment.explained, None where not known."""
     apart = found.grey_white_contrast
     faint = f"grey and white matter differ by {apart:.1f} times the noise only, expected {FAINT[0]:g} or more"
-    faint += "" if explained is None else ", so that the atlas decides between them"
+    faint += ", so that the atlas decides between them" if is_led else ""
     lines = [faint] if apart < FAINT[0] else []
     if explained is not None and explained < _USUALLY_EXPLAINED:
         found_share = f"the atlas explains {explained:.0%} of this image, expected {_USUALLY_EXPLAINED:.0%} or more"

@@ -259,7 +259,7 @@ def segment_mri(
     part = BrainPart.of(images, foreground)
     raised, above = part.raised(contrasts)
     notes += raised
-    atlas, message = atlas_of(part, report)
+    atlas, message, fits = atlas_of(part, report)
     notes.append(message)
     timed("atlas")
     report(0.4)
@@ -293,7 +293,7 @@ def segment_mri(
     found = replace(found, posteriors=less_sure(smoothed_posteriors(found.posteriors, part.inside)))
     timed("neighbours")
     report(0.9)
-    warnings += doubts(found, part, atlas, contrasts)
+    warnings += doubts(found, part, contrasts, fits, atlas is not None)
 
     labels = np.zeros(part.inside.shape, np.uint8)
     labels[part.inside] = found.posteriors.argmax(axis=0) + 1
