@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from SlicerUSSim.Logic.base.volume import Volume
-from SlicerUSSim.Logic.mri.mask_check import follows
+from SlicerUSSim.Logic.mri.given_mask import follows
 from SlicerUSSim.Logic.mri.samples import demo_mri
 
 

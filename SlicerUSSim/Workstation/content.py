@@ -14,7 +14,7 @@ from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.imaging.preset import SECTIONS
 from SlicerUSSim.Logic.mri.ct_unit import looks_like_ct
 from SlicerUSSim.Logic.mri.markups import is_markup_name
-from SlicerUSSim.Logic.mri.recognition import is_head_sized, stripped_brain
+from SlicerUSSim.Logic.mri.recognition import stripped_brain
 from SlicerUSSim.Logic.tissue.label_files import TABLE_SUFFIXES, names_of_file
 from SlicerUSSim.Logic.tissue.label_maps import as_whole
 from SlicerUSSim.Logic.tissue.label_sources import is_label_file
@@ -92,9 +92,7 @@ def of_volume(path: Path, volume: Volume) -> Content:
         return Content(Kind.CT, f"a CT by its numbers (air near -1000), {size}", volume)
     if stripped_brain(volume) is not None:
         return Content(Kind.MRI, f"an MRI of a brain without skull, {size}", volume)
-    if is_head_sized(volume):
-        return Content(Kind.MRI, f"an MRI of a whole head, {size}", volume)
-    return Content(Kind.MRI, f"an image that has neither a brain's nor a head's size, taken for an MRI, {size}", volume)
+    return Content(Kind.MRI, f"an MRI of a whole head, {size}", volume)
 
 
 def _of_labels(path: Path, volume: Volume, size: str) -> Content:

@@ -12,8 +12,7 @@ import numpy as np
 
 from SlicerUSSim.Logic.base.errors import SimulationError, require
 from SlicerUSSim.Logic.base.volume import Volume
-from SlicerUSSim.Logic.mri.given_mask import checked_mask
-from SlicerUSSim.Logic.mri.mask_check import follows
+from SlicerUSSim.Logic.mri.given_mask import checked_mask, follows
 from SlicerUSSim.Logic.mrml.label_nodes import labels_version
 from SlicerUSSim.Logic.mrml.nodes import nodes_of_class, pose_in_labels, probe_pose, read_volume
 from SlicerUSSim.Logic.mrml.taken_sequence import FrozenRecord

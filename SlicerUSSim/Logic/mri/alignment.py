@@ -19,23 +19,17 @@ from SlicerUSSim.Logic.base.errors import required
 from SlicerUSSim.Logic.base.neighbourhood import distance_to
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.mri.atlas import mni152
-from SlicerUSSim.Logic.mri.coarse import CoarseImage
+from SlicerUSSim.Logic.mri.coarse import CoarseImage, resampled_to_ras
 
 #: Nodding of the head in degrees and size of the brain in log percent of the template, at which the search starts
 _PITCHES, _SIZES = (-30.0, -15.0, 0.0, 15.0, 30.0), (-10.0, 4.0)
 #: Expected size: brains of adults have 1000 to 1900 ml, the template (with its CSF) 1886 ml.
 _EXPECTED_SIZE, _SIZE_SPREAD = -5.0, 12.0
-#: The same of small heads, as of children and of wrong voxel sizes, and where the search for them starts
-_SMALL_SIZE, _SMALL_SIZES = -28.0, (-34.0, -22.0)
-#: Brains of adults differ by less than this in size; relative to the template, in one direction.
-SIZES = (0.74, 1.15)
-#: Up to this agreement it is asked whether the head is small, and the position is doubtful: back to front, a T1 had
-#: 0.23, and 0.31 with twice its height.
-DOUBTFUL_AGREEMENT = 0.4
-#: Ratio of agreements from which a small head was found where an adult's was looked for: such had 1.8 to 4
-_CLEARLY_BETTER = 1.15
-#: Agreement of rigid fits below which no affine one is tried
-_HOPELESS = 0.11
+#: A fit that explains less of the image is repeated without fat. Plain T1s have 0.5 to 0.97
+_DOUBTFUL = 0.45
+#: Brighter than so many times the inner brain is fat, which drags the fit outwards; depth of that brain, mm; and its
+#: least brightness as a share of the image's range, below which (CT, half a head) it is no measure of fat
+_FAT, _INNER_MM, _LEAST_INNER = 1.5, 15.0, 0.05
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,22 +38,8 @@ class Alignment:
 
     #: (4, 4) from the template's RAS millimetres to the patient's
     template_to_ras: np.ndarray
-    #: Mean squared local correlation with the template in the brain, 0 to 1: about 0.05 by chance (see docs)
-    agreement: float
-    #: Size relative to the template, as the cube root of the ratio of volumes
-    size: float
-
-    @property
-    def turn_deg(self) -> float:
-        """Angle by which the head is turned against the template, degrees."""
-        left, _, right = np.linalg.svd(self.template_to_ras[:3, :3])
-        return float(np.degrees(np.arccos(np.clip((np.trace(left @ right) - 1.0) / 2.0, -1.0, 1.0))))
-
-    @property
-    def stretch(self) -> float:
-        """Largest over smallest size of the brain relative to the template, over all directions."""
-        sizes = np.linalg.svd(self.template_to_ras[:3, :3], compute_uv=False)
-        return float(sizes[0] / sizes[-1])
+    #: Share of the image's variance that the template's tissues explain, 0 to 1; see `explained`
+    explained: float
 
     def brain_on(self, grid: Volume) -> np.ndarray:
         """(k, j, i) float32 signed distance in template millimetres to the template's brain; negative inside it."""
@@ -67,31 +47,38 @@ class Alignment:
 
 
 def align_template(mri: Volume, progress: Callable[[float], None] | None = None) -> Alignment:
-    """The template's brain in the MRI of a head. Raises SimulationError if nilearn is not installed."""
-    return align_coarse(CoarseImage.of(mri), progress)
+    """The template's brain in the MRI of a head. Raises SimulationError if nilearn is not installed.
 
-
-def align_coarse(image: CoarseImage, progress: Callable[[float], None] | None = None) -> Alignment:
-    """See align_template. Where the best rigid fit is hopeless, it is returned without the affine one.
-
-    An adult's head is looked for, and where none is found, one of 0.65 to 0.85 times its size.
+    If the fit is doubtful, fat is set to air and the fit repeated; the better one is taken.
     """
     report = progress or (lambda share: None)
-    found = _aligned(image, lambda share: report(0.75 * share), is_small=False)
-    if found.agreement < DOUBTFUL_AGREEMENT or not SIZES[0] <= found.size <= SIZES[1]:
-        small = _aligned(image, lambda share: report(0.75 + 0.25 * share), is_small=True)
-        if small.agreement > _CLEARLY_BETTER * found.agreement:
-            found = small
+
+    def fit(image: Volume, first: float) -> Alignment:
+        matrix = _aligned(CoarseImage.of(image), lambda share: report(first + 0.5 * share))
+        return Alignment(matrix, explained(mri, matrix))
+
+    found = fit(mri, 0.0)
+    if found.explained < _DOUBTFUL:
+        found = max(found, fit(_without_fat(mri, found.template_to_ras), 0.5), key=lambda each: each.explained)
     report(1.0)
     return found
 
 
-def _aligned(image: CoarseImage, progress: Callable[[float], None], *, is_small: bool) -> Alignment:
-    brain, report = template(), progress
-    search = _Search(image, _SMALL_SIZE if is_small else _EXPECTED_SIZE)
-    blurred = search.of(image.smoothed(4.0))
-    sizes = _SMALL_SIZES if is_small else _SIZES
-    starts = [start for _, start in blurred.starts(_PITCHES, sizes, 14.0, 30)]
+def _without_fat(mri: Volume, template_to_ras: np.ndarray) -> Volume:
+    """The image with everything much brighter than the inner brain set to air, at full resolution."""
+    values = mri.array.astype(np.float32)
+    air, high = np.percentile(values[::2, ::2, ::2], (1.0, 99.5))
+    inner = values[template().distance_on(mri, template_to_ras) < -_INNER_MM]
+    brain = float(np.median(inner)) - air if inner.size else 0.0
+    if brain < _LEAST_INNER * (high - air):
+        return mri
+    return mri.with_array(np.where(values - air > _FAT * brain, air, values).astype(np.float32))
+
+
+def _aligned(image: CoarseImage, report: Callable[[float], None]) -> np.ndarray:
+    """(4, 4) template_to_ras."""
+    brain, search, blurred = template(), _Search(image), _Search(image.smoothed(4.0))
+    starts = [start for _, start in blurred.starts(_PITCHES, _SIZES, 14.0, 30)]
     report(0.15)
     found = []
     for number, start in enumerate(starts):
@@ -101,31 +88,17 @@ def _aligned(image: CoarseImage, progress: Callable[[float], None], *, is_small:
     found = [search.improved(best, brain.coarse, 1.0, 2) for best, _ in found[:5]]
     found.sort(key=lambda pair: pair[1])
     report(0.6)
-    rough = [search.aligned(best) for best, _ in found]
-    if max(fit.agreement for fit in rough) < _HOPELESS:
-        report(1.0)
-        return rough[0]
     fits = [search.improved(best, brain.fine, 0.7, 2) for best, _ in found[:2]]
     best = np.concatenate([min(fits, key=lambda pair: pair[1])[0], np.zeros(5)])
     report(0.8)
     best, _ = search.improved(best, brain.fine, 0.5, 3)
     report(1.0)
-    return search.aligned(best)
+    return search.matrix(best)
 
 
 @dataclass(frozen=True, eq=False)
 class _Search:
     image: CoarseImage
-    #: Log percent of the template's size
-    expected_size: float = _EXPECTED_SIZE
-
-    def of(self, image: CoarseImage) -> _Search:
-        return _Search(image, self.expected_size)
-
-    def aligned(self, p: np.ndarray) -> Alignment:
-        """The alignment by parameters, with its agreement."""
-        matrix = self.matrix(p)
-        return Alignment(matrix, agreement(self.image, matrix), float(np.cbrt(abs(np.linalg.det(matrix[:3, :3])))))
 
     def linear(self, p: np.ndarray) -> np.ndarray:
         """(3, 3) of parameters: 3 mm, 3 degrees, log percent of size; affine: 2 log percent of shape, 3 shears."""
@@ -148,7 +121,7 @@ class _Search:
 
     def cost(self, p: np.ndarray, points: Points) -> float:
         values = self.image.at(points.from_centre @ self.linear(p).T + p[:3])
-        return 0.01 * ((p[6] - self.expected_size) / _SIZE_SPREAD) ** 2 - points.information(values)
+        return 0.01 * ((p[6] - _EXPECTED_SIZE) / _SIZE_SPREAD) ** 2 - points.information(values)
 
     def improved(self, start, points: Points, scale: float, iterations: int, ftol=1e-4) -> tuple[np.ndarray, float]:
         from scipy.optimize import minimize
@@ -233,7 +206,7 @@ def entropy(shares: np.ndarray) -> float:
 
 
 class Template:
-    """The MNI152 T1 at 5 mm: points for the search, an image for the agreement, and the distance to its brain."""
+    """The MNI152 T1 at 5 mm: points for the search, and the distance to its brain."""
 
     def __init__(self) -> None:
         t1 = required(mni152(), "the brain atlas needs nilearn; install it with: pip install nilearn").t1
@@ -243,28 +216,16 @@ class Template:
         outside, inside = (np.maximum(distance_to(side), 0.0) for side in (brain, ~brain))
         self.distance = t1.with_array((outside - inside).astype(np.float32))
         smooth = ndimage.gaussian_filter(t1.array.astype(np.float32), TEMPLATE_MM / 2.4)
-        self.image, self.is_brain = smooth[step, step, step], brain[step, step, step]
+        image, is_brain = smooth[step, step, step], brain[step, step, step]
         used = self.distance.array[step, step, step] <= _RING_MM
         k, j, i = np.indices(used.shape)
         grid = TEMPLATE_MM * np.stack([i, j, k], axis=-1)
         grid_xyz = grid @ t1.ijk_to_ras[:3, :3].T + t1.ijk_to_ras[:3, 3]
-        self.brain_xyz = grid_xyz[self.is_brain]
-        self.centre = self.brain_xyz.mean(axis=0)
-        self.model = np.where(self.is_brain, self.image / self.image.max(), 0.0).astype(np.float32)
-        self._weight = self._windows(self.is_brain.astype(np.float32))
-        mean = self.local_mean(self.model)
-        self.local = mean, self.local_mean(self.model**2) - mean**2
-        borders = np.quantile(self.image[self.is_brain], np.arange(1, _TEMPLATE_BINS - 1) / (_TEMPLATE_BINS - 1))
-        classes = np.where(self.is_brain, np.digitize(self.image, borders) + 1, 0)
+        self.centre = grid_xyz[is_brain].mean(axis=0)
+        borders = np.quantile(image[is_brain], np.arange(1, _TEMPLATE_BINS - 1) / (_TEMPLATE_BINS - 1))
+        classes = np.where(is_brain, np.digitize(image, borders) + 1, 0)
         coarse = used & (k % 2 == 0) & (j % 2 == 0) & (i % 2 == 0)
         self.fine, self.coarse = (Points(grid_xyz[at], classes[at], self.centre) for at in (used, coarse))
-
-    def _windows(self, values: np.ndarray) -> np.ndarray:
-        return ndimage.gaussian_filter(values, 10.0 / TEMPLATE_MM)[self.is_brain]
-
-    def local_mean(self, values: np.ndarray) -> np.ndarray:
-        """(points of the brain,) means in Gaussian windows of 10 mm deviation of (k, j, i) values, 0 outside it."""
-        return self._windows(values) / self._weight
 
     def distance_on(self, grid: Volume, template_to_ras: np.ndarray) -> np.ndarray:
         matrix = self.distance.ras_to_ijk @ np.linalg.inv(template_to_ras) @ grid.ijk_to_ras
@@ -282,17 +243,38 @@ def template() -> Template:
     return Template()
 
 
-def agreement(image: CoarseImage, template_to_ras: np.ndarray) -> float:
-    """Mean over the template's brain of the squared correlation with the patient in windows of 10 mm deviation.
+# ---- how sure a fit is: the share of the image that the template's tissues explain ----------------------------------
 
-    Local, so that neither a bias field nor the contrast matters: it asks whether borders are in the same places.
-    """
-    model = template()
-    points = model.brain_xyz @ template_to_ras[:3, :3].T + template_to_ras[:3, 3]
-    patient = np.zeros(model.is_brain.shape, np.float32)
-    patient[model.is_brain] = image.at(points)
-    mean_model, variance_model = model.local
-    mean_patient = model.local_mean(patient)
-    covariance = model.local_mean(model.model * patient) - mean_model * mean_patient
-    variances = variance_model * (model.local_mean(patient**2) - mean_patient**2)
-    return float(np.mean(covariance**2 / np.maximum(variances, 1e-10)))
+#: Voxels in which it is measured, and the width of the windows whose means are left out, as a bias field's, mm
+_SCORE_MM, _WINDOW_MM = 3, 20.0
+
+
+@cache
+def _tissues() -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """(inside (k, j, i), (n, 3) RAS points in it, weight (k, j, i), (n, 2) maps of CSF and white matter)."""
+    step = slice(None, None, _SCORE_MM)
+    atlas = required(mni152(), "the brain atlas needs nilearn; install it with: pip install nilearn")
+    inside = template().distance.array[step, step, step] < -2.0
+    points = _SCORE_MM * np.argwhere(inside)[:, ::-1] @ atlas.t1.ijk_to_ras[:3, :3].T + atlas.t1.ijk_to_ras[:3, 3]
+    weight = np.maximum(ndimage.gaussian_filter(inside.astype(np.float32), _WINDOW_MM / _SCORE_MM), 1e-3)
+    maps = (ndimage.gaussian_filter(volume.array, 1.5)[step, step, step][inside] for volume in (atlas.csf, atlas.white))
+    return inside, points, weight, np.stack([_detail(values, inside, weight) for values in maps], axis=1)
+
+
+def _detail(values: np.ndarray, inside: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    """(n,) values without their means in Gaussian windows."""
+    whole = np.zeros(inside.shape, np.float32)
+    whole[inside] = values
+    return values - (ndimage.gaussian_filter(whole, _WINDOW_MM / _SCORE_MM) / weight)[inside]
+
+
+def explained(mri: Volume, template_to_ras: np.ndarray) -> float:
+    """Share of the image's variance, without a bias field, that the template's CSF and white matter explain, 0 to 1."""
+    inside, points, weight, maps = _tissues()
+    image, origin = resampled_to_ras(_without_fat(mri, template_to_ras), 2.0)
+    index = (points @ template_to_ras[:3, :3].T + template_to_ras[:3, 3] - origin) / 2.0
+    values = ndimage.map_coordinates(ndimage.gaussian_filter(image, 0.7), index[:, ::-1].T, order=1, cval=0.0)
+    values = _detail(np.clip(values, *np.percentile(values, (1.0, 95.0))), inside, weight)
+    total = float((values**2).sum())
+    change = np.linalg.lstsq(maps, values, rcond=None)[0]
+    return 1.0 - float(((values - maps @ change) ** 2).sum()) / total if total > 0.0 else 0.0

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import logging
-from contextlib import ExitStack
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from time import perf_counter
 
@@ -14,20 +13,17 @@ from SlicerUSSim.Logic.base.declaration import parameter_of
 from SlicerUSSim.Logic.base.errors import Cancelled, SimulationError, require
 from SlicerUSSim.Logic.base.volume import LARGEST_MM, Volume
 from SlicerUSSim.Logic.mri import extractors
-from SlicerUSSim.Logic.mri.alignment import align_template
+from SlicerUSSim.Logic.mri.alignment import Alignment
 from SlicerUSSim.Logic.mri.atlas import mni152
-from SlicerUSSim.Logic.mri.extractors import Program, Report
+from SlicerUSSim.Logic.mri.extractors import Report
 from SlicerUSSim.Logic.mri.given_mask import checked_mask, label_doubts, mask_doubts, volume_warnings
 from SlicerUSSim.Logic.mri.kept_mask import keep, read_kept
-from SlicerUSSim.Logic.mri.mask_check import cut_off, ends_at_edge
-from SlicerUSSim.Logic.mri.no_data import without_blank
+from SlicerUSSim.Logic.mri.no_data import ends_at_edge, without_blank
 from SlicerUSSim.Logic.mri.recognition import (
     POSSIBLE_ML,
     USUAL_ML,
-    Shown,
     above_noise,
     recognise,
-    stripped_brain,
 )
 from SlicerUSSim.Logic.mri.refinement import on_grid, refined, signed_distance
 from SlicerUSSim.Logic.mri.segmentation_settings import SegmentationSettings
@@ -35,9 +31,6 @@ from SlicerUSSim.Logic.mri.segmentation_settings import SegmentationSettings
 _log = logging.getLogger(__name__)
 
 _NAMES = {"robex": "ROBEX", "deepbet": "deepbet", "atlas": "the atlas"}
-#: Overlap with the registered atlas above which a mask is taken without asking another method, and below which it is
-#: refused
-_SURE, _LEAST_SURE = 0.915, 0.85
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,8 +61,8 @@ def find_brain(
     Parameters
     ----------
     mri : the image, with its orientation and voxel size as in the patient.
-    method : how a brain is extracted from a whole head: "robex", "deepbet" or "atlas"; "auto" for the atlas, and for
-        the programs that are installed if its result is doubtful; "none" takes everything brighter than the background,
+    method : how a brain is extracted from a whole head: "robex", "deepbet" or "atlas"; "auto" for the first of the
+        atlas and the programs that are installed that finds one; "none" takes everything brighter than the background,
         whatever the image shows.
     keep_at : file in which the mask of a whole head is kept and from which it is read again; see mask_beside.
     progress : called with the fraction done, 0 to 1; may raise errors.Cancelled, which ends the extraction at once.
@@ -82,7 +75,7 @@ def find_brain(
         inside = above_noise(mri)
         mask, millilitres = mri.with_array(inside.astype(np.uint8)), _millilitres(inside, mri)
         message = f"everything brighter than the background, {millilitres:.0f} ml"
-        return BrainMask(mask, "none", message, _head_warnings(millilitres), perf_counter() - start)
+        return BrainMask(mask, "none", message, volume_warnings(millilitres), perf_counter() - start)
     kept = _kept(keep_at, mri, method) if keep_at is not None else None
     if kept is not None:
         return kept
@@ -93,41 +86,30 @@ def find_brain(
         f"the image is {'x'.join(f'{mm:g}' for mm in size)} mm large, expected a head of 100 to 400 mm; correct its "
         "voxel size, or the unit of length in its header",
     )
-    with ExitStack() as ahead:
-        robex = extractors.robex
-        _require_program(method, mri)
-        if method == "robex":  # takes more than a minute, on one core: the image is recognised meanwhile
-            robex = ahead.enter_context(extractors.Ahead(robex, mri))
-        recognised_at = 0.05 if method == "robex" else 0.4  # the atlas takes about as long as the recognition
-        shown = recognise(mri, lambda share: report(recognised_at * share))
-        if shown.stripped is not None:
-            mask = mri.with_array(shown.stripped.astype(np.uint8)).along(given)
-            millilitres = _millilitres(shown.stripped, mri)
-            warnings = (*shown.warnings, *volume_warnings(millilitres))
-            message = f"skull-stripped brain, {millilitres:.0f} ml"
-            if method != "auto":
-                message += f"; {_NAMES[method]} is not asked, as there is no skull to strip"
-            return BrainMask(mask, "stripped", message, warnings, perf_counter() - start)
-        found = _extracted(
-            mri, shown, method, robex, lambda share: report(recognised_at + (0.95 - recognised_at) * share)
-        )
+    stripped, alignment = recognise(mri, lambda share: report(0.6 * share))
+    if stripped is not None:
+        mask = mri.with_array(stripped.astype(np.uint8)).along(given)
+        millilitres = _millilitres(stripped, mri)
+        message = f"skull-stripped brain, {millilitres:.0f} ml"
+        if method != "auto":
+            message += f"; {_NAMES[method]} is not asked, as there is no skull to strip"
+        return BrainMask(mask, "stripped", message, volume_warnings(millilitres), perf_counter() - start)
+    found = _extracted(mri, alignment, method, lambda share: report(0.6 + 0.35 * share))
     inside, blank = without_blank(mri, found.inside)
     millilitres = _millilitres(inside, mri)
     warnings = (
-        *shown.warnings,
         *found.warnings,
         *blank,
         *volume_warnings(millilitres),
         *ends_at_edge(mri, inside),
-        *cut_off(mri, inside),
     )
     seconds = perf_counter() - start
     message = f"whole head: brain extracted by {_NAMES[found.method]} in {seconds:.0f} s, {millilitres:.0f} ml"
-    if found.sureness is not None:
-        message += f", overlap with the registered atlas {found.sureness:.2f}"
+    if found.overlap is not None:
+        message += f", overlap with the registered atlas {found.overlap:.2f}"
     mask = mri.with_array(inside.astype(np.uint8)).along(given)
     if keep_at is not None:
-        note = keep(keep_at, given, mask.array, found.method, seconds, warnings, method)
+        note = keep(keep_at, given, mask.array, found.method, seconds, warnings)
         _log.info("%s", note.text)
         warnings = warnings if note.is_beside else (*warnings, note.text)
     report(1.0)
@@ -161,48 +143,30 @@ class _Extracted:
     inside: np.ndarray
     method: str
     #: Dice of the mask with the aligned template's, 0 to 1; None if there is no alignment
-    sureness: float | None
+    overlap: float | None
     warnings: tuple[str, ...] = ()
 
 
-def _extracted(mri: Volume, shown: Shown, method: str, robex: Program, report: Report) -> _Extracted:
-    """The brain by `method`, or by the first of the available ones whose result is plausible."""
+def _extracted(mri: Volume, alignment: Alignment | None, method: str, report: Report) -> _Extracted:
+    """The brain by `method`, or by the first of the available ones whose result has the volume of one."""
     failures: list[str] = []
-    unsure: list[_Extracted] = []
-    alignment = shown.alignment
     expected = None if alignment is None else alignment.brain_on(mri)
-    candidates = _candidates(method)
-    for name in candidates:
+    for name in _candidates(method):
         try:
-            if name == "atlas" and expected is None:
-                require(mni152() is not None, "the brain atlas needs nilearn; install it with: pip install nilearn")
-                alignment = align_template(mri, lambda share: report(0.5 * share))
-                expected = alignment.brain_on(mri)
-            inside = _by(name, mri, expected, robex, report)
+            inside = _by(name, mri, expected, report)
+            millilitres = _millilitres(inside, mri)
+            require(
+                POSSIBLE_ML[0] <= millilitres <= POSSIBLE_ML[1],
+                f"{_NAMES[name]} found {millilitres:.0f} ml, expected {USUAL_ML[0]:.0f} to {USUAL_ML[1]:.0f} ml",
+            )
         except Cancelled:
             raise
         except SimulationError as error:
-            if method != "auto":
-                raise
             failures.append(str(error))
+            _log.warning("%s", error)
             continue
-        millilitres = _millilitres(inside, mri)
-        sureness = None if expected is None else _dice(inside, expected < 0.0)
-        found = _Extracted(inside, name, sureness)
-        if not POSSIBLE_ML[0] <= millilitres <= POSSIBLE_ML[1]:
-            usual = f"{USUAL_ML[0]:.0f} to {USUAL_ML[1]:.0f} ml"
-            failures.append(f"{_NAMES[name]} found {millilitres:.0f} ml, expected {usual}")
-        elif sureness is None or sureness >= _SURE:
-            return replace(found, warnings=tuple(failures))
-        else:
-            unsure.append(found)
-            failures.append(f"the mask by {_NAMES[name]} agrees with the atlas by {sureness:.2f} only; check it")
-        if name != candidates[-1]:
-            following = candidates[candidates.index(name) + 1]
-            _log.warning("%s; %s is asked, which takes up to two minutes", failures[-1], _NAMES[following])
-    best = max(unsure, key=lambda found: found.sureness or 0.0, default=None)
-    if best is not None and (best.sureness or 0.0) >= _LEAST_SURE:
-        return replace(best, warnings=tuple(failures))
+        overlap = None if expected is None else _dice(inside, expected < 0.0)
+        return _Extracted(inside, name, overlap, tuple(failures))
     raise SimulationError(f"no brain was found in this head: {'; '.join(failures)}; give a brain mask (--mask)")
 
 
@@ -223,7 +187,12 @@ def _candidates(method: str) -> list[str]:
     """Methods to try, in the order of their measured quality (docs/brain.md)."""
     if method != "auto":
         return [method]
-    found = _installed()
+    available = {
+        "atlas": mni152() is not None,
+        "deepbet": extractors.has_deepbet(),
+        "robex": extractors.robex_folder() is not None,
+    }
+    found = [name for name, is_available in available.items() if is_available]
     require(
         bool(found),
         "image shows a whole head, and no program for brain extraction is installed; install one with: "
@@ -232,40 +201,20 @@ def _candidates(method: str) -> list[str]:
     return found
 
 
-def _installed() -> list[str]:
-    available = {
-        "atlas": mni152() is not None,
-        "deepbet": extractors.has_deepbet(),
-        "robex": extractors.robex_folder() is not None,
-    }
-    return [name for name, is_available in available.items() if is_available]
-
-
-def _by(name: str, mri: Volume, expected: np.ndarray | None, robex: Program, report: Report) -> np.ndarray:
+def _by(name: str, mri: Volume, expected: np.ndarray | None, report: Report) -> np.ndarray:
     """(k, j, i) the brain by one method, with its border moved to the dark valley outside the cortex.
 
     `expected` (k, j, i) is the distance to the aligned template's brain, which the atlas needs.
     """
-    if name == "atlas" and expected is not None:
-        report(0.5)
+    if name == "atlas":
+        if expected is None:
+            raise SimulationError("the brain atlas needs nilearn; install it with: pip install nilearn")
         return refined(mri, expected, core_mm=8.0, reach_mm=12.0, keep_mm=3.0)
-    program = robex if name == "robex" else extractors.deepbet
+    program = extractors.robex if name == "robex" else extractors.deepbet
     inside = program(mri, lambda share: report(0.9 * share))
     require(bool(inside.any()), f"{_NAMES[name]} found no brain")
     distance = signed_distance(inside, mri.spacing_mm, 20.0)
     return refined(mri, distance, core_mm=6.0, reach_mm=12.0, keep_mm=2.0)
-
-
-def _require_program(method: str, mri: Volume) -> None:
-    """Raise SimulationError for a program that is not installed, before the seconds of recognising the image.
-
-    A skull-stripped brain does not need one.
-    """
-    is_missing = (method == "deepbet" and not extractors.has_deepbet()) or (
-        method == "robex" and extractors.robex_folder() is None
-    )
-    if is_missing and stripped_brain(mri) is None:
-        extractors.require_deepbet() if method == "deepbet" else extractors.require_robex()
 
 
 def _dice(one: np.ndarray, other: np.ndarray) -> float:
@@ -286,23 +235,10 @@ def _kept(path: Path, mri: Volume, method: str) -> BrainMask | None:
     else:
         by = _NAMES.get(kept.method, kept.method)
         message = f"whole head: brain mask kept in {kept.path}, by {by} in {kept.seconds:.0f} s, {millilitres:.0f} ml"
-        if method == "auto" and kept.asked == "atlas":  # auto would have asked them, had it doubted that mask
-            others = [name for name in _installed() if name != "atlas"]
-            options = " or ".join(f"--skull-strip {name}" for name in others)
-            message += f"; it was asked for by name ({options} may be better)" if others else ""
     mask = mri.with_array(kept.inside.astype(np.uint8))
     if not kept.is_edited:
         return BrainMask(mask, kept.method, message, kept.warnings, 0.0)
     return BrainMask(mask, "given", message, mask_doubts(mri, kept.inside))
-
-
-def _head_warnings(millilitres: float) -> tuple[str, ...]:
-    if millilitres <= USUAL_ML[1]:
-        return ()
-    return (
-        f"{millilitres:.0f} ml are segmented, more than a brain has ({USUAL_ML[0]:.0f} to {USUAL_ML[1]:.0f} ml): if "
-        "this is a whole head, its skull and scalp become brain tissues; --skull-strip auto finds the brain",
-    )
 
 
 def _millilitres(inside: np.ndarray, grid: Volume) -> float:

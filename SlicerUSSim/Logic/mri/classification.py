@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -19,8 +19,9 @@ ORDERS = {"t1": (0, 1, 2), "t1gd": (0, 1, 2), "t2": (2, 1, 0), "flair": (0, 2, 1
 _BRIGHT_NAMES = {"t1gd": "enhancing", "flair": "tumour"}
 #: Contrasts from the one that tells grey from white matter best
 _PREFERENCE = ("t1", "t1gd", "flair", "t2")
-#: The spatial prior's exponent: the affine transform leaves the cortex some millimetres off
-_PRIOR_EXPONENT = 0.3
+#: The spatial prior's exponent: the affine transform leaves the cortex some millimetres off. The second where fitted
+#: grey and white matter differ by less than the first of these deviations of the noise: there the atlas has to decide
+_PRIOR_EXPONENT, _STRONG_EXPONENT, FAINT = 0.3, 1.0, (2.5, 4.0)
 #: Noise of posteriors per that of the fit, for filtered images: filters leave more error at borders than within tissues
 FILTER_BLUR = 1.5
 _START_ITERATIONS = 12
@@ -47,6 +48,8 @@ class Classes:
     means: np.ndarray
     standard_deviations: np.ndarray
     mixture: TissueMixture
+    #: Difference of grey and white matter in deviations of the noise, over all channels, before the atlas decides
+    grey_white_contrast: float = np.inf
 
     @property
     def grey_and_white(self) -> tuple[float, float]:
@@ -95,8 +98,27 @@ def classify(
 
     Posteriors assume `blur` times the noise of the fit.
     """
+    found = _classified(values, contrasts, names, prior, _PRIOR_EXPONENT, blur, voxel_mm)
+    apart = found.mixture.means[2] - found.mixture.means[1]
+    contrast = float(np.sqrt(apart @ np.linalg.solve(found.mixture.covariance, apart)))
+    exponent = float(np.interp(contrast, FAINT, (_STRONG_EXPONENT, _PRIOR_EXPONENT)))
+    if prior is not None and exponent > _PRIOR_EXPONENT:
+        found = _classified(values, contrasts, names, prior, exponent, blur, voxel_mm)
+    return replace(found, grey_white_contrast=contrast)
+
+
+def _classified(
+    values: np.ndarray,
+    contrasts: tuple[str, ...],
+    names: tuple[str, ...],
+    prior: np.ndarray | None,
+    exponent: float,
+    blur: float,
+    voxel_mm: float,
+) -> Classes:
+    """See classify; with the prior to the power of `exponent`."""
     if prior is not None:
-        prior = prior**_PRIOR_EXPONENT
+        prior = prior**exponent
         prior /= prior.sum(axis=0)
     first = _best_channel(contrasts)
     histogram = Histogram.of(values[first : first + 1], contrasts[first : first + 1], prior, voxel_mm=voxel_mm)
@@ -171,10 +193,10 @@ def _has_collapsed(fit: TissueMixture) -> bool:
 def _csf_is_grey(fit: TissueMixture, contrast: str) -> bool:
     """Whether CSF is too close to grey matter, as where the mask holds little CSF and two classes share the cortex."""
     csf, grey, white = fit.means[:, 0]
-    return is_csf_near_grey(csf, grey, white, contrast)
+    return _is_csf_near_grey(csf, grey, white, contrast)
 
 
-def is_csf_near_grey(csf: float, grey: float, white: float, contrast: str) -> bool:
+def _is_csf_near_grey(csf: float, grey: float, white: float, contrast: str) -> bool:
     """Whether these intensities are closer to each other in CSF and grey matter than in grey and white matter."""
     way = np.sign(white - csf)
     return bool(contrast != "flair" and way * (grey - csf) < _LEAST_CONTRAST * way * (white - grey))

@@ -1,9 +1,9 @@
-"""A patient's image on a coarse grid along R, A and S, on which heads are recognised."""
+"""Grids of an image: a coarse one along R, A and S, on which heads are recognised, and one without thick slices."""
 
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -13,6 +13,8 @@ from SlicerUSSim.Logic.base.transforms import LPS_TO_RAS
 from SlicerUSSim.Logic.base.volume import Volume
 
 _SPACING_MM = 4.0
+#: Slices thicker than this, and than twice the pixels, are divided into ones of at most so many mm
+_THICK_MM, _THIN_MM = 3.0, 1.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,6 +86,33 @@ def resampled_to_ras(mri: Volume, spacing_mm: float) -> tuple[np.ndarray, np.nda
         image, size.tolist(), sitk.Transform(), sitk.sitkLinear, origin, [spacing_mm] * 3, direction, air
     )
     return sitk.GetArrayFromImage(resampled), low
+
+
+def slices_divided(mri: Volume) -> tuple[int, int]:
+    """(axis of the array along which slices are thick, into how many each is divided); 1 for any other image."""
+    sizes = mri.spacing_mm[::-1]
+    axis = int(sizes.argmax())
+    is_thick = sizes[axis] > max(_THICK_MM, 2.0 * sizes.min())
+    return axis, int(np.ceil(sizes[axis] / _THIN_MM)) if is_thick else 1
+
+
+def with_thin_slices(volume: Volume, interpolate: bool = True) -> Volume:
+    """The volume with thick slices divided, intensities interpolated linearly; the same volume if it has none."""
+    axis, n = slices_divided(volume)
+    if n == 1:
+        return volume
+    array = volume.array
+    if interpolate:
+        places = np.clip((np.arange(n * array.shape[axis]) + 0.5) / n - 0.5, 0.0, array.shape[axis] - 1.0)
+        low = places.astype(int)
+        part = (places - low).astype(np.float32).reshape([-1 if m == axis else 1 for m in range(3)])
+        high = np.minimum(low + 1, array.shape[axis] - 1)
+        array = array.take(low, axis) * (1.0 - part) + array.take(high, axis) * part
+    else:
+        array = array.repeat(n, axis)
+    divided = np.eye(4)
+    divided[2 - axis, 2 - axis], divided[2 - axis, 3] = 1.0 / n, 0.5 / n - 0.5
+    return replace(volume, array=array, ijk_to_ras=volume.ijk_to_ras @ divided)
 
 
 def widened(values: np.ndarray, step: int, shape: tuple[int, ...]) -> np.ndarray:

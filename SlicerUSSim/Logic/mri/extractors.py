@@ -12,23 +12,18 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor, wait
 from pathlib import Path
-from types import TracebackType
 
 import numpy as np
-from scipy.linalg import polar
 
-from SlicerUSSim.Logic.base.errors import Cancelled, SimulationError, require
+from SlicerUSSim.Logic.base.errors import SimulationError, require
 from SlicerUSSim.Logic.base.volume import Volume
 
 #: Both are trained on and work at voxels of about 1 mm.
 _SPACING_MM = 1.0
 _POLL_S = 0.1
-#: Of the registration to ROBEX's atlas: size of voxels, and the largest rotation that a head has in a scanner
-_COARSE_MM, _LARGEST_TURN_DEG = 4.0, 45.0
-#: ROBEX's nine steps: share of its time after each, and that time (measured on three heads)
-_ROBEX_SECONDS, _ROBEX_SHARES = 80.0, (0.01, 0.27, 0.41, 0.75, 0.90, 0.96, 0.96, 0.99, 1.0)
+#: Of a run, for its progress
+_ROBEX_SECONDS = 100.0
 _DEEPBET_SECONDS = 30.0
 _DEEPBET = """
 import json, sys
@@ -38,7 +33,6 @@ run_bet([files["image"]], mask_paths=[files["mask"]], threshold=0.5, n_dilate=0,
 """
 
 Report = Callable[[float], None]
-Program = Callable[[Volume, Report], np.ndarray]
 
 
 def robex_folder() -> Path | None:
@@ -75,13 +69,12 @@ def require_robex() -> Path:
 def robex(mri: Volume, report: Report) -> np.ndarray:
     """(k, j, i) True in the brain, by ROBEX (Iglesias et al., IEEE Trans. Med. Imaging 30(9), 2011).
 
-    Its own affine registration to its atlas takes half of its time; it is given an image that lies there already.
     Raises SimulationError if it is not installed or fails, and what `report` raises, after having ended it.
     """
     source = require_robex()
     with tempfile.TemporaryDirectory(prefix="ussim-robex-") as name:
         folder = Path(name)
-        image, to_mri = _at_atlas(_for_program(mri), source / "ref_vols/atlas.nii.gz")
+        image = _for_program(mri)
         _write(image, folder / "image.nii")
         program = source / "ROBEX"
         if not os.access(program, os.X_OK):  # an installation without the executable bit, perhaps read-only
@@ -90,8 +83,10 @@ def robex(mri: Volume, report: Report) -> np.ndarray:
             program.chmod(0o700)
         # It reads its model from the working folder. The seed makes two runs equal.
         command = [str(program), str(folder / "image.nii"), str(folder / "brain.nii"), str(folder / "mask.nii"), "0"]
-        log = _run("ROBEX", command, program.parent, folder, lambda text, seconds: report(_robex_share(text, seconds)))
-        return _mask_from(folder / "mask.nii", "ROBEX", log, image, mri, to_mri.GetInverse())
+        log = _run(
+            "ROBEX", command, program.parent, folder, lambda seconds: report(1.0 - np.exp(-seconds / _ROBEX_SECONDS))
+        )
+        return _mask_from(folder / "mask.nii", "ROBEX", log, image, mri)
 
 
 def deepbet(mri: Volume, report: Report) -> np.ndarray:
@@ -107,38 +102,9 @@ def deepbet(mri: Volume, report: Report) -> np.ndarray:
         files = json.dumps({"image": str(folder / "image.nii"), "mask": str(folder / "mask.nii")})
         log = _run(
             "deepbet", [sys.executable, "-c", _DEEPBET, files], folder, folder,
-            lambda text, seconds: report(1.0 - np.exp(-seconds / _DEEPBET_SECONDS)),
+            lambda seconds: report(1.0 - np.exp(-seconds / _DEEPBET_SECONDS)),
         )  # fmt: skip
         return _mask_from(folder / "mask.nii", "deepbet", log, image, mri)
-
-
-class Ahead:
-    """A program that works on an image while its caller does something else; with-statement: what is not used ends."""
-
-    def __init__(self, program: Program, mri: Volume) -> None:
-        self._share, self._is_unused = 0.0, False
-        self._pool = ThreadPoolExecutor(1)
-        self._result = self._pool.submit(program, mri, self._report)
-
-    def __enter__(self) -> Ahead:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._is_unused = True
-        self._pool.shutdown()
-
-    def __call__(self, mri: Volume, report: Report) -> np.ndarray:
-        """The program's result for the image it was started with, and its errors; raises what `report` raises."""
-        while wait([self._result], _POLL_S).not_done:
-            report(self._share)
-        return self._result.result()
-
-    def _report(self, share: float) -> None:
-        self._share = share
-        if self._is_unused:
-            raise Cancelled
 
 
 def _package_folder(name: str) -> Path | None:
@@ -170,48 +136,8 @@ def _write(image, path: Path) -> None:
     sitk.WriteImage(image, str(path))
 
 
-def _at_atlas(image, path: Path):
-    """The image resampled to where the atlas lies, in voxels of 1 mm, and the transform from there to the image.
-
-    The transform is affine (moments, then mutual information in voxels of about 4 mm). Where no head lies so,
-    by its volume or its rotation, or where there is no atlas, it is the identity and the image is returned as it is.
-    """
-    import SimpleITK as sitk
-
-    as_it_is = image, sitk.Transform(3, sitk.sitkIdentity)
-    if not path.is_file():
-        return as_it_is
-    atlas = sitk.ReadImage(str(path), sitk.sitkFloat32)
-    air = float(np.percentile(sitk.GetArrayViewFromImage(image)[::4, ::4, ::4], 0.5))
-    bright = sitk.Clamp(image - air, lowerBound=0.0)  # moments of z-scores would be those of nothing
-    small = [sitk.BinShrink(i, [max(1, round(_COARSE_MM / s)) for s in i.GetSpacing()]) for i in (atlas, bright)]
-    registration = sitk.ImageRegistrationMethod()
-    registration.SetMetricAsMattesMutualInformation(32)
-    registration.SetInterpolator(sitk.sitkLinear)
-    registration.SetOptimizerAsRegularStepGradientDescent(2.0, 1e-2, 200, 0.9, 1e-6)
-    registration.SetOptimizerScalesFromPhysicalShift()
-    registration.SetNumberOfWorkUnits(1)  # the same result every time, see atlas_registration.py
-    try:
-        found = sitk.CenteredTransformInitializer(
-            *small, sitk.AffineTransform(3), sitk.CenteredTransformInitializerFilter.MOMENTS
-        )
-        registration.SetInitialTransform(found, True)
-        registration.Execute(*small)
-    except RuntimeError:  # an empty image, or one that left the atlas: ROBEX says what it makes of it
-        return as_it_is
-    matrix = np.reshape(sitk.AffineTransform(found).GetMatrix(), (3, 3))
-    turns = np.degrees(np.arccos(np.clip(np.diag(polar(matrix)[0]), -1.0, 1.0)))
-    if not 0.5 < np.linalg.det(matrix) < 2.0 or turns.max() > _LARGEST_TURN_DEG:
-        return as_it_is
-    size = np.ceil(np.array(atlas.GetSize()) * atlas.GetSpacing() / _SPACING_MM).astype(int).tolist()
-    here = sitk.Resample(
-        image, size, found, sitk.sitkLinear, atlas.GetOrigin(), [_SPACING_MM] * 3, atlas.GetDirection(), air
-    )
-    return here, found
-
-
-def _mask_from(path: Path, program: str, log: str, image, mri: Volume, transform=None) -> np.ndarray:
-    """The mask that the program wrote of `image`, on the grid of the MRI; `transform` from there to the image."""
+def _mask_from(path: Path, program: str, log: str, image, mri: Volume) -> np.ndarray:
+    """The mask that the program wrote of `image`, on the grid of the MRI."""
     import SimpleITK as sitk
 
     if not path.is_file():
@@ -219,12 +145,12 @@ def _mask_from(path: Path, program: str, log: str, image, mri: Volume, transform
     mask = sitk.Cast(sitk.ReadImage(str(path)) > 0, sitk.sitkFloat32)
     if mask.GetSize() == image.GetSize():
         mask.CopyInformation(image)  # its rounding of the geometry is not ours
-    mask = sitk.Resample(mask, mri.to_sitk(), transform or sitk.Transform(), sitk.sitkLinear, 0.0)
+    mask = sitk.Resample(mask, mri.to_sitk(), sitk.Transform(), sitk.sitkLinear, 0.0)
     return sitk.GetArrayFromImage(mask) > 0.5
 
 
-def _run(name: str, command: Sequence[str], where: Path, folder: Path, report: Callable[[str, float], None]) -> str:
-    """What the command writes, after it has ended. `report` is called with that and the seconds, every 0.1 s."""
+def _run(name: str, command: Sequence[str], where: Path, folder: Path, report: Report) -> str:
+    """What the command writes, after it has ended. `report` is called with the seconds, every 0.1 s."""
     start = time.perf_counter()
     log = folder / "log.txt"
     with open(log, "wb") as file:
@@ -240,7 +166,7 @@ def _run(name: str, command: Sequence[str], where: Path, folder: Path, report: C
                     status = process.wait(_POLL_S)
                     break
                 except subprocess.TimeoutExpired:
-                    report(log.read_text(errors="replace"), time.perf_counter() - start)
+                    report(time.perf_counter() - start)
         finally:  # also when `report` raises Cancelled
             if process.poll() is None:
                 process.kill()
@@ -249,15 +175,6 @@ def _run(name: str, command: Sequence[str], where: Path, folder: Path, report: C
     if status != 0:
         raise SimulationError(f"{name} failed with status {status} ({_last_line(text)})")
     return text
-
-
-def _robex_share(log: str, seconds: float) -> float:
-    """The share done: between those before and after the step under way in ROBEX's messages, by the time."""
-    if "Step 1" not in log:
-        return 0.0
-    shares = (0.0, *_ROBEX_SHARES, 1.0)
-    done = min(log.count("It took roughly"), len(_ROBEX_SHARES))
-    return float(np.clip(seconds / _ROBEX_SECONDS, shares[done], shares[done + 1]))
 
 
 def _last_line(log: str) -> str:

@@ -34,8 +34,6 @@ class KeptMask:
     is_edited: bool
     path: Path
     warnings: tuple[str, ...] = ()
-    #: What the user asked for when it was made: "auto", or a method by name
-    asked: str = "auto"
 
 
 @dataclass(frozen=True)
@@ -75,18 +73,15 @@ def read_kept(path: Path, mri: Volume, method: str) -> KeptMask | None:
     return None
 
 
-def keep(
-    path: Path, mri: Volume, inside: np.ndarray, method: str, seconds: float, warnings: tuple[str, ...],
-    asked: str = "auto",
-) -> Kept:  # fmt: skip
+def keep(path: Path, mri: Volume, inside: np.ndarray, method: str, seconds: float, warnings: tuple[str, ...]) -> Kept:
     """Write the mask to `path`, or to the user's cache folder as keep_file does.
 
-    `asked` is what the user asked for, of which `method` came. A file at `path` is never replaced.
+    A file at `path` is never replaced.
     """
     mask = mri.with_array(inside.astype(np.uint8))
     entries = {
         "mri": fingerprint_of(mri), "mask": _hash(mask.array), "method": method, "seconds": f"{seconds:.1f}",
-        "version": __version__, "warnings": " | ".join(warnings), "asked": asked,
+        "version": __version__, "warnings": " | ".join(warnings),
     }  # fmt: skip
     in_cache = _in_cache(path, entries["mri"])
     return keep_file(path, in_cache, "the brain mask is", lambda place: _write(place, mask, entries))
@@ -175,9 +170,7 @@ def _read(path: Path, mri: Volume, method: str, fingerprint: str) -> KeptMask | 
     except ValueError:
         seconds = 0.0
     warnings = tuple(line for line in entries.get("warnings", "").split(" | ") if line)
-    return KeptMask(
-        inside, made_by, seconds, is_edited, path, () if is_edited else warnings, entries.get("asked", "auto")
-    )
+    return KeptMask(inside, made_by, seconds, is_edited, path, () if is_edited else warnings)
 
 
 def _checked(mask: Volume, path: Path, mri: Volume) -> np.ndarray:

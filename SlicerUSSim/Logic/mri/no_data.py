@@ -1,4 +1,4 @@
-"""Where an image has no data: what is padded, cropped or blanked with one value, and reaches the edge of the image."""
+"""Where an image has no data: beyond its edges, and what is padded, cropped or blanked with one value."""
 
 from __future__ import annotations
 
@@ -14,6 +14,8 @@ from SlicerUSSim.Logic.mri.coarse import largest_component
 _THICK_MM = 5.0
 #: Volume of the brain without data from which it is said, millilitres
 _WORTH_ML = 2.0
+#: Area of the brain at an edge of the image from which that is said, and at the bottom, where the stem leaves, cm2
+_WORTH_CM2, _WORTH_AT_BASE_CM2 = 6.0, 20.0
 
 
 def no_data(mri: Volume) -> np.ndarray:
@@ -60,6 +62,25 @@ def without_blank(mri: Volume, inside: np.ndarray) -> tuple[np.ndarray, tuple[st
         f"get no tissue, and the brain is cut off at its {name}"
     )
     return largest_component(inside & ~lost), (line,)
+
+
+def ends_at_edge(mri: Volume, inside: np.ndarray) -> tuple[str, ...]:
+    """One line for each edge of the image that cuts the brain (k, j, i) off; at the bottom only over a larger area.
+
+    A whole brain does not reach the edge but for the stem, however little of scalp and skull is shown.
+    """
+    lines = []
+    for axis in range(3):
+        others = [other for other in range(3) if other != axis]
+        cm2 = float(np.linalg.norm(np.cross(*mri.ijk_to_ras[:3, others].T))) / 100.0
+        for end in (0, -1):
+            area = float(inside.take(end, 2 - axis).sum()) * cm2
+            outwards = mri.ijk_to_ras[:3, axis] * (1 if end else -1)
+            main = int(np.abs(outwards).argmax())
+            name = SIDES[main][int(outwards[main] > 0)]
+            if area >= (_WORTH_AT_BASE_CM2 if name == "bottom" else _WORTH_CM2):
+                lines.append(f"the brain reaches the {name} edge of the image over {area:.0f} cm2: it is cut off there")
+    return tuple(lines)
 
 
 def _frame(array: np.ndarray) -> np.ndarray:

@@ -16,6 +16,7 @@ from scipy import ndimage
 
 from SlicerUSSim.Logic.base.errors import SimulationError, either, require
 from SlicerUSSim.Logic.base.volume import Volume
+from SlicerUSSim.Logic.mri.coarse import with_thin_slices
 from SlicerUSSim.Logic.mri.masks import Masks, read_masks, resampled
 from SlicerUSSim.Logic.tissue.names import labels_of, same_name, similar_tissues, tissue_named
 from SlicerUSSim.Logic.tissue.presets import TISSUES
@@ -188,8 +189,9 @@ def mask_tissue(name: str, tissue_names: Iterable[str] = ()) -> str:
 def texture_below(texture: Texture, mri: Volume, before: Volume, after: Volume) -> Texture:
     """The texture of an MRI's segmentation `before`, with tissues added on top in `after`: their labels are certain.
 
-    All are on one grid.
+    All are on one grid, but the MRI may have the thick slices that were divided.
     """
+    mri = with_thin_slices(mri)
     changed = after.array != before.array
     region = np.where(changed, after.array, 0)
     deviation = tissue_deviation(np.where(changed, mri.array, 0).astype(np.float32), region)

@@ -15,13 +15,14 @@ from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.mri.atlas_registration import AtlasFit
 from SlicerUSSim.Logic.mri.brain import BrainMask, find_brain, given_brain
 from SlicerUSSim.Logic.mri.classification import FILTER_BLUR, class_names, classify
+from SlicerUSSim.Logic.mri.coarse import with_thin_slices
 from SlicerUSSim.Logic.mri.coregistration import aligned
 from SlicerUSSim.Logic.mri.evidence import Evidence
 from SlicerUSSim.Logic.mri.filtering import denoised, estimate_noise as estimate_noise
 from SlicerUSSim.Logic.mri.nuclei import with_nuclei
 from SlicerUSSim.Logic.mri.outside import find_outside, require_findable, watery
-from SlicerUSSim.Logic.mri.plausibility import out_of_place, require_contrast
-from SlicerUSSim.Logic.mri.recognition import check_intensities, require_no_hounsfield
+from SlicerUSSim.Logic.mri.plausibility import require_contrast
+from SlicerUSSim.Logic.mri.recognition import check_intensities, require_no_ct
 from SlicerUSSim.Logic.mri.segmentation_settings import SegmentationSettings
 from SlicerUSSim.Logic.mri.segmentation_steps import (
     BrainPart,
@@ -161,6 +162,7 @@ def segment_mri(
     others : more volumes of the same patient by their contrast, on any grid. They are registered to `mri` rigidly and
         classified together with it; labels are then CSF, grey and white matter, and what enhances.
     mask : foreground on the same grid (non-zero is inside); default: found by `skull_strip`.
+        Slices of more than 3 mm are divided into ones of at most 1.5 mm first, and labels have these.
     keep_mask_at : file in which the mask of a whole head is kept, so that it is extracted once; see brain.find_brain.
     progress : called with the completed fraction, 0 to 1.
     classes : number of tissues; default: 3, or 4 with contrast agent, whose fourth is what enhances.
@@ -203,7 +205,10 @@ def segment_mri(
     if settings.outside:
         require_findable(contrast, settings.skull_strip, mask is not None)
     timed = StepTimes()
-    image = mri.with_array(finite(mri))
+    thickest_mm = float(mri.spacing_mm.max())
+    if mask is not None and mask.array.shape == mri.array.shape:
+        mask = with_thin_slices(mask, interpolate=False)
+    mri = image = with_thin_slices(replace(mri, array=finite(mri)))
     if mask is None and settings.skull_strip != "none":
         _require_intensities(mri, "MRI")
     if mask is None:
@@ -211,7 +216,7 @@ def segment_mri(
             image, settings.skull_strip, keep_at=keep_mask_at, progress=lambda share: told(begin * share)
         )
     else:
-        require_no_hounsfield(mri)
+        require_no_ct(mri)
         brain = given_brain(mask, mri)
         require(
             not others or brain.volume_ml >= _LEAST_TO_REGISTER_ML,
@@ -239,10 +244,10 @@ def segment_mri(
         images.append(image)
         notes.append(message)
         warnings += doubts_of_it
-        thickest_mm = float(other.spacing_mm.max())
-        if thickest_mm > max(_THICK_SLICE_MM, float(mri.spacing_mm.max())):
+        voxel_mm = float(other.spacing_mm.max())
+        if voxel_mm > max(_THICK_SLICE_MM, thickest_mm):
             warnings.append(
-                f"{named} has voxels of {thickest_mm:.3g} mm, across which its tissues mix: compare with the labels of "
+                f"{named} has voxels of {voxel_mm:.3g} mm, across which its tissues mix: compare with the labels of "
                 f"the {contrast} alone"
             )
     if others:
@@ -255,7 +260,7 @@ def segment_mri(
     part = BrainPart.of(images, foreground)
     raised, above = part.raised(contrasts)
     notes += raised
-    atlas, message = atlas_of(part, report)
+    atlas, message, fits = atlas_of(part, report)
     notes.append(message)
     timed("atlas")
     report(0.4)
@@ -288,14 +293,11 @@ def segment_mri(
     found = replace(found, posteriors=less_sure(smoothed_posteriors(found.posteriors, part.inside)))
     timed("neighbours")
     report(0.9)
-    warnings += doubts(found, part, filtered[0][1], atlas, contrasts)
-    if prior is not None:
-        warnings += out_of_place(found, prior)
+    warnings += doubts(found, part, contrasts, fits, atlas is not None)
 
     labels = np.zeros(part.inside.shape, np.uint8)
     labels[part.inside] = found.posteriors.argmax(axis=0) + 1
     tissue_names = names
-    thickest_mm = float(mri.spacing_mm.max())
     if settings.thin_sulci and thickest_mm > _THICK_SLICE_MM:
         notes.append(f"thin sulci get no label of their own: voxels of {thickest_mm:.3g} mm are thicker than they are")
     elif settings.thin_sulci:

@@ -13,17 +13,16 @@ from scipy import ndimage
 
 from SlicerUSSim.Logic.base.errors import require
 from SlicerUSSim.Logic.base.volume import Volume
+from SlicerUSSim.Logic.mri.alignment import explained
 from SlicerUSSim.Logic.mri.atlas import mni152
 from SlicerUSSim.Logic.mri.atlas_registration import AtlasFit, register_atlas
 from SlicerUSSim.Logic.mri.bias import corrected
 from SlicerUSSim.Logic.mri.classification import Classes
 from SlicerUSSim.Logic.mri.plausibility import (
-    csf_is_doubtful,
-    faint,
     implausible,
+    in_other_order,
     is_whole_brain,
-    require_order,
-    require_several_tissues,
+    unsure,
 )
 from SlicerUSSim.Logic.mri.recognition import check_finite
 
@@ -84,18 +83,19 @@ class BrainPart:
         return result
 
 
-def atlas_of(part: BrainPart, report: Callable[[float], None]) -> tuple[AtlasFit | None, str]:
-    """The registered atlas, or None where it is of no use; and a line that says why."""
+def atlas_of(part: BrainPart, report: Callable[[float], None]) -> tuple[AtlasFit | None, str, float | None]:
+    """(the registered atlas, or None where it is of no use; a line that says why; the share that it explains)."""
     reason = is_whole_brain(part.images[0], part.inside)
     if reason:
-        return None, f"without an atlas, since {reason}"
+        return None, f"without an atlas, since {reason}", None
     atlas = mni152()
     if atlas is None:
-        return None, 'without an atlas; install "SlicerUSSim[demo]" for one'
+        return None, 'without an atlas; install "SlicerUSSim[demo]" for one', None
     fit = register_atlas(part.images[0], part.inside, atlas, lambda share: report(0.05 + 0.35 * share))
+    share = explained(part.images[0], np.linalg.inv(fit.patient_to_atlas))
     if not fit.is_good:
-        return None, f"without an atlas, since MNI152 covers the brain with a Dice of {fit.dice:.2f} only"
-    return fit, f"led by the MNI152 atlas, whose brain covers this one with a Dice of {fit.dice:.2f}"
+        return None, f"without an atlas, since MNI152 covers the brain with a Dice of {fit.dice:.2f} only", share
+    return fit, f"led by the MNI152 atlas, whose brain covers this one with a Dice of {fit.dice:.2f}", share
 
 
 class StepTimes:
@@ -151,21 +151,14 @@ def require_different(values: np.ndarray, contrasts: tuple[str, ...]) -> None:
 def doubts(
     found: Classes,
     part: BrainPart,
-    noise: float,
-    atlas: AtlasFit | None,
     contrasts: tuple[str, ...],
+    fits: float | None,
+    is_led: bool,
 ) -> list[str]:
-    """What the user should check; `noise` is that of the first image before the filter.
-
-    Raises SimulationError where the result is none: one tissue only, or tissues in the order of another contrast.
-    """
-    require_several_tissues(found)
-    lines = require_order(found, contrasts[0], atlas is not None) if len(contrasts) == 1 else []
-    lines += implausible(found, part.images[0], part.inside, atlas, contrasts[0])
-    if len(contrasts) == 1:
-        lines += csf_is_doubtful(found, contrasts[0])
-        lines += faint(found, noise)
-    return lines
+    """What the user should check. `fits` is the share that the atlas explains, and `is_led` whether it was used."""
+    lines = in_other_order(found, contrasts[0]) if len(contrasts) == 1 else []
+    lines += implausible(found, float(part.inside.sum()) * part.images[0].voxel_ml, contrasts[0])
+    return lines + unsure(found, fits, is_led)
 
 
 def narrow_sulci(labels: np.ndarray, found: Classes, filtered: np.ndarray, noise: float) -> np.ndarray:

@@ -13,7 +13,7 @@ from SlicerUSSim.Logic.base.errors import require, required
 from SlicerUSSim.Logic.base.neighbourhood import distance_to
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.mri.atlas_registration import AtlasFit
-from SlicerUSSim.Logic.mri.coarse import largest_component, widened
+from SlicerUSSim.Logic.mri.coarse import largest_component, widened, with_thin_slices
 from SlicerUSSim.Logic.mri.refinement import closed, on_grid
 from SlicerUSSim.Logic.mri.segmentation import Segmentation
 
@@ -62,6 +62,7 @@ class Head:
     def of(cls, mri: Volume, segmentation: Segmentation, contrast: str) -> Head:
         """Raises SimulationError for a FLAIR, and for an MRI of another grid."""
         require_contrast(contrast)
+        mri = with_thin_slices(mri)
         require(
             mri.array.shape == segmentation.labels.array.shape
             and bool(np.allclose(mri.ijk_to_ras, segmentation.labels.ijk_to_ras, atol=1e-3)),
