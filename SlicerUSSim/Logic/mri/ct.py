@@ -212,14 +212,13 @@ def _lay_over(
     where the numbers have soft tissue in them, one voxel below their surface.
     Raises SimulationError for organs that do not meet the CT.
     """
-    require(not organs.others, organs.ambiguity)
     volume = organs.labels
     to_organs = (volume.ras_to_ijk @ ct.ijk_to_ras)[[2, 1, 0, 3]][:, [2, 1, 0, 3]]
     on_ct: Any = ndimage.affine_transform(
         volume.array.astype(np.uint8), to_organs[:3, :3], to_organs[:3, 3].tolist(), ct.array.shape, order=0
     )
     require(on_ct.any(), "the label map of organs does not meet the CT, expected one of this patient in its frame")
-    names, lines, of_ct = NAMES, [organs.taken_for] if organs.taken_for else [], classes.copy()
+    names, lines, of_ct = NAMES, [], classes.copy()
     for label, name in enumerate(organs.names, 1):
         where = on_ct == label
         if not where.any():
