@@ -186,12 +186,14 @@ def test_a_body_is_refused_at_once():
 
 @needs_nilearn
 @pytest.mark.slow
-def test_a_turned_head_is_refused(head):
-    turned = Volume(np.ascontiguousarray(np.swapaxes(head[0].array, 0, 1)), head[0].ijk_to_ras)
+def test_a_head_upside_down_is_refused_and_one_on_its_back_doubted(head):
+    upside_down = head[0].with_array(np.ascontiguousarray(head[0].array[::-1]))
     message = "no head or brain is recognised in this .* correct the orientation or the voxel size in its header"
     with pytest.raises(SimulationError, match=message) as caught:
-        find_brain(turned)
+        find_brain(upside_down)
     assert "--skull-strip none" not in str(caught.value)
+    turned = Volume(np.ascontiguousarray(np.swapaxes(head[0].array, 0, 1)), head[0].ijk_to_ras)
+    assert "check the orientation and the voxel size in its header" in recognise(turned).warnings[0]
 
 
 def test_none_takes_everything_brighter_than_the_background():

@@ -44,6 +44,7 @@ def refused(path: Path, words: str, read=Volume.read) -> None:
         (".mha", b"-1 0 0 0 -1 0 0 0 1", b"-1 0 0 0 -1 0 0 nan 1", "cannot be read as an image"),
         (".mha", b"DimSize = 4 5 6", b"DimSize = 4 5 4294967296", "has 4x5x4294967296 voxels, expected at most"),
         (".mha", b"DimSize = 4 5 6", b"DimSize = 4 5 600000", "copy or export it again"),
+        (".nii", b"\0\0\xb0\x43", b"\0\0\0\0", "vox_offset is 0, expected 352 or more, behind the header"),
         (".mha", b"DimSize = 4 5 6", b"DimSize = 4 5 12", "has 240 bytes of voxels, expected 480 for 4x5x12"),
         (".mha", b"ElementDataFile", b"ElementDataPile", "its header has no line ElementDataFile"),
         (".mha", b"LOCAL", b"%n%n.raw 1 9 1", "ElementDataFile is '%n%n.raw 1 9 1', expected a file"),  # went to printf

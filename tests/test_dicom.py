@@ -26,6 +26,14 @@ def tilted(one, number):
     one.ImagePositionPatient[1] += 0.5 * number
 
 
+def of_an_older_class():
+    """MR Image Storage whose frames have places."""
+    one = enhanced(images())
+    one.SOPClassUID = one.file_meta.MediaStorageSOPClassUID = "1.2.840.10008.5.1.4.1.1.4"
+    one.SharedFunctionalGroupsSequence[0].PixelMeasuresSequence[0].SpacingBetweenSlices = 7.0
+    return one
+
+
 def frames_without_places():
     one = images()[0]
     one.NumberOfFrames, one.PixelData = 12, SERIES.array.tobytes()
@@ -53,6 +61,7 @@ READ = {
     "enhanced shuffled": lambda folder: save(folder, [enhanced(images(), SHUFFLED)]),
     "enhanced slopes": lambda folder: save(folder, [enhanced(images(change=slopes))]),
     "enhanced rounded": lambda folder: save(folder, [enhanced(images(change=rounded))]),
+    "frames of an older class": lambda folder: save(folder, [of_an_older_class()]),
     "frames without places": lambda folder: save(folder, [frames_without_places()]),
 }
 
@@ -115,11 +124,15 @@ def test_images_that_are_no_volume_together_are_refused(case, tmp_path):
 
 
 @pytest.mark.parametrize("is_enhanced", [False, True])
-@pytest.mark.parametrize("case", ["gap", "echoes", "tilt"])
+@pytest.mark.parametrize("case", ["gap", "echoes", "tilt", "steps"])
 def test_stacks_that_are_no_volume_are_refused(case, is_enhanced, tmp_path):
     """ITK read all of them without a word, with many frames."""
     series = images(change=tilted if case == "tilt" else None)
     words = "tilted by 9.5 degrees"
+    if case == "steps":  # each of them by less than a fifth, but together by more than a slice
+        for number, one in enumerate(series):
+            one.ImagePositionPatient[2] = 3.0 * number + 0.5 * max(number - 6, 0)
+        words = "slices are unevenly spaced, 3 to 3.5 mm, up to 1.3[0-9] mm away from an even stack"
     if case == "gap":
         del series[5]
         words = "slices are missing or unevenly spaced at 1 place, first 6 mm after slice 5 of 11, expected 3 mm"
@@ -149,6 +162,28 @@ def test_segments_are_labels_with_names_in_their_own_place(kind, tmp_path, caplo
     np.testing.assert_array_equal(found.array, expected)
     np.testing.assert_allclose(found.ijk_to_ras @ [0, 0, 0, 1], SERIES.ijk_to_ras @ [0, 0, 3, 1], atol=1e-6)
     assert ("'Cyst' covers" in caplog.text) == (kind == "BINARY")
+
+
+def test_slices_without_a_segment_are_empty_and_not_missing(tmp_path):
+    """Segments drawn on every second slice, or on one, have frames for these alone."""
+    masks = np.zeros((*SERIES.array.shape, 1), np.uint8)
+    masks[2:9:2, 4:8, 4:8] = 1
+    seg = segmentation(masks, [("Tumour", "Neoplasm")])
+    del seg.SharedFunctionalGroupsSequence[0].PixelMeasuresSequence[0].SpacingBetweenSlices
+    save(tmp_path / "a", [seg])
+    np.testing.assert_array_equal(Volume.read(tmp_path / "a").array, masks[2:9, ..., 0])
+    masks[3:] = 0
+    save(tmp_path / "b", [segmentation(masks, [("Tumour", "Neoplasm")])])
+    found = Volume.read(tmp_path / "b")
+    assert found.array.sum() == 16 and found.spacing_mm[2] == 3.0
+
+
+def test_frames_of_two_stacks_are_refused(tmp_path):
+    one = enhanced(images())
+    for number, frame in enumerate(one.PerFrameFunctionalGroupsSequence):
+        frame.FrameContentSequence[0].StackID = str(number % 2)
+    with pytest.raises(SimulationError, match="has 2 stacks of frames, expected one; export one of them"):
+        Volume.read(save(tmp_path, [one]))
 
 
 def test_what_is_in_a_folder_beside_a_series_does_not_change_it(tmp_path, caplog):

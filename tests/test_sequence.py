@@ -334,6 +334,17 @@ def test_a_transform_that_is_not_needed_may_be_none(tmp_path, name, value):
     assert field in (tmp_path / "again.mha").read_bytes()  # nothing of a file is lost
 
 
+@pytest.mark.parametrize("scale", [0.0, 2.0, -1.0])
+def test_a_tracked_pose_that_is_not_rigid_is_left_out(tmp_path, caplog, scale):
+    poses = [{"ImageToProbe": np.diag([0.1, 0.1, 0.1, 1]), "ProbeToTracker": np.eye(4)} for _ in range(2)]
+    poses[1]["ProbeToTracker"] = np.diag([scale, abs(scale), abs(scale), 1.0])
+    sequence = TrackedSequence(np.ones((2, 4, 5), np.uint8), tuple(poses), np.arange(2.0))
+    sequence.write(tmp_path / "s.igs.mha")
+    found = TrackedSequence.read(tmp_path / "s.igs.mha")
+    assert [found.has_pose(n, "ImageToTracker") for n in range(2)] == [True, False]
+    assert "Seq_Frame0001_ProbeToTrackerTransform" in caplog.text and "such transforms are left out" in caplog.text
+
+
 def test_values_that_slicers_igsio_writes_are_read_with_a_warning(tmp_path, caplog):
     plus_file(tmp_path / "plus.mha", "??", MARKED_FAR, "BRIGHTNESSBRIGHTNESS")
     found = TrackedSequence.read(tmp_path / "plus.mha")

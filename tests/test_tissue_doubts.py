@@ -12,12 +12,7 @@ from scipy import ndimage
 
 from SlicerUSSim.Logic import SimulationError, segment_mri
 from SlicerUSSim.Logic.mri.classification import Classes
-from SlicerUSSim.Logic.mri.plausibility import (
-    csf_is_doubtful,
-    faint,
-    require_order,
-    require_several_tissues,
-)
+from SlicerUSSim.Logic.mri.plausibility import csf_is_doubtful, faint, require_order, require_several_tissues
 from validation.brain_phantoms import TissueMaps, phantom, tissue_maps
 from validation.brain_scores import scores
 
@@ -36,6 +31,14 @@ def test_a_wrong_contrast_is_refused_and_the_right_one_is_named(shown, said):
     case = phantom(brain(), shown)
     with pytest.raises(SimulationError, match=f"contrast is {said}, but .* choose .*{shown}"):
         segment_mri(case.mri, contrast=said, mask=case.mask)
+
+
+def test_a_brain_that_lies_unlike_its_header_is_said():
+    case = phantom(brain(), "t1", noise=0.03, bias=0.0)
+    for axis in (None, 0, 1):
+        mri, mask = (one if axis is None else one.with_array(np.flip(one.array, axis)) for one in (case.mri, case.mask))
+        warnings = segment_mri(mri, mask=mask, thin_sulci=False).warnings
+        assert any("lies as its header says" in line for line in warnings) == (axis is not None), warnings
 
 
 @pytest.mark.slow

@@ -82,20 +82,23 @@ def test_vtk_extent_that_does_not_start_at_zero_keeps_its_place():
     np.testing.assert_allclose(part.ijk_to_ras @ [0, 0, 0, 1], volume.ijk_to_ras @ [1, 1, 1, 1])
 
 
-def test_nifti_with_a_time_axis_of_one_is_a_volume(tmp_path):
+@pytest.mark.parametrize("suffix", [".nii.gz", ".nrrd", ".mha"])
+def test_an_image_with_a_time_axis_of_one_is_a_volume(suffix, tmp_path):
     import SimpleITK as sitk
 
-    sitk.WriteImage(sitk.GetImageFromArray(numbered((1, 3, 4, 5)), isVector=False), str(tmp_path / "t.nii.gz"))
-    assert Volume.read(tmp_path / "t.nii.gz").array.shape == (3, 4, 5)
+    sitk.WriteImage(sitk.GetImageFromArray(numbered((1, 3, 4, 5)), isVector=False), str(tmp_path / f"t{suffix}"))
+    assert Volume.read(tmp_path / f"t{suffix}").array.shape == (3, 4, 5)
 
 
+@pytest.mark.parametrize("suffix", [".nrrd", ".nii", ".mha"])
 @pytest.mark.parametrize("shape", [(4, 5), (3, 2, 4, 5)])
-def test_images_that_are_not_3d_are_refused(tmp_path, shape):
+def test_images_that_are_not_3d_are_refused(tmp_path, shape, suffix):
     import SimpleITK as sitk
 
-    sitk.WriteImage(sitk.GetImageFromArray(np.zeros(shape, np.uint8), isVector=False), str(tmp_path / "i.nrrd"))
-    with pytest.raises(SimulationError, match=r"i\.nrrd: is a .* image, expected three dimensions"):
-        Volume.read(tmp_path / "i.nrrd")
+    path = tmp_path / f"i{suffix}"
+    sitk.WriteImage(sitk.GetImageFromArray(np.zeros(shape, np.uint8), isVector=False), str(path))
+    with pytest.raises(SimulationError, match=rf"i\{suffix}: is a .* image, expected three dimensions"):
+        Volume.read(path)
 
 
 @pytest.mark.parametrize("name", ["i.nii", "i.nii.gz", "i.nrrd", "i.nhdr", "i.mha", "i.vti", "i.mgz"])
@@ -183,6 +186,7 @@ CODES = {"sform_code": 0, "qform_code": 0}
         (CODES, (-2, -2, 2), r"has no orientation \(no sform and no qform\), read as LPS; check left and right"),
         ({"srow_x": [0] * 4, "srow_y": [0] * 4}, (2, 2, 2), "its sform has no three axes and is not used"),
         ({"xyzt_units": 3}, (0.002, 0.002, 0.002), None),
+        ({"sform_code": 0, "pixdim": [-5, 2, 2, 2, 1, 1, 1, 1]}, (2, 2, -2), None),  # any number below 0 is -1
         ({"scl_slope": 0, "scl_inter": 5}, (2, 2, 2), "scl_slope is 0 and scl_inter 5, read without both"),
     ],
 )
@@ -195,6 +199,8 @@ def test_a_nifti_header_that_contradicts_itself_is_told_with_both_values(fields,
     np.testing.assert_allclose(np.diag(found.ijk_to_ras)[:3], diagonal)
     np.testing.assert_array_equal(found.array.ravel(), np.arange(60).reshape(5, 4, 3).T.ravel())
     assert len(found.doubts) == (words is not None) and re.search(words or "", " ".join(found.doubts))
+    if "by the sform" in " ".join(found.doubts):
+        assert "RAS from (30, 0, 0) mm by the qform, RAS from (0, 0, 0) mm by the sform" in found.doubts[0]
     assert caplog.text.count("WARNING") == len(found.doubts)
 
 
@@ -212,7 +218,11 @@ def test_a_nifti_without_the_size_of_voxels_is_refused(tmp_path):
         ({"space": "scanner-xyz"}, (-10, -20, 30), "its space is scanner-xyz, which is not anatomical, read as LPS"),
         ({"space dimension": 3}, (-10, -20, 30), "it has no space, read as LPS, as 3D Slicer does; check left and"),
         ({"space": "RAS", "space units": ["cm", "cm", "cm"]}, (100, 200, 300), None),
-        ({"space": "RAS", "space units": ["furlong"] * 3}, (10, 20, 30), "its space units 'furlong' are unknown"),
+        (
+            {"space": "RAS", "space units": ["furlong"] * 3},
+            (10, 20, 30),
+            "its space units are furlong, expected one of mm",
+        ),
     ],
 )
 def test_a_nrrd_is_read_in_its_space_and_unit(fields, corner, words, tmp_path):

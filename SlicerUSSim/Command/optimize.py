@@ -77,12 +77,7 @@ def optimize(
     from SlicerUSSim.Logic.imaging.figures import require_matplotlib
     from SlicerUSSim.Logic.imaging.preset import Preset
 
-    places = [place for place in (out, report, save_preset, save_transform, state, recording.field) if place]
-    check_outputs(out, report, save_preset, save_transform, recording.field)
-    check_outputs(state, may_replace=True)  # which is read before it is written
-    for place in places:
-        same = [other for other in places if other.resolve() == place.resolve()]
-        require(len(same) == 1, f"{place}: given for {len(same)} outputs, expected a separate file for each")
+    check_outputs(out, report, save_preset, save_transform, recording.field, state=state)
     if save_transform:
         is_json = save_transform.suffix.lower() == ".json"
         require(is_json, f"--save-transform is {save_transform}, expected a name ending in .json")
@@ -120,7 +115,8 @@ def optimize(
     if report:
         _write_report(report, found, tracked, patient, recording)
     _tell(found)
-    note("wrote " + ", ".join(map(str, places)))
+    places = (out, report, save_preset, save_transform, state, recording.field)
+    note("wrote " + ", ".join(str(place) for place in places if place))
 
 
 def _free_parameter(text: str) -> tuple[str, tuple[float, float] | None]:

@@ -252,19 +252,24 @@ overwrite_option = click.option(
 )
 
 
-def check_outputs(*outputs: Path | None, may_replace: bool = False) -> None:
-    """Raise SimulationError before the computation if an output cannot be written, is an input, or exists.
+def check_outputs(*outputs: Path | None, state: Path | None = None) -> None:
+    """Raise SimulationError before the computation if an output cannot be written, is an input or another output, or
+    exists.
 
-    One that exists is let through with `may_replace`, and with the running command's --overwrite. None stands for an
-    output that was not asked for.
+    The running command's --overwrite lets through one that exists, as a `state`, which is read before it is written,
+    always is. None stands for an output that was not asked for.
     """
     from SlicerUSSim.Logic.base.files import require_place
 
-    may_replace = may_replace or bool(given_options("overwrite"))
+    may_replace, outputs = bool(given_options("overwrite")), (*outputs, state)
+    places = [out.resolve() for out in outputs if out]
     for out in filter(None, outputs):
+        many = places.count(out.resolve())
+        require(many == 1, f"{out}: given for {many} outputs, expected a separate file for each")
         require_place(out)
         require_no_input(out)
-        require(may_replace or not out.exists(), f"{out}: exists; give another name, or --overwrite to replace it")
+        is_free = may_replace or out == state or not out.exists()
+        require(is_free, f"{out}: exists; give another name, or --overwrite to replace it")
 
 
 def check_results(folder: Path, names: Iterable[str], summary: str) -> None:

@@ -258,7 +258,7 @@ def _read_files(path: Path, files: Sequence[str]) -> ImageFile:
             try:
                 _ = dataset.pixel_array
             except Exception as error:  # decoders raise various exceptions
-                reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
+                reason = " ".join(str(error).split())[:300] or type(error).__name__
                 raise SimulationError(f"{path}: {Path(file).name} cannot be read ({reason}); export it again") from None
         require(
             frames == 1 or len(files) == 1,
@@ -302,19 +302,30 @@ def _stack(path: Path, files: Sequence[str], datasets: Sequence[Any]) -> ImageFi
         dataset.PixelSpacing, dataset.ImageOrientationPatient = first.PixelSpacing, first.ImageOrientationPatient
         dataset.FrameOfReferenceUID = first.get("FrameOfReferenceUID") or "1.2.3"  # some programs leave it out
     kind = np.float32 if int(first.BitsAllocated) <= 16 else np.float64
-    return _image(highdicom.get_volume_from_series(datasets, dtype=kind, rtol=_UNEVEN, **_VALUES))
+    volume = highdicom.get_volume_from_series(datasets, dtype=kind, rtol=_UNEVEN, **_VALUES)
+    return _image(volume.array, volume.affine)
 
 
 def _frames(path: Path, dataset: Any) -> ImageFile:
     """A file with many frames: enhanced MR, CT and ultrasound volumes, and older classes without places of frames."""
     import highdicom
+    from pydicom.uid import EnhancedMRImageStorage
 
     if "PerFrameFunctionalGroupsSequence" not in dataset:
         slices, doubt = _as_slices(path, dataset)
         return replace(_stack(path, [str(path)] * len(slices), slices), doubts=(doubt,))
     shared = dataset.get("SharedFunctionalGroupsSequence") or [{}]
     positions, cosines = [], []
-    for number, frame in enumerate(dataset.PerFrameFunctionalGroupsSequence, 1):
+    groups = dataset.PerFrameFunctionalGroupsSequence
+    parts = int(dataset.get("InConcatenationTotalNumber") or 1)
+    require(
+        parts == 1 and len(groups) == int(dataset.NumberOfFrames),
+        f"{path}: has {len(groups)} of {dataset.NumberOfFrames} frames in the first of {parts} files, expected one "
+        "file with all frames; export the volume as one",
+    )
+    stacks = {str(item.get("StackID")) for frame in groups for item in frame.get("FrameContentSequence") or ()}
+    require(len(stacks) <= 1, f"{path}: has {len(stacks)} stacks of frames, expected one; export one of them")
+    for number, frame in enumerate(groups, 1):
         name = f"{path}: frame {number}"
         for group in (frame, shared[0]):
             _name_as_of_patients(group)
@@ -330,9 +341,13 @@ def _frames(path: Path, dataset: Any) -> ImageFile:
     )
     _require_even(path, np.array(positions), cosines[0])
     dataset.FrameOfReferenceUID = dataset.get("FrameOfReferenceUID") or "1.2.3"
+    dataset.SOPClassUID = EnhancedMRImageStorage  # whose frames highdicom looks for, of whatever modality
+    for measures in (item for group in (*groups, shared[0]) for item in group.get("PixelMeasuresSequence") or ()):
+        measures.pop("SpacingBetweenSlices", None)  # the places of frames count
     kind = np.float32 if int(dataset.BitsAllocated) <= 16 else np.float64
     image = highdicom.Image.from_dataset(dataset, copy=False)
-    return _image(image.get_volume(dtype=kind, rtol=_UNEVEN, **_VALUES))
+    volume = image.get_volume(dtype=kind, rtol=_UNEVEN, **_VALUES)
+    return _image(volume.array, volume.affine)
 
 
 def _name_as_of_patients(group: Any) -> None:
@@ -351,7 +366,7 @@ def _as_slices(path: Path, dataset: Any) -> tuple[list[Any], str]:
     """The frames of a class without places as images, evenly spaced, which is returned as a doubt."""
     from pydicom.uid import ExplicitVRLittleEndian
 
-    step = float(dataset.get("SpacingBetweenSlices") or dataset.get("SliceThickness") or 0.0)
+    step = abs(float(dataset.get("SpacingBetweenSlices") or dataset.get("SliceThickness") or 0.0))
     require(step > 0, f"{path}: its frames have neither places nor SpacingBetweenSlices; without there is no volume")
     first = _numbers(dataset, "ImagePositionPatient", 3, str(path))
     cosines = _numbers(dataset, "ImageOrientationPatient", 6, str(path))
@@ -368,6 +383,9 @@ def _segments(path: Path, dataset: Any) -> ImageFile:
     """A DICOM SEG as a label map; where segments overlap, the last is on top."""
     import highdicom
 
+    for measures in dataset.SharedFunctionalGroupsSequence[0].get("PixelMeasuresSequence") or ():
+        # Slices without a segment have no frames
+        measures.SpacingBetweenSlices = measures.get("SpacingBetweenSlices") or measures.get("SliceThickness")
     image: Any = highdicom.seg.Segmentation.from_dataset(dataset, copy=False)
     layers, volume, found = [], None, []
     for place, number in enumerate(image.segment_numbers):
@@ -381,13 +399,15 @@ def _segments(path: Path, dataset: Any) -> ImageFile:
         found.append(Segment(name if is_meaningful(name) else kind, place, 1, int(number)))
     require(volume is not None, f"{path}: has no segments")
     voxel_ml = float(abs(np.linalg.det(volume.affine[:3, :3])) / 1000.0)  # type: ignore[union-attr]
+    if len(layers[0]) == 1:  # the slice beside it has no segment
+        layers = [np.pad(layer, ((0, 1), (0, 0), (0, 0))) for layer in layers]
     labels = flattened(np.stack(layers, axis=-1), found, voxel_ml, str(path))
-    return _image(volume.with_array(labels), names={one.label: one.name for one in found})  # type: ignore[union-attr]
+    return _image(labels, volume.affine, {one.label: one.name for one in found})  # type: ignore[union-attr]
 
 
-def _image(volume: Any, names: Mapping[int, str] | None = None) -> ImageFile:
-    """A highdicom.Volume (slices, rows, columns; LPS), with slices in the order of their normal, as ITK has them."""
-    array, matrix = np.asarray(volume.array), LPS_TO_RAS @ np.asarray(volume.affine)[:, [2, 1, 0, 3]]
+def _image(array: np.ndarray, affine: np.ndarray, names: Mapping[int, str] | None = None) -> ImageFile:
+    """Slices, rows and columns in highdicom's LPS, with slices in the order of their normal, as ITK has them."""
+    matrix = LPS_TO_RAS @ np.asarray(affine)[:, [2, 1, 0, 3]]
     if np.linalg.det(matrix[:3, :3]) < 0:
         array = array[::-1]
         matrix[:3, 3] += matrix[:3, 2] * (len(array) - 1)
@@ -432,6 +452,12 @@ def _require_even(path: Path, positions: np.ndarray, cosines: np.ndarray) -> Non
         "coils); put one volume into a folder of its own",
     )
     wide = np.flatnonzero(np.abs(steps - usual) > _UNEVEN * usual)
+    off = np.abs(along - np.linspace(along[0], along[-1], len(along)))  # errors below this share may add up
+    require(
+        len(wide) > 0 or off.max() <= _UNEVEN * usual,
+        f"{path}: slices are unevenly spaced, {steps.min():.4g} to {steps.max():.4g} mm, up to {off.max():.3g} mm away "
+        "from an even stack; resample it to one, for example with 3D Slicer",
+    )
     if len(wide):
         at = int(wide[0])
         raise SimulationError(

@@ -44,7 +44,10 @@ _NIFTI_SUFFIXES = (".nii", ".nii.gz", ".hdr", ".img")
 _NIFTI2_HEADER = 540
 #: Millimetres per unit of length: the lower three bits of NIfTI's xyzt_units (nifti1.h), and NRRD's "space units"
 _NIFTI_UNITS = {0: 1.0, 1: 1000.0, 2: 1.0, 3: 0.001}
-_NRRD_UNITS = {"": 1.0, "mm": 1.0, "millimeter": 1.0, "m": 1000.0, "cm": 10.0, "um": 0.001, "µm": 0.001}
+_NRRD_UNITS = {
+    "": 1.0, "mm": 1.0, "millimeter": 1.0, "m": 1000.0, "meter": 1000.0, "cm": 10.0, "centimeter": 10.0, "um": 0.001,
+    "µm": 0.001, "micron": 0.001, "micrometer": 0.001,
+}  # fmt: skip
 #: NRRD's anatomical spaces, as signs that turn coordinates into RAS (http://teem.sourceforge.net/nrrd/format.html)
 _NRRD_SPACES = {
     "right-anterior-superior": (1, 1, 1), "ras": (1, 1, 1),
@@ -53,7 +56,7 @@ _NRRD_SPACES = {
 }  # fmt: skip
 #: The longest XML text of a label table
 _LONGEST_TABLE = 4 * 2**20
-_LONGEST_HEADER = 2**26
+_LONGEST_HEADER, _CHUNK = 2**26, 2**16
 #: Value of ElementDataFile for a file per slice: a pattern with one number, and first, last and step of that
 _NUMBERED_FILES = r"[^%]*%(0?[0-9]{1,2})?d[^%]*?([ \t]+[0-9]{1,9}){0,3}"
 
@@ -109,7 +112,9 @@ def _reader_of(path: Path) -> Callable[[Path], ImageFile]:
     with path.open("rb") as file:
         start = file.read(4)
     if (start == b"NRRD" or name.endswith((".nrrd", ".nhdr"))) and importlib.util.find_spec("nrrd") is not None:
-        return _read_nrrd
+        with path.open("rb") as file:
+            has_list = re.search(rb"^data ?file:.*(LIST|%)", file.read(_CHUNK), re.MULTILINE)
+        return _read_by_itk if has_list else _read_nrrd  # pynrrd reads no voxels in several files
     return _read_minc1 if name.endswith(".mnc") and start[:3] == b"CDF" else _read_by_itk
 
 
@@ -120,11 +125,15 @@ def checked_image(path: Path, found: ImageFile) -> ImageFile:
     are not perpendicular.
     """
     array, doubts = found.array, list(found.doubts)
+    if found.has_components and array.shape[-1] == 1:
+        array, found = array[..., 0], replace(found, has_components=False)
+    if array.ndim - found.has_components == 4 and array.shape[0] == 1:
+        array = array[0]  # a time axis of length one
     require(not np.iscomplexobj(array), f"{path}: holds complex numbers, expected real ones; save its magnitude")
     space = array.shape[::-1][1:] if found.has_components else array.shape[::-1]
     for name, size in found.sizes.items():
         require(
-            tuple(size) == space[: len(size)],
+            tuple(size[:3]) == space[: len(size[:3])],
             f"{path}: {name} says {_times(size)} voxels, and {_times(space)} were read; copy or export it again",
         )
     axes = found.ijk_to_ras[:3, :3]
@@ -143,10 +152,11 @@ def checked_image(path: Path, found: ImageFile) -> ImageFile:
             )
     used = next(iter(found.matrices), "")
     for name, matrix in found.matrices.items():
-        apart = _distance_mm(matrix, found.ijk_to_ras, space)
+        apart = _distance_mm(matrix, found.ijk_to_ras, (*space, 1, 1)[:3])
         if not apart <= _SAME_MM:
             doubts.append(
-                f"its {name} puts it {apart:.1f} mm away from its {used}, which is used; check left and right"
+                f"its {name} puts it {apart:.1f} mm away from its {used}, which is used: i, j, k go towards "
+                f"{_lies(matrix)} by the {name}, {_lies(found.ijk_to_ras)} by the {used}; check left and right"
             )
     bad = array.size - int(np.isfinite(array).sum()) if array.dtype.kind == "f" else 0
     if bad:
@@ -156,6 +166,18 @@ def checked_image(path: Path, found: ImageFile) -> ImageFile:
     for doubt in doubts:
         _log.warning("%s: %s", path, doubt)
     return replace(found, array=array, doubts=tuple(f"{path}: {doubt}" for doubt in doubts))
+
+
+def _lies(matrix: np.ndarray) -> str:
+    """Directions of i, j, k and place of the first voxel: "RAS from (-90, -126, -72) mm"."""
+    return f"{axis_letters(matrix)} from ({', '.join(f'{mm:.4g}' for mm in matrix[:3, 3])}) mm"
+
+
+def axis_letters(ijk_to_ras: np.ndarray) -> str:
+    """Approximate directions of the axes i, j, k of a (4, 4) ijk_to_ras: "RAS", "LPS", ..."""
+    axes = ijk_to_ras[:3, :3].T
+    main = np.abs(axes).argmax(axis=1)
+    return "".join("RAS"[n] if axis[n] > 0 else "LPI"[n] for axis, n in zip(axes, main, strict=True))
 
 
 def _times(values: Sequence[float] | np.ndarray) -> str:
@@ -235,6 +257,7 @@ def _native(array: np.ndarray) -> np.ndarray:
 def _read_nifti(path: Path) -> ImageFile:
     import nibabel
 
+    doubts = []
     with remarks_withheld():  # what nibabel corrects in a header is compared below
         if path.suffix.lower() in (".hdr", ".img"):
             image: Any = nibabel.load(path)  # type: ignore[attr-defined]
@@ -249,7 +272,15 @@ def _read_nifti(path: Path) -> ImageFile:
             raw = kind.header_class(content[: kind.header_class.sizeof_hdr], check=False)
             require_voxels(path, [int(n) for n in raw["dim"][1 : max(int(raw["dim"][0]), 0) + 1]])
             image = kind.from_bytes(content)
+            first, stored = int(raw["vox_offset"]), int(np.prod(image.shape)) * raw.get_data_dtype().itemsize
+            least = kind.header_class.sizeof_hdr + 4
+            require(first >= least, f"{path}: vox_offset is {first}, expected {least} or more, behind the header")
+            more = len(content) - first - stored
+            if more > 0:
+                doubts.append(f"has {more} bytes more than the {_times(image.shape)} voxels of its header")
         array = np.asanyarray(image.dataobj)
+        if float(raw["pixdim"][0]) < 0:  # nifti1.h: any number below 0 is -1
+            image.header["pixdim"][0] = -1.0
         qform = np.array(image.header.get_qform())
     if array.dtype.names:  # colours
         array = np.stack([array[name] for name in array.dtype.names], axis=-1)[..., None, :]
@@ -258,12 +289,12 @@ def _read_nifti(path: Path) -> ImageFile:
     unit = int(raw["xyzt_units"]) & 7
     scale = np.diag([*[_NIFTI_UNITS.get(unit, 1.0)] * 3, 1.0])
     pixdim = np.asarray(raw["pixdim"][1:4], float) * scale[0, 0]
-    matrices, doubts = {}, []
+    matrices = {}
     if int(raw["sform_code"]) > 0:
         matrices["sform"] = scale @ raw.get_sform()
     if int(raw["qform_code"]) > 0 and pixdim.all():
         matrices["qform"] = scale @ qform
-    for name in [name for name, matrix in matrices.items() if is_singular(matrix)]:
+    for name in [name for name, one in matrices.items() if not np.isfinite(one).all() or is_singular(one)]:
         del matrices[name]
         doubts.append(f"its {name} has no three axes and is not used")
     if not matrices:  # as ITK and 3D Slicer read it
@@ -357,16 +388,19 @@ def _read_nrrd(path: Path) -> ImageFile:
     ]
     fast = [axis for axis in range(count) if axis not in axes and axis not in slow]
     array = array.transpose([count - 1 - axis for axis in (*slow[::-1], *axes[::-1], *fast[::-1])])
-    unit = str(next(iter(values.get("space units") or values.get("units") or [""]))).lower()
-    scale = _NRRD_UNITS.get(unit, 1.0)
-    if unit not in _NRRD_UNITS:
-        doubts.append(f"its space units {unit!r} are unknown, expected mm, cm, m or um; read as millimetres")
+    units = {str(unit).lower().removesuffix("s") for unit in values.get("space units") or values.get("units") or [""]}
+    scale = _NRRD_UNITS.get(min(units), 1.0)
+    if len(units) > 1 or not units <= _NRRD_UNITS.keys():
+        scale = 1.0
+        doubts.append(f"its space units are {', '.join(sorted(units))}, expected one of mm, cm, m, um; read as mm")
     matrix = np.eye(4)
     for place, axis in enumerate(axes):
         if np.isfinite(steps[axis]).all():
             matrix[:3, place] = steps[axis]
         elif np.isfinite(lengths[axis]):
             matrix[place, place] = lengths[axis]
+    if not np.isfinite(np.where(np.isfinite(lengths[axes]), lengths[axes], steps[axes, 0])).all() and len(axes) == 3:
+        doubts.append("its header has no size of voxels, read as 1 mm")
     if np.isfinite(lengths[axes]).all():
         spacings["spacings"] = tuple((lengths[axes] * scale).tolist())
     if values.get("space origin") is not None:
@@ -405,13 +439,14 @@ def _read_by_itk(path: Path) -> ImageFile:
         if "No such file" in reason:  # ITK's words for voxels that it could not read
             reason = "its voxels are missing or incomplete; copy or export it again"
         raise SimulationError(f"{path}: cannot be read as an image ({reason})") from None
-    found = of_sitk(image)
-    require(
-        held is None or held >= found.array.nbytes,
-        f"{path}: has {held} bytes of voxels, expected {found.array.nbytes} for {_times(image.GetSize())}; copy or "
-        "export it again",
-    )
-    return replace(found, sizes=sizes, spacings=spacings)
+    found, doubts = of_sitk(image), ()
+    if held is not None and held != found.array.nbytes:
+        line = f"has {held} bytes of voxels, expected {found.array.nbytes} for {_times(image.GetSize())} voxels"
+        require(held > found.array.nbytes, f"{path}: {line}; copy or export it again")
+        doubts = (f"{line}: check size and type in its header",)
+    if is_metaimage and not spacings and image.GetDimension() > 2 and "Seq_Frame0000_Timestamp" not in found.header:
+        doubts = (*doubts, "its header has no size of voxels, read as 1 mm")
+    return replace(found, sizes=sizes, spacings=spacings, doubts=doubts)
 
 
 def of_sitk(image) -> ImageFile:
@@ -431,7 +466,7 @@ def of_sitk(image) -> ImageFile:
 
 
 def _metaimage_says(path: Path) -> tuple[dict[str, list[int]], dict[str, list[float]], int | None]:
-    """Size and spacing in the header of a MetaImage, and the bytes in its compressed voxels; None if they are not.
+    """Size and spacing in the header of a MetaImage, and the bytes of its voxels; None if they are in several files.
 
     MetaIO leaves voxels that are missing as the memory was, and hands the name of numbered files to printf.
     """
@@ -457,11 +492,11 @@ def _metaimage_says(path: Path) -> tuple[dict[str, list[int]], dict[str, list[fl
         len(size) in (2, 3, 4) and min(size) > 0, f"{path}: DimSize is {_times(size)}, expected 2 to 4 sizes above 0"
     )
     require_voxels(path, size)
-    held = None
+    voxels = path.parent / pattern
+    if pattern != "LOCAL":
+        content = voxels.read_bytes() if voxels.is_file() else b""
+    held = len(content) if content and "HeaderSize" not in fields else None
     if fields.get("CompressedData", "").lower() in ("true", "t", "1"):
-        voxels = path.parent / pattern
-        if pattern != "LOCAL":
-            content = voxels.read_bytes() if voxels.is_file() else b""
         try:
             held = len(zlib.decompress(content))
         except zlib.error:

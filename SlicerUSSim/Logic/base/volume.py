@@ -15,6 +15,7 @@ from SlicerUSSim.Logic.base.errors import require, require_path
 from SlicerUSSim.Logic.base.files import messages_withheld, require_space, written_whole
 from SlicerUSSim.Logic.base.image_files import (
     ImageFile,
+    axis_letters,
     checked_image,
     of_sitk,
     read_image,
@@ -299,13 +300,6 @@ def _log_size(volume: Volume, path: Path) -> None:
             "%s: its size is %s mm if lengths are in millimetres, as assumed; check its voxel size", path,
             "x".join(f"{round(mm, 3):g}" for mm in size),
         )  # fmt: skip
-
-
-def axis_letters(ijk_to_ras: np.ndarray) -> str:
-    """Approximate directions of the axes i, j, k of a (4, 4) ijk_to_ras: "RAS", "LPS", ..."""
-    axes = ijk_to_ras[:3, :3].T
-    main = np.abs(axes).argmax(axis=1)
-    return "".join("RAS"[n] if axis[n] > 0 else "LPI"[n] for axis, n in zip(axes, main, strict=True))
 
 
 def require_image_name(path: Path, also: tuple[str, ...] = ()) -> None:

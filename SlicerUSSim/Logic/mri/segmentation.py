@@ -20,7 +20,7 @@ from SlicerUSSim.Logic.mri.evidence import Evidence
 from SlicerUSSim.Logic.mri.filtering import denoised, estimate_noise as estimate_noise
 from SlicerUSSim.Logic.mri.nuclei import with_nuclei
 from SlicerUSSim.Logic.mri.outside import find_outside, require_findable, watery
-from SlicerUSSim.Logic.mri.plausibility import require_contrast
+from SlicerUSSim.Logic.mri.plausibility import out_of_place, require_contrast
 from SlicerUSSim.Logic.mri.recognition import check_intensities, require_no_hounsfield
 from SlicerUSSim.Logic.mri.segmentation_settings import SegmentationSettings
 from SlicerUSSim.Logic.mri.segmentation_steps import (
@@ -290,6 +290,8 @@ def segment_mri(
     timed("neighbours")
     report(0.9)
     warnings += doubts(found, part, filtered[0][1], atlas, contrasts)
+    if prior is not None:
+        warnings += out_of_place(found, prior)
 
     labels = np.zeros(part.inside.shape, np.uint8)
     labels[part.inside] = found.posteriors.argmax(axis=0) + 1

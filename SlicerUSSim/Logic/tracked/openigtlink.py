@@ -201,10 +201,10 @@ class TrackerLink:
                 remedy = "expected TRANSFORM: configure it to send TRANSFORM messages of the probe's pose"
                 self._say(f"{self._peer_name} sends {kind} messages, {remedy}", logging.WARNING)
             return
-        if self._device is None:
+        if self._device is None and packed[-8:].hex() == f"{CRC64(body):016x}":
             self._device = device
             _log.info("OpenIGTLink: no transform was chosen, the first that came is followed: %r", device)
-        if device != self._device:
+        if self._device not in (None, device):
             self._notice(f"transform {device!r} is passed over, {self._device!r} is followed")
             return
         message, name, crc, expected = TransformMessage(), f"transform {device!r}", packed[-8:].hex(), CRC64(body)

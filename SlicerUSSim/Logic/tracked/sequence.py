@@ -22,7 +22,7 @@ from SlicerUSSim.Logic.base.errors import SimulationError, require, require_pack
 from SlicerUSSim.Logic.base.files import read_text, written_whole
 from SlicerUSSim.Logic.base.image_files import read_image
 from SlicerUSSim.Logic.base.reading import reader
-from SlicerUSSim.Logic.base.transforms import check_affine, is_singular
+from SlicerUSSim.Logic.base.transforms import check_affine, check_rigid, is_singular
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.tracked.pose_files import matrix_of_text
 
@@ -411,10 +411,13 @@ def _from_header(pixels: _Pixels, header: Mapping[str, str], source: str) -> Tra
             except ValueError:
                 raise SimulationError(f"{source}: {key} is {text!r}, expected seconds") from None
             continue
-        if short != name and _FROM_TO.fullmatch(short):
+        if short != name and (frames := _FROM_TO.fullmatch(short)):
             try:
                 if header.get(f"{key}Status", _OK).strip().upper() == _OK:
-                    transforms[number][short] = matrix_of_text(key, text)
+                    matrix = matrix_of_text(key, text)
+                    if "Image" not in frames.groups():  # whose frame is in pixels
+                        check_rigid(key, matrix)
+                    transforms[number][short] = matrix
                     continue
                 lost += 1
             except SimulationError as error:
