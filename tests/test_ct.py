@@ -200,12 +200,14 @@ def test_it_reports_progress_and_can_be_cancelled():
         segment_ct(coarse().ct, progress=Mock(side_effect=Cancelled))
 
 
-def test_the_command_segments_a_ct_with_organs(tmp_path, capsys):
-    spine()[0].ct.write(tmp_path / "ct.nii.gz")
-    spine()[0].organs.write(tmp_path / "organs.nii.gz")
+def test_the_command_segments_a_ct_with_organs_and_a_lesion(tmp_path, capsys):
+    ct, organs, lesion, labels = (str(tmp_path / f"{name}.nii.gz") for name in ("ct", "organs", "lesion", "labels"))
+    spine()[0].ct.write(ct)
+    spine()[0].organs.write(organs)
+    spine()[0].truth.with_array((spine()[0].truth.array == NAMES.index("blood") + 1).astype(np.uint8)).write(lesion)
+    options = ["--ct", "--organs", organs, "--map", "totalsegmentator", "--add", f"tumor={lesion}", "-o", labels]
     with pytest.raises(SystemExit) as ended:
-        files = [str(tmp_path / name) for name in ("ct.nii.gz", "organs.nii.gz", "labels.nii.gz")]
-        cli(["segment", files[0], "--ct", "--organs", files[1], "--map", "totalsegmentator", "-o", files[2]])
+        cli(["segment", ct, *options])
     assert ended.value.code == 0
     assert "cancellous bone" in capsys.readouterr().out
     table = TissueTable.read(tmp_path / "labels.json")
