@@ -55,12 +55,9 @@ def sharpened(hu: np.ndarray, noise: float) -> np.ndarray:
     for axis in range(3):
         steepness = np.abs(ndimage.convolve1d(hu, [1, 0, -1], axis, mode="nearest"))
         known &= steepness < max(_LEAST_STEP, round(_STEP_PER_NOISE * noise))
-    result = hu.copy()
+    result, far = hu.copy(), np.int16(32000)
     for _ in range(2):
-        for side, around, none in (
-            (is_upper, smallest_around, np.int16(32000)),
-            (~is_upper, largest_around, np.int16(-32000)),
-        ):
+        for side, around, none in ((is_upper, smallest_around, far), (~is_upper, largest_around, -far)):
             nearest = around(np.where(known & side, result, none))
             found = side & ~known & (nearest != none)
             np.copyto(result, nearest, where=found)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import logging
 import zipfile
@@ -11,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from SlicerUSSim.Logic.base.errors import SimulationError, require
+from SlicerUSSim.Logic.base.errors import SimulationError
 from SlicerUSSim.Logic.base.files import written_whole
 from SlicerUSSim.Logic.base.version import __version__
 from SlicerUSSim.Logic.base.volume import Volume
@@ -47,7 +46,6 @@ def read_kept_sheets(path: Path, key: str, kinds: tuple[str, ...]) -> tuple[Surf
                     continue
                 arrays = {entry.name: file[entry.name] for entry in fields(Surfels)}
                 surfels, structures = Surfels(**arrays), file["structures"]
-                require(head.get("arrays") == _hash_of(surfels, structures), "its arrays are not as they were written")
                 return surfels, structures, place
         except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile, SimulationError) as error:
             _log.info("%s: is not used as kept sheets (%s)", place, error)
@@ -56,8 +54,7 @@ def read_kept_sheets(path: Path, key: str, kinds: tuple[str, ...]) -> tuple[Surf
 
 def keep_sheets(path: Path, key: str, kinds: tuple[str, ...], surfels: Surfels, structures: np.ndarray) -> str:
     """Write them to `path`, or to the user's cache folder as keep_file does; returns one line about it."""
-    arrays = _hash_of(surfels, structures)
-    head = json.dumps({"key": key, "kinds": kinds, "version": __version__, "arrays": arrays})
+    head = json.dumps({"key": key, "kinds": kinds, "version": __version__})
     return keep_file(
         path, _in_cache(path, key), "the sheets are", lambda place: _write(place, head, surfels, structures)
     ).text
@@ -67,15 +64,6 @@ def _write(path: Path, head: str, surfels: Surfels, structures: np.ndarray) -> N
     arrays = {entry.name: getattr(surfels, entry.name) for entry in fields(surfels)}
     with written_whole(path) as partial:
         np.savez_compressed(partial, ussim_sheets=np.array(head), structures=structures, **arrays)
-
-
-def _hash_of(surfels: Surfels, structures: np.ndarray) -> str:
-    """Of all arrays and their shapes: half of them would be taken for all."""
-    found = hashlib.sha256()
-    for array in (*(getattr(surfels, entry.name) for entry in fields(surfels)), structures):
-        found.update(f"{array.dtype} {array.shape}".encode())
-        found.update(np.ascontiguousarray(array).tobytes())
-    return found.hexdigest()
 
 
 def _holds(kept: set[str], wanted: set[str]) -> bool:

@@ -58,22 +58,10 @@ def write_surfels(path: str | os.PathLike, surfels: Surfels) -> None:
 
 def _is_whole(path: Path, data: vtkPolyData) -> bool:
     """Whether a file has the points and squares of `data`."""
-    from vtkmodules.util.numpy_support import vtk_to_numpy
-    from vtkmodules.vtkIOPLY import vtkPLYReader
-
     if path.suffix.lower() != ".ply":
         return _has_end(path)
     # Of each point 3 float32 and 3 bytes of colour, of each square its size and 4 int32
-    if path.stat().st_size < 15 * data.GetNumberOfPoints() + 17 * data.GetNumberOfCells():
-        return False
-    reader = vtkPLYReader()
-    reader.SetFileName(str(path))
-    reader.Update()
-    found = reader.GetOutput()
-    if found.GetNumberOfCells() != data.GetNumberOfCells():
-        return False
-    one, other = (vtk_to_numpy(surface.GetPoints().GetData()).astype(np.float32) for surface in (found, data))
-    return bool(np.array_equal(one, other))
+    return path.stat().st_size >= 15 * data.GetNumberOfPoints() + 17 * data.GetNumberOfCells()
 
 
 def _has_end(path: Path) -> bool:
