@@ -174,10 +174,7 @@ def open_examination(patient: PatientOptions, pose: np.ndarray | str | None = No
         require_no_mri_options(path, "leave it out, or use --mri if it is one")
     else:
         require_no_map(path, patient.maps, patient.organs)
-        craniotomy.require_head(
-            volume, outside=chosen.outside, contrast=chosen.contrast, skull_strip=chosen.skull_strip,
-            has_mask=patient.mask is not None,
-        )  # fmt: skip
+        craniotomy.require_head(volume, patient)
     also_files(patient.also)
     if chosen.outside and not is_ct:
         require_findable(chosen.contrast, chosen.skull_strip, patient.mask is not None)

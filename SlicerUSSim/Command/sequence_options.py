@@ -87,13 +87,9 @@ class TrackedExamination:
 
 
 def open_tracked(
-    patient: PatientOptions,
-    recording: SequenceOptions,
-    most: int | None = None,
-    apart: str = "",
-    *,
+    patient: PatientOptions, recording: SequenceOptions, most: int | None = None, apart: str = "", *,
     finds_marks: bool = True,
-) -> TrackedExamination:
+) -> TrackedExamination:  # fmt: skip
     """The TrackedExamination of a command's options; `most` is the default number of images.
 
     `apart` selects other images, in the format of --frames; `finds_marks` as in TrackedImages.of.
@@ -124,17 +120,9 @@ def open_tracked(
     chosen = None if recording.frames is None else frame_numbers(recording.frames, len(sequence))
     beside = checked_apart(apart, chosen, len(sequence))
     images = TrackedImages.of(
-        sequence,
-        chosen,
-        path=path,
-        reference_to_ras=to_ras,
-        probe=known_probe,
-        beam=examination.probe,
-        most=most,
-        apart=beside,
-        field=field,
-        finds_marks=finds_marks,
-    )
+        sequence, chosen, path=path, reference_to_ras=to_ras, probe=known_probe, beam=examination.probe, most=most,
+        apart=beside, field=field, finds_marks=finds_marks,
+    )  # fmt: skip
     others = None
     if beside:
         images, others = images.split(beside)
