@@ -148,9 +148,6 @@ def open_examination(patient: PatientOptions, pose: np.ndarray | str | None = No
 
     from SlicerUSSim.Logic.base.volume import Volume
     from SlicerUSSim.Logic.imaging.found_sheets import with_their_tissue
-    from SlicerUSSim.Logic.mri.outside import require_findable
-    from SlicerUSSim.Logic.mri.pathology import texture_below
-    from SlicerUSSim.Logic.mri.segmentation import Segmentation
     from SlicerUSSim.Logic.tissue.label_sources import is_label_file
     from SlicerUSSim.Logic.tissue.presets import TISSUES
     from SlicerUSSim.Logic.tissue.table import TissueTable
@@ -177,6 +174,8 @@ def open_examination(patient: PatientOptions, pose: np.ndarray | str | None = No
         craniotomy.require_head(volume, patient)
     also_files(patient.also)
     if chosen.outside and not is_ct:
+        from SlicerUSSim.Logic.mri.outside import require_findable  # labels alone do not wait for it
+
         require_findable(chosen.contrast, chosen.skull_strip, patient.mask is not None)
     sheets = DrawnSheets.of(patient.sheets, patient.no_sheets, is_labels=is_labels, contrast=chosen.contrast)
     changes = Changes.of(patient.changes)
@@ -188,6 +187,9 @@ def open_examination(patient: PatientOptions, pose: np.ndarray | str | None = No
         )
         tissues = changes.to_tissues(with_their_tissue(added.table(tissues), sheets.read))
         return _placed(patient, craniotomy, preset, added, labels, pose, tissues, None, sheets.read)
+    from SlicerUSSim.Logic.mri.pathology import texture_below
+    from SlicerUSSim.Logic.mri.segmentation import Segmentation
+
     log.info("tissues: %s", patient.tissues or ("the preset's" if patient.preset else "presets of the brain"))
     tissues = preset.tissues if table is None else table
     additions = Additions.read(patient.additions, (tissue.name for tissue in tissues.all_tissues()))
