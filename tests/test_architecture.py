@@ -43,8 +43,8 @@ HEAVY = {
 #: Lines of Python that a room, or a folder beside the product, may have. Raising one is a decision: the commit says
 #: what users get for it.
 BUDGETS = {
-    "base": 3215, "opencl": 1250, "probe": 1470, "tissue": 2935, "tracked": 2155, "mri": 10065, "placement": 815,
-    "imaging": 4800, "fitting": 4390, "vtk": 530, "mrml": 4480, "Widget": 2640, "Workstation": 7765, "Command": 3240,
+    "base": 3220, "opencl": 1250, "probe": 1470, "tissue": 2935, "tracked": 2155, "mri": 10065, "placement": 815,
+    "imaging": 4805, "fitting": 4390, "vtk": 530, "mrml": 4480, "Widget": 2640, "Workstation": 7765, "Command": 3035,
     "module": 370, "validation": 6030, "benchmarks": 3750, "tests": 31180, "tests/reference": 500,
 }  # fmt: skip
 #: Lines of all of SlicerUSSim/, and of kernels/

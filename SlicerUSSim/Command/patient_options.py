@@ -118,11 +118,9 @@ def named_probe(name_or_path: str) -> Probe:
 
     if name_or_path in PROBES:
         return PROBES[name_or_path]
-    is_name = not os.path.exists(name_or_path) and not os.path.splitext(name_or_path)[1]
-    require(
-        not is_name or os.path.dirname(name_or_path) != "",
-        f"--probe is {name_or_path!r}, which is no file, expected a JSON file or one of {', '.join(PROBES)}",
-    )
+    place = Path(name_or_path)
+    wrong = f"--probe is {name_or_path!r}, which is no file, expected a JSON file or one of {', '.join(PROBES)}"
+    require(place.exists() or bool(place.suffix) or os.path.dirname(name_or_path) != "", wrong)
     return probe_from_dict(read_json(name_or_path), name_or_path)
 
 

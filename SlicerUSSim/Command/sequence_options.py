@@ -11,7 +11,7 @@ import click
 from SlicerUSSim.Command.options import declared
 from SlicerUSSim.Command.patient_options import Examination, PatientOptions, open_examination, say_contact
 from SlicerUSSim.Command.progress import note
-from SlicerUSSim.Logic.base.errors import SimulationError, require
+from SlicerUSSim.Logic.base.errors import require
 
 if TYPE_CHECKING:
     import numpy as np
@@ -161,12 +161,10 @@ def _read_cuts(pose_file: str, recording: SequenceOptions) -> tuple[Volume, list
     from SlicerUSSim.Logic.probe.poses import slide_sweep, tilt_sweep
     from SlicerUSSim.Logic.tracked.pose_files import read_pose
 
-    if recording.cut_tilt is not None and recording.cut_slide is not None:
-        raise SimulationError("recording.cut_tilt and recording.cut_slide are both given, expected only one")
-    pose = read_pose(pose_file)
-    poses = [pose]
-    if recording.cut_tilt is not None:
-        poses = tilt_sweep(pose, recording.cut_tilt, recording.cuts)
-    elif recording.cut_slide is not None:
-        poses = slide_sweep(pose, recording.cut_slide, recording.cuts)
-    return Volume.read(recording.sequence), poses
+    tilt, slide, pose = recording.cut_tilt, recording.cut_slide, read_pose(pose_file)
+    if tilt is None and slide is None:
+        return Volume.read(recording.sequence), [pose]
+    given = "recording.cut_tilt and recording.cut_slide are both given, expected only one"
+    require(tilt is None or slide is None, given)
+    around, extent = (slide_sweep, slide or 0.0) if tilt is None else (tilt_sweep, tilt)
+    return Volume.read(recording.sequence), around(pose, extent, recording.cuts)
