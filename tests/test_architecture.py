@@ -44,8 +44,8 @@ HEAVY = {
 #: what users get for it.
 BUDGETS = {
     "base": 3220, "opencl": 1250, "probe": 1470, "tissue": 2935, "tracked": 2155, "mri": 10065, "placement": 815,
-    "imaging": 4805, "fitting": 4390, "vtk": 530, "mrml": 4480, "Widget": 2640, "Workstation": 7765, "Command": 3035,
-    "module": 370, "validation": 6030, "benchmarks": 3750, "tests": 31180, "tests/reference": 500,
+    "imaging": 4805, "fitting": 4390, "vtk": 530, "mrml": 4480, "Widget": 2640, "Workstation": 7765, "Command": 3037,
+    "module": 370, "validation": 6030, "benchmarks": 3750, "tests": 31058, "tests/reference": 500,
 }  # fmt: skip
 #: Lines of all of SlicerUSSim/, and of kernels/
 LARGEST_PRODUCT, LARGEST_KERNELS = 50_000, 5_600

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from SlicerUSSim.Command.mri_options import NONE, MriOptions
 from SlicerUSSim.Command.progress import note
 from SlicerUSSim.Logic.base.errors import SimulationError, require, required
 from SlicerUSSim.Logic.mri.segmentation_settings import GEL_MM as GEL_MM
@@ -14,11 +15,10 @@ from SlicerUSSim.Logic.mri.segmentation_settings import GEL_MM as GEL_MM
 if TYPE_CHECKING:
     import numpy as np
 
-    from SlicerUSSim.Command.mri_options import MriOptions
     from SlicerUSSim.Logic.base import Volume
     from SlicerUSSim.Logic.probe import Probe
 
-NONE, AUTO, DISC = "none", "auto", "disc:"
+AUTO, DISC = "auto", "disc:"
 
 
 @dataclass(frozen=True)

@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from SlicerUSSim.Command.additions import Additions, split_additions
-from SlicerUSSim.Command.craniotomy_options import NONE, Craniotomy
+from SlicerUSSim.Command.craniotomy_options import Craniotomy
 from SlicerUSSim.Command.interrupts import end_at_once
-from SlicerUSSim.Command.mri_options import ImageOptions, also_files, read_mri
+from SlicerUSSim.Command.mri_options import NONE, ImageOptions, also_files, read_mri
 from SlicerUSSim.Command.options import declared, gathered, given_options, require_no_mri_options
 from SlicerUSSim.Command.patient_options import RARE
 from SlicerUSSim.Command.progress import note
