@@ -257,13 +257,13 @@ def centres(volume: Volume) -> np.ndarray:
 
 
 @pytest.mark.parametrize(
-    ("normal", "spacing", "finer", "turn"),
-    [((0, 0, 1), 1.0, 2, 0.0), ((1, 1, 1), 1.0, 1, 0.0), ((0.3, -0.5, 0.81), 0.8, 1, 20.0)],
+    ("normal", "spacing", "turn"),
+    [((0, 0, 1), 0.5, 0.0), ((1, 1, 1), 1.0, 0.0), ((0.3, -0.5, 0.81), 0.8, 20.0)],
 )
-def test_a_tilted_plane_on_voxels_has_its_distance_and_no_holes(normal, spacing, finer, turn):
+def test_a_tilted_plane_on_voxels_has_its_distance_and_no_holes(normal, spacing, turn):
     surfels, place = plane_surfels(normal)
     ras_normal = unit(normal)[::-1]
-    voxels = on_voxels(surfels, grid(spacing, turn_deg=turn), finer=finer)
+    voxels = on_voxels(surfels, grid(spacing, turn_deg=turn))
     away = (place - centres(voxels.entry)) @ ras_normal
     near = voxels.entry.array >= 0
     assert near[np.abs(away) < 1.95].all()
@@ -323,8 +323,6 @@ def test_a_grid_too_coarse_for_the_reach_and_no_surfels():
     surfels, _ = plane_surfels((0, 0, 1))
     with pytest.raises(SimulationError, match=r"reach_mm is 1, expected at least 2\.3"):
         on_voxels(surfels, grid(3.0), reach_mm=1.0)
-    with pytest.raises(SimulationError, match="finer is 0"):
-        on_voxels(surfels, grid(1.0), finer=0)
     assert (on_voxels(Surfels.joined([]), grid(1.0)).entry.array == -1).all()
 
 

@@ -13,7 +13,7 @@ from click.testing import CliRunner
 from PIL import Image
 
 from SlicerUSSim.Command.cli import main
-from SlicerUSSim.Logic import UltrasoundSimulator, Volume
+from SlicerUSSim.Logic import Volume
 from SlicerUSSim.Logic.mri.samples import head_mri
 from SlicerUSSim.Logic.probe.arrays import PROBES
 from SlicerUSSim.Logic.tracked.pose_files import read_pose, write_pose
@@ -121,11 +121,6 @@ def test_simulate_takes_probe_tissues_and_pose_from_files(labels, head, tmp_path
     assert 0.2 < pictures[0].shape[1] / pictures[0].shape[0] < 1.2
     assert np.abs(pictures[0] - pictures[1]).mean() > 1  # another seed
     assert pictures[2].mean() == pytest.approx(pictures[0].mean(), rel=0.1)  # the MRI is segmented alike
-
-
-def test_devices_says_which_is_used():
-    result = ussim("devices")
-    assert result.exit_code == 0 and "used: " in result.output and "* " in result.output
 
 
 def bad_inputs(folder):
@@ -299,21 +294,6 @@ def test_a_pose_past_the_volume_is_a_warning_and_a_black_image(labels, tmp_path)
     assert "ussim: warning: the probe looks past the volume" in result.stderr
     # Below the ring-down at the face there is amplifier noise only.
     assert np.asarray(Image.open(tmp_path / "o.png"))[128:].max() < 40
-
-
-def test_an_mri_gives_its_simulator_shares_of_voxels_and_labels_none(head, labels, tmp_path, monkeypatch):
-    textures = []
-
-    class Seen(UltrasoundSimulator):
-        def __init__(self, labels, tissues, settings=None, device=None, texture=None, sheets=None):
-            textures.append(texture)
-            super().__init__(labels, tissues, settings, device, texture, sheets)
-
-    monkeypatch.setattr("SlicerUSSim.Logic.imaging.simulator.UltrasoundSimulator", Seen)
-    for source in (head, labels):
-        result = ussim("simulate", source, "--pose", "auto", "-o", tmp_path / "image.png", "--overwrite")
-        assert result.exit_code == 0, result.output
-    assert textures[0].volume_share.max() > 0.4 and textures[1] is None
 
 
 @pytest.mark.parametrize("of", ["labels", pytest.param("an MRI", marks=pytest.mark.slow)])

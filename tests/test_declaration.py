@@ -25,7 +25,6 @@ from SlicerUSSim.Logic.base.declaration import (
     parameters_of,
 )
 from SlicerUSSim.Logic.imaging.preset import preset_parameters
-from SlicerUSSim.Logic.mri.segmentation_settings import SegmentationSettings
 from SlicerUSSim.Logic.probe import arrays
 from SlicerUSSim.Logic.probe.arrays import PROBES, ConvexProbe, probe_kind
 from SlicerUSSim.Logic.tissue.presets import TISSUES
@@ -205,17 +204,6 @@ def test_a_text_that_stands_for_nothing_is_refused(entry, texts):
     for text in texts:
         with pytest.raises(SimulationError, match=f"^here: {entry.name} is .*, expected "):
             entry.from_text("here", text)
-
-
-def test_declared_classes_check_themselves_and_convert():
-    settings = SimulationSettings(seed=np.int64(7), intensity_threshold=1)  # type: ignore[arg-type]
-    assert type(settings.seed) is int and type(settings.intensity_threshold) is float
-    with pytest.raises(
-        SimulationError, match=r"segmentation: classes is 3\.0, expected a whole number between 3 and 4"
-    ):
-        SegmentationSettings(classes=3.0)  # type: ignore[arg-type]
-    with pytest.raises(SimulationError, match=r"focus_mm is 'near', expected a number between 0\.1 and 1000 or none"):
-        ConvexProbe(40.0, 60.0, 100.0, focus_mm="near")  # type: ignore[arg-type]
 
 
 # ---- bad presets -----------------------------------------------------------------------------------------------------

@@ -111,7 +111,9 @@ def test_a_report_of_what_does_not_scatter_is_without_controls(folder, tmp_path)
     pytest.importorskip("matplotlib", reason="reports need matplotlib: pip install '.[demo]'")
     silent = TissueTable({n: replace(tissue, mu0=0.0, sigma0=0.0) for n, tissue in TISSUES.items()})
     silent.write(tmp_path / "silent.json")
-    done = optimize(folder, "--tissues", tmp_path / "silent.json", "--report", tmp_path / "report.html")
+    done = optimize(
+        folder, "--set", f"patient.tissues={tmp_path / 'silent.json'}", "--report", tmp_path / "report.html"
+    )
     assert done.exit_code == 0, done.output
     assert "the report has no controls: no tissue of the volume has scatterers" in done.stderr
     assert "uniform tissue" not in (tmp_path / "report.html").read_text("utf-8").lower()

@@ -7,9 +7,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from SlicerUSSim.Command.mri_options import NONE, MriOptions
 from SlicerUSSim.Command.progress import note
-from SlicerUSSim.Logic.base.errors import SimulationError, require
-from SlicerUSSim.Logic.mri.segmentation_settings import CT, GEL_MM as GEL_MM
+from SlicerUSSim.Logic.base.errors import SimulationError, require, required
+from SlicerUSSim.Logic.mri.segmentation_settings import GEL_MM as GEL_MM
 
 if TYPE_CHECKING:
     import numpy as np
@@ -17,7 +18,7 @@ if TYPE_CHECKING:
     from SlicerUSSim.Logic.base import Volume
     from SlicerUSSim.Logic.probe import Probe
 
-NONE, AUTO, DISC = "none", "auto", "disc:"
+AUTO, DISC = "auto", "disc:"
 
 
 @dataclass(frozen=True)
@@ -65,30 +66,26 @@ class Craniotomy:
         """Whether the opening lies under the probe."""
         return self.source in (AUTO, DISC)
 
-    def require_head(
-        self, mri: Volume | None, *, outside: bool, contrast: str, skull_strip: str, has_mask: bool
-    ) -> None:  # fmt: skip
+    def require_head(self, mri: Volume | None, patient: MriOptions) -> None:
         """Raise SimulationError for an opening in a segmentation without skin and skull, as --outside finds them.
 
         Says what is missing: --outside, or a head. `mri` is None for the demo brain.
         """
+        given, chosen = f"--craniotomy is {self.text}", patient.segmentation
         if not self.is_wanted:
             return
-        require(
-            contrast != CT,
-            f"--craniotomy is {self.text}, which opens a head that was found in an MRI, and this is a CT (--ct)",
-        )
-        if outside:
+        is_of_mri = not patient.is_ct
+        require(is_of_mri, f"{given}, which opens a head that was found in an MRI, and this is a CT (--ct)")
+        if chosen.outside:
             return
         from SlicerUSSim.Logic.mri.outside import require_findable
         from SlicerUSSim.Logic.mri.recognition import stripped_brain
 
-        given = f"--craniotomy is {self.text}"
         nothing = "a brain without its skull, which has nothing to open; leave --craniotomy out"
         require(mri is not None, f"{given}, and the demo is {nothing}")
         require(mri is None or stripped_brain(mri) is None, f"{given}, and the image shows {nothing}")
         try:
-            require_findable(contrast, skull_strip, has_mask)
+            require_findable(chosen.contrast, chosen.skull_strip, patient.mask is not None)
         except SimulationError as error:
             raise SimulationError(f"{given}, and only a brain is labelled: {error}") from None
         raise SimulationError(f"{given}, and only a brain is labelled, expected --outside too")
@@ -114,12 +111,9 @@ class Craniotomy:
         )
 
         if self.needs_pose:
-            if probe_to_ras is None:
-                raise SimulationError(
-                    f"--craniotomy {self.source.rstrip(':')} needs one pose of the probe, expected a file"
-                )
-            diameter = self.diameter_mm or disc_diameter_mm(probe)
-            opening, what = disc_opening(labels, names, probe_to_ras, diameter), f"a disc of {diameter:.0f} mm"
+            need = f"--craniotomy {self.source.rstrip(':')} needs one pose of the probe, expected a file"
+            at, diameter = required(probe_to_ras, need), self.diameter_mm or disc_diameter_mm(probe)
+            opening, what = disc_opening(labels, names, at, diameter), f"a disc of {diameter:.0f} mm"
         else:
             opening, what = file_opening(labels, names, self.source), self.source
         found, millilitres = opened(labels, names, opening)

@@ -13,14 +13,7 @@ import click
 
 from SlicerUSSim.Command.additions import Additions
 from SlicerUSSim.Command.mri_options import MriOptions, read_mri, segmented_file
-from SlicerUSSim.Command.options import (
-    check_results,
-    declared,
-    declared_parameters,
-    gathered,
-    out_option,
-    results_of,
-)
+from SlicerUSSim.Command.options import check_results, declared, declared_parameters, gathered, out_option, results_of
 from SlicerUSSim.Command.patient_options import RARE, named_probe
 from SlicerUSSim.Command.progress import Steps, note
 from SlicerUSSim.Command.set_option import Changes

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING
 
 import click
 
-from SlicerUSSim.Command.craniotomy_options import NONE
 from SlicerUSSim.Command.options import declared, declared_parameters, require_no_options_beside_ct
 from SlicerUSSim.Command.progress import Share, note
 from SlicerUSSim.Logic.base.errors import SimulationError, require
@@ -20,6 +19,9 @@ if TYPE_CHECKING:
     from SlicerUSSim.Logic.base import Volume
     from SlicerUSSim.Logic.mri import CtSegmentation, Segmentation
     from SlicerUSSim.Logic.tissue import LabelledTissues
+
+#: Value of --craniotomy and --sheets
+NONE = "none"
 
 
 @dataclass(frozen=True)

@@ -12,12 +12,7 @@ import click
 from SlicerUSSim.Command.options import check_outputs, declared, gathered, out_option, overwrite_option
 from SlicerUSSim.Command.patient_options import RARE, RARE_BESIDE, PatientOptions
 from SlicerUSSim.Command.progress import Curve, note
-from SlicerUSSim.Command.sequence_options import (
-    RARE_OF_SEQUENCE,
-    SequenceOptions,
-    TrackedExamination,
-    open_tracked,
-)
+from SlicerUSSim.Command.sequence_options import RARE_OF_SEQUENCE, SequenceOptions, TrackedExamination, open_tracked
 from SlicerUSSim.Logic.base.errors import SimulationError, require
 from SlicerUSSim.Logic.base.version import __version__
 from SlicerUSSim.Logic.fitting.fit_settings import FitSettings

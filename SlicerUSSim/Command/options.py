@@ -49,7 +49,7 @@ def verbose_option(command: click.Command) -> click.Command:
     command.params.append(
         click.Option(
             ["-v", "--verbose"], count=True, expose_value=False, callback=_set_verbosity,
-            help="Write choices and the interpretation of inputs to stderr; -vv: also times and caches.",
+            help="Write choices and the interpretation of inputs to stderr; -vv: also times and caches."
         )
     )  # fmt: skip
     return command
@@ -68,7 +68,7 @@ def untrusted_option(command: click.Command, *, hidden: bool = False) -> click.C
     command.params.append(
         click.Option(
             ["--untrusted"], is_flag=True, expose_value=False, callback=_trust_nothing, hidden=hidden,
-            help="Read every file in a process of its own, with limits on time and memory: for files of strangers.",
+            help="Read every file in a process of its own, with limits on time and memory: for files of strangers."
         )
     )  # fmt: skip
     return command

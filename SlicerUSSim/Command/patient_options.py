@@ -118,11 +118,9 @@ def named_probe(name_or_path: str) -> Probe:
 
     if name_or_path in PROBES:
         return PROBES[name_or_path]
-    is_name = not os.path.exists(name_or_path) and not os.path.splitext(name_or_path)[1]
-    require(
-        not is_name or os.path.dirname(name_or_path) != "",
-        f"--probe is {name_or_path!r}, which is no file, expected a JSON file or one of {', '.join(PROBES)}",
-    )
+    place = Path(name_or_path)
+    wrong = f"--probe is {name_or_path!r}, which is no file, expected a JSON file or one of {', '.join(PROBES)}"
+    require(place.exists() or bool(place.suffix) or os.path.dirname(name_or_path) != "", wrong)
     return probe_from_dict(read_json(name_or_path), name_or_path)
 
 
@@ -148,9 +146,6 @@ def open_examination(patient: PatientOptions, pose: np.ndarray | str | None = No
 
     from SlicerUSSim.Logic.base.volume import Volume
     from SlicerUSSim.Logic.imaging.found_sheets import with_their_tissue
-    from SlicerUSSim.Logic.mri.outside import require_findable
-    from SlicerUSSim.Logic.mri.pathology import texture_below
-    from SlicerUSSim.Logic.mri.segmentation import Segmentation
     from SlicerUSSim.Logic.tissue.label_sources import is_label_file
     from SlicerUSSim.Logic.tissue.presets import TISSUES
     from SlicerUSSim.Logic.tissue.table import TissueTable
@@ -174,12 +169,11 @@ def open_examination(patient: PatientOptions, pose: np.ndarray | str | None = No
         require_no_mri_options(path, "leave it out, or use --mri if it is one")
     else:
         require_no_map(path, patient.maps, patient.organs)
-        craniotomy.require_head(
-            volume, outside=chosen.outside, contrast=chosen.contrast, skull_strip=chosen.skull_strip,
-            has_mask=patient.mask is not None,
-        )  # fmt: skip
+        craniotomy.require_head(volume, patient)
     also_files(patient.also)
     if chosen.outside and not is_ct:
+        from SlicerUSSim.Logic.mri.outside import require_findable  # labels alone do not wait for it
+
         require_findable(chosen.contrast, chosen.skull_strip, patient.mask is not None)
     sheets = DrawnSheets.of(patient.sheets, patient.no_sheets, is_labels=is_labels, contrast=chosen.contrast)
     changes = Changes.of(patient.changes)
@@ -191,6 +185,9 @@ def open_examination(patient: PatientOptions, pose: np.ndarray | str | None = No
         )
         tissues = changes.to_tissues(with_their_tissue(added.table(tissues), sheets.read))
         return _placed(patient, craniotomy, preset, added, labels, pose, tissues, None, sheets.read)
+    from SlicerUSSim.Logic.mri.pathology import texture_below
+    from SlicerUSSim.Logic.mri.segmentation import Segmentation
+
     log.info("tissues: %s", patient.tissues or ("the preset's" if patient.preset else "presets of the brain"))
     tissues = preset.tissues if table is None else table
     additions = Additions.read(patient.additions, (tissue.name for tissue in tissues.all_tissues()))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import sys
 from time import perf_counter
-from types import TracebackType
 from typing import TYPE_CHECKING
 
 import click
@@ -51,9 +50,7 @@ class _Bar:
             _shown.append(self)
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         if self in _shown:
             _shown.remove(self)
         self.bar.close()

@@ -11,7 +11,7 @@ import click
 from SlicerUSSim.Command.options import declared
 from SlicerUSSim.Command.patient_options import Examination, PatientOptions, open_examination, say_contact
 from SlicerUSSim.Command.progress import note
-from SlicerUSSim.Logic.base.errors import SimulationError, require
+from SlicerUSSim.Logic.base.errors import require
 
 if TYPE_CHECKING:
     import numpy as np
@@ -87,13 +87,9 @@ class TrackedExamination:
 
 
 def open_tracked(
-    patient: PatientOptions,
-    recording: SequenceOptions,
-    most: int | None = None,
-    apart: str = "",
-    *,
+    patient: PatientOptions, recording: SequenceOptions, most: int | None = None, apart: str = "", *,
     finds_marks: bool = True,
-) -> TrackedExamination:
+) -> TrackedExamination:  # fmt: skip
     """The TrackedExamination of a command's options; `most` is the default number of images.
 
     `apart` selects other images, in the format of --frames; `finds_marks` as in TrackedImages.of.
@@ -124,17 +120,9 @@ def open_tracked(
     chosen = None if recording.frames is None else frame_numbers(recording.frames, len(sequence))
     beside = checked_apart(apart, chosen, len(sequence))
     images = TrackedImages.of(
-        sequence,
-        chosen,
-        path=path,
-        reference_to_ras=to_ras,
-        probe=known_probe,
-        beam=examination.probe,
-        most=most,
-        apart=beside,
-        field=field,
-        finds_marks=finds_marks,
-    )
+        sequence, chosen, path=path, reference_to_ras=to_ras, probe=known_probe, beam=examination.probe, most=most,
+        apart=beside, field=field, finds_marks=finds_marks,
+    )  # fmt: skip
     others = None
     if beside:
         images, others = images.split(beside)
@@ -173,12 +161,10 @@ def _read_cuts(pose_file: str, recording: SequenceOptions) -> tuple[Volume, list
     from SlicerUSSim.Logic.probe.poses import slide_sweep, tilt_sweep
     from SlicerUSSim.Logic.tracked.pose_files import read_pose
 
-    if recording.cut_tilt is not None and recording.cut_slide is not None:
-        raise SimulationError("recording.cut_tilt and recording.cut_slide are both given, expected only one")
-    pose = read_pose(pose_file)
-    poses = [pose]
-    if recording.cut_tilt is not None:
-        poses = tilt_sweep(pose, recording.cut_tilt, recording.cuts)
-    elif recording.cut_slide is not None:
-        poses = slide_sweep(pose, recording.cut_slide, recording.cuts)
-    return Volume.read(recording.sequence), poses
+    tilt, slide, pose = recording.cut_tilt, recording.cut_slide, read_pose(pose_file)
+    if tilt is None and slide is None:
+        return Volume.read(recording.sequence), [pose]
+    given = "recording.cut_tilt and recording.cut_slide are both given, expected only one"
+    require(tilt is None or slide is None, given)
+    around, extent = (slide_sweep, slide or 0.0) if tilt is None else (tilt_sweep, tilt)
+    return Volume.read(recording.sequence), around(pose, extent, recording.cuts)

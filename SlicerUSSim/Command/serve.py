@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from SlicerUSSim.Command.additions import Additions, split_additions
-from SlicerUSSim.Command.craniotomy_options import NONE, Craniotomy
+from SlicerUSSim.Command.craniotomy_options import Craniotomy
 from SlicerUSSim.Command.interrupts import end_at_once
-from SlicerUSSim.Command.mri_options import ImageOptions, also_files, read_mri
+from SlicerUSSim.Command.mri_options import NONE, ImageOptions, also_files, read_mri
 from SlicerUSSim.Command.options import declared, gathered, given_options, require_no_mri_options
 from SlicerUSSim.Command.patient_options import RARE
 from SlicerUSSim.Command.progress import note
@@ -126,10 +126,7 @@ def serve(patient: ServeOptions, recording: TrackingOptions) -> None:
             scene is None and also_open is None,
             f"--craniotomy is {patient.craniotomy}, which opens the skull in the MRI of a head, and the file is none",
         )
-        opening.require_head(
-            None if mri is None or chosen.outside else read_head(mri),
-            outside=chosen.outside, contrast=patient.contrast, skull_strip=chosen.skull_strip, has_mask=has_mask,
-        )  # fmt: skip
+        opening.require_head(None if mri is None or chosen.outside else read_head(mri), patient)
     if opening.is_file:
         _require_opening(opening.source)
     require(not (is_ct and others), "--also is for an MRI, and the contrast is ct (--ct); leave it out")
@@ -181,7 +178,7 @@ def serve(patient: ServeOptions, recording: TrackingOptions) -> None:
             sheet_settings=sheet_settings, craniotomy=opening.source, craniotomy_mm=opening.diameter_mm,
             preset=chosen_preset, sequence=tracked, sequence_name=Path(patient.sequence or "").name.split(".")[0],
             transform=recording.transform, to_ras=to_ras, scene=scene, scene_name=scene_name, also_open=also_open,
-            tracker=patient.igtl, tracker_device=patient.igtl_device, volumes=volumes,
+            tracker=patient.igtl, tracker_device=patient.igtl_device, volumes=volumes
         ),
         patient.device,
         SessionStore(sessions_folder()) if patient.autosave else None,

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 import click
 
+from SlicerUSSim.Command.mri_options import NONE
 from SlicerUSSim.Command.progress import Share, note
 from SlicerUSSim.Logic.base.errors import require
 
@@ -27,8 +28,8 @@ sheet_kind_option = click.option(
     help="What --sheets looks for: sulcus, falx, tentorium, ependyma, corpus callosum, choroid plexus or vessels; may "
     "be repeated (default: all).",
 )  # fmt: skip
-#: Values of --sheets that are no file
-AUTO, NONE = "auto", "none"
+#: Value of --sheets that is no file, as NONE
+AUTO = "auto"
 
 
 @dataclass(frozen=True, eq=False)

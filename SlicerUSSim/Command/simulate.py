@@ -18,7 +18,7 @@ from SlicerUSSim.Command.patient_options import (
 )
 from SlicerUSSim.Command.progress import Share, note
 from SlicerUSSim.Command.sequence_options import RARE_OF_SEQUENCE, SequenceOptions, open_tracked
-from SlicerUSSim.Logic.base.errors import SimulationError
+from SlicerUSSim.Logic.base.errors import require
 
 
 @click.command()
@@ -96,12 +96,8 @@ def volume(
 
     require_image_name(out)
     check_outputs(out)
-    if tilt is not None and slide is None:
-        poses_around, extent = tilt_sweep, tilt
-    elif slide is not None and tilt is None:
-        poses_around, extent = slide_sweep, slide
-    else:
-        raise SimulationError("expected exactly one of --tilt DEGREES and --slide MILLIMETRES")
+    require((tilt is None) != (slide is None), "expected exactly one of --tilt DEGREES and --slide MILLIMETRES")
+    poses_around, extent = (slide_sweep, slide or 0.0) if tilt is None else (tilt_sweep, tilt)
     grid = Volume.read(like) if like else None
     examination, middle = open_examination_at(patient, pose)
     poses = poses_around(middle, extent, frames)

@@ -231,8 +231,7 @@ def _closed(
     surfels: Surfels, extent: np.ndarray, padded: np.ndarray, grid: Volume, fluids: tuple[int, ...]
 ) -> tuple[np.ndarray, np.ndarray]:
     """((k, j, i) labels with the tissue beside in narrow gaps around these sheets, (k, j, i) True there)."""
-    gap = np.zeros(padded.shape, bool)
-    index = _along(surfels, grid, padded.shape, np.floor)
+    gap, index = np.zeros(padded.shape, bool), _along(surfels, grid, padded.shape, np.floor)
     for side, sign in enumerate((1.0, -1.0)):
         for step in np.arange(0.0, _WIDE_MM + 1e-6, _STEP_MM):
             gap.ravel()[index(sign * step)[extent[:, side] >= step - 1e-6]] = True

@@ -109,9 +109,8 @@ class Preset:
             f"{source}: is the result of a fit, expected a preset, as ussim optimize --save-preset writes it",
         )
         for name in values:
-            require(
-                name in (*known, *_OF_COMMAND, _MADE_BY), f"{source}: has {short(name)}, expected {', '.join(known)}"
-            )
+            is_known = name in (*known, *_OF_COMMAND, _MADE_BY)
+            require(is_known, f"{source}: has {short(name)}, expected {', '.join(known)}")
         sections: dict[str, Any] = {}
         if "probe" in values:
             sections["probe"] = probe_from_dict(values["probe"], f"{source}: probe")

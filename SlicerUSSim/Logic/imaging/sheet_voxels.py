@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import Any
 
 import numpy as np
 
 from SlicerUSSim.Logic.base.errors import require
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.tissue.surfels import Surfels
-
-if TYPE_CHECKING:
-    from scipy.spatial import KDTree
 
 #: Bits of an entry: distance, normal (two coordinates of its octahedron), thickness, confidence
 _DISTANCE_BITS, _NORMAL_BITS, _THICKNESS_BITS, _CONFIDENCE_BITS = 12, 10, 8, 6
@@ -57,7 +54,7 @@ class SheetVoxels:
         return tuple(value.astype(np.float32) for value in values)
 
 
-def on_voxels(surfels: Surfels, grid: Volume, *, reach_mm: float = 2.0, finer: int = 1) -> SheetVoxels:
+def on_voxels(surfels: Surfels, grid: Volume, *, reach_mm: float = 2.0) -> SheetVoxels:
     """The plane of the nearest sheet in every voxel whose centre is within reach of one.
 
     Parameters
@@ -65,25 +62,20 @@ def on_voxels(surfels: Surfels, grid: Volume, *, reach_mm: float = 2.0, finer: i
     surfels : about as dense as the voxels of the image in which they were found.
     grid : whose voxels are filled, such as a label map's.
     reach_mm : largest distance from a sheet; at least 0.9 of a voxel's diagonal, so that no ray slips through.
-    finer : the grid's voxels are divided by this along each axis.
 
     The plane in a voxel is the mean of the nearest surfels' planes, weighted by their distance from the foot of the
     perpendicular: of surfels on a plane it is that plane, wherever the voxels lie. Beyond the rim of a sheet, by more
     than a surfel's radius, nothing is filled.
 
-    Raises SimulationError for a reach that is shorter than voxels need, and a `finer` below 1.
+    Raises SimulationError for a reach that is shorter than voxels need.
     """
     from scipy.spatial import KDTree  # images of labels alone do not wait for it
 
-    require(finer >= 1, f"finer is {finer}, expected 1 or more")
-    grid = _finer(grid, finer)
     least = 0.9 * 0.5 * float(np.linalg.norm(grid.spacing_mm))
     require(reach_mm >= least, f"reach_mm is {reach_mm:g}, expected at least {least:.2g} mm for voxels of this grid")
     entry = np.full(grid.array.shape, -1, np.int32)
-    if not len(surfels):
-        return SheetVoxels(grid.with_array(entry), np.zeros((0, 2), np.uint32), np.zeros(0, np.uint8), reach_mm)
     # A plane's foot lies this far from its surfel at most
-    farthest = float(np.hypot(reach_mm, max(_RIM * np.sqrt(surfels.area.max() / np.pi), _RIM_MM))) + 1e-3
+    farthest = float(np.hypot(reach_mm, max(_RIM * np.sqrt(surfels.area.max(initial=0.0) / np.pi), _RIM_MM))) + 1e-3
     near = np.argwhere(_near(surfels, grid, farthest))
     if not len(near):
         return SheetVoxels(grid.with_array(entry), np.zeros((0, 2), np.uint32), np.zeros(0, np.uint8), reach_mm)
@@ -102,7 +94,7 @@ def on_voxels(surfels: Surfels, grid: Volume, *, reach_mm: float = 2.0, finer: i
 
 
 def _planes(
-    surfels: Surfels, tree: KDTree, centres: np.ndarray, reach_mm: float
+    surfels: Surfels, tree: Any, centres: np.ndarray, reach_mm: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """((n,) bool: whether a sheet is in reach, (m, 2) uint32 packed, (m,) uint8 kind) of (n, 3) centres."""
     count = min(_NEIGHBOURS, len(surfels))
@@ -194,12 +186,3 @@ def _near(surfels: Surfels, grid: Volume, reach_mm: float) -> np.ndarray:
             is_near = square + apart @ (2.0 * step_mm) <= reach_mm**2 - step_mm @ step_mm
             result.ravel()[flat[is_near] + step @ strides] = True
     return result[tuple(slice(2 * n, -2 * n) for n in around[::-1])]
-
-
-def _finer(grid: Volume, finer: int) -> Volume:
-    """A grid of smaller voxels that fill the same box; its array is of no meaning."""
-    matrix = grid.ijk_to_ras.copy()
-    matrix[:3, :3] /= finer
-    matrix[:3, 3] += matrix[:3, :3] @ np.full(3, 0.5 - 0.5 * finer)
-    shape = tuple(finer * n for n in grid.array.shape)
-    return Volume(np.broadcast_to(np.zeros(1, np.uint8), shape), matrix)
