@@ -23,7 +23,6 @@ pytestmark = pytest.mark.usefixtures("segmented_once")
 #: White matter around the origin in a margin that is not the patient
 BRAIN = block(lambda x, y, z: np.where(x**2 + y**2 + z**2 < 24**2, 1, 0))
 CENTRE, RADIUS = np.array([4.0, -3.0, 2.0]), 8.0
-LESIONS = ("tumour", "oedema", "necrosis", "cyst", "haematoma", "cavity")
 
 
 def ussim(*arguments):

@@ -53,10 +53,6 @@ class Evidence:
         return np.linalg.norm(self.ijk_to_ras[:3, :3], axis=0)[::-1]
 
     @property
-    def voxel_ml(self) -> float:
-        return float(np.prod(self.spacing_mm)) / 1000.0
-
-    @property
     def csf(self) -> np.ndarray:
         """(channels,) mean."""
         return self.means[_CSF]
