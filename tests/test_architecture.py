@@ -43,9 +43,9 @@ HEAVY = {
 #: Lines of Python that a room, or a folder beside the product, may have. Raising one is a decision: the commit says
 #: what users get for it.
 BUDGETS = {
-    "base": 3200, "opencl": 1250, "probe": 1470, "tissue": 2935, "tracked": 2155, "mri": 9545, "placement": 815,
+    "base": 3255, "opencl": 1250, "probe": 1470, "tissue": 2935, "tracked": 2155, "mri": 9500, "placement": 815,
     "imaging": 4800, "fitting": 4390, "vtk": 530, "mrml": 4480, "Widget": 2640, "Workstation": 7750, "Command": 3240,
-    "module": 370, "validation": 6030, "benchmarks": 3750, "tests": 31180, "tests/reference": 500,
+    "module": 370, "validation": 6030, "benchmarks": 3750, "tests": 31220, "tests/reference": 500,
 }  # fmt: skip
 #: Lines of all of SlicerUSSim/, and of kernels/
 LARGEST_PRODUCT, LARGEST_KERNELS = 50_000, 5_600
