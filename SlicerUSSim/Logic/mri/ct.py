@@ -163,7 +163,8 @@ def segment_ct(
         warnings += lines
         notes.append(f"organs: {', '.join(names[len(NAMES) :]) or 'none'}; other soft tissue is muscle")
     present = [0, *(label for label in np.unique(labels) if label)]
-    labels, names = np.searchsorted(present, labels).astype(np.uint8), tuple(names[n - 1] for n in present[1:])
+    labels = np.searchsorted(present, np.arange(256)).astype(np.uint8)[labels]
+    names = tuple(names[n - 1] for n in present[1:])
     of_label = [hu[labels == label] for label in range(1, len(names) + 1)]
     means, deviations = (np.array([f(values, dtype=np.float64) for values in of_label]) for f in (np.mean, np.std))
     for level, line in [(logging.INFO, line) for line in notes] + [(logging.WARNING, line) for line in warnings]:
