@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -20,6 +21,7 @@ from SlicerUSSim.Logic.mri.coregistration import aligned
 from SlicerUSSim.Logic.mri.filtering import guided_filter
 from SlicerUSSim.Logic.mri.histogram import Histogram
 from SlicerUSSim.Logic.mri.mixture import fit_mixture
+from SlicerUSSim.Logic.mri.plausibility import enhancing
 from SlicerUSSim.Logic.mri.samples import head_mri
 from SlicerUSSim.Logic.mri.segmentation import estimate_noise, less_sure
 from tests.conftest import rigid
@@ -473,3 +475,12 @@ def test_white_matter_of_a_part_of_a_brain_is_no_bias_field(part, bias, least):
         true = np.log(case.bias[tissue])
         left = np.log(case.mri.array[tissue] / found.corrected[tissue]) - true
         assert left.std() < 0.4 * true.std()
+
+
+def test_contrast_agent_that_was_not_told_is_a_warning():
+    image = np.random.default_rng(0).normal(100.0, 3.0, (60, 60, 60)).astype(np.float32)
+    found, inside = SimpleNamespace(grey_and_white=(70.0, 100.0)), np.ones(image.shape, bool)
+    assert enhancing(image, inside, found, 0.001) == []
+    image[10:25, 10:25, 10:25] = 160.0
+    (line,) = enhancing(image, inside, found, 0.001)
+    assert line.startswith("contrast is t1, but 3.4 ml in one piece are far brighter than white matter")

@@ -192,7 +192,7 @@ CODES = {"sform_code": 0, "qform_code": 0}
 )
 def test_a_nifti_header_that_contradicts_itself_is_told_with_both_values(fields, diagonal, words, tmp_path, caplog):
     if fields.get("xyzt_units"):
-        with pytest.raises(SimulationError, match="has voxels of 0.002 x 0.002 x 0.002 mm"):
+        with pytest.raises(SimulationError, match=r"has voxels of 0\.002 x 0\.002 x 0\.002 mm"):
             nifti(tmp_path / "i.nii", **fields)
         return
     found = nifti(tmp_path / "i.nii", **fields)

@@ -21,7 +21,7 @@ from SlicerUSSim.Logic.mri.evidence import Evidence
 from SlicerUSSim.Logic.mri.filtering import denoised, estimate_noise as estimate_noise
 from SlicerUSSim.Logic.mri.nuclei import with_nuclei
 from SlicerUSSim.Logic.mri.outside import find_outside, require_findable, watery
-from SlicerUSSim.Logic.mri.plausibility import require_contrast
+from SlicerUSSim.Logic.mri.plausibility import enhancing, require_contrast
 from SlicerUSSim.Logic.mri.recognition import check_intensities, require_no_ct
 from SlicerUSSim.Logic.mri.segmentation_settings import SegmentationSettings
 from SlicerUSSim.Logic.mri.segmentation_steps import (
@@ -294,6 +294,8 @@ def segment_mri(
     timed("neighbours")
     report(0.9)
     warnings += doubts(found, part, contrasts, fits, atlas is not None)
+    if contrasts == ("t1",) and len(names) == 3:
+        warnings += enhancing(filtered[0][0], part.inside, found, part.images[0].voxel_ml)
 
     labels = np.zeros(part.inside.shape, np.uint8)
     labels[part.inside] = found.posteriors.argmax(axis=0) + 1
