@@ -633,7 +633,7 @@ def test_a_label_map_is_opened_with_the_table_of_its_labels(head, tmp_path, tabl
         assert upload.kind is Kind.LABELS
         node, found = opener.labels(upload.path, upload.table)
     with (  # a table is of its own map only
-        pytest.raises(SimulationError, match=r"^rem.nii.gz: .* a \.json file or a table of names"),
+        pytest.raises(SimulationError, match=r"^rem\.nii\.gz: .*--map"),
         opener.sent(alone) as parcel,
     ):
         ((upload,), _) = opener.uploads(parcel)
