@@ -258,9 +258,7 @@ def test_the_notes_follow_the_probe_over_bone_and_openings(head):  # noqa: F811
     closed, misfit = "the skull is closed in front of the probe", "does not fit the opening"
     bench = Bench(head)
     bench.presenter.placing.placeProbe()
-    assert (
-        bench.presenter.notes.text().count(closed) == 1 and "Open skull in 3D Slicer" in bench.presenter.notes.text()
-    )
+    assert bench.presenter.notes.text().count(closed) == 1 and "Open skull in 3D Slicer" in bench.presenter.notes.text()
     bench.presenter.placing.openCraniotomy()
     bench.presenter.placing.placeProbe()
     assert closed not in bench.presenter.notes.text() and misfit not in bench.presenter.notes.text()

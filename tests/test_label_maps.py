@@ -91,7 +91,13 @@ def test_a_name_finds_its_tissue_by_its_most_special_word():
         ("non-enhancing tumor", "tumour"), ("Left lungs", "lung"),
     ):  # fmt: skip
         assert tissue_named(name).name == tissue
-    for name, nearest in (("stomach", "muscle"), ("pancreas", "liver"), ("cheese", None), ("non-tumor tissue", None)):
+    for name, nearest in (
+        ("stomach", "muscle"),
+        ("pancreas", "liver"),
+        ("cheese", None),
+        ("non-tumor tissue", None),
+        ("tumour-free margin", None),
+    ):
         with pytest.raises(SimulationError, match="no preset for tissue"):
             tissue_named(name)
         assert nearest_tissue(name) == nearest

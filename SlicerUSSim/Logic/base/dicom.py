@@ -163,6 +163,7 @@ def _series_of(folder: Path, recursive: bool = False) -> tuple[list[Series], lis
             header = _header(file)
             uid, is_image = str(header.SeriesInstanceUID), "Rows" in header
             cosines = np.array(header.get("ImageOrientationPatient") or [0.0], float)
+            int(header.get("NumberOfFrames") or 1)
         except Exception:  # pydicom raises various exceptions for damaged files
             damaged.append(file)
             continue

@@ -18,6 +18,8 @@ _LABELS = Path(__file__).with_name("labels")
 BRAIN_TISSUES = ("csf", "grey matter", "white matter")
 #: A word after one of these is not what the name means: "non-tumor tissue", "brain without lesion"
 _NOT = "".join(rf"(?<!\b{word} )" for word in ("non", "no", "not", "without"))
+#: A name with one of these says what is not there
+_ABSENT = re.compile(r"\b(free|absen(t|ce)|resected|removed)\b")
 #: Context of codes in 3D Slicer's terminologies, and a coded entry with a category and a type
 _ENTRY = (
     "Segmentation category and type - DICOM master list~SCT^{category_code}^{category}~SCT^{code}^{meaning}~^^~"
@@ -104,6 +106,8 @@ def _by_words(name: str, kind: str) -> str | None:
     key = _synonyms().get(key, key)
     if key in TISSUES:
         return key
+    if _ABSENT.search(key):
+        return None
     for row in label_table("words"):
         words = row["words"].replace(", ", "|")
         if row["kind"] == kind and re.search(rf"\b{_NOT}(?:{words})s?\b", key):  # also in the plural: "kidneys"
