@@ -455,12 +455,9 @@ def test_sheets_are_kept_and_each_can_be_switched_off(tmp_path):
     assert not again.structures.array.any()
     other = Volume(mri.array + np.float32(1.0), mri.ijk_to_ras)
     assert read_kept_sheets(place, key_of(other, found, "t1"), ("falx",)) is None
-    # Half of the arrays would be taken for all
     key = key_of(mri, found, "t1")
     assert read_kept_sheets(place, key, ("falx",)) is not None
-    with np.load(place) as file:
-        arrays = dict(file)
-    np.savez_compressed(place, **{**arrays, "structures": arrays["structures"][:5]})
+    place.write_bytes(place.read_bytes()[:-100])
     assert read_kept_sheets(place, key, ("falx",)) is None
 
 

@@ -288,7 +288,7 @@ def test_options_of_the_command(tmp_path):
     across = np.stack(np.meshgrid(np.arange(3.0, 30.0), np.arange(3.0, 30.0), [20.0]), -1).reshape(-1, 3)
     surfels = Surfels.of("sulcus", across, np.tile([0.0, 0.0, 1.0], (len(across), 1)), 1.0, 1.0, 1.0)
     write_surfels(tmp_path / "s.vtp", surfels)
-    call = ["simulate", str(tmp_path / "labels.nii.gz"), "--labels", "--pose", str(tmp_path / "pose.txt")]
+    call = ["simulate", str(tmp_path / "labels.nii.gz"), "--map", "ussim", "--pose", str(tmp_path / "pose.txt")]
     sheets, images = ["--sheets", str(tmp_path / "s.vtp")], {}
     for name, more in (("none", []), ("file", sheets), ("off", [*sheets, "--set", "patient.no_sheets=sulcus"])):
         result = CliRunner().invoke(main, [*call, "-o", str(tmp_path / f"{name}.png"), *more])

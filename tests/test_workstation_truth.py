@@ -23,6 +23,7 @@ from SlicerUSSim.Logic.base.volume import read_image_file
 from SlicerUSSim.Logic.tracked.sequence import TrackedSequence
 from SlicerUSSim.Workstation.scene_files import read_scene
 from SlicerUSSim.Workstation.state import NAMES
+from tests.conftest import name_labels
 from tests.test_workstation import (
     answer_new_patient,
     browser as browser,
@@ -220,6 +221,7 @@ def test_a_new_patient_clears_image_ruler_cost_and_pose_at_once(head_page, files
     shift = np.eye(4)
     shift[:3, 3] = [0.0, 9.0, -13.0]
     Volume(other.array, shift @ other.ijk_to_ras).write(tmp_path / "other.nii.gz")
+    name_labels(tmp_path / "other.nii.gz", [other.label_names[n] for n in sorted(other.label_names)])
     page.evaluate(
         """() => { window.cleared = [];
         const look = () => { const image = window.ussim.image;
