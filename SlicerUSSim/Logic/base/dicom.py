@@ -63,7 +63,10 @@ class Series:
     patient: tuple[str, str]
     #: Whether it has enough images for a volume, or frames with places
     is_volume: bool
-    modality: str = ""
+    modality: str
+    #: Whether its frames say where they are, and every file is a volume of its own
+    has_frames: bool
+    is_compressed: bool
 
     def __str__(self) -> str:
         name = " ".join(part for part in (self.number, repr(self.description) if self.description else "") if part)
@@ -107,14 +110,13 @@ def read_dicom(path: Path) -> ImageFile:
         series = _only_volume(path)
     else:
         series = next((one for one in _series_of(path.parent)[0] if str(path) in one.files), None)
-        if series is not None and "PerFrameFunctionalGroupsSequence" in _header(path):
-            series = None  # it is a volume of its own
-        elif series is not None and len(series.files) > 1:
+        if series is not None and len(series.files) > 1 and not series.has_frames:
             _log.warning("%s: is one image of a DICOM series, which is read: %s", path, series.size_text)
             _log.info("%s: %s", path, series)
-    files = (str(path),) if series is None else series.files
+    is_alone = series is None or (series.has_frames and not path.is_dir())
+    files = (str(path),) if is_alone else series.files
     _log.info("%s: DICOM, %d files", path, len(files))
-    is_compressed = any(_is_compressed(Path(file)) for file in files)
+    is_compressed = _is_compressed(_header(path)) if series is None else series.is_compressed
     return (_read_compressed if is_compressed else _read_files)(path, files)
 
 
@@ -126,21 +128,18 @@ def is_dicom(file: Path) -> bool:
         return opened.read(132)[128:] == b"DICM"
 
 
-def _header(file: Path, tags: Sequence[str] | None = _TAGS) -> Any:
+def _header(file: Path) -> Any:
     import pydicom
 
     with remarks_withheld():
-        header = pydicom.dcmread(
-            file, stop_before_pixels=True, force=True, specific_tags=None if tags is None else [*tags]
-        )
-        for tag in tags or ():
+        header = pydicom.dcmread(file, stop_before_pixels=True, force=True, specific_tags=[*_TAGS])
+        for tag in _TAGS:
             header.get(tag)  # values are decoded when they are asked for
     return header
 
 
-def _is_compressed(file: Path) -> bool:
-    meta = _header(file, ()).file_meta if file.is_file() else {}
-    syntax = getattr(meta, "TransferSyntaxUID", None)
+def _is_compressed(header: Any) -> bool:
+    syntax = getattr(header.file_meta, "TransferSyntaxUID", None)
     return syntax is not None and not syntax.is_private and syntax.is_compressed and not syntax.is_deflated
 
 
@@ -172,7 +171,7 @@ def _series_of(folder: Path, recursive: bool = False) -> tuple[list[Series], lis
     found = []
     for uid, images in groups.items():
         _, header, cosines = images[0]
-        frames = int(header.get("NumberOfFrames") or 1)
+        frames, has_frames = int(header.get("NumberOfFrames") or 1), "PerFrameFunctionalGroupsSequence" in header
         is_parallel = all(
             len(other) == len(cosines) == 6 and np.allclose(other, cosines, atol=_SAME) for _, _, other in images
         )
@@ -181,9 +180,8 @@ def _series_of(folder: Path, recursive: bool = False) -> tuple[list[Series], lis
                 uid, tuple(str(file) for file, *_ in images), str(header.get("SeriesNumber") or ""),
                 str(header.get("SeriesDescription") or ""), f"{header.get('Columns')}x{header.Rows}",
                 (str(header.get("PatientID") or ""), str(header.get("PatientName") or "")),
-                "PerFrameFunctionalGroupsSequence" in header
-                or (is_parallel and max(frames, len(images)) >= _LEAST_IMAGES),
-                str(header.get("Modality") or ""),
+                has_frames or (is_parallel and max(frames, len(images)) >= _LEAST_IMAGES),
+                str(header.get("Modality") or ""), has_frames, any(_is_compressed(one) for _, one, _ in images),
             )
         )  # fmt: skip
     return sorted(found, key=lambda series: (len(series.number), series.number)), damaged
