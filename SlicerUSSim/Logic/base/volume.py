@@ -135,10 +135,9 @@ class Volume:
         return replace(self, array=array, ijk_to_ras=self.ijk_to_ras @ to_own)
 
     def looks_like_labels(self) -> bool:
-        """Whether the image has regions of equal whole numbers, as a label map has.
+        """Whether the image has whole numbers, also as floating point: few of them, or in regions, as a label map has.
 
-        Also as floating point, with numbers up to 99999, and with a negative background. An MRI with few grey levels
-        differs from a label map: its neighbours differ everywhere, and mostly by one level.
+        Neighbours in an MRI differ, and mostly by little; label_numbers has the limits.
         """
         found, is_labels = numbers_of(self.array)
         _log.info("the volume contains %s, as %s does", found, "a label map" if is_labels else "an MRI")
