@@ -113,8 +113,7 @@ def read_dicom(path: Path) -> ImageFile:
         if series is not None and len(series.files) > 1 and not series.has_frames:
             _log.warning("%s: is one image of a DICOM series, which is read: %s", path, series.size_text)
             _log.info("%s: %s", path, series)
-    is_alone = series is None or (series.has_frames and not path.is_dir())
-    files = (str(path),) if is_alone else series.files
+    files = (str(path),) if series is None or (series.has_frames and not path.is_dir()) else series.files
     _log.info("%s: DICOM, %d files", path, len(files))
     is_compressed = _is_compressed(_header(path)) if series is None else series.is_compressed
     return (_read_compressed if is_compressed else _read_files)(path, files)
