@@ -38,9 +38,17 @@ from SlicerUSSim.Logic.mri.samples import head_mri  # noqa: E402
 from SlicerUSSim.Logic.mri.segmentation_settings import SegmentationSettings  # noqa: E402
 from SlicerUSSim.Logic.mrml.label_nodes import read_labels, write_labels  # noqa: E402
 from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic  # noqa: E402
-from SlicerUSSim.Logic.mrml.nodes import ijk_to_ras, node_to_world, pose_in_labels, set_node_to_world, write_volume  # noqa: E402
+from SlicerUSSim.Logic.mrml.nodes import (
+    ijk_to_ras,
+    node_to_world,
+    pose_in_labels,
+    read_volume,
+    set_node_to_world,
+    write_volume,
+)
 from SlicerUSSim.Logic.mrml.taken_image import about_image, is_frozen, patient_of  # noqa: E402
 from SlicerUSSim.Logic.probe.image_grid import ImageGrid  # noqa: E402
+from SlicerUSSim.Logic.probe.poses import slice_under_probe  # noqa: E402
 from tests.conftest import FLUID, SPECKLE, block, example, rigid  # noqa: E402
 
 pytestmark = pytest.mark.usefixtures("segmented_once")
@@ -718,6 +726,29 @@ def test_with_its_browser_a_sequence_plays_images_under_the_probe(bench):
     shown = browser.GetProxyNode(images)
     assert shown.GetParentTransformNode() is browser.GetProxyNode(transforms)
     np.testing.assert_array_equal(pixels(shown), expected(ABOVE @ rigid(np.eye(3), [0, 0, 1.5]), 1))
+
+
+def test_a_curve_is_swept_and_compounded(bench):
+    """Image planes across the curve on the surface; the volume has an image's grey levels where the image is."""
+    sequences = slicer.vtkSlicerSequencesLogic()
+    sequences.SetMRMLScene(bench.scene)  # registers browsers
+    curve = add(bench.scene, "MarkupsCurve", "path")
+    for z in (-6, 0, 6):
+        curve.AddControlPointWorld(0.0, -16.0, float(z))
+    browser, transforms = bench.logic.followPath(bench.labels, curve)
+    images, volume = add(bench.scene, "Sequence", "images"), add(bench.scene, "ScalarVolume", "volume")
+    assert bench.logic.simulateSequence(bench.labels, transforms, images, browser_node=browser) == 13
+    bench.logic.compoundSequence(images, volume)
+    first, middle = (bench.logic.sequenceImage(images, number) for number in (0, 6))
+    np.testing.assert_allclose(np.abs(middle.probe_to_world[:3, 2]), [0, 0, 1], atol=0.1)
+    found = read_volume(volume)
+    own = slice_under_probe(found, middle.grid, middle.probe_to_world)
+    inside = own > 0
+    assert inside.mean() > 0.8
+    there, beside = (np.corrcoef(own[inside], one.image[inside])[0, 1] for one in (middle, first))
+    assert there > 0.6 and beside < 0.5 * there, (there, beside)  # voxels blend two or three images; 6 mm away
+    with pytest.raises(SimulationError, match="has 0 points, expected two or more"):
+        bench.logic.followPath(bench.labels, add(bench.scene, "MarkupsLine", "nothing"))
 
 
 def test_a_sequence_that_fails_or_is_cancelled_leaves_the_old_images(bench):

@@ -165,3 +165,18 @@ def test_a_surface_tells_how_far_it_is_and_can_be_cancelled():
 
     with pytest.raises(Cancelled):
         PatientSurface(BALL, cancelled)
+
+
+def test_a_path_on_a_ball_becomes_upright_poses_across_it():
+    """Sphere: faces at its radius, axes through its centre, elevation along the path; also from points beside it."""
+    angles = np.deg2rad(np.linspace(-30, 30, 7))
+    path = 1.1 * RADIUS * np.stack([np.zeros(7), np.sin(angles), np.cos(angles)], axis=1)
+    poses = np.array(BALL_SURFACE.along(path, 2.0))
+    assert len(poses) == pytest.approx(RADIUS * np.deg2rad(60) / 2.0, abs=2) and all(map(is_rigid, poses))
+    faces = poses[:, :3, 3]
+    np.testing.assert_allclose(np.linalg.norm(faces, axis=1), RADIUS, atol=1.5)
+    np.testing.assert_allclose(-np.sum(poses[:, :3, 1] * faces, axis=1) / RADIUS, 1.0, atol=0.06)
+    assert (np.abs(np.sum(poses[:-1, :3, 2] * np.diff(faces, axis=0), axis=1)) > 1.8).all()
+    assert (poses[:, 0, 0] > 0.95).all()  # the right of the image is the patient's
+    with pytest.raises(SimulationError, match=r"the path on the patient is 0\.0 mm long"):
+        BALL_SURFACE.along([path[0], path[0]])

@@ -116,6 +116,32 @@ class ImagePresenter:
             parameters.image_sequence = images  # in place of which the next ones come
             panel.view.showStatus(f"{count} images in {images.GetName()!r}")
 
+    def sweepAlongPath(self) -> None:
+        """Simulate the images of a probe that moves along the chosen path, and compound them to a volume."""
+        panel, parameters = self._panel, self._panel.parameters
+        path_node: Any = parameters.path
+        with panel.acting(), panel.working("Sweep along path") as progress:
+            require(path_node is not None, "no path chosen, expected a curve or a line of Markups on the patient")
+            browser, transforms = panel.logic.followPath(parameters.labels, path_node)
+            try:
+                with panel.made(None, "Sequence", f"{path_node.GetName()} ultrasound") as images:
+                    count = panel.logic.simulateSequence(
+                        parameters.labels,
+                        transforms,
+                        images,
+                        browser_node=browser,
+                        progress=lambda share: progress(0.95 * share),
+                    )
+                    with panel.made(None, "ScalarVolume", f"{path_node.GetName()} volume") as volume:
+                        panel.logic.compoundSequence(images, volume)
+            except BaseException:
+                panel.logic.scene.RemoveNode(browser)
+                panel.logic.scene.RemoveNode(transforms)
+                raise
+            images.SetNodeReferenceID(MADE_FROM, transforms.GetID())
+            parameters.transform_sequence, parameters.image_sequence = transforms, images
+            panel.view.showStatus(f"{count} images in {images.GetName()!r}, compounded to {volume.GetName()!r}")
+
     def _browser_of(self, sequence_node: Any) -> Any:
         browsers = nodes_of_class(self._panel.logic.scene, "vtkMRMLSequenceBrowserNode")
         return next((node for node in browsers if node.IsSynchronizedSequenceNode(sequence_node, True)), None)

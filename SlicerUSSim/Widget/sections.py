@@ -213,6 +213,15 @@ def _sequence(panel: PanelPresenter) -> tuple[Row, ...]:
             "Simulate one image for each transform; the same sequence browser plays them",
             panel.images.simulateSequence, panel.canSimulate,
         ),
+        node(
+            "path", "Path", "Curve or line of Markups on the patient, along which the probe moves, its image planes "
+            "across the path",
+        ),
+        button(
+            "sweepAlongPath", "Sweep along path",
+            "Simulate an image every millimetre of the path, as a sequence, and compound them to a volume",
+            panel.images.sweepAlongPath, panel.canSimulate,
+        ),
     )  # fmt: skip
 
 

@@ -77,6 +77,8 @@ class UltrasoundSceneLogic:
     showOutline, showInSlice = _Of("images", ImageLogic.showOutline), _Of("images", ImageLogic.showInSlice)
     startLiveUpdate, stopLiveUpdate = _Of("live", LiveLogic.startLiveUpdate), _Of("live", LiveLogic.stopLiveUpdate)
     simulateSequence = _Of("sequences", SequenceLogic.simulateSequence)
+    followPath = _Of("sequences", SequenceLogic.followPath)
+    compoundSequence = _Of("sequences", SequenceLogic.compoundSequence)
     sequenceImage = _Of("sequences", SequenceLogic.sequenceImage)
     showSequenceImage = _Of("sequences", SequenceLogic.showSequenceImage)
     showFrozen, imageHeld = _Of("sequences", SequenceLogic.showFrozen), _Of("sequences", SequenceLogic.imageHeld)

@@ -114,6 +114,14 @@ def control_points(markups_node) -> np.ndarray:
     return np.array(points).reshape(-1, 3)
 
 
+def path_points(markups_node) -> np.ndarray:
+    """(points, 3) world RAS mm of a curve, or of the control points of other markups."""
+    if not markups_node.IsA("vtkMRMLMarkupsCurveNode"):
+        return control_points(markups_node)
+    curve = markups_node.GetCurvePointsWorld()
+    return np.array([curve.GetPoint(n) for n in range(curve.GetNumberOfPoints() if curve else 0)]).reshape(-1, 3)
+
+
 def ijk_to_ras(volume_node) -> np.ndarray:
     """(4, 4) of a volume node, in its own frame."""
     matrix = vtkMatrix4x4()
@@ -153,7 +161,7 @@ def write_slice(volume_node, in_probe: Volume, transform_node=None) -> None:
     _, rows, columns = in_probe.array.shape
     if image is None or image.GetDimensions() != (columns, rows, 1) or image.GetScalarTypeAsString() != "unsigned char":
         write_volume(volume_node, in_probe)
-        _show_all_greys(volume_node)
+        show_all_greys(volume_node)
     else:
         if not np.array_equal(ijk_to_ras(volume_node), in_probe.ijk_to_ras):
             volume_node.SetIJKToRASMatrix(vtk_matrix(in_probe.ijk_to_ras))
@@ -164,7 +172,7 @@ def write_slice(volume_node, in_probe: Volume, transform_node=None) -> None:
     volume_node.EndModify(was_modifying)
 
 
-def _show_all_greys(volume_node) -> None:
+def show_all_greys(volume_node) -> None:
     """Black at 0 and white at 255, as on a scanner; an automatic window would change the brightness between frames."""
     if volume_node.GetScene() is None:  # an item of a sequence
         return

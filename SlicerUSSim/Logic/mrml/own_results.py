@@ -34,8 +34,8 @@ _RESULT, _DATA = "SlicerUSSim.result", "SlicerUSSim.resultData"
 #: The same of a node with labels: a hash of voxels, place and names as Segment wrote them
 _MADE = "SlicerUSSim.made"
 #: Kinds of results
-IMAGE, OUTLINE, SEQUENCE, SHEETS, FLAP, COMPARED, REGISTRATION = (
-    "image", "outline", "sequence", "sheets", "flap", "compared", "registration"
+IMAGE, OUTLINE, SEQUENCE, COMPOUNDED, SHEETS, FLAP, COMPARED, REGISTRATION = (
+    "image", "outline", "sequence", "compounded", "sheets", "flap", "compared", "registration"
 )  # fmt: skip
 
 

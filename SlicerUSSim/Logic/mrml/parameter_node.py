@@ -206,6 +206,8 @@ class SceneParameters:
     #: Recorded transforms, and the images simulated at them
     transform_sequence = NodeParameter("vtkMRMLSequenceNode")
     image_sequence = NodeParameter("vtkMRMLSequenceNode")
+    #: Along which the probe moves on the patient
+    path = NodeParameter("vtkMRMLMarkupsCurveNode", "vtkMRMLMarkupsLineNode")
 
     segmentation = SettingsParameter(SegmentationSettings)
     sheet = SettingsParameter(SheetSettings, "sheet_")

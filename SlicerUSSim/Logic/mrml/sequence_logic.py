@@ -10,14 +10,24 @@ import numpy as np
 
 from SlicerUSSim.Logic.base.errors import require, required, warn_again
 from SlicerUSSim.Logic.base.transforms import check_rigid
+from SlicerUSSim.Logic.base.volume import Volume
+from SlicerUSSim.Logic.imaging.compounding import Compounder, sweep_grid
 from SlicerUSSim.Logic.mrml.image_logic import ImageLogic
 from SlicerUSSim.Logic.mrml.live import LiveLogic
-from SlicerUSSim.Logic.mrml.nodes import named, node_to_world, require_node
-from SlicerUSSim.Logic.mrml.own_results import require_result
+from SlicerUSSim.Logic.mrml.nodes import (
+    named,
+    node_to_world,
+    path_points,
+    require_node,
+    show_all_greys,
+    write_volume,
+)
+from SlicerUSSim.Logic.mrml.own_results import COMPOUNDED, mark_as_result, require_result
 from SlicerUSSim.Logic.mrml.patient_logic import PatientLogic
-from SlicerUSSim.Logic.mrml.sequence_nodes import SequenceIndex
+from SlicerUSSim.Logic.mrml.sequence_nodes import SequenceIndex, add_poses
 from SlicerUSSim.Logic.mrml.taken_image import TakenImage, follow, freeze, write_image
 from SlicerUSSim.Logic.mrml.taken_sequence import FrozenRecord, read_taken, taken_of, write_taken
+from SlicerUSSim.Logic.probe.surface import PatientSurface
 
 
 class SequenceLogic:
@@ -81,6 +91,49 @@ class SequenceLogic:
             if shown is not None and proxy is not None:
                 shown.SetAndObserveTransformNodeID(proxy.GetID())
         return count
+
+    def followPath(self, labels_node, path_node, *, step_mm: float = 1.0):
+        """(browser, transforms): the poses of a probe that moves along a curve or line of Markups on the patient.
+
+        The nodes are new, for simulateSequence(). The path is projected onto the surface of the labels, on which the
+        probe stands upright, its image planes across the path (PatientSurface.along).
+        Raises SimulationError for a path without length.
+        """
+        require_node(path_node, "vtkMRMLMarkupsCurveNode", "vtkMRMLMarkupsLineNode", use="path of the probe")
+        points, patient = path_points(path_node), self._patient.patient(labels_node)
+        require(len(points) > 1, f"path {named(path_node)} has {len(points)} points, expected two or more")
+        to_patient = patient.world_to_patient
+        local = points @ to_patient[:3, :3].T + to_patient[:3, 3]
+        poses = self._patient.work.do(lambda: PatientSurface(patient.labels).along(local, step_mm))
+        poses = [np.linalg.inv(to_patient) @ pose for pose in poses]
+        return add_poses(self._patient.scene, poses, f"{path_node.GetName()} poses")
+
+    def compoundSequence(self, images_node, volume_node, *, spacing_mm: float = 0.5) -> None:
+        """Write the volume of all images of simulateSequence() into a scalar volume node, along the axes of RAS.
+
+        See imaging.compounding. Raises SimulationError for another sequence, for images of several probes, for a
+        volume that is too large, and for a node with data that this module did not make.
+        """
+        require_node(images_node, "vtkMRMLSequenceNode", use="sequence of images")
+        require_node(volume_node, "vtkMRMLScalarVolumeNode", use="compounded volume")
+        require_result(volume_node, "compounded volume")
+        count = images_node.GetNumberOfDataNodes()
+        require(count > 0, f"sequence {named(images_node)} is empty, expected images")
+        images = [self.sequenceImage(images_node, number) for number in range(count)]
+        probe = images[0].preset.probe
+        require(all(one.preset.probe == probe for one in images), f"{named(images_node)} has images of several probes")
+
+        def compute() -> Volume:
+            grid = sweep_grid(probe, [one.probe_to_world for one in images], spacing_mm)
+            compounder = Compounder(grid, probe, self._patient.device)
+            for one in images:
+                compounder.add_buffer(compounder.device.upload(one.image), one.grid, one.probe_to_world)
+            return compounder.volume()
+
+        volume = self._patient.work.do(compute)
+        write_volume(volume_node, volume)
+        show_all_greys(volume_node)
+        mark_as_result(volume_node, COMPOUNDED)
 
     def sequenceImage(self, images_node, number: int) -> TakenImage:
         """The image with a number, from 0, that simulateSequence made, with all that it is of.

@@ -149,6 +149,22 @@ def add_sequence(
     return browser, images
 
 
+def add_poses(scene, poses: Sequence[np.ndarray], name: str, probe_transform_node=None):
+    """(browser, transforms): a vtkMRMLSequenceBrowserNode with the poses (4, 4) as a vtkMRMLSequenceNode.
+
+    The index is the number of the pose. `probe_transform_node`, or a new one, follows the browser.
+    """
+    transforms = _sequence_node(scene, name)
+    numbers = SequenceIndex(tuple(str(number) for number in range(len(poses))), "pose", "")
+    numbers.fill(transforms, (_transform(name, pose) for pose in poses))
+    browser = scene.AddNewNodeByClass("vtkMRMLSequenceBrowserNode", scene.GenerateUniqueName(f"{name} browser"))
+    browser.SetAndObserveMasterSequenceNodeID(transforms.GetID())
+    if probe_transform_node is None:
+        probe_transform_node = scene.AddNewNodeByClass("vtkMRMLLinearTransformNode", name)
+    browser.AddProxyNode(probe_transform_node, transforms, False)
+    return browser, transforms
+
+
 def _sequence_node(scene, name: str):
     return scene.AddNewNodeByClass("vtkMRMLSequenceNode", scene.GenerateUniqueName(name))
 

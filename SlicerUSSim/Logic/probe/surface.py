@@ -16,7 +16,7 @@ from vtkmodules.vtkCommonTransforms import vtkTransform
 from vtkmodules.vtkFiltersCore import vtkFlyingEdges3D, vtkPolyDataNormals, vtkQuadricDecimation
 from vtkmodules.vtkFiltersGeneral import vtkTransformPolyDataFilter
 
-from SlicerUSSim.Logic.base.errors import require
+from SlicerUSSim.Logic.base.errors import require, require_between
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.base.vtk_data import vtk_matrix
 from SlicerUSSim.Logic.probe.poses import angles_to_surface, carried, turned
@@ -165,6 +165,36 @@ class PatientSurface:
         old, new = self.normal(here), self.normal(there)
         lift = np.clip((face - here) @ old, *_LIFT_MM)
         return carried(probe_to_ras, there + lift * new, -probe_to_ras[:3, 1] if upright else old, new)
+
+    def along(self, path, step_mm: float = 1.0) -> list[np.ndarray]:
+        """(4, 4) probe_to_ras at steps of `step_mm` along a `path` (points, 3) near the surface, both ends included.
+
+        The probe stands upright on the surface, and its image planes are across the path, as in a freehand sweep. In
+        the middle of the path the right of the image is to the right of the patient, or to the front.
+        Raises SimulationError for a path without length on the surface, and for more than 10,000 poses.
+        """
+        require_between("PatientSurface.along", "step_mm", step_mm, 0.01, 100)
+        near = [self.nearest(point) for point in _at_equal_steps(np.asarray(path, float), step_mm)]
+        faces = _at_equal_steps(np.array(near), step_mm)
+        depth = -np.array([self.normal(face) for face in faces])
+        lateral = np.cross(depth, np.gradient(faces, axis=0))
+        lateral /= np.linalg.norm(lateral, axis=1, keepdims=True)
+        if lateral[len(faces) // 2] @ [1.0, 0.1, 0.0] < 0:
+            lateral = -lateral
+        poses = np.tile(np.eye(4), (len(faces), 1, 1))
+        poses[:, :3] = np.stack([lateral, depth, np.cross(lateral, depth), faces], axis=2)
+        return list(poses)
+
+
+def _at_equal_steps(path: np.ndarray, step_mm: float) -> np.ndarray:
+    """(points, 3) of a path, about `step_mm` apart along it, with both its ends."""
+    travelled = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])
+    require(
+        len(path) > 1 and 0 < travelled[-1] <= 10_000 * step_mm,
+        f"the path on the patient is {travelled[-1]:.1f} mm long, expected up to {10_000 * step_mm:g} mm",
+    )
+    at = np.linspace(0.0, travelled[-1], max(round(travelled[-1] / step_mm), 1) + 1)
+    return np.stack([np.interp(at, travelled, axis) for axis in path.T], axis=1)
 
 
 def _written(start: float) -> Any:
