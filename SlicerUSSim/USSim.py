@@ -76,15 +76,25 @@ class USSim(ScriptedLoadableModule):
             "Implements Salehi et al., Patient-specific 3D Ultrasound Simulation Based on Convolutional Ray-tracing "
             "and Appearance Optimization, MICCAI 2015. The sample MRI is the ICBM 152 2009a template (© 1993-2009 "
             "Louis Collins, McConnell Brain Imaging Centre, Montreal Neurological Institute), as distributed "
-            "with nilearn."
+            "with nilearn. The sample head is MRHead, a sample of 3D Slicer."
         )
         slicer.app.connect("startupCompleted()", registerSampleData)
 
 
 def registerSampleData() -> None:
-    """Add the demo brain to Slicer's Sample Data module."""
+    """Add a skull-stripped brain and a whole head to Slicer's Sample Data module."""
     import SampleData
 
+    head = "cc211f0dfd9a05ca3841ce1141b292898b2dd2d3f08286affadf823a7e58df93"
+    SampleData.SampleDataLogic.registerCustomSampleDataSource(
+        category="Ultrasound Simulator",
+        sampleName="Whole head (MRHead)",  # Slicer's own sample
+        thumbnailFileName=str(Path(SampleData.__file__).parent / "Resources" / "Icons" / "MRHead.png"),
+        uris=f"https://github.com/Slicer/SlicerTestingData/releases/download/SHA256/{head}",
+        fileNames="MRHead.nrrd",
+        checksums=f"SHA256:{head}",
+        nodeNames="MRHead",
+    )
     SampleData.SampleDataLogic.registerCustomSampleDataSource(
         category="Ultrasound Simulator",
         sampleName="MNI152 brain",
@@ -271,7 +281,7 @@ class USSimLogic(ScriptedLoadableModuleLogic):
 
 
 class USSimTest(ScriptedLoadableModuleTest):
-    """The main workflow in Slicer: phantom head, Segment, placement of the probe, Live."""
+    """The main workflow in Slicer: phantom head, Segment, placement of the probe, Live, a sequence, a fit."""
 
     def setUp(self) -> None:
         slicer.mrmlScene.Clear()
@@ -280,12 +290,17 @@ class USSimTest(ScriptedLoadableModuleTest):
         """Called by the SelfTests module and by Reload and Test; CTest calls the test_ methods directly."""
         self.setUp()
         try:
-            self.test_image_follows_probe()
+            self.test_from_mri_to_fit()
         except unittest.SkipTest as reason:
             self.delayDisplay(f"Test skipped: {reason}")
 
-    def test_image_follows_probe(self) -> None:
-        """An image appears under the probe and follows it. Skipped where packages or an OpenCL device are missing."""
+    def test_from_mri_to_fit(self) -> None:
+        """An image appears under the probe and follows it; a path is swept; a fit finds the gain of an image.
+
+        Skipped where packages or an OpenCL device are missing.
+        """
+        import numpy as np
+
         from SlicerUSSim.Logic.base.errors import SimulationError
         from SlicerUSSim.Logic.opencl.devices import choose_device
 
@@ -322,4 +337,25 @@ class USSimTest(ScriptedLoadableModuleTest):
         self.assertTrue((slicer.util.arrayFromVolume(output) != before).mean() > 0.1)
         logic.stopLiveUpdate()
         self.assertFalse(logic.isLive)
+
+        self.delayDisplay("Sweep along a line")
+        here = np.array(probe.GetMatrixTransformToParent().MultiplyPoint((0, 0, 0, 1)))[:3]
+        path = slicer.mrmlScene.AddNewNodeByClass("vtkMRMLMarkupsLineNode", "Path")
+        for step in (-3.0, 3.0):
+            path.AddControlPointWorld(*(here + [0, step, 0]))
+        browser, transforms = logic.followPath(labels, path)
+        images = slicer.mrmlScene.AddNewNodeByClass("vtkMRMLSequenceNode", "Images")
+        self.assertGreater(logic.simulateSequence(labels, transforms, images, browser_node=browser), 4)
+        volume = slicer.mrmlScene.AddNewNodeByClass("vtkMRMLScalarVolumeNode", "Volume")
+        logic.compoundSequence(images, volume)
+        self.assertGreater(slicer.util.arrayFromVolume(volume).max(), 100)
+
+        self.delayDisplay("Fit the gain")
+        logic.simulate(labels, probe, output)
+        given = logic.preset.display.gain_db
+        logic.preset = logic.preset.changed("display", gain_db=given + 6.0)
+        found = logic.optimize(
+            labels, output, probe_transform_node=probe, free=["gain_db"], max_evaluations=40, restarts=0
+        )
+        self.assertAlmostEqual(found.appearance.display.gain_db, given, delta=1.0)
         self.delayDisplay("Test passed")

@@ -46,6 +46,8 @@ if factory.modules:
     import slicer
     from SlicerUSSim.Logic.opencl.device import kernel_folder
     slicer.mrmlScene = slicer.vtkMRMLScene()
+    sequences = slicer.vtkSlicerSequencesLogic()
+    sequences.SetMRMLScene(slicer.mrmlScene)  # as Slicer does
     module = sys.modules["USSim"]
     parent = slicer_stand_in.QtWidgets.QWidget()
     slicer_stand_in.QtWidgets.QVBoxLayout(parent)

@@ -231,16 +231,20 @@ def _distribution(requirement: str) -> tuple[str, str]:
 
 
 def test_sample_data_is_registered_with_a_checksum_and_a_thumbnail(module, monkeypatch):
-    registered = {}
+    samples = []
 
     class Logic:
         @staticmethod
         def registerCustomSampleDataSource(**options):
-            registered.update(options)
+            samples.append(options)
 
-    monkeypatch.setitem(sys.modules, "SampleData", type(sys)("SampleData"))
-    sys.modules["SampleData"].SampleDataLogic = Logic
+    stand_in = type(sys)("SampleData")
+    stand_in.SampleDataLogic, stand_in.__file__ = Logic, "/Slicer/SampleData.py"
+    monkeypatch.setitem(sys.modules, "SampleData", stand_in)
     module.registerSampleData()
+    head, registered = samples
+    assert head["thumbnailFileName"] == "/Slicer/Resources/Icons/MRHead.png"
+    assert head["uris"].endswith(head["checksums"].split(":")[1]) and head["fileNames"] == "MRHead.nrrd"
     assert Path(registered["thumbnailFileName"]).exists()
     assert re.fullmatch(r"SHA256:[0-9a-f]{64}", registered["checksums"])
     assert registered["uris"].startswith("https://") and registered["fileNames"].endswith(".nii.gz")
