@@ -227,9 +227,9 @@ def test_values_that_are_no_text_and_sweeps_without_end_are_refused(labels, tmp_
     ("name", "command"),
     [
         ("o.png", "simulate none.mha --pose auto -o o.png"),
-        ("o.mnc", "volume none.mha --pose auto --tilt 5 -o o.mnc"),
-        ("o.mhd", "sweep none.mha --sequence none.mha -o o.mhd"),
-        ("f.png", "sweep none.mha --sequence none.mha -o o.mhd --set recording.field=f.png"),
+        ("o.vti", "volume none.mha --pose auto --tilt 5 -o o.vti"),
+        ("o.seq.mha", "sweep none.mha --sequence none.mha -o o.seq.mha"),
+        ("f.png", "sweep none.mha --sequence none.mha -o o.seq.mha --set recording.field=f.png"),
         ("o.mha", "segment none.mha -o o.mha"),
         ("o.json", "segment none.mha -o o.mha"),
         ("s.vtp", "segment none.mha -o o.mha --sheets s.vtp"),
@@ -249,7 +249,7 @@ def test_an_output_that_exists_is_refused_before_anything_is_read(name, command,
 
 
 def test_an_output_that_exists_is_replaced_with_overwrite(labels, tmp_path):
-    for name in ("o.png", "o.mhd", "o.nii.gz"):
+    for name in ("o.png", "o.mha", "o.nii.gz"):
         simulate = ("simulate", labels, "--pose", "auto", "-o", tmp_path / name)
         assert ussim(*simulate).exit_code == 0
         assert ussim(*simulate).exit_code == 2

@@ -111,7 +111,7 @@ for name in names:
 """
 
 
-NAMES = ("p.tfm", "p.h5", "s.vtp", "t.json", "s.igs.mha", "v.mnc", "v.nii.gz", "v.nrrd", "v.mhd", "v.vti")
+NAMES = ("p.tfm", "p.h5", "s.vtp", "t.json", "s.igs.mha", "v.nii.gz", "v.nrrd", "v.vti")
 
 
 @pytest.mark.slow

@@ -231,7 +231,8 @@ def test_files_that_were_asked_for_leave_stdout_empty(files, tmp_path):
         ["sweep", labels, "--sequence", sequence, "--probe", files / "probe.json", "-o", tmp_path / "sweep.igs.mha"],
     ):
         result = ussim(*arguments)
-        assert result.stdout == "" and result.stderr.startswith("wrote "), arguments[0]
+        # On a busy machine lines of progress come before it
+        assert result.stdout == "" and result.stderr.splitlines()[-1].startswith("wrote "), arguments[0]
 
 
 @pytest.mark.slow

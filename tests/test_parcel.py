@@ -7,6 +7,7 @@ import logging
 
 import numpy as np
 import pytest
+import SimpleITK as sitk
 
 from SlicerUSSim.Logic import SimulationError, Volume
 from SlicerUSSim.Logic.base.reading import untrusted_folder
@@ -57,7 +58,7 @@ def test_texts_are_known_by_their_first_words(text, ending):
 
 def test_a_header_of_another_file_stays_refused_under_any_name(tmp_path):
     """Renamed by its content it would name its voxels again."""
-    Volume(np.ones((3, 4, 5), np.uint8), np.eye(4)).write(tmp_path / "v.mhd")
+    sitk.WriteImage(sitk.GetImageFromArray(np.ones((3, 4, 5), np.uint8)), str(tmp_path / "v.mhd"))
     data = (tmp_path / "v.mhd").read_bytes()
     for name in ("v", "v.dat", "v.img", "v.dcm"):
         with pytest.raises(SimulationError, match="is a header whose voxels are in another file"):

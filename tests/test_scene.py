@@ -38,7 +38,7 @@ from SlicerUSSim.Logic.mri.samples import head_mri  # noqa: E402
 from SlicerUSSim.Logic.mri.segmentation_settings import SegmentationSettings  # noqa: E402
 from SlicerUSSim.Logic.mrml.label_nodes import read_labels, write_labels  # noqa: E402
 from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic  # noqa: E402
-from SlicerUSSim.Logic.mrml.nodes import (
+from SlicerUSSim.Logic.mrml.nodes import (  # noqa: E402
     ijk_to_ras,
     node_to_world,
     pose_in_labels,

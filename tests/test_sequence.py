@@ -132,7 +132,7 @@ def test_shapes_that_do_not_fit_are_refused():
 
 @pytest.mark.parametrize(
     ("suffix", "compress"),
-    [(".igs.mha", True), (".seq.mha", False), (".mha", True), (".mhd", False), (".nrrd", False), (".seq.nrrd", True)],
+    [(".igs.mha", True), (".seq.mha", False), (".mha", True), (".nrrd", False), (".seq.nrrd", True)],
 )
 def test_what_is_written_is_read_back(tmp_path, suffix, compress):
     sequence = chain()

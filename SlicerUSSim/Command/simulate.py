@@ -45,7 +45,7 @@ def simulate(patient: PatientOptions, pose: str, out: Path) -> None:
 
 @click.command()
 @gathered(f"{RARE} {RARE_OF_SEQUENCE} skull_strip tissues seed", patient=PatientOptions, recording=SequenceOptions)
-@out_option("Sequence: .igs.mha .seq.mha .mhd or .nrrd")
+@out_option("Sequence: .igs.mha .seq.mha or .nrrd")
 @overwrite_option
 def sweep(patient: PatientOptions, recording: SequenceOptions, out: Path) -> None:
     """Simulate the images of a tracked sequence, at its poses and on its pixels."""

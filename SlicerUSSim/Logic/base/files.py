@@ -12,7 +12,7 @@ import shutil
 import sys
 import tempfile
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 from threading import Lock
 from typing import IO
@@ -22,10 +22,6 @@ from SlicerUSSim.Logic.base.errors import SimulationError, require, require_path
 _DEEPEST_NESTING = 16
 #: Beginning of the names of folders for what is not complete yet
 _PARTIAL = ".ussim-"
-#: Suffixes of headers with voxels in a second file, and endings of that
-_HEADERS, _VOXELS = (".mhd", ".nhdr"), (".raw.gz", ".zraw", ".raw")
-#: Those that are looked through for the names of files
-_MOST_HEADER_BYTES = 2**26
 
 
 def require_place(path: Path) -> None:
@@ -54,12 +50,6 @@ def make_folder(path: str | os.PathLike) -> Path:
     except OSError as error:
         raise SimulationError(f"{folder}: cannot be created ({error.strerror})") from None
     return folder
-
-
-def require_space(path: Path, most_bytes: int) -> None:
-    """Raise SimulationError unless the disk has room for a file of `most_bytes`."""
-    free = shutil.disk_usage(path.parent).free
-    require(free > most_bytes, f"{path}: cannot be written (may need {most_bytes} bytes, and the disk has {free} left)")
 
 
 @contextmanager
@@ -134,9 +124,7 @@ def written_whole(path: str | os.PathLike) -> Iterator[Path]:
     """Yield a temporary path to write to; it replaces `path` only if the block succeeds.
 
     All of it is on the disk before it replaces anything, so that after a crash or a power cut the file is the old or
-    the new one. The voxels of a .mhd or .nhdr get a name of their own, by their content, and the header that names them
-    comes last; those that this program wrote for the header before are removed then, unless another header names them.
-    Raises SimulationError naming `path` if it cannot be written.
+    the new one. Raises SimulationError naming `path` if it cannot be written.
     """
     path = Path(path)
     require_place(path)
@@ -170,8 +158,6 @@ def _new_partial_folder(parent: Path) -> Path:
     for old in parent.glob(f"{_PARTIAL}{host}-*-*"):
         number = old.name.split("-")[2]
         if number.isdecimal() and not _is_running(int(number)):
-            with suppress(OSError), _alone_in(parent):
-                _remove_unnamed(old)
             shutil.rmtree(old, ignore_errors=True)
     return Path(tempfile.mkdtemp(prefix=f"{_PARTIAL}{host}-{os.getpid()}-", dir=parent))
 
@@ -211,106 +197,9 @@ def _put_on_disk(path: Path) -> None:
 
 def _put_in_place(folder: Path, path: Path) -> None:
     """Move what was written in `folder` under the name of `path` to it."""
-    main = folder / path.name
-    if path.suffix.lower() in _HEADERS:
-        _name_by_content(main)
     for file in folder.iterdir():
-        is_own = file.name == path.name or _is_voxels_of(file.name, path)
-        require(is_own, f"{path}: would be written as {file.name}; give another name")
-    if path.suffix.lower() not in _HEADERS:
-        move_into(path.parent, [main])
-        return
-    voxels = sorted(file for file in folder.iterdir() if file != main)
-    with _alone_in(path.parent):
-        if path.is_file():
-            _keep_header(path, folder)
-        try:
-            move_into(path.parent, [*voxels, main])  # the header, which names the voxels, last
-        finally:
-            with suppress(OSError):
-                _remove_unnamed(folder)
-
-
-@contextmanager
-def _alone_in(folder: Path) -> Iterator[None]:
-    """Keep other runs of this program from moving and removing files in a folder meanwhile, where that can be.
-
-    Another run may write the same voxels, which have the same name: they are there before the header that names them.
-    """
-    lock = None
-    try:
-        import fcntl
-
-        lock = os.open(folder, os.O_RDONLY)
-        fcntl.flock(lock, fcntl.LOCK_EX)
-    except (ImportError, OSError):  # on Windows, and on some network disks
-        pass
-    try:
-        yield
-    finally:
-        if lock is not None:
-            os.close(lock)
-
-
-def _keep_header(path: Path, folder: Path) -> None:
-    """Copy a header that is replaced to a folder in `folder`, so that also the run after a killed one finds it."""
-    old = folder / "replaced"
-    old.mkdir()
-    if path.stat().st_size <= _MOST_HEADER_BYTES:
-        shutil.copyfile(path, old / path.name)
-
-
-def _remove_unnamed(folder: Path) -> None:
-    """Remove the voxels beside a partial folder that headers left in it name, and none of the headers beside it does.
-
-    Only those are removed that have the name, by their content, which this program gives.
-    """
-    for header in (*folder.glob("*"), *folder.glob("*/*")):
-        if header.suffix.lower() not in _HEADERS or not header.is_file():
-            continue
-        named = rf"^(?:ElementDataFile\s*=|data file:)[ \t]*({re.escape(header.stem)}\.[^\r\n]*)"
-        for found in re.finditer(os.fsencode(named), header.read_bytes(), re.MULTILINE):
-            voxels = folder.parent / os.fsdecode(found[1]).strip()
-            if _is_voxels_of(voxels.name, header) and voxels.parent == folder.parent and voxels.is_file():
-                is_ours = hash_of_file(voxels)[:16] == voxels.name[len(header.stem) + 1 :][:16]
-                if is_ours and not _is_named(voxels):
-                    voxels.unlink(missing_ok=True)
-
-
-def _is_named(voxels: Path) -> bool:
-    """Whether a header in its folder names a file, or is too large to be looked through."""
-    name = os.fsencode(voxels.name)
-    headers = (file for file in voxels.parent.iterdir() if file.suffix.lower() in _HEADERS and file.is_file())
-    return any(file.stat().st_size > _MOST_HEADER_BYTES or name in file.read_bytes() for file in headers)
-
-
-def _name_by_content(header: Path) -> None:
-    """Give the file of voxels beside a header a name by its content, also in the header."""
-    for file in sorted(header.parent.iterdir()):
-        ending = next((end for end in _VOXELS if file.name == header.stem + end), None)
-        if ending is None:
-            continue
-        name = f"{header.stem}.{hash_of_file(file)[:16]}{ending}"
-        line = re.compile(
-            rb"^((?:ElementDataFile\s*=|data file:)\s*)" + re.escape(os.fsencode(file.name)), re.MULTILINE
-        )
-        text, count = line.subn(rb"\g<1>" + os.fsencode(name), header.read_bytes())
-        if count != 1:
-            raise OSError(f"its header does not name {file.name}")
-        header.write_bytes(text)
-        file.rename(file.with_name(name))
-
-
-def _is_voxels_of(name: str, header: Path) -> bool:
-    """Whether a name is one of voxels that this program wrote for a header."""
-    endings = "|".join(re.escape(end) for end in _VOXELS)
-    is_header = header.suffix.lower() in _HEADERS
-    return is_header and re.fullmatch(rf"{re.escape(header.stem)}\.[0-9a-f]{{16}}({endings})", name) is not None
-
-
-def hash_of_file(path: Path) -> str:
-    """SHA-256 of what is in a file."""
-    return hashlib.sha256(path.read_bytes()).hexdigest()
+        require(file.name == path.name, f"{path}: would be written as {file.name}; give another name")
+    move_into(path.parent, [folder / path.name])
 
 
 def read_small(path: str | os.PathLike, most_bytes: int = 16 * 2**20) -> bytes:

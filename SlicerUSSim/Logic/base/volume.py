@@ -12,7 +12,7 @@ import numpy as np
 
 from SlicerUSSim.Logic.base.dicom import is_dicom, read_dicom
 from SlicerUSSim.Logic.base.errors import require, require_path
-from SlicerUSSim.Logic.base.files import messages_withheld, require_space, written_whole
+from SlicerUSSim.Logic.base.files import messages_withheld, written_whole
 from SlicerUSSim.Logic.base.image_files import (
     ImageFile,
     axis_letters,
@@ -31,7 +31,8 @@ _log = logging.getLogger(__name__)
 
 #: A smaller or larger side of a volume indicates a wrong unit.
 SMALLEST_MM, LARGEST_MM = 5.0, 2500.0
-WRITABLE_SUFFIXES = (".nii", ".nii.gz", ".nrrd", ".nhdr", ".mha", ".mhd", ".mnc", ".vti")
+#: Formats with header and voxels in one file, so that it is replaced as a whole
+WRITABLE_SUFFIXES = (".nii", ".nii.gz", ".nrrd", ".mha", ".vti")
 #: Names of the sides towards which R, A and S decrease and increase
 SIDES = (("left", "right"), ("back", "front"), ("bottom", "top"))
 
@@ -204,8 +205,6 @@ class Volume:
         path = Path(path)
         require_image_name(path)
         suffix = path.suffix.lower()
-        if suffix == ".mnc":  # HDF5 leaves a torso on a full disk without an error, and may end the program later
-            require_space(path, self.array.nbytes)
         with written_whole(path) as partial, messages_withheld():
             if suffix == ".vti":
                 self._write_vti(partial, about or {})
@@ -216,8 +215,8 @@ class Volume:
                 is_nifti = path.name.lower().endswith((".nii", ".nii.gz"))
                 for key, text in (about or {}).items():
                     image.SetMetaData(key, text)
-                sitk.WriteImage(image, str(partial), useCompression=not path.name.lower().endswith(".mhd"))
-                if is_nifti or suffix in (".nrrd", ".mnc"):  # of which the last blocks may be missing without a word
+                sitk.WriteImage(image, str(partial), useCompression=True)
+                if is_nifti or suffix == ".nrrd":  # of which the last blocks may be missing without a word
                     written = sitk.GetArrayFromImage(sitk.ReadImage(str(partial)))
                     wanted = sitk.GetArrayFromImage(image)
                     is_kept = (written == wanted) | ~np.isfinite(wanted)  # of NIfTI, ITK reads NaN as 0

@@ -29,7 +29,7 @@ from SlicerUSSim.Logic.tracked.pose_files import matrix_of_text
 _log = logging.getLogger(__name__)
 
 #: File name endings that `write` accepts.
-SEQUENCE_SUFFIXES = (".igs.mha", ".seq.mha", ".mha", ".mhd", ".seq.nrrd", ".nrrd")
+SEQUENCE_SUFFIXES = (".igs.mha", ".seq.mha", ".mha", ".seq.nrrd", ".nrrd")
 _FRAME_FIELD = re.compile(r"Seq_Frame(\d+)_(.+)")
 #: Field of sequences whose images are simulated
 SIMULATED = "SlicerUSSimSimulated"
@@ -317,7 +317,7 @@ class TrackedSequence:
 def is_tracked_sequence(path: str | os.PathLike) -> bool:
     """Whether the header of an image file has fields of tracked images."""
     path = Path(path)
-    if not path.name.lower().endswith(SEQUENCE_SUFFIXES) or not path.is_file():
+    if not path.name.lower().endswith((*SEQUENCE_SUFFIXES, ".mhd")) or not path.is_file():
         return False
     with path.open("rb") as file:
         start = file.read(65536)
