@@ -24,7 +24,7 @@ from SlicerUSSim.Logic import (
 from SlicerUSSim.Logic.base.files import write_json
 from SlicerUSSim.Logic.fitting.control_costs import control_costs, mean_cost, neighbours_of
 from SlicerUSSim.Logic.fitting.search import Progress
-from SlicerUSSim.Logic.fitting.speckle_fit import PointSpread, SpeckleFit
+from SlicerUSSim.Logic.fitting.speckle_fit import SpeckleFit
 from SlicerUSSim.Logic.fitting.texture_costs import TextureMisfit
 from SlicerUSSim.Logic.fitting.tracked_fit import simulated
 from SlicerUSSim.Logic.probe import ImageGrid, tilt_sweep
@@ -101,9 +101,7 @@ def test_the_report_says_what_the_fit_of_the_speckle_found(folder):
     done = optimize(folder, "--set", "fit.speckle=true", "--set", "fit.validate=2", "--report", report)
     assert done.exit_code == 0, done.output
     said = {row[0]: row[1] for row in rows_of(report.read_text("utf-8")) if len(row) == 2}
-    assert (
-        "frequency itself cannot be known" in said["point spread function"] and "x " in said["texture of the tissues"]
-    )
+    assert "x " in said["texture of the tissues"]
 
 
 def test_a_report_of_what_does_not_scatter_is_without_controls(folder, tmp_path):
@@ -120,19 +118,15 @@ def test_a_report_of_what_does_not_scatter_is_without_controls(folder, tmp_path)
 
 
 def test_what_the_fit_of_the_speckle_found_is_said():
-    refused = PointSpread(1.1, 26.0, False, TextureMisfit(0.09, 1.0), TextureMisfit(0.12, 0.5))
     shown = replace(SHOWN, smoothing_axial_mm=0.044, smoothing_lateral_deg=0.31, map_black=0.5)
-    found = SpeckleFit(shown, TISSUES, 1.4, TextureMisfit(0.2, 0.4), TextureMisfit(0.12, 0.5), True, refused)
+    found = SpeckleFit(shown, TISSUES, 1.4, TextureMisfit(0.2, 0.4), TextureMisfit(0.12, 0.5), True)
     rows = dict(found.rows())
     assert rows["smoothing of the envelope"] == "0.044 mm axially, 0.31° laterally"
     assert (
         rows["texture of the tissues"] == "x 1.4" and "slope 0.50 at black" in rows["grey map, from the images alone"]
     )
-    for words in ("not taken", "frequency itself cannot be known"):
-        assert words in rows["point spread function"]
-    assert rows["T1 and T2 with it; without"].startswith("0.090 and 1.00")
-    assert json.loads(json.dumps(found.to_dict(), allow_nan=False))["point_spread"]["with_it"]["extrema"] == 1.0
-    untold = replace(found, has_map=False, spread=None).rows()
+    assert json.loads(json.dumps(found.to_dict(), allow_nan=False))["after"]["extrema"] == 0.5
+    untold = replace(found, has_map=False).rows()
     assert "too few grey levels" in untold[0][1] and len(untold) == 5
 
 

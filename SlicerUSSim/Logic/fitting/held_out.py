@@ -46,8 +46,7 @@ def predict(
     Parameters
     ----------
     found, simulator : a fit, and the simulator that it was made with.
-    others : other images of the same recording, at the poses as tracked; a registration moves them as well, and a
-        deformation of the tissues is theirs too.
+    others : other images of the same recording, at the poses as tracked; a registration moves them as well.
     free, display, speckle, max_evaluations, restarts : as they were for the fit; the uniform tissue is fitted with the
         same, since a cost has several minima.
     neighbours, fitted_neighbours : per image of `others`, and of the fitted ones, real images near it
@@ -65,10 +64,9 @@ def predict(
             "1 image is predicted (%d): fits with other speckle (seed) differ by 0.01 there; predict more if there are",
             others.numbers[0],
         )
-    given, simulator = simulator, found.simulator or simulator
     others = as_fitted(found, others)
     result = found.appearance
-    labels, tissues = uniform_tissues(given)
+    labels, tissues = uniform_tissues(simulator)
     plain = replace(simulator.settings, partial_volume=False, mri_modulation_db=0.0)
     uniform = UltrasoundSimulator(labels, tissues, plain, simulator.device)
     control = fit_images(
@@ -78,7 +76,7 @@ def predict(
     shown = control.appearance
     images = {
         FITTED: simulated(simulator, others, result.tissues, result.display),
-        UNIFORM: simulated(uniform, replace(others, probe=control.tracked.probe), shown.tissues, shown.display),
+        UNIFORM: simulated(uniform, others, shown.tissues, shown.display),
     }
     fitted = {FITTED: found.after, UNIFORM: control.after}
 
@@ -99,10 +97,10 @@ def predict(
 
 
 def as_fitted(found: Fit, others: TrackedImages) -> TrackedImages:
-    """Other images of the recording at the poses where a fit has them, with its probe."""
-    if found.registration is not None:
-        others = replace(others, poses=[found.registration.correction @ pose for pose in others.poses])
-    return replace(others, probe=found.tracked.probe)  # whose point spread function a fit may have changed
+    """Other images of the recording at the poses where a fit has them."""
+    if found.registration is None:
+        return others
+    return replace(others, poses=[found.registration.correction @ pose for pose in others.poses])
 
 
 def _free_of_one(free: Iterable[str] | Mapping[str, Bounds | None]) -> dict[str, Bounds | None]:

@@ -191,8 +191,7 @@ def _speckle(speckle: SpeckleFit) -> str:
     """What the fit of the speckle found, step by step."""
     return f"""<h2>Fit of the speckle</h2>
 <p class="dim">The grey map is that of the images alone. Smoothing and texture are found by T1 + T2 / 2, and smoothing
-once more with the width of the speckle. The point spread function by that width is a start only: it is taken if T1 + T2
-/ 2 is lower and T2 not higher. The fit by the paper's cost began with what is below.</p>
+once more with the width of the speckle. The fit by the paper's cost began with what is below.</p>
 {_table(["step", "found"], speckle.rows(), "words")}"""
 
 
