@@ -1,4 +1,4 @@
-"""What the report of a fit says of its controls (fitting/control_costs.py) and of the fit of the speckle."""
+"""What the report of a fit says of the fit of the speckle, and the names of a fit's steps."""
 
 from __future__ import annotations
 
@@ -15,20 +15,16 @@ from SlicerUSSim.Command.cli import main
 from SlicerUSSim.Logic import (
     ConvexProbe,
     DisplaySettings,
-    Preset,
     SimulationSettings,
     TissueTable,
     TrackedSequence,
     UltrasoundSimulator,
 )
 from SlicerUSSim.Logic.base.files import write_json
-from SlicerUSSim.Logic.fitting.control_costs import control_costs, mean_cost, neighbours_of
 from SlicerUSSim.Logic.fitting.search import Progress
 from SlicerUSSim.Logic.fitting.speckle_fit import SpeckleFit
 from SlicerUSSim.Logic.fitting.texture_costs import TextureMisfit
-from SlicerUSSim.Logic.fitting.tracked_fit import simulated
 from SlicerUSSim.Logic.probe import ImageGrid, tilt_sweep
-from SlicerUSSim.Logic.tracked import TrackedImages
 from tests.conftest import block, rigid
 
 PROBE = ConvexProbe(12.0, 60.0, 30.0, scan_lines=80)
@@ -74,23 +70,13 @@ def rows_of(report: str) -> list[list[str]]:
     ]
 
 
-def test_the_report_has_the_costs_of_the_controls(folder):
+def test_a_fit_writes_what_was_asked_for(folder):
     pytest.importorskip("matplotlib", reason="reports need matplotlib: pip install '.[demo]'")
     places = [folder / name for name in ("report.html", "preset.json", "field.png")]
     done = optimize(folder, "--report", places[0], "--save-preset", places[1], "--set", f"recording.field={places[2]}")
     assert done.exit_code == 0, done.output
     assert all(str(place) in done.stderr.splitlines()[-1] for place in places)
     report = places[0].read_text("utf-8")
-    preset, sequence = Preset.read(folder / "preset.json"), TrackedSequence.read(folder / "tracked.igs.mha")
-    made = UltrasoundSimulator(LABELS, preset.tissues, preset.settings)
-    tracked = TrackedImages.of(sequence, probe=PROBE).only([1])
-    images = simulated(made, tracked, preset.tissues, preset.display)
-    costs = control_costs(tracked, images, made, preset.display, neighbours_of(sequence, tracked))
-    assert list(costs) == ["simulated", "uniform tissue", "real neighbours"]
-    rows = rows_of(report)
-    for name, each in costs.items():
-        assert [name, *(f"{value:.3f}" for value in mean_cost(each).values())] in rows
-    assert mean_cost(costs["simulated"])["paper"] < mean_cost(costs["uniform tissue"])["paper"]
     assert "Fit of the speckle" not in report  # which was not asked for
 
 
@@ -102,19 +88,6 @@ def test_the_report_says_what_the_fit_of_the_speckle_found(folder):
     assert done.exit_code == 0, done.output
     said = {row[0]: row[1] for row in rows_of(report.read_text("utf-8")) if len(row) == 2}
     assert "x " in said["texture of the tissues"]
-
-
-def test_a_report_of_what_does_not_scatter_is_without_controls(folder, tmp_path):
-    """There is no tissue for the uniform control; the fit and its report are not lost for it."""
-    pytest.importorskip("matplotlib", reason="reports need matplotlib: pip install '.[demo]'")
-    silent = TissueTable({n: replace(tissue, mu0=0.0, sigma0=0.0) for n, tissue in TISSUES.items()})
-    silent.write(tmp_path / "silent.json")
-    done = optimize(
-        folder, "--set", f"patient.tissues={tmp_path / 'silent.json'}", "--report", tmp_path / "report.html"
-    )
-    assert done.exit_code == 0, done.output
-    assert "the report has no controls: no tissue of the volume has scatterers" in done.stderr
-    assert "uniform tissue" not in (tmp_path / "report.html").read_text("utf-8").lower()
 
 
 def test_what_the_fit_of_the_speckle_found_is_said():

@@ -35,7 +35,7 @@ from SlicerUSSim.Logic.fitting.optimization import (
     search_axes,
 )
 from SlicerUSSim.Logic.fitting.parameters import FreeParameters
-from SlicerUSSim.Logic.fitting.search import Evaluation, Search
+from SlicerUSSim.Logic.fitting.search import Search
 from SlicerUSSim.Logic.probe import pose_looking_at
 from SlicerUSSim.Logic.probe.beam import FWHM_PER_SIGMA
 from SlicerUSSim.Logic.probe.image_grid import ImageGrid
@@ -232,16 +232,6 @@ def test_the_same_problem_gives_the_same_answer(twin):
     assert one.after == other.after and one.history == other.history
 
 
-def test_a_replay_ends_where_the_runs_part():
-    """An equal position in an equal stage, but after another past, is computed: the cost may have another anchor."""
-    past = [Evaluation("local", (units,), 7.0) for units in (0.1, 0.2, 0.5)]
-    search = Search(lambda units: float(units[0]), lambda units: {}, 9, replayed=past)
-    costs = [search.evaluate("local", np.array([units])) for units in (0.1, 0.3, 0.5)]
-    assert costs == [7.0, 0.3, 0.5] and search.computed == 2
-    other = Search(lambda units: float(units[0]), lambda units: {}, 9, replayed=past)
-    assert other.evaluate("polish", np.array([0.1])) == 0.1  # another stage
-
-
 def test_what_a_progress_function_raises_comes_through(twin):
     def fail(progress):
         raise ZeroDivisionError("mine")
@@ -256,7 +246,7 @@ def test_search_finds_the_lowest_point_and_keeps_its_history(algorithm):
     search = Search(lambda units: float(((units - goal) ** 2).sum()), lambda units: {}, 400)
     best = search.minimise(algorithm, "here", np.full(3, 0.1), 400)
     assert np.abs(best - goal).max() < 0.05
-    assert search.computed == len(search.history) <= 400
+    assert len(search.history) <= 400
     assert search.best_cost("here") == min(entry.cost for entry in search.history)
 
 

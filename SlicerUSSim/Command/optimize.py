@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -123,7 +122,6 @@ def _write_report(
     path: Path, found: Fit, tracked: TrackedExamination, patient: PatientOptions, recording: SequenceOptions
 ) -> None:
     """Write --report, with all inputs that are needed to repeat the fit."""
-    from SlicerUSSim.Logic.fitting.control_costs import control_costs, neighbours_of
     from SlicerUSSim.Logic.fitting.report import write_report
 
     simulator = tracked.examination.simulator
@@ -132,17 +130,10 @@ def _write_report(
         f"{recording.sequence}, images {', '.join(map(str, tracked.images.numbers))}. Probe: {tracked.images.probe}. "
         f"Settings: {simulator.settings}."
     )
-    near = neighbours_of(tracked.sequence, tracked.images)
-    try:
-        with simulator.with_tissues(found.appearance.tissues):
-            controls = control_costs(found.tracked, found.after, simulator, found.appearance.display, near)
-    except SimulationError as error:  # as of labels of which nothing scatters
-        logging.getLogger(__name__).warning("the report has no controls: %s", error)
-        controls = None
     write_report(
         path, found.appearance, found.tracked, found.before, found.after, simulator,
         subtitle=f"{Path(recording.sequence).name} on {Path(patient.source).name}", provenance=provenance,
-        prediction=found.prediction, controls=controls, speckle=found.speckle,
+        prediction=found.prediction, speckle=found.speckle,
         reference="twin" if tracked.sequence.is_simulated else "real",
     )  # fmt: skip
 

@@ -1,4 +1,9 @@
-"""predict: judges a fit on images that it has not seen, and a uniform tissue fitted in the same way (prediction.py)."""
+"""predict: the cost of a fit on images that it has not seen, beside controls (docs/realism.md#fit-and-predict).
+
+A cost on the images that were fitted flatters whatever has many parameters. So parameters found on some images are
+judged on others, and the same is done with one uniform tissue without anatomy: fitted to the same images in the same
+way, and judged on the same others. The floor is what real neighbours cost, which nothing needs to go below.
+"""
 
 from __future__ import annotations
 
@@ -10,11 +15,18 @@ import numpy as np
 
 from SlicerUSSim.Logic.base.errors import require
 from SlicerUSSim.Logic.base.settings import DisplaySettings
-from SlicerUSSim.Logic.fitting.control_costs import FITTED, NEIGHBOURS, UNIFORM, Cost, costs_against, uniform_tissues
+from SlicerUSSim.Logic.fitting.control_costs import (
+    FITTED,
+    NEIGHBOURS,
+    UNIFORM,
+    Cost,
+    Prediction,
+    costs_against,
+    uniform_tissues,
+)
 from SlicerUSSim.Logic.fitting.fit_settings import FitSettings
 from SlicerUSSim.Logic.fitting.image_similarity import SimilaritySettings
 from SlicerUSSim.Logic.fitting.parameters import DISPLAY_BOUNDS, GROUPS, TISSUES, Bounds
-from SlicerUSSim.Logic.fitting.prediction import Prediction
 from SlicerUSSim.Logic.fitting.search import Progress
 from SlicerUSSim.Logic.fitting.tracked_fit import Fit, fit as fit_images, simulated
 from SlicerUSSim.Logic.imaging.simulator import UltrasoundSimulator

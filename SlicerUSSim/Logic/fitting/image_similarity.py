@@ -160,13 +160,6 @@ class PatchComparison:
         parts = self.device.download(self._result, (*self.patches, 3), np.float32)
         return self.settings.combine(parts[..., 0], parts[..., 1], parts[..., 2], self.patch[0] * self.patch[1])
 
-    def of(self, image: np.ndarray) -> Similarity:
-        """The cost of an image on the host, (rows, columns) uint8."""
-        image = as_image("image", image)
-        require(image.shape == self.shape, f"the image has shape {image.shape}, expected that of the reference")
-        self.run(self.device.upload(image))
-        return self.result()
-
 
 def as_image(name: str, image: np.ndarray) -> np.ndarray:
     """(rows, columns) uint8, contiguous. Raises SimulationError that names it for anything else."""

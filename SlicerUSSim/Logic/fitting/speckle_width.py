@@ -124,17 +124,6 @@ def width_misfit(widths: Sequence[SpeckleWidth], reference: Sequence[SpeckleWidt
     return float(known.mean()) if known.size else float("nan")
 
 
-def extrema_density_cm2(image: np.ndarray, grid: ImageGrid, inside: np.ndarray) -> float:
-    """Local maxima of an image (rows, columns) per square centimetre of `inside` (rows, columns) bool.
-
-    They are counted as in T2 (texture_costs.py); the number depends on the size of the pixels.
-    """
-    from SlicerUSSim.Logic.fitting.texture_costs import local_extrema
-
-    area = np.count_nonzero(inside) * grid.pixel_spacing_mm[0] * grid.pixel_spacing_mm[1] / 100.0
-    return float(np.count_nonzero(local_extrema(image)[0] & inside) / area) if area else float("nan")
-
-
 def along_beams(values: np.ndarray, probe: Probe, grid: ImageGrid, order: int = 3) -> tuple[np.ndarray, np.ndarray]:
     """Pixels (rows, columns) resampled along and across the beams.
 

@@ -31,7 +31,7 @@ from SlicerUSSim.Logic.tissue.table import TissueTable
 from SlicerUSSim.Logic.tracked.images import TrackedImages
 
 if TYPE_CHECKING:
-    from SlicerUSSim.Logic.fitting.prediction import Prediction
+    from SlicerUSSim.Logic.fitting.control_costs import Prediction
 
 _log = logging.getLogger(__name__)
 
@@ -59,7 +59,7 @@ class Fit:
     texture_after: list[TextureMisfit] = field(default_factory=list)
     #: None unless the speckle was fitted
     speckle: SpeckleFit | None = None
-    #: None unless other images were predicted (prediction.py)
+    #: None unless other images were predicted (control_costs.py)
     prediction: Prediction | None = None
 
     def to_dict(self) -> dict:

@@ -108,7 +108,7 @@ class TrackedImages:
             # All images of the recording show more of the field than the few that are fitted
             every = _as_uint8(spread_images(sequence.images))
             if field is None:
-                field = _located_field(sequence, images, every, spacing, probe, beam)
+                field = _located_field(sequence, every, spacing, probe, beam)
                 if probe is not None:
                     _require_size(field, every, spacing, path)
             finds_marks = finds_marks and sequence.is_recorded
@@ -227,7 +227,6 @@ def _pixel_spacing(image_to_world: np.ndarray, path: str) -> tuple[float, float]
 def _located_field(
     sequence: TrackedSequence,
     images: np.ndarray,
-    every: np.ndarray,
     spacing: tuple[float, float],
     probe: Probe | None,
     beam: Probe | None,
@@ -236,19 +235,7 @@ def _located_field(
         shared = {field.name for field in fields(Probe)}
         known = {} if beam is None else {name: v for name, v in beam.to_dict().items() if name in shared}
         _log.info("no probe is given: its geometry is looked for in the images, the rest is the preset's")
-        try:
-            return estimate_field(every, spacing, **known)
-        except SimulationError as error:
-            if len(every) == len(images):
-                raise
-            of_all = error
-            _log.info(
-                "all images together show no probe's field, as where the depth changes: only the chosen ones count"
-            )
-            try:
-                return estimate_field(images, spacing, **known)
-            except SimulationError:
-                raise of_all from None
+        return estimate_field(images, spacing, **known)
     if all("ImageToProbe" in entry for entry in sequence.transforms):
         image_to_probe = np.array(sequence.transforms[0]["ImageToProbe"])
         if _is_upright(image_to_probe, spacing):
@@ -257,10 +244,10 @@ def _located_field(
             return ImagedField.of(probe, image_to_probe, images.shape[1:])
     _log.info("the probe's place is looked for in the images: no ImageToProbe in the probe's own frame")
     try:
-        found = estimate_field(every, spacing)
+        found = estimate_field(images, spacing)
     except SimulationError as error:
         _log.info("%s; the given probe's field is placed where it covers them best", error)
-        return place_field(every, spacing, probe)
+        return place_field(images, spacing, probe)
     kinds = found.probe.to_dict()["kind"], probe.to_dict()["kind"]
     require(
         kinds[0] == kinds[1] or {"convex", "phased"} == set(kinds),
