@@ -46,7 +46,7 @@ from SlicerUSSim.Logic.fitting.control_costs import (
     neighbours_of,
     uniform_tissues,
 )
-from SlicerUSSim.Logic.fitting.speckle_width import SpeckleWidth, speckle_widths
+from SlicerUSSim.Logic.fitting.speckle_width import HALF_HEIGHT_PER_SIGMA, SpeckleWidth, speckle_widths
 from SlicerUSSim.Logic.fitting.tracked_fit import simulated
 from SlicerUSSim.Logic.imaging.grey_map import EstimatedMap, estimate_grey_map
 from SlicerUSSim.Logic.imaging.medium import Medium
@@ -168,7 +168,10 @@ class Realism:
         widths = [
             [
                 shown(name),
-                *(f"{_text(w.half_height_mm[0])} / {_text(w.half_height_mm[1])}" for w in looks.widths),
+                *(
+                    f"{_text(HALF_HEIGHT_PER_SIGMA * w.axial_mm)} / {_text(HALF_HEIGHT_PER_SIGMA * w.lateral_mm)}"
+                    for w in looks.widths
+                ),
             ]
             for name, looks in self.looks.items()
         ]

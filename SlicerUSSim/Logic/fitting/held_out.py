@@ -7,7 +7,6 @@ way, and judged on the same others. The floor is what real neighbours cost, whic
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 
@@ -31,8 +30,6 @@ from SlicerUSSim.Logic.fitting.search import Progress
 from SlicerUSSim.Logic.fitting.tracked_fit import Fit, fit as fit_images, simulated
 from SlicerUSSim.Logic.imaging.simulator import UltrasoundSimulator
 from SlicerUSSim.Logic.tracked.images import TrackedImages
-
-_log = logging.getLogger(__name__)
 
 #: Names of the display that a fit of one tissue takes over as they are
 _DISPLAY_NAMES = frozenset((*DISPLAY_BOUNDS, *GROUPS, "display"))
@@ -71,11 +68,6 @@ def predict(
         not both,
         f"images {', '.join(map(str, both))} are fitted and predicted, expected others: what was fitted says little",
     )
-    if len(others.images) == 1:
-        _log.warning(
-            "1 image is predicted (%d): fits with other speckle (seed) differ by 0.01 there; predict more if there are",
-            others.numbers[0],
-        )
     others = as_fitted(found, others)
     result = found.appearance
     labels, tissues = uniform_tissues(simulator)

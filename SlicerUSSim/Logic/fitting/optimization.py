@@ -26,7 +26,12 @@ from SlicerUSSim.Logic.fitting.identifiability import (
     equal_variance_draws,
     quantities_of,
 )
-from SlicerUSSim.Logic.fitting.image_similarity import Similarity, SimilaritySettings
+from SlicerUSSim.Logic.fitting.image_similarity import (
+    Similarity,
+    SimilaritySettings,
+    mean_cost,
+    target_comparisons,
+)
 from SlicerUSSim.Logic.fitting.parameters import ECHOGENICITY, Bounds, FreeParameters
 from SlicerUSSim.Logic.fitting.search import (
     GLOBAL_ALGORITHM,
@@ -35,7 +40,6 @@ from SlicerUSSim.Logic.fitting.search import (
     Progress,
     Search,
 )
-from SlicerUSSim.Logic.fitting.targets import mean_cost, target_comparisons
 from SlicerUSSim.Logic.imaging.simulator import UltrasoundSimulator
 from SlicerUSSim.Logic.probe.arrays import Probe
 from SlicerUSSim.Logic.probe.image_grid import ImageGrid

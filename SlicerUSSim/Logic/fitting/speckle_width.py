@@ -61,11 +61,6 @@ class SpeckleWidth:
     #: Windows that could be measured, axially
     windows: int
 
-    @property
-    def half_height_mm(self) -> tuple[float, float]:
-        """(axial, lateral) width at half height of the autocorrelation, as published widths are given."""
-        return HALF_HEIGHT_PER_SIGMA * self.axial_mm, HALF_HEIGHT_PER_SIGMA * self.lateral_mm
-
 
 def log_speckle_correlation(distance: np.ndarray, sigma: float) -> np.ndarray:
     """Autocorrelation of the log of developed speckle at a distance; both in one unit.

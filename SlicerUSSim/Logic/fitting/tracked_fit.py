@@ -111,12 +111,6 @@ def fit(
                 "compared, and the fit says little; expected an image of the patient",
                 number, 100.0 * tracked.mask.sum() / max(tracked.grid.field(tracked.probe).sum(), 1),
             )  # fmt: skip
-    if speckle and len(tracked.images) == 1:
-        _log.warning(
-            "the speckle of 1 image is fitted (%d): grey map, smoothing and texture of one place may not hold at "
-            "others; fit more, or predict others",
-            tracked.numbers[0],
-        )
 
     def appearance_at(poses: Sequence[np.ndarray], **options: Any) -> AppearanceResult:
         return optimize_appearance(

@@ -112,7 +112,7 @@ def _drawn_over(images: np.ndarray, field: np.ndarray) -> np.ndarray:
             "by at most %.0f grey levels, expected %d or more, as of a moving probe", change, _LEAST_CHANGE,
         )  # fmt: skip
         return nothing
-    regions, count = ndimage.label(same, np.ones((3, 3)))  # type: ignore[misc]
-    sizes = np.bincount(regions.ravel(), minlength=count + 1)
-    same &= (sizes >= _LEAST_PIXELS)[regions]
+    regions = np.zeros(same.shape, np.int32)
+    ndimage.label(same, np.ones((3, 3)), regions)
+    same &= (np.bincount(regions.ravel()) >= _LEAST_PIXELS)[regions]
     return np.asarray(ndimage.binary_dilation(same, np.ones((3, 3)), iterations=_AROUND), bool)

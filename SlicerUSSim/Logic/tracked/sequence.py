@@ -33,8 +33,6 @@ SEQUENCE_SUFFIXES = (".igs.mha", ".seq.mha", ".mha", ".mhd", ".seq.nrrd", ".nrrd
 _FRAME_FIELD = re.compile(r"Seq_Frame(\d+)_(.+)")
 #: Field of sequences whose images are simulated
 SIMULATED = "SlicerUSSimSimulated"
-#: Field of those of `ussim sweep` of earlier versions
-_SIMULATED_BEFORE = "ussim_made_by"
 #: Field of sequences whose images are slices of a 3D ultrasound volume
 _CUT = "SlicerUSSimCutFromVolume"
 _ORIENTATION, _TYPE = "UltrasoundImageOrientation", "UltrasoundImageType"
@@ -119,7 +117,7 @@ class TrackedSequence:
     @property
     def is_simulated(self) -> bool:
         """Whether its images say that this package simulated them, as a twin's and those of `ussim sweep` do."""
-        return not self.fields.keys().isdisjoint((SIMULATED, _SIMULATED_BEFORE))
+        return SIMULATED in self.fields
 
     @property
     def is_recorded(self) -> bool:
