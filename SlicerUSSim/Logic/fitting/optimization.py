@@ -26,12 +26,7 @@ from SlicerUSSim.Logic.fitting.identifiability import (
     equal_variance_draws,
     quantities_of,
 )
-from SlicerUSSim.Logic.fitting.image_similarity import (
-    Similarity,
-    SimilaritySettings,
-    mean_cost,
-    target_comparisons,
-)
+from SlicerUSSim.Logic.fitting.image_similarity import Similarity, SimilaritySettings, mean_cost, target_comparisons
 from SlicerUSSim.Logic.fitting.parameters import ECHOGENICITY, Bounds, FreeParameters
 from SlicerUSSim.Logic.fitting.search import (
     GLOBAL_ALGORITHM,
