@@ -224,15 +224,16 @@ def _placed(
     """
     from SlicerUSSim.Logic.imaging.found_sheets import beside_image
     from SlicerUSSim.Logic.imaging.simulator import UltrasoundSimulator
-    from SlicerUSSim.Logic.placement.aiming import opening_pose
     from SlicerUSSim.Logic.placement.bone_before_probe import about_bone
-    from SlicerUSSim.Logic.placement.craniotomy import default_pose, middle_of
-    from SlicerUSSim.Logic.placement.views import opened_view_pose, view_pose
     from SlicerUSSim.Logic.tissue.names import BRAIN_TISSUES
 
     labels, names, settings, probe = added.labels, added.tissue_names, preset.settings, preset.probe
     at, is_open, line = None, craniotomy.is_wanted, ""
     if isinstance(pose, str):
+        from SlicerUSSim.Logic.placement.aiming import opening_pose  # a pose from a file does not wait for surfaces
+        from SlicerUSSim.Logic.placement.craniotomy import default_pose, middle_of
+        from SlicerUSSim.Logic.placement.views import opened_view_pose, view_pose
+
         if craniotomy.is_file:
             labels = craniotomy.on(added.labels, names, probe, None)
             at = middle_of(added.labels, labels)
