@@ -1,4 +1,4 @@
-"""Time per stage and per frame on every OpenCL device, compared with lower bounds for memory and arithmetic.
+"""Time per stage and per frame on every OpenCL device.
 
     python -m benchmarks.frames [--json FILE] [--repeat N] [--brief] [--device D]
 
@@ -11,12 +11,11 @@ from __future__ import annotations
 import argparse
 import platform
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict
 from typing import Any
 
 import numpy as np
 
-from benchmarks.measuring import Machine, frame_work, measured, output_file, summary
+from benchmarks.measuring import measured, output_file, summary
 from SlicerUSSim.Logic.base.errors import SimulationError, require_between
 from SlicerUSSim.Logic.base.files import write_json
 from SlicerUSSim.Logic.base.settings import DisplaySettings
@@ -78,17 +77,15 @@ class _DeviceBenchmark:
         self.simulator: UltrasoundSimulator
 
     def run(self, brief: bool) -> dict:
-        self._tell("memory and arithmetic")
-        machine = Machine.measure(self.device)
         self._tell("segmentation")
-        numbers: dict[str, Any] = {"kind": self.info.kind, **asdict(machine), "frames": {}}
+        numbers: dict[str, Any] = {"kind": self.info.kind, "frames": {}}
         numbers["segmentation"] = measured(self._segment, min(self.repeat, 5))
         self.poses = {name: craniotomy_pose(self.segmentation.labels, probe) for name, probe in FRAMES.items()}
         names = self.segmentation.tissue_names
         self.simulator = UltrasoundSimulator(self.segmentation.labels, TissueTable.brain(names), device=self.device)
         for name in ["A"] if brief else FRAMES:
             self._tell(f"frame {name}")
-            numbers["frames"][name] = self._frame(name, machine)
+            numbers["frames"][name] = self._frame(name)
         if not brief:
             self._tell(f"sweep of {SWEEP_IMAGES} images")
             numbers[f"volume of {SWEEP_IMAGES} images"] = measured(self._sweep, 1)
@@ -102,7 +99,7 @@ class _DeviceBenchmark:
     def _segment(self) -> None:
         self.segmentation = segment_mri(self.mri, device=self.device, thin_sulci=False)
 
-    def _frame(self, name: str, machine: Machine) -> dict:
+    def _frame(self, name: str) -> dict:
         probe, pose, simulator = FRAMES[name], self.poses[name], self.simulator
 
         def whole() -> None:
@@ -121,11 +118,8 @@ class _DeviceBenchmark:
             frames = [simulator.simulate(probe, pose) for _ in range(self.repeat + 1)][1:]
         finally:
             simulator.profiling = False
-        work = frame_work(simulator, probe, pose, frames[0].grid)
         numbers["stages"] = {
-            stage: summary(frame.timings_ms[stage] for frame in frames)
-            | ({**asdict(work[stage]), "floor_ms": machine.floor_ms(work[stage])} if stage in work else {})
-            for stage in frames[0].timings_ms
+            stage: summary(frame.timings_ms[stage] for frame in frames) for stage in frames[0].timings_ms
         }
         return numbers
 
@@ -167,14 +161,10 @@ def _lines(result: dict) -> Iterator[str]:
     yield f"SlicerUSSim {result.get('version', '')} on {result['machine']['processor']}, {result['mri']}"
     for name, numbers in result["devices"].items():
         yield ""
-        yield (
-            f"{name}: {numbers['bytes_per_s'] / 1e9:.1f} GB/s, {numbers['operations_per_s'] / 1e9:.0f} Gflop/s measured"
-        )
-        yield f"  {'':36s}{'best':>10s}{'median':>11s}{'floor':>11s}{'times floor':>13s}"
+        yield name
+        yield f"  {'':36s}{'best':>10s}{'median':>11s}"
         for label, row in rows_of(numbers):
-            floor = row.get("floor_ms")
-            tail = f"{floor:8.2f} ms{row['best_ms'] / max(floor, 1e-9):13.1f}" if floor else ""
-            yield f"  {label:36s}{row['best_ms']:7.2f} ms{row['median_ms']:8.2f} ms{tail}"
+            yield f"  {label:36s}{row['best_ms']:7.2f} ms{row['median_ms']:8.2f} ms"
 
 
 def rows_of(numbers: dict) -> Iterator[tuple[str, dict]]:

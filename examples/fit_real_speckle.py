@@ -57,10 +57,10 @@ def main() -> None:
 def fit_speckle(sequence: TrackedSequence):
     """Display and one tissue to the left part of image 20, where the phantom is homogeneous."""
     # The scanner's settings were not recorded; with these the speckle size is similar to that of the image.
+    mm = WIDTH_MM / estimate_field(sequence.images, (1.0, 1.0)).probe.face_mm
     field = estimate_field(
-        sequence.images, width_mm=WIDTH_MM, scan_lines=256, frequency_mhz=6.6, fractional_bandwidth=0.35,
-        aperture_mm=9.0,
-    )  # fmt: skip
+        sequence.images, (mm, mm), scan_lines=256, frequency_mhz=6.6, fractional_bandwidth=0.35, aperture_mm=9.0
+    )
     window = rows, columns = field.window
     pixel = field.image_to_probe[0, 0], field.image_to_probe[1, 1]
     left, top = (field.image_to_probe @ [columns.start - 0.5, rows.start - 0.5, 0, 1])[:2]

@@ -263,18 +263,16 @@ def centres(volume: Volume) -> np.ndarray:
 def test_a_tilted_plane_on_voxels_has_its_distance_and_no_holes(normal, spacing, turn):
     surfels, place = plane_surfels(normal)
     ras_normal = unit(normal)[::-1]
-    voxels = on_voxels(surfels, grid(spacing, turn_deg=turn))
-    away = (place - centres(voxels.entry)) @ ras_normal
-    near = voxels.entry.array >= 0
-    assert near[np.abs(away) < 1.95].all()
-    assert not near[np.abs(away) > 2.05].any()
-    distance, found, thickness, confidence = voxels.unpacked(voxels.entry.array[near])
-    sign = np.sign(found @ ras_normal)
-    assert np.abs(distance * sign - away[near]).max() < 0.05
-    assert np.abs(found @ ras_normal).min() > np.cos(np.radians(1.0))
-    assert np.allclose(thickness, 0.8, atol=0.02)
-    assert np.allclose(confidence, 0.7, atol=0.02)
-    assert (voxels.kind == KINDS.index("falx")).all()
+    on = grid(spacing, turn_deg=turn)
+    found = on_voxels(surfels, on)
+    away = ((place - centres(on)) @ ras_normal).ravel()
+    assert np.isin(np.flatnonzero(np.abs(away) < 1.95), found.voxels).all()
+    assert np.abs(away[found.voxels]).max() < 2.05
+    sign = np.sign(found.normal @ ras_normal)
+    assert np.abs(found.distance * sign - away[found.voxels]).max() < 0.05
+    assert np.abs(found.normal @ ras_normal).min() > np.cos(np.radians(1.0))
+    assert np.allclose(found.thickness, 0.8, atol=1e-4) and np.allclose(found.confidence, 0.7, atol=1e-4)
+    assert (found.kind == KINDS.index("falx")).all()
 
 
 def test_a_ray_through_voxels_meets_a_sphere_where_it_is():
@@ -284,18 +282,19 @@ def test_a_ray_through_voxels_meets_a_sphere_where_it_is():
     around = np.pi * (1 + 5**0.5) * turns
     normal = np.stack([np.sqrt(1 - up**2) * np.cos(around), np.sqrt(1 - up**2) * np.sin(around), up], 1)
     surfels = Surfels.of("sulcus", radius * normal, normal, 0.5, 1.0, 4 * np.pi * radius**2 / count)
-    voxels = on_voxels(surfels, grid(1.0, 16.0))
+    on = grid(1.0, 16.0)
+    voxels = on_voxels(surfels, on)
     rng = np.random.default_rng(0)
     ways = rng.normal(size=(400, 3))
     ways /= np.linalg.norm(ways, axis=1, keepdims=True)
     steps = np.arange(9.0, 15.0, 0.25)
     points = steps[None, :, None] * ways[:, None] + rng.uniform(-0.5, 0.5, (400, 1, 3))
-    index = np.rint(points @ voxels.entry.ras_to_ijk[:3, :3].T + voxels.entry.ras_to_ijk[:3, 3]).astype(int)
-    entry = voxels.entry.array[tuple(np.moveaxis(index[..., ::-1], -1, 0))]
-    distance, found, _, _ = (
-        values.reshape(*entry.shape, *values.shape[1:]) for values in voxels.unpacked(entry.ravel())
-    )
-    centre = index @ voxels.entry.ijk_to_ras[:3, :3].T + voxels.entry.ijk_to_ras[:3, 3]
+    index = np.rint(points @ on.ras_to_ijk[:3, :3].T + on.ras_to_ijk[:3, 3]).astype(int)
+    entries = np.full(on.array.shape, -1)
+    entries.ravel()[voxels.voxels] = np.arange(len(voxels.voxels))
+    entry = entries[tuple(np.moveaxis(index[..., ::-1], -1, 0))]
+    distance, found = voxels.distance[entry], voxels.normal[entry]
+    centre = index @ on.ijk_to_ras[:3, :3].T + on.ijk_to_ras[:3, 3]
     # Height of a point above the plane stored in its voxel, with normals outwards
     height = ((points - centre) * found).sum(-1) - distance
     height *= np.sign((found * ways[:, None]).sum(-1))
@@ -311,11 +310,9 @@ def test_a_ray_through_voxels_meets_a_sphere_where_it_is():
 def test_two_sheets_near_each_other_stay_apart():
     first, _ = plane_surfels((0, 0, 1))
     second = replace(first, place=first.place + np.array([2.4, 0, 0], np.float32))
-    voxels = on_voxels(Surfels.joined([first, second]), grid(1.0, 8.0))
-    distance, normal, _, _ = voxels.unpacked()
-    at = centres(voxels.entry)[voxels.entry.array >= 0]
-    order = voxels.entry.array[voxels.entry.array >= 0]
-    met = at[:, 0] + distance[order] * normal[order, 0]
+    on = grid(1.0, 8.0)
+    found = on_voxels(Surfels.joined([first, second]), on)
+    met = centres(on).reshape(-1, 3)[found.voxels, 0] + found.distance * found.normal[:, 0]
     assert np.minimum(np.abs(met + 0.3), np.abs(met - 2.1)).max() < 0.06
 
 
@@ -323,7 +320,7 @@ def test_a_grid_too_coarse_for_the_reach_and_no_surfels():
     surfels, _ = plane_surfels((0, 0, 1))
     with pytest.raises(SimulationError, match=r"reach_mm is 1, expected at least 2\.3"):
         on_voxels(surfels, grid(3.0), reach_mm=1.0)
-    assert (on_voxels(Surfels.joined([]), grid(1.0)).entry.array == -1).all()
+    assert not len(on_voxels(Surfels.joined([]), grid(1.0)).voxels)
 
 
 # ---- whole heads ----------------------------------------------------------------------------------------------------

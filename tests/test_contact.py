@@ -88,11 +88,7 @@ def test_a_face_off_the_patient_is_said_with_the_share_that_touches():
     assert about_contact(slab(until_mm=0.25), PHASED, [AT_TOP], 2.0) == ()  # half of it
     corner = slab(until_mm=-4.0)  # a quarter
     assert touching_share(corner, PHASED, AT_TOP, 2.0) == pytest.approx(0.25, abs=0.03)
-    (line,) = about_contact(corner, PHASED, [AT_TOP], 2.0)
-    assert line.startswith("only 2") and "% of the probe's face touches" in line and "the image is black" not in line
-    speck = slab(until_mm=-7.25)
-    assert 0.0 < touching_share(speck, PHASED, AT_TOP, 2.0) < 0.05
-    assert not about_contact(speck, PHASED, [AT_TOP], 2.0)[0].startswith(("0%", "only 0%"))
+    assert about_contact(corner, PHASED, [AT_TOP], 2.0) == ()
 
 
 def test_a_face_far_from_a_patient_in_the_coupling_medium_is_said():
@@ -120,11 +116,11 @@ def test_no_share_of_a_face_touches_where_all_lines_are_dark(probe, off_mm):
 
 
 def test_images_of_a_sweep_without_contact_are_counted():
-    lifted, corner = (AT_TOP @ rigid(np.eye(3), at) for at in ([0.0, -10.0, 0.0], [75.0, 0.0, 0.0]))
+    lifted = AT_TOP @ rigid(np.eye(3), [0.0, -10.0, 0.0])
     assert about_contact(slab(), LINEAR, [AT_TOP, AT_TOP], 2.0) == ()
-    black, partly = about_contact(slab(), LINEAR, [AT_TOP, lifted, corner, lifted], 2.0)
-    assert black.startswith("in 2 of 4 images 0% of the probe's face touches the patient (")
-    assert "): they are black" in black and partly.startswith("in 1 of 4 images only ") and "% or less of" in partly
+    (black,) = about_contact(slab(), LINEAR, [AT_TOP, lifted, lifted], 2.0)
+    assert black.startswith("in 2 of 3 images 0% of the probe's face touches the patient (")
+    assert "): they are black" in black
 
 
 @pytest.mark.parametrize(
@@ -144,13 +140,3 @@ def test_lines_without_contact_are_dark_and_the_others_as_before(probe):
 def test_a_phased_array_half_in_the_air_has_a_quarter_of_its_amplitude():
     found = line_contact(slab(until_mm=0.25), PHASED, AT_TOP, 2.0)
     np.testing.assert_allclose(20.0 * np.log10(found), -12.04, atol=0.7)
-
-
-def test_a_face_deep_in_the_patient_is_said():
-    """A pose 78 mm deep in a brain gave an image without a word."""
-    labels = block(lambda x, y, z: np.ones_like(x, np.uint8), (40, 100, 20), 1.0)  # half sizes
-    deep, shallow = (rigid(np.eye(3), [0, -100 + mm, 0]) for mm in (40, 25))
-    (line,) = about_contact(labels, LINEAR, [deep], None)
-    assert line.startswith("the probe's face lies inside the patient, with more than 30 mm of tissue straight behind")
-    assert about_contact(labels, LINEAR, [deep, shallow], 2.0)[0].startswith("in 1 of 2 images the probe's face lies")
-    assert about_contact(labels, LINEAR, [shallow], None) == ()

@@ -175,12 +175,10 @@ def test_the_probe_stands_on_the_brain_in_the_opening_of_a_file(head, tmp_path):
     head.with_array(mask).write(tmp_path / "hole.nii.gz")
     through, told = image(tmp_path, "--pose", "auto", "--craniotomy", str(tmp_path / "hole.nii.gz"))
     assert "about R -68, A 0, S 0 mm are replaced" in told.replace("-0,", "0,").replace("-0 ", "0 ")
-    assert "bone lie behind" not in told and through.mean() > 10.0
+    assert through.mean() > 10.0
     pose = side.copy()
     pose[:3, 3] = (-59.0, 0.0, 0.0)
     (tmp_path / "pose.json").write_text(json.dumps(pose.tolist()))
-    _, told = image(tmp_path, "--pose", str(tmp_path / "pose.json"))
-    assert "mm of bone lie behind the face of the probe, which stands in a closed skull" in told
     _, told = image(tmp_path, "--pose", str(tmp_path / "pose.json"), "--craniotomy", "disc:10")
     assert re.search(
         r"the face of the probe is 12 mm wide and does not fit the opening, which leaves (9|10) mm of it free: expect",

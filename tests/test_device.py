@@ -410,8 +410,6 @@ def test_kernels_call_no_function_that_devices_round_differently():
     called = re.compile(rf"(?<![\w.])({names})\s*\(")
     found = []
     for path in sorted(kernel_folder().glob("*.cl*")):
-        if path.name == "machine.cl":  # measures a device's speed
-            continue
         code = re.sub(r"//[^\n]*|/\*.*?\*/", "", path.read_text(), flags=re.DOTALL)
         found += [f"{path.name}: {match[1]}" for match in called.finditer(code)]
     assert not found

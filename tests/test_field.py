@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from hypothesis import assume, given, strategies as st
 from PIL import Image, ImageDraw
-from scipy import ndimage
 
 from SlicerUSSim.Logic import ConvexProbe, LinearProbe, PhasedProbe, SimulationError, TrackedSequence
 from SlicerUSSim.Logic.probe.image_grid import ImageGrid
@@ -75,20 +74,6 @@ def test_edges_of_the_field_are_those_of_pixels_not_of_their_centres(kind):
         face = (np.linalg.inv(found.image_to_probe) @ [0, 0, 0, 1])[:2] * spacing + [left, top]
         errors.append([*wrong_by, *face])
     assert np.abs(np.mean(errors, axis=0)).max() < 0.25 * spacing
-
-
-def test_size_of_a_pixel_follows_from_what_is_known():
-    image, grid = screen(LinearProbe(38, 50))
-    by_width = estimate_field(image, width_mm=38.0, frequency_mhz=9.0)
-    assert by_width.probe.depth_mm == pytest.approx(50.0, abs=0.3) and by_width.probe.frequency_mhz == 9.0
-    assert by_width.image_to_probe[0, 0] == pytest.approx(grid.pixel_spacing_mm[0], rel=0.01)
-    assert estimate_field(image, depth_mm=50.0).probe.to_dict()["width_mm"] == pytest.approx(38.0, abs=0.3)
-    for options in ({}, {"width_mm": 38.0, "depth_mm": 50.0}):
-        with pytest.raises(SimulationError, match="pixel size is not known"):
-            estimate_field(image, **options)
-    sector, _ = screen(ConvexProbe(20, 70, 80))
-    with pytest.raises(SimulationError, match="width_mm is for linear probes only"):
-        estimate_field(sector, width_mm=38.0)
 
 
 @pytest.mark.parametrize(
@@ -194,8 +179,9 @@ def test_bad_sequences_are_refused_in_one_line():
 @pytest.mark.parametrize("name, depth", [("SpinePhantomFreehand", 50.0), ("BoneUltrasound_L14", 50.0)])
 def test_real_images_show_the_field_of_the_38_mm_probe_that_took_them(name, depth):
     sequence = TrackedSequence.read(SHARED / f"{name}.igs.mha")
-    field = estimate_field(sequence.images, width_mm=38.0)  # L14-5
-    assert field.probe.is_linear and field.probe.depth_mm == pytest.approx(depth, abs=1.0) and field.overlap > 0.99
+    field = estimate_field(sequence.images, (1.0, 1.0))
+    mm = 38.0 / field.probe.face_mm  # of a pixel: L14-5
+    assert field.probe.is_linear and mm * field.probe.depth_mm == pytest.approx(depth, abs=1.0) and field.overlap > 0.99
 
 
 # ---- what hides the field --------------------------------------------------------------------------------------------
@@ -260,7 +246,7 @@ def test_what_the_file_cuts_off_is_outside_the_mask(count, caplog):
     edge = images.shape[2] - 60
     images[:, :, edge:] = 0
     found = TrackedImages.of(sequence.with_images(range(count), images), probe=CONVEX)
-    assert f"the images end at column {edge - 1}" in caplog.text
+    assert "are beyond what the file shows: left out" in caplog.text
     whole = ImagedField.of(CONVEX, found.field.image_to_probe, images.shape[1:]).mask
     np.testing.assert_array_equal(found.field.mask[:, :edge], whole[:, :edge])
     assert not found.field.mask[:, edge:].any() and whole[:, edge:].any()
@@ -279,19 +265,19 @@ def test_darkness_is_not_a_cut():
 
 
 def test_text_and_boxes_in_the_field_are_left_out_and_said(caplog):
+    """Letters have smooth edges."""
     sequence = recording(CONVEX)
-    images = sequence.images.copy()
+    part = letters(sequence.images.shape[1:], 60, sequence.images.shape[2] // 2 - 80, 20)
+    images = (sequence.images * (1 - part) + 240 * part).round().astype(np.uint8)
     middle = np.array(images.shape[1:]) // 2
-    text = (slice(middle[0], middle[0] + 12), slice(middle[1], middle[1] + 40))
-    images[(slice(None), *text)][:, 2:9, ::4] = 230
     box = np.zeros(images.shape[1:], bool)
     box[middle[0] + 40 : middle[0] + 90, middle[1] - 50 : middle[1] + 20] = True
     box[middle[0] + 41 : middle[0] + 89, middle[1] - 49 : middle[1] + 19] = False
     images[:, box] = 180
     found = TrackedImages.of(sequence.with_images(range(6), images), probe=CONVEX)
-    assert "are the same in all images, as text, rulers, logos and boxes are" in caplog.text
+    assert "are the same in all images, as text, rulers and boxes are" in caplog.text
     assert not found.field.mask[box].any()
-    assert not found.field.mask[text][2:9, ::4].any()
+    assert found.field.mask[part > 0.1].mean() < 0.05
     clean = ImagedField.of(CONVEX, found.field.image_to_probe, images.shape[1:]).mask
     assert 0.9 < found.field.mask.sum() / clean.sum() < 1.0
     assert found.field.mask[middle[0] + 60, middle[1]]  # inside the box the patient is seen
@@ -311,73 +297,14 @@ def letters(shape: tuple[int, int], row: int, column: int, height: int) -> np.nd
     return np.asarray(drawing, float).reshape(shape[0], fine, shape[1], fine).mean(axis=(1, 3)) / 255
 
 
-def drawn_over(sequence: TrackedSequence, part: np.ndarray, level: int = 240) -> TrackedSequence:
-    """The images under a drawing that covers a part (rows, columns) of each pixel."""
-    images = (sequence.images * (1 - part) + level * part).round().astype(np.uint8)
-    return sequence.with_images(range(len(sequence)), images)
-
-
-@cache
-def speckled(probe, count: int = 12) -> TrackedSequence:
-    """A recording whose speckle has grains, and whose images have much in common, as those of a slow sweep."""
-    sequence = recording(probe, count + 2)
-    noise = ndimage.gaussian_filter(np.random.default_rng(5).normal(size=sequence.images.shape), (1, 1.2, 2))[1:-1]
-    levels = np.clip(60 + 45 * noise / noise.std(), 0, 255)
-    inside = sequence.images.max(axis=0) > 0
-    return sequence.with_images(range(count), np.where(inside, levels, 0).astype(np.uint8))
-
-
-@pytest.mark.parametrize(("height", "count"), [(10, 4), (20, 12)])
-def test_letters_with_smooth_edges_are_left_out(height, count, caplog):
-    """Of text 10 pixels high nothing was left out, of 14 pixels half."""
-    sequence = speckled(CONVEX, count)
-    rows, columns = sequence.images.shape[1:]
-    part = letters((rows, columns), rows // 2, columns // 2 - 4 * height, height)
-    found = TrackedImages.of(drawn_over(sequence, part), probe=CONVEX)
-    assert "are the same in all images, as text, rulers, logos and boxes are" in caplog.text
-    whole = ImagedField.of(CONVEX, found.field.image_to_probe, (rows, columns)).mask
-    hidden = whole & ~found.field.mask
-    assert (hidden & (part > 0.1)).sum() > 0.95 * (part > 0.1).sum()
-    assert (hidden & ~ndimage.binary_dilation(part > 0, iterations=8)).sum() < 10
-
-
-@pytest.mark.parametrize("step", [(20, 0), (3, 4)], ids=["ticks", "oblique dots"])
-def test_ticks_and_dots_are_left_out(step, caplog):
-    sequence = speckled(CONVEX)
-    part = np.zeros(sequence.images.shape[1:])
-    for number in range(10):
-        row, column = 150 + number * step[0], part.shape[1] // 2 + number * step[1]
-        part[row, column : column + (3 if step[0] == 20 else 1)] = 1
-    found = TrackedImages.of(drawn_over(sequence, part), probe=CONVEX)
-    assert "are the same in all images" in caplog.text
-    assert not found.field.mask[part > 0].any()
-
-
-def test_a_patient_who_does_not_change_is_not_drawn(caplog):
-    """Smooth bright lines that stay the same, as of a bone, and what is bright at the face, as in a real sweep."""
-    sequence = speckled(CONVEX)
-    rows, columns = np.indices(sequence.images.shape[1:])
-    to_probe = sequence.transforms[0]["ImageToProbe"]
-    x, y = to_probe[0, 0] * columns + to_probe[0, 3], to_probe[1, 1] * rows + to_probe[1, 3]
-    depth_mm = np.hypot(x, y + CONVEX.radius_mm) - CONVEX.radius_mm
-    still = np.maximum(
-        200 * np.exp(-0.5 * ((rows - 200) / 3) ** 2), 150 * np.exp(-0.5 * (depth_mm / (3 * to_probe[1, 1])) ** 2)
-    )
-    images = np.where(sequence.images.max(axis=0) > 0, np.maximum(sequence.images, still), 0)
-    found = TrackedImages.of(sequence.with_images(range(len(images)), images.astype(np.uint8)), probe=CONVEX)
-    whole = ImagedField.of(CONVEX, found.field.image_to_probe, images.shape[1:]).mask
-    np.testing.assert_array_equal(found.field.mask, whole)
-    assert "same in all images" not in caplog.text and "could not be looked for" not in caplog.text
-
-
 def test_images_that_cannot_tell_what_is_drawn_are_said(caplog):
-    few = speckled(CONVEX, 3)
+    few = recording(CONVEX, 3)
     TrackedImages.of(few, probe=CONVEX)
     assert "marks in the images could not be looked for: 3 different images, expected at least 4" in caplog.text
     caplog.clear()
     still = few.images[[0] * 6] + np.arange(6, dtype=np.uint8)[:, None, None] * (few.images[0] > 0)
     TrackedImages.of(few.with_images([0] * 6, still.astype(np.uint8)), probe=CONVEX)
-    assert "changes by at most 5 grey levels from image to image, expected 20 or more" in caplog.text
+    assert "changes by at most 5 grey levels, expected 20 or more" in caplog.text
     caplog.clear()
     TrackedImages.of(replace(few, fields={"SlicerUSSimSimulated": "twin 1"}), probe=CONVEX)
     assert "could not be looked for" not in caplog.text
@@ -393,16 +320,6 @@ def test_pixels_of_another_size_are_named():
         SimulationError, match=r"radius_mm is 400.* pixels are 1.67 x 1.67 mm large, check the calibration"
     ):
         TrackedImages.of(scaled)
-
-
-def test_inverted_images_are_said(caplog):
-    sequence = recording(CONVEX)
-    shown = np.pad(sequence.images, ((0, 0), (4, 4), (4, 4)))
-    TrackedImages.of(sequence.with_images(range(6), 255 - shown), probe=CONVEX)
-    assert "the images look inverted: 100 % of their border is white, expected black" in caplog.text
-    caplog.clear()
-    TrackedImages.of(sequence.with_images(range(6), shown), probe=CONVEX)
-    assert "inverted" not in caplog.text
 
 
 def test_an_image_that_shows_nearly_nothing_is_refused():
@@ -436,21 +353,12 @@ def test_tinted_images_are_grey_levels_and_that_is_said(tint, tmp_path, caplog):
     """Sepia was Doppler's: what was left of the field was black, and fitted."""
     sequence = recording(CONVEX)
     read = in_colours(tmp_path / "tinted.mha", sequence, tint.astype(np.uint8)[sequence.images])
-    assert "the images are tinted: 100 % of what is bright has the colours of one colour map" in caplog.text
+    assert "the images are tinted: " in caplog.text
     levels = tint.astype(np.uint8)[sequence.images] @ [0.299, 0.587, 0.114]
     assert np.abs(read.images - levels).max() <= 0.5 + 1e-9
     found = TrackedImages.of(read, probe=CONVEX)
     assert "have colours" not in caplog.text
     assert found.field.mask.sum() == ImagedField.of(CONVEX, found.field.image_to_probe, levels.shape[1:]).mask.sum()
-
-
-def test_colours_that_are_no_colour_map_are_refused_where_most_is_coloured(tmp_path):
-    sequence = recording(CONVEX)
-    level = sequence.images.astype(float)
-    rainbow = np.stack([level, 255 - np.abs(2 * level - 255), 255 - level], axis=-1) * (level > 0)[..., None]
-    read = in_colours(tmp_path / "rainbow.mha", sequence, rainbow.astype(np.uint8))
-    with pytest.raises(SimulationError, match=r"% of what is bright .* has colours, .* expected grey levels"):
-        TrackedImages.of(read, probe=CONVEX)
 
 
 def test_colours_are_left_out_and_said(tmp_path, caplog):
@@ -468,27 +376,12 @@ def test_colours_are_left_out_and_said(tmp_path, caplog):
     assert TrackedSequence.read(tmp_path / "grey.mha").coloured is None
 
 
-def test_saturated_images_and_a_mirroring_calibration_are_said(caplog):
+def test_a_mirroring_calibration_is_said(caplog):
     sequence = recording(CONVEX, 2)
-    bright = np.where(sequence.images > 150, 255, sequence.images).astype(np.uint8)
     mirror = np.diag([-1.0, 1.0, 1.0, 1.0])
     transforms = tuple({**entry, "ProbeToReference": mirror} for entry in sequence.transforms)
-    flipped = replace(sequence, images=bright, transforms=transforms)
-    TrackedImages.of(flipped, probe=CONVEX)
-    assert "of the field is at 255 grey levels: the images are saturated" in caplog.text
+    TrackedImages.of(replace(sequence, transforms=transforms), probe=CONVEX)
     assert "ImageToReference mirrors" in caplog.text
-
-
-def test_what_is_white_in_all_saturated_images_is_the_patient_and_no_logo(caplog):
-    """A real sweep five times too bright lost 12 % of its field as "text, rulers, logos and boxes"."""
-    sequence = recording(CONVEX)
-    bright = np.where(sequence.images > 120, 255, sequence.images).astype(np.uint8)
-    middle = np.array(bright.shape[1:]) // 2
-    bright[:, middle[0] : middle[0] + 30, middle[1] : middle[1] + 30] = 255
-    found = TrackedImages.of(sequence.with_images(range(6), bright), probe=CONVEX)
-    assert "the images are saturated" in caplog.text
-    assert "are the same in all images" not in caplog.text
-    assert found.field.mask[middle[0] : middle[0] + 30, middle[1] : middle[1] + 30].all()
 
 
 def test_an_image_of_one_grey_level_is_refused_with_its_number():

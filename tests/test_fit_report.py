@@ -1,4 +1,4 @@
-"""What the report of a fit says of its controls (fitting/control_costs.py) and of the fit of the speckle."""
+"""What the report of a fit says of the fit of the speckle, and the names of a fit's steps."""
 
 from __future__ import annotations
 
@@ -15,20 +15,16 @@ from SlicerUSSim.Command.cli import main
 from SlicerUSSim.Logic import (
     ConvexProbe,
     DisplaySettings,
-    Preset,
     SimulationSettings,
     TissueTable,
     TrackedSequence,
     UltrasoundSimulator,
 )
 from SlicerUSSim.Logic.base.files import write_json
-from SlicerUSSim.Logic.fitting.control_costs import control_costs, mean_cost, neighbours_of
 from SlicerUSSim.Logic.fitting.search import Progress
-from SlicerUSSim.Logic.fitting.speckle_fit import PointSpread, SpeckleFit
+from SlicerUSSim.Logic.fitting.speckle_fit import SpeckleFit
 from SlicerUSSim.Logic.fitting.texture_costs import TextureMisfit
-from SlicerUSSim.Logic.fitting.tracked_fit import simulated
 from SlicerUSSim.Logic.probe import ImageGrid, tilt_sweep
-from SlicerUSSim.Logic.tracked import TrackedImages
 from tests.conftest import block, rigid
 
 PROBE = ConvexProbe(12.0, 60.0, 30.0, scan_lines=80)
@@ -74,23 +70,13 @@ def rows_of(report: str) -> list[list[str]]:
     ]
 
 
-def test_the_report_has_the_costs_of_the_controls(folder):
+def test_a_fit_writes_what_was_asked_for(folder):
     pytest.importorskip("matplotlib", reason="reports need matplotlib: pip install '.[demo]'")
     places = [folder / name for name in ("report.html", "preset.json", "field.png")]
     done = optimize(folder, "--report", places[0], "--save-preset", places[1], "--set", f"recording.field={places[2]}")
     assert done.exit_code == 0, done.output
     assert all(str(place) in done.stderr.splitlines()[-1] for place in places)
     report = places[0].read_text("utf-8")
-    preset, sequence = Preset.read(folder / "preset.json"), TrackedSequence.read(folder / "tracked.igs.mha")
-    made = UltrasoundSimulator(LABELS, preset.tissues, preset.settings)
-    tracked = TrackedImages.of(sequence, probe=PROBE).only([1])
-    images = simulated(made, tracked, preset.tissues, preset.display)
-    costs = control_costs(tracked, images, made, preset.display, neighbours_of(sequence, tracked))
-    assert list(costs) == ["simulated", "uniform tissue", "real neighbours"]
-    rows = rows_of(report)
-    for name, each in costs.items():
-        assert [name, *(f"{value:.3f}" for value in mean_cost(each).values())] in rows
-    assert mean_cost(costs["simulated"])["paper"] < mean_cost(costs["uniform tissue"])["paper"]
     assert "Fit of the speckle" not in report  # which was not asked for
 
 
@@ -101,38 +87,19 @@ def test_the_report_says_what_the_fit_of_the_speckle_found(folder):
     done = optimize(folder, "--set", "fit.speckle=true", "--set", "fit.validate=2", "--report", report)
     assert done.exit_code == 0, done.output
     said = {row[0]: row[1] for row in rows_of(report.read_text("utf-8")) if len(row) == 2}
-    assert (
-        "frequency itself cannot be known" in said["point spread function"] and "x " in said["texture of the tissues"]
-    )
-
-
-def test_a_report_of_what_does_not_scatter_is_without_controls(folder, tmp_path):
-    """There is no tissue for the uniform control; the fit and its report are not lost for it."""
-    pytest.importorskip("matplotlib", reason="reports need matplotlib: pip install '.[demo]'")
-    silent = TissueTable({n: replace(tissue, mu0=0.0, sigma0=0.0) for n, tissue in TISSUES.items()})
-    silent.write(tmp_path / "silent.json")
-    done = optimize(
-        folder, "--set", f"patient.tissues={tmp_path / 'silent.json'}", "--report", tmp_path / "report.html"
-    )
-    assert done.exit_code == 0, done.output
-    assert "the report has no controls: no tissue of the volume has scatterers" in done.stderr
-    assert "uniform tissue" not in (tmp_path / "report.html").read_text("utf-8").lower()
+    assert "x " in said["texture of the tissues"]
 
 
 def test_what_the_fit_of_the_speckle_found_is_said():
-    refused = PointSpread(1.1, 26.0, False, TextureMisfit(0.09, 1.0), TextureMisfit(0.12, 0.5))
     shown = replace(SHOWN, smoothing_axial_mm=0.044, smoothing_lateral_deg=0.31, map_black=0.5)
-    found = SpeckleFit(shown, TISSUES, 1.4, TextureMisfit(0.2, 0.4), TextureMisfit(0.12, 0.5), True, refused)
+    found = SpeckleFit(shown, TISSUES, 1.4, TextureMisfit(0.2, 0.4), TextureMisfit(0.12, 0.5), True)
     rows = dict(found.rows())
     assert rows["smoothing of the envelope"] == "0.044 mm axially, 0.31° laterally"
     assert (
         rows["texture of the tissues"] == "x 1.4" and "slope 0.50 at black" in rows["grey map, from the images alone"]
     )
-    for words in ("not taken", "frequency itself cannot be known"):
-        assert words in rows["point spread function"]
-    assert rows["T1 and T2 with it; without"].startswith("0.090 and 1.00")
-    assert json.loads(json.dumps(found.to_dict(), allow_nan=False))["point_spread"]["with_it"]["extrema"] == 1.0
-    untold = replace(found, has_map=False, spread=None).rows()
+    assert json.loads(json.dumps(found.to_dict(), allow_nan=False))["after"]["extrema"] == 0.5
+    untold = replace(found, has_map=False).rows()
     assert "too few grey levels" in untold[0][1] and len(untold) == 5
 
 

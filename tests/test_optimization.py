@@ -16,14 +16,12 @@ from SlicerUSSim.Logic import (
     PhasedProbe,
     SimulationError,
     SimulationSettings,
-    Texture,
     TissueTable,
     UltrasoundSimulator,
     Volume,
     optimize_appearance,
     segment_mri,
 )
-from SlicerUSSim.Logic.base.errors import Cancelled
 from SlicerUSSim.Logic.fitting.appearance import AppearanceModel
 from SlicerUSSim.Logic.fitting.identifiability import variance_db
 from SlicerUSSim.Logic.fitting.image_similarity import SimilaritySettings
@@ -37,8 +35,7 @@ from SlicerUSSim.Logic.fitting.optimization import (
     search_axes,
 )
 from SlicerUSSim.Logic.fitting.parameters import FreeParameters
-from SlicerUSSim.Logic.fitting.search import Evaluation, Search
-from SlicerUSSim.Logic.mri.samples import head_mri
+from SlicerUSSim.Logic.fitting.search import Search
 from SlicerUSSim.Logic.probe import pose_looking_at
 from SlicerUSSim.Logic.probe.beam import FWHM_PER_SIGMA
 from SlicerUSSim.Logic.probe.image_grid import ImageGrid
@@ -235,116 +232,6 @@ def test_the_same_problem_gives_the_same_answer(twin):
     assert one.after == other.after and one.history == other.history
 
 
-@pytest.mark.slow
-def test_an_interrupted_run_is_resumed_without_computing_again(twin):
-    reached = []
-
-    def stop(progress):
-        if progress.evaluations == 25:
-            raise Cancelled
-
-    with pytest.raises(Cancelled):
-        optimise(twin, ["display"], max_evaluations=40, progress=stop, checkpoint=reached.append)
-    state = json.loads(json.dumps(reached[-1]))
-    assert len(state["history"]) == 25
-    whole = optimise(twin, ["display"], max_evaluations=40)
-    resumed = optimise(twin, ["display"], max_evaluations=40, resume=state)
-    assert resumed.after == whole.after and resumed.history == whole.history
-    assert resumed.evaluations == whole.evaluations - 25
-    assert optimise(twin, ["display"], max_evaluations=40, resume=resumed.state).evaluations == 0
-    with pytest.raises(SimulationError, match="another problem"):
-        optimise(twin, ["gain_db"], resume=state)
-    with pytest.raises(SimulationError, match="state to resume is invalid"):
-        optimise(twin, ["gain_db"], resume={"hello": 1})
-
-
-@pytest.mark.long
-def test_a_longer_run_goes_on_from_a_shorter_one_as_if_it_were_alone(twin):
-    short = optimise(twin, ["display"], max_evaluations=40, restarts=1)
-    whole = optimise(twin, ["display"], max_evaluations=60, restarts=2)
-    resumed = optimise(twin, ["display"], max_evaluations=60, restarts=2, resume=json.loads(json.dumps(short.state)))
-    assert resumed.history == whole.history and resumed.after == whole.after
-    assert resumed.to_dict()["identifiability"] == whole.to_dict()["identifiability"]
-    assert whole.evaluations - resumed.evaluations >= 16  # the global search of the shorter one
-
-
-def test_breaking_off_early_again_loses_nothing_of_what_was_reached(twin):
-    reached = []
-
-    def stop(progress):
-        if progress.evaluations == 3:
-            raise Cancelled
-
-    state = optimise(twin, ["display"], max_evaluations=20).state
-    with pytest.raises(Cancelled):
-        optimise(twin, ["display"], max_evaluations=20, resume=state, progress=stop, checkpoint=reached.append)
-    assert reached == [state]
-
-
-def hybrid(labels: Volume, tissues, mri: Volume) -> UltrasoundSimulator:
-    """Scatterers that follow the MRI, whose voxels are taken to lie where those of the labels do."""
-    texture = Texture.from_mri(labels.with_array(mri.array), labels)
-    return UltrasoundSimulator(labels, tissues, SimulationSettings(mri_modulation_db=3.0), texture=texture)
-
-
-@pytest.mark.slow
-def test_a_state_is_refused_if_any_input_is_another(twin):
-    medium, mri = twin.simulator.medium, head_mri(2.0)
-    start = hybrid(medium.labels, medium.tissues, mri)
-    masks = [ImageGrid.for_probe(twin.probe, None).field(twin.probe)] * 3
-    given = {
-        "simulator": start, "probe": twin.probe, "poses": twin.poses, "references": twin.references, "masks": masks,
-        "free": ["gain_db"], "display": twin.display, "max_evaluations": 3, "restarts": 0,
-    }  # fmt: skip
-
-    def fitted(**changes):
-        return optimize_appearance(**{**given, **changes})
-
-    state = fitted().state
-    assert fitted(resume=state).evaluations == 0
-    painted = medium.labels.array.copy()
-    painted[tuple(np.argwhere(painted == 3)[0])] = 2
-    half = masks[0] & (np.arange(masks[0].shape[1]) < masks[0].shape[1] // 2)
-    dot = twin.references[2].copy()
-    dot[200, dot.shape[1] // 2] ^= 1
-    other_mri = mri.with_array(mri.array + 20.0 * (np.indices(mri.array.shape).sum(axis=0) % 2))
-    moved = [*twin.poses[:2], twin.poses[2] @ np.diag([1.0, 1, 1, 1])]
-    moved[2][0, 3] += 1e-3
-    settings = replace(start.settings, seed=4)
-    loud = medium.tissues.replace("csf", sigma0=0.01)
-    for changes, other in (
-        ({"simulator": hybrid(medium.labels, medium.tissues, other_mri)}, "texture"),
-        ({"simulator": hybrid(medium.labels.with_array(painted), medium.tissues, mri)}, "labels, texture"),
-        ({"simulator": hybrid(medium.labels, loud, mri)}, "tissues"),
-        ({"references": [*twin.references[:2], dot]}, "reference images"),
-        ({"masks": [half, *masks[1:]]}, "masks"),
-        ({"poses": moved}, "poses"),
-        ({"probe": replace(twin.probe, frequency_mhz=4.0)}, "probe"),
-        ({"display": replace(twin.display, tgc_db_cm_mhz=0.3)}, "display"),
-        ({"settings": SimilaritySettings(bins=16)}, "similarity settings"),
-        ({"algorithms": (None, "LN_COBYLA")}, "algorithms"),
-        ({"seed": 1}, "seed"),
-        ({"free": {"gain_db": (-3, 3)}}, "free parameters"),
-    ):
-        with pytest.raises(SimulationError) as caught:
-            fitted(**changes, resume=state)
-        assert f"is of another problem: other {other}; start without it" in str(caught.value)
-        assert "\n" not in str(caught.value)
-    start.settings = settings
-    with pytest.raises(SimulationError, match="other simulation settings; start without it"):
-        fitted(resume=state)
-
-
-def test_a_replay_ends_where_the_runs_part():
-    """An equal position in an equal stage, but after another past, is computed: the cost may have another anchor."""
-    past = [Evaluation("local", (units,), 7.0) for units in (0.1, 0.2, 0.5)]
-    search = Search(lambda units: float(units[0]), lambda units: {}, 9, replayed=past)
-    costs = [search.evaluate("local", np.array([units])) for units in (0.1, 0.3, 0.5)]
-    assert costs == [7.0, 0.3, 0.5] and search.computed == 2
-    other = Search(lambda units: float(units[0]), lambda units: {}, 9, replayed=past)
-    assert other.evaluate("polish", np.array([0.1])) == 0.1  # another stage
-
-
 def test_what_a_progress_function_raises_comes_through(twin):
     def fail(progress):
         raise ZeroDivisionError("mine")
@@ -359,7 +246,7 @@ def test_search_finds_the_lowest_point_and_keeps_its_history(algorithm):
     search = Search(lambda units: float(((units - goal) ** 2).sum()), lambda units: {}, 400)
     best = search.minimise(algorithm, "here", np.full(3, 0.1), 400)
     assert np.abs(best - goal).max() < 0.05
-    assert search.computed == len(search.history) <= 400
+    assert len(search.history) <= 400
     assert search.best_cost("here") == min(entry.cost for entry in search.history)
 
 

@@ -106,10 +106,3 @@ def test_a_preset_as_texts_has_every_value(preset):
     assert {f"display.{entry.name}" for entry in fields(preset.display)} <= texts.keys()
     sources = [tissue.sources for tissue in preset.tissues.all_tissues()]
     assert [tissue.sources for tissue in Preset.from_texts(texts).tissues.all_tissues()] == sources
-
-
-def test_a_preset_of_an_older_version_stays_even():
-    """It has no look; one that is written now has."""
-    old = Preset().to_dict()
-    assert old["display"].pop("look") == "scanner"
-    assert Preset.from_dict(old).display.look == "even" and Preset.from_dict(Preset().to_dict()) == Preset()

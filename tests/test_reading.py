@@ -203,12 +203,12 @@ def test_a_warning_of_a_reader_reaches_the_caller(sent):
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         assert warns(sent) == 4
-    assert [(type(w.message).__name__, str(w.message)) for w in caught] == [("BehindBoneWarning", "7 mm of bone")]
+    assert [(type(w.message).__name__, str(w.message)) for w in caught] == [("EmptyViewWarning", "no echoes")]
 
 
 @reader
 def warns(path: Path) -> int:
-    from SlicerUSSim.Logic.imaging.simulator import BehindBoneWarning
+    from SlicerUSSim.Logic.imaging.simulator import EmptyViewWarning
 
-    warnings.warn(BehindBoneWarning("7 mm of bone"), stacklevel=2)
+    warnings.warn(EmptyViewWarning("no echoes"), stacklevel=2)
     return len(path.read_text())

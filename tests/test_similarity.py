@@ -6,7 +6,7 @@ from hypothesis import given, strategies as st
 from hypothesis.extra.numpy import arrays
 
 from SlicerUSSim.Logic import LinearProbe, SimulationError, similarity
-from SlicerUSSim.Logic.fitting.image_similarity import PatchComparison, SimilaritySettings
+from SlicerUSSim.Logic.fitting.image_similarity import PatchComparison, Similarity, SimilaritySettings
 from SlicerUSSim.Logic.opencl.device import Device
 from tests.conftest import SPECKLE, block, simulator
 
@@ -33,12 +33,17 @@ def test_cost_is_that_of_the_equations():
     assert (found.total, found.bhattacharyya, found.sad) == pytest.approx((total, rho, sad), abs=1e-6)
 
 
+def compared(comparison: PatchComparison, image: np.ndarray) -> Similarity:
+    comparison.run(comparison.device.upload(image))
+    return comparison.result()
+
+
 @pytest.mark.parametrize("histogram_weight", [0.0, 1.0, 2.0])
 def test_both_parts_of_the_cost_have_a_weight(histogram_weight):
     random = np.random.default_rng(4)
     a, b = random.integers(0, 256, (2, 40, 60), dtype=np.uint8)
     weights = SimilaritySettings(5.0, 16, sad_weight=0.7, histogram_weight=histogram_weight)
-    found = PatchComparison(Device.get(), b, np.ones(b.shape, bool), (0.5, 0.5), weights).of(a)
+    found = compared(PatchComparison(Device.get(), b, np.ones(b.shape, bool), (0.5, 0.5), weights), a)
     _, rho, sad = by_the_equations(a, b, 10, 16, 0.7)
     assert (found.bhattacharyya, found.sad) == pytest.approx((rho, sad), abs=1e-6)
     assert found.total == pytest.approx(histogram_weight * rho + 0.7 * sad, abs=2e-6)
@@ -72,8 +77,8 @@ def test_device_agrees_with_numpy(rows, columns, bins, patch_mm, weight, seed):
     mask = random.random((rows, columns)) > 0.3
     mask[0, 0] = True
     spacing = (0.7, 0.4)
-    device = Device.get()
-    on_device = PatchComparison(device, b, mask, spacing, SimilaritySettings(patch_mm, bins, weight)).of(a)
+    settings = SimilaritySettings(patch_mm, bins, weight)
+    on_device = compared(PatchComparison(Device.get(), b, mask, spacing, settings), a)
     plain = similarity(a, b, spacing, patch_mm=patch_mm, bins=bins, sad_weight=weight, mask=mask)
     assert on_device.total == pytest.approx(plain.total, abs=2e-6)
     assert on_device.sad == pytest.approx(plain.sad, abs=1e-6)

@@ -25,9 +25,7 @@ from SlicerUSSim.Logic import (
     Volume,
     segment_mri,
 )
-from SlicerUSSim.Logic.imaging.scattering import cells_in_view, scatterer_counts
 from SlicerUSSim.Logic.imaging.simulator import EmptyViewWarning, SlowScatterersWarning
-from SlicerUSSim.Logic.opencl.layout import CONSTANTS
 from SlicerUSSim.Logic.tissue import read_label_map
 from SlicerUSSim.Logic.tissue.presets import TISSUES
 from SlicerUSSim.Logic.tissue.table import MAX_LABEL
@@ -524,22 +522,6 @@ def test_so_many_scatterers_that_an_image_takes_long_are_a_warning():
         for enough in (None, 500.0):
             simulator(labels, SPECKLE, scatterers_per_mm3=enough).simulate(PROBES["convex"], pose)
         simulator(labels, SPECKLE, scatterers_per_mm3=200_000.0, scattering=False).simulate(PROBES["convex"], pose)
-
-
-def test_the_estimate_is_the_number_of_cells_along_the_rays():
-    """Of traced rays, in one tissue, without what elevational side lobes add."""
-    solid = simulator(block(lambda x, y, z: np.ones_like(x), half_mm=(60, 60, 80)), SPECKLE, side_lobes=False)
-    for changes in ({}, {"scan_lines": 600}, {"elevation_aperture_mm": 40.0, "elevation_focus_mm": 10.0}):
-        probe = replace(PROBES["convex"], **changes)
-        pose = rigid(np.eye(3), [0, 0, -30])
-        frame, chunk = solid.device_frame(probe, pose), CONSTANTS["BLOCK"]
-        _, expected = scatterer_counts(frame, solid.trace(probe, pose).segments, chunk)
-        fields = frame.acquisition
-        found = cells_in_view(
-            solid.settings, probe, int(fields["traced_lines"]), int(fields["lateral_rays"]),
-            chunk * float(fields["sample_mm"]),
-        )  # fmt: skip
-        assert found == pytest.approx(expected, rel=0.2)
 
 
 def test_a_probe_that_would_take_minutes_is_refused_with_the_numbers():

@@ -9,13 +9,10 @@ import numpy as np
 import pytest
 
 from benchmarks import frames
-from benchmarks.measuring import Machine
 from SlicerUSSim.Logic import DisplaySettings, LinearProbe
 from SlicerUSSim.Logic.fitting.appearance import AppearanceModel
 from SlicerUSSim.Logic.imaging import stages
-from SlicerUSSim.Logic.imaging.console import EdgeEnhancement
-from SlicerUSSim.Logic.imaging.scattering import LateralBeam
-from SlicerUSSim.Logic.imaging.stage import Stage, Work
+from SlicerUSSim.Logic.imaging.stage import Stage
 from SlicerUSSim.Logic.opencl import device as opencl_device
 from SlicerUSSim.Logic.opencl.device import Workspace, kernel_folder
 from tests.conftest import SPECKLE, block, rigid, simulator
@@ -43,30 +40,6 @@ def test_the_simulator_runs_the_stages_of_the_list_in_its_order():
     found.profiling = True
     frame = found.simulate(PROBE, POSE)
     assert list(frame.timings_ms) == ["upload", *(stage.name for stage in ALL_STAGES), "download"]
-
-
-@pytest.mark.parametrize("kind", ALL_STAGES, ids=lambda kind: kind.name)
-def test_every_stage_that_is_on_has_its_work(plain, kind):
-    work = plain.stage(kind).work(plain.device_frame(PROBE, POSE), plain.trace(PROBE, POSE))
-    is_off = kind is EdgeEnhancement  # by default
-    assert (work.bytes == 0) == is_off and work.operations >= 0
-
-
-def test_work_grows_with_what_is_done(plain):
-    beam, tree = plain.stage(LateralBeam), plain.trace(PROBE, POSE)
-    few, many = (beam.work(plain.device_frame(replace(PROBE, scan_lines=n), POSE), tree) for n in (16, 64))
-    assert many.operations > few.operations > 0 and many.bytes > few.bytes
-
-
-def test_a_stage_without_work_cannot_be_made(plain):
-    class Idle(Stage):
-        name = "idle"
-
-        def run(self, frame) -> None:
-            pass
-
-    with pytest.raises(TypeError, match="work"):
-        Idle(plain.device)  # pyright: ignore[reportAbstractUsage]
 
 
 # ---- one class and one line ------------------------------------------------------------------------------------------
@@ -97,10 +70,6 @@ class Mixing(Stage):
         size = samples // self.device.lanes, lines
         self.device.run(self.kernel, size, frame.grey, np.int32(samples), np.float32(frame.display.share), mixed)
         frame.grey = mixed
-
-    def work(self, frame, tree) -> Work:
-        lines, samples = frame.line_shape
-        return Work(2 * lines * samples, 5 * lines * samples)
 
 
 SOURCE = """
@@ -154,8 +123,8 @@ def test_the_benchmark_uses_an_added_stage(added, monkeypatch):
     monkeypatch.setattr(DisplaySettings, "share", ON.share, raising=False)  # as a field with this default
     benchmark = frames._DeviceBenchmark(added.device.info, None, 1, print)
     benchmark.simulator, benchmark.poses = added, {"A": POSE}
-    row = benchmark._frame("A", Machine(1e9, 1e9))["stages"][Mixing.name]
-    assert row["best_ms"] > 0 and row["floor_ms"] > 0 and row["operations"] > 0
+    row = benchmark._frame("A")["stages"][Mixing.name]
+    assert row["best_ms"] > 0
 
 
 def test_frames_of_which_the_display_changed_start_from_the_same_echoes(plain):

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
-
 import numpy as np
 import pytest
 import vtkmodules.vtkRenderingOpenGL2  # noqa: F401, makes rendering work at all
@@ -197,7 +195,6 @@ def test_alpha_is_the_imaged_field():
         (lambda f: f.SetProbeTransform(vtk_matrix(np.diag([2.0, 1, 1, 1]))), "probe transform is not rigid"),
         (lambda f: f.SetTissues(TissueTable({1: SPECKLE})), "label 2 has no tissue"),
         (lambda f: f.SetSheetsData(outline_polydata(PROBE)), "sheets: has no array 'place' of its cells"),
-        (lambda f: (f.SetSheetsData(sheets_of()), f.SetSheetKinds("wall")), "sheets are of no kind 'wall'"),
     ],
 )
 def test_what_is_wrong_is_one_error_event_and_no_image(break_it, message):
@@ -249,12 +246,6 @@ def test_sheets_of_the_kinds_that_are_chosen_are_drawn():
     expected = UltrasoundSimulator(cyst(), tissues, sheets=surfels)
     np.testing.assert_array_equal(image, expected.simulate(PROBE, pose, DISPLAY, noise_seed=seed_of_pose(pose)).image)
     assert image[25:40].mean() > without[25:40].mean() + 10  # 10 of 30 mm deep, in 96 rows
-    algorithm.SetSheetKinds(["sulcus"])
-    algorithm.Update()
-    np.testing.assert_array_equal(image_of(algorithm), without)
-    algorithm.SetSheetKinds("falx")
-    algorithm.Update()
-    np.testing.assert_array_equal(image_of(algorithm), image)
     assert not executes(algorithm)
     surface.Initialize()  # in place
     algorithm.Modified()
@@ -280,24 +271,10 @@ def test_segmentation_labels_as_the_function_does_and_names_travel():
     assert segmentation.GetSegmentation().tissue_names == expected.tissue_names
     assert shares == sorted(shares) and shares[-1] == 1.0
     # With T2, label 1 is white matter; the names, not the numbers, choose the tissues.
-    segmentation.SetContrast("t2")
+    segmentation.SetSettings(SegmentationSettings("t2"))
     algorithm.Update()
     assert segmentation.GetSegmentation().tissue_names[0] == "white matter"
     assert algorithm._simulator._simulator.medium.tissues[1].name == "white matter"
-
-
-def test_segmentation_has_the_declared_defaults_and_refuses_on_update():
-    segmentation = SegmentationFilter()
-    assert segmentation._values == asdict(SegmentationSettings())
-    settings = SegmentationSettings("t2", filter_radius=2)
-    segmentation.SetSettings(settings)
-    assert segmentation._values == asdict(settings)
-    segmentation.SetInputData(head_mri(4.0).to_vtk())
-    for heard in (segmentation, segmentation.GetExecutive()):
-        heard.AddObserver("ErrorEvent", lambda *_: None)
-    segmentation.SetContrast("pd")
-    segmentation.Update()
-    assert segmentation.GetErrorMessage().startswith("segmentation: contrast is 'pd', expected one of t1, t1gd, t2")
 
 
 @pytest.mark.slow
@@ -313,7 +290,7 @@ def test_segmentation_takes_a_mask_and_can_be_stopped():
 
     segmentation.GetExecutive().AddObserver("ErrorEvent", lambda *_: None)
     stop = segmentation.AddObserver("ProgressEvent", lambda caller, _: caller.SetAbortExecute(1))
-    segmentation.SetClasses(3)
+    segmentation.SetSettings(SegmentationSettings(classes=3))
     segmentation.Modified()
     segmentation.Update()
     assert segmentation.GetOutput().GetNumberOfPoints() == 0 and segmentation.GetErrorMessage() == ""

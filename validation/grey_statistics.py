@@ -10,7 +10,7 @@ from scipy import ndimage, stats
 
 from SlicerUSSim.Logic.base.errors import require
 from SlicerUSSim.Logic.fitting.image_similarity import as_image
-from SlicerUSSim.Logic.fitting.speckle_width import extrema_density_cm2
+from SlicerUSSim.Logic.fitting.texture_costs import local_extrema
 from SlicerUSSim.Logic.probe.arrays import Probe
 from SlicerUSSim.Logic.probe.image_grid import ImageGrid
 
@@ -44,6 +44,15 @@ class TissueGrey:
     def to_dict(self) -> dict:
         """Plain values for JSON."""
         return {**vars(self), "histogram": self.histogram.round(5).tolist()}
+
+
+def extrema_density_cm2(image: np.ndarray, grid: ImageGrid, inside: np.ndarray) -> float:
+    """Local maxima of an image (rows, columns) per square centimetre of `inside` (rows, columns) bool.
+
+    They are counted as in T2 (texture_costs.py); the number depends on the size of the pixels.
+    """
+    area = np.count_nonzero(inside) * grid.pixel_spacing_mm[0] * grid.pixel_spacing_mm[1] / 100.0
+    return float(np.count_nonzero(local_extrema(image)[0] & inside) / area) if area else float("nan")
 
 
 def less_local_mean(image: np.ndarray, grid: ImageGrid, inside: np.ndarray) -> np.ndarray:

@@ -19,7 +19,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -36,6 +36,7 @@ from SlicerUSSim.Command.sequence_options import SequenceOptions, open_tracked
 from SlicerUSSim.Logic.base.errors import SimulationError, require
 from SlicerUSSim.Logic.base.files import write_json, written_whole
 from SlicerUSSim.Logic.base.settings import DisplaySettings
+from SlicerUSSim.Logic.fitting.appearance import AppearanceModel
 from SlicerUSSim.Logic.fitting.control_costs import (
     NEIGHBOURS,
     UNIFORM,
@@ -43,9 +44,9 @@ from SlicerUSSim.Logic.fitting.control_costs import (
     costs_against,
     mean_cost,
     neighbours_of,
-    uniform_control,
+    uniform_tissues,
 )
-from SlicerUSSim.Logic.fitting.speckle_width import SpeckleWidth, extrema_density_cm2, speckle_widths
+from SlicerUSSim.Logic.fitting.speckle_width import HALF_HEIGHT_PER_SIGMA, SpeckleWidth, speckle_widths
 from SlicerUSSim.Logic.fitting.tracked_fit import simulated
 from SlicerUSSim.Logic.imaging.grey_map import EstimatedMap, estimate_grey_map
 from SlicerUSSim.Logic.imaging.medium import Medium
@@ -54,6 +55,7 @@ from SlicerUSSim.Logic.probe.poses import slice_under_probe
 from SlicerUSSim.Logic.tracked.images import TrackedImages
 from validation.grey_statistics import (
     TissueGrey,
+    extrema_density_cm2,
     grey_of_tissues,
     histogram_misfit,
     less_local_mean,
@@ -75,6 +77,8 @@ Table: TypeAlias = tuple[str, list[str], list[list[str]]]
 _MOST_IMAGES = 6
 #: Names of the sources that are always there
 REAL, BLURRED, LEVELLED = "real", "real, blurred", "uniform, real level"
+#: Between which the gain of the uniform control is looked for
+_GAINS_DB = -80.0, 80.0
 _CONTROLS = (REAL, NEIGHBOURS, BLURRED, UNIFORM, LEVELLED)
 #: Sigma of the blurred control, pixels
 BLUR_PIXELS = 2.0
@@ -164,7 +168,10 @@ class Realism:
         widths = [
             [
                 shown(name),
-                *(f"{_text(w.half_height_mm[0])} / {_text(w.half_height_mm[1])}" for w in looks.widths),
+                *(
+                    f"{_text(HALF_HEIGHT_PER_SIGMA * w.axial_mm)} / {_text(HALF_HEIGHT_PER_SIGMA * w.lateral_mm)}"
+                    for w in looks.widths
+                ),
             ]
             for name, looks in self.looks.items()
         ]
@@ -276,6 +283,31 @@ def blurred(image: np.ndarray) -> np.ndarray:
     """(rows, columns) uint8 blurred by a Gaussian of 2 pixels."""
     smooth = ndimage.gaussian_filter(np.asarray(image, np.float32), BLUR_PIXELS)
     return np.clip(np.rint(smooth), 0, 255).astype(np.uint8)
+
+
+def uniform_control(
+    simulator: UltrasoundSimulator, tracked: TrackedImages, display: DisplaySettings
+) -> list[np.ndarray]:
+    """(rows, columns) uint8 images of one uniform tissue at the poses, with the real images' mean grey level."""
+    labels, tissues = uniform_tissues(simulator)
+    settings = replace(simulator.settings, partial_volume=False, mri_modulation_db=0.0)
+    uniform = UltrasoundSimulator(labels, tissues, settings, simulator.device)
+    # Without free tissues it keeps the echoes of every pose, so that only the display is computed again
+    model = AppearanceModel(uniform, tracked.probe, tracked.poses, {}, tracked.grid)
+    wanted = float(np.mean([image[tracked.mask].mean() for image in tracked.images]))
+
+    def at(gain_db: float) -> list[np.ndarray]:
+        shown = replace(display, gain_db=gain_db)
+        return [model.image(number, tissues, shown) for number in range(len(tracked.poses))]
+
+    low, high = _GAINS_DB
+    for _ in range(12):  # to 0.04 dB
+        middle = 0.5 * (low + high)
+        if np.mean([image[tracked.mask].mean() for image in at(middle)]) < wanted:
+            low = middle
+        else:
+            high = middle
+    return at(0.5 * (low + high))
 
 
 def at_level_of(image: np.ndarray, real: np.ndarray, tracked: TrackedImages) -> np.ndarray:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -22,8 +21,6 @@ if TYPE_CHECKING:
 
 #: Default number of images to fit.
 _MOST_IMAGES = 6
-#: Size limit of a state, which contains every evaluation of the cost.
-_STATE_BYTES = 2**30
 
 
 @dataclass(frozen=True)
@@ -36,10 +33,6 @@ class Results:
     save_preset: Path | None = declared(  # noqa: RUF009
         "--save-preset", type=click.Path(path_type=Path), help="Preset with the fitted values: .json"
     )
-    state: Path | None = declared(  # noqa: RUF009
-        "--state", type=click.Path(path_type=Path), help="Save all evaluations in this file and resume from it in the "
-        "next run (with --register only if registration gives the same poses): .json",
-    )  # fmt: skip
     save_transform: Path | None = declared(  # noqa: RUF009
         "--save-transform", type=click.Path(path_type=Path), help="With --register: the refined map from the "
         "ultrasound's reference frame to the MRI, whole, as --to-mri takes it: .json",
@@ -48,8 +41,7 @@ class Results:
 
 @click.command()
 @gathered(
-    f"{RARE} {RARE_BESIDE} {RARE_OF_SEQUENCE} craniotomy look evaluations restarts speckle deform validate state "
-    "save_transform",
+    f"{RARE} {RARE_BESIDE} {RARE_OF_SEQUENCE} craniotomy look evaluations restarts speckle validate save_transform",
     patient=PatientOptions, recording=SequenceOptions, fit=FitSettings, results=Results,
 )  # fmt: skip
 @out_option("Result: .json")
@@ -65,16 +57,16 @@ def optimize(
     free: tuple[str, ...],
 ) -> None:  # fmt: skip
     """Fit display and tissue parameters to tracked real ultrasound."""
-    from SlicerUSSim.Logic.base.files import read_json, write_json
+    from SlicerUSSim.Logic.base.files import write_json
     from SlicerUSSim.Logic.fitting.control_costs import neighbours_of
     from SlicerUSSim.Logic.fitting.held_out import predict
     from SlicerUSSim.Logic.fitting.tracked_fit import fit as fitted_to
     from SlicerUSSim.Logic.imaging.figures import require_matplotlib
     from SlicerUSSim.Logic.imaging.preset import Preset
 
-    report, state, save_transform = results.report, results.state, results.save_transform
-    places = (out, report, results.save_preset, save_transform, recording.field, state)
-    check_outputs(*places[:-1], state=state)
+    report, save_transform = results.report, results.save_transform
+    places = (out, report, results.save_preset, save_transform, recording.field)
+    check_outputs(*places)
     if save_transform:
         expected = f"results.save_transform is {save_transform}, expected a name ending in .json"
         require(save_transform.suffix.lower() == ".json", expected)
@@ -87,10 +79,8 @@ def optimize(
     with Curve("optimize") as curve:
         found = fitted_to(
             simulator, tracked.images, free=names, display=tracked.examination.display,
-            register=fit.register, deform=fit.deform, speckle=fit.speckle,
+            register=fit.register, speckle=fit.speckle,
             max_evaluations=fit.evaluations, restarts=fit.restarts, progress=curve,
-            resume=read_json(state, _STATE_BYTES) if state and state.exists() else None,
-            checkpoint=(lambda reached: write_json(state, reached)) if state else None,
         )  # fmt: skip
         if tracked.others is not None:
             near = [neighbours_of(tracked.sequence, images) for images in (tracked.others, tracked.images)]
@@ -132,7 +122,6 @@ def _write_report(
     path: Path, found: Fit, tracked: TrackedExamination, patient: PatientOptions, recording: SequenceOptions
 ) -> None:
     """Write --report, with all inputs that are needed to repeat the fit."""
-    from SlicerUSSim.Logic.fitting.control_costs import control_costs, neighbours_of
     from SlicerUSSim.Logic.fitting.report import write_report
 
     simulator = tracked.examination.simulator
@@ -141,17 +130,10 @@ def _write_report(
         f"{recording.sequence}, images {', '.join(map(str, tracked.images.numbers))}. Probe: {tracked.images.probe}. "
         f"Settings: {simulator.settings}."
     )
-    fitted, near = found.simulator or simulator, neighbours_of(tracked.sequence, tracked.images)
-    try:
-        with fitted.with_tissues(found.appearance.tissues):
-            controls = control_costs(found.tracked, found.after, fitted, found.appearance.display, near)
-    except SimulationError as error:  # as of labels of which nothing scatters
-        logging.getLogger(__name__).warning("the report has no controls: %s", error)
-        controls = None
     write_report(
-        path, found.appearance, found.tracked, found.before, found.after, fitted,
+        path, found.appearance, found.tracked, found.before, found.after, simulator,
         subtitle=f"{Path(recording.sequence).name} on {Path(patient.source).name}", provenance=provenance,
-        prediction=found.prediction, controls=controls, speckle=found.speckle,
+        prediction=found.prediction, speckle=found.speckle,
         reference="twin" if tracked.sequence.is_simulated else "real",
     )  # fmt: skip
 
@@ -166,12 +148,6 @@ def _tell(found: Fit) -> None:
     if found.registration:
         moved = found.registration
         click.echo(f"moved by {moved.shift_mm:.2f} mm and {moved.turn_deg:.2f} degrees")
-    if found.deformation is not None:
-        shift = found.deformation
-        click.echo(
-            f"deformed by {shift.mean_mm:.2f} mm in the mean, {shift.largest_mm:.2f} mm at most: cost "
-            f"{shift.cost_before:.4f} -> {shift.cost_after:.4f}"
-        )
     result = found.appearance
     click.echo(f"cost {result.cost_before:.4f} -> {result.cost_after:.4f} ({result.evaluations} evaluations)")
     before, after = (
@@ -189,8 +165,6 @@ def _tell(found: Fit) -> None:
     if found.prediction is not None:
         for line in found.prediction.lines():
             click.echo(line)
-    if found.speckle is not None and found.speckle.spread is not None:
-        click.echo(found.speckle.spread.in_words())
     for parameter in result.parameters:
         spread = result.identifiability[parameter.name]
         note = "  at its bound" if parameter.name in result.at_bounds else ""

@@ -135,11 +135,13 @@ class Examination:
     probe_to_ras: np.ndarray | None = None
 
 
-def open_examination(patient: PatientOptions, pose: np.ndarray | str | None = None) -> Examination:
+def open_examination(
+    patient: PatientOptions, pose: np.ndarray | str | None = None, *, one_image: bool = False
+) -> Examination:
     """The Examination of a command's options. An MRI is segmented, with a progress bar.
 
     `pose` is a (4, 4) probe_to_ras, one of STANDARD_VIEWS, or AUTO: a view through a craniotomy, of what --add laid
-    over the labels if there is something.
+    over the labels if there is something. With `one_image` only what an image at this pose shows is prepared.
     Fast checks come before slow computations. Raises SimulationError for inconsistent options.
     """
     import logging  # imported here to keep --help fast
@@ -184,7 +186,7 @@ def open_examination(patient: PatientOptions, pose: np.ndarray | str | None = No
             labels, tissues.names_by_label(), has_brain_mask=False
         )
         tissues = changes.to_tissues(with_their_tissue(added.table(tissues), sheets.read))
-        return _placed(patient, craniotomy, preset, added, labels, pose, tissues, None, sheets.read)
+        return _placed(patient, craniotomy, preset, added, labels, pose, tissues, None, sheets.read, one_image)
     from SlicerUSSim.Logic.mri.pathology import texture_below
     from SlicerUSSim.Logic.mri.segmentation import Segmentation
 
@@ -208,27 +210,30 @@ def open_examination(patient: PatientOptions, pose: np.ndarray | str | None = No
     tissues = with_their_tissue(tissues, surfels, known)
     texture = texture_below(segmentation.texture(), volume, segmentation.labels, added.labels)
     tissues = changes.to_tissues(tissues)
-    return _placed(patient, craniotomy, preset, added, labels, pose, tissues, texture, surfels)
+    return _placed(patient, craniotomy, preset, added, labels, pose, tissues, texture, surfels, one_image)
 
 
 def _placed(
     patient: PatientOptions, craniotomy: Craniotomy, preset: Preset, added: Added, before: Volume,
     pose: np.ndarray | str | None, tissues: TissueTable, texture: Texture | None, sheets: Surfels | None,
+    one_image: bool,
 ) -> Examination:  # fmt: skip
     """A patient with the craniotomy, and the probe at its pose with gel between them; says what bone is before it.
 
     `before` are the labels without what --add laid over them.
     """
+    from SlicerUSSim.Logic.imaging.found_sheets import beside_image
     from SlicerUSSim.Logic.imaging.simulator import UltrasoundSimulator
-    from SlicerUSSim.Logic.placement.aiming import opening_pose
     from SlicerUSSim.Logic.placement.bone_before_probe import about_bone
-    from SlicerUSSim.Logic.placement.craniotomy import default_pose, middle_of
-    from SlicerUSSim.Logic.placement.views import opened_view_pose, view_pose
     from SlicerUSSim.Logic.tissue.names import BRAIN_TISSUES
 
     labels, names, settings, probe = added.labels, added.tissue_names, preset.settings, preset.probe
     at, is_open, line = None, craniotomy.is_wanted, ""
     if isinstance(pose, str):
+        from SlicerUSSim.Logic.placement.aiming import opening_pose  # a pose from a file does not wait for surfaces
+        from SlicerUSSim.Logic.placement.craniotomy import default_pose, middle_of
+        from SlicerUSSim.Logic.placement.views import opened_view_pose, view_pose
+
         if craniotomy.is_file:
             labels = craniotomy.on(added.labels, names, probe, None)
             at = middle_of(added.labels, labels)
@@ -253,6 +258,8 @@ def _placed(
     if pose is not None:
         for line in about_bone(labels, names, tissues.all_tissues(), probe, pose, is_open=is_open):
             note(line)
+    if one_image and sheets is not None and pose is not None:
+        sheets = beside_image(sheets, pose)
     simulator = UltrasoundSimulator(labels, tissues, settings, patient.device, texture, sheets)
     return Examination(simulator, probe, preset.display, pose)
 
@@ -266,7 +273,9 @@ def say_contact(examination: Examination, probe: Probe, poses: Sequence[np.ndarr
         note(line)
 
 
-def open_examination_at(patient: PatientOptions, pose: str) -> tuple[Examination, np.ndarray]:
+def open_examination_at(
+    patient: PatientOptions, pose: str, *, one_image: bool = False
+) -> tuple[Examination, np.ndarray]:
     """(Examination, (4, 4) probe_to_ras) of a command's options.
 
     The pose is a file, AUTO or one of STANDARD_VIEWS, see open_examination.
@@ -283,7 +292,7 @@ def open_examination_at(patient: PatientOptions, pose: str) -> tuple[Examination
         f"--pose is {pose!r} (no such file), expected a file with the pose (.json, .txt, .tfm, .h5), {AUTO}, "
         f"or a view: {_VIEWS}",
     )
-    examination = open_examination(patient, pose if is_chosen else read_pose(pose))
+    examination = open_examination(patient, pose if is_chosen else read_pose(pose), one_image=one_image)
     return examination, required(examination.probe_to_ras, "the examination has no pose")
 
 

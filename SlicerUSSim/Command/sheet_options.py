@@ -63,8 +63,6 @@ class DrawnSheets:
             for kind in dict.fromkeys(kind for kind in without if kind not in KINDS):
                 note(f"no_sheets {kind} leaves nothing out: it is no sheet of {source} but a label, where there is one")
             whole = read_surfels(source)
-            if kinds and len(whole) and "sulcus" not in whole.kinds():
-                note(f"{source} has no sulci, by which sheets of another patient are known: look whether they fit")
             return cls(source, kinds, whole.of_kind(*(set(KINDS) & set(kinds))))
         require(not is_labels, "--sheets is auto, and a label map has no sheets, expected a .vtp or an MRI")
         require_findable(kinds, contrast)

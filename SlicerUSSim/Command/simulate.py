@@ -33,7 +33,7 @@ def simulate(patient: PatientOptions, pose: str, out: Path) -> None:
 
     require_image_name(out, also=(".png",))
     check_outputs(out)
-    examination, probe_to_ras = open_examination_at(patient, pose)
+    examination, probe_to_ras = open_examination_at(patient, pose, one_image=True)
     say_contact(examination, examination.probe, [probe_to_ras])
     frame = examination.simulator.simulate(examination.probe, probe_to_ras, examination.display)
     if out.suffix.lower() == ".png":

@@ -96,7 +96,7 @@ class FitPresenter:
             labels, settings = parameters.labels, parameters.fit
             found = panel.logic.optimize(
                 labels, parameters.real, probe_transform_node=parameters.probe_transform, frames=self._frames(),
-                validate=self._predicted(), free=free, register=settings.register, deform=settings.deform,
+                validate=self._predicted(), free=free, register=settings.register,
                 speckle=settings.speckle, estimate_geometry=settings.estimate, max_evaluations=settings.evaluations,
                 restarts=settings.restarts, plot=plot, progress=report,
             )  # fmt: skip
@@ -188,9 +188,6 @@ def _in_words(found: Fit) -> str:
         lines.append(f"moved by {found.registration.shift_mm:.1f} mm and {found.registration.turn_deg:.1f}°")
     if found.prediction is not None:
         lines += found.prediction.lines()
-    if found.deformation is not None:
-        shift = found.deformation
-        lines.append(f"tissues deformed by {shift.mean_mm:.1f} mm in the mean, {shift.largest_mm:.1f} mm at most")
     for name, value in result.after.items():
         spread = result.identifiability[name]
         line = f"{name}: {result.before[name]:.3g} → {value:.3g}"

@@ -9,7 +9,7 @@ from SlicerUSSim.Logic.base.lazy import lazy_exports
 
 if TYPE_CHECKING:
     from .appearance import AppearanceModel as AppearanceModel
-    from .control_costs import neighbours_of as neighbours_of
+    from .control_costs import Prediction as Prediction, neighbours_of as neighbours_of
     from .fit_settings import FitSettings as FitSettings
     from .held_out import predict as predict
     from .image_similarity import (
@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     )
     from .optimization import AppearanceResult as AppearanceResult, optimize_appearance as optimize_appearance
     from .parameters import FreeParameters as FreeParameters
-    from .prediction import Prediction as Prediction
     from .registration import Registration as Registration, register_poses as register_poses
     from .report import write_report as write_report
     from .search import Progress as Progress

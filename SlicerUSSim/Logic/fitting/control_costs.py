@@ -3,20 +3,18 @@
 A cost alone says little: one uniform tissue without anatomy reaches that of many a simulation. So it is given beside
 
 - *real neighbours*: the images before and after in the recording, the floor that nothing needs to go below;
-- *uniform tissue*: one tissue instead of all, at the gain that gives it the real images' mean grey level.
+- *uniform tissue*: one tissue instead of all.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from SlicerUSSim.Logic.base.errors import require
-from SlicerUSSim.Logic.base.settings import DisplaySettings
 from SlicerUSSim.Logic.base.volume import Volume
-from SlicerUSSim.Logic.fitting.appearance import AppearanceModel
 from SlicerUSSim.Logic.fitting.image_similarity import Similarity, SimilaritySettings, similarity
 from SlicerUSSim.Logic.fitting.texture_costs import TextureMisfit, TextureReference
 from SlicerUSSim.Logic.imaging.simulator import UltrasoundSimulator
@@ -26,8 +24,6 @@ from SlicerUSSim.Logic.tracked.sequence import TrackedSequence
 
 #: Names of the fit's own images and of the controls
 FITTED, NEIGHBOURS, UNIFORM = "simulated", "real neighbours", "uniform tissue"
-#: Between which the gain of the uniform control is looked for
-_GAINS_DB = -80.0, 80.0
 
 
 @dataclass(frozen=True)
@@ -78,26 +74,6 @@ def costs_against(
     return cost
 
 
-def control_costs(
-    tracked: TrackedImages,
-    images: Sequence[np.ndarray],
-    simulator: UltrasoundSimulator,
-    display: DisplaySettings,
-    neighbours: Sequence[Sequence[np.ndarray]] | None = None,
-) -> dict[str, list[Cost]]:
-    """{source: costs against the real images} of simulated images, one per real image, and of the controls.
-
-    `neighbours` are, per real image, real images near it (neighbours_of). Raises SimulationError if no tissue of the
-    simulator's volume has scatterers.
-    """
-    cost = costs_against(tracked)
-    sources = {FITTED: images, UNIFORM: uniform_control(simulator, tracked, display)}
-    found = {name: [cost(image, place) for place, image in enumerate(each)] for name, each in sources.items()}
-    if neighbours is not None:
-        found[NEIGHBOURS] = [cost(image, place) for place, others in enumerate(neighbours) for image in others]
-    return found
-
-
 def neighbours_of(sequence: TrackedSequence, tracked: TrackedImages) -> list[list[np.ndarray]]:
     """The real images before and after each of `tracked` in its recording, cropped to its field.
 
@@ -125,26 +101,63 @@ def uniform_tissues(simulator: UltrasoundSimulator) -> tuple[Volume, TissueTable
     )
 
 
-def uniform_control(
-    simulator: UltrasoundSimulator, tracked: TrackedImages, display: DisplaySettings
-) -> list[np.ndarray]:
-    """(rows, columns) uint8 images of one uniform tissue at the poses, with the real images' mean grey level."""
-    labels, tissues = uniform_tissues(simulator)
-    settings = replace(simulator.settings, partial_volume=False, mri_modulation_db=0.0)
-    uniform = UltrasoundSimulator(labels, tissues, settings, simulator.device)
-    # Without free tissues it keeps the echoes of every pose, so that only the display is computed again
-    model = AppearanceModel(uniform, tracked.probe, tracked.poses, {}, tracked.grid)
-    wanted = float(np.mean([image[tracked.mask].mean() for image in tracked.images]))
+@dataclass(frozen=True, eq=False)
+class Prediction:
+    """Costs of a fit and of its controls, on the images that were fitted and on others."""
 
-    def at(gain_db: float) -> list[np.ndarray]:
-        shown = replace(display, gain_db=gain_db)
-        return [model.image(number, tissues, shown) for number in range(len(tracked.poses))]
+    #: Numbers of the images in the recording
+    fitted_numbers: list[int]
+    numbers: list[int]
+    #: {source: costs}; of the simulated images and the uniform tissue one per image, of real neighbours up to two
+    fitted: dict[str, list[Cost]]
+    predicted: dict[str, list[Cost]]
+    #: {source: (rows, columns) uint8 images of `numbers`}
+    images: dict[str, list[np.ndarray]] = field(repr=False)
 
-    low, high = _GAINS_DB
-    for _ in range(12):  # to 0.04 dB
-        middle = 0.5 * (low + high)
-        if np.mean([image[tracked.mask].mean() for image in at(middle)]) < wanted:
-            low = middle
-        else:
-            high = middle
-    return at(0.5 * (low + high))
+    def mean(self, source: str, name: str = "paper", *, fitted: bool = False) -> float:
+        """Mean of a source's "paper", "t1", "t2" or "sum"; NaN where there is none."""
+        return mean_cost((self.fitted if fitted else self.predicted).get(source, []))[name]
+
+    @property
+    def of_uniform(self) -> float:
+        """The predicted images' cost as a part of the uniform tissue's: below 1, the anatomy tells something."""
+        return self.mean(FITTED) / self.mean(UNIFORM)
+
+    def rows(self) -> list[tuple[str, float, float, float, float]]:
+        """(source, the paper's cost and the sum on the fitted images, the same on the predicted ones)."""
+        return [
+            (
+                source, self.mean(source, fitted=True), self.mean(source, "sum", fitted=True), self.mean(source),
+                self.mean(source, "sum"),
+            )
+            for source in self.predicted
+        ]  # fmt: skip
+
+    def lines(self) -> list[str]:
+        """A table as lines of text, and what it says."""
+        listed = [", ".join(map(str, numbers)) for numbers in (self.fitted_numbers, self.numbers)]
+        found = [f"cost (with texture)   fitted: images {listed[0]}   predicted: images {listed[1]}"]
+        found += [
+            f"{source:20s}  {row[0]:.3f} ({row[1]:.3f})   {row[2]:.3f} ({row[3]:.3f})" for source, *row in self.rows()
+        ]
+        return [*found, f"predicted images cost {self.of_uniform:.2f} of the uniform tissue's"]
+
+    def to_dict(self) -> dict:
+        """Plain values for JSON; what could not be measured is None."""
+
+        def plain(costs: dict[str, list[Cost]]) -> dict:
+            return {
+                source: [
+                    {name: value if np.isfinite(value) else None for name, value in cost.to_dict().items()}
+                    for cost in each
+                ]
+                for source, each in costs.items()
+            }
+
+        return {
+            "fitted_images": self.fitted_numbers,
+            "images": self.numbers,
+            "of_uniform": self.of_uniform if np.isfinite(self.of_uniform) else None,
+            "fitted": plain(self.fitted),
+            "predicted": plain(self.predicted),
+        }

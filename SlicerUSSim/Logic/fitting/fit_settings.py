@@ -43,12 +43,6 @@ class FitSettings(Declared):
         "to the size and number of speckle's grains",
         shown=True, option="speckle/no-speckle",
     )  # fmt: skip
-    deform: bool = parameter(
-        False, "Deform as well",
-        "Also fit a smooth deformation of the tissues, as brains sink when they are opened; after a registration, "
-        "within 8 mm",
-        shown=True, option="deform/no-deform",
-    )  # fmt: skip
     validate: str = parameter(
         "", "Predict",
         "Images of the sequence that are not fitted but predicted, such as 2,6: the cost on them, beside one uniform "

@@ -1,8 +1,12 @@
-"""predict: judges a fit on images that it has not seen, and a uniform tissue fitted in the same way (prediction.py)."""
+"""predict: the cost of a fit on images that it has not seen, beside controls (docs/realism.md#fit-and-predict).
+
+A cost on the images that were fitted flatters whatever has many parameters. So parameters found on some images are
+judged on others, and the same is done with one uniform tissue without anatomy: fitted to the same images in the same
+way, and judged on the same others. The floor is what real neighbours cost, which nothing needs to go below.
+"""
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 
@@ -10,17 +14,22 @@ import numpy as np
 
 from SlicerUSSim.Logic.base.errors import require
 from SlicerUSSim.Logic.base.settings import DisplaySettings
-from SlicerUSSim.Logic.fitting.control_costs import FITTED, NEIGHBOURS, UNIFORM, Cost, costs_against, uniform_tissues
+from SlicerUSSim.Logic.fitting.control_costs import (
+    FITTED,
+    NEIGHBOURS,
+    UNIFORM,
+    Cost,
+    Prediction,
+    costs_against,
+    uniform_tissues,
+)
 from SlicerUSSim.Logic.fitting.fit_settings import FitSettings
 from SlicerUSSim.Logic.fitting.image_similarity import SimilaritySettings
 from SlicerUSSim.Logic.fitting.parameters import DISPLAY_BOUNDS, GROUPS, TISSUES, Bounds
-from SlicerUSSim.Logic.fitting.prediction import Prediction
 from SlicerUSSim.Logic.fitting.search import Progress
 from SlicerUSSim.Logic.fitting.tracked_fit import Fit, fit as fit_images, simulated
 from SlicerUSSim.Logic.imaging.simulator import UltrasoundSimulator
 from SlicerUSSim.Logic.tracked.images import TrackedImages
-
-_log = logging.getLogger(__name__)
 
 #: Names of the display that a fit of one tissue takes over as they are
 _DISPLAY_NAMES = frozenset((*DISPLAY_BOUNDS, *GROUPS, "display"))
@@ -46,8 +55,7 @@ def predict(
     Parameters
     ----------
     found, simulator : a fit, and the simulator that it was made with.
-    others : other images of the same recording, at the poses as tracked; a registration moves them as well, and a
-        deformation of the tissues is theirs too.
+    others : other images of the same recording, at the poses as tracked; a registration moves them as well.
     free, display, speckle, max_evaluations, restarts : as they were for the fit; the uniform tissue is fitted with the
         same, since a cost has several minima.
     neighbours, fitted_neighbours : per image of `others`, and of the fitted ones, real images near it
@@ -60,15 +68,9 @@ def predict(
         not both,
         f"images {', '.join(map(str, both))} are fitted and predicted, expected others: what was fitted says little",
     )
-    if len(others.images) == 1:
-        _log.warning(
-            "1 image is predicted (%d): fits with other speckle (seed) differ by 0.01 there; predict more if there are",
-            others.numbers[0],
-        )
-    given, simulator = simulator, found.simulator or simulator
     others = as_fitted(found, others)
     result = found.appearance
-    labels, tissues = uniform_tissues(given)
+    labels, tissues = uniform_tissues(simulator)
     plain = replace(simulator.settings, partial_volume=False, mri_modulation_db=0.0)
     uniform = UltrasoundSimulator(labels, tissues, plain, simulator.device)
     control = fit_images(
@@ -78,7 +80,7 @@ def predict(
     shown = control.appearance
     images = {
         FITTED: simulated(simulator, others, result.tissues, result.display),
-        UNIFORM: simulated(uniform, replace(others, probe=control.tracked.probe), shown.tissues, shown.display),
+        UNIFORM: simulated(uniform, others, shown.tissues, shown.display),
     }
     fitted = {FITTED: found.after, UNIFORM: control.after}
 
@@ -99,10 +101,10 @@ def predict(
 
 
 def as_fitted(found: Fit, others: TrackedImages) -> TrackedImages:
-    """Other images of the recording at the poses where a fit has them, with its probe."""
-    if found.registration is not None:
-        others = replace(others, poses=[found.registration.correction @ pose for pose in others.poses])
-    return replace(others, probe=found.tracked.probe)  # whose point spread function a fit may have changed
+    """Other images of the recording at the poses where a fit has them."""
+    if found.registration is None:
+        return others
+    return replace(others, poses=[found.registration.correction @ pose for pose in others.poses])
 
 
 def _free_of_one(free: Iterable[str] | Mapping[str, Bounds | None]) -> dict[str, Bounds | None]:

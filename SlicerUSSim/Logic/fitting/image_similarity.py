@@ -9,6 +9,7 @@ depend on the speckle's seed. It does depend on the position of patches, and the
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,6 +18,8 @@ from SlicerUSSim.Logic.base.declaration import Declared, parameter
 from SlicerUSSim.Logic.base.errors import require
 from SlicerUSSim.Logic.opencl.device import Device, Workspace
 from SlicerUSSim.Logic.opencl.layout import CONSTANTS
+from SlicerUSSim.Logic.probe.arrays import Probe
+from SlicerUSSim.Logic.probe.image_grid import ImageGrid
 
 #: A patch at the edge of the common field counts if at least this fraction of it lies inside.
 _LEAST_SHARE = 0.25
@@ -160,13 +163,6 @@ class PatchComparison:
         parts = self.device.download(self._result, (*self.patches, 3), np.float32)
         return self.settings.combine(parts[..., 0], parts[..., 1], parts[..., 2], self.patch[0] * self.patch[1])
 
-    def of(self, image: np.ndarray) -> Similarity:
-        """The cost of an image on the host, (rows, columns) uint8."""
-        image = as_image("image", image)
-        require(image.shape == self.shape, f"the image has shape {image.shape}, expected that of the reference")
-        self.run(self.device.upload(image))
-        return self.result()
-
 
 def as_image(name: str, image: np.ndarray) -> np.ndarray:
     """(rows, columns) uint8, contiguous. Raises SimulationError that names it for anything else."""
@@ -186,3 +182,49 @@ def as_mask(mask: np.ndarray | None, shape: tuple[int, int]) -> np.ndarray:
     require(mask.shape == shape, f"the mask has shape {mask.shape}, expected that of the images, {shape}")
     require(bool(mask.any()), "the fields of the two images do not overlap: no pixel lies inside both")
     return mask
+
+
+def target_comparisons(
+    device: Device,
+    probe: Probe,
+    grid: ImageGrid,
+    references: Sequence[np.ndarray],
+    masks: Sequence[np.ndarray] | None,
+    poses: int,
+    settings: SimilaritySettings,
+) -> list[PatchComparison]:
+    """One comparison per reference, (rows, columns) uint8 on `grid`; only pixels inside both fields count.
+
+    Raises SimulationError where shapes or counts differ, fields do not overlap, or a reference is black.
+    """
+    seen = grid.field(probe)
+    require(len(references) > 0, "no reference image, expected at least one")
+    require(
+        len(references) == poses,
+        f"{len(references)} reference images and {poses} poses, expected equal numbers",
+    )
+    require(
+        masks is None or len(masks) == len(references),
+        f"{len(masks or ())} masks and {len(references)} reference images, expected equal numbers",
+    )
+    comparisons = []
+    for number, reference in enumerate(references):
+        reference = np.asarray(reference)
+        require(
+            reference.shape == (grid.rows, grid.columns),
+            f"reference image {number} has shape {reference.shape}, expected that of the simulated images, "
+            f"{(grid.rows, grid.columns)}",
+        )
+        inside = seen if masks is None else seen & np.asarray(masks[number], bool)
+        require(
+            bool(inside.any()),
+            f"reference image {number}: its field and the probe's do not overlap; check the geometry",
+        )
+        require(int(reference[inside].max()) > 0, f"reference image {number} is black inside the field")
+        comparisons.append(PatchComparison(device, reference, inside, grid.pixel_spacing_mm, settings))
+    return comparisons
+
+
+def mean_cost(similarities: Iterable[Similarity]) -> float:
+    """The mean cost of several images."""
+    return float(np.mean([one.total for one in similarities]))

@@ -3,22 +3,20 @@
 A global search is followed by a local one. Then the bases are recomputed there (appearance.py) and the local search
 continues, until a new anchor no longer changes the cost (docs/optimization.md#search). All evaluations use the same
 seed for scatterers and noise (common random numbers), so the cost is a deterministic function: the same problem gives
-the same result, and an interrupted run is resumed by replaying its evaluations.
+the same result.
 """
 
 from __future__ import annotations
 
-import hashlib
 import logging
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, fields, is_dataclass, replace
+from dataclasses import dataclass, field, replace
 from time import perf_counter
 
 import numpy as np
 
 from SlicerUSSim.Logic.base.errors import require_between
 from SlicerUSSim.Logic.base.settings import DisplaySettings
-from SlicerUSSim.Logic.base.version import __version__
 from SlicerUSSim.Logic.fitting.appearance import AppearanceModel
 from SlicerUSSim.Logic.fitting.fit_settings import FitSettings
 from SlicerUSSim.Logic.fitting.identifiability import (
@@ -28,7 +26,7 @@ from SlicerUSSim.Logic.fitting.identifiability import (
     equal_variance_draws,
     quantities_of,
 )
-from SlicerUSSim.Logic.fitting.image_similarity import Similarity, SimilaritySettings
+from SlicerUSSim.Logic.fitting.image_similarity import Similarity, SimilaritySettings, mean_cost, target_comparisons
 from SlicerUSSim.Logic.fitting.parameters import ECHOGENICITY, Bounds, FreeParameters
 from SlicerUSSim.Logic.fitting.search import (
     GLOBAL_ALGORITHM,
@@ -36,10 +34,7 @@ from SlicerUSSim.Logic.fitting.search import (
     Evaluation,
     Progress,
     Search,
-    history_from,
 )
-from SlicerUSSim.Logic.fitting.targets import mean_cost, target_comparisons
-from SlicerUSSim.Logic.imaging.medium import as_labels
 from SlicerUSSim.Logic.imaging.simulator import UltrasoundSimulator
 from SlicerUSSim.Logic.probe.arrays import Probe
 from SlicerUSSim.Logic.probe.image_grid import ImageGrid
@@ -82,12 +77,13 @@ class AppearanceResult:
     similarity_before: list[Similarity]
     similarity_after: list[Similarity]
     history: list[Evaluation] = field(repr=False)
-    #: Evaluations computed in this run; a resumed one has more in its history
-    evaluations: int
     seconds: float
     identifiability: Identifiability = field(repr=False)
-    #: State for continuing in a later run, as its `resume`
-    state: dict = field(repr=False)
+
+    @property
+    def evaluations(self) -> int:
+        """Number of evaluations of the cost."""
+        return len(self.history)
 
     @property
     def at_bounds(self) -> list[str]:
@@ -194,8 +190,6 @@ def optimize_appearance(
     settings: SimilaritySettings | None = None,
     algorithms: tuple[str | None, str] = (GLOBAL_ALGORITHM, LOCAL_ALGORITHM),
     progress: Callable[[Progress], None] | None = None,
-    resume: dict | None = None,
-    checkpoint: Callable[[dict], None] | None = None,
 ) -> AppearanceResult:
     """Fit display and tissue parameters to real images.
 
@@ -214,11 +208,8 @@ def optimize_appearance(
     seed : of the search; the seed of scatterers and noise is the simulator's.
     algorithms : nlopt's names of the global algorithm (None for none) and the local one.
     progress : called after every evaluation; may raise errors.Cancelled.
-    resume : the state of an earlier run on the same problem, shorter or interrupted: its evaluations are not repeated.
-    checkpoint : called with the state at the end, and if the run ends early (Cancelled, an interrupt).
 
-    Raises SimulationError as FreeParameters, AppearanceModel and AppearanceCost do, and for the state of another
-    problem, with the differences.
+    Raises SimulationError as FreeParameters, AppearanceModel and AppearanceCost do.
 
     Example: recovering the gain of one image:
 
@@ -248,38 +239,27 @@ def optimize_appearance(
     model = AppearanceModel(simulator, probe, poses, parameters.varied(), grid)
     cost = AppearanceCost(model, parameters, references, masks, tissues, display, settings)
     start = parameters.units(*(begin or (tissues, display)))
-    problem = _problem(cost, references, masks, settings, algorithms, seed, None if begin is None else start)
     limit = max_evaluations + restarts * (int(_RESTART_SHARE * max_evaluations) + 1) + _DRAWS
     limit += int(_SHARES[1] * max_evaluations) if restarts else 0
 
     def describe(units: np.ndarray) -> dict[str, float]:
         return dict(zip(parameters.names, parameters.values(units).tolist(), strict=True))
 
-    history = history_from(resume, problem)
     _log.info(
         "fit of %d images, %d free parameters: %s", len(references), len(parameters.names), ", ".join(parameters.names)
     )
-    if history:
-        _log.info("%d evaluations of an earlier run are reused", len(history))
-    search = Search(cost, describe, limit, seed, progress, history)
+    search = Search(cost, describe, limit, seed, progress)
 
     before = cost.of_each(tissues, display)
-    try:
-        if begin is not None:
-            cost.anchor(start)
-        best = _searched(search, cost, start, algorithms, max_evaluations)
-        again = _restarted(
-            cost, search, simulator, best, restarts, int(_RESTART_SHARE * max_evaluations), algorithms[1]
-        )
-        best, best_cost = _better(search, cost, algorithms[1], best, again, int(_SHARES[1] * max_evaluations))
-        fitted_tissues, fitted_display = parameters.apply(best, tissues, display)
-        model.anchor(fitted_tissues)
-        after = cost.of_each(fitted_tissues, fitted_display)
-        identifiability = _identifiability(cost, search, best, best_cost, again)
-    finally:
-        state = {"problem": problem, "history": search.state()}
-        if checkpoint is not None:
-            checkpoint(state)
+    if begin is not None:
+        cost.anchor(start)
+    best = _searched(search, cost, start, algorithms, max_evaluations)
+    again = _restarted(cost, search, simulator, best, restarts, int(_RESTART_SHARE * max_evaluations), algorithms[1])
+    best, best_cost = _better(search, cost, algorithms[1], best, again, int(_SHARES[1] * max_evaluations))
+    fitted_tissues, fitted_display = parameters.apply(best, tissues, display)
+    model.anchor(fitted_tissues)
+    after = cost.of_each(fitted_tissues, fitted_display)
+    identifiability = _identifiability(cost, search, best, best_cost, again)
     return AppearanceResult(
         tissues=_with_source(fitted_tissues, parameters),
         display=fitted_display,
@@ -291,10 +271,8 @@ def optimize_appearance(
         similarity_before=before,
         similarity_after=after,
         history=search.history,
-        evaluations=search.computed,
         seconds=perf_counter() - started,
         identifiability=identifiability,
-        state=state,
     )
 
 
@@ -464,82 +442,6 @@ def _with_source(tissues: TissueTable, parameters: FreeParameters) -> TissueTabl
                 replace(tissue, sources={**tissue.sources, **dict.fromkeys(fitted, "fitted to tracked ultrasound")})
             )
     return tissues
-
-
-def _problem(
-    cost: AppearanceCost,
-    references: Sequence[np.ndarray],
-    masks: Sequence[np.ndarray] | None,
-    settings: SimilaritySettings,
-    algorithms: tuple[str | None, str],
-    seed: int,
-    begin: np.ndarray | None,
-) -> dict[str, str]:
-    """{name: fingerprint} of all inputs that determine the positions and costs of evaluations.
-
-    Numbers of evaluations and restarts are not included, since a longer run begins with the same evaluations as a
-    shorter one. Nor is the device, since all compute the same images.
-    """
-    model, tissues = cost.model, cost.tissues
-    simulator, medium = model.simulator, model.simulator.medium
-    parts = {
-        "free parameters": tuple(cost.parameters),
-        "probe": model.probe,
-        "poses": model.poses,
-        "reference images": list(references),
-        "masks": None if masks is None else [np.asarray(mask, bool) for mask in masks],
-        "pixels": model.grid(cost.display),
-        "display": cost.display,
-        "tissues": (dict(tissues), tissues.membrane),
-        "labels": (as_labels(medium.labels.array), medium.labels.ijk_to_ras),
-        "texture": medium.packed_texture(),
-        "simulation settings": simulator.settings,
-        "similarity settings": settings,
-        "algorithms": algorithms,
-        "seed": seed,
-        "version": __version__,
-    } | ({} if begin is None else {"where the search begins": begin})
-    return {name: fingerprint(part) for name, part in parts.items()}
-
-
-# ---- a hash that is equal only for equal values ----------------------------------------------------------------------
-
-
-def fingerprint(value: object) -> str:
-    """SHA-256 of plain values, arrays, dataclasses (fields that are compared), and sequences and mappings of these.
-
-    Types and shapes of arrays and lengths of sequences are included, so that different values with the same bytes have
-    different hashes. Raises TypeError for other values.
-    """
-    digest = hashlib.sha256()
-    _feed(digest, value)
-    return digest.hexdigest()
-
-
-def _feed(digest, value: object) -> None:
-    if value is None or isinstance(value, str):
-        _feed_bytes(digest, type(value).__name__, repr(value).encode())
-    elif isinstance(value, bool | int | float | np.generic):
-        whole = float(value).is_integer()  # 1 equals 1.0, but 2**53 does not equal 2**53 + 1
-        _feed_bytes(digest, "number", repr(int(value) if whole else float(value)).encode())
-    elif isinstance(value, np.ndarray) and not value.dtype.hasobject:
-        _feed_bytes(digest, f"array {value.dtype.str} {value.shape}", np.ascontiguousarray(value).data)
-    elif isinstance(value, Mapping):
-        _feed(digest, [*value.items()])
-    elif isinstance(value, list | tuple):
-        _feed_bytes(digest, f"sequence of {len(value)}", b"")
-        for item in value:
-            _feed(digest, item)
-    elif is_dataclass(value):
-        compared = {field.name: getattr(value, field.name) for field in fields(value) if field.compare}
-        _feed(digest, [type(value).__name__, compared])
-    else:
-        raise TypeError(f"no fingerprint of a {type(value).__name__}")
-
-
-def _feed_bytes(digest, kind: str, content) -> None:
-    digest.update(f"{kind}, {memoryview(content).nbytes} bytes:".encode())
-    digest.update(content)
 
 
 # ---- axes of a local search: directions that change the images, in steps that change them equally --------------------

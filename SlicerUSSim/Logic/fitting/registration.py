@@ -16,9 +16,13 @@ import numpy as np
 from SlicerUSSim.Logic.base.errors import require_between
 from SlicerUSSim.Logic.base.settings import DisplaySettings, SimulationSettings
 from SlicerUSSim.Logic.base.transforms import check_rigid
-from SlicerUSSim.Logic.fitting.image_similarity import PatchComparison, SimilaritySettings
+from SlicerUSSim.Logic.fitting.image_similarity import (
+    PatchComparison,
+    SimilaritySettings,
+    mean_cost,
+    target_comparisons,
+)
 from SlicerUSSim.Logic.fitting.search import Evaluation, Progress, Search
-from SlicerUSSim.Logic.fitting.targets import mean_cost, target_comparisons
 from SlicerUSSim.Logic.imaging.scattering import sites_per_mm3
 from SlicerUSSim.Logic.imaging.simulator import UltrasoundSimulator
 from SlicerUSSim.Logic.probe.arrays import Probe

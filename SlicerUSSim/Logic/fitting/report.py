@@ -6,7 +6,7 @@ import base64
 import html
 import io
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from string import Template
 from tempfile import TemporaryDirectory
@@ -14,11 +14,10 @@ from tempfile import TemporaryDirectory
 import numpy as np
 
 from SlicerUSSim.Logic.base.files import written_whole
-from SlicerUSSim.Logic.fitting.control_costs import FITTED, UNIFORM, Cost, mean_cost
+from SlicerUSSim.Logic.fitting.control_costs import FITTED, UNIFORM, Prediction
 from SlicerUSSim.Logic.fitting.identifiability import Spread
 from SlicerUSSim.Logic.fitting.optimization import AGAIN, STAGES, AppearanceResult
 from SlicerUSSim.Logic.fitting.parameters import Parameter
-from SlicerUSSim.Logic.fitting.prediction import Prediction
 from SlicerUSSim.Logic.fitting.speckle_fit import SpeckleFit
 from SlicerUSSim.Logic.fitting.texture_costs import TextureReference
 from SlicerUSSim.Logic.imaging.figures import require_matplotlib
@@ -48,15 +47,13 @@ def write_report(
     provenance: str = "",
     prediction: Prediction | None = None,
     reference: str = "real",
-    controls: Mapping[str, Sequence[Cost]] | None = None,
     speckle: SpeckleFit | None = None,
 ) -> None:
     """Write the report; on failure an existing file is kept.
 
     `before` and `after` are the simulated images (rows, columns) for those of `tracked`; `prediction` adds the costs of
     other images with their controls, and the simulated ones. `reference` is what the images of `tracked` are called:
-    those of a twin are not real. `controls` adds the costs of the fitted images beside their controls (control_costs);
-    `speckle` adds what the fit of the speckle found.
+    those of a twin are not real. `speckle` adds what the fit of the speckle found.
     Raises SimulationError without matplotlib and if the file cannot be written.
     """
     require_matplotlib()
@@ -91,7 +88,6 @@ def write_report(
         ).replace(_REFERENCE, html.escape(reference)),
         "reference": html.escape(reference),
         "histograms": _histograms(tracked, before, after, simulator, reference),
-        "controls": "" if controls is None else _controls(controls, reference),
         "speckle": "" if speckle is None else _speckle(speckle),
         "curve": _curve(result),
         "parameters": "\n".join(_parameter_row(result, parameter) for parameter in result.parameters),
@@ -166,18 +162,6 @@ in the same way, costs there; {html.escape(reference)} neighbours are the images
 texture: + T1 + T2 / 2.</p>"""
 
 
-def _controls(controls: Mapping[str, Sequence[Cost]], reference: str) -> str:
-    """A table of the costs of the fitted images, beside those of the controls."""
-    of = html.escape(reference)
-    means = {_named(source, reference): mean_cost(costs) for source, costs in controls.items()}
-    rows = [[name, *(_number(value) for value in mean.values())] for name, mean in means.items()]
-    return f"""<h2>Costs beside the controls</h2>
-<p class="dim">Uniform tissue is the tissue that fills most instead of all, at the gain that gives it the {of} images'
-mean grey level; {of} neighbours, the images before and after in the recording, are the floor. T1 is the size of grains,
-T2 their number; the sum is the paper's cost + T1 + T2 / 2.</p>
-{_table(["images", "the paper's cost", "T1", "T2", "sum"], rows)}"""
-
-
 def _named(source: str, reference: str) -> str:
     """The name of a source, where `reference` is what the real images are called."""
     return source.replace("real", reference)
@@ -191,8 +175,7 @@ def _speckle(speckle: SpeckleFit) -> str:
     """What the fit of the speckle found, step by step."""
     return f"""<h2>Fit of the speckle</h2>
 <p class="dim">The grey map is that of the images alone. Smoothing and texture are found by T1 + T2 / 2, and smoothing
-once more with the width of the speckle. The point spread function by that width is a start only: it is taken if T1 + T2
-/ 2 is lower and T2 not higher. The fit by the paper's cost began with what is below.</p>
+once more with the width of the speckle. The fit by the paper's cost began with what is below.</p>
 {_table(["step", "found"], speckle.rows(), "words")}"""
 
 

@@ -1,4 +1,4 @@
-"""Search: nlopt on a deterministic cost, in stages, with progress, cancellation and resumption at every evaluation."""
+"""Search: nlopt on a deterministic cost, in stages, with progress and cancellation at every evaluation."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from math import isnan, nan
 
 import numpy as np
 
-from SlicerUSSim.Logic.base.errors import SimulationError, require
+from SlicerUSSim.Logic.base.errors import SimulationError
 
 #: Names in nlopt. docs/optimization.md justifies the choice with results of benchmarks/fitting.py.
 GLOBAL_ALGORITHM, LOCAL_ALGORITHM = "G_MLSL_LDS", "LN_BOBYQA"
@@ -81,8 +81,6 @@ class Search:
     limit : largest number of evaluations, for progress.
     seed : of algorithms that draw random numbers.
     progress : called after every evaluation; may raise errors.Cancelled.
-    replayed : the history of an earlier run. Evaluations are taken from it as long as stage and position agree, in its
-        order.
     """
 
     def __init__(
@@ -92,13 +90,10 @@ class Search:
         limit: int,
         seed: int = 0,
         progress: Callable[[Progress], None] | None = None,
-        replayed: list[Evaluation] | None = None,
     ) -> None:
         self.cost, self.describe, self.limit, self.seed = cost, describe, limit, seed
-        self.progress, self.replayed = progress, replayed or []
+        self.progress = progress
         self.history: list[Evaluation] = []
-        #: Number of evaluations computed in this run
-        self.computed = 0
         self._best: Evaluation | None = None
 
     def minimise(
@@ -165,18 +160,8 @@ class Search:
 
     def evaluate(self, stage: str, units: np.ndarray) -> float:
         """The cost at one position, kept in the history."""
-        place = len(self.history)
         key = tuple(np.clip(units, 0.0, 1.0).tolist())
-        known = self.replayed[place] if place < len(self.replayed) else None
-        if known is not None and (known.stage, known.units) != (stage, key):
-            # From here on the run differs, and even an equal position may have another cost, since a stage may depend
-            # on earlier stages.
-            self.replayed, known = self.replayed[:place], None
-        if known is not None:
-            cost = known.cost
-        else:
-            cost = self.cost(np.array(key))
-            self.computed += 1
+        cost = self.cost(np.array(key))
         entry = Evaluation(stage, key, cost)
         self.history.append(entry)
         # A new stage may have another cost function, so earlier values are not comparable.
@@ -195,11 +180,6 @@ class Search:
     def best_cost(self, stage: str) -> float:
         """The lowest cost of one stage."""
         return self.best(stage).cost
-
-    def state(self) -> list:
-        """The history as plain values for `history_from`. It includes the rest of an interrupted replay."""
-        known = self.history + self.replayed[len(self.history) :]
-        return [[entry.stage, list(entry.units), entry.cost] for entry in known]
 
     def _optimiser(self, algorithm: str, parameters: int, step: float, bounded: bool):
         import nlopt
@@ -223,26 +203,3 @@ class Search:
         if "MLSL" in algorithm or "AUGLAG" in algorithm:
             search.set_local_optimizer(made(LOCAL_ALGORITHM, 10.0 * _TOLERANCE))
         return search
-
-
-def history_from(state: dict | None, problem: dict[str, str]) -> list[Evaluation]:
-    """The evaluations of an earlier run from {"problem": {what: fingerprint}, "history": ...}.
-
-    Raises SimulationError if it is invalid or from another problem; the message names the differences.
-    """
-    if state is None:
-        return []
-    try:
-        known = dict(state["problem"])
-        history = [Evaluation(str(stage), tuple(map(float, units)), float(c)) for stage, units, c in state["history"]]
-    except (KeyError, TypeError, ValueError):
-        raise SimulationError(
-            "the state to resume is invalid, expected problem and history of an optimisation"
-        ) from None
-    other = [what for what in problem if known.get(what) != problem[what]]
-    require(
-        not other,
-        f"the state to resume is of another problem: other {', '.join(other)}; start without it, or with the same "
-        "inputs",
-    )
-    return history

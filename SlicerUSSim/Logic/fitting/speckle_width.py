@@ -61,11 +61,6 @@ class SpeckleWidth:
     #: Windows that could be measured, axially
     windows: int
 
-    @property
-    def half_height_mm(self) -> tuple[float, float]:
-        """(axial, lateral) width at half height of the autocorrelation, as published widths are given."""
-        return HALF_HEIGHT_PER_SIGMA * self.axial_mm, HALF_HEIGHT_PER_SIGMA * self.lateral_mm
-
 
 def log_speckle_correlation(distance: np.ndarray, sigma: float) -> np.ndarray:
     """Autocorrelation of the log of developed speckle at a distance; both in one unit.
@@ -122,17 +117,6 @@ def width_misfit(widths: Sequence[SpeckleWidth], reference: Sequence[SpeckleWidt
     ratios = np.log([(a.axial_mm / b.axial_mm, a.lateral_mm / b.lateral_mm) for a, b in both])
     known = np.abs(ratios[np.isfinite(ratios)])
     return float(known.mean()) if known.size else float("nan")
-
-
-def extrema_density_cm2(image: np.ndarray, grid: ImageGrid, inside: np.ndarray) -> float:
-    """Local maxima of an image (rows, columns) per square centimetre of `inside` (rows, columns) bool.
-
-    They are counted as in T2 (texture_costs.py); the number depends on the size of the pixels.
-    """
-    from SlicerUSSim.Logic.fitting.texture_costs import local_extrema
-
-    area = np.count_nonzero(inside) * grid.pixel_spacing_mm[0] * grid.pixel_spacing_mm[1] / 100.0
-    return float(np.count_nonzero(local_extrema(image)[0] & inside) / area) if area else float("nan")
 
 
 def along_beams(values: np.ndarray, probe: Probe, grid: ImageGrid, order: int = 3) -> tuple[np.ndarray, np.ndarray]:

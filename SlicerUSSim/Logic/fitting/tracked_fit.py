@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from SlicerUSSim.Logic.base.settings import DisplaySettings
-from SlicerUSSim.Logic.fitting.deformation import Deformation, find_deformation
 from SlicerUSSim.Logic.fitting.fit_settings import FitSettings
 from SlicerUSSim.Logic.fitting.image_similarity import Similarity, SimilaritySettings, similarity
 from SlicerUSSim.Logic.fitting.optimization import AppearanceResult, optimize_appearance
@@ -22,7 +21,6 @@ from SlicerUSSim.Logic.fitting.speckle_fit import (
     SpeckleFit,
     fit_speckle,
     with_estimated_map,
-    with_point_spread,
     with_preset_texture,
 )
 from SlicerUSSim.Logic.fitting.texture_costs import TextureMisfit, TextureReference
@@ -33,14 +31,12 @@ from SlicerUSSim.Logic.tissue.table import TissueTable
 from SlicerUSSim.Logic.tracked.images import TrackedImages
 
 if TYPE_CHECKING:
-    from SlicerUSSim.Logic.fitting.prediction import Prediction
+    from SlicerUSSim.Logic.fitting.control_costs import Prediction
 
 _log = logging.getLogger(__name__)
 
 #: Fraction of the evaluations for a fit before registration.
 _FIRST_SHARE = 0.4
-#: Evaluations of a fit whose short one is good enough for a deformation to follow
-_LEAST_FOR_DEFORMATION = 300
 #: Successive registrations: bounds (mm and degrees) and evaluations. A fit at wrong poses is biased, and so is the
 #: registration after it; later ones start closer.
 _ROUNDS = ((8.0, 500), (4.0, 300), (2.0, 250))
@@ -63,17 +59,12 @@ class Fit:
     texture_after: list[TextureMisfit] = field(default_factory=list)
     #: None unless the speckle was fitted
     speckle: SpeckleFit | None = None
-    #: None unless the tissues were deformed; `simulator` is then that of the deformed patient
-    deformation: Deformation | None = None
-    simulator: UltrasoundSimulator | None = field(default=None, repr=False)
-    #: None unless other images were predicted (prediction.py)
+    #: None unless other images were predicted (control_costs.py)
     prediction: Prediction | None = None
 
     def to_dict(self) -> dict:
         """Plain values for JSON."""
         found = {} if self.registration is None else {"registration": self.registration.to_dict()}
-        if self.deformation is not None:
-            found["deformation"] = self.deformation.to_dict()
         speckle = {} if self.speckle is None else {"speckle": self.speckle.to_dict()}
         texture = [
             {"before": _plain(before), "after": _plain(after)}
@@ -93,30 +84,25 @@ def fit(
     free: Iterable[str] | Mapping[str, Bounds | None],
     display: DisplaySettings | None = None,
     register: bool = False,
-    deform: bool = False,
     speckle: bool = False,
     max_evaluations: int = FitSettings.evaluations,
     restarts: int = FitSettings.restarts,
     seed: int = 0,
     settings: SimilaritySettings | None = None,
     progress: Callable[[Progress], None] | None = None,
-    resume: dict | None = None,
-    checkpoint: Callable[[dict], None] | None = None,
 ) -> Fit:
     """Fit display and tissue parameters (optimization.optimize_appearance) and, with `register`, the poses.
 
     Registration requires similar images and the fit requires poses. Short fits and registrations therefore alternate,
-    followed by the complete fit at the resulting poses. With `deform`, a short fit and a smooth deformation of the
-    tissues follow (deformation.py), and all else is of the deformed patient. With `speckle`, a short fit with the real
-    images' grey map is followed by fit_speckle, and the complete fit begins where both have ended. Of the free
-    parameters, "tissues" means those that the images can show (see below). `resume` and `checkpoint` are those of the
-    complete fit.
+    followed by the complete fit at the resulting poses. With `speckle`, a short fit with the real images' grey map is
+    followed by fit_speckle, and the complete fit begins where both have ended. Of the free parameters, "tissues" means
+    those that the images can show (see below).
     Raises SimulationError as those do.
     """
     display = display or DisplaySettings()
     free = parameters_seen(free, simulator, tracked)
     masks = [tracked.mask] * len(tracked.images)
-    given, patient = tracked, simulator
+    given = tracked
     references = [TextureReference(image, tracked.grid.pixel_spacing_mm, tracked.mask) for image in tracked.images]
     for number, reference in zip(tracked.numbers, references, strict=True):
         if reference.is_dark:
@@ -125,17 +111,10 @@ def fit(
                 "compared, and the fit says little; expected an image of the patient",
                 number, 100.0 * tracked.mask.sum() / max(tracked.grid.field(tracked.probe).sum(), 1),
             )  # fmt: skip
-    if speckle and len(tracked.images) == 1:
-        _log.warning(
-            "the speckle of 1 image is fitted (%d): grey map, smoothing and texture of one place may not hold at "
-            "others; fit more, or predict others",
-            tracked.numbers[0],
-        )
 
     def appearance_at(poses: Sequence[np.ndarray], **options: Any) -> AppearanceResult:
-        # Of the patient and the probe as they are by then
         return optimize_appearance(
-            patient, tracked.probe, poses, references=tracked.images, free=free, grid=tracked.grid, masks=masks,
+            simulator, tracked.probe, poses, references=tracked.images, free=free, grid=tracked.grid, masks=masks,
             seed=seed, settings=settings, **options,
         )  # fmt: skip
 
@@ -150,43 +129,23 @@ def fit(
             progress=Progress.named("for the registration", progress),
         )  # fmt: skip
         tracked, registration = _registered(simulator, tracked, short, step_from)
-    deformation = None
-    if deform and max_evaluations < _LEAST_FOR_DEFORMATION:
-        _log.warning(
-            "the deformation is looked for after a short fit, of %d evaluations in all, expected at least %d: where "
-            "levels do not fit yet, it stands for them", max_evaluations, _LEAST_FOR_DEFORMATION,
-        )  # fmt: skip
-    if deform:
-        first = appearance_at(
-            tracked.poses, display=display, restarts=0, max_evaluations=max(int(_FIRST_SHARE * max_evaluations), 1),
-            progress=Progress.named("for the deformation", progress),
-        )  # fmt: skip
-        with simulator.with_tissues(first.tissues):
-            deformation, patient = find_deformation(
-                simulator, tracked, first.display, settings=settings, progress=progress
-            )
-        if patient is not simulator:
-            patient.set_tissues(simulator.medium.tissues)
     begun = simulator.medium.tissues
     start, begin, found = display, None, None
     if speckle:
-        found, tracked = _speckle_of(patient, tracked, display, free, seed, settings, max_evaluations, progress)
+        found = _speckle_of(simulator, tracked, display, free, seed, settings, max_evaluations, progress)
         start, begin = _at_the_levels_of(found.display, display), (found.tissues, found.display)
-    with patient.with_tissues(begun if found is None else _at_the_levels_of_tissues(found.tissues, begun)):
+    with simulator.with_tissues(begun if found is None else _at_the_levels_of_tissues(found.tissues, begun)):
         appearance = appearance_at(
             tracked.poses, display=start, begin=begin, restarts=restarts, max_evaluations=max_evaluations,
-            resume=resume, checkpoint=checkpoint, progress=progress,
+            progress=progress,
         )  # fmt: skip
     before = simulated(simulator, given, begun, display)
-    after = simulated(patient, tracked, appearance.tissues, appearance.display)
-    if speckle or deform:
+    after = simulated(simulator, tracked, appearance.tissues, appearance.display)
+    if speckle:
         was = _similarities(given, before, settings or SimilaritySettings())
         appearance = replace(appearance, similarity_before=was, cost_before=float(np.mean([one.total for one in was])))
     textures = ([r.misfit(i) for r, i in zip(references, images, strict=True)] for images in (before, after))
-    return Fit(
-        appearance, registration, tracked, before, after, *textures, speckle=found, deformation=deformation,
-        simulator=None if patient is simulator else patient,
-    )  # fmt: skip
+    return Fit(appearance, registration, tracked, before, after, *textures, speckle=found)
 
 
 def _speckle_of(
@@ -198,8 +157,8 @@ def _speckle_of(
     settings: SimilaritySettings | None,
     max_evaluations: int,
     progress: Callable[[Progress], None] | None,
-) -> tuple[SpeckleFit, TrackedImages]:
-    """The grey map of the real images, a short fit with it, and the speckle there; the images with their probe."""
+) -> SpeckleFit:
+    """The grey map of the real images, a short fit with it, and the speckle there."""
     tissues = with_preset_texture(simulator.medium.tissues)
     shown, has_map = with_estimated_map(display, tracked)
     with simulator.with_tissues(tissues):
@@ -210,9 +169,7 @@ def _speckle_of(
             progress=Progress.named("levels for the speckle", progress),
         )  # fmt: skip
     shares = Progress.shares("smoothing and texture of the speckle", progress)
-    found = replace(fit_speckle(simulator, tracked, first.tissues, first.display, shares), has_map=has_map)
-    shares = Progress.shares("point spread function of the speckle", progress)
-    return with_point_spread(simulator, tracked, found, first.display, shares)
+    return replace(fit_speckle(simulator, tracked, first.tissues, first.display, shares), has_map=has_map)
 
 
 def _at_the_levels_of(found: DisplaySettings, given: DisplaySettings) -> DisplaySettings:

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from SlicerUSSim.Logic.base.settings import SimulationSettings
-from SlicerUSSim.Logic.imaging.signals import RayTree
-from SlicerUSSim.Logic.imaging.stage import DeviceFrame, Stage, Work
+from SlicerUSSim.Logic.imaging.stage import DeviceFrame, Stage
 from SlicerUSSim.Logic.opencl.device import Device, Workspace
 from SlicerUSSim.Logic.opencl.layout import CONSTANTS
 from SlicerUSSim.Logic.probe.arrays import Probe
@@ -22,7 +21,6 @@ _FAN_STEP_MM, _MOST_DEPTHS = (0.25, 1.0), 192  # limits of the length of a look-
 _ANGLE_STEP, _WIDEST = 0.022, 1.5  # radians
 
 _NEPERS_PER_DB = np.log(10.0) / 20.0
-_PER_LOOK_UP, _PER_SUM = 60, 60  # operations counted in the kernels
 
 
 class Aperture(Stage):
@@ -69,15 +67,6 @@ class Aperture(Stage):
         self.device.run(
             self._beams, (1 + depths, traced), frame.acquisition_buffer, frame.screens, shades, all_soft, frame.beams
         )
-
-    def work(self, frame: DeviceFrame, tree: RayTree) -> Work:
-        fields = frame.acquisition
-        if not fields["aperture_beams"]:
-            return Work(1, 0)
-        rays = int(fields["fan_angles"]) * int(fields["fan_points"]) * ROWS
-        looked_up = rays * int(fields["fan_depths"])
-        sums = int(fields["screen_lines"]) * int(fields["screen_depths"]) * _POINTS * ROWS
-        return Work(14 * looked_up, _PER_LOOK_UP * looked_up + _PER_SUM * sums)
 
 
 def acoustic_rows(tissues: np.ndarray, acquisition: np.ndarray) -> np.ndarray:

@@ -11,8 +11,7 @@ from scipy.special import log_ndtr
 from SlicerUSSim.Logic.base.settings import FULL_SCALE_DB
 from SlicerUSSim.Logic.imaging.console import gains_across, gains_along
 from SlicerUSSim.Logic.imaging.noise import noise_key
-from SlicerUSSim.Logic.imaging.signals import RayTree
-from SlicerUSSim.Logic.imaging.stage import SAMPLE_BYTES, DeviceFrame, Stage, Work
+from SlicerUSSim.Logic.imaging.stage import SAMPLE_BYTES, DeviceFrame, Stage
 from SlicerUSSim.Logic.opencl.device import Device, Workspace
 from SlicerUSSim.Logic.opencl.layout import CONSTANTS
 from SlicerUSSim.Logic.probe.arrays import Probe
@@ -23,7 +22,6 @@ if TYPE_CHECKING:
 
 #: Decibels of amplitude in a neper
 DB_PER_NEPER = 20.0 / np.log(10.0)
-_PER_SAMPLE = 130  # operations: noise, TGC, envelope, log compression
 
 
 class PulseFilter(Stage):
@@ -99,11 +97,6 @@ class PulseFilter(Stage):
             frame.scanned.im,
             np.int32(frame.scanned.stride),
         )
-
-    def work(self, frame: DeviceFrame, tree: RayTree) -> Work:
-        lines, samples = frame.line_shape
-        taps = pulse_taps(frame.axial_sigma_mm / float(frame.acquisition["sample_mm"])).size
-        return Work(2 * lines * samples * SAMPLE_BYTES, 4 * taps * lines * samples)
 
 
 def downshift(probe: Probe) -> float:
@@ -201,10 +194,6 @@ class Compressor(Stage):
             self._across = gains.tobytes(), self.device.upload(gains)
         return self._across[1]
 
-    def work(self, frame: DeviceFrame, tree: RayTree) -> Work:
-        lines, samples = frame.line_shape
-        return Work((SAMPLE_BYTES + 5) * lines * samples, _PER_SAMPLE * lines * samples)
-
 
 def ring_down(probe: Probe, depth_mm: np.ndarray, axial_sigma_mm: float, cycles_per_mm: float) -> np.ndarray:
     """(samples,) complex64 baseband signal of the pulse that bounces between the face's layers and the skin.
@@ -237,8 +226,6 @@ def pulse_taps(sigma: float) -> np.ndarray:
 
 
 # ---- from scan lines to pixels (kernels/scan_conversion.cl) ----------------------------------------------------------
-
-_PER_PIXEL = 80  # operations
 
 
 class ScanConverter(Stage):
@@ -279,8 +266,3 @@ class ScanConverter(Stage):
             np.int32(grid.columns),
             frame.image,
         )
-
-    def work(self, frame: DeviceFrame, tree: RayTree) -> Work:
-        grid, (lines, samples) = frame.grid, frame.line_shape
-        pixels, averaged = grid.rows * grid.columns, grid.pixel_spacing_mm[1] / float(frame.acquisition["sample_mm"])
-        return Work(2 * lines * samples + 9 * pixels, averaged * lines * samples + _PER_PIXEL * pixels)

@@ -9,8 +9,7 @@ import numpy as np
 
 from SlicerUSSim.Logic.base.settings import FULL_SCALE_DB, DisplaySettings
 from SlicerUSSim.Logic.imaging.grey_map import TABLE_SIZE, grey_table, is_linear
-from SlicerUSSim.Logic.imaging.signals import RayTree
-from SlicerUSSim.Logic.imaging.stage import DeviceFrame, Stage, Work
+from SlicerUSSim.Logic.imaging.stage import DeviceFrame, Stage
 from SlicerUSSim.Logic.opencl.device import Device, Workspace
 from SlicerUSSim.Logic.probe.arrays import LinearProbe, Probe
 
@@ -58,11 +57,6 @@ class EnvelopeSmoothing(Stage):
             self._taps[sigma] = self.device.upload(gaussian_taps(sigma))
         return self._taps[sigma]
 
-    def work(self, frame: DeviceFrame, tree: RayTree) -> Work:
-        lines, samples = frame.line_shape
-        taps = [len(gaussian_taps(sigma)) for sigma in smoothing_sigmas(frame) if sigma > 0.0]
-        return Work(8 * len(taps) * lines * samples, 2 * sum(taps) * lines * samples)
-
 
 class GreyMapping(Stage):
     """Log compression of an envelope that was smoothed, and of any by a grey map."""
@@ -99,10 +93,6 @@ class GreyMapping(Stage):
         )
         frame.grey = grey
 
-    def work(self, frame: DeviceFrame, tree: RayTree) -> Work:
-        lines, samples = frame.line_shape
-        return Work(5 * lines * samples, 30 * lines * samples) if _maps(frame) else Work(0, 0)
-
 
 class EdgeEnhancement(Stage):
     """Adds the difference of grey levels to the mean around them: borders and speckle get sharper."""
@@ -130,12 +120,6 @@ class EdgeEnhancement(Stage):
             sharp,
         )
         frame.grey = sharp
-
-    def work(self, frame: DeviceFrame, tree: RayTree) -> Work:
-        if frame.display.edge_enhancement == 0.0:
-            return Work(0, 0)
-        lines, samples = frame.line_shape
-        return Work(2 * lines * samples, (2 * _EDGE_SAMPLES + 1) * (2 * _EDGE_LINES + 1) * lines * samples)
 
 
 def smoothing_sigmas(frame: DeviceFrame) -> tuple[float, float]:

@@ -17,10 +17,7 @@ from SlicerUSSim.Logic.probe.poses import sample
 
 #: Places along the face per aperture, and across it; steps through the gap in voxels
 _ALONG, _ACROSS, _STEP = 25, 5, 0.5
-#: A user is told of a face less of which than this share touches the patient; of a curved one on a head half does
-_LEAST_SHARE = 1.0 / 3.0
-#: Without a gap, the same of a face that is further from the patient than a bath or a cavity needs; and of one with so
-#: much of the patient behind it
+#: Without a gap a user is told of a face that is further from the patient than a bath or a cavity needs, mm
 _BATH_MM = 30.0
 
 
@@ -50,45 +47,27 @@ def touching_share(labels: Volume, probe: Probe, probe_to_ras: np.ndarray, gap_m
 
 
 def about_contact(labels: Volume, probe: Probe, poses: Sequence[np.ndarray], gap_mm: float | None) -> tuple[str, ...]:
-    """Lines about a face that does not touch the patient, with little of it, or in him, at one pose (4, 4) or more.
+    """A line about a face no part of which touches the patient, at one pose (4, 4) or more; nothing if all do.
 
-    Without a gap (None) the patient lies in the coupling medium, and only a face that is far from it is told of. The
-    others are as in line_contact.
+    Without a gap (None) the patient lies in the coupling medium, and a face that is far from it is told of. The others
+    are as in line_contact.
     """
-    buried = sum(_is_buried(labels, pose) for pose in poses)
-    which = "the probe's face lies" if len(poses) == 1 else f"in {buried} of {len(poses)} images the probe's face lies"
-    line = f"{which} inside the patient, with more than {_BATH_MM:g} mm of tissue straight behind it; if it should not"
-    inside = (f"{line}, move it to the surface",) if buried else ()
-    return inside + _about_gap(labels, probe, poses, gap_mm)
-
-
-def _is_buried(labels: Volume, pose: np.ndarray) -> bool:
-    behind = pose[:3, 3] - np.arange(0.0, _BATH_MM + 1.0)[:, None] * pose[:3, 1]
-    return bool((sample(labels, behind, order=0) > 0).all())
-
-
-def _about_gap(labels: Volume, probe: Probe, poses: Sequence[np.ndarray], gap_mm: float | None) -> tuple[str, ...]:
-    """Those of about_contact about what lies between face and patient."""
+    reach = _BATH_MM if gap_mm is None else gap_mm
+    steps = (0.1 * reach, reach)  # most faces are near, which takes a tenth of the time to see
+    off = sum(not any(touching_share(labels, probe, pose, mm) > 0.0 for mm in steps) for pose in poses)
+    if not off:
+        return ()
+    which = "" if len(poses) == 1 else f"in {off} of {len(poses)} images "
     if gap_mm is None:
-        steps = (0.1 * _BATH_MM, _BATH_MM)  # most faces are near, which takes a tenth of the time to see
-        far = sum(not any(touching_share(labels, probe, pose, mm) > 0.0 for mm in steps) for pose in poses)
-        which = "the probe's face is" if len(poses) == 1 else f"in {far} of {len(poses)} images the probe's face is"
-        line = f"{which} more than {_BATH_MM:g} mm from the patient, across the coupling medium, as in a water bath"
-        return (f"{line}; if it should touch, move it onto the patient",) if far else ()
-    shares = [touching_share(labels, probe, pose, gap_mm) for pose in poses]
-    little = [share for share in shares if 0.0 < share < _LEAST_SHARE]
-    count, off = len(shares), len(shares) - np.count_nonzero(shares)
-    touches = f"of the probe's face touches the patient (contact gap: {gap_mm:g} mm)"
-    lines = []
-    if off:
-        which = "0%" if count == 1 else f"in {off} of {count} images 0%"
-        black = "the image is black" if count == 1 else "they are black"
-        lines.append(f"{which} {touches}: {black}; move the probe onto the patient")
-    if little:
-        which = "only" if count == 1 else f"in {len(little)} of {count} images only"
-        percent = f"{max(max(little), 0.01):.0%}{'' if count == 1 else ' or less'}"
-        lines.append(f"{which} {percent} {touches}: expect a dark image, or black sectors where it lifts off")
-    return tuple(lines)
+        return (
+            f"{which}the probe's face is more than {_BATH_MM:g} mm from the patient, across the coupling medium, as in "
+            "a water bath; if it should touch, move it onto the patient",
+        )
+    black = "the image is black" if len(poses) == 1 else "they are black"
+    return (
+        f"{which}0% of the probe's face touches the patient (contact gap: {gap_mm:g} mm): {black}; move the probe onto "
+        "the patient",
+    )
 
 
 def _touching(labels: Volume, probe: Probe, probe_to_ras: np.ndarray, gap_mm: float) -> tuple[np.ndarray, np.ndarray]:

@@ -12,7 +12,7 @@ import numpy as np
 
 from SlicerUSSim.Logic.base.errors import require
 from SlicerUSSim.Logic.base.volume import Volume
-from SlicerUSSim.Logic.imaging.sheet_voxels import on_voxels
+from SlicerUSSim.Logic.imaging.sheet_voxels import SheetVoxels, on_voxels
 from SlicerUSSim.Logic.opencl.layout import CONSTANTS
 from SlicerUSSim.Logic.tissue.sheet_looks import SheetLook, looks_of, with_dura
 from SlicerUSSim.Logic.tissue.surfels import KINDS, Surfels
@@ -23,21 +23,12 @@ from SlicerUSSim.Logic.tissue.table import TissueTable
 _WIDE_MM, _STEP_MM, _BESIDE_MM = 2.0, 0.5, 1.0
 #: Dura in the coupling medium has tissue on both sides within this, or hangs in it
 _BETWEEN_MM = 8.0
-_GREY, _WHITE = "grey matter", "white matter"
 #: Least distance from a sheet within which nothing else draws a line, mm
 _OWN_MM = 1.0
-#: A sulcus has fluid and grey matter in it, within the first distance along its normal, and white matter beside it,
-#: between the others, mm. From there to here it is 0.8 to 1.1 steps of fluid, grey and white matter for sheets of six
-#: MRIs on their own labels (0.37 to 0.9 on slices and voxels of 5 mm, 0.7 on those of another MRI of the same patient),
-#: -0.03 to 0.03 for those of others, 0.04 to 0.15 for mirrored ones, and 0.01 to 0.23 for those shifted by 4 mm.
-_IN_SULCUS_MM, _BESIDE_SULCUS_MM, _LEAST_CHANGE = 0.5, (4.0, 5.0), 0.3
-#: So many pieces of sulci tell; of fewer, the walls of ventricles do
-_LEAST_SULCI = 2000
-#: Sheets are another patient's if fewer of so many walls of ventricles lie within this of fluid beside tissue, mm or a
-#: voxel: 0.66 to 0.92 of their own walls do, 0.01 to 0.62 of the others', and 0.37 to 0.77 of mirrored ones.
-_LEAST_WALLS, _LEAST_ON_WALLS, _NEAR_MM = 200, 0.45, 1.5
-#: Or if fewer of those in the volume are beside labelled tissue, or none is within this of the volume, mm
-_LEAST_LABELLED, _FAR_MM = 0.4, 100.0
+#: Sheets farther than this from the plane of an image hardly change it: only rays that leave the plane meet them, mm
+_BESIDE_IMAGE_MM = 20.0
+#: Sheets farther than this from the labels are in another frame, mm
+_FAR_MM = 100.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,7 +54,7 @@ class FoundSheets:
 def found_sheets(
     surfels: Surfels, padded: np.ndarray, grid: Volume, fluids: tuple[int, ...], tissues: TissueTable
 ) -> FoundSheets:
-    """Lay sheets over a label map.
+    """Lay sheets over a label map. Whether they are those of this patient is up to the caller.
 
     Parameters
     ----------
@@ -72,10 +63,10 @@ def found_sheets(
     fluids : labels of which gaps consist, without the coupling medium.
     tissues : of the labels, with a membrane.
 
-    Raises SimulationError for sheets that are not of this patient.
+    Raises SimulationError for sheets that are in another frame.
     """
     grid, looks = _with_margin(grid), looks_of(tissues)
-    _require_of_patient(surfels.whole, padded, grid, fluids, tissues)
+    _require_near(surfels, grid)
     surfels = surfels.chosen(~_hangs(surfels, padded, grid))
     extent = _fluid_beside(surfels, padded, grid, fluids)
     is_gap = np.isin(surfels.kind, [KINDS.index(kind) for kind in ("sulcus", "falx", "tentorium")])
@@ -88,12 +79,9 @@ def found_sheets(
     most = max((look.most_thickness_mm for look in looks.values()), default=0.0)
     reach = max(_OWN_MM, 0.5 * most + half_diagonal)
     planes = on_voxels(surfels, grid, reach_mm=reach)
-    voxels = np.flatnonzero(planes.entry.array >= 0)
-    entry = planes.entry.array.ravel()[voxels]
-    distance, normal, thickness, confidence = planes.unpacked(entry)
-    words, half = _words(planes.kind[entry], distance, normal, thickness, confidence, grid, looks)
-    words[:, 0] |= tissue_beside(labels, voxels, fluids).astype(np.uint32) << np.uint32(26)
-    return FoundSheets(labels, voxels, words, np.abs(distance) <= half + half_diagonal, closed)
+    words, half = _words(planes, grid, looks)
+    words[:, 0] |= tissue_beside(labels, planes.voxels, fluids).astype(np.uint32) << np.uint32(26)
+    return FoundSheets(labels, planes.voxels, words, np.abs(planes.distance) <= half + half_diagonal, closed)
 
 
 def _hangs(surfels: Surfels, padded: np.ndarray, grid: Volume) -> np.ndarray:
@@ -119,81 +107,26 @@ def with_their_tissue(tissues: TissueTable, sheets: Surfels | None, known: Tissu
     return tissues if sheets is None else with_dura(tissues, sheets.kinds(), known)
 
 
-def _require_of_patient(
-    surfels: Surfels, padded: np.ndarray, grid: Volume, fluids: tuple[int, ...], tissues: TissueTable
-) -> None:
-    """Raise SimulationError for sheets that do not fit these labels: they would be drawn as this patient's anatomy."""
+def beside_image(sheets: Surfels, probe_to_ras: np.ndarray) -> Surfels:
+    """The sheets that one image shows, for a simulator of that image alone: within 20 mm of its plane.
+
+    On an MNI152 head with all sheets 0.1 % of an image's pixels differ by more than a grey level from those with all.
+    """
+    away_mm = (sheets.place - probe_to_ras[:3, 3]) @ probe_to_ras[:3, 2]
+    return sheets.chosen(np.abs(away_mm) <= _BESIDE_IMAGE_MM)
+
+
+def _require_near(surfels: Surfels, grid: Volume) -> None:
+    """Raise SimulationError if no sheet is within 100 mm of the volume."""
     if not len(surfels):
         return
-    expected = "expected those that were found in this patient's MRI"
-    matrix, last = grid.ras_to_ijk, np.array(padded.shape[::-1]) - 1.0
-    at = surfels.place @ matrix[:3, :3].T + matrix[:3, 3]
-    apart = (np.clip(at, 0.0, last) - at) @ grid.ijk_to_ras[:3, :3].T
-    away_mm = np.linalg.norm(apart, axis=1)
-    require(away_mm.min() <= _FAR_MM, f"the sheets lie {away_mm.min():.0f} mm outside the labels, {expected}")
-
-    inside = surfels.chosen(away_mm == 0.0)
-    near = max(_NEAR_MM, float(grid.spacing_mm.max()))
-    fluid, tissue, labelled, brain = np.zeros((4, len(inside)), bool)
-    of_brain = [label for label, tissue in tissues.items() if label and tissue.name in (_GREY, _WHITE)]
-    index = _along(inside, grid, padded.shape)
-    for step in np.arange(-near, near + 1e-6, _STEP_MM):
-        label = padded.ravel()[index(step)]
-        is_outside = np.isin(label, (0, *fluids))
-        fluid |= is_outside
-        tissue |= ~is_outside
-        labelled |= label != 0
-        brain |= np.isin(label, (*of_brain, *fluids))
-    share = labelled.mean() if len(inside) else 1.0
-    require(share >= _LEAST_LABELLED, f"only {share:.0%} of the sheets are beside labelled tissue, {expected}")
-
-    # Sulci tell more than walls, which lesions may hide, and which are alike on both sides.
-    change, count = _change_beside_sulci(inside, padded, grid, fluids, tissues)
-    if count >= _LEAST_SULCI:
-        require(
-            change >= _LEAST_CHANGE,
-            "the sheets' sulci do not lie in those of the labels: from them to white matter beside, it is "
-            f"{change:.2f} steps of fluid, grey and white matter on average, {_LEAST_CHANGE:g} or more where they do; "
-            f"{expected}",
-        )
-        return
-    walls = labelled & (inside.kind == KINDS.index("ependyma"))
-    walls &= brain | (not of_brain)  # the others are in a lesion
-    if np.count_nonzero(walls) >= _LEAST_WALLS and np.isin(padded, fluids).any():
-        share = (fluid & tissue)[walls].mean()
-        require(
-            share >= _LEAST_ON_WALLS,
-            f"only {share:.0%} of the sheets' walls of ventricles lie where fluid of the labels ends, {expected}",
-        )
-
-
-def _change_beside_sulci(
-    surfels: Surfels, padded: np.ndarray, grid: Volume, fluids: tuple[int, ...], tissues: TissueTable
-) -> tuple[float, int]:
-    """(Steps from fluid over grey to white matter, from sulci to what is beside them; number of pieces they are of).
-
-    Pieces beside other labels, as of a lesion or the skull, are left out.
-    """
-    steps = np.full(256, -1, np.int8)
-    for label, tissue in tissues.items():
-        if label:
-            steps[label] = 0 if label in fluids else {_GREY: 1, _WHITE: 2}.get(tissue.name, -1)
-    if not np.isin(padded, np.flatnonzero(steps == 2)).any():
-        return 0.0, 0
-    sulci = surfels.of_kind("sulcus")
-    index = _along(sulci, grid, padded.shape)
-    first, last = _BESIDE_SULCUS_MM
-    outwards = np.arange(first, last + 1e-6, _STEP_MM)
-    means, of_brain = [], np.ones(len(sulci), bool)
-    for places in ([-_IN_SULCUS_MM, 0.0, _IN_SULCUS_MM], [*-outwards, *outwards]):
-        total = np.zeros(len(sulci))
-        for place in places:
-            found = steps[padded.ravel()[index(place)]]
-            of_brain &= found >= 0
-            total += found
-        means.append(total / len(places))
-    count = int(np.count_nonzero(of_brain))
-    return float((means[1] - means[0])[of_brain].mean()) if count else 0.0, count
+    at = surfels.place @ grid.ras_to_ijk[:3, :3].T + grid.ras_to_ijk[:3, 3]
+    apart = (np.clip(at, 0.0, np.array(grid.array.shape[::-1]) - 1.0) - at) @ grid.ijk_to_ras[:3, :3].T
+    away_mm = float(np.linalg.norm(apart, axis=1).min())
+    require(
+        away_mm <= _FAR_MM,
+        f"the sheets lie {away_mm:.0f} mm outside the labels, expected those that were found in this patient's MRI",
+    )
 
 
 def _with_margin(grid: Volume) -> Volume:
@@ -277,36 +210,33 @@ def _square(offset: tuple[int, ...]) -> int:
     return sum((step - 4) ** 2 for step in offset)
 
 
-def _words(
-    kind: np.ndarray, distance: np.ndarray, normal: np.ndarray, thickness: np.ndarray, confidence: np.ndarray,
-    grid: Volume, looks: dict[str, SheetLook],
-) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+def _words(planes: SheetVoxels, grid: Volume, looks: dict[str, SheetLook]) -> tuple[np.ndarray, np.ndarray]:
     """((n, 2) uint32 of kernels/sheets.clh, without the label beside; (n,) half the thickness as stored, mm)."""
     of_kind = [looks[name] for name in KINDS]
     least, most, level, is_wall, is_dura, reflection = (
-        np.array([getattr(look, name) for look in of_kind])[kind]
+        np.array([getattr(look, name) for look in of_kind])[planes.kind]
         for name in ("least_thickness_mm", "most_thickness_mm", "level_db", "is_wall", "is_dura", "reflection")
     )
     # From millimetres of distance along the normal to voxels along the gradient in voxels
-    gradient = normal.astype(float) @ grid.ijk_to_ras[:3, :3]
+    gradient = planes.normal.astype(float) @ grid.ijk_to_ras[:3, :3]
     size = np.linalg.norm(gradient, axis=1)
     octahedral = gradient / np.abs(gradient).sum(axis=1, keepdims=True)
     u, v = octahedral[:, 0], octahedral[:, 1]
     below = octahedral[:, 2] < 0.0
     turned_u, turned_v = np.copysign(1.0 - np.abs(v), u), np.copysign(1.0 - np.abs(u), v)
     u, v = np.where(below, turned_u, u), np.where(below, turned_v, v)
-    steps = distance / size / CONSTANTS["SHEET_DISTANCE_STEP"]
+    steps = planes.distance / size / CONSTANTS["SHEET_DISTANCE_STEP"]
     first = _bits(256.0 + 255.0 * u, 0, 511) | _bits(256.0 + 255.0 * v, 9, 511) | _bits(128.0 + steps, 18, 255)
     first = np.where(first >> 18 & 255, first, first | 1 << 18)  # 0 stands for no plane
-    half = 0.5 * np.clip(thickness, least, most)
+    half = 0.5 * np.clip(planes.thickness, least, most)
     halves = np.clip(np.rint(half / CONSTANTS["SHEET_HALF_STEP"]), 1, 255)
     with np.errstate(divide="ignore"):
-        amplitude = level + 20.0 * np.log10(confidence)
+        amplitude = level + 20.0 * np.log10(planes.confidence)
     second = _bits(1024.0 + steps, 0, 2047) | _bits(halves, 11, 255)
     second |= _bits(96.0 + amplitude / CONSTANTS["SHEET_LEVEL_STEP_DB"], 19, 127)
     second |= is_wall.astype(np.int64) << 26 | is_dura.astype(np.int64) << 27
     # A wall of a ventricle is a border, too, which has the coherent echo.
-    second |= _bits(np.abs(reflection) * confidence / CONSTANTS["SHEET_REFLECTION_STEP"], 28, 15)
+    second |= _bits(np.abs(reflection) * planes.confidence / CONSTANTS["SHEET_REFLECTION_STEP"], 28, 15)
     return np.stack([first, second], axis=1).astype(np.uint32), halves * CONSTANTS["SHEET_HALF_STEP"]
 
 

@@ -128,12 +128,6 @@ class Medium:
         matrix[:, 3] += _PAD
         return matrix
 
-    def packed_texture(self) -> np.ndarray | None:
-        """(k, j, i) uint32 with a margin, the texture as on the device; None without one."""
-        if not self.has_texture:
-            return None
-        return self.device.download(self.texture_buffer, tuple(self.dims[::-1]), np.uint32)
-
     def quieter(self, factor: float) -> np.ndarray:
         """(labels,) bool: scatterers' variance below `factor` times the typical one.
 

@@ -29,14 +29,10 @@ SECTIONS: dict[str, type[DisplaySettings] | type[SimulationSettings]] = {
 #: Name of the pose, as in files of poses
 _POSE = "probe_to_ras"
 _KIND = "probe.kind"
-#: Name of a text that presets of earlier fits have
-_MADE_BY = "made_by"
 #: Objects of keys that the command alone has (Command/options.py)
 _OF_COMMAND = ("segmentation", "fit", "patient", "recording", "results")
 #: Name in Preset.from_texts of the whole as JSON, as scenes had it
 AS_ONE = "preset"
-#: A display with all of these and without a look was written by a version whose displays were even
-_OLD_DISPLAY = {"gain_db", "dynamic_range_db", "tgc_db_cm_mhz", "noise_db", "image_size"}
 #: Tissues of segment_mri with thin sulci.
 _BRAIN = ("csf", "grey matter", "white matter", "leptomeninges")
 
@@ -109,23 +105,18 @@ class Preset:
             f"{source}: is the result of a fit, expected a preset, as ussim optimize --save-preset writes it",
         )
         for name in values:
-            is_known = name in (*known, *_OF_COMMAND, _MADE_BY)
+            is_known = name in (*known, *_OF_COMMAND)
             require(is_known, f"{source}: has {short(name)}, expected {', '.join(known)}")
         sections: dict[str, Any] = {}
         if "probe" in values:
             sections["probe"] = probe_from_dict(values["probe"], f"{source}: probe")
         for name, kind in SECTIONS.items():
             if name in values:
-                given = values[name]
-                if name == "display" and isinstance(given, dict) and given.keys() >= _OLD_DISPLAY:
-                    if "look" not in given:
-                        _log.info("%s: its display was written before there were looks, and is read as even", source)
-                    given = {"look": "even", **given}
-                sections[name] = built(kind, given, f"{source}: {name}")
+                sections[name] = built(kind, values[name], f"{source}: {name}")
         if "tissues" in values or "membrane" in values:
             sections["tissues"] = TissueTable.from_dict(values, source)
         if values.get(_POSE) is not None:
-            require(values.keys() - {_MADE_BY, _POSE} != set(), f"{source}: is a pose and no preset; open it as a pose")
+            require(values.keys() != {_POSE}, f"{source}: is a pose and no preset; open it as a pose")
             sections[_POSE] = check_rigid(f"{source}: {_POSE}", values[_POSE])
         missing = [name for name in known[:-2] if name not in values]
         if missing:
@@ -155,8 +146,6 @@ class Preset:
         declared = {name: replace(entry, name=name) for name, entry in preset_parameters().items()}
         kind = declared[_KIND].from_text(source, texts.get(_KIND, probe_kind().default))
         values, nested = _flat_default(kind), {"tissues": {}}
-        if texts.keys() >= {f"display.{name}" for name in _OLD_DISPLAY}:
-            values["display.look"] = "even"
         for name, text in texts.items():
             values[name] = (
                 declared[name].from_text(source, text) if name in declared else _from_json(name, text, source)

@@ -9,18 +9,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from SlicerUSSim.Logic.imaging.signals import RayTree, TreeBuffers
-from SlicerUSSim.Logic.imaging.stage import DeviceFrame, Stage, Work
+from SlicerUSSim.Logic.imaging.stage import DeviceFrame, Stage
 from SlicerUSSim.Logic.opencl.device import Device, Workspace
 from SlicerUSSim.Logic.opencl.layout import CONSTANTS, HIT, SEGMENT
 
 if TYPE_CHECKING:
     from pyopencl import Buffer
-
-
-# Operations counted in the kernel
-_PER_STEP = 35  # a look-up along the ray: position, beam offset, clamp, index
-_PER_BORDER = 5 * 60 + 12 * 15 + 49 * 8 * 10  # bisection; stencil of 12 rows; 7 x 7 rows of eight voxels
-_BORDER_BYTES = 12 * 4 * 2 * 2 + 49 * 8  # the stencil's rows of two smoothed indicators; the voxels' groups
 
 
 class RayTracer(Stage):
@@ -106,15 +100,6 @@ class RayTracer(Stage):
             tree.segment_counts,
             frame.losses,
             few=True,
-        )
-
-    def work(self, frame: DeviceFrame, tree: RayTree) -> Work:
-        rays = 1 + int(frame.acquisition["elevational_rays"])
-        steps = float(tree.segments["length_mm"].sum()) * rays / (0.5 * float(frame.acquisition["voxel_mm"]))
-        borders = len(tree.hits) * rays / (rays - 1)
-        return Work(
-            2 * steps + _BORDER_BYTES * borders + SEGMENT.itemsize * len(tree.segments) + HIT.itemsize * len(tree.hits),
-            _PER_STEP * steps + _PER_BORDER * borders,
         )
 
     def download(self) -> RayTree:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from functools import cache
 from typing import TYPE_CHECKING
 
@@ -11,10 +10,10 @@ import numpy as np
 from SlicerUSSim.Logic.imaging.diffraction import lobes_of
 from SlicerUSSim.Logic.imaging.raytracing import ray_centres
 from SlicerUSSim.Logic.imaging.side_lobes import DARK, Tables, elevational_lobe_record, lines_together
-from SlicerUSSim.Logic.imaging.signals import EchoLines, RayTree
-from SlicerUSSim.Logic.imaging.stage import SAMPLE_BYTES, DeviceFrame, Stage, Work
+from SlicerUSSim.Logic.imaging.signals import EchoLines
+from SlicerUSSim.Logic.imaging.stage import DeviceFrame, Stage
 from SlicerUSSim.Logic.opencl.device import Device, Workspace
-from SlicerUSSim.Logic.opencl.layout import ACQUISITION, CONSTANTS, HIT, WALL
+from SlicerUSSim.Logic.opencl.layout import ACQUISITION, CONSTANTS, WALL
 
 if TYPE_CHECKING:
     from pyopencl import Buffer
@@ -22,12 +21,6 @@ if TYPE_CHECKING:
     from SlicerUSSim.Logic.base.settings import SimulationSettings
     from SlicerUSSim.Logic.probe.arrays import Probe
 
-# Operations counted in the kernels
-_PER_CELL = 130  # per examined lattice cell: two hashes, position, pulse phase, amplitude
-_PER_SCATTERER = 40  # per contributing scatterer: label, amplitude, four impulses
-_PER_HIT = 80
-_PER_ECHO = 40  # of a hit on a scan line
-_PER_EDGE_PAIR = 12  # for the lateral beam, per sample
 #: Of the paper's lattice of scatterers
 PAPER_SITES_PER_MM3 = 0.02**-3
 # In the probe's smallest resolution cell, for developed speckle; thin structures need some too, whatever the probe
@@ -116,16 +109,6 @@ class Scatterers(Stage):
             heavy=True,
         )
 
-    def work(self, frame: DeviceFrame, tree: RayTree) -> Work:
-        probe, traced, (_, samples) = frame.probe, int(frame.acquisition["traced_lines"]), frame.line_shape
-        inside, looked_at = scatterer_counts(frame, tree.segments, self.device.chunk)
-        if frame.settings.side_lobes:
-            lobes = replace(frame, acquisition=elevational_lobe_record(frame.acquisition))
-            together = lines_together(frame.acquisition, probe)
-            counts = scatterer_counts(lobes, tree.segments, _LOBE_CHUNKS * self.device.chunk, together)
-            inside, looked_at = inside + counts[0], looked_at + counts[1]
-        return Work(2 * inside + 2 * traced * samples * SAMPLE_BYTES, _PER_CELL * looked_at + _PER_SCATTERER * inside)
-
 
 class InterfaceEchoes(Stage):
     """Adds the echoes of interfaces to the scan lines, from the hits of the elevational rays near each."""
@@ -167,16 +150,6 @@ class InterfaceEchoes(Stage):
             few=True,
         )
 
-    def work(self, frame: DeviceFrame, tree: RayTree) -> Work:
-        acquisition, probe, hits = frame.acquisition, frame.probe, tree.hits
-        path = hits["path_mm"].astype(float)
-        near = 2.7 * frame.settings.beam_cutoff * probe.beam_sigma_mm(path)[0] / probe.line_distance_mm(path)
-        echoes = float(np.minimum(near, int(acquisition["scan_lines"])).sum())
-        return Work(
-            (HIT.itemsize + 2 * WALL.itemsize) * len(hits) + 2 * SAMPLE_BYTES * float(np.prod(frame.line_shape)),
-            _PER_HIT * len(hits) + _PER_ECHO * echoes,
-        )
-
 
 class LateralBeam(Stage):
     """Distributes the impulses of the traced lines to the scan lines by the lateral beam profile."""
@@ -211,17 +184,6 @@ class LateralBeam(Stage):
             scanned.re,
             scanned.im,
             stride,
-        )
-
-    def work(self, frame: DeviceFrame, tree: RayTree) -> Work:
-        acquisition, probe, (scan_lines, samples) = frame.acquisition, frame.probe, frame.line_shape
-        traced = int(acquisition["traced_lines"])
-        depth = np.arange(samples) * float(acquisition["sample_mm"])
-        distance = probe.line_distance_mm(depth) / float(acquisition["lateral_rays"])
-        sigma = probe.beam_sigma_mm(depth)[0]
-        pairs = np.minimum(frame.settings.beam_cutoff * sigma / distance + 1, traced / 2)
-        return Work(
-            (2 * traced + scan_lines) * samples * SAMPLE_BYTES, _PER_EDGE_PAIR * scan_lines * float(pairs.sum())
         )
 
 
@@ -266,37 +228,6 @@ def lattice_sites(tissues: np.ndarray, acquisition: np.ndarray) -> np.ndarray:
     # Of the share as the kernel draws it
     amplitude = np.sqrt(65536.0 * tissues["scatterer_variance"] / np.maximum(share, 1.0)) * (share > 0.0)
     return np.stack([share, amplitude], axis=1).astype(np.float32)
-
-
-def scatterer_counts(
-    frame: DeviceFrame, segments: np.ndarray, chunk: int, together: int | None = None
-) -> tuple[float, float]:
-    """(number of scatterers inside the strips of all ray segments, number of lattice cells to examine for them).
-
-    `segments` are records of layout.SEGMENT, `chunk` the number of samples of a work-item. With `together`, those of
-    elevational side lobes, for so many traced lines at once.
-    """
-    acquisition, probe, settings = frame.acquisition, frame.probe, frame.settings
-    ends = segments["path_mm"], segments["path_mm"] + segments["length_mm"]
-    path = np.linspace(*ends, 17)  # (17, segments)
-    width = (together or 1) * probe.line_distance_mm(path) / float(acquisition["lateral_rays"])
-    if together is None:
-        away = (path - float(acquisition["elevation_focus"])) / float(acquisition["elevation_rayleigh"])
-        height = 2.0 * settings.beam_cutoff * float(acquisition["elevation_sigma"]) * np.hypot(1.0, away)
-    else:
-        reach = lobes_of(probe).reach_mm
-        height = 2.0 * np.interp(path, np.linspace(0.0, probe.displayed_mm, len(reach)), reach)
-    # A scatterer is up to half a cell from its cell's centre along each axis of the lattice.
-    slack = {
-        name: float(acquisition["cell_mm"]) * np.abs(segments[name]).sum(axis=1) for name in ("lateral", "elevational")
-    }
-    deep = float(acquisition["cell_mm"]) * np.abs(segments["direction"]).sum(axis=1)
-    length = chunk * float(acquisition["sample_mm"]) / segments["depth_per_mm"]
-    along = 1.0 + deep / np.minimum(length, np.maximum(segments["length_mm"], 1e-3))
-    density = float(acquisition["cell_mm"]) ** -3
-    inside = _integral(width * height, path)
-    looked_at = along * _integral((width + slack["lateral"]) * (height + slack["elevational"]), path)
-    return float(density * inside.sum() / (together or 1)), float(density * looked_at.sum() / (together or 1))
 
 
 # ---- echogenicity that varies within a tissue (docs/physics.md#uneven-tissue) ----------------------------------------

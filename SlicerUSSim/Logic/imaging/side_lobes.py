@@ -12,10 +12,8 @@ import numpy as np
 
 from SlicerUSSim.Logic.imaging.diffraction import lateral_weights
 from SlicerUSSim.Logic.imaging.noise import stirred
-from SlicerUSSim.Logic.imaging.signals import RayTree
-from SlicerUSSim.Logic.imaging.stage import SAMPLE_BYTES, DeviceFrame, Stage, Work
+from SlicerUSSim.Logic.imaging.stage import DeviceFrame, Stage
 from SlicerUSSim.Logic.opencl.device import Device
-from SlicerUSSim.Logic.opencl.layout import CONSTANTS
 from SlicerUSSim.Logic.probe.arrays import Probe
 
 if TYPE_CHECKING:
@@ -28,7 +26,6 @@ COARSER = 4.0
 DARK = 0.25
 #: Elevational lobes follow one path for as many traced lines as are within so many sigmas of the beam
 _TOGETHER_SIGMAS, _MOST_TOGETHER = 3.0, 9
-_PER_NODE = 6  # operations per sample and pair of nodes
 _SEED = 0x51DE10BE
 
 
@@ -60,16 +57,6 @@ class SideLobes(Stage):
             np.float32(probe.wavelength_mm / probe.aperture_mm),
             heavy=True,
         )
-
-    def work(self, frame: DeviceFrame, tree: RayTree) -> Work:
-        if not frame.settings.side_lobes:
-            return Work(0.0, 0.0)
-        lines, samples = frame.line_shape
-        depth = np.arange(samples) * float(frame.acquisition["sample_mm"])
-        unit = frame.probe.wavelength_mm * np.maximum(frame.probe.receive_f_number, depth / frame.probe.aperture_mm)
-        apart = np.maximum(frame.probe.line_distance_mm(depth), 1e-4)
-        nodes = np.minimum(lines * np.minimum(apart / (0.7 * unit), 1.0) + 1.0, CONSTANTS["LOBE_NODES"])
-        return Work(2 * lines * samples * SAMPLE_BYTES, samples * lines * 8.0 + _PER_NODE * float((nodes**2).sum()))
 
 
 class Tables:

@@ -49,8 +49,6 @@ _FAR_MM = 1e6
 #: Cells of the scatterer lattice per image: about 5 s on two cores, what is not begun, and per second there (measured
 #: with tall beams; two to three times as many with low ones)
 _MANY_CELLS, _MOST_CELLS, _CELLS_PER_S = 1.5e8, 1e10, 3e7
-#: How far behind the face bone is looked for, and how much of it says that the face is in a closed skull, mm
-_BEHIND_MM, _BONE_BEHIND_MM = 40.0, 2
 _DEFAULT_DISPLAY = DisplaySettings()
 _log = logging.getLogger(__name__)
 
@@ -59,10 +57,6 @@ StageKind = TypeVar("StageKind", bound=Stage)
 
 class EmptyViewWarning(UserWarning):
     """The imaged field is completely outside the volume; the image has no echoes of tissue."""
-
-
-class BehindBoneWarning(UserWarning):
-    """There is bone behind the face of the probe: it stands in a closed skull."""
 
 
 class SlowScatterersWarning(UserWarning):
@@ -161,8 +155,7 @@ class UltrasoundSimulator:
         `grid` gives the pixels, for example those of a real image; by default they cover the bounding box of the imaged
         field, with display.image_size pixels. `noise_seed` selects the amplifier noise (noise.py): 0 depends only on
         the settings' seed, seed_of_pose(probe_to_ras) also on the pose.
-        Warns with EmptyViewWarning and returns a black image if the field is outside the volume, with
-        BehindBoneWarning if bone lies behind the face, and with
+        Warns with EmptyViewWarning and returns a black image if the field is outside the volume, and with
         SlowScatterersWarning if there are so many scatterers that it takes more than seconds on a CPU.
         Raises SimulationError if it would take minutes, for a pose that is not rigid and a noise_seed that is not a
         whole number of 32 bits.
@@ -174,7 +167,6 @@ class UltrasoundSimulator:
         with self._lock:
             frame = self._rendered(probe, pose, display, grid, timings, noise_seed)
             self._warn_if_empty(probe, pose)  # while the device computes
-            self._warn_if_behind_bone(pose)
             with self._timed("download", timings):
                 samples = self._sample_count(probe)
                 iq, envelope, bmode = (frame.download(name)[:, :samples] for name in ("iq", "envelope", "grey"))
@@ -542,23 +534,6 @@ class UltrasoundSimulator:
         if (voxels.max(axis=1) < -0.5).any() or (voxels.min(axis=1) > size - 0.5).any():
             warnings.warn(
                 "the probe looks past the volume: the image has no echoes of tissue", EmptyViewWarning, stacklevel=3
-            )
-
-    def _warn_if_behind_bone(self, pose: np.ndarray) -> None:
-        """Warn if bone lies behind the face, as where a probe stands on the brain of a closed skull."""
-        behind = np.arange(1.0, _BEHIND_MM, 1.0)
-        places = np.stack([0.0 * behind, -behind, 0.0 * behind, 1.0 + 0.0 * behind])
-        i, j, k = np.rint((self.medium.labels.ras_to_ijk @ pose @ places)[:3]).astype(int)
-        array = self.medium.labels.array
-        inside = np.all([(n >= 0) & (n < size) for n, size in zip((k, j, i), array.shape, strict=True)], axis=0)
-        bone = [label for label, tissue in self.medium.tissues.items() if tissue.name in ("skull", "bone")]
-        millimetres = int(np.isin(array[k[inside], j[inside], i[inside]], bone).sum())
-        if millimetres >= _BONE_BEHIND_MM:
-            warnings.warn(
-                f"{millimetres} mm of bone lie behind the face of the probe, which stands in a closed skull; open "
-                "it (craniotomy), or put the probe on the skin",
-                BehindBoneWarning,
-                stacklevel=3,
             )
 
     def _warn_if_overflown(self, frames: int = 1) -> None:

@@ -1,7 +1,7 @@
 """Stage, and the frame under computation on which stages work.
 
 A new *display* stage, which changes grey levels or pixels but not echoes, is one class and one line: a Stage with
-`run` and `work`, and its place in stages.DISPLAY_STAGES. Simulator, appearance model and benchmark use this list. Its
+`run`, and its place in stages.DISPLAY_STAGES. Simulator, appearance model and benchmark use this list. Its
 user settings are fields of DisplaySettings, read from `frame.display`.
 """
 
@@ -15,7 +15,7 @@ import numpy as np
 
 from SlicerUSSim.Logic.base.settings import DisplaySettings, SimulationSettings
 from SlicerUSSim.Logic.imaging.medium import Medium
-from SlicerUSSim.Logic.imaging.signals import EchoLines, RayTree, TreeBuffers
+from SlicerUSSim.Logic.imaging.signals import EchoLines, TreeBuffers
 from SlicerUSSim.Logic.opencl.device import Device
 from SlicerUSSim.Logic.opencl.layout import DISPLAY
 from SlicerUSSim.Logic.probe.arrays import Probe
@@ -24,16 +24,8 @@ from SlicerUSSim.Logic.probe.image_grid import ImageGrid
 if TYPE_CHECKING:
     from pyopencl import Buffer
 
-#: Bytes of a complex float32 sample, for Stage.work
+#: Bytes of a complex float32 sample
 SAMPLE_BYTES = 8
-
-
-@dataclass(frozen=True)
-class Work:
-    """The minimum work: bytes to and from memory, each once; floating-point and integer operations."""
-
-    bytes: float
-    operations: float
 
 
 @dataclass(eq=False)
@@ -120,12 +112,3 @@ class Stage(ABC):
     @abstractmethod
     def run(self, frame: DeviceFrame) -> None:
         """Enqueue the stage without waiting."""
-
-    @abstractmethod
-    def work(self, frame: DeviceFrame, tree: RayTree) -> Work:
-        """The minimum work of any implementation of the stage for a frame with this ray tree.
-
-        Bytes of all data read or written are counted once. Operations are counted in the kernel's source; additions,
-        multiplications and integer operations count equally. The estimate is accurate to a few tens of percent, enough
-        to distinguish twice the lower bound from ten times the lower bound.
-        """

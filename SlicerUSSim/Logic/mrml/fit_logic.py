@@ -33,12 +33,12 @@ class FitLogic:
         self, labels_node, images_node, *, probe_transform_node=None, frames: Sequence[int] | None = None,
         validate: Sequence[int] = (),
         free: Iterable[str] | Mapping[str, tuple[float, float] | None] = ("display", "tissues"),
-        register: bool = False, deform: bool = False, speckle: bool = False, estimate_geometry: bool = False,
+        register: bool = False, speckle: bool = False, estimate_geometry: bool = False,
         max_evaluations: int = FitSettings.evaluations, restarts: int = FitSettings.restarts,
         plot: CostPlot | None = None, progress: Callable[[Progress], None] | None = None,
     ) -> Fit:  # fmt: skip
-        """Fit display and tissue parameters, with `register` the poses, with `deform` the tissues' place and
-        with `speckle` the speckle, to real images. See fitting.fit.
+        """Fit display and tissue parameters, with `register` the poses and with `speckle` the speckle, to
+        real images. See fitting.fit.
 
         `images_node` is a sequence of images with its browser's transforms, a volume of one slice, or a 3D ultrasound
         volume, resampled in the image plane. `frames` are numbers of images (default: six, evenly spaced), `validate`
@@ -64,7 +64,7 @@ class FitLogic:
         def compute() -> Fit:
             simulator = self._patient.simulator(imaged)
             found = fit(
-                simulator, tracked, free=free, display=preset.display, register=register, deform=deform,
+                simulator, tracked, free=free, display=preset.display, register=register,
                 speckle=speckle, restarts=restarts, max_evaluations=max_evaluations, progress=report,
             )  # fmt: skip
             if others is None:

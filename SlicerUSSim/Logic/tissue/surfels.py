@@ -81,11 +81,4 @@ class Surfels:
         """The surfels of some kinds only. Raises SimulationError for a name that is not in KINDS."""
         for name in kinds:
             require(name in KINDS, f"sheets are of no kind {name!r}, expected some of: {', '.join(KINDS)}")
-        part = self.chosen(np.isin(self.kind, [KINDS.index(name) for name in kinds]))
-        vars(part)["_whole"] = self.whole
-        return part
-
-    @property
-    def whole(self) -> Surfels:
-        """What of_kind took these from, or these: all kinds together tell whether sheets are a patient's."""
-        return vars(self).get("_whole", self)
+        return self.chosen(np.isin(self.kind, [KINDS.index(name) for name in kinds]))

@@ -14,7 +14,7 @@ from typing import cast
 import numpy as np
 from scipy import ndimage, signal
 
-from SlicerUSSim.Logic.base.errors import SimulationError, require, require_between
+from SlicerUSSim.Logic.base.errors import SimulationError, require
 from SlicerUSSim.Logic.base.files import written_whole
 from SlicerUSSim.Logic.probe.arrays import Probe, probe_from_dict
 
@@ -65,32 +65,22 @@ class ImagedField:
         return points[:, :2]
 
 
-def estimate_field(
-    images: np.ndarray,
-    pixel_spacing_mm: tuple[float, float] | None = None,
-    *,
-    width_mm: float | None = None,
-    depth_mm: float | None = None,
-    **probe_parameters,
-) -> ImagedField:
+def estimate_field(images: np.ndarray, pixel_spacing_mm: tuple[float, float], **probe_parameters) -> ImagedField:
     """The imaged field in images, and the probe with this field.
 
     Parameters
     ----------
     images : (n, rows, columns) or (rows, columns) uint8, rows away from the probe; more images show more of the field.
-    pixel_spacing_mm : (column, row). Without it, pixels are square and their size follows from one of these:
-    width_mm : of a linear probe's face, or
-    depth_mm : of the field along its lines.
+    pixel_spacing_mm : (column, row).
     probe_parameters : further parameters of the probe, such as frequency_mhz.
 
-    Raises SimulationError if no field is found (black images, or a bright region of another shape), or if the pixel
-    size is not known.
+    Raises SimulationError if no field is found (black images, or a bright region of another shape).
     """
     images = np.asarray(images)
     stack = images if images.ndim == 3 else images[None]
     require(stack.ndim == 3 and stack.size > 0, f"images have shape {images.shape}, expected (n, rows, columns)")
     bright = bright_region(stack)
-    scale = np.asarray((1.0, 1.0) if pixel_spacing_mm is None else pixel_spacing_mm, float)
+    scale = np.asarray(pixel_spacing_mm, float)
     require(
         scale.shape == (2,) and bool((scale > 0).all()), f"pixel spacing is {pixel_spacing_mm}, expected (x, y) in mm"
     )
@@ -101,10 +91,6 @@ def estimate_field(
         kind, geometry, origin = _linear(points, scale)
     else:
         kind, geometry, origin = _sector(points, left, right, scale)
-    if pixel_spacing_mm is None:
-        size = _size_of_pixel(geometry, width_mm=width_mm, depth_mm=depth_mm)
-        geometry = {name: value * size if name.endswith("_mm") else value for name, value in geometry.items()}
-        scale, origin = size * scale, size * origin
     image_to_probe = np.diag([*scale, 1.0, 1.0])
     image_to_probe[:2, 3] = -origin
     try:
@@ -122,8 +108,6 @@ def estimate_field(
     )
     sizes = ", ".join(f"{name} {value:.1f}" for name, value in geometry.items())
     _log.info("field found in the images: %s probe (%s), covers what is bright to %.0f %%", kind, sizes, 100 * overlap)
-    if pixel_spacing_mm is None:
-        _log.info("pixels are %.3g mm large, from the size that was given", scale[0])
     return replace(field, overlap=overlap)
 
 
@@ -231,16 +215,6 @@ def _sides(bright: np.ndarray, scale: np.ndarray) -> tuple[tuple[float, float], 
         outward = 0.5 * max(scale[0], abs(slope) * scale[1]) * (1.0 if is_right else -1.0)
         found.append((float(start) + outward, float(slope)))
     return found[0], found[1]
-
-
-def _size_of_pixel(geometry: dict[str, float], **known: float | None) -> float:
-    """Millimetres per pixel, from one known length of a geometry in pixels."""
-    given = {name: value for name, value in known.items() if value is not None}
-    require(len(given) == 1, "the pixel size is not known, expected the pixel spacing, or one of width_mm and depth_mm")
-    (name, value), *_ = given.items()
-    require(name in geometry, f"{name} is for linear probes only, expected depth_mm or the pixel spacing for this one")
-    require_between("estimate_field", name, value, 1, 400)
-    return value / geometry[name]
 
 
 def _linear(points: np.ndarray, scale: np.ndarray) -> tuple[str, dict[str, float], np.ndarray]:

@@ -12,7 +12,7 @@ from SlicerUSSim.Logic.base.errors import SimulationError, require, required
 from SlicerUSSim.Logic.base.transforms import check_rigid, nearest_rotation
 from SlicerUSSim.Logic.probe.arrays import Probe
 from SlicerUSSim.Logic.probe.image_grid import ImageGrid
-from SlicerUSSim.Logic.tracked.hidden import look_inverted, spread_images, visible_part
+from SlicerUSSim.Logic.tracked.hidden import spread_images, visible_part
 from SlicerUSSim.Logic.tracked.imaged_field import ImagedField, bright_region, estimate_field, place_field
 from SlicerUSSim.Logic.tracked.sequence import TrackedSequence, asked_ends
 
@@ -76,9 +76,9 @@ class TrackedImages:
         finds_marks : whether what a scanner draws over the field is looked for, as for a comparison.
 
         Raises SimulationError for images that do not exist or were not tracked, a skewed calibration, a field that
-        cannot be estimated or whose size is not that of what images show, colours in most of it, and images that are
-        black or of one grey level (nearly everywhere). A calibration that mirrors, saturated, inverted or tinted
-        images, and what a file cuts off or a scanner draws over the field (hidden.py) are warned of.
+        cannot be estimated or whose size is not that of what images show, and images that are black or of one grey
+        level (nearly everywhere). A calibration that mirrors, tinted images, and what a file cuts off or a scanner
+        draws over the field (hidden.py) are warned of.
         """
         require(
             sequence.image_type == "BRIGHTNESS",
@@ -107,12 +107,11 @@ class TrackedImages:
             spacing = _pixel_spacing(matrices[0], path)
             # All images of the recording show more of the field than the few that are fitted
             every = _as_uint8(spread_images(sequence.images))
-            is_inverted = look_inverted(every)
             if field is None:
-                field = _located_field(sequence, images, every, spacing, probe, beam)
-                if probe is not None and not is_inverted:
+                field = _located_field(sequence, every, spacing, probe, beam)
+                if probe is not None:
                     _require_size(field, every, spacing, path)
-            finds_marks = finds_marks and sequence.is_recorded and not is_inverted
+            finds_marks = finds_marks and sequence.is_recorded
             seen = visible_part(every, field.mask, sequence.coloured, finds_marks=finds_marks)
             require(bool(seen.any()), "nothing of the probe's field is seen in the images")
             for number, image in zip(kept, images, strict=True):
@@ -228,7 +227,6 @@ def _pixel_spacing(image_to_world: np.ndarray, path: str) -> tuple[float, float]
 def _located_field(
     sequence: TrackedSequence,
     images: np.ndarray,
-    every: np.ndarray,
     spacing: tuple[float, float],
     probe: Probe | None,
     beam: Probe | None,
@@ -237,19 +235,7 @@ def _located_field(
         shared = {field.name for field in fields(Probe)}
         known = {} if beam is None else {name: v for name, v in beam.to_dict().items() if name in shared}
         _log.info("no probe is given: its geometry is looked for in the images, the rest is the preset's")
-        try:
-            return estimate_field(every, spacing, **known)
-        except SimulationError as error:
-            if len(every) == len(images):
-                raise
-            of_all = error
-            _log.info(
-                "all images together show no probe's field, as where the depth changes: only the chosen ones count"
-            )
-            try:
-                return estimate_field(images, spacing, **known)
-            except SimulationError:
-                raise of_all from None
+        return estimate_field(images, spacing, **known)
     if all("ImageToProbe" in entry for entry in sequence.transforms):
         image_to_probe = np.array(sequence.transforms[0]["ImageToProbe"])
         if _is_upright(image_to_probe, spacing):
@@ -258,10 +244,10 @@ def _located_field(
             return ImagedField.of(probe, image_to_probe, images.shape[1:])
     _log.info("the probe's place is looked for in the images: no ImageToProbe in the probe's own frame")
     try:
-        found = estimate_field(every, spacing)
+        found = estimate_field(images, spacing)
     except SimulationError as error:
         _log.info("%s; the given probe's field is placed where it covers them best", error)
-        return place_field(every, spacing, probe)
+        return place_field(images, spacing, probe)
     kinds = found.probe.to_dict()["kind"], probe.to_dict()["kind"]
     require(
         kinds[0] == kinds[1] or {"convex", "phased"} == set(kinds),

@@ -33,8 +33,6 @@ SEQUENCE_SUFFIXES = (".igs.mha", ".seq.mha", ".mha", ".seq.nrrd", ".nrrd")
 _FRAME_FIELD = re.compile(r"Seq_Frame(\d+)_(.+)")
 #: Field of sequences whose images are simulated
 SIMULATED = "SlicerUSSimSimulated"
-#: Field of those of `ussim sweep` of earlier versions
-_SIMULATED_BEFORE = "ussim_made_by"
 #: Field of sequences whose images are slices of a 3D ultrasound volume
 _CUT = "SlicerUSSimCutFromVolume"
 _ORIENTATION, _TYPE = "UltrasoundImageOrientation", "UltrasoundImageType"
@@ -51,13 +49,8 @@ _NOT_OURS = (
 )  # fmt: skip
 #: Difference of the components of a pixel, grey levels, from which on it has a colour; below are codecs
 _COLOURED = 24
-#: Grey levels from which on colours can be told, and spread of colours of an even tint
-_BRIGHT, _TINTED = 40, 4
-#: Of what is bright: more with a colour at its level is a colour map, whose curve holds for at least as many
-_MOST_COLOURED, _ON_CURVE = 0.5, 0.8
-#: Least part of all pixels at a grey level that counts in a colour map; largest step of a colour from such a level to
-#: the next, and how much more per level: red makes a third of a grey level
-_COMMON, _JUMP, _SLOPE = 1e-4, 48, 3
+#: Grey levels from which on colours can be told; more of what is bright with a colour is a tint
+_BRIGHT, _MOST_COLOURED = 40, 0.5
 _OPPOSITE = {"M": "U", "U": "M", "F": "N", "N": "F"}
 
 
@@ -124,7 +117,7 @@ class TrackedSequence:
     @property
     def is_simulated(self) -> bool:
         """Whether its images say that this package simulated them, as a twin's and those of `ussim sweep` do."""
-        return not self.fields.keys().isdisjoint((SIMULATED, _SIMULATED_BEFORE))
+        return SIMULATED in self.fields
 
     @property
     def is_recorded(self) -> bool:
@@ -496,47 +489,19 @@ def _as_images(array: np.ndarray, components: int, source: str) -> _Pixels:
 
 
 def _are_coloured(colours: np.ndarray, grey: np.ndarray, source: str) -> np.ndarray:
-    """[...] bool, pixels of [..., 3] colours that are no grey, or where all are tinted, not of the colour map.
+    """[...] bool, pixels of [..., 3] colours that are no grey; none where most are, as of a scanner's tint.
 
-    A colour map gives each grey level one colour, so that nearly all pixels lie on one curve; Doppler's do not. That
-    there is one is logged as a warning.
+    A tint is logged as a warning.
     """
     is_coloured = colours.max(axis=-1).astype(int) - colours.min(axis=-1) > _COLOURED
-    if colours.dtype != np.uint8 or not is_coloured.any():
+    is_bright = grey > _BRIGHT
+    if not is_coloured.any() or is_coloured[is_bright].mean() <= _MOST_COLOURED:
         return is_coloured
-    is_bright = grey > _BRIGHT
-    for curve in _colour_maps(colours, grey):
-        if float((np.ptp(curve, axis=1)[grey[is_bright]] > _TINTED).mean()) <= _MOST_COLOURED:
-            continue
-        is_off = np.abs(colours - curve[grey]).max(axis=-1) > _COLOURED
-        on_curve = 1.0 - float(is_off[is_bright].mean())
-        if on_curve >= _ON_CURVE:
-            _log.warning(
-                "%s: the images are tinted: %.0f %% of what is bright has the colours of one colour map, of which the "
-                "luminance is taken for the grey level", source, 100.0 * on_curve,
-            )  # fmt: skip
-            return is_off
-    return is_coloured
-
-
-def _colour_maps(colours: np.ndarray, grey: np.ndarray) -> Iterable[np.ndarray]:
-    """(256, 3) int each, what may be the colours of the grey levels: multiples of the commonest hue, then any curve
-    from black on that has no jump."""
-    is_bright = grey > _BRIGHT
-    if not is_bright.any():
-        return
-    hue = np.median(colours[is_bright] / grey[is_bright][:, None], axis=0)
-    yield np.clip(np.outer(np.arange(256), hue), 0, 255).round().astype(int)
-    levels = 256 * grey.ravel().astype(np.intp)
-    curve, number = np.zeros((256, 3), int), np.bincount(grey.ravel(), minlength=256)
-    for channel in range(3):
-        counts = np.bincount(levels + colours[..., channel].ravel(), minlength=256 * 256).reshape(256, 256)
-        curve[:, channel] = (2 * counts.cumsum(axis=1) >= number[:, None]).argmax(axis=1)
-    common = np.flatnonzero(number >= _COMMON * number.sum())
-    if not len(common) or curve[common[0]].max() > _COLOURED:
-        return
-    if (np.abs(np.diff(curve[common], axis=0)).max(axis=1) <= _JUMP + _SLOPE * np.diff(common)).all():
-        yield curve
+    _log.warning(
+        "%s: the images are tinted: %.0f %% of what is bright has colours; their luminance is taken for the grey level",
+        source, 100.0 * is_coloured[is_bright].mean(),
+    )  # fmt: skip
+    return np.zeros_like(is_coloured)
 
 
 # ---- formats ---------------------------------------------------------------------------------------------------------

@@ -14,8 +14,6 @@ reported by an ErrorEvent with one line, and by GetErrorMessage; the output is t
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable
-from dataclasses import asdict
 
 import numpy as np
 from vtkmodules.util.vtkAlgorithm import VTKPythonAlgorithmBase
@@ -46,9 +44,8 @@ from SlicerUSSim.Logic.mri.sheets.polydata import placed_surfels
 from SlicerUSSim.Logic.probe.arrays import Probe
 from SlicerUSSim.Logic.probe.image_grid import ImageGrid
 from SlicerUSSim.Logic.probe.shape import outline_polydata
-from SlicerUSSim.Logic.tissue.label_findings import NoPatientError
 from SlicerUSSim.Logic.tissue.label_maps import read_label_map
-from SlicerUSSim.Logic.tissue.surfels import KINDS, Surfels
+from SlicerUSSim.Logic.tissue.surfels import Surfels
 from SlicerUSSim.Logic.tissue.table import MAX_LABEL, TissueTable
 from SlicerUSSim.Logic.tissue.texture import Texture
 
@@ -60,10 +57,10 @@ _WHOLE_EXTENT = vtkStreamingDemandDrivenPipeline.WHOLE_EXTENT
 TISSUE_NAMES = "TissueNames"
 #: Options of the command in messages of the segmentation, and what the filter has for them
 _METHODS = (
-    ("--skull-strip none", "SetSkullStrip('none')"), ("--skull-strip auto", "SetSkullStrip('auto')"),
-    ("--skull-strip", "SetSkullStrip"), ("--mask", "SetMaskData"), ("--add tumour=FILE", "AddTissueData"),
-    ("--add", "AddTissueData"), ("--ct (contrast ct)", "SetContrast('ct')"), ("--contrast", "SetContrast"),
-    ("--ct", "SetContrast('ct')"),
+    ("--mask", "SetMaskData"), ("--add tumour=FILE", "AddTissueData"), ("--add", "AddTissueData"),
+    ("--ct (contrast ct)", "contrast='ct'"), ("--ct", "contrast='ct'"), ("--contrast", "contrast"),
+    ("--skull-strip none", "skull_strip='none'"), ("--skull-strip auto", "skull_strip='auto'"),
+    ("--skull-strip", "skull_strip"),
 )  # fmt: skip
 
 
@@ -143,7 +140,7 @@ class SegmentationFilter(_ImageFilter):
 
     def __init__(self) -> None:
         super().__init__(nInputPorts=2)
-        self._values = asdict(SegmentationSettings())
+        self._settings = SegmentationSettings()
         self._segmentation: Segmentation | CtSegmentation | None = None
         self._others: dict[str, vtkImageData] = {}
         self._added: tuple[tuple[str, vtkImageData], ...] = ()
@@ -151,40 +148,8 @@ class SegmentationFilter(_ImageFilter):
         self._warnings: tuple[str, ...] = ()
 
     def SetSettings(self, settings: SegmentationSettings) -> None:
-        """All values at once."""
-        self._change("_values", asdict(settings))
-
-    def SetClasses(self, classes: int | None) -> None:
-        """Number of tissues to distinguish by intensity; None: by the contrast."""
-        self._set("classes", classes)
-
-    def SetContrast(self, contrast: str) -> None:
-        """ "t1", "t1gd", "t2" or "flair" of an MRI; "ct": a CT."""
-        self._set("contrast", contrast)
-
-    def SetFilterRadius(self, voxels: int) -> None:
-        """Radius of the guided filter in voxels; 0 disables it."""
-        self._set("filter_radius", voxels)
-
-    def SetFilterEpsilon(self, epsilon: float | None) -> None:
-        """Strength of the guided filter, squared intensity; None: from the noise in the image."""
-        self._set("filter_epsilon", epsilon)
-
-    def SetBiasCorrection(self, on: bool | None) -> None:
-        """Remove the bias field, for scans with an intensity gradient; None: decided from the image."""
-        self._set("bias_correction", None if on is None else bool(on))
-
-    def SetThinSulci(self, on: bool) -> None:
-        """Label sulci too narrow to reach CSF intensity as leptomeninges."""
-        self._set("thin_sulci", bool(on))
-
-    def SetOutside(self, on: bool) -> None:
-        """Also label skin, scalp, skull, its marrow and air in the T1 of a whole head."""
-        self._set("outside", bool(on))
-
-    def SetSkullStrip(self, method: str) -> None:
-        """How the brain is found in a whole head without a mask: "auto", "robex", "deepbet", "atlas" or "none"."""
-        self._set("skull_strip", method)
+        """What is segmented and how; default: SegmentationSettings()."""
+        self._change("_settings", settings)
 
     def SetOtherData(self, contrast: str, image: vtkImageData | None) -> None:
         """Another MRI of the same patient, on any grid, to classify together with the first; None removes it.
@@ -213,12 +178,8 @@ class SegmentationFilter(_ImageFilter):
         """What should be checked after the last update, one line each."""
         return self._warnings
 
-    def SetMaskConnection(self, port) -> None:
-        """Set the output port that provides the mask: an image on the MRI's grid, non-zero inside."""
-        self.SetInputConnection(1, port)
-
     def SetMaskData(self, mask: vtkImageData | None) -> None:
-        """Set the mask image directly."""
+        """A mask of the brain or patient on the MRI's grid, non-zero inside; or SetInputConnection(1, port)."""
         self.SetInputDataObject(1, mask)
 
     def GetSegmentation(self) -> Segmentation | CtSegmentation | None:
@@ -242,11 +203,10 @@ class SegmentationFilter(_ImageFilter):
     def RequestData(self, request, inInfo, outInfo):  # noqa: N803
         self._segmentation, self._notes, self._warnings = None, (), ()
         mri = vtkImageData.GetData(inInfo[0])
-        self._require_no_lesion(Volume.from_vtk(mri))
         masked = inInfo[1].GetNumberOfInformationObjects() > 0
         masks = [(tissue, Volume.from_vtk(image), f"the mask of {tissue}") for tissue, image in self._added]
         image, mask = Volume.from_vtk(mri), Volume.from_vtk(vtkImageData.GetData(inInfo[1])) if masked else None
-        settings, others = SegmentationSettings(**self._values), self._others.items()
+        settings, others = self._settings, self._others.items()
         is_of_brain = has_brain_mask(settings.contrast)
         skull_strip = settings.skull_strip if is_of_brain else "none"
         require_addable(image, masks, mask=mask, skull_strip=skull_strip)
@@ -266,21 +226,6 @@ class SegmentationFilter(_ImageFilter):
 
     def _fail(self, message: str) -> None:
         super()._fail(_by_methods(message))
-
-    def _require_no_lesion(self, image: Volume) -> None:
-        """Raise SimulationError for a mask or a lesion's labels in place of the MRI, with what takes them."""
-        if self._values["skull_strip"] == "none" or not image.looks_like_labels():
-            return
-        try:
-            read_label_map(image, source="the MRI")
-        except NoPatientError:
-            raise
-        except SimulationError:  # the segmentation says what it is
-            return
-
-    def _set(self, name: str, value) -> None:
-        """Keep a value, which the next update checks."""
-        self._change("_values", {**self._values, name: value})
 
     def _report(self, share: float) -> None:
         self.UpdateProgress(share)
@@ -337,8 +282,7 @@ class UltrasoundSimulationFilter(_ImageFilter):
         self._frame: Frame | None = None
         self._read: tuple[tuple, tuple[Volume, TissueTable]] | None = None  # labels without names, and their version
         self._sheets_data: vtkPolyData | None = None
-        self._sheet_kinds: tuple[str, ...] = KINDS
-        self._sheets: tuple[tuple, Surfels] | None = None  # with the version of their surface, and their kinds
+        self._sheets: tuple[tuple, Surfels] | None = None  # with the version of their surface
         self._placed_outline = vtkTransformPolyDataFilter()
         self._placed_outline.SetInputData(outline_polydata(self._probe))
         self._placed_outline.SetTransform(self._probe_transform)
@@ -400,10 +344,6 @@ class UltrasoundSimulationFilter(_ImageFilter):
         """
         self._change("_sheets_data", surface)
 
-    def SetSheetKinds(self, kinds: Iterable[str]) -> None:
-        """The kinds of sheets (surfels.KINDS) that are drawn; default: all. Another kind is an error of the update."""
-        self._change("_sheet_kinds", (kinds,) if isinstance(kinds, str) else tuple(kinds))
-
     def SetFieldAlpha(self, on: bool) -> None:
         """Add an alpha component to the image, 255 in the imaged field and 0 outside, for overlays; default off."""
         self._change("_field_alpha", bool(on))
@@ -435,7 +375,7 @@ class UltrasoundSimulationFilter(_ImageFilter):
     def RequestData(self, request, inInfo, outInfo):  # noqa: N803
         self._frame = None
         labels = vtkImageData.GetData(inInfo[0])
-        (volume, tissues), sheets = self._patient(labels), self._chosen_sheets()
+        (volume, tissues), sheets = self._patient(labels), self._read_sheets()
         tissues = with_their_tissue(tissues, sheets, self._tissues)
         simulator = self._simulator.get(
             labels.GetMTime(), volume, tissues, self._settings, self._device, self._texture, sheets
@@ -477,13 +417,13 @@ class UltrasoundSimulationFilter(_ImageFilter):
             _log.warning("%s", warning)
         return found.labels, found.tissues
 
-    def _chosen_sheets(self) -> Surfels | None:
-        """The sheets of the kinds that are drawn; the same object as long as the surface is the same."""
+    def _read_sheets(self) -> Surfels | None:
+        """The sheets; the same object as long as the surface is the same."""
         if self._sheets_data is None:
             return None
-        key = (self._sheets_data, self._sheets_data.GetMTime(), self._sheet_kinds)
+        key = (self._sheets_data, self._sheets_data.GetMTime())
         if self._sheets is None or self._sheets[0] != key:
-            self._sheets = key, placed_surfels(self._sheets_data, "sheets").of_kind(*self._sheet_kinds)
+            self._sheets = key, placed_surfels(self._sheets_data, "sheets")
         return self._sheets[1]
 
     def _pose(self) -> np.ndarray:
