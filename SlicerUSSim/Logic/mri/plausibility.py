@@ -7,9 +7,9 @@ from scipy import ndimage
 
 from SlicerUSSim.Logic.base.errors import require
 from SlicerUSSim.Logic.base.volume import Volume
-from SlicerUSSim.Logic.mri.atlas_registration import WHOLE_BRAIN_ML
 from SlicerUSSim.Logic.mri.classification import EXPECTED_SHARES, FAINT, ORDERS, Classes
 from SlicerUSSim.Logic.mri.mixture import TISSUES
+from SlicerUSSim.Logic.mri.recognition import POSSIBLE_ML
 
 #: Smallest extent of a whole brain along any axis of the image, mm
 _LEAST_EXTENT_MM = 90.0
@@ -34,8 +34,8 @@ _ENHANCED, _ENHANCED_ML = 1.5, 2.0
 def is_whole_brain(image: Volume, inside: np.ndarray) -> str:
     """Empty for a mask (k, j, i) of the size of a whole brain, otherwise what is wrong with it."""
     millilitres = float(inside.sum() * image.voxel_ml)
-    if not WHOLE_BRAIN_ML[0] <= millilitres <= WHOLE_BRAIN_ML[1]:
-        low, high = WHOLE_BRAIN_ML
+    if not POSSIBLE_ML[0] <= millilitres <= POSSIBLE_ML[1]:
+        low, high = POSSIBLE_ML
         return f"the brain has {millilitres:.0f} ml, expected {low:.0f} to {high:.0f}"
     places = (
         np.argwhere(inside.any(axis=(1, 2))),

@@ -238,12 +238,9 @@ def segment_mri(
         named = _called(name, other)
         with about_other_file(named):
             _require_intensities(other, named)
-            image, message, doubts_of_it = aligned(
-                other.with_array(finite(other)).along(), images[0], foreground, named
-            )
+            image, message = aligned(other.with_array(finite(other)).along(), images[0], foreground, named)
         images.append(image)
         notes.append(message)
-        warnings += doubts_of_it
         voxel_mm = float(other.spacing_mm.max())
         if voxel_mm > max(_THICK_SLICE_MM, thickest_mm):
             warnings.append(

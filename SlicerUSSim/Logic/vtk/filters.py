@@ -36,7 +36,6 @@ from SlicerUSSim.Logic.imaging.frame import Frame
 from SlicerUSSim.Logic.imaging.noise import seed_of_pose
 from SlicerUSSim.Logic.imaging.preset import Preset
 from SlicerUSSim.Logic.imaging.reuse import ReusedSimulator
-from SlicerUSSim.Logic.mri.addable import require_addable
 from SlicerUSSim.Logic.mri.ct import CtSegmentation
 from SlicerUSSim.Logic.mri.modality import has_brain_mask, segment_image
 from SlicerUSSim.Logic.mri.pathology import add_tissues
@@ -60,7 +59,7 @@ _WHOLE_EXTENT = vtkStreamingDemandDrivenPipeline.WHOLE_EXTENT
 TISSUE_NAMES = "TissueNames"
 #: Options of the command in messages of the segmentation, and what the filter has for them
 _METHODS = (
-    ("--skull-strip none", "SetSkullStrip('none')"), ("--skull-strip auto", "SetSkullStrip('auto')"),
+    ("--skull-strip none", "SetSkullStrip('none')"),
     ("--skull-strip", "SetSkullStrip"), ("--mask", "SetMaskData"), ("--add tumour=FILE", "AddTissueData"),
     ("--add", "AddTissueData"), ("--ct (contrast ct)", "SetContrast('ct')"), ("--contrast", "SetContrast"),
     ("--ct", "SetContrast('ct')"),
@@ -183,7 +182,7 @@ class SegmentationFilter(_ImageFilter):
         self._set("outside", bool(on))
 
     def SetSkullStrip(self, method: str) -> None:
-        """How the brain is found in a whole head without a mask: "auto", "robex", "deepbet", "atlas" or "none"."""
+        """How the brain is found in a whole head without a mask: "atlas" or "none"."""
         self._set("skull_strip", method)
 
     def SetOtherData(self, contrast: str, image: vtkImageData | None) -> None:
@@ -248,8 +247,6 @@ class SegmentationFilter(_ImageFilter):
         image, mask = Volume.from_vtk(mri), Volume.from_vtk(vtkImageData.GetData(inInfo[1])) if masked else None
         settings, others = SegmentationSettings(**self._values), self._others.items()
         is_of_brain = has_brain_mask(settings.contrast)
-        skull_strip = settings.skull_strip if is_of_brain else "none"
-        require_addable(image, masks, mask=mask, skull_strip=skull_strip)
         found = segment_image(
             image, settings, others={name: Volume.from_vtk(other) for name, other in others}, mask=mask,
             device=self._device, progress=self._report,

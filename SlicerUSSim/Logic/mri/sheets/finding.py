@@ -22,7 +22,6 @@ from SlicerUSSim.Logic.mri.coarse import components, largest_component
 from SlicerUSSim.Logic.mri.refinement import closed, on_grid
 from SlicerUSSim.Logic.mri.segmentation import Segmentation
 from SlicerUSSim.Logic.mri.sheets.falx import falx
-from SlicerUSSim.Logic.mri.sheets.falx_of_part import falx_of_part
 from SlicerUSSim.Logic.mri.sheets.head import Head, require_contrast
 from SlicerUSSim.Logic.mri.sheets.kept import keep_sheets, key_of, read_kept_sheets
 from SlicerUSSim.Logic.mri.sheets.regions import lateral_ventricles_of_atlas, ventricles
@@ -40,7 +39,7 @@ ALL_KINDS = (*KINDS, *STRUCTURES)
 #: Those that only contrast agent shows
 _ENHANCING = ("choroid plexus", "vessels")
 #: Those that are found without an atlas, in a part of a brain
-_WITHOUT_ATLAS = ("sulcus", "falx", "ependyma")
+_WITHOUT_ATLAS = ("sulcus", "ependyma")
 #: A sulcus this near to the falx or the tentorium and as parallel to it is the fissure in which that lies, mm
 _SAME_MM, _SAME_COSINE = 2.0, 0.7
 #: About how long each step takes
@@ -85,7 +84,7 @@ def find_sheets(
     ----------
     mri : the image from which `segmentation` was made.
     segmentation : led by the atlas. Without, as of a part of a brain, only sulci and walls of wide deep fluid are
-        found, and a falx that stands out of the sulci (falx_of_part.py).
+        found.
     contrast : of the MRI: "t1", "t1gd" or "t2".
     kinds : what is looked for, of ALL_KINDS. Without contrast agent no vessels and no choroid plexus are found.
     keep_at : file in which they are kept and from which they are read again; see kept.sheets_beside.
@@ -109,17 +108,17 @@ def find_sheets(
     key = key_of(mri, segmentation, contrast) if keep_at is not None else ""
     kept = read_kept_sheets(keep_at, key, wanted) if keep_at is not None else None
     if kept is not None:
-        surfels, array, place = kept
+        surfels, array = kept
         array = np.where(np.isin(array, labels_of(STRUCTURES, wanted)), array, 0)
         structures = Volume(array.astype(np.uint8), mri.ijk_to_ras, label_names=dict(enumerate(STRUCTURES, 1)))
-        surfels, first = surfels.of_kind(*(set(KINDS) & set(wanted))), f"the sheets are those kept in {place}"
+        surfels, first = surfels.of_kind(*(set(KINDS) & set(wanted))), f"the sheets are those kept in {keep_at}"
     else:
         surfels, structures = _found(Head.of(mri, segmentation, contrast), mri, wanted, report)
         first = keep_sheets(keep_at, key, wanted, surfels, structures.array) if keep_at is not None else ""
     notes += [first] if first else []
     if contrast != "t1gd" and set(_ENHANCING) & set(wanted):
         notes.append("no vessels and no choroid plexus are looked for: only a T1 with contrast agent shows them")
-    notes += _lines(surfels, structures, wanted, is_whole=segmentation.atlas is not None)
+    notes += _lines(surfels, structures, wanted)
     for line in notes:
         _log.info("%s", line)
     report(1.0)
@@ -150,24 +149,19 @@ def _found(head: Head, mri: Volume, wanted: tuple[str, ...], report: Callable[[f
     found: dict[str, Surfels] = {}
     masks: dict[str, np.ndarray] = {}
     in_ventricles = np.zeros(head.brain.shape, bool)
-    is_whole = head.registered is not None
-    by_sulci = not is_whole and "falx" in wanted
-    if {"sulcus", "ependyma", *_ENHANCING} & set(wanted) or by_sulci:
+    if {"sulcus", "ependyma", *_ENHANCING} & set(wanted):
         in_ventricles = ventricles(head)
         finished("ventricles")
-    all_sulci = Surfels.joined([])
-    if "sulcus" in wanted or by_sulci:
-        all_sulci = sulci(head, in_ventricles)
-        finished("sulcus")
     if {"falx", "tentorium", "vessels"} & set(wanted):  # the apex of the tentorium is below the falx
-        found["falx"] = falx(head) if is_whole else falx_of_part(head, all_sulci)
+        found["falx"] = falx(head)
         finished("falx")
     if {"tentorium", "vessels"} & set(wanted):
         found["tentorium"] = tentorium(head, found["falx"])
         finished("tentorium")
     dura = Surfels.joined(list(found.values()))
     if "sulcus" in wanted:
-        found["sulcus"] = _beside(all_sulci, dura.of_kind(*(set(KINDS) & set(wanted))))
+        found["sulcus"] = _beside(sulci(head, in_ventricles), dura.of_kind(*(set(KINDS) & set(wanted))))
+        finished("sulcus")
     if "ependyma" in wanted:
         found["ependyma"] = ependyma(head, in_ventricles)
         finished("ependyma")
@@ -205,28 +199,17 @@ def _labels(mri: Volume, head: Head, masks: dict[str, np.ndarray]) -> Volume:
     return Volume(labels, mri.ijk_to_ras, label_names=names)
 
 
-def _lines(surfels: Surfels, structures: Volume, wanted: tuple[str, ...], *, is_whole: bool) -> list[str]:
+def _lines(surfels: Surfels, structures: Volume, wanted: tuple[str, ...]) -> list[str]:
     lines = []
     for kind in KINDS:
         if kind in wanted:
             part = surfels.of_kind(kind)
-            lines.append(f"{kind}: {len(part)} surfels, {part.area.sum() / 100.0:.0f} cm²{_how(part, kind, is_whole)}")
+            lines.append(f"{kind}: {len(part)} surfels, {part.area.sum() / 100.0:.0f} cm²")
     for number, name in enumerate(STRUCTURES, 1):
         count = int((structures.array == number).sum())
         if name in wanted and (count or name == "corpus callosum"):
             lines.append(f"{name}: {count * structures.voxel_ml:.1f} ml")
     return lines
-
-
-def _how(found: Surfels, kind: str, is_whole: bool) -> str:
-    """What a user should know about a falx that no atlas leads."""
-    if kind != "falx" or is_whole:
-        return ""
-    if not len(found):
-        return ", since no straight sulcus is as deep as the fissure between the hemispheres"
-    return (
-        ", without an atlas, by the straight sulcus that is as deep as the fissure between the hemispheres: look at it"
-    )
 
 
 # ---- walls of the ventricles: where the fluid in them ends, between voxels -------------------------------------------

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -21,7 +20,7 @@ from SlicerUSSim.Logic.mri.segmentation import Segmentation
 #: nearest of these stays as it is
 _FINEST_MM, _COARSEST_MM, _NEAR = 0.8, 1.0, 0.15
 #: Along each axis of that grid
-LEAST_VOXELS = 3
+_LEAST_VOXELS = 3
 #: Around the brain
 _MARGIN_MM = 10.0
 #: Across which sulci are closed, so that depth is counted from the hull of the brain
@@ -83,21 +82,10 @@ class Head:
         inside = mask.array > 0
         image = part.with_array(np.float32(sign) * _without_field(part, corrected.array, inside))
         noise = float(segmentation.standard_deviations[names.index("white matter")])
-        return replace(cls.of_part(image, inside, means, noise, contrast == "t1gd"), registered=segmentation.atlas)
-
-    @classmethod
-    def of_part(
-        cls, image: Volume, brain: np.ndarray, means: Sequence[float], noise: float, is_enhanced: bool
-    ) -> Head:  # fmt: skip
-        """The head in which an atlas does not lead: `image` without bias field, (k, j, i) bool `brain` on its grid.
-
-        `means` are those of CSF, grey and white matter, which rise.
-        """
-        csf, grey, white = map(float, means)
         grid = _working_grid(image)
         if grid is not image:
-            brain = on_grid(image.with_array(brain.astype(np.float32)), grid) > 0.5
-        return cls(grid, brain, csf, grey, white, noise, is_enhanced, None)
+            inside = on_grid(image.with_array(inside.astype(np.float32)), grid) > 0.5
+        return cls(grid, inside, *means, noise, contrast == "t1gd", segmentation.atlas)
 
     @property
     def atlas(self) -> AtlasFit:
@@ -139,9 +127,9 @@ class Head:
         n = 2 * int(radius) + 2
         thinnest = min(self.brain.shape)
         require(
-            thinnest >= LEAST_VOXELS,
+            thinnest >= _LEAST_VOXELS,
             f"the image is {thinnest} voxels of {self.image.spacing_mm.min():.2g} mm thick, expected at least "
-            f"{LEAST_VOXELS} to find sheets in it",
+            f"{_LEAST_VOXELS} to find sheets in it",
         )
         # On another grid than the image's, the outermost voxels are outside.
         inner = self.brain[1:-1, 1:-1, 1:-1]
