@@ -12,7 +12,7 @@ from scipy import ndimage
 from scipy.spatial.transform import Rotation
 
 from SlicerUSSim.Command.cli import main
-from SlicerUSSim.Logic import SimulationError, Volume, segment_mri
+from SlicerUSSim.Logic import SimulationError, Volume
 from SlicerUSSim.Logic.base.errors import Cancelled
 from SlicerUSSim.Logic.mri import alignment, atlas, kept_mask, recognition, refinement
 from SlicerUSSim.Logic.mri.alignment import Alignment, align_template
@@ -152,14 +152,6 @@ def test_a_blank_within_the_image_has_data():
     assert blank[radius > 1.1].all() and not blank[radius < 0.9].any()
 
 
-@needs_nilearn
-@pytest.mark.slow
-def test_a_turned_head_is_used_with_a_warning(head):
-    turned = Volume(np.ascontiguousarray(np.swapaxes(head[0].array, 0, 1)), head[0].ijk_to_ras)
-    (line,) = segment_mri(turned).warnings
-    assert "check the orientation and the voxel size in its header" in line
-
-
 def test_none_takes_everything_brighter_than_the_background():
     empty, radius = ellipsoid((60, 80, 65))
     values = np.where(radius < 1, 100.0, 0.0) + np.random.default_rng(0).normal(0, 3, radius.shape)
@@ -271,16 +263,6 @@ def test_an_edited_kept_mask_is_used_and_checked_as_one_that_is_given(head, tmp_
 # ---- masks that are given, and lesions -------------------------------------------------------------------------------
 
 
-def test_masks_empty_on_another_grid_or_of_everything_are_refused():
-    mri = head_mri(4.0)
-    with pytest.raises(SimulationError, match="mask is empty"):
-        given_brain(mri.with_array(np.zeros(mri.array.shape, np.uint8)), mri)
-    with pytest.raises(SimulationError, match="expected the same grid"):
-        given_brain(head_mri(3.0), mri)
-    with pytest.raises(SimulationError, match=r"covers 100% of the image"):
-        given_brain(mri.with_array(np.ones(mri.array.shape, np.uint8)), mri)
-
-
 def test_several_labels_in_a_mask_are_reported(head):
     mri, brain = head
     labels = brain * np.where(np.arange(brain.shape[2]) < 40, 1, 2)
@@ -344,74 +326,6 @@ def test_errors_about_a_mask_name_its_file_and_count_voxels_as_viewers_do(tmp_pa
         given_brain(Volume.read(tmp_path / "small.nii.gz"), mri)
     with pytest.raises(SimulationError, match=r"empty.nii.gz is empty, expected"):
         given_brain(Volume.read(tmp_path / "empty.nii.gz"), mri)
-
-
-# ---- DICOM -----------------------------------------------------------------------------------------------------------
-
-
-def write_series(folder, count, uid, number, description, skip=(), tilt=0.0, patient="1", first_patient="1"):
-    folder.mkdir(exist_ok=True)
-    rng = np.random.default_rng(int(number))
-    voxels = rng.integers(0, 1000, (count, 12, 10)).astype(np.int16)
-    writer = sitk.ImageFileWriter()
-    writer.KeepOriginalImageUIDOn()
-    for k in range(count):
-        if k in skip:
-            continue
-        image = sitk.GetImageFromArray(voxels[k])
-        image.SetSpacing((1.5, 1.5))
-        tags = {
-            "0008|0060": "MR", "0020|000d": "1.2.3", "0020|000e": uid, "0008|0018": f"{uid}.{k + 1}",
-            "0008|0016": "1.2.840.10008.5.1.4.1.1.4", "0020|0011": number, "0020|0013": str(k + 1),
-            "0008|103e": description, "0020|0037": "1\\0\\0\\0\\1\\0", "0020|0032": f"0\\{tilt * k}\\{2.0 * k}",
-            "0018|0050": "2", "0010|0020": patient if k else first_patient,
-        }  # fmt: skip
-        for key, value in tags.items():
-            image.SetMetaData(key, value)
-        writer.SetFileName(str(folder / f"s{number}_{k:03d}.dcm"))
-        writer.Execute(image)
-    return voxels
-
-
-def test_the_only_volume_of_a_dicom_folder_is_read_and_reported(tmp_path, caplog):
-    voxels = write_series(tmp_path / "d", 14, "1.2.3.5", "5", "t1 mprage")
-    write_series(tmp_path / "d", 3, "1.2.3.1", "1", "localizer")
-    mri = Volume.read(tmp_path / "d")
-    assert np.array_equal(mri.array, voxels)
-    assert "2 DICOM series; the only volume is read: series 5: 14 images of 10x12" in caplog.text
-    assert "mprage" not in caplog.text  # descriptions may hold names
-
-
-def test_several_volumes_are_listed_and_one_is_chosen_by_one_of_its_images(tmp_path):
-    write_series(tmp_path / "d", 12, "1.2.3.5", "5", "t1")
-    voxels = write_series(tmp_path / "d", 11, "1.2.3.6", "6", "t2")
-    with pytest.raises(SimulationError, match=r"give the path of one image.*5 't1': 12 images.*6 't2': 11 images"):
-        Volume.read(tmp_path / "d")
-    assert np.array_equal(Volume.read(tmp_path / "d" / "s6_004.dcm").array, voxels)
-
-
-def test_volumes_of_different_patients_in_one_folder_are_reported(tmp_path):
-    write_series(tmp_path / "d", 12, "1.2.3.5", "5", "t1")
-    write_series(tmp_path / "d", 11, "1.2.3.6", "6", "t2", patient="2", first_patient="2")
-    with pytest.raises(SimulationError, match="has 2 DICOM series of 2 different patients, 2 of them with 10 or more"):
-        Volume.read(tmp_path / "d")
-
-
-def test_a_missing_slice_and_a_tilted_stack_are_refused(tmp_path):
-    write_series(tmp_path / "gap", 14, "1.2.3.5", "5", "t1", skip=(6,))
-    with pytest.raises(
-        SimulationError, match="slices are missing or unevenly spaced at 1 place, first 4 mm after slice 6"
-    ):
-        Volume.read(tmp_path / "gap")
-    write_series(tmp_path / "tilt", 14, "1.2.3.5", "5", "t1", tilt=0.5)
-    with pytest.raises(SimulationError, match=r"tilted by 14\.0 degrees"):
-        Volume.read(tmp_path / "tilt")
-
-
-def test_images_of_two_patients_with_one_series_number_are_refused(tmp_path):
-    write_series(tmp_path / "mixed", 14, "1.2.3.5", "5", "t1", patient="2")
-    with pytest.raises(SimulationError, match="its images are of 2 patients by their PatientID"):
-        Volume.read(tmp_path / "mixed")
 
 
 # ---- real heads ------------------------------------------------------------------------------------------------------

@@ -69,10 +69,10 @@ def keep(path: Path, mri: Volume, mask: Volume) -> str:
     return keep_file(path, "the brain mask", write)
 
 
-def keep_file(path: Path, what: str, write: Callable[[Path], None]) -> str:
-    """Write a file to `path`, where there is none; a line that says so, or why not."""
+def keep_file(path: Path, what: str, write: Callable[[Path], None], *, replaces: bool = False) -> str:
+    """Write a file to `path`, where there is none unless it `replaces` one; a line that says so, or why not."""
     try:
-        require(not path.exists(), f"{path} exists and is of another image")
+        require(replaces or not path.exists(), f"{path} exists and is of another image")
         write(path)
     except SimulationError as error:
         return f"{what} is not kept: {error}"

@@ -69,18 +69,24 @@ def ends_at_edge(mri: Volume, inside: np.ndarray) -> tuple[str, ...]:
 
     A whole brain does not reach the edge but for the stem, however little of scalp and skull is shown.
     """
-    lines = []
+    return tuple(
+        f"the brain reaches the {name} edge of the image over {area:.0f} cm2: it is cut off there"
+        for name, area in areas_at_edges(mri, inside)
+        if area >= (_WORTH_AT_BASE_CM2 if name == "bottom" else _WORTH_CM2)
+    )
+
+
+def areas_at_edges(mri: Volume, inside: np.ndarray) -> list[tuple[str, float]]:
+    """(side of the patient, cm2 of a mask (k, j, i) at that edge of the image) of all six edges."""
+    areas = []
     for axis in range(3):
         others = [other for other in range(3) if other != axis]
         cm2 = float(np.linalg.norm(np.cross(*mri.ijk_to_ras[:3, others].T))) / 100.0
         for end in (0, -1):
-            area = float(inside.take(end, 2 - axis).sum()) * cm2
             outwards = mri.ijk_to_ras[:3, axis] * (1 if end else -1)
             main = int(np.abs(outwards).argmax())
-            name = SIDES[main][int(outwards[main] > 0)]
-            if area >= (_WORTH_AT_BASE_CM2 if name == "bottom" else _WORTH_CM2):
-                lines.append(f"the brain reaches the {name} edge of the image over {area:.0f} cm2: it is cut off there")
-    return tuple(lines)
+            areas.append((SIDES[main][int(outwards[main] > 0)], np.count_nonzero(inside.take(end, 2 - axis)) * cm2))
+    return areas
 
 
 def _frame(array: np.ndarray) -> np.ndarray:

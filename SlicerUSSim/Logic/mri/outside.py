@@ -20,6 +20,7 @@ from SlicerUSSim.Logic.base.errors import require
 from SlicerUSSim.Logic.base.neighbourhood import distance_to
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.mri.coarse import largest_component
+from SlicerUSSim.Logic.mri.no_data import areas_at_edges
 
 #: Contrasts in which bone is known to be found
 CONTRASTS = ("t1", "t1gd")
@@ -195,20 +196,13 @@ def _beside(inner: np.ndarray, fluid: np.ndarray, mm: np.ndarray) -> np.ndarray:
 
 def _cut(labels: np.ndarray, mri: Volume) -> tuple[str, ...]:
     """A line about the faces of the image at which the head ends, other than the lower one, as in a neck."""
-    lines = []
-    for axis, direction in enumerate(mri.ijk_to_ras[:3, :3].T[::-1]):
-        area = mri.voxel_ml * 10.0 / mri.spacing_mm[::-1][axis]  # cm2 of a voxel
-        for end, sign in ((0, -1.0), (-1, 1.0)):
-            along = int(np.abs(direction).argmax())
-            is_up = bool(direction[along] * sign > 0)
-            square_cm = float((np.take(labels, end, axis=axis) > 0).sum()) * area
-            if square_cm > _CUT_CM2 and (along != 2 or is_up):
-                side = (("left", "right"), ("back", "front"), ("bottom", "top"))[along][is_up]
-                lines.append(f"{side} {square_cm:.0f} cm2")
-    if not lines:
+    areas = [
+        f"{name} {cm2:.0f} cm2" for name, cm2 in areas_at_edges(mri, labels) if name != "bottom" and cm2 > _CUT_CM2
+    ]
+    if not areas:
         return ()
     return (
-        f"the image cuts the head ({', '.join(lines)}): there it has no skin, and what is missing of its skull lets a "
+        f"the image cuts the head ({', '.join(areas)}): there it has no skin, and what is missing of its skull lets a "
         "beam in; do not put a probe there",
     )
 

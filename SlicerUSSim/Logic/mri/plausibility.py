@@ -83,18 +83,6 @@ def enhancing(image: np.ndarray, inside: np.ndarray, found: Classes, voxel_ml: f
     ]
 
 
-def in_other_order(found: Classes, contrast: str) -> list[str]:
-    """A warning where the tissues found are not in the order of the contrast."""
-    means = found.means[[found.names.index(TISSUES[tissue]) for tissue in ORDERS[contrast]], 0]
-    if (np.diff(means) > 0).all():
-        return []
-    names = ", ".join(f"{TISSUES[tissue]} {mean:.4g}" for tissue, mean in zip(ORDERS[contrast], means, strict=True))
-    return [
-        f"contrast is {contrast}, but its tissues are not in that order of brightness ({names}): check the contrast "
-        "and the brain mask"
-    ]
-
-
 def unsure(found: Classes, explained: float | None, is_led: bool) -> list[str]:
     """The warning that says how sure labels are; `explained` is alignment.explained, None where not known."""
     apart = found.grey_white_contrast

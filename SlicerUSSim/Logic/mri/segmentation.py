@@ -21,14 +21,13 @@ from SlicerUSSim.Logic.mri.evidence import Evidence
 from SlicerUSSim.Logic.mri.filtering import denoised, estimate_noise as estimate_noise
 from SlicerUSSim.Logic.mri.nuclei import with_nuclei
 from SlicerUSSim.Logic.mri.outside import find_outside, require_findable, watery
-from SlicerUSSim.Logic.mri.plausibility import enhancing, require_contrast
+from SlicerUSSim.Logic.mri.plausibility import enhancing, implausible, require_contrast, unsure
 from SlicerUSSim.Logic.mri.recognition import check_intensities, require_no_ct
 from SlicerUSSim.Logic.mri.segmentation_settings import SegmentationSettings
 from SlicerUSSim.Logic.mri.segmentation_steps import (
     BrainPart,
     StepTimes,
     atlas_of,
-    doubts,
     finite,
     narrow_sulci,
     remove_fields,
@@ -290,7 +289,7 @@ def segment_mri(
     found = replace(found, posteriors=less_sure(smoothed_posteriors(found.posteriors, part.inside)))
     timed("neighbours")
     report(0.9)
-    warnings += doubts(found, part, contrasts, fits, atlas is not None)
+    warnings += implausible(found, brain.volume_ml, contrast) + unsure(found, fits, atlas is not None)
     if contrasts == ("t1",) and len(names) == 3:
         warnings += enhancing(filtered[0][0], part.inside, found, part.images[0].voxel_ml)
 

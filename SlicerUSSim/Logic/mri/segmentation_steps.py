@@ -18,12 +18,7 @@ from SlicerUSSim.Logic.mri.atlas import mni152
 from SlicerUSSim.Logic.mri.atlas_registration import AtlasFit, register_atlas
 from SlicerUSSim.Logic.mri.bias import corrected
 from SlicerUSSim.Logic.mri.classification import Classes
-from SlicerUSSim.Logic.mri.plausibility import (
-    implausible,
-    in_other_order,
-    is_whole_brain,
-    unsure,
-)
+from SlicerUSSim.Logic.mri.plausibility import is_whole_brain
 from SlicerUSSim.Logic.mri.recognition import check_finite
 
 #: Percentile of the brain that is taken for 0 where it has more than this share of negative values
@@ -146,19 +141,6 @@ def require_different(values: np.ndarray, contrasts: tuple[str, ...]) -> None:
             f"MRI is constant ({channel[0]:g}) inside the foreground, expected tissues of different intensity"
             + (f" in {name}" if len(contrasts) > 1 else ""),
         )
-
-
-def doubts(
-    found: Classes,
-    part: BrainPart,
-    contrasts: tuple[str, ...],
-    fits: float | None,
-    is_led: bool,
-) -> list[str]:
-    """What the user should check. `fits` is the share that the atlas explains, and `is_led` whether it was used."""
-    lines = in_other_order(found, contrasts[0]) if len(contrasts) == 1 else []
-    lines += implausible(found, float(part.inside.sum()) * part.images[0].voxel_ml, contrasts[0])
-    return lines + unsure(found, fits, is_led)
 
 
 def narrow_sulci(labels: np.ndarray, found: Classes, filtered: np.ndarray, noise: float) -> np.ndarray:

@@ -7,6 +7,7 @@ import logging
 import zipfile
 from dataclasses import fields
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -35,23 +36,31 @@ def key_of(mri: Volume, segmentation: Segmentation, contrast: str) -> str:
 
 def read_kept_sheets(path: Path, key: str, kinds: tuple[str, ...]) -> tuple[Surfels, np.ndarray] | None:
     """(surfels, structures) if all `kinds` are kept for this key; None if not."""
+    found = _read(path)
+    if found is None or found[0]["key"] != key or not _holds(set(found[0]["kinds"]), set(kinds)):
+        return None
+    return found[1:]
+
+
+def keep_sheets(path: Path, key: str, kinds: tuple[str, ...], surfels: Surfels, structures: np.ndarray) -> str:
+    """Write them as keep_file does, also over others that were kept; returns one line about it."""
+    head = json.dumps({"key": key, "kinds": kinds})
+    is_ours = _read(path) is not None
+    write = lambda place: _write(place, head, surfels, structures)  # noqa: E731
+    return keep_file(path, "the file of the sheets", write, replaces=is_ours)
+
+
+def _read(path: Path) -> tuple[dict[str, Any], Surfels, np.ndarray] | None:
+    """(what they depend on, surfels, structures) of a file by keep_sheets; None for another, and for none."""
     if not path.is_file():
         return None
     try:
         with np.load(path, allow_pickle=False) as file:
-            head = json.loads(str(file["ussim_sheets"]))
-            if head["key"] != key or not _holds(set(head["kinds"]), set(kinds)):
-                return None
-            return Surfels(**{entry.name: file[entry.name] for entry in fields(Surfels)}), file["structures"]
+            surfels = Surfels(**{entry.name: file[entry.name] for entry in fields(Surfels)})
+            return json.loads(str(file["ussim_sheets"])), surfels, file["structures"]
     except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile, SimulationError) as error:
         _log.info("%s: is not used as kept sheets (%s)", path, error)
     return None
-
-
-def keep_sheets(path: Path, key: str, kinds: tuple[str, ...], surfels: Surfels, structures: np.ndarray) -> str:
-    """Write them as keep_file does; returns one line about it."""
-    head = json.dumps({"key": key, "kinds": kinds})
-    return keep_file(path, "the file of the sheets", lambda place: _write(place, head, surfels, structures))
 
 
 def _write(path: Path, head: str, surfels: Surfels, structures: np.ndarray) -> None:
