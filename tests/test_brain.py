@@ -18,8 +18,8 @@ from SlicerUSSim.Logic.mri import alignment, atlas, kept_mask, recognition, refi
 from SlicerUSSim.Logic.mri.alignment import Alignment, align_template
 from SlicerUSSim.Logic.mri.atlas import mni152
 from SlicerUSSim.Logic.mri.brain import BrainMask, find_brain, given_brain
+from SlicerUSSim.Logic.mri.edges import ends_at_edge
 from SlicerUSSim.Logic.mri.kept_mask import mask_beside
-from SlicerUSSim.Logic.mri.no_data import ends_at_edge, no_data, without_blank
 from SlicerUSSim.Logic.mri.recognition import recognise
 from SlicerUSSim.Logic.mri.samples import head_mri
 from tests.conftest import SHARED, needs_shared
@@ -125,31 +125,6 @@ def test_what_is_no_mri_is_reported(change, message):
     with pytest.raises(SimulationError) as caught:
         find_brain(mri.with_array(change(mri.array)))
     assert message in str(caught.value) and "\n" not in str(caught.value)
-
-
-@pytest.mark.long
-@needs_nilearn
-def test_voxels_without_data_are_left_out_with_a_warning(head, found):
-    (mri, _), value = head, -3.0
-    inside = found.result.mask.array > 0
-    array = mri.array.copy()
-    array[: np.argwhere(inside)[:, 0].min() + 12] = value  # as in an image padded below
-    brain, lines = without_blank(mri.with_array(array), inside)
-    assert not brain[array == value].any() and (brain == inside)[array != value].all()
-    lost = (inside & (array == value)).sum() * mri.voxel_ml
-    assert len(lines) == 1 and f"{lost:.0f} ml where the brain should be have no data" in lines[0]
-    assert lines[0].endswith("cut off at its bottom")
-    assert without_blank(mri, inside) == (inside, ())
-
-
-def test_a_blank_within_the_image_has_data():
-    """Dark CSF and bone may have the background's value, but do not reach the edge without a gap."""
-    empty, radius = ellipsoid((70, 90, 70), spacing=2.0)
-    array = np.where(radius < 1, 100.0, 0.0)
-    array[radius < 0.3] = 0.0
-    array[:, :, radius.shape[2] // 2][radius[:, :, radius.shape[2] // 2] < 1] = 0.0  # a slit to the edge
-    blank = no_data(empty.with_array(array))
-    assert blank[radius > 1.1].all() and not blank[radius < 0.9].any()
 
 
 def test_none_takes_everything_brighter_than_the_background():

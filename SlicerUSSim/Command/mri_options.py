@@ -94,7 +94,7 @@ class ImageOptions(MriOptions):
         "--craniotomy", default=NONE, show_default=True, metavar="none|auto|disc:MM|FILE",
         help="Opening in skin and skull of a whole head (a label map with them, or an MRI with segmentation.outside), "
         "filled with the coupling medium: a disc of this diameter under the probe, auto (as wide as the probe's face "
-        "needs), the mask in FILE, or the polygon through points of 3D Slicer (.mrk.json, .fcsv). With --pose auto the "
+        "needs), the mask in FILE, or the polygon through points of 3D Slicer (.mrk.json). With --pose auto the "
         "probe then stands on the brain.",
     )  # fmt: skip
     #: A file, auto or none

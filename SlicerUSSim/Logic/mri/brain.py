@@ -13,9 +13,9 @@ from SlicerUSSim.Logic.base.declaration import parameter_of
 from SlicerUSSim.Logic.base.errors import SimulationError, require
 from SlicerUSSim.Logic.base.volume import LARGEST_MM, Volume
 from SlicerUSSim.Logic.mri.alignment import Alignment
+from SlicerUSSim.Logic.mri.edges import ends_at_edge
 from SlicerUSSim.Logic.mri.given_mask import checked_mask, label_doubts, volume_doubts
 from SlicerUSSim.Logic.mri.kept_mask import keep, read_kept
-from SlicerUSSim.Logic.mri.no_data import ends_at_edge, without_blank
 from SlicerUSSim.Logic.mri.recognition import POSSIBLE_ML, USUAL_ML, above_noise, recognise
 from SlicerUSSim.Logic.mri.refinement import refined
 from SlicerUSSim.Logic.mri.segmentation_settings import SegmentationSettings
@@ -80,7 +80,7 @@ def find_brain(
     if not isinstance(shown, Alignment):
         return _found(given, mri.with_array(shown).along(given).array, "stripped", "skull-stripped brain")
     distance = shown.brain_on(mri)
-    inside, blank = without_blank(mri, refined(mri, distance, core_mm=8.0, reach_mm=12.0, keep_mm=3.0))
+    inside = refined(mri, distance, core_mm=8.0, reach_mm=12.0, keep_mm=3.0)
     millilitres = float(inside.sum() * mri.voxel_ml)
     require(
         POSSIBLE_ML[0] <= millilitres <= POSSIBLE_ML[1],
@@ -89,7 +89,7 @@ def find_brain(
     )
     overlap = 2.0 * float((inside & (distance < 0.0)).sum() / (inside.sum() + (distance < 0.0).sum()))
     how = f"whole head: brain extracted by the atlas in {perf_counter() - start:.0f} s"
-    found = _found(given, mri.with_array(inside).along(given).array, "atlas", how, (*blank, *ends_at_edge(mri, inside)))
+    found = _found(given, mri.with_array(inside).along(given).array, "atlas", how, ends_at_edge(mri, inside))
     message = f"{found.message}, overlap with the registered atlas {overlap:.2f}"
     if keep_at is not None:
         message += f"; {keep(keep_at, given, found.mask)}"

@@ -13,7 +13,7 @@ from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.mri.alignment import Alignment, align_template
 from SlicerUSSim.Logic.mri.coarse import largest_component
 from SlicerUSSim.Logic.mri.ct_unit import looks_like_ct
-from SlicerUSSim.Logic.mri.no_data import edge_value
+from SlicerUSSim.Logic.mri.edges import edge_value
 
 #: Volumes of a brain, millilitres: outside the first range a user should look, outside the second it is no brain.
 USUAL_ML, POSSIBLE_ML = (1000.0, 1900.0), (500.0, 2600.0)

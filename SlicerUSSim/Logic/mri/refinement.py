@@ -106,6 +106,15 @@ def on_grid(volume: Volume, grid: Volume, outside: float = 0.0) -> np.ndarray:
     )  # fmt: skip
 
 
+def near_points(grid: Volume, points: np.ndarray, distance_mm: float) -> np.ndarray:
+    """(k, j, i) True in voxels of a grid within a distance of (n, 3) RAS points in it."""
+    index = np.rint(points @ grid.ras_to_ijk[:3, :3].T + grid.ras_to_ijk[:3, 3]).astype(int)[:, ::-1]
+    index = index[((index >= 0) & (index < grid.array.shape)).all(axis=1)]
+    result = np.zeros(grid.array.shape, bool)
+    result[tuple(index.T)] = True
+    return distance_to(result, grid.spacing_mm) <= distance_mm if len(index) else result
+
+
 def box_around(points: np.ndarray, grid: Volume) -> tuple[slice, ...]:
     """(k, j, i) part of a grid that holds (n, 3) RAS points, with a voxel more on every side."""
     places = (points @ grid.ras_to_ijk[:3, :3].T + grid.ras_to_ijk[:3, 3])[:, ::-1]

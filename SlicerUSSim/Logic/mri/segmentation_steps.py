@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable
 from dataclasses import dataclass
-from time import perf_counter
 from typing import cast
 
 import numpy as np
@@ -91,22 +90,6 @@ def atlas_of(part: BrainPart, report: Callable[[float], None]) -> tuple[AtlasFit
     if not fit.is_good:
         return None, f"without an atlas, since MNI152 covers the brain with a Dice of {fit.dice:.2f} only", share
     return fit, f"led by the MNI152 atlas, whose brain covers this one with a Dice of {fit.dice:.2f}", share
-
-
-class StepTimes:
-    """Milliseconds of steps, for the log."""
-
-    def __init__(self) -> None:
-        self._last, self._steps = perf_counter(), []
-
-    def __call__(self, step: str) -> None:
-        """A step has ended."""
-        now = perf_counter()
-        self._steps.append(f"{step} {(now - self._last) * 1e3:.0f} ms")
-        self._last = now
-
-    def __str__(self) -> str:
-        return ", ".join(self._steps)
 
 
 def finite(mri: Volume) -> np.ndarray:

@@ -16,6 +16,9 @@ from SlicerUSSim.Logic.mri.evidence import Evidence
 from SlicerUSSim.Logic.mri.lesions.grown_lesion import GrownLesion, place
 from SlicerUSSim.Logic.mri.lesions.half_maximum import SNAP_MM, Region, Window, closed, grow, smoothed
 from SlicerUSSim.Logic.mri.pathology import LESIONS, tissue_to_add
+from SlicerUSSim.Logic.mri.refinement import near_points
+from SlicerUSSim.Logic.mri.sheets.falx_of_part import fissure_of_part
+from SlicerUSSim.Logic.mri.sheets.head import LEAST_VOXELS, Head
 
 if TYPE_CHECKING:
     from SlicerUSSim.Logic.mri.segmentation import Segmentation
@@ -40,6 +43,8 @@ _GAP_MM, _RIM_MM, _LEAST_ENCLOSED = 4.0, 4.0, 0.5
 _LEAST_DEPTH_MM, _LEAST_NECROSIS_ML, _DARK = 2.0, 0.1, 0.3
 #: Radius of the largest ball in a lesion: vessels and the cortex are thinner
 _THIN_MM = 2.0
+#: From the fissure, whose points are 1 mm apart, to its sides
+_SIDE_MM = 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -197,7 +202,7 @@ def _unlike_white(window: Window) -> _Grown | None:
     if not ball.any():
         return None
     is_fluid = fluid[ball].mean() >= 0.5
-    allowed = inside if is_fluid else inside & ~fluid & (window.of(evidence.between_hemispheres) < 0.5)
+    allowed = inside if is_fluid else inside & ~fluid & (window.of(_between_hemispheres(evidence)) < 0.5)
     images = np.stack([window.of(image) for image in evidence.images])
     healthy = evidence.white
     spread = np.maximum(np.abs(evidence.grey - healthy), 2.0 * evidence.deviations)
@@ -213,6 +218,24 @@ def _unlike_white(window: Window) -> _Grown | None:
     strongest = int(np.abs(contrast).argmax())
     shown = f"{'bright' if step[strongest] > 0 else 'dark'} in {evidence.contrasts[strongest].upper()}"
     return _Grown(window, region, image, weights, "fluid" if is_fluid else shown)
+
+
+@lru_cache(maxsize=1)
+def _between_hemispheres(evidence: Evidence) -> np.ndarray:
+    """(k, j, i) bool: the fissure; without an atlas as sheets/falx_of_part.py finds it, where it does."""
+    channel = evidence.channel("t1", "t1gd", "t2")
+    if evidence.atlas is not None or channel is None:
+        return evidence.between_hemispheres
+    contrast = evidence.contrasts[channel]
+    sign = np.float32(-1.0 if contrast == "t2" else 1.0)
+    means = sign * evidence.means[:, channel]
+    image = Volume(sign * evidence.images[channel], evidence.ijk_to_ras)
+    if not means[0] < means[1] < means[2]:
+        return evidence.between_hemispheres
+    head = Head.of_part(image, evidence.inside, means.tolist(), float(evidence.deviations[channel]), contrast == "t1gd")
+    if min(head.brain.shape) < LEAST_VOXELS:
+        return evidence.between_hemispheres
+    return near_points(image, fissure_of_part(head), _SIDE_MM + 0.5 * float(evidence.spacing_mm.max()))
 
 
 def _rim_of(grown: _Grown) -> np.ndarray | None:

@@ -114,11 +114,15 @@ def _distance_to_thick_white(head: Head) -> np.ndarray:
     result = np.zeros(head.brain.shape, np.float32)
     x, _, _ = head.in_atlas
     box = ndimage.find_objects((np.abs(x) < _X_MM + _FARTHEST_MM).astype(np.uint8))[0]
-    white, spacing = head.white_matter[box], head.image.spacing_mm
-    inner = distance_to(~white, spacing) > _THIN_MM
-    thick = white & (distance_to(inner, spacing) <= _THIN_MM + _ROUNDING_MM)
-    result[box] = np.maximum(distance_to(thick, spacing), 0.0)
+    result[box] = np.maximum(distance_to(thick_white_matter(head, box), head.image.spacing_mm), 0.0)
     return result
+
+
+def thick_white_matter(head: Head, box: tuple[slice, ...] = (slice(None),) * 3) -> np.ndarray:
+    """(k, j, i) bool in a box of the head: white matter that is at least 3 mm thick."""
+    spacing = head.image.spacing_mm
+    inner = distance_to(~head.white_matter[box], spacing) > _THIN_MM
+    return head.white_matter[box] & (distance_to(inner, spacing) <= _THIN_MM + _ROUNDING_MM)
 
 
 def _sampled_evidence(

@@ -19,9 +19,10 @@ from SlicerUSSim.Logic.base.neighbourhood import distance_to
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.mri.atlas import Atlas
 from SlicerUSSim.Logic.mri.coarse import components, largest_component
-from SlicerUSSim.Logic.mri.refinement import closed, on_grid
+from SlicerUSSim.Logic.mri.refinement import closed, near_points, on_grid
 from SlicerUSSim.Logic.mri.segmentation import Segmentation
 from SlicerUSSim.Logic.mri.sheets.falx import falx
+from SlicerUSSim.Logic.mri.sheets.falx_of_part import falx_of_part
 from SlicerUSSim.Logic.mri.sheets.head import Head, require_contrast
 from SlicerUSSim.Logic.mri.sheets.kept import keep_sheets, key_of, read_kept_sheets
 from SlicerUSSim.Logic.mri.sheets.regions import lateral_ventricles_of_atlas, ventricles
@@ -39,7 +40,7 @@ ALL_KINDS = (*KINDS, *STRUCTURES)
 #: Those that only contrast agent shows
 _ENHANCING = ("choroid plexus", "vessels")
 #: Those that are found without an atlas, in a part of a brain
-_WITHOUT_ATLAS = ("sulcus", "ependyma")
+_WITHOUT_ATLAS = ("sulcus", "falx", "ependyma")
 #: A sulcus this near to the falx or the tentorium and as parallel to it is the fissure in which that lies, mm
 _SAME_MM, _SAME_COSINE = 2.0, 0.7
 #: About how long each step takes
@@ -84,7 +85,7 @@ def find_sheets(
     ----------
     mri : the image from which `segmentation` was made.
     segmentation : led by the atlas. Without, as of a part of a brain, only sulci and walls of wide deep fluid are
-        found.
+        found, and a falx that stands out of the sulci (falx_of_part.py).
     contrast : of the MRI: "t1", "t1gd" or "t2".
     kinds : what is looked for, of ALL_KINDS. Without contrast agent no vessels and no choroid plexus are found.
     keep_at : file in which they are kept and from which they are read again; see kept.sheets_beside.
@@ -119,6 +120,8 @@ def find_sheets(
     if contrast != "t1gd" and set(_ENHANCING) & set(wanted):
         notes.append("no vessels and no choroid plexus are looked for: only a T1 with contrast agent shows them")
     notes += _lines(surfels, structures, wanted)
+    if segmentation.atlas is None and "falx" in wanted:
+        notes.append("the falx is the straight sulcus, if there is one, that is as deep as the fissure: look at it")
     for line in notes:
         _log.info("%s", line)
     report(1.0)
@@ -149,19 +152,24 @@ def _found(head: Head, mri: Volume, wanted: tuple[str, ...], report: Callable[[f
     found: dict[str, Surfels] = {}
     masks: dict[str, np.ndarray] = {}
     in_ventricles = np.zeros(head.brain.shape, bool)
-    if {"sulcus", "ependyma", *_ENHANCING} & set(wanted):
+    is_whole = head.registered is not None
+    by_sulci = "sulcus" in wanted or ("falx" in wanted and not is_whole)
+    if {"ependyma", *_ENHANCING} & set(wanted) or by_sulci:
         in_ventricles = ventricles(head)
         finished("ventricles")
+    all_sulci = Surfels.joined([])
+    if by_sulci:
+        all_sulci = sulci(head, in_ventricles)
+        finished("sulcus")
     if {"falx", "tentorium", "vessels"} & set(wanted):  # the apex of the tentorium is below the falx
-        found["falx"] = falx(head)
+        found["falx"] = falx(head) if is_whole else falx_of_part(head, all_sulci)
         finished("falx")
     if {"tentorium", "vessels"} & set(wanted):
         found["tentorium"] = tentorium(head, found["falx"])
         finished("tentorium")
     dura = Surfels.joined(list(found.values()))
     if "sulcus" in wanted:
-        found["sulcus"] = _beside(sulci(head, in_ventricles), dura.of_kind(*(set(KINDS) & set(wanted))))
-        finished("sulcus")
+        found["sulcus"] = _beside(all_sulci, dura.of_kind(*(set(KINDS) & set(wanted))))
     if "ependyma" in wanted:
         found["ependyma"] = ependyma(head, in_ventricles)
         finished("ependyma")
@@ -366,7 +374,7 @@ def vessels(head: Head, sheets: Surfels, apart: np.ndarray) -> np.ndarray:
     core = distance_to(~wide, head.image.spacing_mm) > 0.5 * _SINUS_MM
     if core.any():
         found &= distance_to(core, head.image.spacing_mm) > 0.5 * _SINUS_MM + _SINUS_RIM_MM
-    found &= (head.depth > _SURFACE_MM) & ~apart & ~_near(head, sheets, _DURA_MM)
+    found &= (head.depth > _SURFACE_MM) & ~apart & ~near_points(head.image, sheets.place, _DURA_MM)
     parts = components(found, corners=True)
     sizes = np.bincount(parts.ravel())
     peaks = ndimage.maximum(head.image.array, parts, np.arange(len(sizes)))
@@ -387,18 +395,6 @@ def _tubeness(head: Head) -> np.ndarray:
         )
         result = np.maximum(result, sigma**2 * sitk.GetArrayViewFromImage(lines))
     return result
-
-
-def _near(head: Head, sheets: Surfels, distance_mm: float) -> np.ndarray:
-    """(k, j, i) True within a distance of surfels."""
-    result = np.zeros(head.brain.shape, bool)
-    matrix = head.image.ras_to_ijk
-    index = np.rint(sheets.place @ matrix[:3, :3].T + matrix[:3, 3]).astype(int)[:, ::-1]
-    index = index[((index >= 0) & (index < result.shape)).all(axis=1)]
-    if not len(index):
-        return result
-    result[tuple(index.T)] = True
-    return distance_to(result, head.image.spacing_mm) <= distance_mm
 
 
 def _large(inside: np.ndarray, voxels: float) -> np.ndarray:

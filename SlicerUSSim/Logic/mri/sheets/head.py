@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -20,7 +21,7 @@ from SlicerUSSim.Logic.mri.segmentation import Segmentation
 #: nearest of these stays as it is
 _FINEST_MM, _COARSEST_MM, _NEAR = 0.8, 1.0, 0.15
 #: Along each axis of that grid
-_LEAST_VOXELS = 3
+LEAST_VOXELS = 3
 #: Around the brain
 _MARGIN_MM = 10.0
 #: Across which sulci are closed, so that depth is counted from the hull of the brain
@@ -70,11 +71,12 @@ class Head:
         )
         sign = -1.0 if contrast == "t2" else 1.0
         names = segmentation.tissue_names
-        means = [sign * float(segmentation.means[names.index(f)]) for f in ("csf", "grey matter", "white matter")]
+        tissues = ("csf", "grey matter", "white matter")
+        csf, grey, white = (sign * float(segmentation.means[names.index(tissue)]) for tissue in tissues)
         require(
-            means[0] < means[1] < means[2],
-            f"CSF, grey and white matter have means {', '.join(f'{sign * m:.4g}' for m in means)}, expected the order "
-            f"of {contrast}",
+            csf < grey < white,
+            f"CSF, grey and white matter have means {sign * csf:.4g}, {sign * grey:.4g}, {sign * white:.4g}, expected "
+            f"the order of {contrast}",
         )
         box = _box(segmentation.brain.mask, _MARGIN_MM)
         images = (mri, segmentation.brain.mask, mri.with_array(segmentation.corrected))
@@ -82,10 +84,22 @@ class Head:
         inside = mask.array > 0
         image = part.with_array(np.float32(sign) * _without_field(part, corrected.array, inside))
         noise = float(segmentation.standard_deviations[names.index("white matter")])
+        head = cls.of_part(image, inside, (csf, grey, white), noise, contrast == "t1gd")
+        return replace(head, registered=segmentation.atlas)
+
+    @classmethod
+    def of_part(
+        cls, image: Volume, brain: np.ndarray, means: Sequence[float], noise: float, is_enhanced: bool
+    ) -> Head:  # fmt: skip
+        """The head in which an atlas does not lead: `image` without bias field, (k, j, i) bool `brain` on its grid.
+
+        `means` are those of CSF, grey and white matter, which rise.
+        """
+        csf, grey, white = map(float, means)
         grid = _working_grid(image)
         if grid is not image:
-            inside = on_grid(image.with_array(inside.astype(np.float32)), grid) > 0.5
-        return cls(grid, inside, *means, noise, contrast == "t1gd", segmentation.atlas)
+            brain = on_grid(image.with_array(brain.astype(np.float32)), grid) > 0.5
+        return cls(grid, brain, csf, grey, white, noise, is_enhanced, None)
 
     @property
     def atlas(self) -> AtlasFit:
@@ -127,9 +141,9 @@ class Head:
         n = 2 * int(radius) + 2
         thinnest = min(self.brain.shape)
         require(
-            thinnest >= _LEAST_VOXELS,
+            thinnest >= LEAST_VOXELS,
             f"the image is {thinnest} voxels of {self.image.spacing_mm.min():.2g} mm thick, expected at least "
-            f"{_LEAST_VOXELS} to find sheets in it",
+            f"{LEAST_VOXELS} to find sheets in it",
         )
         # On another grid than the image's, the outermost voxels are outside.
         inner = self.brain[1:-1, 1:-1, 1:-1]
