@@ -36,7 +36,7 @@ def refined(mri: Volume, distance: np.ndarray, *, core_mm: float, reach_mm: floa
     matrix[:3, 3] = origin
     # Outside the field of view there is no brain.
     far = on_grid(mri.with_array(distance), Volume(image, matrix), outside=reach_mm + 6.0)
-    box = _box(far <= reach_mm + 6.0)
+    box = ndimage.find_objects((far <= reach_mm + 6.0).astype(np.uint8))[0]
     image, far = image[box], far[box]
     mm = _SPACING_MM
     core = far < -core_mm
@@ -121,24 +121,6 @@ def box_around(points: np.ndarray, grid: Volume) -> tuple[slice, ...]:
     ends = np.floor(places.min(axis=0)) - 1, np.ceil(places.max(axis=0)) + 2
     first, last = (np.clip(end, 0, grid.array.shape).astype(int) for end in ends)
     return tuple(map(slice, first, np.maximum(first, last)))
-
-
-def signed_distance(inside: np.ndarray, spacing_mm: np.ndarray, most_mm: float) -> np.ndarray:
-    """(k, j, i) float32 distance to the border of `inside`, negative in it, in a box that reaches `most_mm` outside."""
-    box = _box(inside, [int(np.ceil(most_mm / size)) + 1 for size in spacing_mm[::-1]])
-    result = np.full(inside.shape, most_mm, np.float32)
-    part = inside[box]
-    outer, inner = (np.maximum(distance_to(side, spacing_mm), 0.0) for side in (part, ~part))
-    result[box] = np.minimum(outer - inner, most_mm)
-    return result
-
-
-def _box(inside: np.ndarray, margin=(0, 0, 0)) -> tuple[slice, ...]:
-    slices = ndimage.find_objects(inside.astype(np.uint8))[0]
-    return tuple(
-        slice(max(part.start - more, 0), min(part.stop + more, size))
-        for part, more, size in zip(slices, margin, inside.shape, strict=True)
-    )
 
 
 def _ball(radius: float) -> np.ndarray:
