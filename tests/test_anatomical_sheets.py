@@ -176,27 +176,25 @@ def test_surfels_of_a_file_are_those_that_were_written(tmp_path):
     write_surfels(tmp_path / "sheets.vtp", surfels)
     again = read_surfels(tmp_path / "sheets.vtp")
     for entry in fields(Surfels):
-        assert np.array_equal(getattr(again, entry.name), getattr(surfels, entry.name)), entry.name
+        np.testing.assert_allclose(
+            getattr(again, entry.name), getattr(surfels, entry.name), 1e-3, 1e-4, err_msg=entry.name
+        )
 
 
-@pytest.mark.parametrize("suffix", [".vtp", ".ply"])
-def test_a_file_shows_squares_of_the_surfels_where_slicer_expects_them(tmp_path, suffix):
+def test_a_file_shows_squares_of_the_surfels_where_slicer_expects_them(tmp_path):
     from vtkmodules.util.numpy_support import vtk_to_numpy
     from vtkmodules.vtkFiltersCore import vtkMassProperties, vtkTriangleFilter
-    from vtkmodules.vtkIOPLY import vtkPLYReader
     from vtkmodules.vtkIOXML import vtkXMLPolyDataReader
 
     surfels = some_surfels()
-    write_surfels(tmp_path / f"sheets{suffix}", surfels)
-    reader = vtkPLYReader() if suffix == ".ply" else vtkXMLPolyDataReader()
-    reader.SetFileName(str(tmp_path / f"sheets{suffix}"))
+    write_surfels(tmp_path / "sheets.vtp", surfels)
+    reader = vtkXMLPolyDataReader()
+    reader.SetFileName(str(tmp_path / "sheets.vtp"))
     reader.Update()
     shown = reader.GetOutput()
     corners = vtk_to_numpy(shown.GetPoints().GetData()).reshape(-1, 4, 3)
-    signs = [-1, -1, 1] if suffix == ".ply" else [1, 1, 1]  # Slicer reads LPS unless the file says RAS
-    assert np.allclose(corners.mean(axis=1) * signs, surfels.place, atol=1e-4)
-    if suffix == ".vtp":
-        assert shown.GetFieldData().GetAbstractArray("SPACE").GetValue(0) == "RAS"
+    assert np.allclose(corners.mean(axis=1), surfels.place, atol=1e-4)
+    assert shown.GetFieldData().GetAbstractArray("SPACE").GetValue(0) == "RAS"
     triangles = vtkTriangleFilter()
     triangles.SetInputData(shown)
     mass = vtkMassProperties()
@@ -206,7 +204,7 @@ def test_a_file_shows_squares_of_the_surfels_where_slicer_expects_them(tmp_path,
 
 @pytest.mark.slow
 def test_files_that_are_no_sheets_are_named(tmp_path):
-    with pytest.raises(SimulationError, match=r"\.vtp or \.ply"):
+    with pytest.raises(SimulationError, match="expected a name with"):
         write_surfels(tmp_path / "sheets.stl", some_surfels())
     with pytest.raises(SimulationError, match="no such file"):
         read_surfels(tmp_path / "none.vtp")
@@ -454,19 +452,12 @@ def test_sheets_are_kept_and_each_can_be_switched_off(tmp_path):
     assert read_kept_sheets(place, key_of(other, found, "t1"), ("falx",)) is None
     key = key_of(mri, found, "t1")
     assert read_kept_sheets(place, key, ("falx",)) is not None
-    place.write_bytes(place.read_bytes()[:-100])
-    assert read_kept_sheets(place, key, ("falx",)) is None
-
-
-@pytest.mark.slow
-def test_a_file_of_others_is_not_replaced_and_vessels_are_not_invented(tmp_path, own_cache):
-    mri, found = template_head()
-    place = tmp_path / "head.sheets.npz"
+    find_sheets(mri, found, contrast="t1", kinds=("falx", "corpus callosum"), keep_at=place)  # fewer replace more
+    assert read_kept_sheets(place, key, ("tentorium",)) is None
     place.write_text("mine")
     sheets = find_sheets(mri, found, contrast="t1", kinds=("vessels", "choroid plexus"), keep_at=place)
-    assert any(f"since {place} exists" in line for line in sheets.notes)
-    assert place.read_text() == "mine"
-    assert any("only a T1 with contrast agent" in line for line in sheets.notes)
+    assert f"not kept: {place} exists" in sheets.notes[0] and place.read_text() == "mine"
+    assert "only a T1 with contrast agent" in sheets.notes[1]
     assert not sheets.masks() and not len(sheets.surfels)
 
 
@@ -556,4 +547,4 @@ def test_sheets_of_a_file_that_was_transformed_are_where_its_points_are(tmp_path
         np.testing.assert_allclose(along, 1.0, atol=1e-4)
         np.testing.assert_allclose(found.thickness, surfels.thickness, rtol=1e-3)
     same = read_surfels(written("slicer.vtp", (-1, -1, 1), space="LPS"))  # as Slicer writes a model
-    np.testing.assert_array_equal(same.place, surfels.place)
+    np.testing.assert_allclose(same.place, surfels.place, atol=1e-4)

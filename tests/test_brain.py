@@ -1,8 +1,6 @@
 """The brain in an MRI: recognition, extraction, kept masks, DICOM series."""
 
 import importlib.util
-import os
-import sys
 from pathlib import Path
 from typing import NamedTuple
 
@@ -14,14 +12,14 @@ from scipy import ndimage
 from scipy.spatial.transform import Rotation
 
 from SlicerUSSim.Command.cli import main
-from SlicerUSSim.Logic import SimulationError, Volume, segment_mri
+from SlicerUSSim.Logic import SimulationError, Volume
 from SlicerUSSim.Logic.base.errors import Cancelled
-from SlicerUSSim.Logic.mri import brain as brain_module, extractors, recognition, refinement
+from SlicerUSSim.Logic.mri import alignment, atlas, kept_mask, recognition, refinement
 from SlicerUSSim.Logic.mri.alignment import Alignment, align_template
 from SlicerUSSim.Logic.mri.atlas import mni152
-from SlicerUSSim.Logic.mri.brain import BrainMask, find_brain, given_brain, left_out
+from SlicerUSSim.Logic.mri.brain import BrainMask, find_brain, given_brain
+from SlicerUSSim.Logic.mri.edges import ends_at_edge
 from SlicerUSSim.Logic.mri.kept_mask import mask_beside
-from SlicerUSSim.Logic.mri.no_data import ends_at_edge, no_data, without_blank
 from SlicerUSSim.Logic.mri.recognition import recognise
 from SlicerUSSim.Logic.mri.samples import head_mri
 from tests.conftest import SHARED, needs_shared
@@ -129,39 +127,6 @@ def test_what_is_no_mri_is_reported(change, message):
     assert message in str(caught.value) and "\n" not in str(caught.value)
 
 
-@pytest.mark.long
-@needs_nilearn
-def test_voxels_without_data_are_left_out_with_a_warning(head, found):
-    (mri, _), value = head, -3.0
-    inside = found.result.mask.array > 0
-    array = mri.array.copy()
-    array[: np.argwhere(inside)[:, 0].min() + 12] = value  # as in an image padded below
-    brain, lines = without_blank(mri.with_array(array), inside)
-    assert not brain[array == value].any() and (brain == inside)[array != value].all()
-    lost = (inside & (array == value)).sum() * mri.voxel_ml
-    assert len(lines) == 1 and f"{lost:.0f} ml where the brain should be have no data" in lines[0]
-    assert lines[0].endswith("cut off at its bottom")
-    assert without_blank(mri, inside) == (inside, ())
-
-
-def test_a_blank_within_the_image_has_data():
-    """Dark CSF and bone may have the background's value, but do not reach the edge without a gap."""
-    empty, radius = ellipsoid((70, 90, 70), spacing=2.0)
-    array = np.where(radius < 1, 100.0, 0.0)
-    array[radius < 0.3] = 0.0
-    array[:, :, radius.shape[2] // 2][radius[:, :, radius.shape[2] // 2] < 1] = 0.0  # a slit to the edge
-    blank = no_data(empty.with_array(array))
-    assert blank[radius > 1.1].all() and not blank[radius < 0.9].any()
-
-
-@needs_nilearn
-@pytest.mark.slow
-def test_a_turned_head_is_used_with_a_warning(head):
-    turned = Volume(np.ascontiguousarray(np.swapaxes(head[0].array, 0, 1)), head[0].ijk_to_ras)
-    (line,) = segment_mri(turned).warnings
-    assert "check the orientation and the voxel size in its header" in line
-
-
 def test_none_takes_everything_brighter_than_the_background():
     empty, radius = ellipsoid((60, 80, 65))
     values = np.where(radius < 1, 100.0, 0.0) + np.random.default_rng(0).normal(0, 3, radius.shape)
@@ -211,47 +176,6 @@ def test_the_atlas_finds_the_brain_in_a_stack_of_thick_sagittal_slices(head):
     assert dice(result.mask.array > 0, inside) > 0.94
 
 
-def fake_robex(folder, script):
-    program = folder / "ROBEX"
-    program.write_text(f"#!{sys.executable}\n{script}")
-    program.chmod(0o700)
-    return folder
-
-
-COPY = """
-import sys, SimpleITK as sitk
-print("Step 1 of 9: ...It took roughly 1 seconds", flush=True)
-image = sitk.ReadImage(sys.argv[1])
-sitk.WriteImage(sitk.Cast(image > 60, sitk.sitkUInt8), sys.argv[3])
-"""
-
-
-def test_a_program_gets_a_copy_of_1_mm_and_its_mask_comes_back_on_the_grid(tmp_path, monkeypatch):
-    monkeypatch.setattr(extractors, "robex_folder", lambda: fake_robex(tmp_path, COPY))
-    mri = head_mri(3.0)
-    turned = Volume(mri.array[::-1].copy(), mri.ijk_to_ras @ np.diag([1.0, 1.0, -1.0, 1.0]))
-    mask = extractors.robex(turned, lambda share: None)
-    assert dice(mask, turned.array > 60) > 0.97
-
-
-def test_a_cancelled_program_is_ended_and_leaves_nothing(tmp_path, monkeypatch):
-    script = f"import os, time\nopen({str(tmp_path / 'pid')!r}, 'w').write(str(os.getpid()))\ntime.sleep(60)"
-    monkeypatch.setattr(extractors, "robex_folder", lambda: fake_robex(tmp_path, script))
-    temporary = tmp_path / "temporary"
-    temporary.mkdir()
-    monkeypatch.setattr(extractors.tempfile, "tempdir", str(temporary))
-
-    def progress(share):
-        if (tmp_path / "pid").exists() and (tmp_path / "pid").read_text():
-            raise Cancelled
-
-    with pytest.raises(Cancelled):
-        extractors.robex(head_mri(4.0), progress)
-    with pytest.raises(ProcessLookupError):
-        os.kill(int((tmp_path / "pid").read_text()), 0)
-    assert not list(temporary.iterdir())
-
-
 def test_a_command_that_is_interrupted_says_so_in_one_line(monkeypatch, tmp_path):
     def interrupted(*_, **__):
         raise KeyboardInterrupt
@@ -261,19 +185,11 @@ def test_a_command_that_is_interrupted_says_so_in_one_line(monkeypatch, tmp_path
     assert result.exit_code == 130 and result.stderr == "ussim: interrupted\n"
 
 
-def test_a_program_that_fails_is_named_with_its_last_line(tmp_path, monkeypatch):
-    script = "import sys; print('no model'); sys.exit(3)"
-    monkeypatch.setattr(extractors, "robex_folder", lambda: fake_robex(tmp_path, script))
-    with pytest.raises(SimulationError, match=r"ROBEX failed with status 3 \(no model\)"):
-        extractors.robex(head_mri(4.0), lambda share: None)
-
-
-def test_a_head_without_any_program_gets_the_remedy(monkeypatch):
-    monkeypatch.setattr(brain_module, "mni152", lambda: None)
-    monkeypatch.setattr(extractors, "robex_folder", lambda: None)
-    monkeypatch.setattr(extractors, "has_deepbet", lambda: False)
-    with pytest.raises(SimulationError, match=r"whole head.*SlicerUSSim\[head\]"):
-        brain_module._candidates("auto")
+def test_a_head_without_the_atlas_gets_the_remedy(monkeypatch, head):
+    monkeypatch.setattr(atlas, "mni152", lambda: None)
+    alignment.template.cache_clear()
+    with pytest.raises(SimulationError, match=r"whole head needs the brain atlas of nilearn: pip install nilearn"):
+        recognise(head[0])
 
 
 # ---- kept masks ------------------------------------------------------------------------------------------------------
@@ -287,118 +203,46 @@ def test_the_mask_has_the_name_of_its_mri(tmp_path, name, mask):
 
 
 @needs_nilearn
-def test_a_kept_mask_is_read_instead_of_extracted_again(head, found):
-    result, place = found.result, found.place
-    again = find_brain(head[0], keep_at=place)
-    assert again.seconds == 0.0 and "kept in" in again.message
-    assert np.array_equal(again.mask.array, result.mask.array)
+def test_a_kept_mask_is_read_and_never_replaced(head, found, tmp_path):
+    mri, place = head[0], tmp_path / "head.brain-mask.nrrd"
+    assert f"the brain mask is kept in {found.place}" in found.result.message
+    again = find_brain(mri, keep_at=found.place)
+    assert f"brain mask in {found.place}" in again.message and again.method == "given"
+    assert np.array_equal(again.mask.array, found.result.mask.array)
+    place.write_bytes(found.place.read_bytes())
+    other = mri.with_array(mri.array + 1.0)
+    assert kept_mask.read_kept(place, other) is None
+    assert kept_mask.keep(place, other, found.result.mask).endswith(f"not kept: {place} exists and is of another image")
+    assert place.read_bytes() == found.place.read_bytes()
+    assert "is not kept: " in kept_mask.keep(tmp_path / "absent" / "mask.nrrd", mri, found.result.mask)
 
 
-def save_edited(place, array, path):
-    """Save other voxels with the notes of the kept mask at `place`, as an editor does."""
-    image = sitk.ReadImage(str(place))
-    edited = sitk.GetImageFromArray(array)
-    edited.CopyInformation(image)
-    for key in image.GetMetaDataKeys():
-        edited.SetMetaData(key, image.GetMetaData(key))
-    sitk.WriteImage(edited, str(path))
-
-
-@needs_nilearn
-@pytest.mark.slow
-def test_an_edited_kept_mask_is_used_and_reported_and_never_overwritten(head, found, tmp_path, own_cache):
-    array = found.result.mask.array.copy()
-    array[: array.shape[0] // 2] = 0
-    place = tmp_path / "edited.nrrd"
-    save_edited(found.place, array, place)
-    result = find_brain(head[0], "atlas", keep_at=place)
-    assert "as edited in" in result.message and result.method == "given"
-    assert np.array_equal(result.mask.array, array > 0)
-    other = head[0].with_array(head[0].array + 1.0)
-    before = place.read_bytes()
-    assert not brain_module.keep(place, other, array > 0, "atlas", 1.0, ()).is_beside
-    assert place.read_bytes() == before
-
-
-@pytest.mark.parametrize("edit", ["everything", pytest.param("smoothed", marks=pytest.mark.slow)])
-def test_an_edited_kept_mask_is_checked_as_one_that_is_given(edit, head, found, tmp_path):
-    """All of the head would be segmented as a brain, and a smoothed mask would be wider by a litre."""
-    mask = found.result.mask.array.astype(np.float32)
+def test_an_edited_kept_mask_is_used_and_checked_as_one_that_is_given(head, tmp_path):
+    mri, brain = head
     path = tmp_path / "head.brain-mask.nrrd"
-    save_edited(found.place, np.ones_like(mask) if edit == "everything" else ndimage.gaussian_filter(mask, 1.5), path)
-    if edit == "smoothed":
-        used = find_brain(head[0], keep_at=path)
-        assert used.volume_ml == pytest.approx((mask > 0).sum() * head[0].voxel_ml, rel=0.05)
-        return
-    with pytest.raises(SimulationError, match=r"head.brain-mask.nrrd has .* covers 100% .*or delete it"):
-        find_brain(head[0], keep_at=path)
-
-
-def test_a_mask_edited_in_a_program_that_keeps_no_notes_is_the_users(head, found, tmp_path):
-    path = tmp_path / "head.brain-mask.nrrd"
-    edited = found.result.mask.array.copy()
+    edited = brain.astype(np.uint8)
     edited[:, : edited.shape[1] // 2] = 0
-    head[0].with_array(edited).write(path)  # without the entries of `keep`
-    used = find_brain(head[0], keep_at=path)
-    assert np.array_equal(used.mask.array > 0, edited > 0) and "edited" in used.message
-    assert any("expected a brain of 1000 to 1900 ml" in line for line in used.warnings)  # half of it is gone
+    mri.with_array(edited).write(path)  # by a program that drops our entry
+    used = find_brain(mri, keep_at=path)
+    assert np.array_equal(used.mask.array, edited)
+    assert any("expected 1000 to 1900 ml of an adult" in line for line in used.warnings)  # half of it is gone
+    mri.with_array(ndimage.gaussian_filter(brain.astype(np.float32), 1.5)).write(path)
+    assert find_brain(mri, keep_at=path).volume_ml == pytest.approx(brain.sum() * mri.voxel_ml, rel=0.05)
+    mri.with_array(np.ones_like(edited)).write(path)
+    with pytest.raises(SimulationError, match=r"head.brain-mask.nrrd has .* covers 100% .*or delete it"):
+        find_brain(mri, keep_at=path)
     Volume(edited, np.eye(4)).write(path)
-    assert brain_module.read_kept(path, head[0], "auto") is None
-
-
-def test_a_mask_of_another_image_or_method_is_not_used(tmp_path):
-    mri = head_mri(4.0)
-    place = tmp_path / "head.brain-mask.nrrd"
-    assert brain_module.keep(place, mri, mri.array > 0, "robex", 1.0, ()).is_beside
-    assert brain_module.read_kept(place, mri, "auto") is not None
-    assert brain_module.read_kept(place, mri, "atlas") is None
-    assert brain_module.read_kept(place, mri.with_array(mri.array * 2), "auto") is None
-
-
-@pytest.mark.parametrize("is_taken", [True, False])
-def test_a_mask_is_kept_in_the_cache_where_it_cannot_be_beside(is_taken, tmp_path, own_cache):
-    mri = head_mri(4.0)
-    place = tmp_path / "absent" / "head.brain-mask.nrrd"  # a folder that cannot be written, also for root
-    if is_taken:
-        place.parent.mkdir()
-        place.write_text("mine")
-    kept = brain_module.keep(place, mri, mri.array > 0, "robex", 1.0, ())
-    why = f"{place} exists" if is_taken else f"{place.parent} cannot be written"
-    assert str(own_cache) in kept.text and kept.text.endswith(f"since {why}") and not kept.is_beside
-    assert brain_module.read_kept(place, mri, "auto").method == "robex"
-    assert not is_taken or place.read_text() == "mine"
+    assert kept_mask.read_kept(path, mri) is None
 
 
 # ---- masks that are given, and lesions -------------------------------------------------------------------------------
-
-
-def test_masks_empty_on_another_grid_or_of_everything_are_refused():
-    mri = head_mri(4.0)
-    with pytest.raises(SimulationError, match="mask is empty"):
-        given_brain(mri.with_array(np.zeros(mri.array.shape, np.uint8)), mri)
-    with pytest.raises(SimulationError, match="expected the same grid"):
-        given_brain(head_mri(3.0), mri)
-    with pytest.raises(SimulationError, match=r"covers 100% of the image"):
-        given_brain(mri.with_array(np.ones(mri.array.shape, np.uint8)), mri)
-
-
-def test_the_share_of_a_lesion_outside_the_mask_is_found_on_another_grid():
-    grid, radius = ellipsoid((70, 80, 60))
-    mask = grid.with_array((radius < 1.0).astype(np.uint8))
-    lesion = Volume(
-        np.ones((20, 20, 20), np.uint8), np.array([[1.0, 0, 0, 60], [0, 1, 0, -10], [0, 0, 1, -10], [0, 0, 0, 1]])
-    )
-    x = np.arange(60, 80)
-    assert left_out(mask, lesion) == pytest.approx((x > 69.5).mean(), abs=0.1)
-    with pytest.raises(SimulationError, match="lesion is empty"):
-        left_out(mask, lesion.with_array(np.zeros((20, 20, 20))))
 
 
 def test_several_labels_in_a_mask_are_reported(head):
     mri, brain = head
     labels = brain * np.where(np.arange(brain.shape[2]) < 40, 1, 2)
     (line,) = given_brain(mri.with_array(labels.astype(np.uint8)), mri).warnings
-    assert "the mask holds 2 values (1, 2), expected one; the brain is taken where it is not 0" in line
+    assert "the mask holds the labels 1, 2, expected one; the brain is taken where any of them is" in line
 
 
 @needs_nilearn
@@ -436,22 +280,14 @@ def test_a_mask_whose_voxels_are_stored_in_another_order_is_the_same_mask():
         given_brain(Volume(Volume.from_sitk(sitk.DICOMOrient(other, "SPL")).array, matrix), mri)
 
 
-def test_a_mask_may_be_a_probability_and_an_image_is_none():
+def test_a_mask_may_be_a_probability():
     mri = Volume(np.random.default_rng(0).normal(100.0, 10.0, (50, 60, 70)).astype(np.float32), np.diag([2, 2, 2, 1.0]))
     inside = np.zeros(mri.array.shape, np.float32)
     inside[5:45, 5:55, 5:65] = 1.0
     smooth = ndimage.gaussian_filter(inside, 1.0)
     assert np.array_equal(given_brain(mri.with_array(smooth), mri).mask.array, smooth > 0.5)
-    image = inside * np.clip(mri.array / 150.0, 0.0, 1.0)  # as intensities scaled from 0 to 1
     with pytest.raises(SimulationError, match="is it an image"):
-        given_brain(mri.with_array(image.astype(np.float32)), mri)
-
-
-def test_a_head_segmented_whole_by_the_users_wish_is_reported():
-    grid, radius = ellipsoid((85, 105, 100))
-    values = np.where(radius < 1.0, 100.0, 0.0) + np.random.default_rng(0).normal(0.0, 5.0, radius.shape)
-    (warning,) = find_brain(grid.with_array(values.astype(np.float32)), "none").warnings
-    assert "expected 1000 to 1900 ml of an adult" in warning
+        given_brain(mri, mri)
 
 
 def test_errors_about_a_mask_name_its_file_and_count_voxels_as_viewers_do(tmp_path):
@@ -467,100 +303,6 @@ def test_errors_about_a_mask_name_its_file_and_count_voxels_as_viewers_do(tmp_pa
         given_brain(Volume.read(tmp_path / "empty.nii.gz"), mri)
 
 
-def test_more_than_any_brain_given_as_the_brain_is_refused():
-    mri = Volume(np.zeros((40, 40, 40), np.float32), np.diag([5.0, 5.0, 5.0, 1.0]))
-    outside = np.ones(mri.array.shape, np.uint8)
-    outside[12:28, 12:28, 12:28] = 0
-    with pytest.raises(SimulationError, match=r"mask has 7488 ml, expected a brain \(1000 to 1900 ml\)"):
-        given_brain(mri.with_array(outside), mri)
-
-
-def test_masks_of_an_infant_of_a_part_and_of_a_small_image_are_taken():
-    def of(millilitres, box_mm):
-        """A ball of so many ml in a noisy cube, without whole heads' surroundings."""
-        place = np.linalg.norm(np.indices([round(box_mm / 2)] * 3) * 2.0 - box_mm / 2, axis=0)
-        ball = (place < 10.0 * (3.0 * millilitres / (4.0 * np.pi)) ** (1 / 3)).astype(np.uint8)
-        values = np.random.default_rng(0).normal(100.0, 10.0, ball.shape).astype(np.float32)
-        mri = Volume(values, np.diag([2.0, 2.0, 2.0, 1.0]))
-        return mri, mri.with_array(ball)
-
-    for millilitres, box_mm in ((300.0, 160.0), (110.0, 160.0), (60.0, 54.0)):
-        mri, mask = of(millilitres, box_mm)
-        assert given_brain(mask, mri).volume_ml == pytest.approx(millilitres, rel=0.05)
-    mri, mask = of(60.0, 160.0)
-    assert "the mask has 60" in given_brain(mask, mri).warnings[-1]
-    stripped = mri.with_array(mri.array * mask.array)  # a small brain in a large empty box
-    assert given_brain(mask, stripped).volume_ml == pytest.approx(60.0, rel=0.05)
-
-
-# ---- DICOM -----------------------------------------------------------------------------------------------------------
-
-
-def write_series(folder, count, uid, number, description, skip=(), tilt=0.0, patient="1", first_patient="1"):
-    folder.mkdir(exist_ok=True)
-    rng = np.random.default_rng(int(number))
-    voxels = rng.integers(0, 1000, (count, 12, 10)).astype(np.int16)
-    writer = sitk.ImageFileWriter()
-    writer.KeepOriginalImageUIDOn()
-    for k in range(count):
-        if k in skip:
-            continue
-        image = sitk.GetImageFromArray(voxels[k])
-        image.SetSpacing((1.5, 1.5))
-        tags = {
-            "0008|0060": "MR", "0020|000d": "1.2.3", "0020|000e": uid, "0008|0018": f"{uid}.{k + 1}",
-            "0008|0016": "1.2.840.10008.5.1.4.1.1.4", "0020|0011": number, "0020|0013": str(k + 1),
-            "0008|103e": description, "0020|0037": "1\\0\\0\\0\\1\\0", "0020|0032": f"0\\{tilt * k}\\{2.0 * k}",
-            "0018|0050": "2", "0010|0020": patient if k else first_patient,
-        }  # fmt: skip
-        for key, value in tags.items():
-            image.SetMetaData(key, value)
-        writer.SetFileName(str(folder / f"s{number}_{k:03d}.dcm"))
-        writer.Execute(image)
-    return voxels
-
-
-def test_the_only_volume_of_a_dicom_folder_is_read_and_reported(tmp_path, caplog):
-    voxels = write_series(tmp_path / "d", 14, "1.2.3.5", "5", "t1 mprage")
-    write_series(tmp_path / "d", 3, "1.2.3.1", "1", "localizer")
-    mri = Volume.read(tmp_path / "d")
-    assert np.array_equal(mri.array, voxels)
-    assert "2 DICOM series; the only volume is read: series 5: 14 images of 10x12" in caplog.text
-    assert "mprage" not in caplog.text  # descriptions may hold names
-
-
-def test_several_volumes_are_listed_and_one_is_chosen_by_one_of_its_images(tmp_path):
-    write_series(tmp_path / "d", 12, "1.2.3.5", "5", "t1")
-    voxels = write_series(tmp_path / "d", 11, "1.2.3.6", "6", "t2")
-    with pytest.raises(SimulationError, match=r"give the path of one image.*5 't1': 12 images.*6 't2': 11 images"):
-        Volume.read(tmp_path / "d")
-    assert np.array_equal(Volume.read(tmp_path / "d" / "s6_004.dcm").array, voxels)
-
-
-def test_volumes_of_different_patients_in_one_folder_are_reported(tmp_path):
-    write_series(tmp_path / "d", 12, "1.2.3.5", "5", "t1")
-    write_series(tmp_path / "d", 11, "1.2.3.6", "6", "t2", patient="2", first_patient="2")
-    with pytest.raises(SimulationError, match="has 2 DICOM series of 2 different patients, 2 of them with 10 or more"):
-        Volume.read(tmp_path / "d")
-
-
-def test_a_missing_slice_and_a_tilted_stack_are_refused(tmp_path):
-    write_series(tmp_path / "gap", 14, "1.2.3.5", "5", "t1", skip=(6,))
-    with pytest.raises(
-        SimulationError, match="slices are missing or unevenly spaced at 1 place, first 4 mm after slice 6"
-    ):
-        Volume.read(tmp_path / "gap")
-    write_series(tmp_path / "tilt", 14, "1.2.3.5", "5", "t1", tilt=0.5)
-    with pytest.raises(SimulationError, match=r"tilted by 14\.0 degrees"):
-        Volume.read(tmp_path / "tilt")
-
-
-def test_images_of_two_patients_with_one_series_number_are_refused(tmp_path):
-    write_series(tmp_path / "mixed", 14, "1.2.3.5", "5", "t1", patient="2")
-    with pytest.raises(SimulationError, match="its images are of 2 patients by their PatientID"):
-        Volume.read(tmp_path / "mixed")
-
-
 # ---- real heads ------------------------------------------------------------------------------------------------------
 
 
@@ -571,7 +313,7 @@ def test_the_atlas_finds_colin_as_his_own_mask_does():
     mri = Volume.read(COLIN)
     result = find_brain(mri, "atlas")
     assert dice(result.mask.array > 0, Volume.read(COLIN_BRAIN).array > 0) > 0.95
-    assert recognise(Volume.read(COLIN_BRAIN))[0] is not None
+    assert isinstance(recognise(Volume.read(COLIN_BRAIN)), np.ndarray)
 
 
 @pytest.mark.long
@@ -583,7 +325,8 @@ def test_the_mask_of_a_t1_has_the_gyri_of_the_vertex_that_its_t2_shows():
     first, second = find_brain(t1), find_brain(t2, "atlas")
     assert first.method == "atlas"  # sure enough of it
     assert 1200 < first.volume_ml < 1700
-    assert left_out(first.mask, Volume.read(SHARED / "remind022/glioma.nii.gz")) == 0.0
+    glioma = Volume.read(SHARED / "remind022/glioma.nii.gz")
+    assert (refinement.on_grid(first.mask, glioma)[glioma.array > 0] > 0.5).all()
     values, within = refinement.on_grid(t2, t1), refinement.on_grid(second.mask, t1) > 0.5
     relative = values / np.median(values[ndimage.binary_erosion(within, iterations=10)])
     depth = ndimage.distance_transform_edt(within, t1.spacing_mm[::-1])

@@ -209,17 +209,6 @@ def test_a_falx_does_not_hang_in_the_saline_of_an_opening():
     assert at.max() > 10.0 and at.min() > -2.5
 
 
-def test_changed_tissues_keep_the_sheets():
-    phantom, tissues = grey()
-    louder = tissues.with_membrane(replace(sulci._MEMBRANE, thickness_mm=0.8))
-    surfels = plane("sulcus", phantom.probe_to_ras)
-    changed = UltrasoundSimulator(phantom.labels, tissues, sheets=surfels)
-    changed.set_tissues(louder)
-    fresh = UltrasoundSimulator(phantom.labels, louder, sheets=surfels)
-    images = [s.simulate(sulci._PROBE, phantom.probe_to_ras).iq for s in (changed, fresh)]
-    assert np.array_equal(images[0], images[1])
-
-
 @pytest.mark.slow
 def test_options_of_the_command(tmp_path):
     from SlicerUSSim.Command.cli import main

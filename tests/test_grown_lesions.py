@@ -57,7 +57,6 @@ def test_one_seed_grows_the_lesion_and_a_larger_version(kind, aside_mm):
     assert (segmentation.labels.array == before).all()
     assert lesion.tissues == (("tumour", "necrosis") if kind == "ring" else ("tumour",))
     assert any("say what it is" in line for line in lesion.warnings) == (kind == "low")
-    assert not any("looks the same" in line for line in lesion.warnings)
 
 
 @pytest.mark.long
@@ -174,17 +173,3 @@ def test_seeds_are_points_of_a_file_of_slicer(tmp_path):
         split_seeds([write("Fiducial", (0.0, 0.0, 0.0), status="undefined")])
     with pytest.raises(SimulationError, match=r"none\.mrk\.json: cannot be read \(No such file"):
         split_seeds([str(tmp_path / "none.mrk.json")])
-
-
-@pytest.mark.parametrize(("named", "sign"), [("LPS", -1.0), ("0", 1.0)])
-def test_seeds_are_points_of_a_list_of_slicer_before_5(named, sign, tmp_path):
-    """The frame by its name, or as 4.10 numbered them; a label may have a comma, in quotes."""
-    path = tmp_path / "F.fcsv"
-    head = f"# Markups fiducial file version = 4.11\n# CoordinateSystem = {named}\n"
-    columns = "# columns = id,x,y,z,ow,ox,oy,oz,vis,sel,lock,label,desc,associatedNodeID\n"
-    rows = '1,-1.5,2.5,3,0,0,0,1,1,1,0,"F-1, rim",,\n2,4,5,6.25,0,0,0,1,1,1,0,F-2,,vtkMRMLScalarVolumeNode1\n'
-    path.write_text(head + columns + rows)
-    assert split_seeds([str(path)]) == [((-1.5 * sign, 2.5 * sign, 3.0), None), ((4.0 * sign, 5.0 * sign, 6.25), None)]
-    path.write_text(head)
-    with pytest.raises(SimulationError, match=r"F\.fcsv: has no point that was placed"):
-        split_seeds([str(path)])

@@ -12,7 +12,7 @@ from scipy import ndimage
 
 from SlicerUSSim.Command.cli import main
 from SlicerUSSim.Logic import SimulationError, Volume, segment_mri
-from SlicerUSSim.Logic.mri.outside import OUTSIDE, find_outside, watery
+from SlicerUSSim.Logic.mri.outside import OUTSIDE, find_outside
 from SlicerUSSim.Logic.mri.samples import head_mri
 from SlicerUSSim.Logic.tissue.table import TissueTable
 
@@ -75,36 +75,6 @@ def test_a_head_that_the_image_cuts_is_reported():
         (line,) = found.warnings
         assert line.startswith(f"the image cuts the head ({side} ") and "do not put a probe there" in line
     assert find_outside(Volume(mri.array[5:].copy(), mri.ijk_to_ras), brain[5:]).warnings == ()  # the neck
-
-
-@pytest.mark.long
-def test_wide_csf_around_a_shrunken_brain_is_csf_with_a_t2_only():
-    mri, _, radius = round_head()
-    brain, csf = radius <= 53.0, (radius > 54.5) & (radius <= 61.5)
-    csf[: len(csf) // 2] = False  # below a brain is the base of the skull, with orbits
-    noisy = np.random.default_rng(1).normal(LAYERS["fluid"][1], 2.0, radius.shape)
-    t1 = mri.with_array(np.where((radius > 53.0) & (radius <= 61.5), noisy, mri.array))
-    t2 = np.select(
-        [radius <= limit for limit in (53.0, 62.0, 64.5, 67.5, 70.0, 80.0)], (60.0, 150.0, 6.0, 55.0, 6.0, 90.0)
-    )
-    names, labels = ("csf", "grey matter"), np.where(brain, np.where(radius < 20.0, 1, 2), 0)
-    t2 = np.where(radius < 20.0, 190.0, t2) * (1.0 + 0.004 * (radius - 60.0))  # coils hear more near the skin
-    alone, both = find_outside(t1, brain), find_outside(t1, brain, watery(t2, names, labels))
-    skull = OUTSIDE.index("skull") + 1
-    assert (alone.labels == skull)[
-        csf
-    ].mean() > 0.7 and "so is CSF between brain and skull, which a T2 shows" in alone.text(mri.voxel_ml)
-    assert both.fluid is not None and both.fluid[csf].mean() > 0.95 and not both.fluid[brain | (radius > 64.0)].any()
-    assert not both.labels[csf].any() and "so is CSF" not in both.text(mri.voxel_ml)
-    found, all_names = both.over(mri.with_array(labels.astype(np.uint8)), names)
-    assert (found.array == 1)[csf].mean() > 0.95 and all_names == (*names, *OUTSIDE)
-    truth, bone = (
-        (radius > 62.0) & (radius <= 70.0),
-        np.isin(both.labels, (skull, OUTSIDE.index("cancellous bone") + 1)),
-    )
-    truth, bone = truth[len(csf) // 2 :], bone[len(csf) // 2 :]
-    assert 2.0 * (bone & truth).sum() / (bone.sum() + truth.sum()) > 0.85
-    assert watery(np.where(t2 > 100.0, 40.0, t2), names, labels) is None  # dark fluid, as in a FLAIR
 
 
 def test_the_tissues_of_the_brain_go_first():

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -207,31 +206,10 @@ def test_noise_is_estimated_beside_edges(sigma):
     assert estimate_noise(noisy.astype(np.float32), np.ones(image.shape, bool)) == pytest.approx(sigma, rel=0.35)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "contrast, order",
-    [
-        ("t1", ("csf", "grey matter", "white matter")),
-        ("t2", ("white matter", "grey matter", "csf")),
-        ("flair", ("csf", "white matter", "grey matter")),
-    ],
-)
-def test_classes_are_named_by_contrast(contrast, order):
-    head = head_mri(4.0)
-    mri = head.with_array(np.where(head.array > 0, 160 - head.array, 0)) if contrast == "t2" else head
-    result = segment_once(mri, contrast=contrast, thin_sulci=False)
-    assert result.tissue_names == order
-    assert (np.diff(result.means) > 0).all()
-
-
-@pytest.mark.slow
-def test_the_table_has_a_line_per_label_and_its_millilitres_add_up():
-    result = segment_mri(head_mri(3.0), thin_sulci=True)
-    rows = [line.split() for line in result.table().splitlines()[1:]]
-    assert [row[0] for row in rows] == ["1", "2", "3", "4"]
-    total = (result.labels.array > 0).sum() * 27 / 1000
-    millilitres = sum(float(row[3 if row[2].endswith("matter") is False else 4]) for row in rows)
-    assert millilitres == pytest.approx(total, abs=0.5)
+def test_classes_are_named_by_contrast():
+    assert class_names(("t1",), None) == ("csf", "grey matter", "white matter")
+    assert class_names(("t2",), None) == ("white matter", "grey matter", "csf")
+    assert class_names(("flair",), 4) == ("csf", "white matter", "grey matter", "tumour")
 
 
 @pytest.mark.slow
@@ -243,17 +221,6 @@ def test_the_table_has_means_and_deviations_in_any_unit():
     for line, mean, deviation in zip(lines, result.means, result.standard_deviations, strict=True):
         numbers = [float(text) for text in line.split()[-2:]]
         assert numbers == pytest.approx([mean, deviation], rel=0.006, abs=0.006 * unit)
-
-
-def test_posteriors_sum_to_one_inside_and_agree_with_the_labels():
-    result = segment_once(head_mri(3.0), thin_sulci=False)
-    posteriors = result.posteriors
-    inside = result.labels.array > 0
-    assert posteriors.shape == (3, *inside.shape) and posteriors.dtype == np.float32
-    np.testing.assert_allclose(posteriors.sum(axis=0)[inside], 1, atol=1e-5)
-    assert (posteriors[:, ~inside] == 0).all()
-    agree = posteriors.argmax(axis=0)[inside] + 1 == result.labels.array[inside]
-    assert agree.mean() > 0.99
 
 
 def test_thin_sulci_are_found_on_their_middle_and_only_there():
@@ -273,40 +240,6 @@ def test_thin_sulci_are_found_on_their_middle_and_only_there():
     assert sulcus[4:24, 20, 12:28].mean() > 0.95
     assert sulcus[4:24, 12:18, 12:28].mean() < 0.01
     assert not (segment_mri(mri, mask=mask, thin_sulci=False).labels.array == 4).any()
-
-
-@pytest.mark.slow
-def test_bias_correction_saves_the_classes_of_a_shaded_image():
-    head = head_mri(3.0)
-    shade = np.linspace(0.72, 1.28, head.array.shape[0])[:, None, None].astype(np.float32)
-    reference = segment_mri(head, bias_correction=False, thin_sulci=False).labels.array
-    shaded = head.with_array(head.array * shade)
-    plain = (segment_mri(shaded, bias_correction=False, thin_sulci=False).labels.array == reference)[
-        reference > 0
-    ].mean()
-    result = segment_mri(shaded, thin_sulci=False)
-    assert any("across the brain: removed" in line for line in result.notes)
-    corrected = (result.labels.array == reference)[reference > 0].mean()
-    assert corrected > max(plain + 0.1, 0.95)
-
-
-@pytest.mark.slow
-def test_the_field_found_with_the_tissues_is_the_one_that_was_applied():
-    """Of a field that varies by a tenth of its mean less than a third remains in grey and white matter."""
-    head = head_mri(3.0)
-    inside = head.array > 0
-    k, j, i = (np.linspace(-1, 1, n) for n in head.array.shape)
-    log = 0.25 * k[:, None, None] * j[:, None] + 0.18 * i + 0.15 * (i**2 - 0.4)
-    shaded = np.where(inside, head.array * np.exp(log), 0).astype(np.float32)
-    atlas = mni152()
-    if atlas is None:
-        pytest.skip("needs nilearn's MNI152")
-    prior = register_atlas(head, inside, atlas).prior(head, inside)
-    found = estimate_field(shaded, inside, head.spacing_mm, "t1", prior)
-    tissue = inside & (head.array > 60)
-    left = np.log(found.factor[tissue]) - log[tissue]
-    assert log[tissue].std() > 0.08
-    assert left.std() < log[tissue].std() / 3
 
 
 def test_a_brain_of_which_two_thirds_are_white_matter_keeps_its_grey():
@@ -329,45 +262,13 @@ def test_wrong_arguments_are_named(change, message):
         segment_mri(head_mri(4.0), **change)
 
 
-def test_images_without_tissue_are_refused():
-    grid = head_mri(4.0)
-    with pytest.raises(SimulationError, match="not finite numbers"):
-        segment_mri(grid.with_array(np.where(grid.array > 80, np.nan, grid.array)))
-    with pytest.raises(SimulationError, match="MRI is constant"):
-        segment_mri(grid.with_array(np.full_like(grid.array, 7)))
-    with pytest.raises(SimulationError, match="mask is empty"):
-        segment_mri(grid, mask=grid.with_array(np.zeros_like(grid.array)))
-
-
-@pytest.mark.parametrize("is_cropped", [False, True])
 @pytest.mark.slow
-def test_a_second_mri_may_lack_a_part_of_the_brain(mni2, is_cropped):
-    """It is said how much, whether it was cropped there or has zeros, and too much is refused."""
+def test_a_second_mri_without_much_of_the_brain_is_refused(mni2):
     j = np.flatnonzero((mni2.array > 0).any(axis=(0, 2)))
-
-    def without(share: float) -> Volume:
-        end = int(j[0] + (1.0 - share) * len(j))
-        if is_cropped:
-            return Volume(mni2.array[:, :end].copy(), mni2.ijk_to_ras)
-        array = mni2.array.copy()
-        array[:, end:] = 0
-        return mni2.with_array(array)
-
-    found = segment_mri(mni2, contrast="t1", others={"t1gd": without(0.25)}, thin_sulci=False)
-    assert any(re.search(r"t1gd: has no data in (1\d|[89])% of the brain", line) for line in found.warnings)
-    refusal = r"has data in [67]\d% of the brain of the" if is_cropped else r"is 0 in \d+% of the brain.*with a gap"
-    with pytest.raises(SimulationError, match=f"t1gd: {refusal}"):
-        segment_mri(mni2, contrast="t1", others={"t1gd": without(0.4)})
-
-
-@pytest.mark.skipif(not COLIN27.exists(), reason="Debian's mricron-data is not installed")
-@pytest.mark.slow
-def test_the_brain_of_another_patient_is_refused_as_second_mri(mni):
-    """Both are skull-stripped, in one space, and alike as wholes."""
-    with pytest.raises(
-        SimulationError, match=r"t1gd \(.*ch2bet.*\): \d+% of the brain's parts lie where the first volume has them"
-    ):
-        segment_mri(mni[0], contrast="t1", others={"t1gd": Volume.read(COLIN27)})
+    end = int(j[0] + 0.6 * len(j))
+    cropped = Volume(mni2.array[:, :end].copy(), mni2.ijk_to_ras)
+    with pytest.raises(SimulationError, match=r"t1gd: has data \(other than 0\) in [67]\d% of the brain of the first"):
+        segment_mri(mni2, contrast="t1", others={"t1gd": cropped})
 
 
 @pytest.mark.slow
@@ -381,22 +282,6 @@ def test_a_label_map_is_refused_as_second_mri(mni2):
         segment_mri(mni2, contrast="t1", others={"t2": mni2.with_array(parts.astype(np.uint8))})
 
 
-@pytest.mark.long
-def test_the_map_of_one_tissue_is_refused_as_second_mri(mni2):
-    grey = mni2.with_array(np.clip(1.0 - np.abs(mni2.array - 60.0) / 30.0, 0.0, 1.0).astype(np.float32))
-    with pytest.raises(SimulationError, match=r"t2: is 0 in \d+% of the brain, as the map of one tissue is"):
-        segment_mri(mni2, contrast="t1", others={"t2": grey})
-
-
-@pytest.mark.slow
-def test_a_small_whole_brain_is_led_by_the_atlas(mni2):
-    matrix = mni2.ijk_to_ras.copy()
-    matrix[:3, :3] *= (620.0 / 1886.0) ** (1.0 / 3.0)
-    found = segment_mri(Volume(mni2.array, matrix), contrast="t1", thin_sulci=False)
-    assert any("led by the MNI152 atlas" in line for line in found.notes)
-    assert any("expected 1000 to 1900 ml of an adult" in line for line in found.warnings)
-
-
 @pytest.mark.slow
 def test_thick_slices_of_a_turned_head_are_registered(mni):
     """A T2 of 5 mm slices, turned by 10 degrees."""
@@ -407,9 +292,9 @@ def test_thick_slices_of_a_turned_head_are_registered(mni):
     thick = thick[: thick.shape[0] // 5 * 5].reshape(-1, 5, *thick.shape[1:]).mean(axis=1)
     matrix = t1.ijk_to_ras @ np.array([[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 5, 2], [0, 0, 0, 1.0]])
     turned = rigid(Rotation.from_rotvec(10.0 * np.eye(3)[axis], degrees=True).as_matrix(), [6.0, -4.0, 9.0])
-    moved, line, warnings = aligned(Volume(thick.astype(np.float32), turned @ matrix), t1, inside, "t2")
+    moved, line = aligned(Volume(thick.astype(np.float32), turned @ matrix), t1, inside, "t2")
     angle = float(line.split("turned by ")[1].split()[0])
-    assert angle == pytest.approx(10.0, abs=0.6) and not warnings
+    assert angle == pytest.approx(10.0, abs=0.6)
     assert np.corrcoef(moved.array[inside], t1.array[inside])[0, 1] < -0.75
 
 
@@ -424,14 +309,11 @@ def test_less_sure_posteriors_shrink_log_odds_and_change_no_label():
 
 def test_a_registration_is_the_same_every_time():
     """Whatever the order of threads and the memory before; else kept sheets are not found again."""
-    from SlicerUSSim.Logic.mri import atlas_registration
-
     atlas, head = mni152(), head_mri(4.0)
     if atlas is None:
         pytest.skip("needs nilearn's MNI152")
     found = set()
     for _ in range(2):
-        atlas_registration._known.clear()
         fit = register_atlas(head, head.array > 0, atlas)
         found.add((fit.patient_to_atlas.tobytes(), fit.dice))
         np.ones(500_000)  # uses memory again

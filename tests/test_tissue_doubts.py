@@ -11,8 +11,7 @@ import pytest
 from scipy import ndimage
 
 from SlicerUSSim.Logic import SimulationError, segment_mri
-from SlicerUSSim.Logic.mri.classification import Classes
-from SlicerUSSim.Logic.mri.plausibility import in_other_order, unsure
+from SlicerUSSim.Logic.mri.plausibility import unsure
 from validation.brain_phantoms import TissueMaps, phantom, tissue_maps
 from validation.brain_scores import scores
 
@@ -46,18 +45,6 @@ def test_cortex_is_not_csf_where_the_mask_leaves_only_the_ventricles():
     share = float((found.labels.array == found.tissue_names.index("csf") + 1).sum() / kept.sum())
     assert 0.3 * true < share < 2.0 * true
     assert scores(found.labels.array, dict(enumerate(found.tissue_names, 1)), case)["grey and white"] > 0.9
-
-
-def classes_of(means, posteriors=None, names=("csf", "grey matter", "white matter")):
-    posteriors = np.eye(len(names)) if posteriors is None else np.asarray(posteriors, float)
-    means = np.array(means, float)[:, None]
-    return Classes(names, posteriors, means, np.ones_like(means), None)
-
-
-def test_tissues_in_the_order_of_another_contrast_are_reported():
-    (line,) = in_other_order(classes_of([10.6, 277.5, 130.4]), "t1")
-    assert "(csf 10.6, grey matter 277.5, white matter 130.4): check the contrast" in line
-    assert in_other_order(classes_of([10.6, 130.4, 277.5]), "t1") == []
 
 
 def test_a_brain_that_lies_unlike_its_header_is_said():

@@ -68,13 +68,6 @@ class Additions:
             masks.append((tissue, mask, Path(file).name))
         return cls(tuple(masks), own)
 
-    def require_addable(self, mri: Volume, mask: Volume | None, skull_strip: str) -> None:
-        """Raise SimulationError for what could not be added after a segmentation of `mri`, which is slow."""
-        if self.masks:
-            from SlicerUSSim.Logic.mri.addable import require_addable
-
-            require_addable(mri, self.masks, mask=mask, skull_strip=skull_strip, also=self.own_tissues)
-
     def with_presets(self, tissues: TissueTable) -> TissueTable:
         """A table with the presets of those tissues that it lacks."""
         from SlicerUSSim.Logic.tissue.presets import TISSUES

@@ -70,7 +70,7 @@ def demo(out: Path, patient: DemoOptions) -> None:
     with Steps(5) as step:
         step("segment the MRI")
         start = perf_counter()
-        found = segmented_file(path or mri.name, mri, patient, additions=masks, tell_all=True, is_file=path is not None)
+        found = segmented_file(path or mri.name, mri, patient, tell_all=True, is_file=path is not None)
         if not isinstance(found, Segmentation):
             raise SimulationError(f"{source}: is read as a CT, expected an MRI; use ussim simulate")
         seconds = perf_counter() - start

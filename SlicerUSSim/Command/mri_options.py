@@ -15,7 +15,6 @@ from SlicerUSSim.Logic.base.errors import SimulationError, require
 from SlicerUSSim.Logic.mri.segmentation_settings import CT, MRI_CONTRASTS, SegmentationSettings
 
 if TYPE_CHECKING:
-    from SlicerUSSim.Command.additions import Additions
     from SlicerUSSim.Logic.base import Volume
     from SlicerUSSim.Logic.mri import CtSegmentation, Segmentation
     from SlicerUSSim.Logic.tissue import LabelledTissues
@@ -95,7 +94,7 @@ class ImageOptions(MriOptions):
         "--craniotomy", default=NONE, show_default=True, metavar="none|auto|disc:MM|FILE",
         help="Opening in skin and skull of a whole head (a label map with them, or an MRI with segmentation.outside), "
         "filled with the coupling medium: a disc of this diameter under the probe, auto (as wide as the probe's face "
-        "needs), the mask in FILE, or the polygon through points of 3D Slicer (.mrk.json, .fcsv). With --pose auto the "
+        "needs), the mask in FILE, or the polygon through points of 3D Slicer (.mrk.json). With --pose auto the "
         "probe then stands on the brain.",
     )  # fmt: skip
     #: A file, auto or none
@@ -139,12 +138,11 @@ def require_no_map(path: str, maps: Iterable[str], organs: str | None) -> None:
 
 
 def segmented_file(
-    path: str, mri: Volume, patient: MriOptions, *, additions: Additions, tell_all: bool = False, is_file: bool = True
+    path: str, mri: Volume, patient: MriOptions, *, tell_all: bool = False, is_file: bool = True
 ) -> Segmentation | CtSegmentation:
     """Segment the MRI or CT of a file; the brain mask of an MRI is kept beside it, unless it is none (`is_file`).
 
     Says how the brain was found, with `tell_all` also what else; what should be checked is logged as warnings.
-    Raises SimulationError before the segmentation for `additions` that could not be added after it.
     """
     from SlicerUSSim.Logic.base.errors import about_file
     from SlicerUSSim.Logic.base.volume import Volume
@@ -161,7 +159,6 @@ def segmented_file(
     require(organs is None or not is_of_brain, f"--organs is for a CT, expected --ct; {path} is read as an MRI")
     others = {contrast: Volume.read(file) for contrast, file in also_files(patient.also, path).items()}
     brain = read_mask(patient.mask) if patient.mask else None
-    additions.require_addable(mri, brain, settings.skull_strip if is_of_brain else "none")
     found = None if organs is None else _read_organs(organs, maps)
     with Share("segment") as progress, about_file(path):
         result = segment_image(

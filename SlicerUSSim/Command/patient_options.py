@@ -197,7 +197,7 @@ def open_examination(
         changes.check_tissues((*(tissue.name for tissue in tissues.all_tissues()), *TISSUES))
     else:
         changes.to_tissues(additions.with_presets(tissues))
-    segmentation = segmented_file(path, volume, patient, additions=additions)
+    segmentation = segmented_file(path, volume, patient)
     labels, names, surfels = segmentation.labels, segmentation.tissue_names, sheets.read
     if isinstance(segmentation, Segmentation):
         surfels, labels, names = sheets.found(path, volume, segmentation, patient.contrast)

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 seed_option = click.option(
     "--seed", "seeds", multiple=True, metavar="R,A,S|FILE[=TISSUE]",
     help="Grow the lesion around a point, RAS mm in the frame of the MRI, or around each point of a file of 3D "
-    "Slicer (.mrk.json, .fcsv): masks beside the labels, which stay as they are, each in a smaller and a larger "
+    "Slicer (.mrk.json): masks beside the labels, which stay as they are, each in a smaller and a larger "
     "version; --add lays them over. With a tissue (tumour, oedema, necrosis, cyst, haematoma, cavity, enhancing) it "
     "is called that. May be repeated.",
 )  # fmt: skip
@@ -38,8 +38,8 @@ def split_seeds(texts: Iterable[str]) -> list[tuple[tuple[float, ...], str | Non
         points = _points_of(place)
         require(
             bool(points) and ("=" not in text or bool(tissue.strip())),
-            f"--seed is {text!r}, expected R,A,S in mm, such as 31.5,-20,42, or points of 3D Slicer (.mrk.json, "
-            f".fcsv), and with a tissue 31.5,-20,42=oedema{_if_mask(place)}",
+            f"--seed is {text!r}, expected R,A,S in mm, such as 31.5,-20,42, or points of 3D Slicer "
+            f"(.mrk.json), and with a tissue 31.5,-20,42=oedema{_if_mask(place)}",
         )
         if tissue:
             from SlicerUSSim.Logic.base.errors import about_file

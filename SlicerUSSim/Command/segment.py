@@ -58,7 +58,7 @@ def segment(
         require(has_brain_mask(settings.contrast), "--seed grows lesions of an MRI, and this is a CT")
         require_seeds(seeds, volume, out)
     start = perf_counter()
-    result = segmented_file(mri, volume, patient, additions=masks, tell_all=True)
+    result = segmented_file(mri, volume, patient, tell_all=True)
     seconds = perf_counter() - start
     lesions, refused = grown_at(result, seeds) if isinstance(result, Segmentation) else ([], [])
     labels, names = result.labels, result.tissue_names

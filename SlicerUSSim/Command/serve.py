@@ -147,9 +147,6 @@ def serve(patient: ServeOptions, recording: TrackingOptions) -> None:
     if mri is not None and patient.labels is None:
         volumes[mri] = read_head(mri)
     checked = Additions.of((tissue, with_label_names(volumes[file], file), file) for tissue, file in added)
-    if mri is not None and patient.labels is None:
-        mask = None if patient.mask is None else volumes[patient.mask]
-        checked.require_addable(volumes[mri], mask, "none" if is_ct else chosen.skull_strip)
     if patient.labels is not None and mri is not None and (has_mask or others):
         what = " and ".join([*["--mask"] * has_mask, *["--also"] * bool(others)])
         note(f"{what}: for Segment in the page; the labels shown are those of {patient.labels}")

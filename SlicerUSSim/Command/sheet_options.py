@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 sheets_option = click.option(
     "--sheets", type=click.Path(path_type=Path), metavar="FILE",
-    help="Also find sulci, falx, tentorium and walls of ventricles as surfaces and write them to FILE, a .vtp or .ply "
+    help="Also find sulci, falx, tentorium and walls of ventricles as surfaces and write them to FILE, a .vtp "
     "for Slicer; corpus callosum, choroid plexus and vessels are laid over the labels. T1, T1 with contrast, or T2.",
 )  # fmt: skip
 sheet_kind_option = click.option(

@@ -13,7 +13,7 @@ _NIFTI_AT, _NIFTI = 344, (b"n+1\0", b"ni1\0")
 _META = re.compile(rb"\s*(?:ObjectType|NDims|Comment|ObjectSubType|BinaryData)\s*=")
 _TABLES = (".txt", ".ctbl", ".csv", ".tsv", ".lut")
 #: Endings of texts whose content says nothing more
-_TEXTS = (".json", ".xml", ".xfm", ".tag", ".tfm", ".mat", ".fcsv", *_TABLES)
+_TEXTS = (".json", ".xml", ".xfm", ".tag", ".tfm", ".mat", *_TABLES)
 
 
 def is_dicom_file(name: str, content: bytes) -> bool:

@@ -72,7 +72,7 @@ class Files:
     maps: tuple[str, ...] = ()
     contrast: str = "t1"
     mask: str | None = None
-    skull_strip: str = "auto"
+    skull_strip: str = "atlas"
     #: Whether skin, scalp, skull and air are labelled, too
     outside: bool = False
     #: Label map of organs of a CT

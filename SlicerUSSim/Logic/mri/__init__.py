@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING
 from SlicerUSSim.Logic.base.lazy import lazy_exports
 
 if TYPE_CHECKING:
-    from .addable import require_addable as require_addable
     from .ct import CtSegmentation as CtSegmentation, segment_ct as segment_ct
     from .filtering import guided_filter as guided_filter
     from .lesions.grown_lesion import GrownLesion as GrownLesion

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from SlicerUSSim.Logic.base.errors import required
 from SlicerUSSim.Logic.base.volume import Volume
 
 
@@ -38,3 +39,10 @@ def mni152() -> Atlas | None:
     shares = [np.where(inside, volume.array.astype(np.float32) / 255.0, 0.0) for volume in (grey, white)]
     csf = np.where(inside, np.clip(1.0 - shares[0] - shares[1], 0.0, 1.0), 0.0)
     return Atlas(t1, *(t1.with_array(share.astype(np.float32)) for share in (csf, *shares)))
+
+
+def required_atlas() -> Atlas:
+    """As mni152. Raises SimulationError, with the remedy, if nilearn is not installed."""
+    return required(
+        mni152(), "a whole head needs the brain atlas of nilearn: pip install nilearn, or give a brain mask (--mask)"
+    )

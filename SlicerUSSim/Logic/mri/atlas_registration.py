@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import itertools
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -25,11 +24,6 @@ _COARSE_MM, _MAPS_MM = 4.0, 2.0
 _PRIOR_SIGMA_MM, _PRIOR_FLOOR = 3.0, 0.02
 #: Overlap of the two brain masks from which the atlas counts as found
 _LEAST_DICE = 0.85
-#: A whole brain's mask in millilitres
-WHOLE_BRAIN_ML = (500.0, 2300.0)
-#: Results of the last registrations, by content: a patient is segmented again and again, with other settings.
-_known: dict[bytes, tuple[np.ndarray, float]] = {}
-_MOST_KNOWN = 8
 #: Start rotations about the patient's axes in degrees, besides none
 _TURNS = ((25, 0, 0), (-25, 0, 0), (0, 25, 0), (0, -25, 0), (0, 0, 25), (0, 0, -25))
 
@@ -83,12 +77,6 @@ class AtlasFit:
             result[box] = on_grid(Volume(array, atlas_to_ras), Volume(inside[box], box_to_ras))
         return result[inside]
 
-    def is_left(self, grid: Volume, inside: np.ndarray) -> np.ndarray:
-        """(voxels,) whether each voxel `inside` (k, j, i) is left of the atlas's midline."""
-        row = (self.patient_to_atlas @ grid.ijk_to_ras)[0]
-        k, j, i = np.ogrid[tuple(map(slice, inside.shape))]
-        return (row[0] * i + row[1] * j + row[2] * k + row[3] < 0)[inside]
-
 
 def register_atlas(
     image: Volume, inside: np.ndarray, atlas: Atlas, progress: Callable[[float], None] | None = None
@@ -98,32 +86,10 @@ def register_atlas(
     `image` is any contrast, and `inside` (k, j, i) its brain mask. Started from the centres and sizes of the masks, in
     seven orientations. Takes about two seconds.
     """
+    import SimpleITK as sitk
+
+    report = progress or (lambda share: None)
     fixed, fixed_mask = _coarse(image, inside)
-    content = _content(fixed, fixed_mask)
-    if content not in _known:
-        if len(_known) >= _MOST_KNOWN:
-            _known.pop(next(iter(_known)))
-        _known[content] = _registered(fixed, fixed_mask, atlas, progress or (lambda share: None))
-    return AtlasFit(*_known[content], atlas)
-
-
-def _content(*images: sitk.Image) -> bytes:
-    """A key that differs between images of different voxels or geometry."""
-    import SimpleITK as sitk
-
-    content = hashlib.sha256()
-    for image in images:
-        content.update(repr((image.GetOrigin(), image.GetSpacing(), image.GetDirection())).encode())
-        content.update(sitk.GetArrayViewFromImage(image).tobytes())
-    return content.digest()
-
-
-def _registered(
-    fixed: sitk.Image, fixed_mask: sitk.Image, atlas: Atlas, report: Callable[[float], None]
-) -> tuple[np.ndarray, float]:
-    """((4, 4) patient_to_atlas in RAS, Dice of the masks)."""
-    import SimpleITK as sitk
-
     moving, moving_mask = _coarse(atlas.t1, atlas.t1.array > 0)
     centres = [_centroid(mask) for mask in (fixed_mask, moving_mask)]
     volumes = [float(sitk.GetArrayViewFromImage(mask).sum()) for mask in (fixed_mask, moving_mask)]
@@ -136,22 +102,23 @@ def _registered(
         rotation = sitk.Euler3DTransform()
         rotation.SetRotation(*np.radians(turn).tolist())
         similarity.SetMatrix((np.reshape(rotation.GetMatrix(), (3, 3)) * scale).ravel().tolist())
-        starts.append((_metric(fixed, moving, similarity), similarity))
+        starts.append((metric_at(registration_method(bins=32), fixed, moving, similarity), similarity))
     report(0.2)
     starts.sort(key=lambda start: start[0])
-    best = min((_optimised(fixed, moving, start, 40, (2,)) for _, start in starts[:2]), key=lambda found: found[0])[1]
+    fits = [optimised(_method(40, (2,)), fixed, moving, start) for _, start in starts[:2]]
+    best = min(fits, key=lambda found: found[0])[1]
     report(0.6)
     affine = sitk.AffineTransform(3)
     linear, shift = _matrix(best)
     affine.SetCenter(centres[0].tolist())
     affine.SetMatrix(linear.ravel().tolist())
     affine.SetTranslation((linear @ centres[0] + shift - centres[0]).tolist())
-    found = _optimised(fixed, moving, affine, 50, (2, 1))[1]
+    found = optimised(_method(50, (2, 1)), fixed, moving, affine)[1]
     # An array of its own: a view of an image that nothing else holds is of memory that is used again
     warped = sitk.GetArrayFromImage(sitk.Resample(moving_mask, fixed_mask, found)) > 0.5
     mask = sitk.GetArrayViewFromImage(fixed_mask) > 0.5
     report(1.0)
-    return _ras_matrix(found), 2.0 * float((warped & mask).sum()) / float(warped.sum() + mask.sum())
+    return AtlasFit(_ras_matrix(found), 2.0 * float((warped & mask).sum()) / float(warped.sum() + mask.sum()), atlas)
 
 
 @cache
@@ -201,30 +168,40 @@ def _centroid(mask: sitk.Image) -> np.ndarray:
     return np.array(mask.TransformContinuousIndexToPhysicalPoint(centre[::-1].tolist()))
 
 
-def _method(moving: sitk.Image) -> sitk.ImageRegistrationMethod:
+def registration_method(bins: int) -> sitk.ImageRegistrationMethod:
+    """One by Mattes' mutual information, which gives the same result every time."""
     import SimpleITK as sitk
 
     method = sitk.ImageRegistrationMethod()
-    method.SetMetricAsMattesMutualInformation(32)
+    method.SetMetricAsMattesMutualInformation(bins)
     method.SetInterpolator(sitk.sitkLinear)
     method.SetNumberOfWorkUnits(1)  # ITK adds up what several find in the order in which they end
     return method
 
 
-def _metric(fixed: sitk.Image, moving: sitk.Image, transform: Any) -> float:
-    method = _method(moving)
-    method.SetInitialTransform(transform)
+def metric_at(method: sitk.ImageRegistrationMethod, fixed: sitk.Image, moving: sitk.Image, transform: Any) -> float:
+    """Negative mutual information; 0 where the images do not overlap."""
+    method.SetInitialTransform(transform, inPlace=False)
     try:
-        return method.MetricEvaluate(fixed, moving)
-    except RuntimeError:  # the images do not overlap
+        return float(method.MetricEvaluate(fixed, moving))
+    except RuntimeError:
         return 0.0
 
 
-def _optimised(
-    fixed: sitk.Image, moving: sitk.Image, start: Any, iterations: int, shrink: tuple[int, ...]
+def optimised(
+    method: sitk.ImageRegistrationMethod, fixed: sitk.Image, moving: sitk.Image, start: Any
 ) -> tuple[float, Any]:
-    """(negative mutual information, transform) after gradient descent; the start where that fails."""
-    method = _method(moving)
+    """(negative mutual information, transform); (0, start) where the images lose each other."""
+    method.SetInitialTransform(start, inPlace=False)
+    try:
+        found = method.Execute(fixed, moving)
+    except RuntimeError:
+        return 0.0, start
+    return method.GetMetricValue(), found
+
+
+def _method(iterations: int, shrink: tuple[int, ...]) -> sitk.ImageRegistrationMethod:
+    method = registration_method(bins=32)
     method.SetShrinkFactorsPerLevel(shrink)
     method.SetSmoothingSigmasPerLevel([0.5 * factor * _COARSE_MM for factor in shrink])
     method.SmoothingSigmasAreSpecifiedInPhysicalUnitsOn()
@@ -232,12 +209,7 @@ def _optimised(
         learningRate=1.0, minStep=0.02, numberOfIterations=iterations, gradientMagnitudeTolerance=1e-6
     )
     method.SetOptimizerScalesFromPhysicalShift()
-    method.SetInitialTransform(start, inPlace=False)
-    try:
-        found = method.Execute(fixed, moving)
-    except RuntimeError:  # the images have lost each other
-        return 0.0, start
-    return method.GetMetricValue(), found
+    return method
 
 
 def _matrix(transform: sitk.Transform) -> tuple[np.ndarray, np.ndarray]:

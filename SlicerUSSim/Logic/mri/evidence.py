@@ -7,7 +7,6 @@ from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy import ndimage
 
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.mri.mixture import TISSUES
@@ -118,28 +117,6 @@ class Evidence:
         result = np.zeros((len(TISSUES), *self.inside.shape), np.float32)
         result[:, self.inside] = self.atlas.prior(self.grid, self.inside)
         return result
-
-    @cached_property
-    def _to_mirrored(self) -> np.ndarray | None:
-        """(4, 4) from indices k, j, i, 1 of the box to those of the counterpart in the other hemisphere."""
-        if self.atlas is None:
-            return None
-        there = self.atlas.patient_to_atlas
-        ijk = np.linalg.inv(self.ijk_to_ras) @ np.linalg.inv(there) @ np.diag([-1.0, 1.0, 1.0, 1.0])
-        matrix = ijk @ there @ self.ijk_to_ras
-        order = [2, 1, 0, 3]
-        return matrix[np.ix_(order, order)]
-
-    def mirrored(self, array: np.ndarray, window: tuple[slice, slice, slice] | None = None) -> np.ndarray | None:
-        """(k, j, i) float32 values of an array of the box at the counterparts of its voxels in the other hemisphere,
-        0 outside the box; of the voxels of a window alone. None without an atlas."""
-        if self._to_mirrored is None:
-            return None
-        window = window or (slice(0, array.shape[0]), slice(0, array.shape[1]), slice(0, array.shape[2]))
-        linear = self._to_mirrored[:3, :3]
-        offset = self._to_mirrored[:3, 3] + linear @ [part.start for part in window]
-        size = tuple(part.stop - part.start for part in window)
-        return ndimage.affine_transform(array, linear, offset, size, order=1, output=np.float32)  # pyright: ignore
 
     @cached_property
     def between_hemispheres(self) -> np.ndarray:

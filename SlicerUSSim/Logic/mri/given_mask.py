@@ -14,10 +14,6 @@ from SlicerUSSim.Logic.mri.recognition import POSSIBLE_ML, USUAL_ML
 
 #: Labels of a segmentation count as inside too; an image has more values
 _MOST_MASK_VALUES = 128
-#: Values that are listed
-_LISTED = 6
-
-
 #: What a filter leaves beyond 0 and 1
 _ROUNDING = 1e-3
 
@@ -38,8 +34,8 @@ def checked_mask(mask: Volume, mri: Volume) -> np.ndarray:
         f"{name} lies up to {apart:.1f} mm from the MRI's voxels, expected the same origin, spacing and directions; "
         "resample the mask",
     )
-    if _is_probability(mask.array):
-        mask = mask.with_array(mask.array > 0.5)
+    if np.issubdtype(mask.array.dtype, np.floating) and float(mask.array.max()) <= 1.0 + _ROUNDING:
+        mask = mask.with_array(mask.array > 0.5)  # probabilities
     values = np.unique(mask.array[:: max(mask.array.shape[0] // 16, 1)])
     require(
         len(values) <= _MOST_MASK_VALUES,
@@ -56,53 +52,25 @@ def checked_mask(mask: Volume, mri: Volume) -> np.ndarray:
     return inside
 
 
-def _is_probability(array: np.ndarray) -> bool:
-    """Whether these are probabilities of the brain: from 0 to 1, most of them near one of the two."""
-    low, high = float(array.min()), float(array.max())
-    if not np.issubdtype(array.dtype, np.floating) or low < -_ROUNDING or not 0.9 < high <= 1.0 + _ROUNDING:
-        return False
-    some = array[::3, ::3, ::3]
-    some = some[some > 0.05]
-    return bool(some.size and (some > 0.95).mean() > 0.5)
-
-
-def mask_doubts(mri: Volume, inside: np.ndarray) -> tuple[str, ...]:
-    """What should be checked in a mask (k, j, i) that a user made."""
-    millilitres = float(inside.sum() * mri.voxel_ml)
-    if millilitres < POSSIBLE_ML[0]:
-        small = (
-            f"the mask has {millilitres:.3g} ml, expected a brain of {USUAL_ML[0]:.0f} to {USUAL_ML[1]:.0f} ml or a "
-            "large part of one; what is outside it has no tissue (a lesion is added with --add tumour=FILE)"
-        )
-        return (small,)
-    return volume_warnings(millilitres)
-
-
 def label_doubts(mask: Volume) -> tuple[str, ...]:
     """A warning about a mask that is a label map, all of whose labels are taken."""
     values = np.unique(mask.array[mask.array > 0])
-    if len(values) < 2 or _is_probability(mask.array):
+    if len(values) < 2 or (values < 1).any():
         return ()
-    segments = several_segments(mask)
-    if segments:
-        return (
-            f"the mask holds the segments {segments}, expected a file with one; the brain is taken where any of them "
-            "is: if some are not brain, export the brain alone",
-        )
-    listed = ", ".join(f"{value:g}" for value in values[:_LISTED]) + (", ..." if len(values) > _LISTED else "")
+    listed = several_segments(mask) or ", ".join(f"{value:g}" for value in values)
     return (
-        f"the mask holds {len(values)} values ({listed}), expected one; the brain is taken where it is not 0: if some "
-        "are not brain, give a mask without them",
+        f"the mask holds the labels {listed}, expected one; the brain is taken where any of them is: if some are not "
+        "brain, export the brain alone",
     )
 
 
-def volume_warnings(millilitres: float) -> tuple[str, ...]:
+def volume_doubts(millilitres: float) -> tuple[str, ...]:
     """A warning about a brain that is smaller or larger than an adult's."""
     if USUAL_ML[0] <= millilitres <= USUAL_ML[1]:
         return ()
     return (
-        f"the brain has {millilitres:.0f} ml, expected {USUAL_ML[0]:.0f} to {USUAL_ML[1]:.0f} ml of an adult; "
-        "check the mask",
+        f"the brain has {millilitres:.0f} ml, expected {USUAL_ML[0]:.0f} to {USUAL_ML[1]:.0f} ml of an adult; check "
+        "the mask: what is outside it has no tissue (a lesion is added with --add tumour=FILE)",
     )
 
 

@@ -20,11 +20,10 @@ from SlicerUSSim.Logic.base.errors import require
 from SlicerUSSim.Logic.base.neighbourhood import distance_to
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.mri.coarse import largest_component
+from SlicerUSSim.Logic.mri.edges import areas_at_edges
 
 #: Contrasts in which bone is known to be found
 CONTRASTS = ("t1", "t1gd")
-#: The tissue between a brain and its skull
-CSF = "csf"
 #: Tissues outside the brain, in the order of their labels
 OUTSIDE = ("skin", "scalp", "skull", "cancellous bone", "air")
 #: Air around the head: below this part of Otsu's threshold. Bone: below this part of the one beside the brain
@@ -43,9 +42,6 @@ _SMOOTH_MM = 6.0
 _CUT_CM2 = 4.0
 #: Near the faces of an image no air is labelled
 _FACES_MM = 8.0
-#: CSF is brighter than this times grey matter in a T2, and in the brain clearly so; in a T1 it is darker than this part
-#: of what is dark, as marrow is not; threads of fluid up to this thick do not join
-_BRIGHTER, _CLEARLY, _FLUID, _THREAD_MM = 1.2, 1.5, 0.6, 0.8
 #: Tables of the skull over its marrow
 _TABLE_MM = 1.2
 #: Air in the head, other than cracks between tissues; it is darker than this part of what is dark, as bone between fat
@@ -63,17 +59,13 @@ class Outside:
     dark: float
     #: What a user should check, one line each
     warnings: tuple[str, ...] = ()
-    #: (k, j, i) bool, CSF between the brain and the skull that another image shows, 0 in `labels`; None without one
-    fluid: np.ndarray | None = None
 
     def text(self, voxel_ml: float) -> str:
         """One line for the user: "outside the brain: skin 240 ml, scalp 1100 ml, ..."."""
         counts = np.bincount(self.labels.ravel(), minlength=len(OUTSIDE) + 1)[1:]
         parts = [f"{name} {count * voxel_ml:.0f} ml" for name, count in zip(OUTSIDE, counts, strict=True)]
-        if self.fluid is not None:
-            parts.insert(0, f"csf {np.count_nonzero(self.fluid) * voxel_ml:.0f} ml (by the t2)")
         line = f"outside the brain: {', '.join(parts)}; bone is what is darker than {self.dark:.4g}"
-        return line if self.fluid is not None else f"{line}, and so is CSF between brain and skull, which a T2 shows"
+        return f"{line}, and so is CSF between brain and skull"
 
     def over(self, labels: Volume, names: Sequence[str]) -> tuple[Volume, tuple[str, ...]]:
         """(labels with those outside the brain after them, names of all labels from 1 on).
@@ -83,10 +75,7 @@ class Outside:
         present = [n for n in range(1, len(OUTSIDE) + 1) if (self.labels == n).any()]
         lookup = np.zeros(len(OUTSIDE) + 1, labels.array.dtype)
         lookup[present] = len(names) + 1 + np.arange(len(present))
-        around = lookup[self.labels]
-        if self.fluid is not None and CSF in names:
-            around[self.fluid] = names.index(CSF) + 1
-        array = np.where(labels.array > 0, labels.array, around)
+        array = np.where(labels.array > 0, labels.array, lookup[self.labels])
         return labels.with_array(array), (*names, *(OUTSIDE[n - 1] for n in present))
 
 
@@ -104,29 +93,15 @@ def require_findable(contrast: str, skull_strip: str, has_mask: bool) -> None:
     )
 
 
-def watery(t2: np.ndarray, names: Sequence[str], labels: np.ndarray) -> np.ndarray | None:
-    """(k, j, i) bool: what is as bright as CSF in a T2, by the labels 1, 2, ... called `names` of the brain.
-
-    None where CSF is not clearly brighter than grey matter in it, as in one of FLAIR.
-    """
-    fluid, grey = (t2[labels == names.index(name) + 1] for name in (CSF, "grey matter"))
-    if not fluid.size or not grey.size:
-        return None
-    # At the vertex coils hear so little that fluid is hardly half as bright as in the ventricles; bone is far darker.
-    bright, usual = float(np.median(fluid)), float(np.median(grey))
-    return t2 > _BRIGHTER * usual if bright > _CLEARLY * usual > 0.0 else None
-
-
-def find_outside(mri: Volume, brain: np.ndarray, fluid: np.ndarray | None = None) -> Outside:
+def find_outside(mri: Volume, brain: np.ndarray) -> Outside:
     """Label what lies outside the brain in the MRI of a whole head (T1, with or without contrast agent).
 
     Parameters
     ----------
     mri : whole head.
     brain : (k, j, i) bool, the brain.
-    fluid : (k, j, i) bool, what another image shows as fluid (watery). In a T1, CSF is as dark as bone: without it,
-        what lies between a shrunken brain and its skull counts as skull.
 
+    In a T1, CSF is as dark as bone: what lies between a shrunken brain and its skull counts as skull.
     Raises SimulationError if there is no brain, or nothing around it.
     """
     require(brain.any(), "the brain mask is empty, expected a brain")
@@ -135,7 +110,7 @@ def find_outside(mri: Volume, brain: np.ndarray, fluid: np.ndarray | None = None
     margin = [slice(max(box.start - 2, 0), box.stop + 2) for box in ndimage.find_objects(head.astype(np.uint8))[0]]
     box = tuple(margin)
     image, head, brain, mm = image[box], head[box], brain[box], mri.spacing_mm
-    inner = _with_dura(brain, mm)
+    inner = _within(_closed(brain, _SULCUS_MM, mm), _DURA_MM, mm)  # with sulci, dura and what is between
     from_brain = distance_to(inner, mm)
     beside = image[head & (from_brain > _BESIDE_MM[0]) & (from_brain < _BESIDE_MM[1])]
     require(
@@ -144,19 +119,8 @@ def find_outside(mri: Volume, brain: np.ndarray, fluid: np.ndarray | None = None
     )
     dark = _DARK * _otsu(beside)
     below_skin = _depth(head, mm)
-
-    def skull_over(inner: np.ndarray, from_brain: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Where it may be, and how thick it is."""
-        may_be = (below_skin > _SKIN_MM) & (from_brain < _LARGEST_SKULL_MM)
-        return may_be, thickness_of_skull(image, inner, below_skin, dark, mm, mri.ijk_to_ras)
-
-    may_be, thickness = skull_over(inner, from_brain)
-    around = None
-    if fluid is not None:
-        around = _beside(inner, fluid[box] & (image < _FLUID * dark) & may_be & ~np.isnan(thickness), mm) & ~brain
-        inner = _with_dura(brain | around, mm)
-        from_brain = distance_to(inner, mm)
-        may_be, thickness = skull_over(inner, from_brain)
+    may_be = (below_skin > _SKIN_MM) & (from_brain < _LARGEST_SKULL_MM)
+    thickness = thickness_of_skull(image, inner, below_skin, dark, mm, mri.ijk_to_ras)
     is_dark = head & (image < dark) & ~inner
     vault = may_be & (from_brain <= thickness)
     base = may_be & np.isnan(thickness) & (is_dark | inner)
@@ -174,42 +138,18 @@ def find_outside(mri: Volume, brain: np.ndarray, fluid: np.ndarray | None = None
     labels[~head | inner] = 0
     whole = np.zeros(mri.array.shape, np.uint8)
     whole[box] = labels
-    found = None
-    if around is not None:
-        found = np.zeros(mri.array.shape, bool)
-        found[box] = around & head
-    return Outside(whole, float(dark), _cut(whole, mri), found)
-
-
-def _with_dura(brain: np.ndarray, mm: np.ndarray) -> np.ndarray:
-    """(k, j, i) bool: the brain with its sulci, the dura and what is between."""
-    return _within(_closed(brain, _SULCUS_MM, mm), _DURA_MM, mm)
-
-
-def _beside(inner: np.ndarray, fluid: np.ndarray, mm: np.ndarray) -> np.ndarray:
-    """(k, j, i) bool: the fluid that goes on from the brain, without threads to other fluid, as in the orbits."""
-    joined, _ = ndimage.label(_opened(fluid, _THREAD_MM, mm) | inner)  # type: ignore[misc]
-    near = np.unique(joined[inner])
-    return np.isin(joined, near[near > 0]) & fluid & ~inner
+    return Outside(whole, float(dark), _cut(whole, mri))
 
 
 def _cut(labels: np.ndarray, mri: Volume) -> tuple[str, ...]:
     """A line about the faces of the image at which the head ends, other than the lower one, as in a neck."""
-    lines = []
-    for axis, direction in enumerate(mri.ijk_to_ras[:3, :3].T[::-1]):
-        area = mri.voxel_ml * 10.0 / mri.spacing_mm[::-1][axis]  # cm2 of a voxel
-        for end, sign in ((0, -1.0), (-1, 1.0)):
-            along = int(np.abs(direction).argmax())
-            is_up = bool(direction[along] * sign > 0)
-            square_cm = float((np.take(labels, end, axis=axis) > 0).sum()) * area
-            if square_cm > _CUT_CM2 and (along != 2 or is_up):
-                side = (("left", "right"), ("back", "front"), ("bottom", "top"))[along][is_up]
-                lines.append(f"{side} {square_cm:.0f} cm2")
-    if not lines:
+    cut = [(name, cm2) for name, cm2 in areas_at_edges(mri, labels) if name != "bottom" and cm2 > _CUT_CM2]
+    if not cut:
         return ()
+    sides = ", ".join(f"{name} {cm2:.0f} cm2" for name, cm2 in cut)
     return (
-        f"the image cuts the head ({', '.join(lines)}): there it has no skin, and what is missing of its skull lets a "
-        "beam in; do not put a probe there",
+        f"the image cuts the head ({sides}): there it has no skin, and what is missing of its skull lets a beam in; do "
+        "not put a probe there",
     )
 
 

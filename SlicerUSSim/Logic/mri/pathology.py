@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import ndimage
+from scipy.spatial import KDTree
 
 from SlicerUSSim.Logic.base.errors import SimulationError, either, require
 from SlicerUSSim.Logic.base.volume import Volume
@@ -32,15 +33,11 @@ LESIONS = ("tumour", "oedema", "necrosis", "cyst", "haematoma", "cavity", "enhan
 LESION_GROUPS = (("tumour", "enhancing", "necrosis", "cyst", "haematoma"), ("cavity",), ("oedema",))
 ENHANCING = "enhancing"
 #: A mask of more than this share of the patient is not a lesion.
-LARGEST_SHARE = 0.6
-#: A mask without a voxel in the patient may lie this far from it: a meningioma that brain extraction has cut off.
-FARTHEST_MM = 5.0
-#: Tissues that are part of a patient only as a lesion, which may be up to this large; gliomas with their oedema have up
-#: to 300 ml, a hemisphere 500 and more
-_LESIONS_ONLY = frozenset(LESIONS) - {"blood", "brats"}
-_LARGEST_LESION_ML = 400.0
+_LARGEST_SHARE = 0.6
+#: A mask without a voxel in the patient may lie this far from it: a meningioma that brain extraction has cut off, bone.
+_FARTHEST_MM = 5.0
 #: Shares below these are not mentioned.
-_LEAST_LEFT_OUT, _LEAST_OVER, _LEAST_LOST = 0.02, 0.01, 0.2
+_LEAST_LEFT_OUT, _LEAST_OVER = 0.02, 0.01
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,8 +133,7 @@ def add_tissue(
         "brats" adds every label by its name in `mask.label_names`, or as a BraTS map: 1 necrosis, 2 oedema,
         3 enhancing, 4 cavity (4 enhancing without 3; "brats-2022" and "brats-2023" say which).
     source : of the mask, for messages.
-    has_brain_mask : whether the labels are a segmentation within a brain mask, which may have cut a lesion off;
-        otherwise a lesion has to meet the patient.
+    has_brain_mask : whether the labels are a segmentation within a brain mask, which may have cut a lesion off.
 
     Voxels outside the patient are labelled too, with a warning. Raises SimulationError for an unknown tissue, a mask
     that is empty or no mask, one that does not meet the patient (other patient, other frame), and one that covers more
@@ -214,16 +210,23 @@ def _added(labels: Volume, names: Sequence[str], masks: Masks, has_brain_mask: b
     below = array[where]
     covered = below[numbers > 0]
     met = int((covered > 0).sum())
-    if not met:
-        is_cut = has_brain_mask or not _is_lesion(masks)  # or is bone and skin around a brain
-        farthest_mm = FARTHEST_MM if is_cut else 0.0
-        require_in_patient(masks, float(mm_outside(array > 0, labels, masks).min()), farthest_mm)
-    require_size(masks, met / patient)
     voxel_mm3 = 1000.0 * labels.voxel_ml
     require(
-        covered.size > 0,
+        covered.size > 0 or lost == 1.0,
         f"{masks.source}: {masks.volume_ml * 1000:.2g} mm³ are too small for the voxels of the labels, "
         f"{voxel_mm3:.2g} mm³; nothing would be added",
+    )
+    if not met:
+        apart_mm = _mm_outside(array > 0, labels, masks)
+        require(
+            apart_mm <= _FARTHEST_MM,
+            f"{masks.source}: lies {apart_mm:.0f} mm outside the patient, expected a mask in the frame of the MRI or "
+            "labels; is it of another patient, or not registered?",
+        )
+    require(
+        met <= _LARGEST_SHARE * patient,
+        f"{masks.source}: covers {met / patient:.0%} of the patient, expected a lesion in it; is it the mask of the "
+        "brain (--mask)?",
     )
     result, messages = array.astype(np.promote_types(array.dtype, np.uint8)), []
     for number, tissue in enumerate(masks.tissues, 1):
@@ -232,7 +235,7 @@ def _added(labels: Volume, names: Sequence[str], masks: Masks, has_brain_mask: b
             label, names = _label_of(tissue, array, names)
             result[where][numbers == number] = label
             messages.append(_message(tissue, over, names, voxel_mm3))
-    warnings = (*masks.warnings, *_warnings(masks, covered, lost, covered.size * voxel_mm3 / 1000.0, has_brain_mask))
+    warnings = (*masks.warnings, *_warnings(masks, covered, lost, has_brain_mask))
     for line in messages:
         _log.info("%s", line)
     for line in warnings:
@@ -253,34 +256,12 @@ def _label_of(tissue: str, array: np.ndarray, names: Sequence[str]) -> tuple[int
     return free[0], tuple(longer)
 
 
-def mm_outside(patient: np.ndarray, grid: Volume, masks: Masks) -> np.ndarray:
-    """(voxels,) distance of each voxel inside the masks from the patient, 0 within it; bool (k, j, i) on a grid."""
-    distance = ndimage.distance_transform_edt(~patient, sampling=grid.spacing_mm[::-1].tolist())
-    assert isinstance(distance, np.ndarray)
-    to_grid = grid.ras_to_ijk @ masks.union.ijk_to_ras
-    index = to_grid[:3, :3] @ np.argwhere(masks.inside)[:, ::-1].T + to_grid[:3, 3:]
-    nearest = np.clip(np.rint(index), 0, np.array(patient.shape[::-1])[:, None] - 1)
-    beyond = np.maximum(np.abs(index - nearest) - 0.5, 0.0) * grid.spacing_mm[:, None]  # 0 within the grid
-    i, j, k = nearest.astype(int)
-    return distance[k, j, i] + np.linalg.norm(beyond, axis=0)
-
-
-def require_in_patient(masks: Masks, apart_mm: float, farthest_mm: float = FARTHEST_MM) -> None:
-    """Raise SimulationError for masks that lie farther than this from the patient."""
-    require(
-        apart_mm <= farthest_mm,
-        f"{masks.source}: lies {max(apart_mm, 1.0):.0f} mm outside the patient, expected a mask in the frame of "
-        "the MRI or labels; is it of another patient, or not registered?",
-    )
-
-
-def require_size(masks: Masks, share: float) -> None:
-    """Raise SimulationError for masks that cover too large a share of the patient for a lesion."""
-    require(
-        share <= LARGEST_SHARE,
-        f"{masks.source}: covers {100 * share:.0f} % of the patient, expected a lesion in it; is it the mask "
-        "of the brain (--mask)?",
-    )
+def _mm_outside(patient: np.ndarray, grid: Volume, masks: Masks) -> float:
+    """Least distance of what is inside the masks from the patient, bool (k, j, i) on a grid."""
+    points = masks.union.ijk_to_ras[:3, :3] @ np.argwhere(masks.inside)[:, ::-1].T + masks.union.ijk_to_ras[:3, 3:]
+    surface = np.argwhere(patient & ~ndimage.binary_erosion(patient))  # type: ignore[operator]
+    places = surface[:, ::-1] @ grid.ijk_to_ras[:3, :3].T + grid.ijk_to_ras[:3, 3]
+    return float(KDTree(places).query(points.T)[0].min())
 
 
 def box_ras(inside: np.ndarray, volume: Volume) -> tuple[np.ndarray, np.ndarray]:
@@ -304,22 +285,7 @@ def _message(tissue: str, before: np.ndarray, names: Sequence[str], voxel_mm3: f
     return f"{tissue}: {before.size} voxel{'s' * (before.size > 1)}, {volume}, added over {', '.join(over)}"
 
 
-def _is_lesion(masks: Masks) -> bool:
-    return all(tissue in _LESIONS_ONLY for tissue in masks.tissues)
-
-
-def _warnings(masks: Masks, covered: np.ndarray, lost: float, volume_ml: float, has_brain_mask: bool) -> Iterable[str]:
-    if _is_lesion(masks) and masks.volume_ml > _LARGEST_LESION_ML:
-        yield (
-            f"{masks.source}: has {masks.volume_ml:.0f} ml, expected a lesion of up to {_LARGEST_LESION_ML:.0f} ml; is "
-            "it the map of a tissue, or a part of the brain?"
-        )
-    if masks.inside.all():
-        mm = " x ".join(f"{length:.0f}" for length in masks.inside.shape[::-1] * masks.union.spacing_mm)
-        yield (
-            f"{masks.source}: every voxel of its image is inside, so that a box of {mm} mm is added; a mask is 0 "
-            "outside the lesion"
-        )
+def _warnings(masks: Masks, covered: np.ndarray, lost: float, has_brain_mask: bool) -> Iterable[str]:
     left_out = float((covered == 0).mean())
     if left_out >= _LEAST_LEFT_OUT:
         where = f"the brain mask leaves out {left_out * 100:.0f} % of {masks.source}"
@@ -328,8 +294,3 @@ def _warnings(masks: Masks, covered: np.ndarray, lost: float, volume_ml: float, 
         yield f"{where}; those voxels are added"
     if lost >= _LEAST_LEFT_OUT:
         yield f"{lost * 100:.0f} % of {masks.source} lie outside the volume of the labels and are not added"
-    elif abs(volume_ml - masks.volume_ml) > _LEAST_LOST * masks.volume_ml:
-        yield (
-            f"{masks.source}: {masks.volume_ml:.2g} ml become {volume_ml:.2g} ml on the voxels of the labels, which "
-            "are coarse for it"
-        )

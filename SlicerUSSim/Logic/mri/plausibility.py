@@ -7,9 +7,9 @@ from scipy import ndimage
 
 from SlicerUSSim.Logic.base.errors import require
 from SlicerUSSim.Logic.base.volume import Volume
-from SlicerUSSim.Logic.mri.atlas_registration import WHOLE_BRAIN_ML
 from SlicerUSSim.Logic.mri.classification import EXPECTED_SHARES, FAINT, ORDERS, Classes
 from SlicerUSSim.Logic.mri.mixture import TISSUES
+from SlicerUSSim.Logic.mri.recognition import POSSIBLE_ML
 
 #: Smallest extent of a whole brain along any axis of the image, mm
 _LEAST_EXTENT_MM = 90.0
@@ -34,8 +34,8 @@ _ENHANCED, _ENHANCED_ML = 1.5, 2.0
 def is_whole_brain(image: Volume, inside: np.ndarray) -> str:
     """Empty for a mask (k, j, i) of the size of a whole brain, otherwise what is wrong with it."""
     millilitres = float(inside.sum() * image.voxel_ml)
-    if not WHOLE_BRAIN_ML[0] <= millilitres <= WHOLE_BRAIN_ML[1]:
-        low, high = WHOLE_BRAIN_ML
+    if not POSSIBLE_ML[0] <= millilitres <= POSSIBLE_ML[1]:
+        low, high = POSSIBLE_ML
         return f"the brain has {millilitres:.0f} ml, expected {low:.0f} to {high:.0f}"
     places = (
         np.argwhere(inside.any(axis=(1, 2))),
@@ -80,18 +80,6 @@ def enhancing(image: np.ndarray, inside: np.ndarray, found: Classes, voxel_ml: f
     return [
         f"contrast is t1, but {largest:.1f} ml in one piece are far brighter than white matter, as vessels and tumours "
         "are after contrast agent: if it was given, choose t1gd (--contrast t1gd)"
-    ]
-
-
-def in_other_order(found: Classes, contrast: str) -> list[str]:
-    """A warning where the tissues found are not in the order of the contrast."""
-    means = found.means[[found.names.index(TISSUES[tissue]) for tissue in ORDERS[contrast]], 0]
-    if (np.diff(means) > 0).all():
-        return []
-    names = ", ".join(f"{TISSUES[tissue]} {mean:.4g}" for tissue, mean in zip(ORDERS[contrast], means, strict=True))
-    return [
-        f"contrast is {contrast}, but its tissues are not in that order of brightness ({names}): check the contrast "
-        "and the brain mask"
     ]
 
 

@@ -11,11 +11,9 @@ from scipy import ndimage
 from SlicerUSSim.Logic.base.errors import SimulationError, require, require_kind
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.mri.alignment import Alignment, align_template
-from SlicerUSSim.Logic.mri.atlas import mni152
-from SlicerUSSim.Logic.mri.atlas_registration import WHOLE_BRAIN_ML
 from SlicerUSSim.Logic.mri.coarse import largest_component
 from SlicerUSSim.Logic.mri.ct_unit import looks_like_ct
-from SlicerUSSim.Logic.mri.no_data import edge_value
+from SlicerUSSim.Logic.mri.edges import edge_value
 
 #: Volumes of a brain, millilitres: outside the first range a user should look, outside the second it is no brain.
 USUAL_ML, POSSIBLE_ML = (1000.0, 1900.0), (500.0, 2600.0)
@@ -28,10 +26,8 @@ _BRIGHT, _LEAST_AROUND = 0.25, 0.06
 _MOST_LABELS = 12
 
 
-def recognise(
-    mri: Volume, progress: Callable[[float], None] | None = None
-) -> tuple[np.ndarray | None, Alignment | None]:
-    """((k, j, i) True in the brain of a skull-stripped image, None for a head; the fitted atlas where it was needed).
+def recognise(mri: Volume, progress: Callable[[float], None] | None = None) -> np.ndarray | Alignment:
+    """(k, j, i) True in the brain of a skull-stripped image, or the fitted atlas for a head.
 
     Raises SimulationError, with how well the atlas fits, if the image shows neither a brain nor a head.
     """
@@ -39,8 +35,8 @@ def recognise(
     check_intensities(mri)
     require_no_ct(mri)
     stripped = stripped_brain(mri)
-    if stripped is not None or mni152() is None:
-        return stripped, None
+    if stripped is not None:
+        return stripped
     alignment = align_template(mri, progress)
     share = alignment.explained
     if share < LEAST_EXPLAINED:
@@ -53,7 +49,7 @@ def recognise(
     distance, air = alignment.brain_on(mri), float(np.percentile(mri.array, 1.0))
     level = air + _BRIGHT * (float(np.median(mri.array[distance < -8.0])) - air)
     around = mri.array[(distance > 8.0) & (distance < 24.0)]
-    return None if np.mean(around > level) > _LEAST_AROUND else above_noise(mri), alignment
+    return alignment if np.mean(around > level) > _LEAST_AROUND else above_noise(mri)
 
 
 def require_no_ct(mri: Volume) -> None:
@@ -109,7 +105,7 @@ def stripped_brain(mri: Volume) -> np.ndarray | None:
         return None
     inside = cast(np.ndarray, ndimage.binary_fill_holes(inside))
     millilitres = inside.sum() * mri.voxel_ml
-    return inside if WHOLE_BRAIN_ML[0] <= millilitres <= WHOLE_BRAIN_ML[1] else None
+    return inside if POSSIBLE_ML[0] <= millilitres <= POSSIBLE_ML[1] else None
 
 
 def _is_cut(inside: np.ndarray) -> bool:

@@ -36,7 +36,7 @@ def refined(mri: Volume, distance: np.ndarray, *, core_mm: float, reach_mm: floa
     matrix[:3, 3] = origin
     # Outside the field of view there is no brain.
     far = on_grid(mri.with_array(distance), Volume(image, matrix), outside=reach_mm + 6.0)
-    box = _box(far <= reach_mm + 6.0)
+    box = ndimage.find_objects((far <= reach_mm + 6.0).astype(np.uint8))[0]
     image, far = image[box], far[box]
     mm = _SPACING_MM
     core = far < -core_mm
@@ -106,30 +106,21 @@ def on_grid(volume: Volume, grid: Volume, outside: float = 0.0) -> np.ndarray:
     )  # fmt: skip
 
 
+def near_points(grid: Volume, points: np.ndarray, distance_mm: float) -> np.ndarray:
+    """(k, j, i) True in voxels of a grid within a distance of (n, 3) RAS points in it."""
+    index = np.rint(points @ grid.ras_to_ijk[:3, :3].T + grid.ras_to_ijk[:3, 3]).astype(int)[:, ::-1]
+    index = index[((index >= 0) & (index < grid.array.shape)).all(axis=1)]
+    result = np.zeros(grid.array.shape, bool)
+    result[tuple(index.T)] = True
+    return distance_to(result, grid.spacing_mm) <= distance_mm if len(index) else result
+
+
 def box_around(points: np.ndarray, grid: Volume) -> tuple[slice, ...]:
     """(k, j, i) part of a grid that holds (n, 3) RAS points, with a voxel more on every side."""
     places = (points @ grid.ras_to_ijk[:3, :3].T + grid.ras_to_ijk[:3, 3])[:, ::-1]
     ends = np.floor(places.min(axis=0)) - 1, np.ceil(places.max(axis=0)) + 2
     first, last = (np.clip(end, 0, grid.array.shape).astype(int) for end in ends)
     return tuple(map(slice, first, np.maximum(first, last)))
-
-
-def signed_distance(inside: np.ndarray, spacing_mm: np.ndarray, most_mm: float) -> np.ndarray:
-    """(k, j, i) float32 distance to the border of `inside`, negative in it, in a box that reaches `most_mm` outside."""
-    box = _box(inside, [int(np.ceil(most_mm / size)) + 1 for size in spacing_mm[::-1]])
-    result = np.full(inside.shape, most_mm, np.float32)
-    part = inside[box]
-    outer, inner = (np.maximum(distance_to(side, spacing_mm), 0.0) for side in (part, ~part))
-    result[box] = np.minimum(outer - inner, most_mm)
-    return result
-
-
-def _box(inside: np.ndarray, margin=(0, 0, 0)) -> tuple[slice, ...]:
-    slices = ndimage.find_objects(inside.astype(np.uint8))[0]
-    return tuple(
-        slice(max(part.start - more, 0), min(part.stop + more, size))
-        for part, more, size in zip(slices, margin, inside.shape, strict=True)
-    )
 
 
 def _ball(radius: float) -> np.ndarray:

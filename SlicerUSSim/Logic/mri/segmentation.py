@@ -20,15 +20,13 @@ from SlicerUSSim.Logic.mri.coregistration import aligned
 from SlicerUSSim.Logic.mri.evidence import Evidence
 from SlicerUSSim.Logic.mri.filtering import denoised, estimate_noise as estimate_noise
 from SlicerUSSim.Logic.mri.nuclei import with_nuclei
-from SlicerUSSim.Logic.mri.outside import find_outside, require_findable, watery
-from SlicerUSSim.Logic.mri.plausibility import enhancing, require_contrast
+from SlicerUSSim.Logic.mri.outside import find_outside, require_findable
+from SlicerUSSim.Logic.mri.plausibility import enhancing, implausible, require_contrast, unsure
 from SlicerUSSim.Logic.mri.recognition import check_intensities, require_no_ct
 from SlicerUSSim.Logic.mri.segmentation_settings import SegmentationSettings
 from SlicerUSSim.Logic.mri.segmentation_steps import (
     BrainPart,
-    StepTimes,
     atlas_of,
-    doubts,
     finite,
     narrow_sulci,
     remove_fields,
@@ -204,7 +202,6 @@ def segment_mri(
     names = class_names(contrasts, settings.classes)
     if settings.outside:
         require_findable(contrast, settings.skull_strip, mask is not None)
-    timed = StepTimes()
     thickest_mm = float(mri.spacing_mm.max())
     if mask is not None and mask.array.shape == mri.array.shape:
         mask = with_thin_slices(mask, interpolate=False)
@@ -230,7 +227,6 @@ def segment_mri(
     )
     # Blocks of coarse images begin at the first voxel: in any order of voxels but this, others would
     foreground = brain.mask.along().array > 0
-    timed("brain")
     report(0.05)
     notes, warnings = [brain.message], [*brain.warnings]
     images = [image.along()]
@@ -238,31 +234,25 @@ def segment_mri(
         named = _called(name, other)
         with about_other_file(named):
             _require_intensities(other, named)
-            image, message, doubts_of_it = aligned(
-                other.with_array(finite(other)).along(), images[0], foreground, named
-            )
+            image, message = aligned(other.with_array(finite(other)).along(), images[0], foreground, named)
         images.append(image)
         notes.append(message)
-        warnings += doubts_of_it
         voxel_mm = float(other.spacing_mm.max())
         if voxel_mm > max(_THICK_SLICE_MM, thickest_mm):
             warnings.append(
                 f"{named} has voxels of {voxel_mm:.3g} mm, across which its tissues mix: compare with the labels of "
                 f"the {contrast} alone"
             )
-    if others:
-        if brain.method != "given":
-            notes.append(
-                f"the brain mask is of the {contrast} image alone: tissue outside it stays out, also where "
-                f"{' and '.join(others)} shows it"
-            )
-        timed("registration")
+    if others and brain.method != "given":
+        notes.append(
+            f"the brain mask is of the {contrast} image alone: tissue outside it stays out, also where "
+            f"{' and '.join(others)} shows it"
+        )
     part = BrainPart.of(images, foreground)
     raised, above = part.raised(contrasts)
     notes += raised
     atlas, message, fits = atlas_of(part, report)
     notes.append(message)
-    timed("atlas")
     report(0.4)
     prior = atlas.prior(part.images[0], part.inside) if atlas else None
     if prior is not None:
@@ -274,26 +264,21 @@ def segment_mri(
     if settings.bias_correction is not False:
         share = lambda done: report(0.4 + 0.3 * done)  # noqa: E731
         notes += remove_fields(part, contrasts, atlas, prior, settings.bias_correction, share)
-        timed("bias field")
     report(0.7)
     filtered = [
         denoised(image.array, part.inside, settings.filter_radius, settings.filter_epsilon, device)
         for image in part.images
     ]
-    timed("filter")
     report(0.8)
     intensities = np.stack([image[part.inside] for image, _, _ in filtered])
     require_different(intensities, contrasts)
     voxel_mm = float(mri.spacing_mm.mean())
     found = classify(intensities, contrasts, names, prior, FILTER_BLUR if settings.filter_radius else 1.0, voxel_mm)
-    timed("mixture")
     if atlas:
         found = with_nuclei(found, intensities, atlas, part.images[0], part.inside)
-        timed("nuclei")
     found = replace(found, posteriors=less_sure(smoothed_posteriors(found.posteriors, part.inside)))
-    timed("neighbours")
     report(0.9)
-    warnings += doubts(found, part, contrasts, fits, atlas is not None)
+    warnings += implausible(found, brain.volume_ml, contrast) + unsure(found, fits, atlas is not None)
     if contrasts == ("t1",) and len(names) == 3:
         warnings += enhancing(filtered[0][0], part.inside, found, part.images[0].voxel_ml)
 
@@ -306,22 +291,17 @@ def segment_mri(
         middles = narrow_sulci(labels, found, filtered[0][0], filtered[0][1])
         labels[middles] = len(names) + 1
         tissue_names = (*names, "leptomeninges")
-        timed("thin sulci")
         _log.info("thin sulci: %d voxels become leptomeninges", int(middles.sum()))
     whole, brain_labels = images[0].with_array(part.whole(labels)), len(tissue_names)
     if settings.outside:
-        t2 = images[contrasts.index("t2")].array if "t2" in contrasts else None
-        fluid = None if t2 is None else watery(t2, names, whole.array)
-        around = find_outside(images[0], foreground, fluid)
+        around = find_outside(images[0], foreground)
         whole, tissue_names = around.over(whole, tissue_names)
         notes.append(around.text(mri.voxel_ml))
         warnings += around.warnings
-        timed("outside the brain")
     for line in notes:
         _log.info("%s", line)
     for line in warnings:
         _log.warning("%s", line)
-    _log.debug("segmentation: %s", timed)
     told(1.0)
 
     def as_given(array: np.ndarray) -> Volume:

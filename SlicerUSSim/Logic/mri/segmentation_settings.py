@@ -30,8 +30,8 @@ class SegmentationSettings(Declared):
         "with t1gd", bounds=(3, 4), shown=Shown(2, 4, none_at=2), option="classes",
     )  # fmt: skip
     skull_strip: str = parameter(
-        "auto", "Brain extraction", "How the brain is found in a whole head", option="skull-strip", shown=True,
-        choices=("auto", "robex", "deepbet", "atlas", "none"),
+        "atlas", "Brain extraction", "How the brain is found in a whole head; none: everything brighter than the "
+        "background is brain", option="skull-strip", shown=True, choices=("atlas", "none"),
     )  # fmt: skip
     thin_sulci: bool = parameter(
         True, "Label thin sulci",

@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable
 from dataclasses import dataclass
-from time import perf_counter
 from typing import cast
 
 import numpy as np
@@ -18,12 +17,7 @@ from SlicerUSSim.Logic.mri.atlas import mni152
 from SlicerUSSim.Logic.mri.atlas_registration import AtlasFit, register_atlas
 from SlicerUSSim.Logic.mri.bias import corrected
 from SlicerUSSim.Logic.mri.classification import Classes
-from SlicerUSSim.Logic.mri.plausibility import (
-    implausible,
-    in_other_order,
-    is_whole_brain,
-    unsure,
-)
+from SlicerUSSim.Logic.mri.plausibility import is_whole_brain
 from SlicerUSSim.Logic.mri.recognition import check_finite
 
 #: Percentile of the brain that is taken for 0 where it has more than this share of negative values
@@ -98,22 +92,6 @@ def atlas_of(part: BrainPart, report: Callable[[float], None]) -> tuple[AtlasFit
     return fit, f"led by the MNI152 atlas, whose brain covers this one with a Dice of {fit.dice:.2f}", share
 
 
-class StepTimes:
-    """Milliseconds of steps, for the log."""
-
-    def __init__(self) -> None:
-        self._last, self._steps = perf_counter(), []
-
-    def __call__(self, step: str) -> None:
-        """A step has ended."""
-        now = perf_counter()
-        self._steps.append(f"{step} {(now - self._last) * 1e3:.0f} ms")
-        self._last = now
-
-    def __str__(self) -> str:
-        return ", ".join(self._steps)
-
-
 def finite(mri: Volume) -> np.ndarray:
     """The voxels as float32. Raises SimulationError for voxels that are not finite, or all the same."""
     check_finite(mri)
@@ -146,19 +124,6 @@ def require_different(values: np.ndarray, contrasts: tuple[str, ...]) -> None:
             f"MRI is constant ({channel[0]:g}) inside the foreground, expected tissues of different intensity"
             + (f" in {name}" if len(contrasts) > 1 else ""),
         )
-
-
-def doubts(
-    found: Classes,
-    part: BrainPart,
-    contrasts: tuple[str, ...],
-    fits: float | None,
-    is_led: bool,
-) -> list[str]:
-    """What the user should check. `fits` is the share that the atlas explains, and `is_led` whether it was used."""
-    lines = in_other_order(found, contrasts[0]) if len(contrasts) == 1 else []
-    lines += implausible(found, float(part.inside.sum()) * part.images[0].voxel_ml, contrasts[0])
-    return lines + unsure(found, fits, is_led)
 
 
 def narrow_sulci(labels: np.ndarray, found: Classes, filtered: np.ndarray, noise: float) -> np.ndarray:

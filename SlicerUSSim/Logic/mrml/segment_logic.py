@@ -11,7 +11,6 @@ import numpy as np
 
 from SlicerUSSim.Logic.base.errors import require
 from SlicerUSSim.Logic.base.volume import Volume
-from SlicerUSSim.Logic.mri.addable import require_addable
 from SlicerUSSim.Logic.mri.ct import CtSegmentation
 from SlicerUSSim.Logic.mri.modality import has_brain_mask, segment_image
 from SlicerUSSim.Logic.mri.pathology import Added, add_tissues, texture_below
@@ -104,8 +103,7 @@ class SegmentLogic:
         organs = None if organs_node is None else self._organs(organs_node, mri_node, contrast)
         report = progress or (lambda share: None)
         until = _SEGMENTED if wanted else 1.0
-        own, skull_strip = self._own_tissues(), settings.skull_strip if is_of_brain else "none"
-        self._work.do(lambda: require_addable(mri, lesions, mask=mask, skull_strip=skull_strip, also=own))
+        own = self._own_tissues()
         result = self._work.do(
             lambda: segment_image(
                 mri, settings=settings, others=volumes, mask=mask, organs=organs, keep_mask_at=keep_mask_at,

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from SlicerUSSim.Logic.mri.sheets.polydata import as_polydata, surfels_of, surfels_of_squares
+from SlicerUSSim.Logic.mri.sheets.polydata import as_polydata, placed_surfels
 from SlicerUSSim.Logic.mrml.nodes import display_of, named, node_to_world, require_node
 from SlicerUSSim.Logic.mrml.own_results import SHEETS, mark_as_result
 from SlicerUSSim.Logic.tissue.surfels import KINDS, Surfels
@@ -36,7 +36,7 @@ def sheets_version(model_node) -> Hashable:
 
 
 def holds_sheets(model_node) -> bool:
-    """Whether a model has what surfels_of reads, whoever made it; not the surface of something else."""
+    """Whether a model has what placed_surfels reads, whoever made it; not the surface of something else."""
     data = model_node.GetPolyData()
     arrays = None if data is None else data.GetCellData()
     return arrays is not None and all(arrays.HasArray(entry.name) for entry in fields(Surfels))
@@ -52,6 +52,5 @@ def read_sheets(model_node, world_to_labels: np.ndarray, kinds: Iterable[str]) -
     data: Any = model_node.GetPolyData()
     if data is None or data.GetNumberOfCells() == 0:
         return Surfels.joined([])
-    what = f"sheets {named(model_node)}"
-    placed = surfels_of_squares(data, surfels_of(data, what), world_to_labels @ node_to_world(model_node), what)
+    placed = placed_surfels(data, f"sheets {named(model_node)}", world_to_labels @ node_to_world(model_node))
     return placed.of_kind(*(kind for kind in KINDS if kind in set(kinds)))

@@ -121,7 +121,7 @@ def polygon_opening(labels: Volume, names: Sequence[str], points_ras: np.ndarray
 
 
 def file_opening(labels: Volume, names: Sequence[str], path: str) -> np.ndarray:
-    """(k, j, i) bool of a file: a mask (not 0 is open), or points of 3D Slicer (.mrk.json, .fcsv), a polygon.
+    """(k, j, i) bool of a file: a mask (not 0 is open), or points of 3D Slicer (.mrk.json), a polygon.
 
     Raises SimulationError for another file, and for a mask that is empty or lies elsewhere.
     """
@@ -283,7 +283,7 @@ def _crossing_sides(outline: np.ndarray) -> tuple[int, int] | None:
 
 
 def polygon_of_file(path: str) -> np.ndarray:
-    """(points, 3) RAS mm of the points in a file of 3D Slicer (.mrk.json, .fcsv), which are a polygon.
+    """(points, 3) RAS mm of the points in a file of 3D Slicer (.mrk.json), which are a polygon.
 
     Raises SimulationError for another file, and for several markups, another kind, frame or unit.
     """

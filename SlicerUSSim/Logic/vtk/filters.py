@@ -34,7 +34,6 @@ from SlicerUSSim.Logic.imaging.frame import Frame
 from SlicerUSSim.Logic.imaging.noise import seed_of_pose
 from SlicerUSSim.Logic.imaging.preset import Preset
 from SlicerUSSim.Logic.imaging.reuse import ReusedSimulator
-from SlicerUSSim.Logic.mri.addable import require_addable
 from SlicerUSSim.Logic.mri.ct import CtSegmentation
 from SlicerUSSim.Logic.mri.modality import has_brain_mask, segment_image
 from SlicerUSSim.Logic.mri.pathology import add_tissues
@@ -59,7 +58,7 @@ TISSUE_NAMES = "TissueNames"
 _METHODS = (
     ("--mask", "SetMaskData"), ("--add tumour=FILE", "AddTissueData"), ("--add", "AddTissueData"),
     ("--ct (contrast ct)", "contrast='ct'"), ("--ct", "contrast='ct'"), ("--contrast", "contrast"),
-    ("--skull-strip none", "skull_strip='none'"), ("--skull-strip auto", "skull_strip='auto'"),
+    ("--skull-strip none", "skull_strip='none'"),
     ("--skull-strip", "skull_strip"),
 )  # fmt: skip
 
@@ -208,8 +207,6 @@ class SegmentationFilter(_ImageFilter):
         image, mask = Volume.from_vtk(mri), Volume.from_vtk(vtkImageData.GetData(inInfo[1])) if masked else None
         settings, others = self._settings, self._others.items()
         is_of_brain = has_brain_mask(settings.contrast)
-        skull_strip = settings.skull_strip if is_of_brain else "none"
-        require_addable(image, masks, mask=mask, skull_strip=skull_strip)
         found = segment_image(
             image, settings, others={name: Volume.from_vtk(other) for name, other in others}, mask=mask,
             device=self._device, progress=self._report,

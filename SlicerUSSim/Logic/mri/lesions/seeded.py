@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy import ndimage
@@ -16,6 +16,7 @@ from SlicerUSSim.Logic.mri.evidence import Evidence
 from SlicerUSSim.Logic.mri.lesions.grown_lesion import GrownLesion, place
 from SlicerUSSim.Logic.mri.lesions.half_maximum import SNAP_MM, Region, Window, closed, grow, smoothed
 from SlicerUSSim.Logic.mri.pathology import LESIONS, tissue_to_add
+from SlicerUSSim.Logic.mri.refinement import near_points
 from SlicerUSSim.Logic.mri.sheets.falx_of_part import fissure_of_part
 from SlicerUSSim.Logic.mri.sheets.head import LEAST_VOXELS, Head
 
@@ -44,8 +45,6 @@ _LEAST_DEPTH_MM, _LEAST_NECROSIS_ML, _DARK = 2.0, 0.1, 0.3
 _THIN_MM = 2.0
 #: From the fissure, whose points are 1 mm apart, to its sides
 _SIDE_MM = 1.0
-#: What is nearer to the midline has no counterpart; the likeness there from which on both sides look the same
-_MIDLINE_MM, _ALIKE = 5.0, 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,7 +87,7 @@ def grow_lesion(segmentation: Segmentation, seed_ras_mm: Sequence[float], tissue
             f"the seed {place(seed)} is in what looks as its surroundings, or has no border within "
             f"{_WINDOWS_MM[-1][0]:.0f} mm: expected a point in a lesion that stands out; draw a mask for --add"
         )
-    warnings = tuple(_doubts(evidence, grown, named))
+    warnings = tuple(_doubts(grown, named))
     larger = _lesion(segmentation, grown, grown.region.larger, seed, named, warnings, None)
     return _lesion(segmentation, grown, grown.region.inside, seed, named, warnings, larger)
 
@@ -227,25 +226,16 @@ def _between_hemispheres(evidence: Evidence) -> np.ndarray:
     channel = evidence.channel("t1", "t1gd", "t2")
     if evidence.atlas is not None or channel is None:
         return evidence.between_hemispheres
-    result = np.zeros(evidence.inside.shape, bool)
     contrast = evidence.contrasts[channel]
     sign = np.float32(-1.0 if contrast == "t2" else 1.0)
     means = sign * evidence.means[:, channel]
     image = Volume(sign * evidence.images[channel], evidence.ijk_to_ras)
     if not means[0] < means[1] < means[2]:
-        return result
+        return evidence.between_hemispheres
     head = Head.of_part(image, evidence.inside, means.tolist(), float(evidence.deviations[channel]), contrast == "t1gd")
     if min(head.brain.shape) < LEAST_VOXELS:
-        return result
-    places = fissure_of_part(head)
-    index = np.rint((places @ image.ras_to_ijk[:3, :3].T + image.ras_to_ijk[:3, 3])[:, ::-1]).astype(int)
-    index = index[((index >= 0) & (index < result.shape)).all(axis=1)]
-    if not len(index):
-        return result
-    result[tuple(index.T)] = True
-    spacing = evidence.spacing_mm
-    away = np.asarray(ndimage.distance_transform_edt(~result, sampling=spacing.tolist()))
-    return away < _SIDE_MM + 0.5 * float(spacing.max())
+        return evidence.between_hemispheres
+    return near_points(image, fissure_of_part(head), _SIDE_MM + 0.5 * float(evidence.spacing_mm.max()))
 
 
 def _rim_of(grown: _Grown) -> np.ndarray | None:
@@ -289,7 +279,7 @@ def _lesion(
     return GrownLesion(whole, tissues, grown.look, seed, warnings, larger)
 
 
-def _doubts(evidence: Evidence, grown: _Grown, named: str | None) -> Iterator[str]:
+def _doubts(grown: _Grown, named: str | None) -> Iterator[str]:
     """What a user should look at, a line each."""
     if named is None and grown.look == "fluid":
         yield "fluid looks alike in ventricles, sulci and cysts: look which it is"
@@ -297,21 +287,3 @@ def _doubts(evidence: Evidence, grown: _Grown, named: str | None) -> Iterator[st
         yield "what does not enhance may be tumour or oedema: look, and say what it is (TISSUE)"
     if grown.region.radius_mm < _THIN_MM:
         yield "it is thin, as vessels and the cortex are: look whether it is one"
-    if _is_on_both_sides(evidence, grown):
-        yield "the other hemisphere looks the same there: look whether it is healthy tissue"
-
-
-def _is_on_both_sides(evidence: Evidence, grown: _Grown) -> bool:
-    """Whether most of a region looks as its counterpart; not without an atlas, and for what has none."""
-    if evidence.sideways_mm is None:
-        return False
-    window, region = grown.window, grown.region
-    bright = region.inside & (grown.image > 0.5 * (region.own + region.base))  # without necrosis
-    inside = window.to_box(bright) & (np.abs(evidence.sideways_mm) > _MIDLINE_MM)
-    if not inside.any():
-        return False
-    box = cast("tuple[slice, slice, slice]", ndimage.find_objects(inside.astype(np.uint8))[0])
-    other = [cast(np.ndarray, evidence.mirrored(image, box))[inside[box]].mean() for image in evidence.images]
-    own = [image[inside].mean() for image in evidence.images]
-    difference = float(grown.weights @ (np.array(own) - np.array(other)))
-    return difference < _ALIKE * (region.own - region.base)

@@ -114,8 +114,7 @@ def _distance_to_thick_white(head: Head) -> np.ndarray:
     result = np.zeros(head.brain.shape, np.float32)
     x, _, _ = head.in_atlas
     box = ndimage.find_objects((np.abs(x) < _X_MM + _FARTHEST_MM).astype(np.uint8))[0]
-    thick = thick_white_matter(head, box)
-    result[box] = np.maximum(distance_to(thick, head.image.spacing_mm), 0.0)
+    result[box] = np.maximum(distance_to(thick_white_matter(head, box), head.image.spacing_mm), 0.0)
     return result
 
 

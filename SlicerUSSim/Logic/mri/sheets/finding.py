@@ -19,7 +19,7 @@ from SlicerUSSim.Logic.base.neighbourhood import distance_to
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.mri.atlas import Atlas
 from SlicerUSSim.Logic.mri.coarse import components, largest_component
-from SlicerUSSim.Logic.mri.refinement import closed, on_grid
+from SlicerUSSim.Logic.mri.refinement import closed, near_points, on_grid
 from SlicerUSSim.Logic.mri.segmentation import Segmentation
 from SlicerUSSim.Logic.mri.sheets.falx import falx
 from SlicerUSSim.Logic.mri.sheets.falx_of_part import falx_of_part
@@ -109,17 +109,19 @@ def find_sheets(
     key = key_of(mri, segmentation, contrast) if keep_at is not None else ""
     kept = read_kept_sheets(keep_at, key, wanted) if keep_at is not None else None
     if kept is not None:
-        surfels, array, place = kept
+        surfels, array = kept
         array = np.where(np.isin(array, labels_of(STRUCTURES, wanted)), array, 0)
         structures = Volume(array.astype(np.uint8), mri.ijk_to_ras, label_names=dict(enumerate(STRUCTURES, 1)))
-        surfels, first = surfels.of_kind(*(set(KINDS) & set(wanted))), f"the sheets are those kept in {place}"
+        surfels, first = surfels.of_kind(*(set(KINDS) & set(wanted))), f"the sheets are those kept in {keep_at}"
     else:
         surfels, structures = _found(Head.of(mri, segmentation, contrast), mri, wanted, report)
         first = keep_sheets(keep_at, key, wanted, surfels, structures.array) if keep_at is not None else ""
     notes += [first] if first else []
     if contrast != "t1gd" and set(_ENHANCING) & set(wanted):
         notes.append("no vessels and no choroid plexus are looked for: only a T1 with contrast agent shows them")
-    notes += _lines(surfels, structures, wanted, is_whole=segmentation.atlas is not None)
+    notes += _lines(surfels, structures, wanted)
+    if segmentation.atlas is None and "falx" in wanted:
+        notes.append("the falx is the straight sulcus, if there is one, that is as deep as the fissure: look at it")
     for line in notes:
         _log.info("%s", line)
     report(1.0)
@@ -151,12 +153,12 @@ def _found(head: Head, mri: Volume, wanted: tuple[str, ...], report: Callable[[f
     masks: dict[str, np.ndarray] = {}
     in_ventricles = np.zeros(head.brain.shape, bool)
     is_whole = head.registered is not None
-    by_sulci = not is_whole and "falx" in wanted
-    if {"sulcus", "ependyma", *_ENHANCING} & set(wanted) or by_sulci:
+    by_sulci = "sulcus" in wanted or ("falx" in wanted and not is_whole)
+    if {"ependyma", *_ENHANCING} & set(wanted) or by_sulci:
         in_ventricles = ventricles(head)
         finished("ventricles")
     all_sulci = Surfels.joined([])
-    if "sulcus" in wanted or by_sulci:
+    if by_sulci:
         all_sulci = sulci(head, in_ventricles)
         finished("sulcus")
     if {"falx", "tentorium", "vessels"} & set(wanted):  # the apex of the tentorium is below the falx
@@ -205,28 +207,17 @@ def _labels(mri: Volume, head: Head, masks: dict[str, np.ndarray]) -> Volume:
     return Volume(labels, mri.ijk_to_ras, label_names=names)
 
 
-def _lines(surfels: Surfels, structures: Volume, wanted: tuple[str, ...], *, is_whole: bool) -> list[str]:
+def _lines(surfels: Surfels, structures: Volume, wanted: tuple[str, ...]) -> list[str]:
     lines = []
     for kind in KINDS:
         if kind in wanted:
             part = surfels.of_kind(kind)
-            lines.append(f"{kind}: {len(part)} surfels, {part.area.sum() / 100.0:.0f} cm²{_how(part, kind, is_whole)}")
+            lines.append(f"{kind}: {len(part)} surfels, {part.area.sum() / 100.0:.0f} cm²")
     for number, name in enumerate(STRUCTURES, 1):
         count = int((structures.array == number).sum())
         if name in wanted and (count or name == "corpus callosum"):
             lines.append(f"{name}: {count * structures.voxel_ml:.1f} ml")
     return lines
-
-
-def _how(found: Surfels, kind: str, is_whole: bool) -> str:
-    """What a user should know about a falx that no atlas leads."""
-    if kind != "falx" or is_whole:
-        return ""
-    if not len(found):
-        return ", since no straight sulcus is as deep as the fissure between the hemispheres"
-    return (
-        ", without an atlas, by the straight sulcus that is as deep as the fissure between the hemispheres: look at it"
-    )
 
 
 # ---- walls of the ventricles: where the fluid in them ends, between voxels -------------------------------------------
@@ -383,7 +374,7 @@ def vessels(head: Head, sheets: Surfels, apart: np.ndarray) -> np.ndarray:
     core = distance_to(~wide, head.image.spacing_mm) > 0.5 * _SINUS_MM
     if core.any():
         found &= distance_to(core, head.image.spacing_mm) > 0.5 * _SINUS_MM + _SINUS_RIM_MM
-    found &= (head.depth > _SURFACE_MM) & ~apart & ~_near(head, sheets, _DURA_MM)
+    found &= (head.depth > _SURFACE_MM) & ~apart & ~near_points(head.image, sheets.place, _DURA_MM)
     parts = components(found, corners=True)
     sizes = np.bincount(parts.ravel())
     peaks = ndimage.maximum(head.image.array, parts, np.arange(len(sizes)))
@@ -404,18 +395,6 @@ def _tubeness(head: Head) -> np.ndarray:
         )
         result = np.maximum(result, sigma**2 * sitk.GetArrayViewFromImage(lines))
     return result
-
-
-def _near(head: Head, sheets: Surfels, distance_mm: float) -> np.ndarray:
-    """(k, j, i) True within a distance of surfels."""
-    result = np.zeros(head.brain.shape, bool)
-    matrix = head.image.ras_to_ijk
-    index = np.rint(sheets.place @ matrix[:3, :3].T + matrix[:3, 3]).astype(int)[:, ::-1]
-    index = index[((index >= 0) & (index < result.shape)).all(axis=1)]
-    if not len(index):
-        return result
-    result[tuple(index.T)] = True
-    return distance_to(result, head.image.spacing_mm) <= distance_mm
 
 
 def _large(inside: np.ndarray, voxels: float) -> np.ndarray:

@@ -71,11 +71,12 @@ class Head:
         )
         sign = -1.0 if contrast == "t2" else 1.0
         names = segmentation.tissue_names
-        means = [sign * float(segmentation.means[names.index(f)]) for f in ("csf", "grey matter", "white matter")]
+        tissues = ("csf", "grey matter", "white matter")
+        csf, grey, white = (sign * float(segmentation.means[names.index(tissue)]) for tissue in tissues)
         require(
-            means[0] < means[1] < means[2],
-            f"CSF, grey and white matter have means {', '.join(f'{sign * m:.4g}' for m in means)}, expected the order "
-            f"of {contrast}",
+            csf < grey < white,
+            f"CSF, grey and white matter have means {sign * csf:.4g}, {sign * grey:.4g}, {sign * white:.4g}, expected "
+            f"the order of {contrast}",
         )
         box = _box(segmentation.brain.mask, _MARGIN_MM)
         images = (mri, segmentation.brain.mask, mri.with_array(segmentation.corrected))
@@ -83,7 +84,8 @@ class Head:
         inside = mask.array > 0
         image = part.with_array(np.float32(sign) * _without_field(part, corrected.array, inside))
         noise = float(segmentation.standard_deviations[names.index("white matter")])
-        return replace(cls.of_part(image, inside, means, noise, contrast == "t1gd"), registered=segmentation.atlas)
+        head = cls.of_part(image, inside, (csf, grey, white), noise, contrast == "t1gd")
+        return replace(head, registered=segmentation.atlas)
 
     @classmethod
     def of_part(

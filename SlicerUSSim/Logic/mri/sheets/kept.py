@@ -7,14 +7,14 @@ import logging
 import zipfile
 from dataclasses import fields
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from SlicerUSSim.Logic.base.errors import SimulationError
 from SlicerUSSim.Logic.base.files import written_whole
-from SlicerUSSim.Logic.base.version import __version__
 from SlicerUSSim.Logic.base.volume import Volume
-from SlicerUSSim.Logic.mri.kept_mask import cache_folder, fingerprint_of, keep_file, named_beside
+from SlicerUSSim.Logic.mri.kept_mask import fingerprint_of, keep_file, named_beside
 from SlicerUSSim.Logic.mri.segmentation import Segmentation
 from SlicerUSSim.Logic.tissue.surfels import Surfels
 
@@ -34,30 +34,33 @@ def key_of(mri: Volume, segmentation: Segmentation, contrast: str) -> str:
     return " ".join([fingerprint_of(mri), fingerprint_of(segmentation.brain.mask), contrast, means, str(_RECIPE)])
 
 
-def read_kept_sheets(path: Path, key: str, kinds: tuple[str, ...]) -> tuple[Surfels, np.ndarray, Path] | None:
-    """(surfels, structures, their file) if all `kinds` are kept for this key; None if not."""
-    for place in (path, _in_cache(path, key)):
-        if not place.is_file():
-            continue
-        try:
-            with np.load(place, allow_pickle=False) as file:
-                head = json.loads(str(file["ussim_sheets"]))
-                if head["key"] != key or not _holds(set(head["kinds"]), set(kinds)):
-                    continue
-                arrays = {entry.name: file[entry.name] for entry in fields(Surfels)}
-                surfels, structures = Surfels(**arrays), file["structures"]
-                return surfels, structures, place
-        except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile, SimulationError) as error:
-            _log.info("%s: is not used as kept sheets (%s)", place, error)
-    return None
+def read_kept_sheets(path: Path, key: str, kinds: tuple[str, ...]) -> tuple[Surfels, np.ndarray] | None:
+    """(surfels, structures) if all `kinds` are kept for this key; None if not."""
+    found = _read(path)
+    if found is None or found[0]["key"] != key or not _holds(set(found[0]["kinds"]), set(kinds)):
+        return None
+    return found[1:]
 
 
 def keep_sheets(path: Path, key: str, kinds: tuple[str, ...], surfels: Surfels, structures: np.ndarray) -> str:
-    """Write them to `path`, or to the user's cache folder as keep_file does; returns one line about it."""
-    head = json.dumps({"key": key, "kinds": kinds, "version": __version__})
-    return keep_file(
-        path, _in_cache(path, key), "the sheets are", lambda place: _write(place, head, surfels, structures)
-    ).text
+    """Write them as keep_file does, also over others that were kept; returns one line about it."""
+    head = json.dumps({"key": key, "kinds": kinds})
+    is_ours = _read(path) is not None
+    write = lambda place: _write(place, head, surfels, structures)  # noqa: E731
+    return keep_file(path, "the file of the sheets", write, replaces=is_ours)
+
+
+def _read(path: Path) -> tuple[dict[str, Any], Surfels, np.ndarray] | None:
+    """(what they depend on, surfels, structures) of a file by keep_sheets; None for another, and for none."""
+    if not path.is_file():
+        return None
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            surfels = Surfels(**{entry.name: file[entry.name] for entry in fields(Surfels)})
+            return json.loads(str(file["ussim_sheets"])), surfels, file["structures"]
+    except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile, SimulationError) as error:
+        _log.info("%s: is not used as kept sheets (%s)", path, error)
+    return None
 
 
 def _write(path: Path, head: str, surfels: Surfels, structures: np.ndarray) -> None:
@@ -70,7 +73,3 @@ def _holds(kept: set[str], wanted: set[str]) -> bool:
     """Whether what is wanted is part of what is kept. Sulci beside the dura are left out where that is found, too."""
     dura = {"falx", "tentorium"}
     return wanted <= kept and ("sulcus" not in wanted or wanted & dura == kept & dura)
-
-
-def _in_cache(path: Path, key: str) -> Path:
-    return cache_folder() / "sheets" / f"{key.split()[0]}-{path.name}"

@@ -12,14 +12,12 @@ import numpy as np
 from SlicerUSSim.Logic.base.errors import require
 from SlicerUSSim.Logic.base.files import messages_withheld, written_whole
 from SlicerUSSim.Logic.base.reading import in_child
+from SlicerUSSim.Logic.base.transforms import LPS_TO_RAS
 from SlicerUSSim.Logic.tissue.surfels import KINDS, Surfels
 
 if TYPE_CHECKING:
     from vtkmodules.vtkCommonDataModel import vtkPolyData
 
-_SUFFIXES = (".vtp", ".ply")
-#: By so much the middle of a square may differ from its surfel's place, for what other programs round, mm
-_MOVED_MM = 0.05
 #: Colours of the kinds, 0 to 255
 COLOURS = ((255, 140, 26), (0, 229, 255), (77, 107, 255), (57, 230, 57))
 
@@ -27,41 +25,25 @@ COLOURS = ((255, 140, 26), (0, 229, 255), (77, 107, 255), (57, 230, 57))
 def require_surfel_file(path: str | os.PathLike) -> None:
     """Raise SimulationError unless surfels can be written under this name."""
     require(
-        Path(path).suffix.lower() in _SUFFIXES,
-        f"{path}: sheets are written as {' or '.join(_SUFFIXES)}, expected such a name",
+        Path(path).suffix.lower() == ".vtp", f"{path}: sheets are written as a VTK surface, expected a name with .vtp"
     )
 
 
 def write_surfels(path: str | os.PathLike, surfels: Surfels) -> None:
-    """Write a .vtp, which read_surfels reads and Slicer shows in RAS, or a .ply with colours, in LPS as Slicer expects.
+    """Write a .vtp, which read_surfels reads and Slicer shows in RAS.
 
     Raises SimulationError for another suffix, and if the file cannot be written.
     """
     require_surfel_file(path)
-    from vtkmodules.vtkIOPLY import vtkPLYWriter
     from vtkmodules.vtkIOXML import vtkXMLPolyDataWriter
 
-    is_ply = Path(path).suffix.lower() == ".ply"
-    data = as_polydata(surfels, (-1.0, -1.0, 1.0) if is_ply else (1.0, 1.0, 1.0))
+    writer = vtkXMLPolyDataWriter()
+    writer.SetInputData(as_polydata(surfels))
     with written_whole(path) as partial, messages_withheld():
-        if is_ply:
-            writer = vtkPLYWriter()
-            writer.SetArrayName("colour")
-        else:
-            writer = vtkXMLPolyDataWriter()
-        writer.SetInputData(data)
         writer.SetFileName(str(partial))
         # On a full disk VTK writes a part of the file, and says that it has written it.
-        if writer.Write() != 1 or not _is_whole(partial, data):
+        if writer.Write() != 1 or not _has_end(partial):
             raise OSError("not all of it is in the file; is the disk full?")
-
-
-def _is_whole(path: Path, data: vtkPolyData) -> bool:
-    """Whether a file has the points and squares of `data`."""
-    if path.suffix.lower() != ".ply":
-        return _has_end(path)
-    # Of each point 3 float32 and 3 bytes of colour, of each square its size and 4 int32
-    return path.stat().st_size >= 15 * data.GetNumberOfPoints() + 17 * data.GetNumberOfCells()
 
 
 def _has_end(path: Path) -> bool:
@@ -71,8 +53,8 @@ def _has_end(path: Path) -> bool:
         return b"</VTKFile>" in file.read()
 
 
-def as_polydata(surfels: Surfels, signs: tuple[float, float, float] = (1.0, 1.0, 1.0)) -> vtkPolyData:
-    """A square of its area for each surfel, with every entry as an array of the cells; axes times `signs`."""
+def as_polydata(surfels: Surfels) -> vtkPolyData:
+    """A square of its area for each surfel, with every entry as an array of the cells."""
     from vtkmodules.util.numpy_support import numpy_to_vtk, numpy_to_vtkIdTypeArray
     from vtkmodules.vtkCommonCore import vtkPoints, vtkStringArray
     from vtkmodules.vtkCommonDataModel import vtkCellArray, vtkPolyData
@@ -84,7 +66,7 @@ def as_polydata(surfels: Surfels, signs: tuple[float, float, float] = (1.0, 1.0,
     half = (0.5 * np.sqrt(surfels.area))[:, None]
     corners = [surfels.place + half * (a * first + b * second) for a, b in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
     points = vtkPoints()
-    points.SetData(numpy_to_vtk(np.stack(corners, 1).reshape(-1, 3) * np.array(signs, np.float32), deep=1))
+    points.SetData(numpy_to_vtk(np.stack(corners, 1).reshape(-1, 3), deep=1))
     cells = vtkCellArray()
     offsets, places = np.arange(0, 4 * count + 1, 4), np.arange(4 * count)
     cells.SetData(*(numpy_to_vtkIdTypeArray(array.astype(np.int64), deep=1) for array in (offsets, places)))
@@ -92,9 +74,7 @@ def as_polydata(surfels: Surfels, signs: tuple[float, float, float] = (1.0, 1.0,
     result.SetPoints(points)
     result.SetPolys(cells)
     for entry in fields(surfels):
-        values = getattr(surfels, entry.name)
-        values = values * np.array(signs, np.float32) if values.ndim == 2 else values
-        array = numpy_to_vtk(np.ascontiguousarray(values), deep=1)
+        array = numpy_to_vtk(np.ascontiguousarray(getattr(surfels, entry.name)), deep=1)
         array.SetName(entry.name)
         result.GetCellData().AddArray(array)
     colours = numpy_to_vtk(np.repeat(np.array(COLOURS, np.uint8)[surfels.kind], 4, axis=0), deep=1)
@@ -102,8 +82,7 @@ def as_polydata(surfels: Surfels, signs: tuple[float, float, float] = (1.0, 1.0,
     result.GetPointData().AddArray(colours)
     result.GetPointData().SetActiveScalars("colour")
     # SPACE is what Slicer looks for; without it, it takes a file to be in LPS.
-    space = "RAS" if signs[0] > 0 else "LPS"
-    for name, texts in (("SPACE", [space]), ("kinds", KINDS)):
+    for name, texts in (("SPACE", ["RAS"]), ("kinds", KINDS)):
         strings = vtkStringArray()
         strings.SetName(name)
         for text in texts:
@@ -148,30 +127,22 @@ def surfels_of(data: vtkPolyData, source: str) -> Surfels:
     return Surfels(*arrays)
 
 
-def placed_surfels(data: vtkPolyData, source: str) -> Surfels:
-    """The surfels of a surface by as_polydata in RAS, where its squares are: another program may have moved them.
+def placed_surfels(data: vtkPolyData, source: str, to_ras: np.ndarray | None = None) -> Surfels:
+    """The surfels of a surface by as_polydata, where its squares are after a (4, 4) linear transform.
 
-    Raises SimulationError as surfels_of does, and for squares that were moved and cut.
-    """
-    surfels, to_ras = surfels_of(data, source), np.eye(4)
-    space = data.GetFieldData().GetAbstractArray("SPACE")
-    if space is not None and space.GetValue(0) == "LPS":  # as Slicer writes a model; its arrays stay as they were
-        to_ras = np.diag([-1.0, -1.0, 1.0, 1.0])
-    by_squares = surfels_of_squares(data, surfels, to_ras, source)
-    same = len(by_squares) == len(surfels) and np.allclose(by_squares.place, surfels.place, rtol=0.0, atol=_MOVED_MM)
-    return surfels if same else by_squares
-
-
-def surfels_of_squares(data: vtkPolyData, surfels: Surfels, matrix: np.ndarray, source: str) -> Surfels:
-    """Surfels with the places, normals and areas of their squares after a (4, 4) linear transform.
-
-    What is in a sheet grows by its volume, and the thickness with it. Squares of no area are left out.
-    Raises SimulationError for cells that are no squares.
+    Other programs move squares and leave the arrays as they were. What is in a sheet grows by its volume, and the
+    thickness with it. Squares of no area are left out. Without `to_ras`, the surface is in the frame that it says.
+    Raises SimulationError as surfels_of does, and for cells that are no squares.
     """
     from vtkmodules.util.numpy_support import vtk_to_numpy
 
+    surfels = surfels_of(data, source)
     if not len(surfels):
         return surfels
+    if to_ras is None:
+        space = data.GetFieldData().GetAbstractArray("SPACE")
+        # As Slicer writes a model
+        to_ras = LPS_TO_RAS if space is not None and space.GetValue(0) == "LPS" else np.eye(4)
     squares = np.asarray(vtk_to_numpy(data.GetPolys().GetConnectivityArray()), np.int64)
     count = data.GetNumberOfPoints()
     require(
@@ -179,12 +150,12 @@ def surfels_of_squares(data: vtkPolyData, surfels: Surfels, matrix: np.ndarray, 
         f"{source} has cells that are no squares, expected a model of `ussim segment --sheets`",
     )
     corners = (
-        vtk_to_numpy(data.GetPoints().GetData())[squares].reshape(-1, 4, 3).astype(float) @ matrix[:3, :3].T
-        + matrix[:3, 3]
+        vtk_to_numpy(data.GetPoints().GetData())[squares].reshape(-1, 4, 3).astype(float) @ to_ras[:3, :3].T
+        + to_ras[:3, 3]
     )
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 3] - corners[:, 0])
     area = np.linalg.norm(normal, axis=1)
-    volume = abs(float(np.linalg.det(matrix[:3, :3])))
+    volume = abs(float(np.linalg.det(to_ras[:3, :3])))
     is_whole = (area > 1e-9) & (surfels.area > 1e-9)
     thickness = surfels.thickness[is_whole] * volume * surfels.area[is_whole] / area[is_whole]
     chosen = surfels.chosen(is_whole)
