@@ -74,8 +74,7 @@ class Craniotomy:
         given, chosen = f"--craniotomy is {self.text}", patient.segmentation
         if not self.is_wanted:
             return
-        is_of_mri = not patient.is_ct
-        require(is_of_mri, f"{given}, which opens a head that was found in an MRI, and this is a CT (--ct)")
+        require(not patient.is_ct, f"{given}, which opens a head that was found in an MRI, and this is a CT")
         if chosen.outside:
             return
         from SlicerUSSim.Logic.mri.outside import require_findable

@@ -17,7 +17,7 @@ from SlicerUSSim.Command.options import check_results, declared, declared_parame
 from SlicerUSSim.Command.patient_options import RARE, named_probe
 from SlicerUSSim.Command.progress import Steps, note
 from SlicerUSSim.Command.set_option import Changes
-from SlicerUSSim.Logic.base.errors import SimulationError
+from SlicerUSSim.Logic.base.errors import require
 from SlicerUSSim.Logic.base.settings import SimulationSettings
 
 
@@ -64,15 +64,16 @@ def demo(out: Path, patient: DemoOptions) -> None:
     if path is None:
         mri, source = demo_mri()
     else:
-        mri = read_mri(path, mask=patient.mask, skull_strip=patient.segmentation.skull_strip)
+        mri = read_mri(path, patient)
+        patient = patient.for_image(mri)
+        require(not patient.is_ct, f"{path}: is a CT, expected an MRI; use ussim simulate")
         source = os.path.abspath(path)
     note(f"MRI: {source}, {mri.size_text} voxels")
     with Steps(5) as step:
         step("segment the MRI")
         start = perf_counter()
         found = segmented_file(path or mri.name, mri, patient, additions=masks, tell_all=True, is_file=path is not None)
-        if not isinstance(found, Segmentation):
-            raise SimulationError(f"{source}: is read as a CT, expected an MRI; use ussim simulate")
+        assert isinstance(found, Segmentation)
         seconds = perf_counter() - start
 
         step("build the acoustic medium")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -15,6 +15,8 @@ from SlicerUSSim.Logic.base.errors import SimulationError, require
 from SlicerUSSim.Logic.mri.segmentation_settings import CT, MRI_CONTRASTS, SegmentationSettings
 
 if TYPE_CHECKING:
+    from typing_extensions import Self
+
     from SlicerUSSim.Command.additions import Additions
     from SlicerUSSim.Logic.base import Volume
     from SlicerUSSim.Logic.mri import CtSegmentation, Segmentation
@@ -37,11 +39,10 @@ class MriOptions:
         "brats, brats-2022. May be repeated.",
     )  # fmt: skip
     segmentation: SegmentationSettings = declared_parameters(  # noqa: RUF009, a dataclasses.field like the others
-        SegmentationSettings,
-        also=(click.Option(["--ct", "contrast"], flag_value=CT, default=MRI_CONTRASTS[0], hidden=True),),
+        SegmentationSettings
     )
     organs: str | None = declared(
-        "--organs", type=click.Path(), help="Label map of organs of a CT (--ct), such as TotalSegmentator's, whose "
+        "--organs", type=click.Path(), help="Label map of organs of a CT, such as TotalSegmentator's, whose "
         "soft tissues replace muscle and blood.",
     )  # fmt: skip
     mask: str | None = declared(
@@ -78,8 +79,17 @@ class MriOptions:
 
     @property
     def is_ct(self) -> bool:
-        """Whether the image is said to be a CT."""
+        """Whether the image is a CT."""
         return self.contrast == CT
+
+    def for_image(self, image: Volume) -> Self:
+        """With the contrast of a CT if the image is one, after a note that says why."""
+        from SlicerUSSim.Logic.mri.ct_unit import settings_for
+
+        settings, line = settings_for(image, self.segmentation)
+        if line is not None:
+            note(f"{image.name}: {line}")
+        return replace(self, segmentation=settings)
 
 
 @dataclass(frozen=True)
@@ -158,7 +168,10 @@ def segmented_file(
     if not is_of_brain:
         require_no_options_beside_ct(path)
     require_no_map(path, maps, organs)
-    require(organs is None or not is_of_brain, f"--organs is for a CT, expected --ct; {path} is read as an MRI")
+    require(
+        organs is None or not is_of_brain,
+        f"--organs is for a CT, and {path} is read as an MRI; for a CT, give --contrast ct",
+    )
     others = {contrast: Volume.read(file) for contrast, file in also_files(patient.also, path).items()}
     brain = read_mask(patient.mask) if patient.mask else None
     additions.require_addable(mri, brain, settings.skull_strip if is_of_brain else "none")
@@ -195,9 +208,7 @@ def _read_organs(path: str, maps: Iterable[str]) -> LabelledTissues:
     return found
 
 
-def read_mri(
-    path: str, *, mask: str | None, skull_strip: str, contrast: str = MRI_CONTRASTS[0], is_served: bool = False
-) -> Volume:
+def read_mri(path: str, patient: MriOptions, *, is_served: bool = False) -> Volume:
     """Read an MRI or a CT, which is not a label map unless it is segmented all the same.
 
     `is_served` is for the words of the errors: the command is that of the workstation.
@@ -213,7 +224,7 @@ def read_mri(
 
     require_no_sequence(path)
     volume = Volume.read(path)
-    if mask is not None or skull_strip == "none" or contrast == CT:
+    if patient.mask is not None or patient.segmentation.skull_strip == "none" or patient.is_ct:
         return volume
     with about_file(path):
         check_finite(volume)

@@ -138,13 +138,12 @@ def declared(*names: str, **about: Any) -> Any:
     return field(metadata={"option": (names, about)})
 
 
-def declared_parameters(kind: type, *, of_preset: bool = False, also: Iterable[click.Option] = ()) -> Any:
+def declared_parameters(kind: type, *, of_preset: bool = False) -> Any:
     """A field of a dataclass of options: a `kind` with its parameters that have an option.
 
-    `also` are further options for the same values. With `of_preset` it is {name: value} of those that were given, and
-    --help refers to the preset for the default.
+    With `of_preset` it is {name: value} of those that were given, and --help refers to the preset for the default.
     """
-    return field(metadata={"kind": kind, "of_preset": of_preset, "also": tuple(also)})
+    return field(metadata={"kind": kind, "of_preset": of_preset})
 
 
 class Key(NamedTuple):
@@ -180,9 +179,8 @@ def gathered(keys: str = "", **kinds: type) -> Callable[[Command], Command]:
             command(**options, **given)
 
         shown = [entry.option for entry in known.values() if entry.option.name not in rare]
-        more = [option for kind in kinds.values() for option in _further_of(kind)]
         below = getattr(command, "__click_params__", [])
-        with_options.__click_params__ = [*below, *reversed(shown + more)]  # type: ignore[attr-defined]
+        with_options.__click_params__ = [*below, *reversed(shown)]  # type: ignore[attr-defined]
         with_options.keys = known  # type: ignore[attr-defined]
         return with_options
 
@@ -224,12 +222,6 @@ def _keys_of(section: str, kind: type, of_preset: bool = False) -> Iterator[tupl
         option = click.Option([*names, place.name], **about) if names else click.Argument([place.name], **about)
         default = about.get("default", () if "multiple" in about else None)
         yield f"{section}.{place.name}", Key(option, None, default)
-
-
-def _further_of(kind: type) -> Iterator[click.Option]:
-    if not issubclass(kind, Declared):
-        for place in fields(kind):  # type: ignore[arg-type]
-            yield from place.metadata.get("also", ())
 
 
 def _read_keys(context: click.Context, known: Mapping[str, Key]) -> None:
@@ -309,21 +301,14 @@ def _value(place: Field, given: dict[str, Any]) -> Any:
 
 
 def given_options(*names: str) -> list[str]:
-    """Those of the running command's options with these names of parameters that the user gave, as "--mask".
-
-    Of several options of one parameter, as --contrast and --ct, it is the one that stands for the value.
-    """
+    """Those of the running command's options with these names of parameters that the user gave, as "--mask"."""
     context = click.get_current_context()
-    rare = {entry.option: f"--set {key}" for key, entry in rare_keys(context.command).items()}
-    given = dict[str, str]()
-    for parameter in (*context.command.params, *rare):
-        name = parameter.name or ""
-        if name not in names or context.get_parameter_source(name) is not ParameterSource.COMMANDLINE:
-            continue
-        stands_for = getattr(parameter, "flag_value", None) if getattr(parameter, "is_flag", False) else None
-        if name not in given or (isinstance(stands_for, str) and stands_for == context.params.get(name)):
-            given[name] = rare.get(parameter, parameter.opts[0])
-    return list(given.values())
+    shown = {option: option.opts[0] for option in context.command.params}
+    shown |= {entry.option: f"--set {key}" for key, entry in rare_keys(context.command).items()}
+    return [
+        text for option, text in shown.items()
+        if option.name in names and context.get_parameter_source(option.name) is ParameterSource.COMMANDLINE
+    ]  # fmt: skip
 
 
 def require_no_mri_options(labels: str, remedy: str) -> None:
@@ -335,14 +320,13 @@ def require_no_mri_options(labels: str, remedy: str) -> None:
 def require_no_options_beside_ct(path: str) -> None:
     """Raise SimulationError if options that only MRIs have were given with the CT of this file."""
     names = {entry.name for entry in parameters_of(SegmentationSettings)} - {"contrast", "filter_radius"}
-    _require_not_given(f"{path}: is a CT (--ct)", "leave it out", "also", *sorted(names))
+    _require_not_given(f"{path}: is a CT", "leave it out", "also", *sorted(names))
 
 
 def _require_not_given(what: str, remedy: str, *names: str) -> None:
     given = given_options(*names)
-    kind = "a CT" if given == ["--ct"] else "an MRI"
     verb = "is" if len(given) == 1 else "are"
-    require(not given, f"{what}, and {' and '.join(given)} {verb} for {kind}; {remedy}")
+    require(not given, f"{what}, and {' and '.join(given)} {verb} for an MRI; {remedy}")
 
 
 def check_outputs(*outputs: Path | None, state: Path | None = None) -> None:

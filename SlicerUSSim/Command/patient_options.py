@@ -154,11 +154,8 @@ def open_examination(patient: PatientOptions, pose: np.ndarray | str | None = No
     preset = patient.changed_preset()
     require_no_sequence(patient.mri_or_labels)
     volume = Volume.read(patient.mri_or_labels)
-    chosen = patient.segmentation
-    is_ct = patient.is_ct
     craniotomy = Craniotomy.of(patient.craniotomy)
-    path, is_labels = patient.mri_or_labels, False if is_ct else patient.is_labels
-    require(not (is_ct and patient.is_labels), f"{path}: --labels and --ct are given, expected one of them")
+    path, is_labels = patient.mri_or_labels, False if patient.is_ct else patient.is_labels
     if is_labels is None:
         is_labels = is_label_file(Path(path), volume)
         kinds = ("a label map", "--mri") if is_labels else ("an MRI, to be segmented", "--labels")
@@ -169,8 +166,14 @@ def open_examination(patient: PatientOptions, pose: np.ndarray | str | None = No
         require_no_mri_options(path, "leave it out, or use --mri if it is one")
     else:
         require_no_map(path, patient.maps, patient.organs)
+        patient = patient.for_image(volume)
         craniotomy.require_head(volume, patient)
+        require(
+            not (patient.is_ct and isinstance(pose, str)),
+            f"--pose is {pose}, which is on a head, and the image is a CT, expected a file with the pose",
+        )
     also_files(patient.also)
+    chosen, is_ct = patient.segmentation, patient.is_ct
     if chosen.outside and not is_ct:
         from SlicerUSSim.Logic.mri.outside import require_findable  # labels alone do not wait for it
 
@@ -274,10 +277,6 @@ def open_examination_at(patient: PatientOptions, pose: str) -> tuple[Examination
     from SlicerUSSim.Logic.tracked.pose_files import read_pose
 
     is_chosen = pose == AUTO or pose in STANDARD_VIEWS
-    require(
-        not is_chosen or not patient.is_ct,
-        f"--pose is {pose}, which is on a head, and the image is a CT (--ct), expected a file with the pose",
-    )
     require(
         is_chosen or (pose != "" and Path(pose).exists()),
         f"--pose is {pose!r} (no such file), expected a file with the pose (.json, .txt, .tfm, .h5), {AUTO}, "

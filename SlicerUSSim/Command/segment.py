@@ -35,25 +35,26 @@ from SlicerUSSim.Logic.base.errors import SimulationError, require
 def segment(
     mri: str, patient: MriOptions, out: Path, seeds: tuple[str, ...], sheets: Path | None, sheet_kinds: tuple[str, ...]
 ) -> None:
-    """Segment an MRI of a head or a brain, or a CT (--ct), into tissues."""
+    """Segment an MRI of a head or a brain, or a CT, into tissues."""
     from SlicerUSSim.Logic.base.volume import require_image_name
     from SlicerUSSim.Logic.mri.modality import has_brain_mask
     from SlicerUSSim.Logic.mri.outside import require_findable
     from SlicerUSSim.Logic.mri.segmentation import Segmentation
     from SlicerUSSim.Logic.tissue.table import TissueTable, tissues_beside, write_label_files
 
-    settings, mask = patient.segmentation, patient.mask
     for change in patient.changes:
         raise SimulationError(f"--set {change}: no image is simulated, expected a key of segmentation")
     require_image_name(out)
     check_outputs(out, tissues_beside(out))
-    if settings.outside and not patient.is_ct:
-        require_findable(settings.contrast, settings.skull_strip, mask is not None)
-    require_sheets(sheets, sheet_kinds, settings.contrast)
     also_files(patient.also)
     split_seeds(seeds)
     masks = Additions.read(patient.additions)
-    volume = read_mri(mri, mask=mask, skull_strip=settings.skull_strip, contrast=settings.contrast)
+    volume = read_mri(mri, patient)
+    patient = patient.for_image(volume)
+    settings = patient.segmentation
+    if settings.outside and not patient.is_ct:
+        require_findable(settings.contrast, settings.skull_strip, patient.mask is not None)
+    require_sheets(sheets, sheet_kinds, settings.contrast)
     if seeds:
         require(has_brain_mask(settings.contrast), "--seed grows lesions of an MRI, and this is a CT")
         require_seeds(seeds, volume, out)

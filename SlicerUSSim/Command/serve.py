@@ -6,7 +6,6 @@ import importlib.util
 import os
 import sys
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -84,6 +83,8 @@ def serve(patient: ServeOptions, recording: TrackingOptions) -> None:
 
     The file is an MRI, or what the page opens, by its content: a scene (.mrb), tracked ultrasound, a preset, ...
     """
+    from SlicerUSSim.Logic.base.volume import Volume
+
     _require_workstation()
     scene, scene_name, also_open, mri = None, "", None, patient.mri
     if mri is not None and _is_no_image(mri):
@@ -104,32 +105,33 @@ def serve(patient: ServeOptions, recording: TrackingOptions) -> None:
         LabelMapping.of(patient.maps)
     if patient.labels is not None and mri is None:
         require_no_mri_options(patient.labels, "give an MRI, too, to segment it")
+    volumes = {}
+    if mri is not None:
+        volumes[mri] = Volume.read(mri) if patient.labels is not None else read_mri(mri, patient, is_served=True)
+        patient = patient.for_image(volumes[mri])
     chosen, is_ct, has_mask = patient.segmentation, patient.is_ct, patient.mask is not None
     require(
-        mri is not None or not is_ct,
-        "the contrast is ct (--ct), expected a CT; without a file the demo brain is shown, an MRI",
+        mri is not None or not is_ct, "--contrast is ct, expected a CT; without a file the demo brain is shown, an MRI"
     )
     if chosen.outside and not is_ct:
         from SlicerUSSim.Logic.mri.outside import require_findable
 
         require_findable(patient.contrast, chosen.skull_strip, has_mask)
         require(mri is not None, "--outside is for a whole head, expected an MRI of one; the demo brain has no head")
-    require(patient.organs is None or is_ct, "--organs is for a CT, expected --ct too")
+    require(patient.organs is None or is_ct, "--organs is for a CT, expected one; if this is one, give --contrast ct")
     drawn = DrawnSheets.of(
         patient.sheets, patient.no_sheets, is_labels=patient.labels is not None, contrast=patient.contrast
     )
-    more = {"mask": patient.mask, "skull_strip": chosen.skull_strip, "contrast": patient.contrast}
-    read_head = partial(read_mri, is_served=True, **more)
     opening = Craniotomy.of(patient.craniotomy)
     if opening.is_wanted and patient.labels is None:
         require(
             scene is None and also_open is None,
             f"--craniotomy is {patient.craniotomy}, which opens the skull in the MRI of a head, and the file is none",
         )
-        opening.require_head(None if mri is None or chosen.outside else read_head(mri), patient)
+        opening.require_head(None if mri is None else volumes[mri], patient)
     if opening.is_file:
         _require_opening(opening.source)
-    require(not (is_ct and others), "--also is for an MRI, and the contrast is ct (--ct); leave it out")
+    require(not (is_ct and others), "--also is for an MRI, and this is a CT; leave it out")
     if patient.igtl is not None:
         from SlicerUSSim.Logic.tracked.openigtlink import parse_address, require_usable
 
@@ -137,15 +139,12 @@ def serve(patient: ServeOptions, recording: TrackingOptions) -> None:
     tls = _tls(patient.cert, patient.key)
     port = _usable_port(patient.host, patient.port)
 
-    from SlicerUSSim.Logic.base.volume import Volume
     from SlicerUSSim.Logic.imaging.preset import Preset
     from SlicerUSSim.Logic.mri.masks import with_label_names
     from SlicerUSSim.Logic.opencl.devices import choose_device
 
     choose_device(patient.device)
-    volumes = {file: Volume.read(file) for file in files if file != mri or patient.labels is not None}
-    if mri is not None and patient.labels is None:
-        volumes[mri] = read_head(mri)
+    volumes |= {file: Volume.read(file) for file in files if file != mri}
     checked = Additions.of((tissue, with_label_names(volumes[file], file), file) for tissue, file in added)
     if mri is not None and patient.labels is None:
         mask = None if patient.mask is None else volumes[patient.mask]

@@ -267,7 +267,8 @@ def _read_files(path: Path, files: Sequence[str]) -> ImageFile:
         channels = int(first.get("SamplesPerPixel") or 1)
         require(channels == 1, f"{path}: has {channels} components per voxel, expected 1; export it in grey levels")
         try:
-            return _frames(path, first) if frames > 1 else _stack(path, files, datasets)
+            found = _frames(path, first) if frames > 1 else _stack(path, files, datasets)
+            return replace(found, modality=str(first.get("Modality") or ""))
         except (ValueError, RuntimeError, AttributeError) as error:  # what highdicom refuses
             raise SimulationError(f"{path}: is not one volume ({str(error).splitlines()[0]})") from None
 

@@ -82,6 +82,8 @@ class ImageFile:
     label_codes: Mapping[int, tuple[str, ...]] = field(default_factory=dict)
     #: One line each, without the name of the file
     doubts: tuple[str, ...] = ()
+    #: Of DICOM: "CT", "MR", ...
+    modality: str = ""
 
 
 @reader

@@ -48,6 +48,7 @@ class Volume:
     label_names : {label: name} of masks and label maps, where their file gives them; see mri.read_mask.
     label_codes : {label: SNOMED CT codes, the most special first}, likewise.
     doubts : what a user should check about its file, one line each, which read() has also logged.
+    modality : of a DICOM file, such as "CT" or "MR"; "" for another file.
 
     Raises SimulationError for an array that is not 3D or not numeric, and for a singular or non-affine matrix.
 
@@ -69,6 +70,7 @@ class Volume:
     label_names: Mapping[int, str] = field(default_factory=dict, compare=False)
     doubts: tuple[str, ...] = field(default=(), compare=False)
     label_codes: Mapping[int, tuple[str, ...]] = field(default_factory=dict, compare=False)
+    modality: str = field(default="", compare=False)
 
     def __post_init__(self) -> None:
         array = np.asarray(self.array)
@@ -176,7 +178,7 @@ class Volume:
                 f"{name}: has {array.shape[-1]} components per voxel, expected 1; save one of them, or a label map",
             )
             array = flattened(array, segments, float(abs(np.linalg.det(found.ijk_to_ras[:3, :3])) / 1000.0), name)
-        return cls(array, found.ijk_to_ras, name, found.label_names, found.doubts, found.label_codes)
+        return cls(array, found.ijk_to_ras, name, found.label_names, found.doubts, found.label_codes, found.modality)
 
     @classmethod
     def from_sitk(cls, image, name: str = "image") -> Volume:

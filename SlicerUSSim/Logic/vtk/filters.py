@@ -62,8 +62,7 @@ TISSUE_NAMES = "TissueNames"
 _METHODS = (
     ("--skull-strip none", "SetSkullStrip('none')"), ("--skull-strip auto", "SetSkullStrip('auto')"),
     ("--skull-strip", "SetSkullStrip"), ("--mask", "SetMaskData"), ("--add tumour=FILE", "AddTissueData"),
-    ("--add", "AddTissueData"), ("--ct (contrast ct)", "SetContrast('ct')"), ("--contrast", "SetContrast"),
-    ("--ct", "SetContrast('ct')"),
+    ("--add", "AddTissueData"), ("--contrast", "SetContrast"),
 )  # fmt: skip
 
 
