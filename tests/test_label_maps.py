@@ -16,7 +16,7 @@ from SlicerUSSim.Logic import SimulationError, TissueTable, Volume
 from SlicerUSSim.Logic.mri import segment_mri
 from SlicerUSSim.Logic.mri.samples import head_mri
 from SlicerUSSim.Logic.tissue import LabelMapping, names_of_file, read_label_file, read_label_map, read_names
-from SlicerUSSim.Logic.tissue.label_sources import is_label_file
+from SlicerUSSim.Logic.tissue.label_sources import is_label_file, not_intensities
 from SlicerUSSim.Logic.tissue.names import nearest_tissue, terminology_entry, tissue_named
 from SlicerUSSim.Logic.tissue.presets import TISSUES
 from SlicerUSSim.Logic.tissue.schemes import recognised, schemes
@@ -353,7 +353,7 @@ def test_labels_are_no_mri_also_with_fractions_and_noise():
     labels = numbered(ASEG).array.astype(np.float32)
     noise = np.random.default_rng(0).normal(0, 1e-3, labels.shape)
     for array, message in (
-        (labels + 0.3 * (labels > 0), "uniform regions of few values with fractions"), (labels + noise, "label map"),
+        (labels + 0.3 * (labels > 0), "uniform regions with fractions"), (labels + noise, "label map"),
     ):  # fmt: skip
         with pytest.raises(SimulationError, match=message):
             segment_mri(Volume(array, np.eye(4)))
@@ -581,6 +581,9 @@ def test_an_mri_in_any_numbers_is_an_mri(mni, parcels):
         for name in ("t1.nii.gz", "c1_t1.nii.gz"):  # or called as SPM's maps are
             assert not is_label_file(Path(name), Volume(array, np.eye(4)))
     assert Volume(np.kron(parcels, np.ones((2, 2, 2), int)), np.eye(4)).looks_like_labels()
+    for array, is_labels in ((parcels, True), (t1, False)):
+        found = not_intensities(Volume(ndimage.zoom(array.astype(float), 1.4, order=1), np.eye(4)))
+        assert ("nearest-neighbour" in str(found)) == is_labels
 
 
 @pytest.mark.slow
