@@ -20,6 +20,7 @@ from SlicerUSSim.Logic.tissue.label_sources import is_label_file, not_intensitie
 from SlicerUSSim.Logic.tissue.names import nearest_tissue, terminology_entry, tissue_named
 from SlicerUSSim.Logic.tissue.presets import TISSUES
 from SlicerUSSim.Logic.tissue.schemes import recognised, schemes
+from SlicerUSSim.Logic.tissue.table import write_label_files
 from tests.conftest import name_labels
 
 #: Labels that recon-all wrote for one person (a public aseg.mgz)
@@ -89,6 +90,8 @@ def test_a_name_finds_its_tissue_by_its_most_special_word():
         ("non-WM-hypointensities", "grey matter"), ("Left-choroid-plexus", "enhancing"), ("5th-Ventricle", "csf"),
         ("heart_ventricle_left", "blood"), ("kidney_cyst_left", "cyst"), ("liver tumor", "tumour"),
         ("non-enhancing tumor", "tumour"), ("Left lungs", "lung"),
+        ("Meninges", "leptomeninges"), ("liquor", "csf"), ("tumour bed", "cavity"),
+        ("resected tumour cavity", "cavity"),
     ):  # fmt: skip
         assert tissue_named(name).name == tissue
     for name, nearest in (
@@ -97,6 +100,10 @@ def test_a_name_finds_its_tissue_by_its_most_special_word():
         ("cheese", None),
         ("non-tumor tissue", None),
         ("tumour-free margin", None),
+        ("bone wax", None),
+        ("white matter lesion", "tumour"),
+        ("Liver lesion", "tumour"),
+        ("soft tissue", "muscle"),
     ):
         with pytest.raises(SimulationError, match="no preset for tissue"):
             tissue_named(name)
@@ -424,11 +431,14 @@ def test_names_have_quotes_and_files_marks_of_their_encoding(tmp_path):
             assert read_names(tmp_path / name) == expected
 
 
-TERMS = """LabelValue,Name,Color_R,Type_CodingScheme,Type_CodeValue,Type_CodeMeaning,TypeModifier_CodeValue
+TERMS = """LabelValue,Name,Color_R,Scheme,Type_CodeValue,M,TypeModifier_CodeValue,Category_CodeValue,Region_CodeValue
 1,Leptomeninges,102,SCT,113257007,Structure of bone,
 2,Segment_2,102,SCT,12738006,Brain,389080008
 3,Hirnhaut,102,SCT,1231004,Meninges,
 4,non-tumor tissue,1,SCT,85756007,Tissue,
+5,Substantia alba,1,SCT,12738006,Brain,,123037004,68594002
+6,Wucherung,1,SCT,108369006,Neoplasm,,49755003,10200004
+7,Herd,1,SCT,52988006,Lesion,,49755003,10200004
 """
 
 
@@ -437,6 +447,7 @@ def test_codes_of_slicer_name_what_has_no_name_of_a_tissue(tmp_path):
 
     (tmp_path / "seg_ColorTable.csv").write_text(TERMS)
     expected = {1: "Leptomeninges", 2: "white matter", 3: "leptomeninges", 4: "non-tumor tissue"}
+    expected |= {5: "white matter", 6: "tumour", 7: "Herd"}
     assert read_names(tmp_path / "seg_ColorTable.csv") == expected
     volume = tumour((1, 2, 3))
     header = {"space": "left-posterior-superior"}
@@ -449,6 +460,17 @@ def test_codes_of_slicer_name_what_has_no_name_of_a_tissue(tmp_path):
     assert "SCT^389080008^White Matter" in terminology_entry("white matter") and terminology_entry("gel") == ""
     message = str(refusal_of(tumour((1, 1, 4)), {1: "liver", 4: "non-tumor tissue"}))
     assert "no tissue is called 'non-tumor tissue' (4, " in message
+
+
+@pytest.mark.parametrize("name", ["labels.nii.gz", "labels.nii", "labels.seg.nrrd", "labels.nrrd"])
+def test_labels_keep_their_names_without_the_table_beside_them(tmp_path, name):
+    path, names = tmp_path / name, ("csf", "grey matter", "white matter")
+    labels = brain({"csf": 1, "grey matter": 2, "white matter": 3})
+    write_label_files(path, labels, TissueTable.brain(names)).unlink()
+    volume = Volume.read(path)
+    assert read_label_file(path, volume).names == names and np.array_equal(volume.array, labels.array)
+    if name.endswith(".nrrd"):
+        assert volume.label_codes[3] == ("389080008",)
 
 
 def test_totalsegmentators_header_names_the_labels(tmp_path):

@@ -15,6 +15,7 @@ from SlicerUSSim.Logic.base.errors import require, require_path
 from SlicerUSSim.Logic.base.files import messages_withheld, require_space, written_whole
 from SlicerUSSim.Logic.base.image_files import (
     ImageFile,
+    add_label_table,
     axis_letters,
     checked_image,
     of_sitk,
@@ -200,7 +201,8 @@ class Volume:
     def write(self, path: str | os.PathLike, about: Mapping[str, str] | None = None) -> None:
         """Write the volume in the format of the suffix; on failure an existing file is kept.
 
-        `about` are further lines of its header, {key: text without line ends}, of NRRD, MetaImage and VTI.
+        `about` are further lines of its header, {key: text without line ends}, of NRRD, MetaImage and VTI. NIfTI has
+        the label names as Connectome Workbench and TotalSegmentator write them, if nibabel is installed.
         Raises SimulationError for an unknown suffix or if the file cannot be written.
         """
         path = Path(path)
@@ -225,6 +227,8 @@ class Volume:
                     is_kept = (written == wanted) | ~np.isfinite(wanted)  # of NIfTI, ITK reads NaN as 0
                     if not is_kept.all():
                         raise OSError("not all voxels are in the file; is the disk full?")
+                if is_nifti and self.label_names:
+                    add_label_table(partial, self.label_names)
 
     # ---- VTK ---------------------------------------------------------------------------------------------------
 

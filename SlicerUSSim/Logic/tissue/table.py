@@ -15,7 +15,7 @@ from SlicerUSSim.Logic.base.declaration import built, kind_of, parameters_of, sh
 from SlicerUSSim.Logic.base.errors import SimulationError, require, require_kind
 from SlicerUSSim.Logic.base.files import read_json, write_json
 from SlicerUSSim.Logic.base.reading import PlainValue, reader
-from SlicerUSSim.Logic.tissue.names import plain_name, tissue_named
+from SlicerUSSim.Logic.tissue.names import plain_name, segments_header, tissue_named
 from SlicerUSSim.Logic.tissue.presets import MEMBRANE, TISSUES
 from SlicerUSSim.Logic.tissue.tissue import Membrane, Tissue
 
@@ -266,9 +266,13 @@ def tissues_beside(labels: Path) -> Path:
 def write_label_files(path: Path, labels: Volume, tissues: TissueTable) -> Path:
     """Write a label map, and its tissue table beside it, whose path is returned.
 
-    Raises SimulationError if one of them cannot be written.
+    The names are in the label map, too, if it is NIfTI, or NRRD, which has 3D Slicer's segments.
+    Raises SimulationError if one of the files cannot be written.
     """
     beside = tissues_beside(path)
-    labels.write(path)
+    names = {label: tissue.name for label, tissue in tissues.items() if label}
+    is_nrrd = path.suffix.lower() in (".nrrd", ".nhdr")
+    about = segments_header(names, labels.array.shape[::-1]) if is_nrrd else None
+    replace(labels, label_names=names).write(path, about)
     tissues.write(beside)
     return beside
