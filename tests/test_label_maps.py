@@ -272,7 +272,7 @@ def test_a_command_for_an_mri_says_what_a_label_map_is_for(tmp_path, monkeypatch
     tumour((255, 255, 255)).write("glioma.nii.gz")
     tumour((1, 2, 4)).write("brats.nii.gz")
     unknown = head()
-    unknown.with_array(np.where(unknown.array == 3, 515, unknown.array)).write("unknown.nii.gz")
+    unknown.with_array(np.where(unknown.array > 1, unknown.array + 512, unknown.array)).write("unknown.nii.gz")
     for name, message in (
         (
             "glioma",
@@ -299,15 +299,37 @@ def test_two_tissues_for_one_label_are_refused(tmp_path):
 def test_unknown_labels_are_listed_with_volumes_and_a_remedy_that_works(tmp_path):
     volume = head()
     volume.array[:6, :6, :6] = 512
+    volume.array[6:9, :6, :6] = 513
+    volume.array[9:12, :6, :6] = 514
     message = str(refusal_of(volume))
-    assert "most of its numbers are FreeSurfer's, and no tissue is called label 512 (5.8 ml); map" in message
+    assert "most of its numbers are FreeSurfer's, and no tissue is called label 512 (5.8 ml), label 513" in message
     file = tmp_path / "mapping.json"
-    file.write_text(json.dumps({"512": "skull", "3": "csf", "42": 0}))
-    for texts in ([str(file)], ["512=skull", "Left-Cerebral-Cortex=csf", "42=0"]):
+    file.write_text(json.dumps({"512": "skull", "513": "skull", "514": "skull", "3": "csf", "42": 0}))
+    skull = [f"{label}=skull" for label in (512, 513, 514)]
+    for texts in ([str(file)], [*skull, "Left-Cerebral-Cortex=csf", "42=0"]):
         found = read_label_map(volume, mapping=LabelMapping.of(texts))
-        assert found.message == "FreeSurfer: 9 labels to 3 tissues"
+        assert found.message == "FreeSurfer: 11 labels to 3 tissues"
     message = str(refusal_of(made({90: "", 150: "", 151: ""})))
     assert "no program's numbers are recognised, and no tissue is called label 90 (" in message and "150 (" in message
+
+
+def test_few_unknown_labels_are_taken_as_what_is_around_them():
+    volume = head()
+    beside = int(volume.array[25, 25, 38])
+    volume.array[24:27, 24:27, 37:40] = 9999
+    for texts in ((), "freesurfer"):
+        found = read_label_map(volume, mapping=LabelMapping.of(texts))
+        assert found.relabelled[9999] == found.relabelled[beside]
+        assert "label 9999 (0.73 ml) is unknown and taken as white matter, which is around" in found.warnings[0]
+
+
+def test_a_numbering_that_is_said_has_to_have_most_labels():
+    message = str(refusal_of(numbered(ASEG), mapping=LabelMapping.of("brats")))
+    assert message.endswith("are not of --map brats; expected --map freesurfer")
+    found = read_label_map(tumour((1, 2, 3)), mapping=LabelMapping.of("brats"))
+    assert found.names == ("necrosis", "oedema", "enhancing") and "has a tumour alone" in found.warnings[0]
+    found = read_label_map(tumour((1, 2, 4)), mapping=LabelMapping.of("brats"))
+    assert "its labels are those of BraTS 2017 to 2022 (--map brats-2022)" in found.warnings[1]
 
 
 def test_a_mapping_goes_before_names_and_numbers_and_removes_labels():

@@ -14,7 +14,7 @@ from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.tissue.label_mapping import LabelMapping
 from SlicerUSSim.Logic.tissue.names import nearest_tissue, plain_name, same_name, tissue_named
 from SlicerUSSim.Logic.tissue.presets import TISSUES
-from SlicerUSSim.Logic.tissue.schemes import OF_BODY, Scheme, nearest_scheme, schemes
+from SlicerUSSim.Logic.tissue.schemes import OF_BODY, Scheme, nearest_scheme, recognised, schemes
 from SlicerUSSim.Logic.tissue.table import TissueTable
 from SlicerUSSim.Logic.tissue.tissue import Tissue
 
@@ -76,9 +76,19 @@ class Findings:
         """Their number in words: "41 labels"."""
         return f"{len(self.names)} label{'s' * (len(self.names) > 1)}"
 
+    def require_scheme(self) -> None:
+        """Raise SimulationError for a numbering of the user that lacks half of the labels."""
+        key, scheme = self.mapping.scheme, self.scheme
+        other = [] if scheme is None else [label for label in self.names if label not in scheme.names]
+        if key is None or scheme is None or 2 * len(other) < len(self.names):
+            return
+        found, choices = recognised(self.names, of_ct=self.of_ct)
+        fits = " or ".join(f"--map {one.key}" for one in ([found] if found else choices) or schemes().values())
+        raise SimulationError(f"{self.source}: labels {listed(other, 4)} are not of --map {key}; expected {fits}")
+
     def require_patient(self) -> None:
         """Raise NoPatientError for a mask or lesion, which is no patient, unless the user gave it a tissue."""
-        if self.is_mapped:
+        if self.is_mapped or self.mapping.scheme:
             return
         size = f"{self.number()}, {self._size(self.names)}"
         known = [None if tissue is None else tissue.name for tissue in self.found.values()]
@@ -117,9 +127,22 @@ class Findings:
         remedy = MAP_THEM.format(label=unknown[0])
         raise SimulationError(f"{self.source}: {nothing}no tissue is called {called}{mistaken}; {remedy}: {known}")
 
-    def doubts(self) -> list[str]:
-        """What a user should know, each in one line."""
+    def doubts(self, around: Mapping[int, int]) -> list[str]:
+        """What a user should know, each in one line; `around` are unknown labels, which are taken as others."""
         doubts = []
+        for label in around:
+            doubts.append(
+                f"{self.source}: {self._described(label)} is unknown and taken as {self._called(label)}, which is "
+                f"around it; --map {label}=TISSUE gives it another tissue"
+            )
+        if self.scheme is not None and self.scheme.is_lesion and not self.is_mapped:
+            doubts.append(
+                f"{self.source}: has a tumour alone, in the coupling medium; --add brats={shlex.quote(self._file)} "
+                "adds it to a patient's labels"
+            )
+        complete = recognised(self.names, of_ct=self.of_ct)[0] if self.mapping.scheme else None
+        if complete is not None and complete is not self.scheme:
+            doubts.append(f"{self.source}: its labels are those of {complete.title} (--map {complete.key})")
         nearest: dict[str, list[str]] = {}
         for label, name in self.names.items():
             tissue = self.found[label]
@@ -167,6 +190,10 @@ class Findings:
         ijk = [np.bincount(inverse, axis) * step / counts for axis in where[::-1]]
         ras = self.labels.ijk_to_ras @ [*ijk, np.ones(len(values))]
         return dict(zip(map(int, values), ras[:3].T, strict=True))
+
+    def _called(self, label: int) -> str:
+        tissue = self.found[label]
+        return "" if tissue is None else tissue.name
 
     def _described(self, label: int) -> str:
         """'Left-Lesion' (25, 3.1 ml)"""
