@@ -238,12 +238,12 @@ def tumour(labels: tuple[int, int, int]) -> Volume:
 @pytest.mark.parametrize("stored", [np.uint8, np.float32])
 def test_a_tumour_of_brats_is_no_patient(stored, tmp_path):
     path = tmp_path / "BraTS-GLI-00001-000-seg.nii.gz"
-    for labels, said, title in (((1, 2, 4), (), "2017 to 2022"), ((1, 2, 3), ("--map", "brats"), "since 2023")):
-        found = tumour(labels)
-        found.with_array(found.array.astype(stored)).write(path)
-        message = refused("simulate", path, *said, "--pose", "auto", "-o", tmp_path / "o.png")
-        assert f"a tumour's labels (as BraTS {title}: necrotic core, oedema, enhancing tumour; 3 labels, 67" in message
-        assert f"not a patient's tissues; add it to a segmentation with --add brats={path}" in message
+    found = tumour((1, 2, 4))
+    found.with_array(found.array.astype(stored)).write(path)
+    message = refused("simulate", path, "--pose", "auto", "-o", tmp_path / "o.png")
+    assert "a tumour's labels (as BraTS 2017 to 2022: necrotic core, oedema, enhancing tumour; 3 labels, 67" in message
+    assert f"not a patient's tissues; add it to a segmentation with --add brats={path}" in message
+    tumour((1, 2, 3)).write(path)
     message = refused("simulate", path, "--pose", "auto", "-o", tmp_path / "o.png")
     assert "--map brats (BraTS since 2023: 1 necrotic core, 2 oedema, 3 enhancing tumour)" in message
 
