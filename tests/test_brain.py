@@ -16,11 +16,11 @@ from scipy.spatial.transform import Rotation
 from SlicerUSSim.Command.cli import main
 from SlicerUSSim.Logic import SimulationError, Volume, segment_mri
 from SlicerUSSim.Logic.base.errors import Cancelled
+from SlicerUSSim.Logic.base.files import mask_beside
 from SlicerUSSim.Logic.mri import brain as brain_module, extractors, recognition, refinement
 from SlicerUSSim.Logic.mri.alignment import Alignment, align_template
 from SlicerUSSim.Logic.mri.atlas import mni152
 from SlicerUSSim.Logic.mri.brain import BrainMask, find_brain, given_brain, left_out
-from SlicerUSSim.Logic.mri.kept_mask import mask_beside
 from SlicerUSSim.Logic.mri.no_data import ends_at_edge, no_data, without_blank
 from SlicerUSSim.Logic.mri.recognition import recognise
 from SlicerUSSim.Logic.mri.samples import head_mri

@@ -15,7 +15,6 @@ from SlicerUSSim.Command.cli import main
 from SlicerUSSim.Command.seeds import split_seeds
 from SlicerUSSim.Command.serve import _require_opening
 from SlicerUSSim.Logic import SimulationError, Volume
-from SlicerUSSim.Logic.mri.outside import OUTSIDE
 from SlicerUSSim.Logic.mri.samples import head_mri
 from SlicerUSSim.Logic.placement.craniotomy import (
     disc_opening,
@@ -27,6 +26,7 @@ from SlicerUSSim.Logic.placement.craniotomy import (
 )
 from SlicerUSSim.Logic.placement.views import view_pose
 from SlicerUSSim.Logic.probe.poses import pose_looking_at
+from SlicerUSSim.Logic.tissue.names import OUTSIDE
 from SlicerUSSim.Logic.tissue.table import TissueTable, write_label_files
 
 NAMES = ("csf", "grey matter", *OUTSIDE)

@@ -12,8 +12,9 @@ from scipy import ndimage
 
 from SlicerUSSim.Command.cli import main
 from SlicerUSSim.Logic import SimulationError, Volume, segment_mri
-from SlicerUSSim.Logic.mri.outside import OUTSIDE, find_outside, watery
+from SlicerUSSim.Logic.mri.outside import find_outside, watery
 from SlicerUSSim.Logic.mri.samples import head_mri
+from SlicerUSSim.Logic.tissue.names import OUTSIDE
 from SlicerUSSim.Logic.tissue.table import TissueTable
 
 pytestmark = pytest.mark.usefixtures("segmented_once")

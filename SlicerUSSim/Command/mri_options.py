@@ -157,8 +157,8 @@ def segmented_file(
     Raises SimulationError before the segmentation for `additions` that could not be added after it.
     """
     from SlicerUSSim.Logic.base.errors import about_file
+    from SlicerUSSim.Logic.base.files import mask_beside
     from SlicerUSSim.Logic.base.volume import Volume
-    from SlicerUSSim.Logic.mri.kept_mask import mask_beside
     from SlicerUSSim.Logic.mri.masks import read_mask
     from SlicerUSSim.Logic.mri.modality import has_brain_mask, segment_image
     from SlicerUSSim.Logic.mri.segmentation import Segmentation

@@ -407,7 +407,7 @@ def _inputs() -> list[Path]:
     They are the values of its options and arguments that are text (outputs are Path objects), also behind a name, as in
     tumour=FILE.
     """
-    from SlicerUSSim.Logic.mri.kept_mask import mask_beside
+    from SlicerUSSim.Logic.base.files import mask_beside
     from SlicerUSSim.Logic.tissue.table import tissues_beside
 
     params = click.get_current_context().params

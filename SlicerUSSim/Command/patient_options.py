@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -153,6 +154,7 @@ def open_examination(patient: PatientOptions, pose: np.ndarray | str | None = No
     log = logging.getLogger(__name__)
     preset = patient.changed_preset()
     require_no_sequence(patient.mri_or_labels)
+    _import_nibabel()
     volume = Volume.read(patient.mri_or_labels)
     craniotomy = Craniotomy.of(patient.craniotomy)
     path, is_labels = patient.mri_or_labels, False if patient.is_ct else patient.is_labels
@@ -214,6 +216,23 @@ def open_examination(patient: PatientOptions, pose: np.ndarray | str | None = No
     return _placed(patient, craniotomy, preset, added, labels, pose, tissues, texture, surfels)
 
 
+def _import_nibabel() -> None:
+    """Import nibabel without pydicom, which it looks for to read an extension of NIfTI that is not used here.
+
+    pydicom imports its network libraries and decoders, a fifth of the time of a command. While it is hidden no other
+    thread may import it.
+    """
+    import sys
+
+    if "pydicom" in sys.modules or importlib.util.find_spec("nibabel") is None:
+        return
+    sys.modules["pydicom"] = None  # type: ignore[assignment]
+    try:
+        import nibabel  # noqa: F401
+    finally:
+        del sys.modules["pydicom"]
+
+
 def _placed(
     patient: PatientOptions, craniotomy: Craniotomy, preset: Preset, added: Added, before: Volume,
     pose: np.ndarray | str | None, tissues: TissueTable, texture: Texture | None, sheets: Surfels | None,
@@ -223,15 +242,14 @@ def _placed(
     `before` are the labels without what --add laid over them.
     """
     from SlicerUSSim.Logic.imaging.simulator import UltrasoundSimulator
-    from SlicerUSSim.Logic.placement.aiming import opening_pose
     from SlicerUSSim.Logic.placement.bone_before_probe import about_bone
-    from SlicerUSSim.Logic.placement.craniotomy import default_pose, middle_of
-    from SlicerUSSim.Logic.placement.views import opened_view_pose, view_pose
     from SlicerUSSim.Logic.tissue.names import BRAIN_TISSUES
 
     labels, names, settings, probe = added.labels, added.tissue_names, preset.settings, preset.probe
     at, is_open, line = None, craniotomy.is_wanted, ""
     if isinstance(pose, str):
+        from SlicerUSSim.Logic.placement.craniotomy import default_pose, middle_of
+
         if craniotomy.is_file:
             labels = craniotomy.on(added.labels, names, probe, None)
             at = middle_of(added.labels, labels)
@@ -239,13 +257,18 @@ def _placed(
         if pose == AUTO and not set(names) & {*BRAIN_TISSUES, "brain"}:
             note("--pose is auto, and no tissue of a brain is labelled: the probe stands on top of what is")
         if at is not None and pose == AUTO:
+            from SlicerUSSim.Logic.placement.aiming import opening_pose
+
             pose, line = opening_pose(labels, names, probe, at, target)
-        elif at is not None:
-            pose, line = opened_view_pose(labels, names, pose)
         elif pose == AUTO:
             pose = default_pose(labels, names, probe, is_open=is_open, target_ras=target)
         else:
-            pose, line = view_pose(labels, names, pose, is_open=is_open)
+            from SlicerUSSim.Logic.placement.views import opened_view_pose, view_pose
+
+            if at is None:
+                pose, line = view_pose(labels, names, pose, is_open=is_open)
+            else:
+                pose, line = opened_view_pose(labels, names, pose)
         if line:
             note(f"probe: {line}")
     if at is None:

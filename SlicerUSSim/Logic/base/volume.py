@@ -6,6 +6,7 @@ import logging
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from itertools import permutations
 from pathlib import Path
 
 import numpy as np
@@ -125,11 +126,9 @@ class Volume:
 
         By default along R, A and S, so that results do not depend on the order of the voxels in a file.
         """
-        from scipy.optimize import linear_sum_assignment
-
         wanted = np.eye(3) if like is None else like.ijk_to_ras[:3, :3] / like.spacing_mm
         cosines = wanted.T @ self.ijk_to_ras[:3, :3] / self.spacing_mm
-        _, own = linear_sum_assignment(-np.abs(cosines))
+        own = max(permutations(range(3)), key=lambda order: np.abs(cosines[range(3), list(order)]).sum())
         ways = np.sign(cosines[range(3), own])
         array = self.array.T.transpose(own)
         to_own = np.eye(4)[:, [*own, 3]] * [*ways, 1.0]

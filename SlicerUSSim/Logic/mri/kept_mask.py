@@ -20,7 +20,6 @@ from SlicerUSSim.Logic.mri.given_mask import checked_mask
 _log = logging.getLogger(__name__)
 
 _PREFIX = "ussim_"
-_SUFFIXES = (".nii.gz", ".nii", ".nrrd", ".nhdr", ".mha", ".mhd", ".mnc", ".vti", ".dcm", ".mgz", ".img", ".hdr")
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,21 +42,6 @@ class Kept:
     #: One line for the user
     text: str
     is_beside: bool
-
-
-def mask_beside(mri_path: str | Path) -> Path:
-    """The file of an MRI's brain mask: head.nii.gz has head.brain-mask.nrrd, a DICOM folder the same beside it."""
-    return named_beside(mri_path, "brain-mask.nrrd")
-
-
-def named_beside(mri_path: str | Path, ending: str) -> Path:
-    """The file beside an MRI's that has its name and another ending."""
-    path = Path(mri_path)
-    if path.is_dir():
-        path = path.resolve()  # "." has no name
-    name = path.name
-    suffix = next((end for end in _SUFFIXES if not path.is_dir() and name.lower().endswith(end)), "")
-    return path.with_name(f"{name[: len(name) - len(suffix)]}.{ending}")
 
 
 def read_kept(path: Path, mri: Volume, method: str) -> KeptMask | None:

@@ -6,7 +6,6 @@ import logging
 
 import numpy as np
 from scipy import ndimage
-from scipy.spatial.transform import Rotation
 
 from SlicerUSSim.Logic.base.errors import require
 from SlicerUSSim.Logic.base.volume import Volume
@@ -117,6 +116,8 @@ def turned(probe_to_ras: np.ndarray, *, rock_deg=0.0, tilt_deg=0.0, rotate_deg=0
     >>> round(float(turned(np.eye(4), tilt_deg=90)[2, 1]), 3)  # the axis points along +z
     1.0
     """
+    from scipy.spatial.transform import Rotation  # not needed for an image
+
     motion = np.eye(4)
     motion[:3, :3] = Rotation.from_euler("ZXY", [rock_deg, tilt_deg, rotate_deg], degrees=True).as_matrix()
     return probe_to_ras @ motion
@@ -129,6 +130,8 @@ def carried(probe_to_ras: np.ndarray, face_ras, outward_from, outward_to) -> np.
     to the surface. If they are the reversed probe axis and the new normal, the probe is aligned with the normal.
     Raises SimulationError for a direction of zero length.
     """
+    from scipy.spatial.transform import Rotation
+
     start, end = (np.asarray(v, float) for v in (outward_from, outward_to))
     require(
         min(np.linalg.norm(start), np.linalg.norm(end)) > 1e-9,

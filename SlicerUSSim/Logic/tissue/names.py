@@ -16,6 +16,8 @@ from SlicerUSSim.Logic.tissue.tissue import Tissue
 
 _LABELS = Path(__file__).with_name("labels")
 BRAIN_TISSUES = ("csf", "grey matter", "white matter")
+#: Tissues outside the brain of a whole head, in the order of their labels
+OUTSIDE = ("skin", "scalp", "skull", "cancellous bone", "air")
 #: A word after one of these is not what the name means: "non-tumor tissue", "brain without lesion"
 _NOT = "".join(rf"(?<!\b{word} )" for word in ("non", "no", "not", "without"))
 #: A name with one of these says what is not there
