@@ -318,7 +318,7 @@ def test_set_changes_the_tissues_of_labels_and_of_an_mri(of, head, labels, tmp_p
 
 
 @pytest.mark.long
-def test_the_demo_replaces_only_files_that_it_wrote_itself(head, tmp_path):
+def test_the_demo_replaces_its_files_only_with_overwrite(head, tmp_path):
     pytest.importorskip("matplotlib", reason="pictures need matplotlib: pip install '.[demo]'")
     out = tmp_path / "out"
     out.mkdir()
@@ -326,11 +326,11 @@ def test_the_demo_replaces_only_files_that_it_wrote_itself(head, tmp_path):
     mine.write_bytes(b"my figure")
     (out / "notes.txt").write_text("mine")
     result = ussim("demo", "--mri", head, "-o", out)
-    assert result.exit_code == 2 and f"{mine}: exists, and without demo.json the folder is" in result.stderr
+    assert result.exit_code == 2 and f"{mine}: exists; give another name, or --overwrite" in result.stderr
     assert mine.read_bytes() == b"my figure"
     mine.unlink()
     assert ussim("demo", "--mri", head, "-o", out).exit_code == 0
-    assert ussim("demo", "--mri", head, "-o", out).exit_code == 0  # its own files are replaced
+    assert ussim("demo", "--mri", head, "-o", out, "--overwrite").exit_code == 0
     assert not list(out.glob(".results-*")) and (out / "notes.txt").read_text() == "mine"
     result = ussim("demo", "--mri", out / "labels.nii.gz", "--out", out)
     assert result.exit_code == 2 and "labels.nii.gz is an input, which it would replace" in result.stderr

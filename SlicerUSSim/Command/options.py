@@ -8,7 +8,7 @@ from __future__ import annotations
 import logging
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import Field, field, fields
 from difflib import get_close_matches
 from functools import wraps
@@ -349,49 +349,26 @@ def check_outputs(*outputs: Path | None, state: Path | None = None) -> None:
         require(is_free, f"{out}: exists; give another name, or --overwrite to replace it")
 
 
-def check_results(folder: Path, names: Iterable[str], summary: str) -> None:
-    """Raise SimulationError if a folder of results cannot be written, or has one of these files without the `summary`.
-
-    With it, a command wrote the files before and replaces them, unless it reads one.
-    """
+def check_results(folder: Path, names: Iterable[str]) -> None:
+    """Raise SimulationError if a folder of results cannot be written, or as check_outputs for one of these files."""
     from SlicerUSSim.Logic.base.files import require_folder
 
     require_folder(folder)
-    is_own = (folder / summary).is_file()
-    for path in (folder / name for name in (*names, summary)):
-        require_no_input(path)
-        require(
-            is_own or not path.exists(),
-            f"{path}: exists, and without {summary} the folder is not one of this command; give another folder (--out)",
-        )
+    if folder.exists():
+        check_outputs(*(folder / name for name in names))
 
 
 @contextmanager
-def results_of(folder: Path, summary: str) -> Iterator[tuple[Path, dict]]:
-    """(a temporary folder for files, the summary to be filled): both are moved to `folder` if the block succeeds.
+def results_of(folder: Path) -> Iterator[Path]:
+    """A temporary folder, whose files are moved to `folder` if the block succeeds: a run that fails changes nothing.
 
-    So a run that fails or is interrupted changes nothing. Raises SimulationError if the folder cannot be created or a
-    file cannot be written, naming it by its later place.
+    Raises SimulationError if the folder cannot be created or a file cannot be written.
     """
-    from SlicerUSSim.Logic.base.files import make_folder, move_into, partial_folder, write_json
+    from SlicerUSSim.Logic.base.files import make_folder, move_into, partial_folder
 
-    is_new = not folder.exists()
-    make_folder(folder)
-    content: dict = {}
-    try:
-        with partial_folder(folder, "cannot be written to") as partial:
-            try:
-                yield partial, content
-                files = sorted(file for file in partial.iterdir() if file.name != summary)
-                write_json(partial / summary, content)
-            except SimulationError as error:  # the user knows no temporary folder
-                raise SimulationError(str(error).replace(str(partial), str(folder))) from None
-            move_into(folder, [*files, partial / summary])
-    except BaseException:
-        if is_new:
-            with suppress(OSError):  # not empty
-                folder.rmdir()
-        raise
+    with partial_folder(make_folder(folder), "cannot be written to") as partial:
+        yield partial
+        move_into(folder, sorted(partial.iterdir()))
 
 
 def require_no_input(out: Path) -> None:

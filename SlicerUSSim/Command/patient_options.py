@@ -196,20 +196,17 @@ def open_examination(patient: PatientOptions, pose: np.ndarray | str | None = No
     log.info("tissues: %s", patient.tissues or ("the preset's" if patient.preset else "presets of the brain"))
     tissues = preset.tissues if table is None else table
     additions = Additions.read(patient.additions, (tissue.name for tissue in tissues.all_tissues()))
-    if table is None:  # the tissues are not known before the segmentation
-        changes.check_tissues((*(tissue.name for tissue in tissues.all_tissues()), *TISSUES))
-    else:
-        changes.to_tissues(additions.with_presets(tissues))
+    changes.check_tissues((*(tissue.name for tissue in tissues.all_tissues()), *TISSUES))
     segmentation = segmented_file(path, volume, patient, additions=additions)
     labels, names, surfels = segmentation.labels, segmentation.tissue_names, sheets.read
     if isinstance(segmentation, Segmentation):
         surfels, labels, names = sheets.found(path, volume, segmentation, patient.contrast)
-    if table is not None:
-        of_brain = segmentation.brain_names if isinstance(segmentation, Segmentation) else segmentation.tissue_names
-        labels, names = _numbered_as(tissues, labels, names, len(of_brain), patient.tissues or "tissues")
     added = additions.on(labels, names, has_brain_mask=not is_ct)
-    known = tissues
-    tissues = tissues.for_names(added.tissue_names) if table is None else added.table(tissues)
+    known, tissues = tissues, tissues.for_names(added.tissue_names)
+    if table is not None:
+        found = set(table.names()) & set(tissues.names())
+        expected = f"expected tissues called {', '.join(added.tissue_names)}"
+        require(bool(found - {"coupling"}), f"{patient.tissues}: has none of the patient's tissues, {expected}")
     tissues = with_their_tissue(tissues, surfels, known)
     texture = texture_below(segmentation.texture(), volume, segmentation.labels, added.labels)
     tissues = changes.to_tissues(tissues)
@@ -331,38 +328,3 @@ def _labelled(
     for warning in found.warnings:
         log.warning("%s", warning)
     return found.labels, found.tissues
-
-
-def _numbered_as(
-    table: TissueTable, labels: Volume, names: Sequence[str], classes: int, source: str
-) -> tuple[Volume, tuple[str, ...]]:
-    """(labels, names of all) of a segmentation whose classes, the first labels, are those of a table (--tissues).
-
-    What was found besides them has its number from the table, if a tissue is called so there, or one after all of it.
-    Raises SimulationError for a table that lacks a class, or has another class under its number, and one without room.
-    """
-    import numpy as np
-
-    from SlicerUSSim.Logic.tissue.names import same_name
-    from SlicerUSSim.Logic.tissue.table import MAX_LABEL
-
-    numbered = list(table.names_by_label())
-    expected = ", ".join(f"{number} {name}" for number, name in enumerate(names[:classes], 1))
-    for number, name in enumerate(names[:classes], 1):
-        there = numbered[number - 1] if number <= len(numbered) else ""
-        is_used = bool((labels.array == number).any())
-        require(there or not is_used, f"{source}: has no label {number}, which is {name} here, expected {expected}")
-        others = [other for other in names[:classes] if other != name]
-        require(
-            not any(same_name(there, other) for other in others),
-            f"{source}: label {number} is {there}, and it is {name} here, expected {expected}",
-        )
-    others = list(dict.fromkeys(name for name in names[classes:] if name not in numbered))
-    numbered += [""] * (classes - len(numbered)) + others
-    require(
-        len(numbered) <= MAX_LABEL,
-        f"{source}: has labels up to {len(numbered) - len(others)}, which leaves no room for {', '.join(others)}, "
-        f"expected at most {MAX_LABEL} in all",
-    )
-    numbers = [*range(classes + 1), *(numbered.index(name) + 1 for name in names[classes:])]
-    return labels.with_array(np.asarray(numbers, np.uint8)[labels.array]), tuple(numbered)
