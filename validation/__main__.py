@@ -11,7 +11,7 @@ import click
 
 from SlicerUSSim.Command.cli import ToolCommand
 from SlicerUSSim.Command.options import check_results, device_option, overwrite_option, results_of
-from SlicerUSSim.Command.progress import Steps, note
+from SlicerUSSim.Command.progress import note
 from SlicerUSSim.Logic.base.files import write_json
 from validation.run import chosen_checks, validate
 
@@ -35,9 +35,8 @@ _TABLES, _SUMMARY = "report.md", "report.json"
 def main(ctx: click.Context, out: Path, only: tuple[str, ...], device: str | None) -> None:
     checks = chosen_checks(only)
     check_results(out, (_TABLES, _SUMMARY, *(check.picture for check in checks)))
-    count = sum(len(check.orientations) for check in checks)
-    with results_of(out) as folder, Steps(count) as step:
-        report = validate(folder, device, only, step)
+    with results_of(out) as folder:
+        report = validate(folder, device, only, lambda name: note(f"{name} ..."))
         write_json(folder / _SUMMARY, report.to_dict())
     for finding in report.failed:
         row = finding.row

@@ -231,18 +231,14 @@ def read_mri(path: str, patient: MriOptions, *, is_served: bool = False) -> Volu
     if is_label_file(Path(path), volume):
         used_by = f"--labels {path}" if is_served else f"ussim simulate {path} ..."
         try:
-            found = read_label_file(Path(path), volume)
+            what = read_label_file(Path(path), volume).message
         except NoPatientError:  # says how to add it
             raise
-        except SimulationError as error:
-            if "--map" not in str(error):
-                raise
-            count = np.unique(volume.array[volume.array != 0]).size
-            remedy = f"use it as it is ({used_by}), which says what its labels need"
-            raise SimulationError(f"{path}: is a label map ({count} labels), expected an MRI; {remedy}") from error
+        except SimulationError:  # simulate says what its labels need
+            what = f"{np.unique(volume.array[volume.array != 0]).size} labels"
         raise SimulationError(
-            f"{path}: is a label map ({found.message}), expected an MRI; use it as it is ({used_by}), or segment it "
-            "all the same with --skull-strip none"
+            f"{path}: is a label map ({what}), expected an MRI; use it as it is ({used_by}), or segment it all the "
+            "same with --skull-strip none"
         )
     return volume
 

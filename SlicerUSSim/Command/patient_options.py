@@ -169,7 +169,7 @@ def open_examination(patient: PatientOptions, pose: np.ndarray | str | None = No
     else:
         require_no_map(path, patient.maps, patient.organs)
         patient = patient.for_image(volume)
-        craniotomy.require_head(volume, patient)
+        craniotomy.require_head(patient)
         require(
             not (patient.is_ct and isinstance(pose, str)),
             f"--pose is {pose}, which is on a head, and the image is a CT, expected a file with the pose",

@@ -20,7 +20,7 @@ from SlicerUSSim.Command.seeds import (
     split_seeds,
     write_lesions,
 )
-from SlicerUSSim.Command.sheet_options import require_sheets, sheet_kind_option, sheets_option, write_sheets
+from SlicerUSSim.Command.sheet_options import require_sheets, sheets_option, write_sheets
 from SlicerUSSim.Logic.base.errors import SimulationError, require
 
 
@@ -30,11 +30,8 @@ from SlicerUSSim.Logic.base.errors import SimulationError, require
 @out_option("Label map; the tissue table is written to a .json file of the same name.")
 @seed_option
 @sheets_option
-@sheet_kind_option
 @overwrite_option
-def segment(
-    mri: str, patient: MriOptions, out: Path, seeds: tuple[str, ...], sheets: Path | None, sheet_kinds: tuple[str, ...]
-) -> None:
+def segment(mri: str, patient: MriOptions, out: Path, seeds: tuple[str, ...], sheets: Path | None) -> None:
     """Segment an MRI of a head or a brain, or a CT, into tissues."""
     from SlicerUSSim.Logic.base.volume import require_image_name
     from SlicerUSSim.Logic.mri.modality import has_brain_mask
@@ -54,7 +51,8 @@ def segment(
     settings = patient.segmentation
     if settings.outside and not patient.is_ct:
         require_findable(settings.contrast, settings.skull_strip, patient.mask is not None)
-    require_sheets(sheets, sheet_kinds, settings.contrast)
+    if sheets is not None:
+        require_sheets(sheets, settings.contrast)
     if seeds:
         require(has_brain_mask(settings.contrast), "--seed grows lesions of an MRI, and this is a CT")
         require_seeds(seeds, volume, out)
@@ -64,7 +62,7 @@ def segment(
     lesions, refused = grown_at(result, seeds) if isinstance(result, Segmentation) else ([], [])
     labels, names = result.labels, result.tissue_names
     if sheets is not None and isinstance(result, Segmentation):
-        labels, names = write_sheets(sheets, mri, volume, result, settings.contrast, sheet_kinds)
+        labels, names = write_sheets(sheets, mri, volume, result, settings.contrast)
     added = masks.on(labels, names, has_brain_mask=has_brain_mask(settings.contrast))
     beside = write_label_files(out, added.labels, TissueTable.brain().for_names(added.tissue_names))
     click.echo(replace(result, labels=added.labels, tissue_names=added.tissue_names).table())

@@ -128,9 +128,7 @@ def serve(patient: ServeOptions, recording: TrackingOptions) -> None:
             scene is None and also_open is None,
             f"--craniotomy is {patient.craniotomy}, which opens the skull in the MRI of a head, and the file is none",
         )
-        opening.require_head(None if mri is None else volumes[mri], patient)
-    if opening.is_file:
-        _require_opening(opening.source)
+        opening.require_head(patient)
     require(not (is_ct and others), "--also is for an MRI, and this is a CT; leave it out")
     if patient.igtl is not None:
         from SlicerUSSim.Logic.tracked.openigtlink import parse_address, require_usable
@@ -212,18 +210,6 @@ def _opened_first(path: str, options: list[str]) -> tuple[tuple[SceneRecord | No
     require(not options, f"{path} is a scene, which has a patient and settings, expected no {', '.join(options)}")
     _prepare_libraries()
     return (read_scene(path), Path(path).name), None, None
-
-
-def _require_opening(path: str) -> None:
-    """Raise SimulationError for a file of --craniotomy that is neither a mask nor a polygon."""
-    from SlicerUSSim.Logic.mri.markups import is_markup_name
-    from SlicerUSSim.Logic.mri.masks import read_mask
-    from SlicerUSSim.Logic.placement.craniotomy import is_open, polygon_of_file
-
-    if is_markup_name(path):
-        polygon_of_file(path)
-    else:
-        is_open(read_mask(path), path)
 
 
 def _require_workstation() -> None:
