@@ -202,8 +202,6 @@ def _read_organs(path: str, maps: Iterable[str]) -> LabelledTissues:
     found = read_label_file(Path(path), Volume.read(path), LabelMapping.of(maps, table), default=table, of_ct=True)
     note(f"{path}: {found.message}")
     for warning in found.warnings:
-        if "--map 0=" in warning:  # between organs the CT says what is there
-            continue
         logging.getLogger(__name__).warning("%s", warning)
     return found
 

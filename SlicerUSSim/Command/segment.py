@@ -42,7 +42,7 @@ def segment(mri: str, patient: MriOptions, out: Path, seeds: tuple[str, ...], sh
     for change in patient.changes:
         raise SimulationError(f"--set {change}: no image is simulated, expected a key of segmentation")
     require_image_name(out)
-    check_outputs(out, tissues_beside(out))
+    check_outputs(out, tissues_beside(out), sheets)
     also_files(patient.also)
     split_seeds(seeds)
     masks = Additions.read(patient.additions)

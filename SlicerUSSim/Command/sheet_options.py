@@ -75,14 +75,12 @@ class DrawnSheets:
 
 
 def require_sheets(path: Path, contrast: str) -> None:
-    """Raise SimulationError, before anything slow, for a file of --sheets that cannot be written or found."""
-    from SlicerUSSim.Command.options import check_outputs
+    """Raise SimulationError, before anything slow, for a file of --sheets of another kind, or another contrast."""
     from SlicerUSSim.Logic.mri.sheets.finding import require_findable
     from SlicerUSSim.Logic.mri.sheets.polydata import require_surfel_file
 
     require_findable((), contrast)
     require_surfel_file(path)
-    check_outputs(path)
 
 
 def write_sheets(

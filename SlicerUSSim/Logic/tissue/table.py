@@ -214,8 +214,6 @@ class TissueTable(PlainValue, Mapping[int, Tissue]):
             within = f"{source}: membrane"
             if isinstance(membrane, dict) and "tissue" in membrane:
                 membrane = {**membrane, "tissue": built(Tissue, membrane["tissue"], f"{within}: tissue")}
-                if not membrane.keys() & _SINCE_ROUGH:
-                    membrane = {**_BEFORE_ROUGH, **membrane}
             membrane = built(Membrane, membrane, within)
         return cls(table, membrane)
 
@@ -228,12 +226,6 @@ class TissueTable(PlainValue, Mapping[int, Tissue]):
     def write(self, path: str | os.PathLike) -> None:
         """Write the table as JSON; on failure an existing file is kept."""
         write_json(path, self.to_dict())
-
-
-#: A file that has none of these was written when the membrane was a layer that is equally bright on all sides: its
-#: images stay as they were.
-_SINCE_ROUGH = {"roughness_mm", "diffuse_db", "diffuse_exponent"}
-_BEFORE_ROUGH = {"thickness_mm": 1.0, **dict.fromkeys(_SINCE_ROUGH, 0.0)}
 
 
 def _label(text: str, source: str) -> int:
