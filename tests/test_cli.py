@@ -145,7 +145,6 @@ def bad_inputs(folder):
         ([*segment, folder / "l.nii.gz", "--classes", 9], "classes is 9"),
         ([*segment, folder / "l.nii.gz", "--map", "24=csf"], "--map is for a label map"),
         ([*segment, folder / "l.nii.gz", "--mask", folder / "nine.nrrd"], "same grid"),
-        ([*segment, folder / "l.nii.gz", "--also", f"t2={folder / 'head.nii.gz'}"], "is the file of the MRI again"),
         (
             ["segment", folder / "sweep.igs.mha", "-o", folder / "l.nii.gz"],
             "is a sequence of tracked ultrasound images",

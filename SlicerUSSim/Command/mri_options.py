@@ -123,10 +123,10 @@ class ImageOptions(MriOptions):
     )  # fmt: skip
 
 
-def also_files(texts: Iterable[str], mri: str | None = None) -> dict[str, str]:
+def also_files(texts: Iterable[str]) -> dict[str, str]:
     """{contrast: file} of the values of --also.
 
-    Raises SimulationError for another text or contrast, one twice, and one file for two, of which `mri` may be one.
+    Raises SimulationError for another text or contrast, and for one twice.
     """
     found: dict[str, str] = {}
     for text in texts:
@@ -135,10 +135,6 @@ def also_files(texts: Iterable[str], mri: str | None = None) -> dict[str, str]:
         expected = f"expected one of {', '.join(MRI_CONTRASTS)}"
         require(contrast in MRI_CONTRASTS, f"--also: contrast is {contrast!r}, {expected}")
         require(contrast not in found, f"--also: {contrast} is given twice, expected one volume per contrast")
-        others = {"the MRI": mri} if mri else {}
-        for name, other in (others | {f"--also {name}": at for name, at in found.items()}).items():
-            is_same = Path(file).exists() and Path(other).exists() and Path(other).samefile(file)
-            require(not is_same, f"--also {contrast}={file}: is the file of {name} again, expected another image")
         found[contrast] = file
     return found
 
@@ -172,7 +168,7 @@ def segmented_file(
         organs is None or not is_of_brain,
         f"--organs is for a CT, and {path} is read as an MRI; for a CT, give --contrast ct",
     )
-    others = {contrast: Volume.read(file) for contrast, file in also_files(patient.also, path).items()}
+    others = {contrast: Volume.read(file) for contrast, file in also_files(patient.also).items()}
     brain = read_mask(patient.mask) if patient.mask else None
     additions.require_addable(mri, brain, settings.skull_strip if is_of_brain else "none")
     found = None if organs is None else _read_organs(organs, maps)

@@ -90,7 +90,7 @@ def serve(patient: ServeOptions, recording: TrackingOptions) -> None:
     if mri is not None and _is_no_image(mri):
         (scene, scene_name), also_open, mri = _opened_first(mri, given_options(*_OF_PATIENT))
     added = split_additions(patient.additions)
-    others = also_files(patient.also, mri)
+    others = also_files(patient.also)
     require(len(others) < 2, f"--also is given {len(others)} times, expected one further MRI in the workstation")
     own = (mri, patient.labels, patient.mask, patient.organs)
     files = [file for file in (*own, *(file for _, file in added), *others.values()) if file is not None]
