@@ -228,7 +228,7 @@ def test_the_command_segments_a_ct_with_organs_and_a_lesion(tmp_path, capsys):
     [
         (["segment", "--thin-sulci"], "--thin-sulci is for an MRI"),
         (["segment", "--sheets", "x.vtp"], "sheets are not found in contrast 'ct'"),
-        (["simulate", "--pose", "auto"], "--pose is auto, which is on a head, and the image is a CT"),
+        (["simulate", "--pose", "temporal"], "brain"),
     ],
 )
 def test_the_command_refuses_what_does_not_go_together(tmp_path, capsys, options, message):

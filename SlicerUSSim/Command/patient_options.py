@@ -170,10 +170,6 @@ def open_examination(patient: PatientOptions, pose: np.ndarray | str | None = No
         require_no_map(path, patient.maps, patient.organs)
         patient = patient.for_image(volume)
         craniotomy.require_head(patient)
-        require(
-            not (patient.is_ct and isinstance(pose, str)),
-            f"--pose is {pose}, which is on a head, and the image is a CT, expected a file with the pose",
-        )
     also_files(patient.also)
     chosen, is_ct = patient.segmentation, patient.is_ct
     if chosen.outside and not is_ct:

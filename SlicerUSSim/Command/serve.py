@@ -17,7 +17,6 @@ from SlicerUSSim.Command.interrupts import end_at_once
 from SlicerUSSim.Command.mri_options import NONE, ImageOptions, also_files, read_mri
 from SlicerUSSim.Command.options import declared, gathered, given_options, require_no_mri_options
 from SlicerUSSim.Command.patient_options import RARE
-from SlicerUSSim.Command.progress import note
 from SlicerUSSim.Command.sequence_options import TrackingOptions, read_sequence, read_to_mri
 from SlicerUSSim.Command.set_option import Changes
 from SlicerUSSim.Command.sheet_options import AUTO, DrawnSheets
@@ -33,6 +32,7 @@ _PORT = 8080
 #: Parameters that are about a patient, his ultrasound or settings
 _OF_PATIENT = (
     "labels", "maps", "sequence", "calibration", "to_mri", "preset", "outside", "mask", "also", "additions", "organs",
+    "craniotomy",
 )  # fmt: skip
 #: Suffixes of files that are no images, and that the page opens
 _TEXTS = (".json", ".vtp", ".tfm", ".h5", ".hdf5", ".mat", ".xfm", ".xml", ".tag", ".txt")
@@ -124,10 +124,6 @@ def serve(patient: ServeOptions, recording: TrackingOptions) -> None:
     )
     opening = Craniotomy.of(patient.craniotomy)
     if opening.is_wanted and patient.labels is None:
-        require(
-            scene is None and also_open is None,
-            f"--craniotomy is {patient.craniotomy}, which opens the skull in the MRI of a head, and the file is none",
-        )
         opening.require_head(patient)
     require(not (is_ct and others), "--also is for an MRI, and this is a CT; leave it out")
     if patient.igtl is not None:
@@ -147,9 +143,6 @@ def serve(patient: ServeOptions, recording: TrackingOptions) -> None:
     if mri is not None and patient.labels is None:
         mask = None if patient.mask is None else volumes[patient.mask]
         checked.require_addable(volumes[mri], mask, "none" if is_ct else chosen.skull_strip)
-    if patient.labels is not None and mri is not None and (has_mask or others):
-        what = " and ".join([*["--mask"] * has_mask, *["--also"] * bool(others)])
-        note(f"{what}: for Segment in the page; the labels shown are those of {patient.labels}")
     masks = tuple((tissue, file) for (tissue, _, _), (_, file) in zip(checked.masks, added, strict=True))
     chosen_preset = Preset.read(patient.preset) if patient.preset else None
     if patient.changes:
