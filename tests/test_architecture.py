@@ -44,8 +44,8 @@ HEAVY = {
 #: what users get for it.
 BUDGETS = {
     "base": 3350, "opencl": 1250, "probe": 1470, "tissue": 2070, "tracked": 2155, "mri": 8500, "placement": 810,
-    "imaging": 4810, "fitting": 4390, "vtk": 530, "mrml": 4490, "Widget": 2660, "Workstation": 7765, "Command": 2880,
-    "module": 370, "validation": 6030, "benchmarks": 3750, "tests": 30740, "tests/reference": 500,
+    "imaging": 4810, "fitting": 4390, "vtk": 530, "mrml": 4490, "Widget": 2660, "Workstation": 7765, "Command": 2870,
+    "module": 370, "validation": 6030, "benchmarks": 3750, "tests": 30750, "tests/reference": 500,
 }  # fmt: skip
 #: Lines of all of SlicerUSSim/, and of kernels/
 LARGEST_PRODUCT, LARGEST_KERNELS = 47_500, 5_600

@@ -316,6 +316,18 @@ def test_set_changes_the_tissues_of_labels_and_of_an_mri(of, head, labels, tmp_p
         assert not (tmp_path / "o.png").exists()
 
 
+def test_an_image_of_labels_imports_no_library_without_need(labels, tmp_path):
+    (tmp_path / "pose.json").write_text(json.dumps({"probe_to_ras": np.eye(4).tolist()}))
+    call = ["simulate", str(labels), "--pose", str(tmp_path / "pose.json"), "-o", str(tmp_path / "o.png")]
+    code = (
+        f"import sys; from SlicerUSSim.Command.cli import main; main({call}, standalone_mode=False); "
+        "print(*{'.'.join(name.split('.')[:n]) for name in sys.modules for n in (1, 2)})"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    slow = {"SimpleITK", "skimage", "vtkmodules", "pydicom", "scipy.optimize", "scipy.spatial"}
+    assert not slow & set(done.stdout.split())
+
+
 @pytest.mark.long
 def test_the_demo_replaces_its_files_only_with_overwrite(head, tmp_path):
     pytest.importorskip("matplotlib", reason="pictures need matplotlib: pip install '.[demo]'")

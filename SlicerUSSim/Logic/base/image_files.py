@@ -329,13 +329,14 @@ def add_label_table(path: Path, names: Mapping[int, str]) -> None:
     if importlib.util.find_spec("nibabel") is None:
         return
     import nibabel
+    from nibabel.nifti1 import Nifti1Extension
 
     root = ElementTree.Element("CaretExtension")
     table = ElementTree.SubElement(ElementTree.SubElement(root, "VolumeInformation", Index="0"), "LabelTable")
     for label, name in names.items():
         ElementTree.SubElement(table, "Label", Key=str(label), Red="1", Green="1", Blue="1", Alpha="1").text = name
     image = nibabel.Nifti1Image.from_bytes(content_of(path))
-    image.header.extensions.append(nibabel.nifti1.Nifti1Extension(0, ElementTree.tostring(root)))
+    image.header.extensions.append(Nifti1Extension(0, ElementTree.tostring(root)))
     content = image.to_bytes()
     path.write_bytes(gzip.compress(content, mtime=0) if path.name.endswith(".gz") else content)
 
