@@ -471,11 +471,11 @@ def test_the_command_writes_sheets_and_lays_structures_over_the_labels(tmp_path)
     head, out, sheets = tmp_path / "head.nii.gz", tmp_path / "labels.nii.gz", tmp_path / "sheets.vtp"
     mri.write(head)
     call = ["segment", str(head), "-o", str(out), "--sheets", str(sheets)]
-    done = CliRunner().invoke(main, [*call, "--sheet", "falx", "--sheet", "corpus callosum"])
+    done = CliRunner().invoke(main, call)
     assert done.exit_code == 0, done.output
     assert "corpus callosum" in done.output
     surfels = read_surfels(sheets)
-    assert set(surfels.kind) == {KINDS.index("falx")}
+    assert KINDS.index("falx") in surfels.kind
     assert (tmp_path / "head.sheets.npz").is_file()
     assert len(np.unique(Volume.read(out).array)) > 4
 

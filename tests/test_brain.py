@@ -14,12 +14,12 @@ from scipy.spatial.transform import Rotation
 from SlicerUSSim.Command.cli import main
 from SlicerUSSim.Logic import SimulationError, Volume
 from SlicerUSSim.Logic.base.errors import Cancelled
+from SlicerUSSim.Logic.base.files import mask_beside
 from SlicerUSSim.Logic.mri import alignment, atlas, kept_mask, recognition, refinement
 from SlicerUSSim.Logic.mri.alignment import Alignment, align_template
 from SlicerUSSim.Logic.mri.atlas import mni152
 from SlicerUSSim.Logic.mri.brain import BrainMask, find_brain, given_brain
 from SlicerUSSim.Logic.mri.edges import ends_at_edge
-from SlicerUSSim.Logic.mri.kept_mask import mask_beside
 from SlicerUSSim.Logic.mri.recognition import recognise
 from SlicerUSSim.Logic.mri.samples import head_mri
 from tests.conftest import SHARED, needs_shared

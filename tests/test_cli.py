@@ -145,7 +145,6 @@ def bad_inputs(folder):
         ([*segment, folder / "l.nii.gz", "--classes", 9], "classes is 9"),
         ([*segment, folder / "l.nii.gz", "--map", "24=csf"], "--map is for a label map"),
         ([*segment, folder / "l.nii.gz", "--mask", folder / "nine.nrrd"], "same grid"),
-        ([*segment, folder / "l.nii.gz", "--also", f"t2={folder / 'head.nii.gz'}"], "is the file of the MRI again"),
         (
             ["segment", folder / "sweep.igs.mha", "-o", folder / "l.nii.gz"],
             "is a sequence of tracked ultrasound images",
@@ -317,8 +316,20 @@ def test_set_changes_the_tissues_of_labels_and_of_an_mri(of, head, labels, tmp_p
         assert not (tmp_path / "o.png").exists()
 
 
+def test_an_image_of_labels_imports_no_library_without_need(labels, tmp_path):
+    (tmp_path / "pose.json").write_text(json.dumps({"probe_to_ras": np.eye(4).tolist()}))
+    call = ["simulate", str(labels), "--pose", str(tmp_path / "pose.json"), "-o", str(tmp_path / "o.png")]
+    code = (
+        f"import sys; from SlicerUSSim.Command.cli import main; main({call}, standalone_mode=False); "
+        "print(*{'.'.join(name.split('.')[:n]) for name in sys.modules for n in (1, 2)})"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    slow = {"SimpleITK", "skimage", "vtkmodules", "pydicom", "scipy.optimize", "scipy.spatial"}
+    assert not slow & set(done.stdout.split())
+
+
 @pytest.mark.long
-def test_the_demo_replaces_only_files_that_it_wrote_itself(head, tmp_path):
+def test_the_demo_replaces_its_files_only_with_overwrite(head, tmp_path):
     pytest.importorskip("matplotlib", reason="pictures need matplotlib: pip install '.[demo]'")
     out = tmp_path / "out"
     out.mkdir()
@@ -326,11 +337,11 @@ def test_the_demo_replaces_only_files_that_it_wrote_itself(head, tmp_path):
     mine.write_bytes(b"my figure")
     (out / "notes.txt").write_text("mine")
     result = ussim("demo", "--mri", head, "-o", out)
-    assert result.exit_code == 2 and f"{mine}: exists, and without demo.json the folder is" in result.stderr
+    assert result.exit_code == 2 and f"{mine}: exists; give another name, or --overwrite" in result.stderr
     assert mine.read_bytes() == b"my figure"
     mine.unlink()
     assert ussim("demo", "--mri", head, "-o", out).exit_code == 0
-    assert ussim("demo", "--mri", head, "-o", out).exit_code == 0  # its own files are replaced
+    assert ussim("demo", "--mri", head, "-o", out, "--overwrite").exit_code == 0
     assert not list(out.glob(".results-*")) and (out / "notes.txt").read_text() == "mine"
     result = ussim("demo", "--mri", out / "labels.nii.gz", "--out", out)
     assert result.exit_code == 2 and "labels.nii.gz is an input, which it would replace" in result.stderr

@@ -12,11 +12,7 @@ from click.testing import CliRunner
 from PIL import Image
 
 from SlicerUSSim.Command.cli import main
-from SlicerUSSim.Command.seeds import split_seeds
-from SlicerUSSim.Command.serve import _require_opening
 from SlicerUSSim.Logic import SimulationError, Volume
-from SlicerUSSim.Logic.mri.outside import OUTSIDE
-from SlicerUSSim.Logic.mri.samples import head_mri
 from SlicerUSSim.Logic.placement.craniotomy import (
     disc_opening,
     file_opening,
@@ -27,6 +23,7 @@ from SlicerUSSim.Logic.placement.craniotomy import (
 )
 from SlicerUSSim.Logic.placement.views import view_pose
 from SlicerUSSim.Logic.probe.poses import pose_looking_at
+from SlicerUSSim.Logic.tissue.names import OUTSIDE
 from SlicerUSSim.Logic.tissue.table import TissueTable, write_label_files
 
 NAMES = ("csf", "grey matter", *OUTSIDE)
@@ -188,16 +185,11 @@ def test_the_probe_stands_on_the_brain_in_the_opening_of_a_file(head, tmp_path):
 
 
 def test_only_a_head_that_is_labelled_whole_can_be_opened(head, tmp_path):
-    """For a brain without its skull, --outside was asked for, which is refused for it."""
-    head_mri(spacing_mm=4.0).write(tmp_path / "brain.nii.gz")
-    told = refused_craniotomy(tmp_path / "brain.nii.gz")
-    assert "a brain without its skull, which has nothing to open; leave --craniotomy out" in told
-    assert "expected --outside" not in told
     noise = np.random.default_rng(3).normal(1.0, 0.05, head.array.shape)
     levels = np.array([5.0, 0.0, 100.0, 150.0, 120.0, 10.0, 90.0])
     head.with_array((levels[head.array] * noise).astype(np.float32)).write(tmp_path / "head.nii.gz")
     told = refused_craniotomy(tmp_path / "head.nii.gz")
-    assert "--craniotomy is disc:30, and only a brain is labelled, expected --outside too" in told
+    assert "--craniotomy is disc:30, and only a brain is labelled, expected --outside and an MRI" in told
 
 
 def refused_craniotomy(path, *arguments) -> str:
@@ -216,11 +208,8 @@ def test_a_file_with_two_segments_is_no_opening_and_both_are_named(head, tmp_pat
         for key, value in (("Name", name), ("LabelValue", number + 1), ("Layer", 0), ("ID", f"Segment_{number + 1}")):
             stored.SetMetaData(f"Segment{number}_{key}", str(value))
     sitk.WriteImage(stored, path := str(tmp_path / "two.seg.nrrd"))
-    for checked in (lambda: file_opening(head, NAMES, path), lambda: _require_opening(path)):
-        with pytest.raises(SimulationError, match=r"two\.seg\.nrrd: holds the segments 1 'Flap', 2 'Burr hole'"):
-            checked()
-    with pytest.raises(SimulationError, match="a segment of 3D Slicer, is not grown but laid over the labels"):
-        split_seeds([path])
+    with pytest.raises(SimulationError, match=r"two\.seg\.nrrd: holds the segments 1 'Flap', 2 'Burr hole'"):
+        file_opening(head, NAMES, path)
 
 
 def image(tmp_path, *arguments) -> tuple[np.ndarray, str]:

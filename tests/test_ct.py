@@ -17,7 +17,8 @@ from SlicerUSSim.Logic.base.errors import Cancelled, SimulationError
 from SlicerUSSim.Logic.base.neighbourhood import largest_around
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.mri import CtSegmentation, head_mri
-from SlicerUSSim.Logic.mri.ct_unit import looks_like_ct
+from SlicerUSSim.Logic.mri.ct_unit import why_ct
+from SlicerUSSim.Logic.mri.modality import segment_image
 from SlicerUSSim.Logic.probe.poses import pose_looking_at
 from SlicerUSSim.Logic.tissue import LabelledTissues, LabelMapping, read_label_map
 from tests.conftest import coarse_chest
@@ -126,7 +127,7 @@ def test_organs_in_another_place_cause_a_warning_or_are_refused():
 def test_an_offset_is_removed_and_reported():
     ct = coarse().ct
     found = segment_ct(ct.with_array(np.maximum(ct.array + 1024, 0).astype(np.uint16)))
-    assert "1024 is subtracted" in found.warnings[0] and looks_like_ct(ct)
+    assert "1024 is subtracted" in found.warnings[0] and why_ct(ct) == "its values are Hounsfield units"
     assert (found.labels.array == segment_ct(ct).labels.array).mean() > 0.9999
 
 
@@ -135,7 +136,7 @@ def test_an_offset_is_removed_and_reported():
     [
         (lambda a: a / 1000.0, "expected Hounsfield units"),
         (lambda a: np.clip(a, -160, 240), "that are not cut off"),
-        (lambda a: (np.clip(a, -160, 240) + 160) / 400.0 * 255.0, "for an MRI or labels leave --ct out"),
+        (lambda a: (np.clip(a, -160, 240) + 160) / 400.0 * 255.0, "for an MRI give its contrast"),
         (lambda a: np.where(a > 900, np.nan, a), "not finite numbers.*by -1000"),
         (lambda a: np.where(np.indices(a.shape).sum(axis=0) % 40 < 2, a, -1000.0 - a % 7), "in the CT has 0 ml"),
     ],
@@ -170,14 +171,21 @@ def test_padding_around_a_round_field_of_view_is_no_unit():
 def test_an_mri_or_labels_called_ct_are_refused():
     mri = head_mri(4.0)
     for image in (coarse().organs, *(mri.with_array(np.float32(scale) * mri.array) for scale in (1.0, 9.0, 20.0))):
-        assert not looks_like_ct(image)
-        with pytest.raises(SimulationError, match="for an MRI or labels leave --ct out"):
+        assert why_ct(image) is None
+        with pytest.raises(SimulationError, match="for an MRI give its contrast"):
             segment_ct(image)
 
 
-def test_a_ct_called_mri_is_refused_with_the_option():
-    with pytest.raises(SimulationError, match="segment a CT with --ct"):
-        segment_mri(coarse().ct)
+def test_a_ct_is_recognised_by_its_modality_or_its_numbers():
+    ct = coarse().ct
+    for image, why in (
+        (ct, "its values are Hounsfield units"),
+        (replace(ct, modality="CT"), "its DICOM modality is CT"),
+    ):
+        assert segment_image(image, contrast="t1").notes[0] == f"taken as a CT: {why}"
+    assert why_ct(replace(ct, modality="MR")) is None
+    with pytest.raises(SimulationError, match="the image is a CT"):
+        segment_mri(ct)
     with pytest.raises(SimulationError, match="contrast is ct"):
         segment_mri(head_mri(4.0), contrast="ct")
 
@@ -205,10 +213,11 @@ def test_the_command_segments_a_ct_with_organs_and_a_lesion(tmp_path, capsys):
     spine()[0].ct.write(ct)
     spine()[0].organs.write(organs)
     spine()[0].truth.with_array((spine()[0].truth.array == NAMES.index("blood") + 1).astype(np.uint8)).write(lesion)
-    options = ["--ct", "--organs", organs, "--map", "totalsegmentator", "--add", f"tumor={lesion}", "-o", labels]
+    options = ["--organs", organs, "--map", "totalsegmentator", "--add", f"tumor={lesion}", "-o", labels]
     with pytest.raises(SystemExit) as ended:
         cli(["segment", ct, *options])
-    assert ended.value.code == 0 and "cancellous bone" in capsys.readouterr().out
+    told = capsys.readouterr()
+    assert ended.value.code == 0 and "cancellous bone" in told.out and f"{ct}: taken as a CT" in told.err
     table = TissueTable.read(tmp_path / "labels.json")
     assert {"skin", "cancellous bone", "bone"} <= set(table.names())
     assert table.membrane is not None and "coupling" not in table.membrane.fluids
@@ -217,9 +226,9 @@ def test_the_command_segments_a_ct_with_organs_and_a_lesion(tmp_path, capsys):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (["segment", "--ct", "--thin-sulci"], "--thin-sulci is for an MRI"),
-        (["segment", "--organs", "x.nii.gz", "--skull-strip", "none"], "--organs is for a CT, expected --ct"),
-        (["simulate", "--ct", "--pose", "auto"], "--pose is auto, which is on a head, and the image is a CT"),
+        (["segment", "--thin-sulci"], "--thin-sulci is for an MRI"),
+        (["segment", "--sheets", "x.vtp"], "sheets are not found in contrast 'ct'"),
+        (["simulate", "--pose", "temporal"], "brain"),
     ],
 )
 def test_the_command_refuses_what_does_not_go_together(tmp_path, capsys, options, message):

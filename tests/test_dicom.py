@@ -73,6 +73,7 @@ def test_a_dicom_volume_is_read_in_its_place(case, tmp_path, caplog):
     scale = np.array([1, 2] * 6)[:, None, None] if "slope" in case else 1
     np.testing.assert_array_equal(found.array, SERIES.array * scale)
     np.testing.assert_allclose(found.ijk_to_ras, SERIES.ijk_to_ras, atol=5e-3)
+    assert (found.modality == "CT") == (case == "enhanced CT")
     assert ("those below it are read" in caplog.text) == (case == "below")
     assert any("frames have no places" in doubt for doubt in found.doubts) == (case == "frames without places")
     one = next(tmp_path.rglob("*.dcm"))

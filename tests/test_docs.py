@@ -26,7 +26,7 @@ SOURCES = {
 }
 EACH_PAGE = pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 #: Options in the text that are none of `ussim`.
-NOT_OURS = {"--no-deps"}
+NOT_OURS = {"--no-deps", "--sheet"}
 #: Files in the text that are written, not kept.
 WRITTEN = {"report.html", "build/docs/README.html"}
 

@@ -16,10 +16,11 @@ from SlicerUSSim.Logic import SimulationError, TissueTable, Volume
 from SlicerUSSim.Logic.mri import segment_mri
 from SlicerUSSim.Logic.mri.samples import head_mri
 from SlicerUSSim.Logic.tissue import LabelMapping, names_of_file, read_label_file, read_label_map, read_names
-from SlicerUSSim.Logic.tissue.label_sources import is_label_file
+from SlicerUSSim.Logic.tissue.label_sources import is_label_file, not_intensities
 from SlicerUSSim.Logic.tissue.names import nearest_tissue, terminology_entry, tissue_named
 from SlicerUSSim.Logic.tissue.presets import TISSUES
 from SlicerUSSim.Logic.tissue.schemes import recognised, schemes
+from SlicerUSSim.Logic.tissue.table import write_label_files
 from tests.conftest import name_labels
 
 #: Labels that recon-all wrote for one person (a public aseg.mgz)
@@ -89,6 +90,8 @@ def test_a_name_finds_its_tissue_by_its_most_special_word():
         ("non-WM-hypointensities", "grey matter"), ("Left-choroid-plexus", "enhancing"), ("5th-Ventricle", "csf"),
         ("heart_ventricle_left", "blood"), ("kidney_cyst_left", "cyst"), ("liver tumor", "tumour"),
         ("non-enhancing tumor", "tumour"), ("Left lungs", "lung"),
+        ("Meninges", "leptomeninges"), ("liquor", "csf"), ("tumour bed", "cavity"),
+        ("resected tumour cavity", "cavity"),
     ):  # fmt: skip
         assert tissue_named(name).name == tissue
     for name, nearest in (
@@ -97,6 +100,10 @@ def test_a_name_finds_its_tissue_by_its_most_special_word():
         ("cheese", None),
         ("non-tumor tissue", None),
         ("tumour-free margin", None),
+        ("bone wax", None),
+        ("white matter lesion", "tumour"),
+        ("Liver lesion", "tumour"),
+        ("soft tissue", "muscle"),
     ):
         with pytest.raises(SimulationError, match="no preset for tissue"):
             tissue_named(name)
@@ -152,7 +159,7 @@ def test_totalsegmentators_whole_bodies_are_recognised_and_said(key):
     table = {name: found.names[found.relabelled[label] - 1] for label, name in names.items()}
     assert (table["liver"], table["spleen"], table["aorta"], table["hip_left"]) == ("liver", "spleen", "blood", "bone")
     doubts = "\n".join(found.warnings)
-    assert "the nearest tissue is used for" in doubts and "as muscle" in doubts and "has no label" in doubts
+    assert "the nearest tissue is used for" in doubts and "as muscle" in doubts
 
 
 @pytest.mark.parametrize(
@@ -231,12 +238,12 @@ def tumour(labels: tuple[int, int, int]) -> Volume:
 @pytest.mark.parametrize("stored", [np.uint8, np.float32])
 def test_a_tumour_of_brats_is_no_patient(stored, tmp_path):
     path = tmp_path / "BraTS-GLI-00001-000-seg.nii.gz"
-    for labels, said, title in (((1, 2, 4), (), "2017 to 2022"), ((1, 2, 3), ("--map", "brats"), "since 2023")):
-        found = tumour(labels)
-        found.with_array(found.array.astype(stored)).write(path)
-        message = refused("simulate", path, *said, "--pose", "auto", "-o", tmp_path / "o.png")
-        assert f"a tumour's labels (as BraTS {title}: necrotic core, oedema, enhancing tumour; 3 labels, 67" in message
-        assert f"not a patient's tissues; add it to a segmentation with --add brats={path}" in message
+    found = tumour((1, 2, 4))
+    found.with_array(found.array.astype(stored)).write(path)
+    message = refused("simulate", path, "--pose", "auto", "-o", tmp_path / "o.png")
+    assert "a tumour's labels (as BraTS 2017 to 2022: necrotic core, oedema, enhancing tumour; 3 labels, 67" in message
+    assert f"not a patient's tissues; add it to a segmentation with --add brats={path}" in message
+    tumour((1, 2, 3)).write(path)
     message = refused("simulate", path, "--pose", "auto", "-o", tmp_path / "o.png")
     assert "--map brats (BraTS since 2023: 1 necrotic core, 2 oedema, 3 enhancing tumour)" in message
 
@@ -265,7 +272,7 @@ def test_a_command_for_an_mri_says_what_a_label_map_is_for(tmp_path, monkeypatch
     tumour((255, 255, 255)).write("glioma.nii.gz")
     tumour((1, 2, 4)).write("brats.nii.gz")
     unknown = head()
-    unknown.with_array(np.where(unknown.array == 3, 515, unknown.array)).write("unknown.nii.gz")
+    unknown.with_array(np.where(unknown.array > 1, unknown.array + 512, unknown.array)).write("unknown.nii.gz")
     for name, message in (
         (
             "glioma",
@@ -292,15 +299,37 @@ def test_two_tissues_for_one_label_are_refused(tmp_path):
 def test_unknown_labels_are_listed_with_volumes_and_a_remedy_that_works(tmp_path):
     volume = head()
     volume.array[:6, :6, :6] = 512
+    volume.array[6:9, :6, :6] = 513
+    volume.array[9:12, :6, :6] = 514
     message = str(refusal_of(volume))
-    assert "most of its numbers are FreeSurfer's, and no tissue is called label 512 (5.8 ml); map" in message
+    assert "label 512 (5.8 ml), label 513" in message
     file = tmp_path / "mapping.json"
-    file.write_text(json.dumps({"512": "skull", "3": "csf", "42": 0}))
-    for texts in ([str(file)], ["512=skull", "Left-Cerebral-Cortex=csf", "42=0"]):
+    file.write_text(json.dumps({"512": "skull", "513": "skull", "514": "skull", "3": "csf", "42": 0}))
+    skull = [f"{label}=skull" for label in (512, 513, 514)]
+    for texts in ([str(file)], [*skull, "Left-Cerebral-Cortex=csf", "42=0"]):
         found = read_label_map(volume, mapping=LabelMapping.of(texts))
-        assert found.message == "FreeSurfer: 9 labels to 3 tissues"
+        assert found.message == "FreeSurfer: 11 labels to 3 tissues"
     message = str(refusal_of(made({90: "", 150: "", 151: ""})))
     assert "no program's numbers are recognised, and no tissue is called label 90 (" in message and "150 (" in message
+
+
+def test_few_unknown_labels_are_taken_as_what_is_around_them():
+    volume = head()
+    beside = int(volume.array[25, 25, 38])
+    volume.array[24:27, 24:27, 37:40] = 9999
+    for texts in ((), "freesurfer"):
+        found = read_label_map(volume, mapping=LabelMapping.of(texts))
+        assert found.relabelled[9999] == found.relabelled[beside]
+        assert "label 9999 (0.73 ml) is unknown and taken as white matter, which is around" in found.warnings[0]
+
+
+def test_a_numbering_that_is_said_has_to_have_most_labels():
+    message = str(refusal_of(numbered(ASEG), mapping=LabelMapping.of("brats")))
+    assert message.endswith("are not of --map brats; expected --map freesurfer")
+    found = read_label_map(tumour((1, 2, 3)), mapping=LabelMapping.of("brats"))
+    assert found.names == ("necrosis", "oedema", "enhancing") and "has a tumour alone" in found.warnings[0]
+    found = read_label_map(tumour((1, 2, 4)), mapping=LabelMapping.of("brats"))
+    assert "its labels are those of BraTS 2017 to 2022 (--map brats-2022)" in found.warnings[1]
 
 
 def test_a_mapping_goes_before_names_and_numbers_and_removes_labels():
@@ -353,7 +382,7 @@ def test_labels_are_no_mri_also_with_fractions_and_noise():
     labels = numbered(ASEG).array.astype(np.float32)
     noise = np.random.default_rng(0).normal(0, 1e-3, labels.shape)
     for array, message in (
-        (labels + 0.3 * (labels > 0), "uniform regions of few values with fractions"), (labels + noise, "label map"),
+        (labels + 0.3 * (labels > 0), "uniform regions with fractions"), (labels + noise, "label map"),
     ):  # fmt: skip
         with pytest.raises(SimulationError, match=message):
             segment_mri(Volume(array, np.eye(4)))
@@ -424,11 +453,14 @@ def test_names_have_quotes_and_files_marks_of_their_encoding(tmp_path):
             assert read_names(tmp_path / name) == expected
 
 
-TERMS = """LabelValue,Name,Color_R,Type_CodingScheme,Type_CodeValue,Type_CodeMeaning,TypeModifier_CodeValue
+TERMS = """LabelValue,Name,Color_R,Scheme,Type_CodeValue,M,TypeModifier_CodeValue,Category_CodeValue,Region_CodeValue
 1,Leptomeninges,102,SCT,113257007,Structure of bone,
 2,Segment_2,102,SCT,12738006,Brain,389080008
 3,Hirnhaut,102,SCT,1231004,Meninges,
 4,non-tumor tissue,1,SCT,85756007,Tissue,
+5,Substantia alba,1,SCT,12738006,Brain,,123037004,68594002
+6,Wucherung,1,SCT,108369006,Neoplasm,,49755003,10200004
+7,Herd,1,SCT,52988006,Lesion,,49755003,10200004
 """
 
 
@@ -437,6 +469,7 @@ def test_codes_of_slicer_name_what_has_no_name_of_a_tissue(tmp_path):
 
     (tmp_path / "seg_ColorTable.csv").write_text(TERMS)
     expected = {1: "Leptomeninges", 2: "white matter", 3: "leptomeninges", 4: "non-tumor tissue"}
+    expected |= {5: "white matter", 6: "tumour", 7: "Herd"}
     assert read_names(tmp_path / "seg_ColorTable.csv") == expected
     volume = tumour((1, 2, 3))
     header = {"space": "left-posterior-superior"}
@@ -449,6 +482,17 @@ def test_codes_of_slicer_name_what_has_no_name_of_a_tissue(tmp_path):
     assert "SCT^389080008^White Matter" in terminology_entry("white matter") and terminology_entry("gel") == ""
     message = str(refusal_of(tumour((1, 1, 4)), {1: "liver", 4: "non-tumor tissue"}))
     assert "no tissue is called 'non-tumor tissue' (4, " in message
+
+
+@pytest.mark.parametrize("name", ["labels.nii.gz", "labels.nii", "labels.seg.nrrd", "labels.nrrd"])
+def test_labels_keep_their_names_without_the_table_beside_them(tmp_path, name):
+    path, names = tmp_path / name, ("csf", "grey matter", "white matter")
+    labels = brain({"csf": 1, "grey matter": 2, "white matter": 3})
+    write_label_files(path, labels, TissueTable.brain(names)).unlink()
+    volume = Volume.read(path)
+    assert read_label_file(path, volume).names == names and np.array_equal(volume.array, labels.array)
+    if name.endswith(".nrrd"):
+        assert volume.label_codes[3] == ("389080008",)
 
 
 def test_totalsegmentators_header_names_the_labels(tmp_path):
@@ -581,6 +625,9 @@ def test_an_mri_in_any_numbers_is_an_mri(mni, parcels):
         for name in ("t1.nii.gz", "c1_t1.nii.gz"):  # or called as SPM's maps are
             assert not is_label_file(Path(name), Volume(array, np.eye(4)))
     assert Volume(np.kron(parcels, np.ones((2, 2, 2), int)), np.eye(4)).looks_like_labels()
+    for array, is_labels in ((parcels, True), (t1, False)):
+        found = not_intensities(Volume(ndimage.zoom(array.astype(float), 1.4, order=1), np.eye(4)))
+        assert ("nearest-neighbour" in str(found)) == is_labels
 
 
 @pytest.mark.slow

@@ -12,8 +12,9 @@ from scipy import ndimage
 
 from SlicerUSSim.Command.cli import main
 from SlicerUSSim.Logic import SimulationError, Volume, segment_mri
-from SlicerUSSim.Logic.mri.outside import OUTSIDE, find_outside
+from SlicerUSSim.Logic.mri.outside import find_outside
 from SlicerUSSim.Logic.mri.samples import head_mri
+from SlicerUSSim.Logic.tissue.names import OUTSIDE
 from SlicerUSSim.Logic.tissue.table import TissueTable
 
 pytestmark = pytest.mark.usefixtures("segmented_once")
@@ -151,9 +152,9 @@ def test_the_segmentation_has_what_is_outside_after_its_own_labels():
 
 
 @pytest.mark.slow
-def test_a_table_of_other_numbers_is_refused(tmp_path):
-    names = ("grey matter", "csf", "white matter")
-    message = "label 1 is grey matter, and it is csf here, expected 1 csf, 2 grey"
+def test_a_table_of_other_tissues_is_refused(tmp_path):
+    names = ("liver", "kidney")
+    message = "has none of the patient's tissues, expected tissues called csf, grey"
     mri, brain, _ = round_head(COARSE_MM)
     mri.write(tmp_path / "head.nii.gz")
     mri.with_array(brain.astype(np.uint8)).write(tmp_path / "brain.nii.gz")

@@ -24,7 +24,7 @@ from SlicerUSSim.Logic.mrml.share_nodes import read_shares  # noqa: E402
 from SlicerUSSim.Logic.mrml.taken_image import about_image, is_frozen, patient_of  # noqa: E402
 from SlicerUSSim.Logic.probe.arrays import PROBE_KINDS, PROBES, LinearProbe  # noqa: E402
 from SlicerUSSim.Logic.tissue.schemes import schemes  # noqa: E402
-from SlicerUSSim.Widget.interface import by_widget  # noqa: E402
+from SlicerUSSim.Widget.interface import by_widget, in_panel  # noqa: E402
 from SlicerUSSim.Widget.presenter import PanelPresenter  # noqa: E402
 from SlicerUSSim.Widget.sections import panel_sections  # noqa: E402
 from SlicerUSSim.Widget.value_presenter import CUSTOM_PROBE  # noqa: E402
@@ -263,19 +263,21 @@ def test_the_notes_say_what_the_shown_labels_were_recognised_as(presenter):
     presenter.images.simulate()
     assert presenter.notes.text().startswith("Head:") and not presenter.view.errors
     scene = presenter.logic.scene
-    for name, volume in (("aseg", numbered(ASEG)), ("mirrored", numbered(ASEG, mirrored=True))):
+    more = numbered(ASEG)
+    more.array[more.array == 255] = 9999
+    for name, volume in (("aseg", numbered(ASEG)), ("more", more)):
         node = scene.AddNewNodeByClass("vtkMRMLLabelMapVolumeNode", name)
         write_volume(node, volume)
         presenter.logic.parameters.labels = node
         presenter.images.simulate()
         assert presenter.notes.text().startswith(f"{name}: FreeSurfer"), presenter.notes.text()
-    assert "labels of the left side are on the right" in presenter.notes.text() and not presenter.view.errors
+    assert "ml) is unknown and taken as" in presenter.notes.text() and not presenter.view.errors
     presenter.images.simulate()
-    assert presenter.notes.text().startswith("mirrored:")
+    assert presenter.notes.text().startswith("more:")
 
 
 def test_lesions_leave_the_checks_of_the_tissues_under_them_in_the_notes(presenter):
-    """The line about the sides of the brain was gone when a tumour had been laid over the tissues."""
+    """The line about the nearest tissue was gone when a tumour had been laid over the tissues."""
     from tests.test_label_maps import head as head_of_freesurfer
 
     scene, parameters = presenter.logic.scene, presenter.logic.parameters
@@ -283,17 +285,17 @@ def test_lesions_leave_the_checks_of_the_tissues_under_them_in_the_notes(present
     labels, numbers = np.unique(whole.array, return_inverse=True)
     names = [schemes()["freesurfer"].names[int(label)] for label in labels[1:]]
     whole = whole.with_array(numbers.reshape(whole.array.shape).astype(np.uint8))
-    mirrored = whole.with_array(np.flip(whole.array, 2).copy())
-    parameters.labels = scene.AddNewNodeByClass("vtkMRMLLabelMapVolumeNode", "mirrored")
-    write_labels(parameters.labels, mirrored, names, parameters.mri)
+    names[-1] = "Cerebral-Exterior"
+    parameters.labels = scene.AddNewNodeByClass("vtkMRMLLabelMapVolumeNode", "whole")
+    write_labels(parameters.labels, whole, names, parameters.mri)
     presenter.images.simulate()
-    checks = [line for line in presenter.notes.text().splitlines() if "labels of the left side" in line]
+    checks = [line for line in presenter.notes.text().splitlines() if "the nearest tissue is used" in line]
     assert len(checks) == 1
-    mask = np.zeros(mirrored.array.shape, np.uint8)
-    centre = np.argwhere(mirrored.array > 0).mean(axis=0).astype(int)
+    mask = np.zeros(whole.array.shape, np.uint8)
+    centre = np.argwhere(whole.array > 0).mean(axis=0).astype(int)
     mask[tuple(slice(at - 3, at + 4) for at in centre)] = 1
     parameters.lesions = scene.AddNewNodeByClass("vtkMRMLSegmentationNode", "Lesions")
-    add_lesion(parameters.lesions, mirrored.with_array(mask), "tumour", "tumour.nii.gz")
+    add_lesion(parameters.lesions, whole.with_array(mask), "tumour", "tumour.nii.gz")
     for _ in range(2):
         presenter.lesions.addTissues()
         lines = presenter.notes.text().splitlines()
@@ -440,3 +442,17 @@ def test_settings_come_back_with_undo_or_it_says_so(presenter):
         presenter.notes.text()
         == f"{notes}\nUndo left the settings of Segment as they are, since they were changed after it"
     )
+
+
+@pytest.mark.parametrize(
+    ("message", "shown"),
+    [
+        ("give a brain mask (--mask)", "give a brain mask"),
+        ("choose another, --skull-strip none or --mask", "choose another, Brain extraction none or Mask"),
+        ("map them with --map 9=TISSUE", "map them with the name of a tissue for 9 in its colour table"),
+        ("add it with --add brats=FILE, or alone with --map 1=csf --map 2='grey matter' (ussim simulate)",
+         "add it with Add to tissues, or alone with names of its tissues"),
+    ],
+)  # fmt: skip
+def test_messages_name_controls_and_no_options_of_the_command(message, shown):
+    assert in_panel(message) == shown

@@ -55,20 +55,6 @@ def test_tables_survive_json(members, membrane):
     assert TissueTable.from_dict(json.loads(json.dumps(table.to_dict()))) == table
 
 
-def test_a_table_from_before_sheets_were_rough_keeps_its_even_layer():
-    old = TissueTable.brain().to_dict()
-    for name in ("roughness_mm", "diffuse_db", "diffuse_exponent"):
-        del old["membrane"][name]
-    old["membrane"]["thickness_mm"] = 0.8
-    read = TissueTable.from_dict(old).membrane
-    assert read is not None and read.thickness_mm == 0.8
-    assert (read.roughness_mm, read.diffuse_db, read.diffuse_exponent) == (0.0, 0.0, 0.0)
-    del old["membrane"]["thickness_mm"]
-    assert TissueTable.from_dict(old).membrane.thickness_mm == 1.0
-    old["membrane"]["roughness_mm"] = 0.05
-    assert TissueTable.from_dict(old).membrane.roughness_mm == 0.05
-
-
 def test_replace_changes_every_label_of_a_name_and_the_membrane_with_them():
     """Left and right hemisphere have separate labels; sulci can be labelled and also be the membrane."""
     louder = replace(TISSUES["white matter"], speed_of_sound_m_s=1550.0)

@@ -10,8 +10,9 @@ from pathlib import Path
 import click
 
 from SlicerUSSim.Command.cli import ToolCommand
-from SlicerUSSim.Command.options import check_results, device_option, results_of
-from SlicerUSSim.Command.progress import Steps, note
+from SlicerUSSim.Command.options import check_results, device_option, overwrite_option, results_of
+from SlicerUSSim.Command.progress import note
+from SlicerUSSim.Logic.base.files import write_json
 from validation.run import chosen_checks, validate
 
 _TABLES, _SUMMARY = "report.md", "report.json"
@@ -29,14 +30,14 @@ _TABLES, _SUMMARY = "report.md", "report.json"
     "--only", multiple=True, metavar="TEXT", help="Run only checks with this text in their names; may be repeated."
 )
 @device_option
+@overwrite_option
 @click.pass_context
 def main(ctx: click.Context, out: Path, only: tuple[str, ...], device: str | None) -> None:
     checks = chosen_checks(only)
-    check_results(out, (_TABLES, *(check.picture for check in checks)), _SUMMARY)
-    count = sum(len(check.orientations) for check in checks)
-    with results_of(out, _SUMMARY) as (folder, summary), Steps(count) as step:
-        report = validate(folder, device, only, step)
-        summary |= report.to_dict()
+    check_results(out, (_TABLES, _SUMMARY, *(check.picture for check in checks)))
+    with results_of(out) as folder:
+        report = validate(folder, device, only, lambda name: note(f"{name} ..."))
+        write_json(folder / _SUMMARY, report.to_dict())
     for finding in report.failed:
         row = finding.row
         click.echo(

@@ -13,7 +13,6 @@ from SlicerUSSim.Logic.base.errors import require
 if TYPE_CHECKING:
     from SlicerUSSim.Logic.base import Volume
     from SlicerUSSim.Logic.mri import Added
-    from SlicerUSSim.Logic.tissue import TissueTable
 
 
 def split_additions(texts: Iterable[str]) -> list[tuple[str, str]]:
@@ -67,16 +66,6 @@ class Additions:
             read_masks(mask, tissue, Path(file).name)
             masks.append((tissue, mask, Path(file).name))
         return cls(tuple(masks), own)
-
-    def with_presets(self, tissues: TissueTable) -> TissueTable:
-        """A table with the presets of those tissues that it lacks."""
-        from SlicerUSSim.Logic.tissue.presets import TISSUES
-
-        known = [tissue.name for tissue in tissues.all_tissues()]
-        for tissue in dict.fromkeys(tissue for tissue, _, _ in self.masks):
-            if tissue in TISSUES and tissue not in known:
-                tissues = tissues.with_tissue(TISSUES[tissue])
-        return tissues
 
     def on(self, labels: Volume, tissue_names: Iterable[str], *, has_brain_mask: bool) -> Added:
         """The labels with these tissues on top, after notes of what was done; warnings are logged.

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from SlicerUSSim.Command.mri_options import NONE, MriOptions
 from SlicerUSSim.Command.progress import note
-from SlicerUSSim.Logic.base.errors import SimulationError, require, required
+from SlicerUSSim.Logic.base.errors import require, required
 from SlicerUSSim.Logic.mri.segmentation_settings import GEL_MM as GEL_MM
 
 if TYPE_CHECKING:
@@ -66,29 +66,13 @@ class Craniotomy:
         """Whether the opening lies under the probe."""
         return self.source in (AUTO, DISC)
 
-    def require_head(self, mri: Volume | None, patient: MriOptions) -> None:
-        """Raise SimulationError for an opening in a segmentation without skin and skull, as --outside finds them.
-
-        Says what is missing: --outside, or a head. `mri` is None for the demo brain.
-        """
-        given, chosen = f"--craniotomy is {self.text}", patient.segmentation
-        if not self.is_wanted:
-            return
-        is_of_mri = not patient.is_ct
-        require(is_of_mri, f"{given}, which opens a head that was found in an MRI, and this is a CT (--ct)")
-        if chosen.outside:
-            return
-        from SlicerUSSim.Logic.mri.outside import require_findable
-        from SlicerUSSim.Logic.mri.recognition import stripped_brain
-
-        nothing = "a brain without its skull, which has nothing to open; leave --craniotomy out"
-        require(mri is not None, f"{given}, and the demo is {nothing}")
-        require(mri is None or stripped_brain(mri) is None, f"{given}, and the image shows {nothing}")
-        try:
-            require_findable(chosen.contrast, chosen.skull_strip, patient.mask is not None)
-        except SimulationError as error:
-            raise SimulationError(f"{given}, and only a brain is labelled: {error}") from None
-        raise SimulationError(f"{given}, and only a brain is labelled, expected --outside too")
+    def require_head(self, patient: MriOptions) -> None:
+        """Raise SimulationError for an opening in a segmentation without skin and skull, as --outside finds them."""
+        given = f"--craniotomy is {self.text}"
+        if self.is_wanted:
+            require(not patient.is_ct, f"{given}, which opens a head that was found in an MRI, and this is a CT")
+            is_whole = patient.segmentation.outside
+            require(is_whole, f"{given}, and only a brain is labelled, expected --outside and an MRI of a whole head")
 
     @property
     def text(self) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -15,6 +15,8 @@ from SlicerUSSim.Logic.base.errors import SimulationError, require
 from SlicerUSSim.Logic.mri.segmentation_settings import CT, MRI_CONTRASTS, SegmentationSettings
 
 if TYPE_CHECKING:
+    from typing_extensions import Self
+
     from SlicerUSSim.Logic.base import Volume
     from SlicerUSSim.Logic.mri import CtSegmentation, Segmentation
     from SlicerUSSim.Logic.tissue import LabelledTissues
@@ -36,11 +38,10 @@ class MriOptions:
         "brats, brats-2022. May be repeated.",
     )  # fmt: skip
     segmentation: SegmentationSettings = declared_parameters(  # noqa: RUF009, a dataclasses.field like the others
-        SegmentationSettings,
-        also=(click.Option(["--ct", "contrast"], flag_value=CT, default=MRI_CONTRASTS[0], hidden=True),),
+        SegmentationSettings
     )
     organs: str | None = declared(
-        "--organs", type=click.Path(), help="Label map of organs of a CT (--ct), such as TotalSegmentator's, whose "
+        "--organs", type=click.Path(), help="Label map of organs of a CT, such as TotalSegmentator's, whose "
         "soft tissues replace muscle and blood.",
     )  # fmt: skip
     mask: str | None = declared(
@@ -77,8 +78,17 @@ class MriOptions:
 
     @property
     def is_ct(self) -> bool:
-        """Whether the image is said to be a CT."""
+        """Whether the image is a CT."""
         return self.contrast == CT
+
+    def for_image(self, image: Volume) -> Self:
+        """With the contrast of a CT if the image is one, after a note that says why."""
+        from SlicerUSSim.Logic.mri.ct_unit import settings_for
+
+        settings, line = settings_for(image, self.segmentation)
+        if line is not None:
+            note(f"{image.name}: {line}")
+        return replace(self, segmentation=settings)
 
 
 @dataclass(frozen=True)
@@ -112,10 +122,10 @@ class ImageOptions(MriOptions):
     )  # fmt: skip
 
 
-def also_files(texts: Iterable[str], mri: str | None = None) -> dict[str, str]:
+def also_files(texts: Iterable[str]) -> dict[str, str]:
     """{contrast: file} of the values of --also.
 
-    Raises SimulationError for another text or contrast, one twice, and one file for two, of which `mri` may be one.
+    Raises SimulationError for another text or contrast, and for one twice.
     """
     found: dict[str, str] = {}
     for text in texts:
@@ -124,10 +134,6 @@ def also_files(texts: Iterable[str], mri: str | None = None) -> dict[str, str]:
         expected = f"expected one of {', '.join(MRI_CONTRASTS)}"
         require(contrast in MRI_CONTRASTS, f"--also: contrast is {contrast!r}, {expected}")
         require(contrast not in found, f"--also: {contrast} is given twice, expected one volume per contrast")
-        others = {"the MRI": mri} if mri else {}
-        for name, other in (others | {f"--also {name}": at for name, at in found.items()}).items():
-            is_same = Path(file).exists() and Path(other).exists() and Path(other).samefile(file)
-            require(not is_same, f"--also {contrast}={file}: is the file of {name} again, expected another image")
         found[contrast] = file
     return found
 
@@ -145,8 +151,8 @@ def segmented_file(
     Says how the brain was found, with `tell_all` also what else; what should be checked is logged as warnings.
     """
     from SlicerUSSim.Logic.base.errors import about_file
+    from SlicerUSSim.Logic.base.files import mask_beside
     from SlicerUSSim.Logic.base.volume import Volume
-    from SlicerUSSim.Logic.mri.kept_mask import mask_beside
     from SlicerUSSim.Logic.mri.masks import read_mask
     from SlicerUSSim.Logic.mri.modality import has_brain_mask, segment_image
     from SlicerUSSim.Logic.mri.segmentation import Segmentation
@@ -156,8 +162,11 @@ def segmented_file(
     if not is_of_brain:
         require_no_options_beside_ct(path)
     require_no_map(path, maps, organs)
-    require(organs is None or not is_of_brain, f"--organs is for a CT, expected --ct; {path} is read as an MRI")
-    others = {contrast: Volume.read(file) for contrast, file in also_files(patient.also, path).items()}
+    require(
+        organs is None or not is_of_brain,
+        f"--organs is for a CT, and {path} is read as an MRI; for a CT, give --contrast ct",
+    )
+    others = {contrast: Volume.read(file) for contrast, file in also_files(patient.also).items()}
     brain = read_mask(patient.mask) if patient.mask else None
     found = None if organs is None else _read_organs(organs, maps)
     with Share("segment") as progress, about_file(path):
@@ -186,15 +195,11 @@ def _read_organs(path: str, maps: Iterable[str]) -> LabelledTissues:
     found = read_label_file(Path(path), Volume.read(path), LabelMapping.of(maps, table), default=table, of_ct=True)
     note(f"{path}: {found.message}")
     for warning in found.warnings:
-        if "--map 0=" in warning:  # between organs the CT says what is there
-            continue
         logging.getLogger(__name__).warning("%s", warning)
     return found
 
 
-def read_mri(
-    path: str, *, mask: str | None, skull_strip: str, contrast: str = MRI_CONTRASTS[0], is_served: bool = False
-) -> Volume:
+def read_mri(path: str, patient: MriOptions, *, is_served: bool = False) -> Volume:
     """Read an MRI or a CT, which is not a label map unless it is segmented all the same.
 
     `is_served` is for the words of the errors: the command is that of the workstation.
@@ -210,25 +215,21 @@ def read_mri(
 
     require_no_sequence(path)
     volume = Volume.read(path)
-    if mask is not None or skull_strip == "none" or contrast == CT:
+    if patient.mask is not None or patient.segmentation.skull_strip == "none" or patient.is_ct:
         return volume
     with about_file(path):
         check_finite(volume)
     if is_label_file(Path(path), volume):
         used_by = f"--labels {path}" if is_served else f"ussim simulate {path} ..."
         try:
-            found = read_label_file(Path(path), volume)
+            what = read_label_file(Path(path), volume).message
         except NoPatientError:  # says how to add it
             raise
-        except SimulationError as error:
-            if "--map" not in str(error):
-                raise
-            count = np.unique(volume.array[volume.array != 0]).size
-            remedy = f"use it as it is ({used_by}), which says what its labels need"
-            raise SimulationError(f"{path}: is a label map ({count} labels), expected an MRI; {remedy}") from error
+        except SimulationError:  # simulate says what its labels need
+            what = f"{np.unique(volume.array[volume.array != 0]).size} labels"
         raise SimulationError(
-            f"{path}: is a label map ({found.message}), expected an MRI; use it as it is ({used_by}), or segment it "
-            "all the same with --skull-strip none"
+            f"{path}: is a label map ({what}), expected an MRI; use it as it is ({used_by}), or segment it all the "
+            "same with --skull-strip none"
         )
     return volume
 

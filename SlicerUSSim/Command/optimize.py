@@ -138,11 +138,6 @@ def _write_report(
     )  # fmt: skip
 
 
-def _mean(values: list[float]) -> float:
-    known = [value for value in values if value == value]  # not NaN
-    return sum(known) / len(known) if known else float("nan")
-
-
 def _tell(found: Fit) -> None:
     """Print the result, one line for the cost and one for each parameter."""
     if found.registration:
@@ -150,18 +145,6 @@ def _tell(found: Fit) -> None:
         click.echo(f"moved by {moved.shift_mm:.2f} mm and {moved.turn_deg:.2f} degrees")
     result = found.appearance
     click.echo(f"cost {result.cost_before:.4f} -> {result.cost_after:.4f} ({result.evaluations} evaluations)")
-    before, after = (
-        [_mean([getattr(one, name) for one in misfits]) for name in ("autocorrelation", "extrema")]
-        for misfits in (found.texture_before, found.texture_after)
-    )
-    click.echo(f"texture T1 {before[0]:.3f} -> {after[0]:.3f}, T2 {before[1]:.2f} -> {after[1]:.2f}")
-    if found.speckle is not None:
-        shown = found.speckle.display
-        slopes = f"{shown.map_black:.2f} {shown.map_dark:.2f} {shown.map_white:.2f}"
-        click.echo(
-            f"speckle: smoothing {shown.smoothing_axial_mm:.3f} mm, {shown.smoothing_lateral_deg:.2f} degrees; texture "
-            f"x {found.speckle.texture_factor:g}; grey map {slopes if found.speckle.has_map else 'as given'}"
-        )
     if found.prediction is not None:
         for line in found.prediction.lines():
             click.echo(line)

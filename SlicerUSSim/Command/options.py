@@ -8,7 +8,7 @@ from __future__ import annotations
 import logging
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import Field, field, fields
 from difflib import get_close_matches
 from functools import wraps
@@ -138,13 +138,12 @@ def declared(*names: str, **about: Any) -> Any:
     return field(metadata={"option": (names, about)})
 
 
-def declared_parameters(kind: type, *, of_preset: bool = False, also: Iterable[click.Option] = ()) -> Any:
+def declared_parameters(kind: type, *, of_preset: bool = False) -> Any:
     """A field of a dataclass of options: a `kind` with its parameters that have an option.
 
-    `also` are further options for the same values. With `of_preset` it is {name: value} of those that were given, and
-    --help refers to the preset for the default.
+    With `of_preset` it is {name: value} of those that were given, and --help refers to the preset for the default.
     """
-    return field(metadata={"kind": kind, "of_preset": of_preset, "also": tuple(also)})
+    return field(metadata={"kind": kind, "of_preset": of_preset})
 
 
 class Key(NamedTuple):
@@ -180,9 +179,8 @@ def gathered(keys: str = "", **kinds: type) -> Callable[[Command], Command]:
             command(**options, **given)
 
         shown = [entry.option for entry in known.values() if entry.option.name not in rare]
-        more = [option for kind in kinds.values() for option in _further_of(kind)]
         below = getattr(command, "__click_params__", [])
-        with_options.__click_params__ = [*below, *reversed(shown + more)]  # type: ignore[attr-defined]
+        with_options.__click_params__ = [*below, *reversed(shown)]  # type: ignore[attr-defined]
         with_options.keys = known  # type: ignore[attr-defined]
         return with_options
 
@@ -224,12 +222,6 @@ def _keys_of(section: str, kind: type, of_preset: bool = False) -> Iterator[tupl
         option = click.Option([*names, place.name], **about) if names else click.Argument([place.name], **about)
         default = about.get("default", () if "multiple" in about else None)
         yield f"{section}.{place.name}", Key(option, None, default)
-
-
-def _further_of(kind: type) -> Iterator[click.Option]:
-    if not issubclass(kind, Declared):
-        for place in fields(kind):  # type: ignore[arg-type]
-            yield from place.metadata.get("also", ())
 
 
 def _read_keys(context: click.Context, known: Mapping[str, Key]) -> None:
@@ -309,21 +301,14 @@ def _value(place: Field, given: dict[str, Any]) -> Any:
 
 
 def given_options(*names: str) -> list[str]:
-    """Those of the running command's options with these names of parameters that the user gave, as "--mask".
-
-    Of several options of one parameter, as --contrast and --ct, it is the one that stands for the value.
-    """
+    """Those of the running command's options with these names of parameters that the user gave, as "--mask"."""
     context = click.get_current_context()
-    rare = {entry.option: f"--set {key}" for key, entry in rare_keys(context.command).items()}
-    given = dict[str, str]()
-    for parameter in (*context.command.params, *rare):
-        name = parameter.name or ""
-        if name not in names or context.get_parameter_source(name) is not ParameterSource.COMMANDLINE:
-            continue
-        stands_for = getattr(parameter, "flag_value", None) if getattr(parameter, "is_flag", False) else None
-        if name not in given or (isinstance(stands_for, str) and stands_for == context.params.get(name)):
-            given[name] = rare.get(parameter, parameter.opts[0])
-    return list(given.values())
+    shown = {option: option.opts[0] for option in context.command.params}
+    shown |= {entry.option: f"--set {key}" for key, entry in rare_keys(context.command).items()}
+    return [
+        text for option, text in shown.items()
+        if option.name in names and context.get_parameter_source(option.name) is ParameterSource.COMMANDLINE
+    ]  # fmt: skip
 
 
 def require_no_mri_options(labels: str, remedy: str) -> None:
@@ -335,14 +320,13 @@ def require_no_mri_options(labels: str, remedy: str) -> None:
 def require_no_options_beside_ct(path: str) -> None:
     """Raise SimulationError if options that only MRIs have were given with the CT of this file."""
     names = {entry.name for entry in parameters_of(SegmentationSettings)} - {"contrast", "filter_radius"}
-    _require_not_given(f"{path}: is a CT (--ct)", "leave it out", "also", *sorted(names))
+    _require_not_given(f"{path}: is a CT", "leave it out", "also", *sorted(names))
 
 
 def _require_not_given(what: str, remedy: str, *names: str) -> None:
     given = given_options(*names)
-    kind = "a CT" if given == ["--ct"] else "an MRI"
     verb = "is" if len(given) == 1 else "are"
-    require(not given, f"{what}, and {' and '.join(given)} {verb} for {kind}; {remedy}")
+    require(not given, f"{what}, and {' and '.join(given)} {verb} for an MRI; {remedy}")
 
 
 def check_outputs(*outputs: Path | None, state: Path | None = None) -> None:
@@ -365,49 +349,26 @@ def check_outputs(*outputs: Path | None, state: Path | None = None) -> None:
         require(is_free, f"{out}: exists; give another name, or --overwrite to replace it")
 
 
-def check_results(folder: Path, names: Iterable[str], summary: str) -> None:
-    """Raise SimulationError if a folder of results cannot be written, or has one of these files without the `summary`.
-
-    With it, a command wrote the files before and replaces them, unless it reads one.
-    """
+def check_results(folder: Path, names: Iterable[str]) -> None:
+    """Raise SimulationError if a folder of results cannot be written, or as check_outputs for one of these files."""
     from SlicerUSSim.Logic.base.files import require_folder
 
     require_folder(folder)
-    is_own = (folder / summary).is_file()
-    for path in (folder / name for name in (*names, summary)):
-        require_no_input(path)
-        require(
-            is_own or not path.exists(),
-            f"{path}: exists, and without {summary} the folder is not one of this command; give another folder (--out)",
-        )
+    if folder.exists():
+        check_outputs(*(folder / name for name in names))
 
 
 @contextmanager
-def results_of(folder: Path, summary: str) -> Iterator[tuple[Path, dict]]:
-    """(a temporary folder for files, the summary to be filled): both are moved to `folder` if the block succeeds.
+def results_of(folder: Path) -> Iterator[Path]:
+    """A temporary folder, whose files are moved to `folder` if the block succeeds: a run that fails changes nothing.
 
-    So a run that fails or is interrupted changes nothing. Raises SimulationError if the folder cannot be created or a
-    file cannot be written, naming it by its later place.
+    Raises SimulationError if the folder cannot be created or a file cannot be written.
     """
-    from SlicerUSSim.Logic.base.files import make_folder, move_into, partial_folder, write_json
+    from SlicerUSSim.Logic.base.files import make_folder, move_into, partial_folder
 
-    is_new = not folder.exists()
-    make_folder(folder)
-    content: dict = {}
-    try:
-        with partial_folder(folder, "cannot be written to") as partial:
-            try:
-                yield partial, content
-                files = sorted(file for file in partial.iterdir() if file.name != summary)
-                write_json(partial / summary, content)
-            except SimulationError as error:  # the user knows no temporary folder
-                raise SimulationError(str(error).replace(str(partial), str(folder))) from None
-            move_into(folder, [*files, partial / summary])
-    except BaseException:
-        if is_new:
-            with suppress(OSError):  # not empty
-                folder.rmdir()
-        raise
+    with partial_folder(make_folder(folder), "cannot be written to") as partial:
+        yield partial
+        move_into(folder, sorted(partial.iterdir()))
 
 
 def require_no_input(out: Path) -> None:
@@ -423,7 +384,7 @@ def _inputs() -> list[Path]:
     They are the values of its options and arguments that are text (outputs are Path objects), also behind a name, as in
     tumour=FILE.
     """
-    from SlicerUSSim.Logic.mri.kept_mask import mask_beside
+    from SlicerUSSim.Logic.base.files import mask_beside
     from SlicerUSSim.Logic.tissue.table import tissues_beside
 
     params = click.get_current_context().params

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -155,12 +156,10 @@ def open_examination(
     log = logging.getLogger(__name__)
     preset = patient.changed_preset()
     require_no_sequence(patient.mri_or_labels)
+    _import_nibabel()
     volume = Volume.read(patient.mri_or_labels)
-    chosen = patient.segmentation
-    is_ct = patient.is_ct
     craniotomy = Craniotomy.of(patient.craniotomy)
-    path, is_labels = patient.mri_or_labels, False if is_ct else patient.is_labels
-    require(not (is_ct and patient.is_labels), f"{path}: --labels and --ct are given, expected one of them")
+    path, is_labels = patient.mri_or_labels, False if patient.is_ct else patient.is_labels
     if is_labels is None:
         is_labels = is_label_file(Path(path), volume)
         kinds = ("a label map", "--mri") if is_labels else ("an MRI, to be segmented", "--labels")
@@ -171,8 +170,10 @@ def open_examination(
         require_no_mri_options(path, "leave it out, or use --mri if it is one")
     else:
         require_no_map(path, patient.maps, patient.organs)
-        craniotomy.require_head(volume, patient)
+        patient = patient.for_image(volume)
+        craniotomy.require_head(patient)
     also_files(patient.also)
+    chosen, is_ct = patient.segmentation, patient.is_ct
     if chosen.outside and not is_ct:
         from SlicerUSSim.Logic.mri.outside import require_findable  # labels alone do not wait for it
 
@@ -193,24 +194,38 @@ def open_examination(
     log.info("tissues: %s", patient.tissues or ("the preset's" if patient.preset else "presets of the brain"))
     tissues = preset.tissues if table is None else table
     additions = Additions.read(patient.additions, (tissue.name for tissue in tissues.all_tissues()))
-    if table is None:  # the tissues are not known before the segmentation
-        changes.check_tissues((*(tissue.name for tissue in tissues.all_tissues()), *TISSUES))
-    else:
-        changes.to_tissues(additions.with_presets(tissues))
+    changes.check_tissues((*(tissue.name for tissue in tissues.all_tissues()), *TISSUES))
     segmentation = segmented_file(path, volume, patient)
     labels, names, surfels = segmentation.labels, segmentation.tissue_names, sheets.read
     if isinstance(segmentation, Segmentation):
         surfels, labels, names = sheets.found(path, volume, segmentation, patient.contrast)
-    if table is not None:
-        of_brain = segmentation.brain_names if isinstance(segmentation, Segmentation) else segmentation.tissue_names
-        labels, names = _numbered_as(tissues, labels, names, len(of_brain), patient.tissues or "tissues")
     added = additions.on(labels, names, has_brain_mask=not is_ct)
-    known = tissues
-    tissues = tissues.for_names(added.tissue_names) if table is None else added.table(tissues)
+    known, tissues = tissues, tissues.for_names(added.tissue_names)
+    if table is not None:
+        found = set(table.names()) & set(tissues.names())
+        expected = f"expected tissues called {', '.join(added.tissue_names)}"
+        require(bool(found - {"coupling"}), f"{patient.tissues}: has none of the patient's tissues, {expected}")
     tissues = with_their_tissue(tissues, surfels, known)
     texture = texture_below(segmentation.texture(), volume, segmentation.labels, added.labels)
     tissues = changes.to_tissues(tissues)
     return _placed(patient, craniotomy, preset, added, labels, pose, tissues, texture, surfels, one_image)
+
+
+def _import_nibabel() -> None:
+    """Import nibabel without pydicom, which it looks for to read an extension of NIfTI that is not used here.
+
+    pydicom imports its network libraries and decoders, a fifth of the time of a command. While it is hidden no other
+    thread may import it.
+    """
+    import sys
+
+    if "pydicom" in sys.modules or importlib.util.find_spec("nibabel") is None:
+        return
+    sys.modules["pydicom"] = None  # type: ignore[assignment]
+    try:
+        import nibabel  # noqa: F401
+    finally:
+        del sys.modules["pydicom"]
 
 
 def _placed(
@@ -241,13 +256,18 @@ def _placed(
         if pose == AUTO and not set(names) & {*BRAIN_TISSUES, "brain"}:
             note("--pose is auto, and no tissue of a brain is labelled: the probe stands on top of what is")
         if at is not None and pose == AUTO:
+            from SlicerUSSim.Logic.placement.aiming import opening_pose
+
             pose, line = opening_pose(labels, names, probe, at, target)
-        elif at is not None:
-            pose, line = opened_view_pose(labels, names, pose)
         elif pose == AUTO:
             pose = default_pose(labels, names, probe, is_open=is_open, target_ras=target)
         else:
-            pose, line = view_pose(labels, names, pose, is_open=is_open)
+            from SlicerUSSim.Logic.placement.views import opened_view_pose, view_pose
+
+            if at is None:
+                pose, line = view_pose(labels, names, pose, is_open=is_open)
+            else:
+                pose, line = opened_view_pose(labels, names, pose)
         if line:
             note(f"probe: {line}")
     if at is None:
@@ -284,10 +304,6 @@ def open_examination_at(
 
     is_chosen = pose == AUTO or pose in STANDARD_VIEWS
     require(
-        not is_chosen or not patient.is_ct,
-        f"--pose is {pose}, which is on a head, and the image is a CT (--ct), expected a file with the pose",
-    )
-    require(
         is_chosen or (pose != "" and Path(pose).exists()),
         f"--pose is {pose!r} (no such file), expected a file with the pose (.json, .txt, .tfm, .h5), {AUTO}, "
         f"or a view: {_VIEWS}",
@@ -318,38 +334,3 @@ def _labelled(
     for warning in found.warnings:
         log.warning("%s", warning)
     return found.labels, found.tissues
-
-
-def _numbered_as(
-    table: TissueTable, labels: Volume, names: Sequence[str], classes: int, source: str
-) -> tuple[Volume, tuple[str, ...]]:
-    """(labels, names of all) of a segmentation whose classes, the first labels, are those of a table (--tissues).
-
-    What was found besides them has its number from the table, if a tissue is called so there, or one after all of it.
-    Raises SimulationError for a table that lacks a class, or has another class under its number, and one without room.
-    """
-    import numpy as np
-
-    from SlicerUSSim.Logic.tissue.names import same_name
-    from SlicerUSSim.Logic.tissue.table import MAX_LABEL
-
-    numbered = list(table.names_by_label())
-    expected = ", ".join(f"{number} {name}" for number, name in enumerate(names[:classes], 1))
-    for number, name in enumerate(names[:classes], 1):
-        there = numbered[number - 1] if number <= len(numbered) else ""
-        is_used = bool((labels.array == number).any())
-        require(there or not is_used, f"{source}: has no label {number}, which is {name} here, expected {expected}")
-        others = [other for other in names[:classes] if other != name]
-        require(
-            not any(same_name(there, other) for other in others),
-            f"{source}: label {number} is {there}, and it is {name} here, expected {expected}",
-        )
-    others = list(dict.fromkeys(name for name in names[classes:] if name not in numbered))
-    numbered += [""] * (classes - len(numbered)) + others
-    require(
-        len(numbered) <= MAX_LABEL,
-        f"{source}: has labels up to {len(numbered) - len(others)}, which leaves no room for {', '.join(others)}, "
-        f"expected at most {MAX_LABEL} in all",
-    )
-    numbers = [*range(classes + 1), *(numbered.index(name) + 1 for name in names[classes:])]
-    return labels.with_array(np.asarray(numbers, np.uint8)[labels.array]), tuple(numbered)

@@ -38,8 +38,8 @@ def split_seeds(texts: Iterable[str]) -> list[tuple[tuple[float, ...], str | Non
         points = _points_of(place)
         require(
             bool(points) and ("=" not in text or bool(tissue.strip())),
-            f"--seed is {text!r}, expected R,A,S in mm, such as 31.5,-20,42, or points of 3D Slicer "
-            f"(.mrk.json), and with a tissue 31.5,-20,42=oedema{_if_mask(place)}",
+            f"--seed is {text!r}, expected R,A,S in mm, such as 31.5,-20,42, or points of 3D Slicer (.mrk.json), and "
+            "with a tissue 31.5,-20,42=oedema; a mask is laid over the labels with --add tumour=FILE",
         )
         if tissue:
             from SlicerUSSim.Logic.base.errors import about_file
@@ -49,13 +49,6 @@ def split_seeds(texts: Iterable[str]) -> list[tuple[tuple[float, ...], str | Non
                 tissue = lesion_tissue(tissue.strip())
         seeds += [(point, tissue or None) for point in points]
     return seeds
-
-
-def _if_mask(place: str) -> str:
-    """What to do with a file that is no list of points, as a mask or a segmentation; "" for another text."""
-    if not Path(place).is_file():
-        return ""
-    return "; a mask, as a segment of 3D Slicer, is not grown but laid over the labels with --add tumour=FILE"
 
 
 def _points_of(place: str) -> list[tuple[float, ...]]:

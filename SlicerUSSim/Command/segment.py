@@ -20,7 +20,7 @@ from SlicerUSSim.Command.seeds import (
     split_seeds,
     write_lesions,
 )
-from SlicerUSSim.Command.sheet_options import require_sheets, sheet_kind_option, sheets_option, write_sheets
+from SlicerUSSim.Command.sheet_options import require_sheets, sheets_option, write_sheets
 from SlicerUSSim.Logic.base.errors import SimulationError, require
 
 
@@ -30,30 +30,29 @@ from SlicerUSSim.Logic.base.errors import SimulationError, require
 @out_option("Label map; the tissue table is written to a .json file of the same name.")
 @seed_option
 @sheets_option
-@sheet_kind_option
 @overwrite_option
-def segment(
-    mri: str, patient: MriOptions, out: Path, seeds: tuple[str, ...], sheets: Path | None, sheet_kinds: tuple[str, ...]
-) -> None:
-    """Segment an MRI of a head or a brain, or a CT (--ct), into tissues."""
+def segment(mri: str, patient: MriOptions, out: Path, seeds: tuple[str, ...], sheets: Path | None) -> None:
+    """Segment an MRI of a head or a brain, or a CT, into tissues."""
     from SlicerUSSim.Logic.base.volume import require_image_name
     from SlicerUSSim.Logic.mri.modality import has_brain_mask
     from SlicerUSSim.Logic.mri.outside import require_findable
     from SlicerUSSim.Logic.mri.segmentation import Segmentation
     from SlicerUSSim.Logic.tissue.table import TissueTable, tissues_beside, write_label_files
 
-    settings, mask = patient.segmentation, patient.mask
     for change in patient.changes:
         raise SimulationError(f"--set {change}: no image is simulated, expected a key of segmentation")
     require_image_name(out)
-    check_outputs(out, tissues_beside(out))
-    if settings.outside and not patient.is_ct:
-        require_findable(settings.contrast, settings.skull_strip, mask is not None)
-    require_sheets(sheets, sheet_kinds, settings.contrast)
+    check_outputs(out, tissues_beside(out), sheets)
     also_files(patient.also)
     split_seeds(seeds)
     masks = Additions.read(patient.additions)
-    volume = read_mri(mri, mask=mask, skull_strip=settings.skull_strip, contrast=settings.contrast)
+    volume = read_mri(mri, patient)
+    patient = patient.for_image(volume)
+    settings = patient.segmentation
+    if settings.outside and not patient.is_ct:
+        require_findable(settings.contrast, settings.skull_strip, patient.mask is not None)
+    if sheets is not None:
+        require_sheets(sheets, settings.contrast)
     if seeds:
         require(has_brain_mask(settings.contrast), "--seed grows lesions of an MRI, and this is a CT")
         require_seeds(seeds, volume, out)
@@ -63,7 +62,7 @@ def segment(
     lesions, refused = grown_at(result, seeds) if isinstance(result, Segmentation) else ([], [])
     labels, names = result.labels, result.tissue_names
     if sheets is not None and isinstance(result, Segmentation):
-        labels, names = write_sheets(sheets, mri, volume, result, settings.contrast, sheet_kinds)
+        labels, names = write_sheets(sheets, mri, volume, result, settings.contrast)
     added = masks.on(labels, names, has_brain_mask=has_brain_mask(settings.contrast))
     beside = write_label_files(out, added.labels, TissueTable.brain().for_names(added.tissue_names))
     click.echo(replace(result, labels=added.labels, tissue_names=added.tissue_names).table())

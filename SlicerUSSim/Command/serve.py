@@ -6,7 +6,6 @@ import importlib.util
 import os
 import sys
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,7 +17,6 @@ from SlicerUSSim.Command.interrupts import end_at_once
 from SlicerUSSim.Command.mri_options import NONE, ImageOptions, also_files, read_mri
 from SlicerUSSim.Command.options import declared, gathered, given_options, require_no_mri_options
 from SlicerUSSim.Command.patient_options import RARE
-from SlicerUSSim.Command.progress import note
 from SlicerUSSim.Command.sequence_options import TrackingOptions, read_sequence, read_to_mri
 from SlicerUSSim.Command.set_option import Changes
 from SlicerUSSim.Command.sheet_options import AUTO, DrawnSheets
@@ -34,6 +32,7 @@ _PORT = 8080
 #: Parameters that are about a patient, his ultrasound or settings
 _OF_PATIENT = (
     "labels", "maps", "sequence", "calibration", "to_mri", "preset", "outside", "mask", "also", "additions", "organs",
+    "craniotomy",
 )  # fmt: skip
 #: Suffixes of files that are no images, and that the page opens
 _TEXTS = (".json", ".vtp", ".tfm", ".h5", ".hdf5", ".mat", ".xfm", ".xml", ".tag", ".txt")
@@ -84,12 +83,14 @@ def serve(patient: ServeOptions, recording: TrackingOptions) -> None:
 
     The file is an MRI, or what the page opens, by its content: a scene (.mrb), tracked ultrasound, a preset, ...
     """
+    from SlicerUSSim.Logic.base.volume import Volume
+
     _require_workstation()
     scene, scene_name, also_open, mri = None, "", None, patient.mri
     if mri is not None and _is_no_image(mri):
         (scene, scene_name), also_open, mri = _opened_first(mri, given_options(*_OF_PATIENT))
     added = split_additions(patient.additions)
-    others = also_files(patient.also, mri)
+    others = also_files(patient.also)
     require(len(others) < 2, f"--also is given {len(others)} times, expected one further MRI in the workstation")
     own = (mri, patient.labels, patient.mask, patient.organs)
     files = [file for file in (*own, *(file for _, file in added), *others.values()) if file is not None]
@@ -104,32 +105,27 @@ def serve(patient: ServeOptions, recording: TrackingOptions) -> None:
         LabelMapping.of(patient.maps)
     if patient.labels is not None and mri is None:
         require_no_mri_options(patient.labels, "give an MRI, too, to segment it")
+    volumes = {}
+    if mri is not None:
+        volumes[mri] = Volume.read(mri) if patient.labels is not None else read_mri(mri, patient, is_served=True)
+        patient = patient.for_image(volumes[mri])
     chosen, is_ct, has_mask = patient.segmentation, patient.is_ct, patient.mask is not None
     require(
-        mri is not None or not is_ct,
-        "the contrast is ct (--ct), expected a CT; without a file the demo brain is shown, an MRI",
+        mri is not None or not is_ct, "--contrast is ct, expected a CT; without a file the demo brain is shown, an MRI"
     )
     if chosen.outside and not is_ct:
         from SlicerUSSim.Logic.mri.outside import require_findable
 
         require_findable(patient.contrast, chosen.skull_strip, has_mask)
         require(mri is not None, "--outside is for a whole head, expected an MRI of one; the demo brain has no head")
-    require(patient.organs is None or is_ct, "--organs is for a CT, expected --ct too")
+    require(patient.organs is None or is_ct, "--organs is for a CT, expected one; if this is one, give --contrast ct")
     drawn = DrawnSheets.of(
         patient.sheets, patient.no_sheets, is_labels=patient.labels is not None, contrast=patient.contrast
     )
-    more = {"mask": patient.mask, "skull_strip": chosen.skull_strip, "contrast": patient.contrast}
-    read_head = partial(read_mri, is_served=True, **more)
     opening = Craniotomy.of(patient.craniotomy)
     if opening.is_wanted and patient.labels is None:
-        require(
-            scene is None and also_open is None,
-            f"--craniotomy is {patient.craniotomy}, which opens the skull in the MRI of a head, and the file is none",
-        )
-        opening.require_head(None if mri is None or chosen.outside else read_head(mri), patient)
-    if opening.is_file:
-        _require_opening(opening.source)
-    require(not (is_ct and others), "--also is for an MRI, and the contrast is ct (--ct); leave it out")
+        opening.require_head(patient)
+    require(not (is_ct and others), "--also is for an MRI, and this is a CT; leave it out")
     if patient.igtl is not None:
         from SlicerUSSim.Logic.tracked.openigtlink import parse_address, require_usable
 
@@ -137,19 +133,13 @@ def serve(patient: ServeOptions, recording: TrackingOptions) -> None:
     tls = _tls(patient.cert, patient.key)
     port = _usable_port(patient.host, patient.port)
 
-    from SlicerUSSim.Logic.base.volume import Volume
     from SlicerUSSim.Logic.imaging.preset import Preset
     from SlicerUSSim.Logic.mri.masks import with_label_names
     from SlicerUSSim.Logic.opencl.devices import choose_device
 
     choose_device(patient.device)
-    volumes = {file: Volume.read(file) for file in files if file != mri or patient.labels is not None}
-    if mri is not None and patient.labels is None:
-        volumes[mri] = read_head(mri)
+    volumes |= {file: Volume.read(file) for file in files if file != mri}
     checked = Additions.of((tissue, with_label_names(volumes[file], file), file) for tissue, file in added)
-    if patient.labels is not None and mri is not None and (has_mask or others):
-        what = " and ".join([*["--mask"] * has_mask, *["--also"] * bool(others)])
-        note(f"{what}: for Segment in the page; the labels shown are those of {patient.labels}")
     masks = tuple((tissue, file) for (tissue, _, _), (_, file) in zip(checked.masks, added, strict=True))
     chosen_preset = Preset.read(patient.preset) if patient.preset else None
     if patient.changes:
@@ -210,18 +200,6 @@ def _opened_first(path: str, options: list[str]) -> tuple[tuple[SceneRecord | No
     require(not options, f"{path} is a scene, which has a patient and settings, expected no {', '.join(options)}")
     _prepare_libraries()
     return (read_scene(path), Path(path).name), None, None
-
-
-def _require_opening(path: str) -> None:
-    """Raise SimulationError for a file of --craniotomy that is neither a mask nor a polygon."""
-    from SlicerUSSim.Logic.mri.markups import is_markup_name
-    from SlicerUSSim.Logic.mri.masks import read_mask
-    from SlicerUSSim.Logic.placement.craniotomy import is_open, polygon_of_file
-
-    if is_markup_name(path):
-        polygon_of_file(path)
-    else:
-        is_open(read_mask(path), path)
 
 
 def _require_workstation() -> None:

@@ -124,6 +124,9 @@ def _hint(name: str, section: str, of_preset: dict[str, Parameter], of_tissue: d
     if own:
         return either(get_close_matches(name, own, n=3) or own)
     everything = [*of_preset, *(f"{tissue}.{known}" for tissue in TISSUES for known in of_tissue)]
-    same = [known for known in everything if known.rpartition(".")[2] == attribute]
+    last = {known: known.rpartition(".")[2] for known in everything}
+    parts = dict.fromkeys(last.values())
+    near = [part for part in parts if attribute in part] or get_close_matches(attribute, parts, n=3)
+    same = [known for name in near for known in everything if last[known] == name]
     sections = list(dict.fromkeys(known.partition(".")[0] for known in of_preset))
-    return either(same[:3] or get_close_matches(name, everything, n=3) or [*sections, "a tissue"])
+    return either(same[:3] or [*sections, "a tissue"])

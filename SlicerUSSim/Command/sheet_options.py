@@ -1,4 +1,4 @@
-"""--sheets, --sheet and no_sheets: thin sheets and small structures found after a segmentation, and in images."""
+"""--sheets and no_sheets: thin sheets and small structures found after a segmentation, and in images."""
 
 from __future__ import annotations
 
@@ -22,11 +22,6 @@ sheets_option = click.option(
     "--sheets", type=click.Path(path_type=Path), metavar="FILE",
     help="Also find sulci, falx, tentorium and walls of ventricles as surfaces and write them to FILE, a .vtp "
     "for Slicer; corpus callosum, choroid plexus and vessels are laid over the labels. T1, T1 with contrast, or T2.",
-)  # fmt: skip
-sheet_kind_option = click.option(
-    "--sheet", "sheet_kinds", multiple=True, metavar="KIND",
-    help="What --sheets looks for: sulcus, falx, tentorium, ependyma, corpus callosum, choroid plexus or vessels; may "
-    "be repeated (default: all).",
 )  # fmt: skip
 #: Value of --sheets that is no file, as NONE
 AUTO = "auto"
@@ -77,38 +72,32 @@ class DrawnSheets:
         return _searched(mri_path, mri, segmentation, contrast, self.kinds)
 
 
-def require_sheets(path: Path | None, kinds: tuple[str, ...], contrast: str) -> None:
-    """Raise SimulationError, before anything slow, for values of --sheets and --sheet that cannot be met."""
-    require(path is not None or not kinds, "--sheet chooses what --sheets FILE looks for; give --sheets, too")
-    if path is None:
-        return
-    from SlicerUSSim.Command.options import check_outputs
+def require_sheets(path: Path, contrast: str) -> None:
+    """Raise SimulationError, before anything slow, for a file of --sheets of another kind, or another contrast."""
     from SlicerUSSim.Logic.mri.sheets.finding import require_findable
     from SlicerUSSim.Logic.mri.sheets.polydata import require_surfel_file
 
-    require_findable(kinds, contrast)
+    require_findable((), contrast)
     require_surfel_file(path)
-    check_outputs(path)
 
 
 def write_sheets(
-    path: Path, mri_path: str, mri: Volume, found: Segmentation, contrast: str, kinds: tuple[str, ...]
+    path: Path, mri_path: str, mri: Volume, found: Segmentation, contrast: str
 ) -> tuple[Volume, tuple[str, ...]]:
     """Find the sheets of a segmented MRI and write them; returns the labels and names with the structures on top."""
     from SlicerUSSim.Logic.mri.sheets.finding import ALL_KINDS
     from SlicerUSSim.Logic.mri.sheets.polydata import write_surfels
 
-    wanted = kinds or ALL_KINDS
-    surfels, labels, names = _searched(mri_path, mri, found, contrast, wanted, wanted)
+    surfels, labels, names = _searched(mri_path, mri, found, contrast, ALL_KINDS)
     write_surfels(path, surfels)
     note(f"wrote {path}")
     return labels, names
 
 
 def _searched(
-    mri_path: str, mri: Volume, found: Segmentation, contrast: str, shown: Sequence[str], wanted: Sequence[str] = ()
+    mri_path: str, mri: Volume, found: Segmentation, contrast: str, shown: Sequence[str]
 ) -> tuple[Surfels, Volume, tuple[str, ...]]:
-    """(Sheets, labels, names) of the kinds `shown` of those that are `wanted`, all by default; with notes on them."""
+    """(Sheets, labels, names) of the kinds `shown` of all; with notes on them."""
     from SlicerUSSim.Logic.base.errors import about_file
     from SlicerUSSim.Logic.mri.pathology import add_tissues
     from SlicerUSSim.Logic.mri.sheets.finding import ALL_KINDS, find_sheets
@@ -117,7 +106,7 @@ def _searched(
 
     with Share("sheets") as progress, about_file(mri_path):
         sheets = find_sheets(
-            mri, found, contrast=contrast, kinds=wanted or ALL_KINDS, keep_at=sheets_beside(mri_path), progress=progress
+            mri, found, contrast=contrast, kinds=ALL_KINDS, keep_at=sheets_beside(mri_path), progress=progress
         )
     for line in sheets.notes:
         if not line.startswith(tuple(f"{kind}:" for kind in ALL_KINDS if kind not in shown)):

@@ -6,6 +6,7 @@ presenters of all subjects have in common.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Collection, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
@@ -170,6 +171,24 @@ class PanelView(Protocol):
         ...
 
 
+#: Options of the command in messages, and what a panel has for them
+_IN_PANEL = (
+    (r" ?\((?:--|ussim )[^()]*\)", ""),
+    (r"--map (\d+)=TISSUE", r"the name of a tissue for \1 in its colour table"),
+    (r"--map [^\s=]+=(?:'[^']*'|\S+)(?: --map [^\s=]+=(?:'[^']*'|\S+))*", "names of its tissues"),
+    (r"--map (\S+)", r"names of \1"), (r"--add [^\s,;]+", "Add to tissues"), (r"--skull-strip", "Brain extraction"),
+    (r"--contrast", "Contrast"), (r"--mask", "Mask"), (r"--organs", "Organs of a CT"),
+    (r"--outside", "Label what is outside the brain"), (r"--craniotomy", "Open skull"),
+)  # fmt: skip
+
+
+def in_panel(message: str) -> str:
+    """A message with the names of controls in place of the command's options."""
+    for option, control in _IN_PANEL:
+        message = re.sub(option, control, message)
+    return message
+
+
 class PanelHost:
     """What the presenters of all subjects share: the scene's logic, the view, and the work under way."""
 
@@ -215,7 +234,7 @@ class PanelHost:
             if message is None:
                 raise
             if not isinstance(error, Cancelled):
-                self.view.showError(message)
+                self.view.showError(in_panel(message))
             self.view.refresh()
 
     @contextmanager

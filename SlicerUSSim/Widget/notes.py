@@ -7,7 +7,7 @@ from typing import Any
 
 from SlicerUSSim.Logic.base.errors import SimulationError
 from SlicerUSSim.Logic.mri.segmentation_settings import GEL_MM
-from SlicerUSSim.Widget.interface import PanelHost
+from SlicerUSSim.Widget.interface import PanelHost, in_panel
 
 #: Begin of the lines that a user should check
 _CHECK = "Check: "
@@ -30,7 +30,7 @@ class Notes:
     def text(self) -> str:
         """All lines, with those that follow from the present choices."""
         self._about_probe = self._found_about_probe()
-        return "\n".join([*self._lines, *self._gel(), *self._about_probe])
+        return in_panel("\n".join([*self._lines, *self._gel(), *self._about_probe]))
 
     @property
     def lines(self) -> tuple[str, ...]:

@@ -12,7 +12,7 @@ from SlicerUSSim.Logic.base.errors import SimulationError
 from SlicerUSSim.Logic.base.files import read_json
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.imaging.preset import SECTIONS
-from SlicerUSSim.Logic.mri.ct_unit import looks_like_ct
+from SlicerUSSim.Logic.mri.ct_unit import why_ct
 from SlicerUSSim.Logic.mri.markups import is_markup_name
 from SlicerUSSim.Logic.mri.recognition import stripped_brain
 from SlicerUSSim.Logic.tissue.label_files import TABLE_SUFFIXES, names_of_file
@@ -88,8 +88,9 @@ def of_volume(path: Path, volume: Volume) -> Content:
     size = f"{volume.size_text} voxels of {'x'.join(f'{mm:.3g}' for mm in volume.spacing_mm)} mm"
     if is_label_file(path, volume):
         return _of_labels(path, volume, size)
-    if looks_like_ct(volume):
-        return Content(Kind.CT, f"a CT by its numbers (air near -1000), {size}", volume)
+    why = why_ct(volume)
+    if why is not None:
+        return Content(Kind.CT, f"a CT ({why}), {size}", volume)
     if stripped_brain(volume) is not None:
         return Content(Kind.MRI, f"an MRI of a brain without skull, {size}", volume)
     return Content(Kind.MRI, f"an MRI of a whole head, {size}", volume)

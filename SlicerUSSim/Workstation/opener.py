@@ -17,11 +17,10 @@ from typing import Any
 import numpy as np
 
 from SlicerUSSim.Logic.base.errors import Cancelled, SimulationError, require
-from SlicerUSSim.Logic.base.files import read_json
+from SlicerUSSim.Logic.base.files import mask_beside, read_json
 from SlicerUSSim.Logic.base.reading import untrusted_folder
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.imaging.preset import Preset
-from SlicerUSSim.Logic.mri.kept_mask import mask_beside
 from SlicerUSSim.Logic.mri.markups import is_markup_name
 from SlicerUSSim.Logic.mri.masks import with_label_names
 from SlicerUSSim.Logic.mri.samples import demo_mri

@@ -22,7 +22,7 @@ from SlicerUSSim.Logic.base.image_files import (
     require_voxels,
 )
 from SlicerUSSim.Logic.base.reading import in_child, reader
-from SlicerUSSim.Logic.base.segments import Segment, flattened, is_meaningful
+from SlicerUSSim.Logic.base.segments import Segment, flattened, is_meaningful, ranked_codes
 from SlicerUSSim.Logic.base.transforms import LPS_TO_RAS
 
 _log = logging.getLogger(__name__)
@@ -267,7 +267,8 @@ def _read_files(path: Path, files: Sequence[str]) -> ImageFile:
         channels = int(first.get("SamplesPerPixel") or 1)
         require(channels == 1, f"{path}: has {channels} components per voxel, expected 1; export it in grey levels")
         try:
-            return _frames(path, first) if frames > 1 else _stack(path, files, datasets)
+            found = _frames(path, first) if frames > 1 else _stack(path, files, datasets)
+            return replace(found, modality=str(first.get("Modality") or ""))
         except (ValueError, RuntimeError, AttributeError) as error:  # what highdicom refuses
             raise SimulationError(f"{path}: is not one volume ({str(error).splitlines()[0]})") from None
 
@@ -394,7 +395,12 @@ def _segments(path: Path, dataset: Any) -> ImageFile:
             segment_numbers=[number], combine_segments=False, allow_missing_positions=True, dtype=np.float32
         )
         layers.append((np.asarray(volume.array)[..., 0] > 0.5).astype(np.uint8))
-        found.append(Segment(name if is_meaningful(name) else kind.meaning, place, 1, int(number), (kind.value,)))
+        codes = ranked_codes(
+            described.segmented_property_category.value, kind.value,
+            _first_code(kind, "SegmentedPropertyTypeModifierCodeSequence"),
+            _first_code(described, "AnatomicRegionSequence"),
+        )  # fmt: skip
+        found.append(Segment(name if is_meaningful(name) else kind.meaning, place, 1, int(number), codes))
     require(volume is not None, f"{path}: has no segments")
     voxel_ml = float(abs(np.linalg.det(volume.affine[:3, :3])) / 1000.0)  # type: ignore[union-attr]
     if len(layers[0]) == 1:  # the slice beside it has no segment
@@ -403,6 +409,11 @@ def _segments(path: Path, dataset: Any) -> ImageFile:
     codes = {one.label: one.codes for one in found}
     names = {one.label: one.name for one in found}
     return replace(_image(labels, volume.affine), label_names=names, label_codes=codes)  # type: ignore[union-attr]
+
+
+def _first_code(item: Any, sequence: str) -> str:
+    """The value of the first code in a sequence; "" without."""
+    return str(item[sequence][0].CodeValue) if item.get(sequence) else ""
 
 
 def _image(array: np.ndarray, affine: np.ndarray) -> ImageFile:

@@ -22,6 +22,23 @@ from SlicerUSSim.Logic.base.errors import SimulationError, require, require_path
 _DEEPEST_NESTING = 16
 #: Beginning of the names of folders for what is not complete yet
 _PARTIAL = ".ussim-"
+#: Endings of images that names of files beside them leave out
+_IMAGES = (".nii.gz", ".nii", ".nrrd", ".nhdr", ".mha", ".mhd", ".mnc", ".vti", ".dcm", ".mgz", ".img", ".hdr")
+
+
+def mask_beside(mri_path: str | Path) -> Path:
+    """The file of an MRI's brain mask: head.nii.gz has head.brain-mask.nrrd, a DICOM folder the same beside it."""
+    return named_beside(mri_path, "brain-mask.nrrd")
+
+
+def named_beside(mri_path: str | Path, ending: str) -> Path:
+    """The file beside an MRI's that has its name and another ending."""
+    path = Path(mri_path)
+    if path.is_dir():
+        path = path.resolve()  # "." has no name
+    name = path.name
+    suffix = next((end for end in _IMAGES if not path.is_dir() and name.lower().endswith(end)), "")
+    return path.with_name(f"{name[: len(name) - len(suffix)]}.{ending}")
 
 
 def require_place(path: Path) -> None:

@@ -82,6 +82,8 @@ class ImageFile:
     label_codes: Mapping[int, tuple[str, ...]] = field(default_factory=dict)
     #: One line each, without the name of the file
     doubts: tuple[str, ...] = ()
+    #: Of DICOM: "CT", "MR", ...
+    modality: str = ""
 
 
 @reader
@@ -320,6 +322,23 @@ def _read_nifti(path: Path) -> ImageFile:
         _native(turned), matrices[used], has_components, spacings={"pixdim": tuple(pixdim.tolist())}, matrices=matrices,
         label_names=_label_table(image), doubts=tuple(doubts),
     )  # fmt: skip
+
+
+def add_label_table(path: Path, names: Mapping[int, str]) -> None:
+    """Add the names of labels to a NIfTI file, as _label_table reads them; without nibabel it stays as it is."""
+    if importlib.util.find_spec("nibabel") is None:
+        return
+    import nibabel
+    from nibabel.nifti1 import Nifti1Extension
+
+    root = ElementTree.Element("CaretExtension")
+    table = ElementTree.SubElement(ElementTree.SubElement(root, "VolumeInformation", Index="0"), "LabelTable")
+    for label, name in names.items():
+        ElementTree.SubElement(table, "Label", Key=str(label), Red="1", Green="1", Blue="1", Alpha="1").text = name
+    image = nibabel.Nifti1Image.from_bytes(content_of(path))
+    image.header.extensions.append(Nifti1Extension(0, ElementTree.tostring(root)))
+    content = image.to_bytes()
+    path.write_bytes(gzip.compress(content, mtime=0) if path.name.endswith(".gz") else content)
 
 
 def _label_table(image) -> dict[int, str]:

@@ -12,6 +12,9 @@ _SCALED, _BYTES = 0.25, 256
 #: share of equal neighbours and half of the distance of the others, by that of two by chance, are at least the second
 #: number. Labels of brains in voxels of 1 to 8 mm had 0.70 to 1, MRIs of 40 grey levels and more up to 0.58
 _FEW, _EQUAL_OR_FAR = 32, 0.65
+#: Relative difference of neighbours that are equal in spite of rounding, and their share in labels with fractions:
+#: 0.2 to 0.8 after linear and cubic interpolation, at most 0.12 in MRIs of 50 to 700 levels, treated alike
+_SAME, _UNIFORM = 1e-4, 0.17
 #: Ranges of numbers up to this wide are counted one by one, wider ones sorted
 _COUNTED = 1_000_000
 #: Voxels along each side of the part of a volume that is examined
@@ -63,11 +66,18 @@ def whole_numbers(array: np.ndarray) -> np.ndarray | None:
 
 
 def has_uniform_fractions(array: np.ndarray) -> bool:
-    """Whether these are few values with fractions, in uniform regions: labels to which something was added or done."""
+    """Whether these are fractions in uniform regions: labels that were scaled, shifted, interpolated or smoothed.
+
+    The two most frequent values do not count: an MRI or a CT has a background, and may have padding.
+    """
     if not np.issubdtype(array.dtype, np.floating):
         return False
     array = _without_repeats(array)
-    return 1 < len(np.unique(array[middle(array)])) <= _BYTES and _has_regions(array)
+    part = array[middle(array)]
+    values, counts = np.unique(part, return_counts=True)
+    inside = ~np.isin(part, values[np.argsort(counts)[-2:]])
+    first, second = np.concatenate([_pairs(part, inside, axis) for axis in range(3)], axis=1)
+    return first.size > 0 and float(np.isclose(first, second, rtol=_SAME, atol=0.0).mean()) >= _UNIFORM
 
 
 def middle(array: np.ndarray) -> tuple[slice, ...]:
@@ -96,7 +106,7 @@ def _has_regions(array: np.ndarray) -> bool:
 
 
 def _pairs(ranks: np.ndarray, inside: np.ndarray, axis: int) -> np.ndarray:
-    """(2, n) ranks of neighbours along an axis that are both inside."""
+    """(2, n) numbers of neighbours along an axis that are both inside."""
     first, second = (np.moveaxis(each, axis, 0) for each in (ranks, inside))
     both = second[:-1] & second[1:]
     return np.stack([first[:-1][both], first[1:][both]])

@@ -18,6 +18,8 @@ from SlicerUSSim.Logic.base.errors import require
 
 _log = logging.getLogger(__name__)
 
+#: SNOMED CT categories "Anatomical Structure" and "Tissue"
+_HEALTHY = ("123037004", "85756007")
 #: Names that programs give when the user gave none
 _MEANINGLESS = re.compile(r"(label|segment|region|class|colou?r|unnamed|\(none\)|n/?a)?[ _-]*\d*", re.IGNORECASE)
 
@@ -85,12 +87,21 @@ def flattened(layers: np.ndarray, segments: list[Segment], voxel_ml: float, name
 
 
 def codes_of_entry(entry: str) -> tuple[str, ...]:
-    """The SNOMED CT codes of an entry of 3D Slicer's terminologies: of the type's modifier, and of the type.
+    """The SNOMED CT codes of an entry of 3D Slicer's terminologies, as ranked_codes returns them.
 
-    An entry is context~category~type~modifier~..., each of them a scheme^code^meaning.
+    An entry is context~category~type~modifier~context~region~modifier, each of them a scheme^code^meaning.
     """
-    found = re.findall(r"SCT\^(\w+)\^", "~".join(entry.split("~")[2:4]))
-    return tuple(found[::-1])
+    parts = [re.match(r"SCT\^(\w+)\^", part) for part in (*entry.split("~"), *[""] * 7)]
+    category, kind, modifier, region = (part[1] if part else "" for part in (parts[1], parts[2], parts[3], parts[5]))
+    return ranked_codes(category, kind, modifier, region)
+
+
+def ranked_codes(category: str, kind: str, modifier: str, region: str) -> tuple[str, ...]:
+    """Codes of a segment, the most special first: of the type's modifier, of the type, and of the anatomic region.
+
+    The region counts for healthy tissue alone, as "white matter" of the type "brain": a mass in the liver is no liver.
+    """
+    return tuple(code for code in (modifier, kind, region if category in _HEALTHY else "") if code)
 
 
 def is_meaningful(name: str | None) -> bool:

@@ -6,6 +6,7 @@ import logging
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from itertools import permutations
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,7 @@ from SlicerUSSim.Logic.base.errors import require, require_path
 from SlicerUSSim.Logic.base.files import messages_withheld, written_whole
 from SlicerUSSim.Logic.base.image_files import (
     ImageFile,
+    add_label_table,
     axis_letters,
     checked_image,
     of_sitk,
@@ -49,6 +51,7 @@ class Volume:
     label_names : {label: name} of masks and label maps, where their file gives them; see mri.read_mask.
     label_codes : {label: SNOMED CT codes, the most special first}, likewise.
     doubts : what a user should check about its file, one line each, which read() has also logged.
+    modality : of a DICOM file, such as "CT" or "MR"; "" for another file.
 
     Raises SimulationError for an array that is not 3D or not numeric, and for a singular or non-affine matrix.
 
@@ -70,6 +73,7 @@ class Volume:
     label_names: Mapping[int, str] = field(default_factory=dict, compare=False)
     doubts: tuple[str, ...] = field(default=(), compare=False)
     label_codes: Mapping[int, tuple[str, ...]] = field(default_factory=dict, compare=False)
+    modality: str = field(default="", compare=False)
 
     def __post_init__(self) -> None:
         array = np.asarray(self.array)
@@ -123,11 +127,9 @@ class Volume:
 
         By default along R, A and S, so that results do not depend on the order of the voxels in a file.
         """
-        from scipy.optimize import linear_sum_assignment
-
         wanted = np.eye(3) if like is None else like.ijk_to_ras[:3, :3] / like.spacing_mm
         cosines = wanted.T @ self.ijk_to_ras[:3, :3] / self.spacing_mm
-        _, own = linear_sum_assignment(-np.abs(cosines))
+        own = max(permutations(range(3)), key=lambda order: np.abs(cosines[range(3), list(order)]).sum())
         ways = np.sign(cosines[range(3), own])
         array = self.array.T.transpose(own)
         to_own = np.eye(4)[:, [*own, 3]] * [*ways, 1.0]
@@ -177,7 +179,7 @@ class Volume:
                 f"{name}: has {array.shape[-1]} components per voxel, expected 1; save one of them, or a label map",
             )
             array = flattened(array, segments, float(abs(np.linalg.det(found.ijk_to_ras[:3, :3])) / 1000.0), name)
-        return cls(array, found.ijk_to_ras, name, found.label_names, found.doubts, found.label_codes)
+        return cls(array, found.ijk_to_ras, name, found.label_names, found.doubts, found.label_codes, found.modality)
 
     @classmethod
     def from_sitk(cls, image, name: str = "image") -> Volume:
@@ -199,7 +201,8 @@ class Volume:
     def write(self, path: str | os.PathLike, about: Mapping[str, str] | None = None) -> None:
         """Write the volume in the format of the suffix; on failure an existing file is kept.
 
-        `about` are further lines of its header, {key: text without line ends}, of NRRD, MetaImage and VTI.
+        `about` are further lines of its header, {key: text without line ends}, of NRRD, MetaImage and VTI. NIfTI has
+        the label names as Connectome Workbench and TotalSegmentator write them, if nibabel is installed.
         Raises SimulationError for an unknown suffix or if the file cannot be written.
         """
         path = Path(path)
@@ -222,6 +225,8 @@ class Volume:
                     is_kept = (written == wanted) | ~np.isfinite(wanted)  # of NIfTI, ITK reads NaN as 0
                     if not is_kept.all():
                         raise OSError("not all voxels are in the file; is the disk full?")
+                if is_nifti and self.label_names:
+                    add_label_table(partial, self.label_names)
 
     # ---- VTK ---------------------------------------------------------------------------------------------------
 

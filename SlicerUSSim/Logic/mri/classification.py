@@ -72,7 +72,7 @@ def class_names(contrasts: tuple[str, ...], classes: int | None) -> tuple[str, .
     """
     entry = parameter_of(SegmentationSettings, "contrast")
     contrasts = tuple(entry.checked("segmentation", contrast) for contrast in contrasts)
-    require(CT not in contrasts, "contrast is ct, and an MRI was expected; a CT is segmented by segment_ct (--ct)")
+    require(CT not in contrasts, "contrast is ct, expected that of an MRI; segment_ct and segment_image segment a CT")
     order = ORDERS[contrasts[0]] if len(contrasts) == 1 else range(len(TISSUES))
     names = tuple(TISSUES[n] for n in order)
     bright = next((_BRIGHT_NAMES[contrast] for contrast in contrasts if contrast in _BRIGHT_NAMES), None)

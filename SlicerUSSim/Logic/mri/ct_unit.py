@@ -1,4 +1,4 @@
-"""The unit of a CT: whether its numbers are Hounsfield units (air -1000, water 0), or lie above them."""
+"""What is a CT, and its unit: whether its numbers are Hounsfield units (air -1000, water 0), or lie above them."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import numpy as np
 
 from SlicerUSSim.Logic.base.errors import require
 from SlicerUSSim.Logic.base.volume import Volume
+from SlicerUSSim.Logic.mri.segmentation_settings import CT, SegmentationSettings
 
 #: Voxels that are looked at, about
 _SAMPLE = 2_000_000
@@ -34,14 +35,27 @@ def hounsfield_offset(ct: Volume) -> tuple[float, str | None]:
     require(
         float(np.mean(values < -50.0)) > 0.005 and float(np.mean(values == low)) < 0.01,
         f"values are from {low:g} to {high:g}, expected Hounsfield units (air -1000, water 0, bone 1000) that are not "
-        "cut off; for an MRI or labels leave --ct out, for a CT apply slope and intercept of its header",
+        "cut off; for an MRI give its contrast, for a CT apply slope and intercept of its header",
     )
     return 0.0, f"values are from {low:g} to {high:g} without air at -1000; they are taken for Hounsfield units"
 
 
-def looks_like_ct(volume: Volume) -> bool:
-    """Whether the numbers are a CT's in Hounsfield units, also with an offset; takes some 50 ms."""
-    return _offset_of(_sample(volume.array)) is not None
+def why_ct(image: Volume) -> str | None:
+    """What tells that an image is a CT: its DICOM modality, or else numbers in Hounsfield units, also with an offset.
+
+    None for another image. Takes some 50 ms.
+    """
+    if image.modality:
+        return "its DICOM modality is CT" if image.modality == "CT" else None
+    return "its values are Hounsfield units" if _offset_of(_sample(image.array)) is not None else None
+
+
+def settings_for(image: Volume, settings: SegmentationSettings) -> tuple[SegmentationSettings, str | None]:
+    """(the settings, with the contrast "ct" for what is a CT, a line that says so and why or None)."""
+    why = None if settings.contrast == CT else why_ct(image)
+    if why is None:
+        return settings, None
+    return SegmentationSettings.of(settings, contrast=CT), f"taken as a CT: {why}"
 
 
 def _offset_of(values: np.ndarray) -> float | None:

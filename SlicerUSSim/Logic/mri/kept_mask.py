@@ -19,22 +19,6 @@ _log = logging.getLogger(__name__)
 
 #: Entry of the file with the fingerprint of its MRI
 _MRI = "ussim_mri"
-_SUFFIXES = (".nii.gz", ".nii", ".nrrd", ".nhdr", ".mha", ".mhd", ".mnc", ".vti", ".dcm", ".mgz", ".img", ".hdr")
-
-
-def mask_beside(mri_path: str | Path) -> Path:
-    """The file of an MRI's brain mask: head.nii.gz has head.brain-mask.nrrd, a DICOM folder the same beside it."""
-    return named_beside(mri_path, "brain-mask.nrrd")
-
-
-def named_beside(mri_path: str | Path, ending: str) -> Path:
-    """The file beside an MRI's that has its name and another ending."""
-    path = Path(mri_path)
-    if path.is_dir():
-        path = path.resolve()  # "." has no name
-    name = path.name
-    suffix = next((end for end in _SUFFIXES if not path.is_dir() and name.lower().endswith(end)), "")
-    return path.with_name(f"{name[: len(name) - len(suffix)]}.{ending}")
 
 
 def read_kept(path: Path, mri: Volume) -> Volume | None:

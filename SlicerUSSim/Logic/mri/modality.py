@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from SlicerUSSim.Logic.base.errors import require
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.mri.ct import CtSegmentation, segment_ct
+from SlicerUSSim.Logic.mri.ct_unit import settings_for
 from SlicerUSSim.Logic.mri.segmentation import Segmentation, segment_mri
 from SlicerUSSim.Logic.mri.segmentation_settings import CT, SegmentationSettings
 from SlicerUSSim.Logic.opencl.device import DeviceChoice
@@ -27,19 +29,18 @@ def segment_image(
     progress: Callable[[float], None] | None = None,
     **values: Any,
 ) -> Segmentation | CtSegmentation:
-    """segment_ct of a CT (contrast "ct"), and segment_mri of an MRI, which alone has `others`.
+    """segment_ct of a CT, and segment_mri of an MRI, which alone has `others`.
 
-    `values` change those of `settings`. Raises SimulationError as they do, for other images beside a CT, and for organs
-    beside an MRI.
+    A CT is what settings_for recognises, with a note, or what has the contrast "ct". `values` change those of
+    `settings`. Raises SimulationError as they do, for other images beside a CT, and for organs beside an MRI.
     """
-    settings = SegmentationSettings.of(settings, **values)
+    settings, line = settings_for(image, SegmentationSettings.of(settings, **values))
     if settings.contrast == CT:
         names = " and ".join(others or ())
         require(not others, f"{names} cannot be classified together with a CT, expected the CT alone")
-        return segment_ct(image, settings, organs=organs, mask=mask, device=device, progress=progress)
-    require(
-        organs is None, f"organs are for a CT, and contrast is {settings.contrast}; a CT has the contrast ct (--ct)"
-    )
+        found = segment_ct(image, settings, organs=organs, mask=mask, device=device, progress=progress)
+        return found if line is None else replace(found, notes=(line, *found.notes))
+    require(organs is None, f"organs are for a CT, and contrast is {settings.contrast}; a CT has the contrast ct")
     return segment_mri(
         image, settings, others=others, mask=mask, keep_mask_at=keep_mask_at, device=device, progress=progress
     )

@@ -21,11 +21,10 @@ from SlicerUSSim.Logic.base.neighbourhood import distance_to
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.mri.coarse import largest_component
 from SlicerUSSim.Logic.mri.edges import areas_at_edges
+from SlicerUSSim.Logic.tissue.names import OUTSIDE
 
 #: Contrasts in which bone is known to be found
 CONTRASTS = ("t1", "t1gd")
-#: Tissues outside the brain, in the order of their labels
-OUTSIDE = ("skin", "scalp", "skull", "cancellous bone", "air")
 #: Air around the head: below this part of Otsu's threshold. Bone: below this part of the one beside the brain
 _AIR, _DARK = 0.35, 0.8
 #: Gaps of the head's outline that are closed: mouth, ears, sinuses

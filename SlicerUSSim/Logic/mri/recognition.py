@@ -12,7 +12,7 @@ from SlicerUSSim.Logic.base.errors import SimulationError, require, require_kind
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.mri.alignment import Alignment, align_template
 from SlicerUSSim.Logic.mri.coarse import largest_component
-from SlicerUSSim.Logic.mri.ct_unit import looks_like_ct
+from SlicerUSSim.Logic.mri.ct_unit import why_ct
 from SlicerUSSim.Logic.mri.edges import edge_value
 
 #: Volumes of a brain, millilitres: outside the first range a user should look, outside the second it is no brain.
@@ -53,13 +53,9 @@ def recognise(mri: Volume, progress: Callable[[float], None] | None = None) -> n
 
 
 def require_no_ct(mri: Volume) -> None:
-    """Raise SimulationError for an image with the numbers of a CT, also with an offset."""
-    low, high = float(mri.array.min()), float(mri.array.max())
-    require(
-        not looks_like_ct(mri),
-        f"image has values from {low:g} to {high:g}, as CT has (Hounsfield units, air and soft tissue 1000 apart), "
-        "expected an MRI; segment a CT with --ct (contrast ct)",
-    )
+    """Raise SimulationError for a CT."""
+    why = why_ct(mri)
+    require(why is None, f"the image is a CT ({why}), expected an MRI; segment_ct and segment_image segment a CT")
 
 
 def check_finite(mri: Volume, name: str = "MRI", remedy: str = "for example by 0 outside the head") -> None:

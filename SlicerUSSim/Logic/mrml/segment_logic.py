@@ -12,6 +12,7 @@ import numpy as np
 from SlicerUSSim.Logic.base.errors import require
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.mri.ct import CtSegmentation
+from SlicerUSSim.Logic.mri.ct_unit import settings_for
 from SlicerUSSim.Logic.mri.modality import has_brain_mask, segment_image
 from SlicerUSSim.Logic.mri.pathology import Added, add_tissues, texture_below
 from SlicerUSSim.Logic.mri.segmentation import Segmentation
@@ -82,11 +83,11 @@ class SegmentLogic:
         Raises SimulationError for a node with labels that were not made by this method, or edited since; `overwrite`
         replaces them nevertheless.
         """
-        settings = SegmentationSettings.of(settings, **values)
-        contrast, is_of_brain = settings.contrast, has_brain_mask(settings.contrast)
         require_node(labels_node, *LABEL_CLASSES, use="output of Segment")
         require(labels_node is not mri_node, f"input and output are both {named(mri_node)}, expected different nodes")
         mri = read_volume(mri_node, "MRI")
+        settings, line = settings_for(mri, SegmentationSettings.of(settings, **values))
+        contrast, is_of_brain = settings.contrast, has_brain_mask(settings.contrast)
         mask = None if mask_node is None else read_mask(mask_node, mri_node)
         require(
             mask_node is not labels_node, f"mask and output are both {named(labels_node)}, expected different nodes"
@@ -138,7 +139,8 @@ class SegmentLogic:
         if found is not None:
             write_sheets(sheets_node, found.surfels, mri_node)
         sheet_notes = () if found is None else found.notes
-        self.notes = (*result.notes, *sheet_notes, *result.table().splitlines(), *added.messages)
+        recognised = () if line is None else (line,)
+        self.notes = (*recognised, *result.notes, *sheet_notes, *result.table().splitlines(), *added.messages)
         self.warnings = (*result.warnings, *skipped, *added.warnings)
         return result
 

@@ -7,9 +7,9 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 
 from SlicerUSSim.Logic.base.volume import Volume
-from SlicerUSSim.Logic.mri.outside import OUTSIDE
 from SlicerUSSim.Logic.probe.arrays import Probe
 from SlicerUSSim.Logic.probe.poses import sample
+from SlicerUSSim.Logic.tissue.names import OUTSIDE
 from SlicerUSSim.Logic.tissue.tissue import Tissue
 
 #: Tissues of the skull, which an opening removes

@@ -17,11 +17,9 @@ from SlicerUSSim.Logic.base.neighbourhood import distance_to
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.mri.markups import is_markup_name, markup_points
 from SlicerUSSim.Logic.mri.masks import read_mask, several_segments
-from SlicerUSSim.Logic.mri.outside import OUTSIDE
 from SlicerUSSim.Logic.probe.arrays import Probe
 from SlicerUSSim.Logic.probe.poses import craniotomy_pose, sample
-from SlicerUSSim.Logic.probe.surface import PatientSurface
-from SlicerUSSim.Logic.tissue.names import labels_of
+from SlicerUSSim.Logic.tissue.names import OUTSIDE, labels_of
 
 _log = logging.getLogger(__name__)
 
@@ -184,6 +182,8 @@ def default_pose(
     ground = without_outside(labels, names) if is_open else labels
     pose = craniotomy_pose(ground, probe, target_ras=target_ras)
     if not is_open and "skin" in names:  # a face that is oblique to the skin would stand in the bone
+        from SlicerUSSim.Logic.probe.surface import PatientSurface  # a pose on a brain does not wait for VTK
+
         surface = PatientSurface(labels)
         return surface.slid(pose, surface.nearest(pose[:3, 3]))
     return pose

@@ -116,7 +116,7 @@ def turned(probe_to_ras: np.ndarray, *, rock_deg=0.0, tilt_deg=0.0, rotate_deg=0
     >>> round(float(turned(np.eye(4), tilt_deg=90)[2, 1]), 3)  # the axis points along +z
     1.0
     """
-    from scipy.spatial.transform import Rotation
+    from scipy.spatial.transform import Rotation  # not needed for an image
 
     motion = np.eye(4)
     motion[:3, :3] = Rotation.from_euler("ZXY", [rock_deg, tilt_deg, rotate_deg], degrees=True).as_matrix()

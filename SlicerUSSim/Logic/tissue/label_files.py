@@ -15,7 +15,7 @@ from pathlib import Path
 from SlicerUSSim.Logic.base.errors import SimulationError, require
 from SlicerUSSim.Logic.base.files import read_text
 from SlicerUSSim.Logic.base.reading import reader
-from SlicerUSSim.Logic.base.segments import is_meaningful
+from SlicerUSSim.Logic.base.segments import is_meaningful, ranked_codes
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.tissue.names import name_or_term
 
@@ -29,8 +29,8 @@ _SNAP = re.compile(r'\s*(\d+)\s[\d\s.]+"((?:[^"\\]|\\.)*)"\s*')
 _SEPARATED = re.compile(r'\s*"?\d+"?\s*([\t,;])')
 #: 24  CSF  60 60 60 0
 _PLAIN = re.compile(r"\s*(\d+)\s+(.*?)((?:\s+[\d.]+){3,8})?\s*")
-#: Columns of 3D Slicer's tables with codes, the most special first
-_CODES = ("TypeModifier_CodeValue", "Type_CodeValue")
+#: Columns of 3D Slicer's tables with codes, in the order of ranked_codes
+_CODES = tuple(f"{name}_CodeValue" for name in ("Category", "Type", "TypeModifier", "Region"))
 
 
 def names_of_file(path: Path, volume: Volume) -> tuple[dict[int, str], str]:
@@ -74,7 +74,8 @@ def read_names(path: Path) -> dict[int, str]:
         label, name, columns = _entry(line)
         if label is None and "CodeValue" in line:
             header = next(csv.reader([line]))
-        name = name_or_term(name, [columns[header.index(c)] for c in _CODES if c in header[: len(columns)]])
+        codes = [columns[header.index(column)] if column in header[: len(columns)] else "" for column in _CODES]
+        name = name_or_term(name, ranked_codes(*codes))
         if label is None or not is_meaningful(name):
             continue
         require(

@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
-from pathlib import PurePath
 
 import numpy as np
 
 from SlicerUSSim.Logic.base.errors import SimulationError
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.tissue.label_mapping import LabelMapping
-from SlicerUSSim.Logic.tissue.names import nearest_tissue, plain_name, same_name, tissue_named
+from SlicerUSSim.Logic.tissue.names import nearest_tissue, same_name, tissue_named
 from SlicerUSSim.Logic.tissue.presets import TISSUES
-from SlicerUSSim.Logic.tissue.schemes import OF_BODY, Scheme, nearest_scheme, schemes
+from SlicerUSSim.Logic.tissue.schemes import Scheme, recognised, schemes
 from SlicerUSSim.Logic.tissue.table import TissueTable
 from SlicerUSSim.Logic.tissue.tissue import Tissue
 
@@ -33,10 +32,6 @@ _NO_PATIENT = (
 UNNAMED = "label map"
 #: Tissues of a lesion, which alone are no patient
 _LESIONS = ("tumour", "oedema", "necrosis", "cyst", "cavity", "enhancing")
-#: Centres nearer to each other tell nothing of sides, and share of structures whose sides are exchanged
-_APART_MM, _MOST_EXCHANGED = 2.0, 0.8
-#: Voxels from which on places of structures are known well enough
-_VOXELS = 2_000_000
 
 
 class NoPatientError(SimulationError):
@@ -76,9 +71,19 @@ class Findings:
         """Their number in words: "41 labels"."""
         return f"{len(self.names)} label{'s' * (len(self.names) > 1)}"
 
+    def require_scheme(self) -> None:
+        """Raise SimulationError for a numbering of the user that lacks half of the labels."""
+        key, scheme = self.mapping.scheme, self.scheme
+        other = [] if scheme is None else [label for label in self.names if label not in scheme.names]
+        if key is None or scheme is None or 2 * len(other) < len(self.names):
+            return
+        found, choices = recognised(self.names, of_ct=self.of_ct)
+        fits = " or ".join(f"--map {one.key}" for one in ([found] if found else choices) or schemes().values())
+        raise SimulationError(f"{self.source}: labels {listed(other, 4)} are not of --map {key}; expected {fits}")
+
     def require_patient(self) -> None:
         """Raise NoPatientError for a mask or lesion, which is no patient, unless the user gave it a tissue."""
-        if self.is_mapped:
+        if self.is_mapped or self.mapping.scheme:
             return
         size = f"{self.number()}, {self._size(self.names)}"
         known = [None if tissue is None else tissue.name for tissue in self.found.values()]
@@ -91,10 +96,10 @@ class Findings:
             what = f"a lesion ({', '.join(names)}; {size})"
         else:
             return
-        of_file = _tissue_of_file(self.source) or ("liver" if self.of_ct else "tumour")
-        maps = options(f"{label}={tissue or of_file}" for label, tissue in zip(self.names, known, strict=True))
+        usual = "liver" if self.of_ct else "tumour"
+        maps = options(f"{label}={tissue or usual}" for label, tissue in zip(self.names, known, strict=True))
         is_brats = self.scheme is not None and self.scheme.is_lesion
-        tissue = "brats" if is_brats or len(set(known)) > 1 else known[0] or of_file
+        tissue = "brats" if is_brats or len(set(known)) > 1 else known[0] or usual
         remedy = _NO_PATIENT.format(added=shlex.quote(f"{tissue}={self._file}"), maps=maps)
         if self.of_ct:
             remedy = f"say which organ it is with {maps}"
@@ -106,20 +111,28 @@ class Findings:
         if not unknown:
             return
         nothing = "no program's numbers are recognised, and " if len(unknown) == len(self.names) else ""
-        nearest = nearest_scheme(unknown) if nothing else None
-        if nearest is not None:
-            lacking = [label for label in unknown if label not in nearest.names]
-            nothing, unknown = f"most of its numbers are {nearest.title}'s, and ", lacking or unknown
         known = ", ".join(dict.fromkeys([*self.tissues.names()[1:], *TISSUES]))
         called = listed(map(self._described, unknown))
-        unused = self.mapping.unused(self.names)
-        mistaken = f"; it has no label {listed(unused)}, which --map mentions" if unused else ""
         remedy = MAP_THEM.format(label=unknown[0])
-        raise SimulationError(f"{self.source}: {nothing}no tissue is called {called}{mistaken}; {remedy}: {known}")
+        raise SimulationError(f"{self.source}: {nothing}no tissue is called {called}; {remedy}: {known}")
 
-    def doubts(self) -> list[str]:
-        """What a user should know, each in one line."""
+    def doubts(self, around: Collection[int]) -> list[str]:
+        """What a user should know, each in one line; `around` are unknown labels, which are taken as others."""
         doubts = []
+        taken = {label: tissue.name for label, tissue in self.found.items() if tissue and label in around}
+        for label, name in taken.items():
+            doubts.append(
+                f"{self.source}: {self._described(label)} is unknown and taken as {name}, which is around it; --map "
+                f"{label}=TISSUE gives it another tissue"
+            )
+        if self.scheme is not None and self.scheme.is_lesion and not self.is_mapped:
+            doubts.append(
+                f"{self.source}: has a tumour alone, in the coupling medium; --add brats={shlex.quote(self._file)} "
+                "adds it to a patient's labels"
+            )
+        complete = recognised(self.names, of_ct=self.of_ct)[0] if self.mapping.scheme else None
+        if complete is not None and complete is not self.scheme:
+            doubts.append(f"{self.source}: its labels are those of {complete.title} (--map {complete.key})")
         nearest: dict[str, list[str]] = {}
         for label, name in self.names.items():
             tissue = self.found[label]
@@ -132,58 +145,16 @@ class Findings:
         unused = self.mapping.unused(self.names)
         if unused:
             doubts.append(f"{self.source}: has no label {listed(unused)}, which --map mentions")
-        if self._has_exchanged_sides():
-            doubts.append(
-                f"{self.source}: labels of the left side are on the right; check the orientation in its header"
-            )
-        organs = {plain_name(name) for key in OF_BODY for name in schemes()[key].names.values()}
-        is_body = organs.issuperset(plain_name(str(name)) for name in self.names.values())
-        if is_body and 0 not in self.mapping.by_label and self.counts[0]:
-            share = self.counts[0] / self.counts.sum()
-            doubts.append(
-                f"{self.source}: {share:.0%} of the volume has no label and is the coupling medium, also between the "
-                "organs; --map 0=fat gives it a tissue"
-            )
         return doubts
-
-    def _has_exchanged_sides(self) -> bool:
-        """Whether what is called left is on the right, of structures with a name for both sides."""
-        centres = self._centres()
-        own = {label: name for label, name in self.names.items() if self.mapping.tissue_of(label, name) is None}
-        places = {_words(name): centres[label][0] for label, name in own.items() if name}
-        pairs = [
-            (place, places.get((words - {"left"}) | {"right"})) for words, place in places.items() if "left" in words
-        ]
-        steps = np.array([right - left for left, right in pairs if right is not None])
-        told = steps[np.abs(steps) > _APART_MM]
-        return bool(len(told)) and float(np.mean(told < 0)) >= _MOST_EXCHANGED
-
-    def _centres(self) -> dict[int, np.ndarray]:
-        """{label: its centre, RAS mm} of the labels that are seen in every so-manieth voxel."""
-        step = max(1, int(np.ceil((self.labels.array.size / _VOXELS) ** (1 / 3))))
-        array = self.labels.array[::step, ::step, ::step]
-        where = np.nonzero(array)
-        values, inverse, counts = np.unique(array[where], return_inverse=True, return_counts=True)
-        ijk = [np.bincount(inverse, axis) * step / counts for axis in where[::-1]]
-        ras = self.labels.ijk_to_ras @ [*ijk, np.ones(len(values))]
-        return dict(zip(map(int, values), ras[:3].T, strict=True))
 
     def _described(self, label: int) -> str:
         """'Left-Lesion' (25, 3.1 ml)"""
         name = self.names[label]
         return f"{name!r} ({label}, {self._size([label])})" if name else f"label {label} ({self._size([label])})"
 
-    def _millilitres(self, labels: Iterable[int]) -> float:
-        return float(self.counts[list(labels)].sum() * self.labels.voxel_ml)
-
     def _size(self, labels: Iterable[int]) -> str:
-        size_ml = self._millilitres(labels)
+        size_ml = float(self.counts[list(labels)].sum() * self.labels.voxel_ml)
         return f"{size_ml:.0f} ml" if size_ml >= 10 else f"{size_ml:.2g} ml"
-
-
-def _words(name: str) -> frozenset[str]:
-    """The words of a name, in any order: "kidney_left" and "Left kidney"."""
-    return frozenset({"lh": "left", "rh": "right"}.get(word, word) for word in plain_name(name).split())
 
 
 def options(texts: Iterable[str]) -> str:
@@ -204,12 +175,3 @@ def _is_nearest(name: str) -> bool:
     except SimulationError:
         return nearest_tissue(name) is not None
     return False
-
-
-def _tissue_of_file(source: str) -> str | None:
-    """The tissue that a file is called after: glioma.nii.gz."""
-    name = PurePath(source).name.split(".")[0]
-    try:
-        return tissue_named(name).name
-    except SimulationError:
-        return nearest_tissue(name)

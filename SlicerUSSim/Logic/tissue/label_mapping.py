@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
-from difflib import get_close_matches
 from pathlib import Path
 
 from SlicerUSSim.Logic.base.declaration import kind_of, short
 from SlicerUSSim.Logic.base.errors import SimulationError, require
 from SlicerUSSim.Logic.base.files import read_json
 from SlicerUSSim.Logic.tissue.label_files import TABLE_SUFFIXES, read_names
-from SlicerUSSim.Logic.tissue.names import plain_name, tissue_named
+from SlicerUSSim.Logic.tissue.names import plain_name, similar_tissues, tissue_named
 from SlicerUSSim.Logic.tissue.presets import TISSUES
 from SlicerUSSim.Logic.tissue.schemes import schemes
 from SlicerUSSim.Logic.tissue.table import TissueTable
@@ -136,8 +135,7 @@ def _tissue(text: str, owner: str, tissues: TissueTable | None) -> str:
     try:
         return tissue_named(text).name
     except SimulationError:
-        known = list(dict.fromkeys([*mine, *TISSUES]))
-        near = get_close_matches(text.lower(), known, n=3)
+        near = similar_tissues(text, mine) or list(dict.fromkeys([*mine, *TISSUES]))
         raise SimulationError(
-            f"{owner}: no tissue {text!r}, expected 0 (nothing) or one of: {', '.join(near or known)}"
+            f"{owner}: no tissue {text!r}, expected 0 (nothing) or one of: {', '.join(near)}"
         ) from None

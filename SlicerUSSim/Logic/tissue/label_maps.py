@@ -28,6 +28,8 @@ _log = logging.getLogger(__name__)
 LARGEST_LABEL = 99_999
 #: Smallest distance of a label from a whole number that is said
 _WORTH_ROUNDING = 0.01
+#: Share of the labels that may be unknown to a program, and are taken as what is around them
+_MOST_UNKNOWN = 0.25
 #: Labels of each numbering that is offered
 _SHOWN = 4
 
@@ -160,14 +162,17 @@ class _Reading:
     def by_tissue(self) -> LabelledTissues:
         """Labels renumbered from 1, one for each tissue, in the order of their first labels."""
         scheme = self._scheme()
+        coupling = (self._by_number or self._tissues)[0]
         names = {label: self._names.get(label, scheme.names.get(label) if scheme else None) for label in self._present}
         found = {label: self._tissue(label, name, scheme) for label, name in names.items()}
+        around = self._around(found) if scheme is not None and not scheme.is_lesion else {}
+        found |= {label: found[beside] if beside else coupling for label, beside in around.items()}
         findings = Findings(
             self._source, self._volume, self._counts, names, found, scheme, self._mapping, self._tissues, self._of_ct
         )  # fmt: skip
+        findings.require_scheme()
         findings.require_patient()
         findings.require_known()
-        coupling = (self._by_number or self._tissues)[0]
         order: list[Tissue] = []
         relabelled = {0: 0}
         between = self._mapping.by_label.get(0, "coupling")
@@ -191,7 +196,22 @@ class _Reading:
         labels = self._volume.with_array(lookup[self._volume.array])
         tissues = f"{len(order)} tissue{'s' * (len(order) > 1)}"
         message = f"{self._title(findings)}: {findings.number()} to {tissues}"
-        return LabelledTissues(labels, table, relabelled, message, tuple(findings.doubts()))
+        return LabelledTissues(labels, table, relabelled, message, tuple(findings.doubts(around)))
+
+    def _around(self, found: Mapping[int, Tissue | None]) -> dict[int, int]:
+        """{unknown label: the known one that it touches most, 0 without} if few labels are unknown, and no names."""
+        unknown = [label for label, tissue in found.items() if tissue is None and label not in self._names]
+        if len(unknown) > _MOST_UNKNOWN * len(found):
+            return {}
+        around, array = {}, self._volume.array
+        for label in unknown:
+            touched = np.zeros(len(self._counts), int)
+            for first, second in ((np.moveaxis(array, n, 0)[:-1], np.moveaxis(array, n, 0)[1:]) for n in range(3)):
+                for one, other in ((first, second), (second, first)):
+                    touched += np.bincount(other[one == label], minlength=len(touched))
+            touched[[0, *unknown]] = 0
+            around[label] = int(touched.argmax())
+        return around
 
     def _scheme(self) -> Scheme | None:
         """The numbering that the user said, or, if neither names nor the user tell of any label, the recognised one.
@@ -201,8 +221,11 @@ class _Reading:
         if self._mapping.scheme:
             return schemes()[self._mapping.scheme]
         unknown = [label for label in self._present if self._tissue(label, self._names.get(label)) is None]
-        if len(unknown) < 2 or (self._names and len(unknown) < len(self._present)):
+        if len(unknown) < 2 or self._names:
             return None
+        of_programs = [label for label in unknown if any(label in scheme.names for scheme in schemes().values())]
+        if len(unknown) - len(of_programs) <= _MOST_UNKNOWN * len(unknown):
+            unknown = of_programs
         scheme, choices = recognised(unknown, of_ct=self._of_ct)
         if scheme is None and choices:
             raise SimulationError(

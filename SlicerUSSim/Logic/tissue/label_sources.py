@@ -40,8 +40,8 @@ def not_intensities(volume: Volume) -> str | None:
         return "is a label map, expected the intensities of an MRI"
     if has_uniform_fractions(volume.array):
         return (
-            "is uniform regions of few values with fractions, as a label map that was scaled or shifted, expected an "
-            "MRI or labels; save the labels as whole numbers"
+            "is uniform regions with fractions, as a label map that was scaled or interpolated, expected an MRI or "
+            "labels; save labels as whole numbers, and resample them with nearest-neighbour interpolation"
         )
     return None
 

@@ -4,18 +4,20 @@ from __future__ import annotations
 
 import csv
 import re
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from difflib import get_close_matches
 from functools import cache
 from pathlib import Path
 
 from SlicerUSSim.Logic.base.errors import require
 from SlicerUSSim.Logic.base.segments import is_meaningful
-from SlicerUSSim.Logic.tissue.presets import TISSUES
+from SlicerUSSim.Logic.tissue.presets import TISSUES, colour_of
 from SlicerUSSim.Logic.tissue.tissue import Tissue
 
 _LABELS = Path(__file__).with_name("labels")
 BRAIN_TISSUES = ("csf", "grey matter", "white matter")
+#: Tissues outside the brain of a whole head, in the order of their labels
+OUTSIDE = ("skin", "scalp", "skull", "cancellous bone", "air")
 #: A word after one of these is not what the name means: "non-tumor tissue", "brain without lesion"
 _NOT = "".join(rf"(?<!\b{word} )" for word in ("non", "no", "not", "without"))
 #: A name with one of these says what is not there
@@ -87,6 +89,18 @@ def terminology_entry(tissue_name: str) -> str:
     return next((_ENTRY.format(**row) for row in terms), "")
 
 
+def segments_header(names: Mapping[int, str], size: Sequence[int]) -> dict[str, str]:
+    """Header of a .seg.nrrd of 3D Slicer with these labels, named as tissues, in `size` voxels along i, j, k."""
+    header = {}
+    extent = " ".join(f"0 {n - 1}" for n in size)
+    for place, (label, name) in enumerate(names.items()):
+        colour = " ".join(f"{part:.3g}" for part in colour_of(name))
+        values = {"ID": name, "Name": name, "Color": colour, "LabelValue": label, "Layer": 0, "Extent": extent}
+        values["Tags"] = f"TerminologyEntry:{entry}|" if (entry := terminology_entry(name)) else ""
+        header |= {f"Segment{place}_{key}": str(value) for key, value in values.items()}
+    return header
+
+
 @cache
 def _tissues_by_code() -> dict[str, str]:
     tables = [label_table(path.stem) for path in sorted(_LABELS.glob("*.csv"))]
@@ -100,16 +114,15 @@ def _synonyms() -> dict[str, str]:
 
 @cache
 def _by_words(name: str, kind: str) -> str | None:
-    """By the first row of words.csv with a word in the name, so that what is special comes before what is general: a
-    cyst of the kidney is no kidney, and the ventricle of the heart is not the brain's."""
+    """By the first row of words.csv with a word in the name, if it is of this kind, so that what is special comes
+    before what is general: neither a cyst nor a lesion of the kidney is kidney, nor is bone wax bone."""
     key = plain_name(name)
     key = _synonyms().get(key, key)
     if key in TISSUES:
         return key
-    if _ABSENT.search(key):
-        return None
     for row in label_table("words"):
         words = row["words"].replace(", ", "|")
-        if row["kind"] == kind and re.search(rf"\b{_NOT}(?:{words})s?\b", key):  # also in the plural: "kidneys"
-            return row["tissue"]
+        if row["kind"] != "synonym" and re.search(rf"\b{_NOT}(?:{words})s?\b", key):  # also in the plural: "kidneys"
+            is_there = row["tissue"] == "cavity" or not _ABSENT.search(key)
+            return row["tissue"] if row["kind"] == kind and is_there else None
     return None

@@ -27,9 +27,8 @@ _TITLES = {
     "totalsegmentator-tissues": "TotalSegmentator tissue_types", "brats-2022": "BraTS 2017 to 2022",
     "brats": "BraTS since 2023",
 }  # fmt: skip
-#: Those of organs of a CT, and of a body
+#: Those of organs of a CT
 OF_CT = ("totalsegmentator", "totalsegmentator-v1")
-OF_BODY = (*OF_CT, "totalsegmentator-mr")
 
 
 @dataclass(frozen=True)
@@ -86,10 +85,3 @@ def recognised(values: Collection[int], *, of_ct: bool = False) -> tuple[Scheme 
     found = list(choices.values())[::-1]
     is_sure = len(found) == 1 and bool(complete or (usual and not is_counted))
     return (found[0] if is_sure else None), found
-
-
-def nearest_scheme(values: Collection[int]) -> Scheme | None:
-    """The scheme that has most of these labels, if it has more than half of them."""
-    shares = {key: sum(label in scheme.names for label in values) for key, scheme in schemes().items()}
-    best = max(shares, key=lambda key: shares[key])
-    return schemes()[best] if 2 * shares[best] > len(values) else None

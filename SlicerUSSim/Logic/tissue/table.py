@@ -15,7 +15,7 @@ from SlicerUSSim.Logic.base.declaration import built, kind_of, parameters_of, sh
 from SlicerUSSim.Logic.base.errors import SimulationError, require, require_kind
 from SlicerUSSim.Logic.base.files import read_json, write_json
 from SlicerUSSim.Logic.base.reading import PlainValue, reader
-from SlicerUSSim.Logic.tissue.names import plain_name, tissue_named
+from SlicerUSSim.Logic.tissue.names import plain_name, segments_header, tissue_named
 from SlicerUSSim.Logic.tissue.presets import MEMBRANE, TISSUES
 from SlicerUSSim.Logic.tissue.tissue import Membrane, Tissue
 
@@ -214,8 +214,6 @@ class TissueTable(PlainValue, Mapping[int, Tissue]):
             within = f"{source}: membrane"
             if isinstance(membrane, dict) and "tissue" in membrane:
                 membrane = {**membrane, "tissue": built(Tissue, membrane["tissue"], f"{within}: tissue")}
-                if not membrane.keys() & _SINCE_ROUGH:
-                    membrane = {**_BEFORE_ROUGH, **membrane}
             membrane = built(Membrane, membrane, within)
         return cls(table, membrane)
 
@@ -228,12 +226,6 @@ class TissueTable(PlainValue, Mapping[int, Tissue]):
     def write(self, path: str | os.PathLike) -> None:
         """Write the table as JSON; on failure an existing file is kept."""
         write_json(path, self.to_dict())
-
-
-#: A file that has none of these was written when the membrane was a layer that is equally bright on all sides: its
-#: images stay as they were.
-_SINCE_ROUGH = {"roughness_mm", "diffuse_db", "diffuse_exponent"}
-_BEFORE_ROUGH = {"thickness_mm": 1.0, **dict.fromkeys(_SINCE_ROUGH, 0.0)}
 
 
 def _label(text: str, source: str) -> int:
@@ -266,9 +258,13 @@ def tissues_beside(labels: Path) -> Path:
 def write_label_files(path: Path, labels: Volume, tissues: TissueTable) -> Path:
     """Write a label map, and its tissue table beside it, whose path is returned.
 
-    Raises SimulationError if one of them cannot be written.
+    The names are in the label map, too, if it is NIfTI, or NRRD, which has 3D Slicer's segments.
+    Raises SimulationError if one of the files cannot be written.
     """
     beside = tissues_beside(path)
-    labels.write(path)
+    names = {label: tissue.name for label, tissue in tissues.items() if label}
+    is_nrrd = path.suffix.lower() in (".nrrd", ".nhdr")
+    about = segments_header(names, labels.array.shape[::-1]) if is_nrrd else None
+    replace(labels, label_names=names).write(path, about)
     tissues.write(beside)
     return beside

@@ -57,9 +57,7 @@ TISSUE_NAMES = "TissueNames"
 #: Options of the command in messages of the segmentation, and what the filter has for them
 _METHODS = (
     ("--mask", "SetMaskData"), ("--add tumour=FILE", "AddTissueData"), ("--add", "AddTissueData"),
-    ("--ct (contrast ct)", "contrast='ct'"), ("--ct", "contrast='ct'"), ("--contrast", "contrast"),
-    ("--skull-strip none", "skull_strip='none'"),
-    ("--skull-strip", "skull_strip"),
+    ("--contrast", "contrast"), ("--skull-strip none", "skull_strip='none'"), ("--skull-strip", "skull_strip"),
 )  # fmt: skip
 
 

@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 
 from SlicerUSSim.Logic.base.errors import SimulationError
-from SlicerUSSim.Logic.base.files import written_whole
+from SlicerUSSim.Logic.base.files import named_beside, written_whole
 from SlicerUSSim.Logic.base.volume import Volume
-from SlicerUSSim.Logic.mri.kept_mask import fingerprint_of, keep_file, named_beside
+from SlicerUSSim.Logic.mri.kept_mask import fingerprint_of, keep_file
 from SlicerUSSim.Logic.mri.segmentation import Segmentation
 from SlicerUSSim.Logic.tissue.surfels import Surfels
 
