@@ -101,13 +101,6 @@ def _own_state(tmp_path_factory):
         os.environ["XDG_STATE_HOME"] = before
 
 
-@pytest.fixture
-def own_cache(tmp_path, monkeypatch) -> Path:
-    """The user's cache folder, in one of the test."""
-    monkeypatch.setattr("platformdirs.user_cache_dir", lambda *_, **__: str(tmp_path / "cache"))
-    return tmp_path / "cache"
-
-
 @pytest.fixture(autouse=True)
 def _unchanged_locale():
     """ITK's DICOM writer, which some tests use, sets the C locale, in which Python reads text files as ASCII."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -27,8 +26,6 @@ from tests.conftest import rigid
 from tests.remembered import segment_once
 from validation.brain_phantoms import part_of, phantom, tissue_maps
 from validation.brain_scores import scores
-
-COLIN27 = Path("/usr/share/mricron/templates/ch2bet.nii.gz")
 
 
 def with_rician_noise(volume: Volume, share: float, seed: int = 0) -> Volume:
