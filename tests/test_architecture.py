@@ -48,7 +48,7 @@ BUDGETS = {
     "module": 370, "validation": 6030, "benchmarks": 3750, "tests": 30750, "tests/reference": 500,
 }  # fmt: skip
 #: Lines of all of SlicerUSSim/, and of kernels/
-LARGEST_PRODUCT, LARGEST_KERNELS = 47_500, 5_600
+LARGEST_PRODUCT, LARGEST_KERNELS = 47_410, 5_600
 #: Packages of the checkout that use the product and are not installed with it
 CHECKOUT = {"validation", "benchmarks", "tests", "examples"}
 
