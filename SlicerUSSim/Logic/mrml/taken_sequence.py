@@ -102,8 +102,6 @@ class FrozenRecord:
     about: Mapping[str, Any]
     #: (rows, columns) uint8
     image: np.ndarray
-    #: Whether it shows labels and sheets as they were when it was kept
-    is_of_tissues: bool = False
 
     @property
     def number(self) -> int | None:
@@ -157,8 +155,6 @@ class SimulatedRecord:
     index: SequenceIndex
     #: (rows, columns) uint8 of each
     images: tuple[np.ndarray, ...]
-    #: Whether they show labels and sheets as they were when they were kept
-    are_of_tissues: bool = False
 
 
 def version_taken(images_node: Any) -> Hashable:
