@@ -157,10 +157,10 @@ class Exports:
             with self._logic.imageHeld():
                 files = write_bundle(self._app, Path(folder) / "ultrasound")
                 self._saved()
-            return self._tasks.doAside(lambda: _zipped(files, progress))
+            return self._tasks.doAside(lambda: zipped(files, progress))
 
 
-def _zipped(files: Mapping[str, Path], progress: Callable[[float], None]) -> bytes:
+def zipped(files: Mapping[str, Path], progress: Callable[[float], None]) -> bytes:
     """A .zip of {name: file}; `progress` may raise errors.Cancelled."""
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:

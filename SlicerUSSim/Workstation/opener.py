@@ -127,7 +127,7 @@ class Opener:
 
     def _open(self, paths: Sequence[Path], meant: str = "") -> None:
         with self._presenter.view.progress(f"Open {listed([path.name for path in paths])}"):
-            files, wrong = self._recognised(paths)
+            files, wrong = self.recognised(paths)
         for file in files:
             with self._presenter.shown(), self._nodes.known_names():
                 if meant:
@@ -140,7 +140,7 @@ class Opener:
         for line in wrong:  # after a new patient, with whom the messages about the one before are gone
             self._panel.showError(line)
 
-    def _recognised(self, paths: Sequence[Path]) -> tuple[list[_File], list[str]]:
+    def recognised(self, paths: Sequence[Path]) -> tuple[list[_File], list[str]]:
         """(what files are, in the order in which they can be opened; lines about those that cannot).
 
         Label maps come with the tables of their labels. Raises SimulationError if there is nothing to open.
