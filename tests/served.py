@@ -32,7 +32,7 @@ class Served:
 
     Parameters
     ----------
-    state : folder in which it keeps its session.
+    state : folder in which it keeps pose and settings.
 
     Raises AssertionError with what it has said if it does not serve.
     """

@@ -55,7 +55,7 @@ POSE = ("right_deg", "front_deg", "rotate_deg", "rock_deg", "tilt_deg", "lift_mm
 @contextlib.contextmanager
 def serving(*arguments: str):
     """The URL printed by `ussim serve`, while it runs."""
-    with tempfile.TemporaryDirectory(prefix="ussim-state-") as state:  # of its own: it offers no other one's session
+    with tempfile.TemporaryDirectory(prefix="ussim-state-") as state:  # of its own: it offers no other one's pose
         server = Served("--port", "0", *arguments, state=state)
         try:
             yield server.url

@@ -13,6 +13,7 @@ import pytest
 pytest.importorskip("trame_slicer", reason="the workstation comes with: pip install '.[serve]'")
 pytest.importorskip("playwright", reason="browser tests need playwright: pip install '.[test]'")
 
+from SlicerUSSim.Workstation import kept_state
 from SlicerUSSim.Workstation.state import NAMES
 from tests.served import Served
 from tests.test_workstation import (
@@ -130,18 +131,16 @@ def test_an_uploaded_patient_goes_on_with_his_saved_scene(start, browser, files,
     page.close()
 
 
-@pytest.mark.slow
-def test_what_is_damaged_is_not_offered_and_without_autosave_nothing_is_kept(start, browser, files):
-    served, file = start
-    file.parent.mkdir(parents=True)
-    for text in (
-        "",
-        "[1]",
-        '{"patient": "x"}',
-        '{"saved": "now", "patient": "x", "files": [], "pose": [1], "values": {}}',
-    ):
-        file.write_text(text)
-    page = opened(browser, served("--labels", files / "labels.nii.gz", "--no-autosave").url)
-    settled(page)
-    assert page.locator("#offer").count() == 0 and file.read_text() == text
-    page.close()
+@pytest.mark.parametrize(
+    "text",
+    ["", "[1]", '{"patient": "x"}', '{"saved": "2026-01-01", "patient": "x", "files": [], "pose": [1], "values": {}}'],
+)
+def test_what_is_damaged_is_not_offered(tmp_path, text):
+    (tmp_path / "state.json").write_text(text)
+    assert kept_state._Kept.of_file(tmp_path / "state.json") is None
+
+
+def test_the_file_is_in_the_state_folder_of_the_user(monkeypatch):
+    monkeypatch.setattr("sys.platform", "linux")
+    monkeypatch.setenv("XDG_STATE_HOME", "/some/where")
+    assert kept_state.state_file() == Path("/some/where/slicerussim/workstation.json")
