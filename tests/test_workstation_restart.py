@@ -137,7 +137,7 @@ def test_an_uploaded_patient_goes_on_with_his_saved_scene(start, browser, files,
 )
 def test_what_is_damaged_is_not_offered(tmp_path, text):
     (tmp_path / "state.json").write_text(text)
-    assert kept_state._Kept.of_file(tmp_path / "state.json") is None
+    assert kept_state._State.of_file(tmp_path / "state.json") is None
 
 
 def test_the_file_is_in_the_state_folder_of_the_user(monkeypatch):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 import sys
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, field, replace
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -43,29 +43,31 @@ def state_file() -> Path:
 
 
 @dataclass(frozen=True)
-class _Kept:
-    saved: datetime
+class _State:
+    """What is kept."""
+
     patient: str
     #: Of this computer: MRI or CT, labels
-    files: tuple[str, ...]
-    #: (4, 4) probe_to_ras; None without a probe
-    pose: np.ndarray | None
+    files: list[str]
+    #: (4, 4) probe_to_ras by rows; None without a probe
+    pose: list[list[float]] | None
     #: {name: text} of the scene's values, see scene_record.recorded_values
     values: dict[str, str]
+    #: Time at which it was written, local
+    saved: str = field(default="", compare=False)
 
     @classmethod
-    def of_file(cls, path: Path) -> _Kept | None:
+    def of_file(cls, path: Path) -> _State | None:
         """What a file holds; None if there is none, or it cannot be read: it is offered, and not asked for."""
         try:
-            found = read_json(path)
-            pose, values = found["pose"], found["values"]
-            Preset.from_texts(preset_texts(values), str(path))
-            return cls(
-                datetime.fromisoformat(found["saved"]), str(found["patient"]), tuple(map(str, found["files"])),
-                None if pose is None else check_rigid("the pose", pose),
-                {str(name): str(text) for name, text in values.items()},
-            )  # fmt: skip
-        except (SimulationError, LookupError, TypeError, ValueError, AttributeError):
+            found = cls(**read_json(path))
+            datetime.fromisoformat(found.saved)
+            Preset.from_texts(preset_texts(found.values), str(path))
+            if found.pose is not None:
+                check_rigid("the pose", found.pose)
+            require(all(isinstance(text, str) for text in (found.patient, *found.files)), "no names")
+            return found
+        except (SimulationError, TypeError, ValueError, AttributeError):
             return None
 
 
@@ -84,16 +86,18 @@ class KeptState:
     ) -> None:
         self._path, self._panel, self._logic = path, panel, panel.logic
         self._patient, self._opener, self._probe = patient, opener, probe
-        self._offered = None if path is None else _Kept.of_file(path)
-        self._written: dict[str, Any] | None = None
+        self._offered = None if path is None else _State.of_file(path)
+        self._written: _State | None = None
         #: Called when anything may have changed
         self.changed = AtMost(_EVERY_S, self._write)
 
     def offer(self) -> None:
-        """Show the offer, if there is one."""
+        """Show the offer, unless there is none, or all is as it was."""
         kept, text = self._offered, ""
+        if kept == self._state():
+            self._offered = kept = None
         if kept is not None:
-            saved = kept.saved.astimezone()
+            saved = datetime.fromisoformat(kept.saved).astimezone()
             is_today = saved.date() == saved.now(saved.tzinfo).date()
             when = f"{saved:%H:%M}" if is_today else f"{saved:%d %B, %H:%M}"
             text = f"Go on with {kept.patient} as at {when} (pose and settings)?"
@@ -123,7 +127,7 @@ class KeptState:
             for line in refused:
                 self._panel.showError(line)
             if kept.pose is not None:
-                self._probe.move(kept.pose)
+                self._probe.move(np.array(kept.pose))
             self._offered = None
             self.offer()
             self.changed()
@@ -134,23 +138,25 @@ class KeptState:
         self.offer()
         self.changed()
 
-    def _write(self) -> None:
-        path = self._path
-        if path is None or self._offered is not None:
-            return
+    def _state(self) -> _State:
         parameters: Any = self._logic.parameters
         nodes = (parameters.mri, parameters.labels)
         pose = None if parameters.labels is None else self._probe.pose()
         files = {file for node in nodes if node is not None and os.path.isabs(file := node.GetAttribute(FILE) or "")}
-        state = {
-            "patient": self._patient.name, "files": sorted(files), "pose": None if pose is None else pose.tolist(),
-            "values": recorded_values(parameters),
-        }  # fmt: skip
+        return _State(
+            self._patient.name, sorted(files), None if pose is None else pose.tolist(), recorded_values(parameters)
+        )
+
+    def _write(self) -> None:
+        path = self._path
+        if path is None or self._offered is not None:
+            return
+        state = self._state()
         if state != self._written:
             self._written = state
             self._panel.tasks.start(lambda: self._save(path, state))
 
-    def _save(self, path: Path, state: dict[str, Any]) -> None:
+    def _save(self, path: Path, state: _State) -> None:
         try:
             self._panel.tasks.doAside(lambda: _write(path, state))
         except (SimulationError, OSError) as error:
@@ -158,9 +164,9 @@ class KeptState:
             self._panel.showError(f"pose and settings are not kept: {error}")
 
 
-def _write(path: Path, state: dict[str, Any]) -> None:
+def _write(path: Path, state: _State) -> None:
     """Write a state for this user alone; without a patient there is none."""
-    if not state["patient"]:
+    if not state.patient:
         path.unlink(missing_ok=True)
         return
     folder = make_folder(path.parent)
@@ -169,4 +175,4 @@ def _write(path: Path, state: dict[str, Any]) -> None:
     saved = datetime.now().astimezone().isoformat(timespec="seconds")
     with written_whole(path) as partial:
         partial.touch(0o600)
-        partial.write_text(json.dumps({"saved": saved, **state}), "utf-8")
+        partial.write_text(json.dumps(asdict(replace(state, saved=saved))), "utf-8")

@@ -104,7 +104,8 @@ class Opener:
             if sent.has_dicom:
                 sent.take(self._chosen(series), series)
             if sent.left_out:
-                self._say(f"{_counted(sent.left_out)} beside the DICOM images left out, as no image")
+                files_left = f"{sent.left_out} file{'s' * (sent.left_out > 1)}"
+                self._say(f"{files_left} beside the DICOM images left out, as no image")
             self._open(sent.paths, meant)
 
     def open_paths(self, paths: Sequence[str]) -> None:
@@ -413,10 +414,6 @@ class Opener:
 
 def _organs_of(patient: str) -> Choice:
     return Choice(_ORGANS, f"Organs of the CT {patient}", "They replace muscle and blood when Segment is pressed")
-
-
-def _counted(count: int) -> str:
-    return f"{count} file{'s' * (count > 1)}"
 
 
 def _tables_of(found: Mapping[Path, Content]) -> tuple[set[Path], dict[Path, Path]]:

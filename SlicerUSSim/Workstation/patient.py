@@ -369,11 +369,8 @@ def _remove_patient_nodes(scene, kept: Iterable[Any]) -> None:
 
 def _is_data(node) -> bool:
     """Not a model of a slice view, which Slicer makes and needs."""
-    return (not (node.GetName() or "").endswith("Volume Slice") and not node.GetHideFromEditors()) or _is_shares(node)
-
-
-def _is_shares(node) -> bool:
-    return node.GetAttribute("SlicerUSSim.sharesOf") is not None
+    is_shares = node.GetAttribute("SlicerUSSim.sharesOf") is not None
+    return (not (node.GetName() or "").endswith("Volume Slice") and not node.GetHideFromEditors()) or is_shares
 
 
 def _helpers(node) -> list[Any]:
