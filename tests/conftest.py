@@ -91,7 +91,7 @@ def example(name: str):
 
 @pytest.fixture(autouse=True, scope="session")
 def _own_state(tmp_path_factory):
-    """Sessions of workstations are kept in a folder of the tests, not of the user."""
+    """Workstations keep their state in a folder of the tests, not of the user."""
     before = os.environ.get("XDG_STATE_HOME")
     os.environ["XDG_STATE_HOME"] = str(tmp_path_factory.mktemp("state"))
     yield

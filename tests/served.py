@@ -11,7 +11,6 @@ import hashlib
 import multiprocessing
 import os
 import pickle
-import runpy
 import sys
 import tempfile
 from collections.abc import Callable
@@ -33,7 +32,7 @@ class Served:
 
     Parameters
     ----------
-    state : folder in which it keeps its session.
+    state : folder in which it keeps pose and settings.
 
     Raises AssertionError with what it has said if it does not serve.
     """
@@ -90,23 +89,6 @@ def refused(*arguments: object) -> str:
     (line,) = done.stderr.splitlines()
     assert line.startswith("ussim: ")
     return line
-
-
-def run_script(path: Path) -> None:
-    """Run a Python program in its folder, in a process of its own."""
-    with tempfile.TemporaryDirectory(prefix="ussim-script-") as folder:
-        errors = Path(folder) / "errors"
-        process = _CONTEXT.Process(target=_run_script, args=(str(path), str(errors)), daemon=True)
-        process.start()
-        process.join()
-        assert process.exitcode == 0, errors.read_text()
-
-
-def _run_script(path: str, errors: str) -> None:
-    _write_errors_to(errors)
-    os.chdir(os.path.dirname(path))
-    sys.path.insert(0, os.path.dirname(path))
-    runpy.run_path(path, run_name="__main__")
 
 
 def _write_errors_to(path: str) -> None:

@@ -1,22 +1,18 @@
-"""Parts of the workstation without a browser: tasks, cine loops, scripts, sequences as nodes, the probe's shape."""
+"""Parts of the workstation without a browser: tasks, cine loops, sequences as nodes, the probe's shape."""
 
 from __future__ import annotations
 
-import ast
 import asyncio
 import io
 import json
-import re
 import selectors
 import threading
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from hypothesis import assume, given, settings, strategies as st
 from PIL import Image
 from vtkmodules.util.numpy_support import vtk_to_numpy
 from vtkmodules.vtkFiltersCore import vtkCleanPolyData, vtkFeatureEdges, vtkMassProperties, vtkTriangleFilter
@@ -26,23 +22,18 @@ from SlicerUSSim.Logic import (
     LinearProbe,
     PhasedProbe,
     SimulationError,
-    Tissue,
     TissueTable,
     UltrasoundSimulator,
 )
 from SlicerUSSim.Logic.base.errors import Cancelled
-from SlicerUSSim.Logic.base.volume import Volume, read_image_file
-from SlicerUSSim.Logic.imaging.noise import seed_of_pose
-from SlicerUSSim.Logic.imaging.preset import Preset
+from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.mri.samples import head_mri
 from SlicerUSSim.Logic.mri.segmentation import segment_mri
 from SlicerUSSim.Logic.probe.arrays import PROBES
 from SlicerUSSim.Logic.probe.image_grid import ImageGrid
 from SlicerUSSim.Logic.probe.poses import craniotomy_pose, tilt_sweep, turned
 from SlicerUSSim.Logic.probe.shape import field_polydata, probe_polydata
-from SlicerUSSim.Logic.tissue.table import write_label_files
 from SlicerUSSim.Logic.tracked.sequence import TrackedSequence
-from SlicerUSSim.Workstation.script import LabelSource, python_script
 
 slicer = pytest.importorskip("slicer", reason="MRML nodes come with slicer-core: pip install '.[slicer]'")
 pytest.importorskip("greenlet", reason="the workstation comes with: pip install '.[serve]'")
@@ -53,15 +44,13 @@ from trame_server.state import State  # noqa: E402
 
 from SlicerUSSim.Logic.mrml.fit_nodes import tracked_images  # noqa: E402
 from SlicerUSSim.Logic.mrml.label_nodes import write_labels  # noqa: E402
-from SlicerUSSim.Logic.mrml.logic import AtOnce, UltrasoundSceneLogic  # noqa: E402
+from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic  # noqa: E402
 from SlicerUSSim.Logic.mrml.nodes import node_to_world, probe_pose, read_volume, set_node_to_world, write_volume  # noqa: E402
 from SlicerUSSim.Logic.mrml.sequence_nodes import TIME, SequenceIndex, add_sequence  # noqa: E402
 from SlicerUSSim.Logic.tracked.images import TrackedImages  # noqa: E402
 from SlicerUSSim.Workstation.browser_panel import BrowserPanel  # noqa: E402
 from SlicerUSSim.Workstation.comparison import Comparison, RealImages  # noqa: E402
-from SlicerUSSim.Workstation.content import Kind  # noqa: E402
 from SlicerUSSim.Workstation.export import Cine, gif  # noqa: E402
-from SlicerUSSim.Workstation.opener import Files, Opener  # noqa: E402
 from SlicerUSSim.Workstation.state import (  # noqa: E402
     NAMES,
     ComparisonMode,
@@ -71,7 +60,6 @@ from SlicerUSSim.Workstation.state import (  # noqa: E402
     value_of,
 )
 from SlicerUSSim.Workstation.tasks import AtMost, Tasks  # noqa: E402
-from tests.served import run_script  # noqa: E402
 
 
 @pytest.fixture(scope="module")
@@ -387,7 +375,7 @@ def test_a_cine_keeps_time_and_begins_anew_with_another_size():
         cine.add(np.full((12, 16), 50 * number, np.uint8), 10.0 + 0.25 * number, about)
     told: list[float] = []
     loop = Image.open(io.BytesIO(gif(cine.images, told.append)))
-    assert loop.size == (16, 12) and loop.n_frames == 4 and len(cine) == 4 and told == [0.25, 0.5, 0.75]
+    assert loop.size == (16, 12) and loop.n_frames == 4 and len(cine.images) == 4 and told == [0.25, 0.5, 0.75]
     for number in range(3):
         loop.seek(number)
         assert loop.info["duration"] == 250 and np.asarray(loop.convert("L"))[0, 0] == 50 * number
@@ -451,88 +439,6 @@ def test_a_changed_value_brings_the_page_no_other_values(monkeypatch):
     presenter.logic.scene.AddNewNodeByClass("vtkMRMLScalarVolumeNode", "head")
     presenter.parametersChanged()
     assert "head" in [item.title for item in panel.shared.now.panel.nodes["mriSelector"]]
-
-
-#: What breaks text that is pasted between quotes.
-NASTY = ["it's", 'a "b"', "back\\slash\\", "two\nlines", "'''", '"""', "\\N{x} {y} %s", "grüße ∎"]
-
-
-def run_again(script: str, folder) -> np.ndarray:
-    """The (rows, columns) image written by a script."""
-    (folder / "again.py").write_text(script, encoding="utf-8")
-    run_script(folder / "again.py")
-    return read_image_file(folder / "image.nrrd").array[0]
-
-
-@pytest.mark.slow
-def test_the_script_of_labels_gives_the_same_image_whatever_their_names(head, tmp_path):
-    nasty = "\"'''\n\\"
-    # Labels that the scene numbers in another way: 7 for white matter, and 3 for grey matter.
-    numbers = {"csf": 2, "grey matter": 3, "white matter": 7, "leptomeninges": 5}
-    table = np.zeros(len(head.tissue_names) + 1, np.uint8)
-    for label, name in enumerate(head.tissue_names, 1):
-        table[label] = numbers[name]
-    file = tmp_path / f"my {nasty}labels.nii.gz"
-    head.labels.with_array(table[head.labels.array]).write(file)
-    back = [0] * 8
-    for label, name in enumerate(head.tissue_names, 1):
-        back[numbers[name]] = label
-    probe = PhasedProbe(60.0, 60.0, scan_lines=48)
-    in_name = nasty.replace("\n", "")  # a name is one line
-    tissues = TissueTable(
-        {
-            label: replace(tissue, name=f"{in_name}{tissue.name}{in_name}", sources={"mu0": f"measured {nasty}"})
-            for label, tissue in TissueTable.brain(head.tissue_names).items()
-        }
-    )
-    preset = Preset(probe=probe, tissues=tissues).changed("display", gain_db=4.0)
-    pose = craniotomy_pose(head.labels, probe)
-    script = python_script(LabelSource(str(file), True, relabelled=dict(enumerate(back))), preset, pose)
-    frame = UltrasoundSimulator(head.labels, preset.tissues).simulate(
-        probe, pose, preset.display, noise_seed=seed_of_pose(pose)
-    )
-    assert np.array_equal(run_again(script, tmp_path), frame.image)
-
-
-@settings(max_examples=20)
-@given(name=st.one_of(st.sampled_from(NASTY), st.text(min_size=1)).filter(str.strip), path=st.text(min_size=1))
-def test_a_script_means_the_very_names_it_was_given(name, path):
-    in_one_line = " ".join(name.split())
-    assume(in_one_line.isprintable() and len(in_one_line) <= 200)
-    tissues = Preset().tissues.with_tissue(Tissue(in_one_line, 1540.0, 1.6, 0.5, sources={"mu0": name}))
-    preset = replace(Preset(), tissues=tissues)
-    source = LabelSource(path, mask=path, options={"contrast": name})
-    calls = {
-        ast.unparse(call.func): call
-        for call in ast.walk(ast.parse(python_script(source, preset, np.eye(4))))
-        if isinstance(call, ast.Call)
-    }
-    again = Preset.from_dict(ast.literal_eval(calls["Preset.from_dict"].args[0]))
-    assert again == preset and again.to_dict() == preset.to_dict()
-    assert ast.literal_eval(calls["Volume.read"].args[0]) == path
-    keywords = {keyword.arg: keyword.value for keyword in calls["segment_mri"].keywords}
-    assert ast.literal_eval(keywords["contrast"]) == name
-
-
-def test_the_script_of_an_mri_has_its_files_options_and_texture():
-    source = LabelSource("it's here.nii", mask="mask.nii", options={"contrast": "t2", "classes": 3})
-    hard = Preset().changed("settings", partial_volume=False)
-    plain = python_script(source, hard, np.eye(4))
-    assert """Volume.read("it's here.nii")""" in plain and "mask=Volume.read('mask.nii')" in plain
-    assert "contrast='t2'" in plain and "texture=" not in plain
-    hybrid = hard.changed("settings", mri_modulation_db=1.0)
-    for preset in (Preset(), hybrid):  # the page keeps the shares of the tissues
-        assert "texture=segmentation.texture()" in python_script(source, preset, np.eye(4))
-    for text in (plain, python_script(LabelSource(""), hybrid, np.eye(4))):
-        compile(text, "script", "exec")
-    source = LabelSource(
-        "/data/t1.nii.gz", options={"contrast": "t1"}, others={"t2": "t2.nii.gz"},
-        additions=(("my tissue", "/data/x.nrrd"), ("brats", "seg.nii.gz")),
-    )  # fmt: skip
-    tissues = Preset().tissues.with_tissue(Tissue("my tissue", 1540.0, 1.6, 0.5))
-    script = python_script(source, replace(Preset(), tissues=tissues), np.eye(4))
-    assert "others={'t2': Volume.read('t2.nii.gz')}" in script and "also=['my tissue']" in script
-    assert source.missing == ("t2.nii.gz", "seg.nii.gz") and script.count("# Opened in a page") == 2
 
 
 # ---- sequences as nodes ----------------------------------------------------------------------------------------------
@@ -599,86 +505,6 @@ def test_equal_times_of_images_follow_each_other():
     _, images = add_sequence(scene, sequence, "sweep")
     assert [images.GetNthDataNode(number).GetAttribute(TIME) for number in range(3)] == ["0.200000", "0.200000", None]
     assert (images.GetIndexName(), images.GetIndexUnit(), images.GetIndexTypeAsString()) == ("time", "s", "numeric")
-
-
-def _as_sent(folder: Path) -> dict[str, bytes]:
-    """The files of a folder as a page sends them."""
-    return {path.name: path.read_bytes() for path in sorted(folder.iterdir())}
-
-
-def _opener() -> Opener:
-    scene = slicer.vtkMRMLScene()
-    return Opener(scene, UltrasoundSceneLogic(scene), AtOnce(), Files())
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("table", ["t2", "names"])
-def test_a_label_map_is_opened_with_the_table_of_its_labels(head, tmp_path, table):
-    """Of ussim segment, or of another program; the label map alone is refused with this remedy."""
-    numbers = (0, 3, 2, 1, 4) if table == "t2" else (0, 507, 502, 504, 509)
-    names = ("csf", "grey matter", "white matter", "leptomeninges")
-    assert head.tissue_names == names
-    labels = head.labels.with_array(np.array(numbers, np.uint16)[head.labels.array])
-    if table == "t2":
-        order = ("white matter", "grey matter", "csf", "leptomeninges")
-        write_label_files(tmp_path / "rem.nii.gz", labels, TissueTable.brain().for_names(order))
-    else:
-        labels.write(tmp_path / "rem.nii.gz")
-        lines = [f'{n} 255 0 0 1 1 1 "{name}"' for n, name in zip(numbers[1:], names, strict=True)]
-        (tmp_path / "colours.txt").write_text("\n".join(lines))
-    sent, opener = _as_sent(tmp_path), _opener()
-    alone = {name: content for name, content in sent.items() if name == "rem.nii.gz"}
-    with opener.sent(sent) as parcel:
-        ((upload,), _) = opener.uploads(parcel)
-        assert upload.kind is Kind.LABELS
-        node, found = opener.labels(upload.path, upload.table)
-    with (  # a table is of its own map only
-        pytest.raises(SimulationError, match=r"^rem\.nii\.gz: .*--map"),
-        opener.sent(alone) as parcel,
-    ):
-        ((upload,), _) = opener.uploads(parcel)
-        opener.labels(upload.path, upload.table)
-    assert node.GetName() == "rem.nii.gz" and set(found.names) == set(names)
-    for name, n in zip(names, range(1, 5), strict=True):
-        np.testing.assert_array_equal(found.labels.array == found.names.index(name) + 1, head.labels.array == n)
-    if table == "names":
-        assert found.message.endswith("named in colours.txt")
-
-
-@pytest.mark.parametrize(
-    ("names", "message"),
-    [
-        (["rem.json"], "rem.json is the tissue table of a label map: open both files together"),
-        (["a.nii.gz", "names.txt", "rem.json"], "names.txt, rem.json: are tables of 1 label map, expected one for"),
-        (["mri.nii.gz", "rem.json"], "mri.nii.gz is no label map, and rem.json a table of labels"),
-    ],
-)  # fmt: skip
-def test_files_that_cannot_be_opened_are_one_line(head, tmp_path, names, message):
-    write_label_files(tmp_path / "rem.nii.gz", head.labels, TissueTable.brain().for_names(head.tissue_names))
-    for name in ("a.nii.gz", "b.nii.gz"):
-        (tmp_path / name).write_bytes((tmp_path / "rem.nii.gz").read_bytes())
-    head_mri(3.0).write(tmp_path / "mri.nii.gz")
-    (tmp_path / "names.txt").write_text('1 255 0 0 1 1 1 "csf"')
-    Preset().write(tmp_path / "preset.json")
-    with (
-        pytest.raises(SimulationError, match=re.escape(message)) as caught,
-        (opener := _opener()).sent({name: (tmp_path / name).read_bytes() for name in names}) as parcel,
-    ):
-        opener.uploads(parcel)
-    assert str(tmp_path) not in str(caught.value) and "/tmp" not in str(caught.value)
-
-
-def test_a_label_map_and_a_preset_are_told_apart(head, tmp_path):
-    """A preset is no table of the labels that are opened with it."""
-    Preset().write(tmp_path / "preset.json")
-    head.labels.write(tmp_path / "a.nii.gz")
-    opener = _opener()
-    with opener.sent(_as_sent(tmp_path)) as parcel:
-        uploads, wrong = opener.uploads(parcel)
-    assert [(upload.name, upload.kind) for upload in uploads] == [
-        ("preset.json", Kind.PRESET), ("a.nii.gz", Kind.LABELS),
-    ]  # fmt: skip
-    assert not wrong and all(upload.table is None for upload in uploads)
 
 
 # ---- the probe's shape -----------------------------------------------------------------------------------------------
@@ -849,9 +675,8 @@ def test_a_scene_is_written_again_after_nodes_are_gone(tmp_path):
     """It named the folder of the last one as the file of a node that was gone, and was refused."""
     from trame_slicer.core import SlicerApp
 
-    from SlicerUSSim.Workstation.export import write_bundle
+    from SlicerUSSim.Workstation.export import write_bundle, zipped
     from SlicerUSSim.Workstation.scene_files import read_scene
-    from SlicerUSSim.Workstation.zipped import zipped
 
     app = SlicerApp()
     app.register_module_logic(slicer.vtkSlicerSequencesLogic())
@@ -867,7 +692,7 @@ def test_a_scene_is_written_again_after_nodes_are_gone(tmp_path):
         told: list[float] = []
         (tmp_path / "scene.mrb").write_bytes(zipped(files, told.append))
         record = read_scene(tmp_path / "scene.mrb")
-        assert np.array_equal(record.nodes["mri"].volume.array, mri.array) and told[-1] == 1.0
+        assert np.array_equal(record.nodes["mri"].volume.array, mri.array) and 0.0 == told[0] < told[-1] < 1.0
         assert 'useCompression="0"' not in files[f"scene {number}/scene {number}.mrml"].read_text()
         if number == 0:
             app.scene.RemoveNode(images)

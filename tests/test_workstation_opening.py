@@ -19,7 +19,7 @@ from SlicerUSSim.Logic.imaging.preset import Preset
 from SlicerUSSim.Logic.tracked.sequence import TrackedSequence
 from SlicerUSSim.Workstation.state import NAMES
 from tests.test_label_maps import head
-from tests.test_parcel import write_series
+from tests.test_uploads import write_series
 from tests.test_workstation import (
     browser as browser,
     click,
@@ -137,9 +137,17 @@ def test_a_mask_is_a_tumour_or_a_brain_mask_as_the_user_says(page, files, tmp_pa
     assert shown(page, "lesionsSelector") is None and shown(page, "maskSelector") is None
     with new_image(page):
         answer(page, "Add as tumour")
+    kept = shown(page, "lesionsSelector")
     assert state(page, NAMES.opened)[0].endswith(": tumour of head.nii.gz, over the tissues") and not errors(page)
     assert "tumour" in {row["name"] for row in state(page, NAMES.panel.tissues)}
     assert shown(page, "lesionsSelector") is not None and shown(page, "maskSelector") is None
+    far = ball(mri)
+    Volume(far.array, far.ijk_to_ras + np.array([[0, 0, 0, 400.0], *[[0] * 4] * 3])).write(tmp_path / "far.nii.gz")
+    answered(page, tmp_path / "far.nii.gz", "Add as cyst")
+    assert "outside the patient" in errors(page)[0] and "/tmp" not in errors(page)[0]
+    assert "cyst" not in {row["name"] for row in state(page, NAMES.panel.tissues)}
+    assert shown(page, "lesionsSelector") == kept
+    dismiss_messages(page)
     mri.with_array((mri.array > 0).astype(np.uint8)).write(tmp_path / "brain.nii.gz")
     with new_image(page):
         said = answered(page, tmp_path / "brain.nii.gz", "Use as brain mask")
@@ -210,7 +218,7 @@ def test_several_files_at_once_are_opened_in_their_order(page, files, tmp_path):
             tmp_path / "broken.nii.gz"]  # fmt: skip
     said = answered(page, sent, "New patient").splitlines()
     assert [line.partition(":")[0] for line in said] == ["a.json", "z.nii.gz", "labels.nii.gz", "sweep.igs.mha"]
-    assert "its labels came with it; head.nii.gz is closed" in said[1] and said[2].endswith("tissues to simulate")
+    assert "its labels came with it; head.nii.gz is closed" in said[1] and said[2].endswith("tissues of z.nii.gz")
     assert state(page, NAMES.title) == "labels.nii.gz" and state(page, NAMES.sequence.length) == 6
     assert page.locator("#mriSelector option:checked").inner_text().strip() == "z.nii.gz"
     assert len(errors(page)) == 1 and errors(page)[0].startswith("broken.nii.gz: ") and "/tmp" not in errors(page)[0]
@@ -238,7 +246,7 @@ def dicom(files, tmp_path_factory) -> Path:
 def test_the_series_of_a_dicom_folder_is_asked_by_its_description(page, dicom):
     page.set_input_files("#open-folder", dicom)
     text = question(page)
-    assert text == "The DICOM files have 2 series that are volumes; 1 more is no volume."
+    assert text == "The DICOM files have 2 series that are volumes."
     titles = page.locator("#question .ussim-choice").all_inner_texts()
     assert [title.split("\n")[0] for title in titles] == [
         "T1 MPRAGE (series 3): 74 images of 80x94", "T2 tse (series 4): 74 images of 80x94", "Cancel",

@@ -146,7 +146,7 @@ def test_a_pose_is_saved_and_opened_again(page, tmp_path):
     page.evaluate("window.trame.trigger('press', ['placeButton'])")
     settled(page)
     assert not np.allclose(where(page), saved, atol=1e-2)
-    page.set_input_files("#open-pose", file)
+    page.set_input_files("#open-file", file)
     eventually(page, lambda: np.allclose(where(page), saved, atol=1e-3))
     settled(page)
     assert not errors(page)

@@ -40,8 +40,6 @@ from tests.test_workstation import (
     pixels,
     pose,
     pytestmark as pytestmark,
-    run_again,
-    script_of,
     serving,
     settled,
     shown,
@@ -141,9 +139,8 @@ def test_ruler_and_image_change_together(page):
 
 
 @pytest.mark.long
-def test_a_frozen_image_stays_where_it_was_taken_in_every_export(head_page, files, tmp_path):
+def test_a_frozen_image_stays_where_it_was_taken_in_every_export(head_page, tmp_path):
     page = head_page
-    shutil.copy(files / "head.nii.gz", tmp_path)  # for the script, if the page has opened it
     assert page.locator("#frozen").is_hidden()
     click(page, "#live")
     page.locator("#frozen").wait_for()
@@ -156,14 +153,9 @@ def test_a_frozen_image_stays_where_it_was_taken_in_every_export(head_page, file
     assert page.evaluate("window.ussim.image.pose") == taken and np.array_equal(pixels(page), seen)
     shutil.copy(download(page, "nrrd"), tmp_path / "frozen.nrrd")
     frozen = read_image_file(tmp_path / "frozen.nrrd")
-    array, to_ras = frozen.array, frozen.ijk_to_ras
-    script = script_of(page)
-    assert np.array_equal(run_again(script, tmp_path), array[0])
-    np.testing.assert_allclose(read_image_file(tmp_path / "image.nrrd").ijk_to_ras, to_ras, atol=1e-3)
     node, in_scene = output_of_scene(download(page, "mrb"), tmp_path)
-    np.testing.assert_allclose(in_scene, to_ras, atol=1e-3)
-    assert node.GetAttribute("SlicerUSSim.frozen")
-    assert script_of(page) == script and not errors(page)  # a scene that is saved is no change of the tissues
+    np.testing.assert_allclose(in_scene, frozen.ijk_to_ras, atol=1e-3)
+    assert node.GetAttribute("SlicerUSSim.frozen") and not errors(page)
     click(page, "#live")
     page.locator("#frozen").wait_for(state="hidden")
 
@@ -331,9 +323,7 @@ def test_simulated_sequences_are_shown_and_played_where_they_were_taken(head_pag
     page.set_viewport_size({"width": 1500, "height": 900})
     # The probe is there, and what is exported is that image
     np.testing.assert_allclose(probe_pose(page), recorded.transforms[4]["ProbeToReference"], atol=0.05)
-    (tmp_path / "head.nii.gz").write_bytes((files / "head.nii.gz").read_bytes())
-    again = run_again(script_of(page), tmp_path)
-    assert np.array_equal(again, np.asarray(Image.open(download(page, "png"))))
+    again = np.asarray(Image.open(download(page, "png")))
     shutil.copy(download(page, "mrb"), tmp_path / "sequence.mrb")
     record = read_scene(str(tmp_path / "sequence.mrb")).simulated
     assert record is not None and len(record.images) == 6 and np.array_equal(record.images[4], again)

@@ -68,7 +68,7 @@ class ServeOptions(ImageOptions):
     )
     autosave: bool = declared(
         "--autosave/--no-autosave", default=True, show_default=True, envvar="USSIM_AUTOSAVE", show_envvar=True,
-        help="Keep patient, probe and settings in a folder of yours, to be restored after a crash; see "
+        help="Keep pose, settings and the names of files in a file of yours, to go on with after a restart; see "
         "docs/security.md.",
     )  # fmt: skip
     igtl_device: str | None = declared(
@@ -150,8 +150,8 @@ def serve(patient: ServeOptions, recording: TrackingOptions) -> None:
 
     _prepare_libraries()
     from SlicerUSSim.Logic.mri.segmentation_settings import SheetSettings
-    from SlicerUSSim.Workstation.opener import Files
-    from SlicerUSSim.Workstation.session_store import SessionStore, sessions_folder
+    from SlicerUSSim.Workstation.file_nodes import Files
+    from SlicerUSSim.Workstation.kept_state import state_file
     from SlicerUSSim.Workstation.workstation import Workstation
 
     sheet_settings = SheetSettings()
@@ -168,7 +168,7 @@ def serve(patient: ServeOptions, recording: TrackingOptions) -> None:
             tracker=patient.igtl, tracker_device=patient.igtl_device, volumes=volumes
         ),
         patient.device,
-        SessionStore(sessions_folder()) if patient.autosave else None,
+        state_file() if patient.autosave else None,
     )  # fmt: skip
     _run(workstation, patient.host, port, tls)
 
@@ -220,11 +220,12 @@ def _tls(cert: str | None, key: str | None) -> ssl.SSLContext | None:
 
 def _run(workstation: Workstation, host: str, port: int, tls: ssl.SSLContext | None) -> None:
     """Print the URL and serve until the command is interrupted."""
+    import secrets
     import socket
 
     from SlicerUSSim.Workstation.access import guard
 
-    server, token = workstation.server, workstation.take_token(port)
+    server, token = workstation.server, secrets.token_urlsafe(24)
 
     def bind(wslink: Any) -> None:
         guard(wslink.app, token, host)
@@ -236,16 +237,10 @@ def _run(workstation: Workstation, host: str, port: int, tls: ssl.SSLContext | N
     def tell(**_: Any) -> None:
         shown = host if host not in ("0.0.0.0", "::") else socket.gethostname()
         shown = f"[{shown}]" if ":" in shown else shown
-        workstation.keep_token(server.port, token)
         click.echo(f"http{'' if tls is None else 's'}://{shown}:{server.port}/?token={token}")
 
     server.controller.on_server_ready.add(tell)
-    try:
-        server.start(
-            port=port, host=host, open_browser=False, show_connection_info=False, disable_logging=True, timeout=0
-        )
-    finally:
-        workstation.end_session()
+    server.start(port=port, host=host, open_browser=False, show_connection_info=False, disable_logging=True, timeout=0)
     if workstation.is_computing:
         end_at_once()
 

@@ -35,14 +35,6 @@ class FitPresenter:
         self._fit = self._before = None
         self.summary = ""
 
-    def kept(self) -> tuple[Fit, Preset | None] | None:
-        """(the last fit, the preset that Apply replaced), as `restore` takes them; None without a fit."""
-        return None if self._fit is None else (self._fit[0], self._before)
-
-    def restore(self, found: Fit, before: Preset | None, labels: object) -> None:
-        """Have a fit of a session of before again, on these labels."""
-        self._fit, self._before, self.summary = (found, labels), before, _in_words(found)
-
     # ---- free parameters ---------------------------------------------------------------------------------------
 
     def freeParameters(self) -> list[tuple[str, bool]]:

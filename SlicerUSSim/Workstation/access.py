@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hmac
 import logging
-import re
 import ssl
 from html import escape
 from pathlib import Path
@@ -18,8 +17,6 @@ from SlicerUSSim.Logic.base.errors import SimulationError, require
 _log = logging.getLogger(__name__)
 
 _LOOPBACK = {"127.0.0.1", "localhost", "::1"}
-#: Where pages ask whether the server is there again
-_ALIVE = "/alive"
 #: Of every answer. Vue compiles the page's templates in the browser, which needs eval; images are data and blobs
 _HEADERS = {
     "Content-Security-Policy": "default-src 'self'; script-src 'self' 'unsafe-inline' 'unsafe-eval' blob:; "
@@ -33,16 +30,6 @@ _HEADERS = {
 _REFUSED = """<!doctype html><meta charset="utf-8"><title>SlicerUSSim</title>
 <body style="font-family: sans-serif; background: #111; color: #ddd; margin: 4em">
 <h1>Not allowed</h1><p id="reason">{reason}</p>"""
-
-
-def proof_key(token: str) -> str:
-    """The key by which pages know the server of this token again; the token cannot be found from it."""
-    return hmac.new(token.encode(), b"proof of a SlicerUSSim workstation", "sha256").hexdigest()
-
-
-def proof(token: str, nonce: str) -> str:
-    """What only a server with this token answers to a text, which a page has made up."""
-    return hmac.new(bytes.fromhex(proof_key(token)), nonce.encode(), "sha256").hexdigest()
 
 
 def is_loopback(host: str) -> bool:
@@ -93,10 +80,6 @@ def _in_one_line(record: logging.LogRecord) -> bool:
 def _checker(token: str, is_local: bool):
     @web.middleware
     async def check(request: web.Request, handler):
-        nonce = request.query.get("nonce", "")
-        if request.path == _ALIVE and re.fullmatch(r"[0-9a-f]{16,64}", nonce) and _is_own_host(request, is_local):
-            # Asked by pages without the cookie, which another program at this port must not get
-            return web.Response(text=proof(token, nonce), headers=_HEADERS)
         reason = _objection(request, token, is_local)
         if reason:
             text = _REFUSED.format(reason=reason)
@@ -128,13 +111,6 @@ def _checker(token: str, is_local: bool):
 def _cookie(request: web.Request) -> str:
     """Name of the cookie, by port: browsers share cookies between ports, but each workstation has its own token."""
     return f"ussim_token_{request.url.port}"
-
-
-def _is_own_host(request: web.Request, is_local: bool) -> bool:
-    try:
-        return not is_local or is_loopback(urlsplit(f"//{request.host}").hostname or "")
-    except ValueError:
-        return False
 
 
 def _objection(request: web.Request, token: str, is_local: bool) -> str:

@@ -70,8 +70,6 @@ class Comparison:
         self._waiting: tuple[RealImages, int, np.ndarray, ImageGrid] | None = None  # to be compared
         self._comparing: asyncio.Task | None = None
         self._era = 0  # changes when a similarity of before must not be shown any more
-        #: Called when real images are shown in another frame
-        self.grid_changed: Callable[[], None] = lambda: None
         #: For display next to the simulated image, and over it
         self.streams = (ImageStream("real"), ImageStream("real-over"))
 
@@ -86,32 +84,6 @@ class Comparison:
         with self._shared.changing() as now:
             now.sequence.length = len(self._real)
         self.show(number)
-
-    def pixel_at(self, across: float, down: float) -> tuple[int, np.ndarray] | None:
-        """(number of the real image in its file, (2,) column and row there) at fractions of the shown image's size.
-
-        None while no real image is shown.
-        """
-        if self._real is None or self._grid is None:
-            return None
-        grid, tracked = self._grid, self._real.tracked
-        width, height = (
-            count * spacing for count, spacing in zip((grid.columns, grid.rows), grid.pixel_spacing_mm, strict=True)
-        )
-        in_probe = [grid.left_mm + across * width, grid.top_mm + down * height, 0.0, 1.0]
-        pixel = np.linalg.inv(tracked.field.image_to_probe) @ in_probe
-        return tracked.numbers[self._shared.now.sequence.number], pixel[:2]
-
-    def place_of(self, pixel: np.ndarray) -> tuple[float, float] | None:
-        """The inverse of pixel_at: fractions of the width and height, also outside; None while no image is shown."""
-        if self._real is None or self._grid is None:
-            return None
-        in_probe = self._real.tracked.field.image_to_probe @ [*pixel, 0.0, 1.0]
-        grid = self._grid
-        width, height = (
-            count * spacing for count, spacing in zip((grid.columns, grid.rows), grid.pixel_spacing_mm, strict=True)
-        )
-        return float((in_probe[0] - grid.left_mm) / width), float((in_probe[1] - grid.top_mm) / height)
 
     def show(self, number: int) -> None:
         """Move the probe to the pose of the real image with this index, and show that image."""
@@ -151,7 +123,6 @@ class Comparison:
         if grid != self._grid:
             self._grid = grid
             self.send()
-            self.grid_changed()
         if self._real is None:
             return
         self._waiting = (self._real, self._shared.now.sequence.number, simulated, grid)

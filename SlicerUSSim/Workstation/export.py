@@ -1,13 +1,12 @@
-"""Export of images, frames with their geometry, cine loops, the scene and scripts."""
+"""Export of images, frames with their geometry, cine loops and the scene."""
 
 from __future__ import annotations
 
 import io
 import json
-import os
+import zipfile
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
@@ -19,21 +18,14 @@ from trame_slicer.core import SlicerApp
 from vtkmodules.vtkCommonCore import vtkOutputWindow
 
 from SlicerUSSim.Logic.base.errors import SimulationError, require, required
-from SlicerUSSim.Logic.mrml.label_nodes import read_labels
-from SlicerUSSim.Logic.mrml.nodes import nodes_of_class, pose_in_labels
+from SlicerUSSim.Logic.mrml.nodes import nodes_of_class
 from SlicerUSSim.Logic.mrml.taken_image import TakenImage
-from SlicerUSSim.Logic.tissue.sheet_looks import with_dura
-from SlicerUSSim.Logic.tissue.surfels import KINDS
 from SlicerUSSim.Workstation.browser_panel import BrowserPanel
-from SlicerUSSim.Workstation.opener import FILE, Opener
-from SlicerUSSim.Workstation.script import LabelSource, python_script
-from SlicerUSSim.Workstation.zipped import zipped
 
 #: File formats of an image with its geometry.
 FRAME_SUFFIXES = (".nrrd", ".mha", ".vti")
 #: Key of a file's header under which is what its image is of, see TakenImage.about
 ABOUT = "SlicerUSSim"
-_NO_IMAGE = "there is no image, expected labels and a probe"
 #: Number of images in a cine loop; and limits of the display time of each, in milliseconds.
 MOST_IMAGES = 200
 _SHORTEST_MS, _LONGEST_MS = 40, 500
@@ -75,34 +67,16 @@ class Cine:
 
     def __init__(self) -> None:
         self._images: deque[CineImage] = deque(maxlen=MOST_IMAGES)
-        #: Number of images that were ever added, and of loops that were begun
-        self.added = self.loop = 0
-
-    def __len__(self) -> int:
-        return len(self._images)
 
     def add(self, image: np.ndarray, seconds: float, about: str = "") -> None:
         """Append a (rows, columns) uint8 image with its time and what it is of; another size starts a new loop."""
         if self._images and self._images[-1].image.shape != image.shape:
             self.clear()
         self._images.append(CineImage(seconds, image, about))
-        self.added += 1
 
     def clear(self) -> None:
         """Forget all images."""
         self._images.clear()
-        self.loop += 1
-
-    def since(self, added: int) -> list[CineImage]:
-        """Those in the loop that were added after the first `added` images."""
-        count = min(max(self.added - added, 0), len(self._images))
-        return list(self._images)[len(self._images) - count :]
-
-    def restore(self, images: list[CineImage], until: float) -> None:
-        """Begin with the images of an earlier loop, the last of which is moved to the time `until`."""
-        self.clear()
-        for seconds, image, about in images:
-            self.add(image, until + seconds - images[-1].seconds, about)
 
     @property
     def images(self) -> list[CineImage]:
@@ -151,14 +125,14 @@ def of_images(images: Sequence[CineImage]) -> str:
 
 
 class Exports:
-    """The contents of the menu Export, by kind: png, .nrrd, .mha, .vti, gif, mrb, json, zip; and the script.
+    """The contents of the menu Export, by kind: png, .nrrd, .mha, .vti, gif, mrb, json.
 
     Each is (file name, content, MIME type). Raises SimulationError if there is nothing to export.
     """
 
-    def __init__(self, app: SlicerApp, panel: BrowserPanel, opener: Opener, cine: Cine) -> None:
-        self._app, self._logic, self._tasks, self._opener = app, panel.logic, panel.tasks, opener
-        self._cine, self._preset, self._progress = cine, panel.presenter.values.presetToSave, panel.progress
+    def __init__(self, app: SlicerApp, panel: BrowserPanel, cine: Cine, saved: Callable[[], None]) -> None:
+        self._app, self._logic, self._tasks, self._cine, self._saved = app, panel.logic, panel.tasks, cine, saved
+        self._preset, self._progress = panel.presenter.values.presetToSave, panel.progress
 
     def export(self, kind: str) -> tuple[str, bytes, str]:
         """Export one kind, in a task: what takes time can be cancelled, and images go on meanwhile."""
@@ -166,21 +140,13 @@ class Exports:
             return "preset.json", json.dumps(self._preset().to_dict(), indent=2).encode(), "application/json"
         if kind == "mrb":
             return "ultrasound.mrb", self._scene(), "application/zip"
-        if kind == "zip":
-            text, missing = self._script()
-            sent = self._opener.sent_files
-            for name in missing:
-                require(sent.has(name), f"{name} was not opened in this page, expected it beside the script")
-            with self._progress("Export the script") as progress:
-                content = self._tasks.doAside(lambda: sent.bundle(text, missing, progress))
-            return "ultrasound.zip", content, "application/zip"
         if kind == "gif":
             images = self._cine.images
             with self._progress("Export the images") as progress:
                 content = self._tasks.doAside(lambda: gif(images, progress))
             return "ultrasound.gif", content, "image/gif"
         require(kind in ("png", *FRAME_SUFFIXES), f"the export is {kind[:20]!r}, expected one of the menu")
-        taken = required(self._logic.taken, _NO_IMAGE)
+        taken = required(self._logic.taken, "there is no image, expected labels and a probe")
         if kind == "png":
             return "ultrasound.png", png(taken), "image/png"
         return f"ultrasound{kind}", frame_file(taken, kind), "application/octet-stream"
@@ -190,55 +156,18 @@ class Exports:
         with self._progress("Export the scene") as progress, TemporaryDirectory() as folder:
             with self._logic.imageHeld():
                 files = write_bundle(self._app, Path(folder) / "ultrasound")
+                self._saved()
             return self._tasks.doAside(lambda: zipped(files, progress))
 
-    def script(self) -> tuple[str, bool]:
-        """(a Python script that reproduces the image on the screen, whether it needs files that a page has sent)."""
-        text, missing = self._script()
-        return text, bool(missing)
 
-    def _script(self) -> tuple[str, tuple[str, ...]]:
-        """(the script, names of the files that a page has sent which it needs beside it)."""
-        labels: Any = self._logic.parameters.labels
-        taken = required(self._logic.taken, _NO_IMAGE)
-        require(labels is not None, _NO_IMAGE)
-        source, preset = self._opener.source_of(labels), taken.preset
-        require(
-            taken.anatomy is not None,
-            "it is not known of which tissues the image was taken, expected those that are there; make a new one",
-        )
-        require(
-            self._logic.anatomyOf(labels) == taken.anatomy,
-            "the tissues or sheets have changed since the image was taken, expected those of the image; make a new one",
-        )
-        in_labels, moved = pose_in_labels(labels, taken.probe_to_world)
-        require(np.allclose(moved, np.eye(4)), f"the transform of {labels.GetName()!r} scales, expected a rigid one")
-        sheets = self._shown_sheets(source)
-        shown = KINDS if isinstance(sheets, str) else sheets
-        tissues = preset.tissues.for_names(read_labels(labels, preset.tissues).names)
-        tissues = with_dura(tissues, shown, preset.tissues)
-        text = python_script(source, replace(preset, tissues=tissues), in_labels, sheets, taken.number)
-        needed = (*source.missing, *((sheets,) if isinstance(sheets, str) and not os.path.isabs(sheets) else ()))
-        return text, tuple(dict.fromkeys(needed))
-
-    def _shown_sheets(self, source: LabelSource) -> tuple[str, ...] | str:
-        """Kinds of the sheets of Segment that the image shows, or the file with them; () without.
-
-        Raises SimulationError for sheets that are neither.
-        """
-        node, kinds = self._logic.parameters.sheets, self._logic.parameters.sheet.kinds
-        drawn = tuple(kind for kind in KINDS if kind in kinds)
-        if node is None or not drawn:
-            return ()
-        file = node.GetAttribute(FILE)
-        if file and drawn == KINDS:
-            return file
-        require(
-            not file and set(drawn) <= set(source.sheets),
-            f"the image shows sheets of {node.GetName()!r} that the script cannot make, expected those of the last "
-            "Segment, or all of a file",
-        )
-        return drawn
+def zipped(files: Mapping[str, Path], progress: Callable[[float], None]) -> bytes:
+    """A .zip of {name: file}; `progress` may raise errors.Cancelled."""
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
+        for number, (name, file) in enumerate(files.items()):
+            progress(number / len(files))
+            archive.write(file, name)
+    return buffer.getvalue()
 
 
 def write_bundle(app: SlicerApp, folder: Path) -> dict[str, Path]:

@@ -1,131 +1,71 @@
-"""Opener: reads files into nodes of the scene: MRI, label maps, masks, tracked sequences."""
+"""Opener: files from a page or the command line are recognised, asked about where it matters, and put into the scene.
+
+Each file is one line on the page: what it was recognised as, and what was done with it. Nothing changes for a file that
+cannot be read, or whose question is answered with none of its choices.
+"""
 
 from __future__ import annotations
 
-import filecmp
 import logging
-import os
-import shutil
-from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
-from pathlib import Path, PurePosixPath
-from tempfile import TemporaryDirectory
-from typing import Any
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import islice
+from pathlib import Path
+from typing import Any, TypeVar
 
-import numpy as np
-
+from SlicerUSSim.Logic.base.dicom import Series
 from SlicerUSSim.Logic.base.errors import Cancelled, SimulationError, require
-from SlicerUSSim.Logic.base.files import mask_beside, read_json
+from SlicerUSSim.Logic.base.files import read_json
 from SlicerUSSim.Logic.base.reading import untrusted_folder
-from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.imaging.preset import Preset
-from SlicerUSSim.Logic.mri.markups import is_markup_name
-from SlicerUSSim.Logic.mri.masks import with_label_names
-from SlicerUSSim.Logic.mri.samples import demo_mri
-from SlicerUSSim.Logic.mri.segmentation_settings import SheetSettings
-from SlicerUSSim.Logic.mri.sheets.kept import sheets_beside
-from SlicerUSSim.Logic.mri.sheets.polydata import as_polydata, read_surfels
-from SlicerUSSim.Logic.mrml.label_nodes import read_labels, write_labels
-from SlicerUSSim.Logic.mrml.lesion_nodes import add_lesion
-from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic
-from SlicerUSSim.Logic.mrml.nodes import display_of, write_volume
-from SlicerUSSim.Logic.mrml.scene_record import SceneRecord, SequenceRecord
-from SlicerUSSim.Logic.mrml.sequence_nodes import KnownField, add_sequence, write_known_field
-from SlicerUSSim.Logic.mrml.taken_image import PATIENT, patient_of
-from SlicerUSSim.Logic.placement.craniotomy import is_open, polygon_of_file
-from SlicerUSSim.Logic.probe.arrays import Probe
+from SlicerUSSim.Logic.mri.markups import markup_points
+from SlicerUSSim.Logic.mri.modality import has_brain_mask
+from SlicerUSSim.Logic.mri.pathology import LESIONS
+from SlicerUSSim.Logic.mri.segmentation_settings import CT, MRI_CONTRASTS
+from SlicerUSSim.Logic.placement.craniotomy import POLYGONS
 from SlicerUSSim.Logic.tissue.label_mapping import LabelMapping
-from SlicerUSSim.Logic.tissue.label_maps import LabelledTissues, as_whole
-from SlicerUSSim.Logic.tissue.label_sources import read_label_file, table_beside
 from SlicerUSSim.Logic.tissue.table import TissueTable, tissues_beside
-from SlicerUSSim.Logic.tracked.images import TrackedImages
-from SlicerUSSim.Logic.tracked.sequence import TrackedSequence
-from SlicerUSSim.Workstation.content import Content, Kind, content_of, has_probe
-from SlicerUSSim.Workstation.parcel import Parcel
-from SlicerUSSim.Workstation.script import LabelSource
-from SlicerUSSim.Workstation.tasks import Tasks
-from SlicerUSSim.Workstation.zipped import zipped
+from SlicerUSSim.Logic.tracked.pose_files import read_pose
+from SlicerUSSim.Workstation.browser_panel import BrowserPanel
+from SlicerUSSim.Workstation.content import Content, Kind, content_of
+from SlicerUSSim.Workstation.file_nodes import FileNodes, LabelTable
+from SlicerUSSim.Workstation.patient import OpenPatient
+from SlicerUSSim.Workstation.pose_entry import PoseEntry
+from SlicerUSSim.Workstation.pose_registration import Registration
+from SlicerUSSim.Workstation.questions import Questions
+from SlicerUSSim.Workstation.scenes import Scenes
+from SlicerUSSim.Workstation.state import Choice
+from SlicerUSSim.Workstation.uploads import Sent, listed
 
 _log = logging.getLogger(__name__)
+_T = TypeVar("_T")
 
-#: Kinds of files in the order in which those of one parcel are opened: settings, a patient, what is laid on him
+#: Kinds of files in the order in which those that are opened together are: settings, a patient, what is laid on him
 _ORDER = (
     Kind.SCENE, Kind.PRESET, Kind.MRI, Kind.CT, Kind.LABELS, Kind.LESIONS, Kind.MASK, Kind.SHEETS, Kind.SEQUENCE,
-    Kind.TRANSFORM, Kind.POSE, Kind.POINTS, Kind.TABLE,
+    Kind.TRANSFORM, Kind.POSE, Kind.POINTS,
 )  # fmt: skip
-#: Parcels whose names of files are known
-_MOST_PARCELS = 8
-#: Attribute of a node: the file from which it was read; "" for the demo brain, the name alone for one sent by a page.
-FILE = "SlicerUSSim.file"
+#: Keys of choices
+_NEW, _SECOND, _SHOWN, _OWN = "new", "second", "shown", "own"
+_ORGANS, _BRAIN, _OPENING, _AS = "organs", "brain", "opening", "as "
+_CALIBRATION, _REGISTRATION, _POSE = "calibration", "registration", "pose"
+#: The tissue that stands for several
+_SEVERAL = "brats"
 
 
-@dataclass(frozen=True)
-class Files:
-    """Files and options at the start; without an MRI and labels, the demo brain is used."""
-
-    mri: str | None = None
-    labels: str | None = None
-    #: Tissues of the labels, as label_mapping.LabelMapping.of reads them
-    maps: tuple[str, ...] = ()
-    contrast: str = "t1"
-    mask: str | None = None
-    skull_strip: str = "atlas"
-    #: Whether skin, scalp, skull and air are labelled, too
-    outside: bool = False
-    #: Label map of organs of a CT
-    organs: str | None = None
-    #: A .vtp with thin sheets; and what Segment looks for, and images show
-    sheets: str | None = None
-    sheet_settings: SheetSettings = field(default_factory=SheetSettings)
-    #: Opening of skin and skull: none, auto or disc: (under the probe), or a file; and the diameter of the disc
-    craniotomy: str = "none"
-    craniotomy_mm: float | None = None
-    #: {contrast: file} of further MRIs of the patient; the first is selected
-    also: Mapping[str, str] = field(default_factory=dict)
-    #: (tissue, file) of masks that are laid over the labels
-    additions: tuple[tuple[str, str], ...] = ()
-    preset: Preset | None = None
-    sequence: TrackedSequence | None = None
-    sequence_name: str = "sequence"
-    #: Transform from pixels to the reference frame, and from there to the MRI; see TrackedImages.of
-    transform: str = "ImageToReference"
-    to_ras: np.ndarray | None = None
-    #: A scene that is shown in place of a patient from files, and its name
-    scene: SceneRecord | None = None
-    scene_name: str = ""
-    #: A file that is opened as if a page had sent it, after the others
-    also_open: str | None = None
-    #: OpenIGTLink, as openigtlink.parse_address reads it, and the transform to follow
-    tracker: str | None = None
-    tracker_device: str | None = None
-    #: Volumes that have already been read, by file
-    volumes: Mapping[str, Volume] = field(default_factory=dict)
-
-
-@dataclass(frozen=True)
-class LabelTable:
-    """What the file of a table says about the labels of a label map."""
-
-    name: str
-    #: As `ussim segment` writes them; None of another table
-    tissues: TissueTable | None = None
-    mapping: LabelMapping = field(default_factory=LabelMapping)
-
-
-@dataclass(frozen=True)
-class Upload:
-    """A file that a page has sent."""
+@dataclass
+class _File:
+    """A file that was recognised."""
 
     path: str
     content: Content
     #: Of the labels; None without
-    table: LabelTable | None = None
+    table: LabelTable | None
+    #: Whether an MRI or CT of a new patient was opened together with it
+    has_image: bool = False
 
     @property
     def kind(self) -> Kind:
-        """What it was recognised as."""
         return self.content.kind
 
     @property
@@ -135,539 +75,361 @@ class Upload:
 
 
 class Opener:
-    """Reads files in the worker thread and adds them to the scene. Raises SimulationError for invalid files."""
+    """Opens files. All methods run in a task."""
 
-    def __init__(self, scene, logic: UltrasoundSceneLogic, tasks: Tasks, files: Files) -> None:
-        self._scene, self._logic, self._tasks, self._files = scene, logic, tasks, files
-        self._sources: dict[tuple, LabelSource] = {}
-        #: {segments of a node: (tissue, file) of each}
-        self._lesion_files: dict[tuple, tuple[tuple[str, str], ...]] = {}
-        self._volumes = dict(files.volumes)  # read, but not yet used
-        #: Names of the preset's tissues since the table of a label map was added to them
-        self._names_of_table: list[str] | tuple[str, ...] = ()
-        #: The sequence of the patient, which is opened
-        self.opened_sequence: SequenceRecord | None = None
-        #: What pages have sent last, some of which may still wait for an answer
-        self._parcels: deque[Parcel] = deque(maxlen=_MOST_PARCELS)
-        #: Of files that pages have sent, by temporary path: the others that are read with it, and the name under which
-        #: it is kept
-        self._read_with: dict[str, tuple[Path, ...]] = {}
-        self._kept_names: dict[str, str] = {}
-        #: Those of the patient that scripts need
-        self.sent_files = SentFiles()
-
-    def mri(self, path: str | None):
-        """A volume node with the MRI of a file, or with the demo brain."""
-        volume = self._tasks.doAside(lambda: demo_mri()[0]) if path is None else self._volume(path)
-        name = "MNI152 brain" if path is None else Path(path).name
-        node = self._scene.AddNewNodeByClass("vtkMRMLScalarVolumeNode", name)
-        write_volume(node, volume)
-        node.SetAttribute(FILE, "" if path is None else self._place(path))
-        show_all_tissue(node, volume)
-        return node
-
-    def mask_file(self, mri_node) -> Path | None:
-        """Where the brain mask of an MRI is kept: beside the file with which the workstation was started."""
-        path = None if self._files.mri is None else os.path.abspath(self._files.mri)
-        return mask_beside(path) if path is not None and mri_node.GetAttribute(FILE) == path else None
-
-    def sheets_file(self, mri_node) -> Path | None:
-        """The same of the sheets that were found in it."""
-        kept = self.mask_file(mri_node)
-        return None if kept is None else sheets_beside(os.path.abspath(str(self._files.mri)))
-
-    def sheets(self, path: str):
-        """A model node with the sheets of a .vtp."""
-        surfels = self._tasks.doAside(lambda: read_surfels(path))
-        node = self._scene.AddNewNodeByClass("vtkMRMLModelNode", Path(path).name)
-        node.SetAndObservePolyData(as_polydata(surfels))
-        node.SetAttribute(FILE, self._place(path))
-        display_of(node).SetVisibility(False)
-        return node
-
-    def organs(self, path: str, maps: Iterable[str] = ()) -> tuple[Any, LabelledTissues]:
-        """(label map node with the organs of a CT, what was recognised) of a file."""
-        volume, table = self._volume(path), TissueTable({})
-        mapping = LabelMapping.of(maps, table)
-        found = self._tasks.doAside(lambda: read_label_file(Path(path), volume, mapping, default=table, of_ct=True))
-        return self._label_map(found.labels, path, found.names), replace(found, message=self.as_known(found.message))
-
-    def second_mri(self, path: str):
-        """A volume node with a further MRI of the patient."""
-        node = self._scene.AddNewNodeByClass("vtkMRMLScalarVolumeNode", Path(path).name)
-        write_volume(node, self._volume(path))
-        node.SetAttribute(FILE, self._place(path))
-        return node
-
-    def mask(self, path: str):
-        """A label map node with the mask of a file."""
-        return self._label_map(self._volume(path), path, ["inside"])
-
-    def opening(self, path: str):
-        """A node with the opening of a file: a closed curve through the points of a markup, or a mask."""
-        if not is_markup_name(path):
-            return self._label_map(is_open(self._mask(path), path), path, ["opening"])
-        return self._markups("vtkMRMLMarkupsClosedCurveNode", path, polygon_of_file(path))
-
-    def points(self, path: str, points: np.ndarray):
-        """A node with the list of points, (n, 3) RAS mm, of a file."""
-        return self._markups("vtkMRMLMarkupsFiducialNode", path, points)
-
-    def _markups(self, kind: str, path: str, points: np.ndarray):
-        node = self._scene.AddNewNodeByClass(kind, Path(path).name)
-        for point in points:
-            node.AddControlPointWorld(*point)
-        node.SetAttribute(FILE, self._place(path))
-        return node
-
-    def labels(self, path: str, table: LabelTable | None = None) -> tuple[Any, LabelledTissues]:
-        """(label map node, what was recognised) of a file; see label_sources.read_label_file.
-
-        Tissues are those of `table`, of the table or names beside it, of the preset, or of a known program's numbers.
-        """
-        volume = self._volume(path)
-        mine = self._logic.preset.tissues
-        mapping = LabelMapping.of(self._files.maps if path == self._files.labels else (), mine)
-        if table is not None:
-            mapping, beside = table.mapping, table.tissues
-        else:
-            beside = None if mapping else table_beside(Path(path))
-        # A table that came with other labels was not chosen for these, whose numbers mean something else.
-        is_chosen = mine.names() not in (Preset().tissues.names(), self._names_of_table)
-        found = self._tasks.doAside(
-            lambda: read_label_file(
-                Path(path), volume, mapping, table=beside, preset=mine if is_chosen else None, default=mine
-            )
-        )  # fmt: skip
-        if beside is not None:
-            for tissue in beside.values():
-                mine = mine.with_tissue(tissue)
-            self._logic.preset = replace(self._logic.preset, tissues=mine)
-            self._names_of_table = mine.names()
-        if mapping.names and table is not None:
-            found = replace(found, message=f"{found.message}, named in {table.name}")
-        found = replace(
-            found,
-            message=self.as_known(found.message),
-            warnings=tuple(map(self.as_known, (*found.warnings, *volume.doubts))),
-        )
-        node = self._label_map(found.labels, path, found.names)
-        node.SetAttribute(PATIENT, node.GetName())
-        order = read_labels(node, self._logic.preset.tissues).names
-        relabelled = {old: order.index(found.names[new - 1]) + 1 if new else 0 for old, new in found.relabelled.items()}
-        source = LabelSource(self._place(path), True, relabelled=relabelled, tissue_names=tuple(order))
-        self._sources = {_voxels_of(node): source}
-        return node, found
-
-    def lesion(self, path: str) -> tuple[Volume, str]:
-        """(volume with the names of its labels, path or kept name) of a file with lesions."""
-        return self._mask(path), self._place(path)
-
-    def peek(self, path: str) -> Volume:
-        """The volume of a file, which is read again from what is known of it."""
-        self._volumes[path] = volume = self._volume(path)
-        return volume
-
-    def lesion_of_file(self, lesions_node, tissue: str, path: str):
-        """The segmentation node with the lesions, with a mask of a file; made if it is None."""
-        node, _ = self.add_lesion(lesions_node, self._mask(path), tissue, Path(path).name, os.path.abspath(path))
-        return node
-
-    def add_lesion(self, lesions_node, mask: Volume, tissue: str, name: str, file: str):
-        """(segmentation node with the lesions, function that takes the mask out of it again).
-
-        `file` is that of the mask: its path, or the name under which what a page has sent is kept.
-        """
-        files = self.lesion_files(lesions_node)
-        made = lesions_node is None
-        node = self._scene.AddNewNodeByClass("vtkMRMLSegmentationNode", "Lesions") if made else lesions_node
-
-        def undo(ids: Iterable[str] = ()) -> None:
-            for segment_id in ids:
-                node.GetSegmentation().RemoveSegment(segment_id)
-            if made:
-                self._scene.RemoveNode(node)
-
-        try:
-            told = replace(mask, doubts=tuple(map(self.as_known, mask.doubts)))
-            ids = add_lesion(node, told, tissue, name)
-        except SimulationError:
-            undo()
-            raise
-        if files is not None:
-            self._lesion_files[_segments_of(node)] = (*files, (tissue, file))
-        return node, lambda: undo(ids)
-
-    def restore_lesions(self, lesions_node, files: tuple[tuple[str, str], ...]) -> None:
-        """Record the (tissue, file) of all lesions of a node that was restored."""
-        self._lesion_files[_segments_of(lesions_node)] = files
-
-    def lesion_files(self, lesions_node) -> tuple[tuple[str, str], ...] | None:
-        """(tissue, file) of all lesions; None if they are not all of files."""
-        if lesions_node is None:
-            return ()
-        return self._lesion_files.get(_segments_of(lesions_node))
-
-    def segmented(
-        self, labels_node, mri_node, mask_node, options: dict, others: Mapping[str, Any], lesions_node,
-        sheets: tuple[str, ...] = (), organs_node=None,
+    def __init__(
+        self, panel: BrowserPanel, nodes: FileNodes, patient: OpenPatient, scenes: Scenes,
+        registration: Registration, questions: Questions, poses: PoseEntry,
     ) -> None:  # fmt: skip
-        """Record the source of labels that Segment made, from these nodes and {contrast: node}, with the lesions.
+        self._shared, self._logic, self._tasks = panel.shared, panel.logic, panel.tasks
+        self._panel, self._presenter, self._nodes, self._patient = panel, panel.presenter, nodes, patient
+        self._scenes, self._registration, self._questions, self._poses = scenes, registration, questions, poses
+        self._take: dict[Kind, Callable[[_File, list[_File]], str]] = {
+            Kind.MRI: self._image, Kind.CT: self._image, Kind.LABELS: self._labels, Kind.MASK: self._mask,
+            Kind.LESIONS: self._mask, Kind.SEQUENCE: self._sequence, Kind.SHEETS: self._sheets, Kind.SCENE: self._scene,
+            Kind.PRESET: self._preset, Kind.TRANSFORM: self._transform, Kind.POSE: self._pose,
+            Kind.POINTS: self._points,
+        }  # fmt: skip
 
-        `sheets` are the kinds that were looked for. Labels with organs have no source.
+    def open_sent(self, files: Mapping[str, bytes], meant: str = "") -> None:
+        """Open what a page has sent, {name: content}: any files of a patient, his ultrasound, and settings.
+
+        A transform that is `meant` to be a calibration or a registration is used as such without a question.
         """
-        labels_node.SetAttribute(PATIENT, mri_node.GetName())
-        file, mask = mri_node.GetAttribute(FILE), None if mask_node is None else _file_of(mask_node)
-        self._sources = {}
-        additions = self.lesion_files(lesions_node)
-        if file is not None and additions is not None and organs_node is None:
-            files = {contrast: _file_of(node) for contrast, node in others.items()}
-            source = LabelSource(file, mask=mask, options=options, others=files, additions=additions, sheets=sheets)
-            self._sources[_voxels_of(labels_node)] = source
+        self._begin()
+        with self._presenter.shown(), untrusted_folder() as folder, self._nodes.sent_in(folder):
+            with self._presenter.view.progress(f"Open {listed(list(files))}"), self._nodes.known_names():
+                sent = Sent(folder, files)
+                series = self._tasks.doAside(sent.series) if sent.has_dicom else []
+            if sent.has_dicom:
+                sent.take(self._chosen(series), series)
+            if sent.left_out:
+                files_left = f"{sent.left_out} file{'s' * (sent.left_out > 1)}"
+                self._say(f"{files_left} beside the DICOM images left out, as no image")
+            self._open(sent.paths, meant)
 
-    def added(self, source: LabelSource | None, patient: str, labels_node, lesions_node) -> None:
-        """Record the source of labels that are those of `source`, of this patient, with the lesions on top."""
-        labels_node.SetAttribute(PATIENT, patient)
-        additions = self.lesion_files(lesions_node)
-        if source is not None and additions is not None:
-            self._sources[_voxels_of(labels_node)] = replace(source, additions=additions)
+    def open_paths(self, paths: Sequence[str]) -> None:
+        """Open files of this computer."""
+        self._begin()
+        with self._presenter.shown():
+            self._open([Path(path) for path in paths])
 
-    def restored(self, source: LabelSource | None, labels_node) -> None:
-        """Record the source of labels that are those from before Segment again."""
-        self._sources = {} if source is None else {_voxels_of(labels_node): source}
+    def close_patient(self) -> None:
+        """Close the patient, after a question if something of him would be lost."""
+        with self._presenter.shown():
+            if self._patient.unsaved:
+                text = "Export, Scene for 3D Slicer (MRB), saves what was made here."
+                self._ask(f"Close {self._patient.name}?", text, [Choice("close", "Close", self._closed())])
+            self._patient.close()
 
-    def opened(
-        self, source: LabelSource | None, patient: str, labels_node, disc: tuple[float, np.ndarray] | None
-    ) -> None:
-        """Record the source of labels that are those of `source` with a disc opened; None: with another opening."""
-        labels_node.SetAttribute(PATIENT, patient)
-        if source is not None and disc is not None:
-            self._sources[_voxels_of(labels_node)] = replace(source, disc=disc)
+    def _begin(self) -> None:
+        with self._shared.changing() as now:
+            now.opened = []
 
-    def forget_patient(self, *new: Any) -> None:
-        """Release what is kept of the last patient; `new` are nodes of the next one."""
-        self.sent_files.forget(node.GetAttribute(FILE) or "" for node in new if node is not None)
-        self._sources, self._lesion_files = {}, {}
+    def _open(self, paths: Sequence[Path], meant: str = "") -> None:
+        with self._presenter.view.progress(f"Open {listed([path.name for path in paths])}"):
+            files, wrong = self.recognised(paths)
+        for file in files:
+            with self._presenter.shown(), self._nodes.known_names():
+                if meant:
+                    is_one = file.kind in (Kind.TRANSFORM, Kind.POSE)
+                    require(is_one, f"{file.name} is {file.content.what}, expected the {meant} of tracked ultrasound")
+                    deed = self._transform_as(file, meant)
+                else:
+                    deed = self._take[file.kind](file, files)
+                self._say(f"{file.name}: {file.content.what}: {deed}")
+        for line in wrong:  # after a new patient, with whom the messages about the one before are gone
+            self._panel.showError(line)
 
-    def patient(self) -> str:
-        """Name of the patient of the chosen labels, or of the MRI if there are none; "" without either."""
-        labels, mri = self._logic.parameters.labels, self._logic.parameters.mri
-        if labels is not None:
-            return patient_of(labels)
-        return "" if mri is None else patient_of(mri)
-
-    def known_source(self, labels_node) -> LabelSource | None:
-        """The source of labels; None if it is unknown, or there are no labels."""
-        return None if labels_node is None else self._sources.get(_voxels_of(labels_node))
-
-    def source_of(self, labels_node) -> LabelSource:
-        """The source of labels. Raises SimulationError if they were not made from files."""
-        source = self.known_source(labels_node)
-        if source is None:
-            name = labels_node.GetName()
-            raise SimulationError(f"{name!r} has no source file, expected labels of a file (save, open with --labels)")
-        return source
-
-    def sequence(self, record: SequenceRecord):
-        """(TrackedImages, sequence browser node, sequence node of the images, all nodes that were made).
-
-        The probe of images that were not prepared yet is that of the preset at the start, if there was one.
-        """
-        preset, scene, tracked = self._logic.preset, self._scene, record.tracked
-        if tracked is None:
-            tracked = self._prepared(record, preset.probe, is_known=self._files.preset is not None)
-        before = {scene.GetNthNode(number) for number in range(scene.GetNumberOfNodes())}
-        browser, images = add_sequence(
-            scene, record.sequence, record.name, record.path, record.to_ras, tracked.poses,
-            self._logic.parameters.probe_transform,
-        )  # fmt: skip
-        write_known_field(images, KnownField(tracked.field, np.eye(4) if record.to_ras is None else record.to_ras))
-        now = [scene.GetNthNode(number) for number in range(scene.GetNumberOfNodes())]
-        return tracked, browser, images, [node for node in now if node not in before]
-
-    def prepared(self, record: SequenceRecord, probe: Probe) -> TrackedImages:
-        """The images of a scene in which the probe was this one at last. Raises SimulationError without its field.
-
-        They are of the probe that was kept with them. In a scene of before it is the present one, unless a user has
-        changed that so that it does not fit to the images: it is looked for in them then, as when they were opened.
-        """
-        try:
-            return self._prepared(record, probe, is_known=True)
-        except Cancelled:
-            raise
-        except SimulationError as error:
-            _log.info("%s: %s; the probe is looked for in the images", record.name, error)
-            return self._prepared(record, probe, is_known=False)
-
-    def _prepared(self, record: SequenceRecord, probe: Probe, *, is_known: bool) -> TrackedImages:
-        """`probe` is that of the images if it is known, and otherwise that of which the geometry alone is not used."""
-        return self._tasks.doAside(
-            lambda: TrackedImages.of(
-                record.sequence, path=record.path, reference_to_ras=record.to_ras, beam=probe,
-                probe=probe if is_known else None, field=record.field,
-            )
-        )  # fmt: skip
-
-    @contextmanager
-    def uploaded_mask(self, name: str, content: bytes) -> Iterator[tuple[Volume, str]]:
-        """(volume, name under which it is kept) of a file with a mask uploaded from a page."""
-        with self.sent({name: content}) as parcel:
-            path = str(parcel.paths[0] if parcel.paths else self._tasks.doAside(lambda: _of_dicom(parcel)))
-            volume, file = self.lesion(path)
-            self.keep(path)
-        yield volume, file
-
-    @contextmanager
-    def sent(self, files: Mapping[str, bytes]) -> Iterator[Parcel]:
-        """What a page has sent together, {name: content}, which can be opened within the block.
-
-        Errors within the block are about the names of files, as the user knows them. Raises SimulationError for names
-        that are no plain names and for headers without their voxels, before anything is written.
-        """
-        with untrusted_folder() as folder:
-            parcel = Parcel(folder, files)
-            self._parcels.append(parcel)
-            try:
-                with self.known_names():
-                    yield parcel
-            finally:
-                for path in parcel.names:
-                    for known in (self._volumes, self._read_with, self._kept_names):
-                        known.pop(path, None)
-
-    @contextmanager
-    def known_names(self) -> Iterator[None]:
-        """Errors within the block are about the names of files, as the user knows them."""
-        try:
-            yield
-        except SimulationError as error:
-            if isinstance(error, Cancelled):
-                raise
-            raise SimulationError(self.as_known(str(error))) from None
-
-    def uploads(self, parcel: Parcel) -> tuple[list[Upload], list[str]]:
-        """(what the files of a parcel are, in the order in which they can be opened; lines about those that cannot).
+    def recognised(self, paths: Sequence[Path]) -> tuple[list[_File], list[str]]:
+        """(what files are, in the order in which they can be opened; lines about those that cannot).
 
         Label maps come with the tables of their labels. Raises SimulationError if there is nothing to open.
         """
         found: dict[Path, Content] = {}
         wrong: list[str] = []
-        for path in parcel.paths:
+        for path in paths:
             try:
-                found[path] = content = self._tasks.doAside(lambda path=path: content_of(path))
+                with self._nodes.known_names():
+                    found[path] = content = self._tasks.doAside(lambda path=path: content_of(path))
+            except Cancelled:
+                raise
             except SimulationError as error:
-                if isinstance(error, Cancelled):
-                    raise
-                wrong.append(parcel.as_known(str(error)))
+                wrong.append(str(error))
                 continue
             _log.info("%s: is %s", path.name, content.what)
             if content.volume is not None:
-                self._volumes[str(path)] = content.volume
+                self._nodes.volumes[str(path)] = content.volume
         if not found:
             raise SimulationError("; ".join(wrong) or "no files were sent, expected one or more")
-        tables = _tables_of(found)
+        tables, maps = _tables_of(found)
         parts = {name for content in found.values() for name in content.files[1:]}
-        for path, content in found.items():
-            self._read_with[str(path)] = tuple(path.with_name(name) for name in content.files[1:])
-        uploads = [
-            Upload(str(path), content, None if path not in tables else self._table(tables[path]))
+        files = [
+            _File(str(path), content, self._table(maps[path]) if path in maps else None)
             for path, content in found.items()
-            if path not in tables.values() and path.name not in parts
+            if path not in tables and path.name not in parts
         ]
-        return sorted(uploads, key=lambda upload: _ORDER.index(upload.kind)), wrong
+        return sorted(files, key=lambda file: _ORDER.index(file.kind)), wrong
 
     def _table(self, path: Path) -> LabelTable:
-        if _is_json(path) and _has_tissues_only(path):
+        values = read_json(path) if path.suffix.lower() == ".json" else None
+        if isinstance(values, dict) and "tissues" in values:
             return LabelTable(path.name, TissueTable.read(path))
         return LabelTable(path.name, mapping=LabelMapping.of([str(path)], self._logic.preset.tissues))
 
-    def as_known(self, text: str) -> str:
-        """A message with the names of files as the user knows them, without the temporary folder."""
-        for parcel in self._parcels:
-            text = parcel.as_known(text)
-        return text
+    def _say(self, line: str) -> None:
+        with self._shared.changing() as now:
+            now.opened = [*now.opened, self._nodes.as_known(line)]
 
-    def _place(self, path: str) -> str:
-        """The path of a file; if a page has sent it, the name under which it is kept."""
-        parcel = next((parcel for parcel in self._parcels if path in parcel.names), None)
-        if parcel is None:
-            return os.path.abspath(path)
-        if path not in self._kept_names:
-            self._kept_names[path] = self.sent_files.name_for(Path(path), self._read_with.get(path, ()))
-        return self._kept_names[path]
+    def _read(self, file: _File, read: Callable[[str], _T]) -> _T:
+        with self._presenter.view.progress(f"Open {file.name}"):
+            return read(file.path)
 
-    def keep(self, path: str) -> None:
-        """Keep a file that a page has sent for scripts, if it was read into a node; it is moved from where it was."""
-        if path in self._kept_names:
-            self.sent_files.keep(self._kept_names[path], Path(path), self._read_with.get(path, ()))
-
-    def _volume(self, path: str) -> Volume:
-        """The volume of a file, read once."""
-        return self._volumes.pop(path, None) or self._tasks.doAside(lambda: Volume.read(path))
-
-    def _mask(self, path: str) -> Volume:
-        """The same of a mask, with the names of its labels."""
-        return with_label_names(self._volume(path), path)
-
-    def _label_map(self, volume: Volume, path: str, names):
-        volume = as_whole(volume, path)
-        node = self._scene.AddNewNodeByClass("vtkMRMLLabelMapVolumeNode", Path(path).name)
-        node.SetAttribute(FILE, self._place(path))
-        write_labels(node, volume.with_array(volume.array.astype(np.uint8)), names, node)
-        return node
-
-
-def show_all_tissue(mri_node, volume: Volume) -> None:
-    """Choose the grey levels of an MRI; the automatic window saturates bright tissue."""
-    display = display_of(mri_node)
-    display.SetAutoWindowLevel(False)
-    inside = volume.array[volume.array > 0]
-    display.SetWindowLevelMinMax(0.0, 1.1 * float(np.percentile(inside, 99.8)) if inside.size else 1.0)
-
-
-def _is_json(path: Path) -> bool:
-    return path.suffix.lower() == ".json"
-
-
-def _has_tissues_only(path: Path) -> bool:
-    """Whether a .json file has the tissues of a label map, as `ussim segment` writes them, and is no preset."""
-    values = read_json(path)
-    return isinstance(values, dict) and "tissues" in values and not has_probe(values)
-
-
-def _tables_of(found: dict[Path, Content]) -> dict[Path, Path]:
-    """{label map: table of its labels} of what was sent together. Raises SimulationError for tables of nothing."""
-    maps = [path for path, content in found.items() if content.kind in (Kind.LABELS, Kind.MASK, Kind.LESIONS)]
-    # With a label map, a .json file that is no preset says what its labels are
-    tables = [
-        path
-        for path, content in found.items()
-        if content.kind is Kind.TABLE
-        or (maps and content.kind is Kind.PRESET and _is_json(path) and not has_probe(read_json(path)))
-    ]
-    if not tables:
-        return {}
-    called = ", ".join(path.name for path in tables)
-    others = [path.name for path in found if path not in tables]
-    if not maps:
-        what = "the tissue table" if _is_json(tables[0]) else "a table of the labels"
+    def _chosen(self, series: list[Series]) -> Series:
+        """The only series that is a volume, or the one that the user chooses."""
+        volumes = [one for one in series if one.is_volume]
+        listing = "; ".join(f"{one.title}: {one.images}" for one in series[:12])
         require(
-            not others,
-            f"{', '.join(others)} is no label map, and {called} a table of labels, expected both of a label map; open "
-            "it alone",
+            bool(volumes),
+            f"the DICOM files have no series with enough parallel images for a volume, expected one "
+            f"({listing or 'none'})",
         )
-        require(len(tables) == 1, f"{called}: are tables, expected a label map with one of them")
-        raise SimulationError(f"{called} is {what} of a label map: open both files together")
+        if len(volumes) == 1:
+            if len(series) > 1:
+                title = volumes[0].title
+                self._say(f"the DICOM files have {len(series)} series, of which one is a volume: {title}")
+            return volumes[0]
+        patients = list(dict.fromkeys(one.patient for one in volumes))
+        whose = [f", patient {patients.index(one.patient) + 1}" if len(patients) > 1 else "" for one in volumes]
+        of_many = f" of {len(patients)} different patients" if len(patients) > 1 else ""
+        number = self._ask(
+            "Which series?",
+            f"The DICOM files have {len(volumes)} series that are volumes{of_many}.",
+            [Choice(str(n), f"{one.title}: {one.images}{whose[n]}") for n, one in enumerate(volumes)],
+        )
+        return volumes[int(number)]
+
+    # ---- the patient -------------------------------------------------------------------------------------------
+
+    def _image(self, file: _File, together: list[_File]) -> str:
+        parameters: Any = self._logic.parameters
+        patient, is_ct, before = self._patient.name, file.kind is Kind.CT, parameters.segmentation.contrast
+        contrast = CT if is_ct else MRI_CONTRASTS[0] if before == CT else before
+        key = _NEW
+        if self._patient.is_of_user:
+            choices = [self._new()]
+            if parameters.mri is None:
+                choices.append(Choice(_SHOWN, f"Image of {patient}", "Shown under the labels, which stay"))
+            elif not is_ct and before != CT:
+                tip = "Registered to the first MRI and classified together with it by Segment"
+                choices.append(Choice(_SECOND, f"Second MRI of {patient}", tip))
+            key = self._ask_what(file, choices)
+        if key == _SECOND:
+            second = self._ask(
+                f"Contrast of {file.name}?",
+                f"The first MRI of {patient} is used as {before}.",
+                [Choice(name, name) for name in MRI_CONTRASTS],
+            )
+            self._patient.take_second(self._read(file, self._nodes.second_mri), second)
+            return f"second MRI of {patient}, {second}; Segment uses it"
+        node = self._read(file, self._nodes.mri)
+        labels = [other for other in together if other.kind is Kind.LABELS]
+        for other in labels:
+            other.has_image = True
+        if key == _SHOWN:
+            self._patient.show_image(node)
+            return f"shown as the image of {patient}"
+        if not self._patient.take_mri(node, contrast, then_segment=not labels):
+            return "a new patient, whose tissues were not found"
+        then = "its labels came with it" if labels else f"segmented as {contrast}"
+        changed = f" (before: {before})" if contrast != before else ""
+        return f"a new patient, {then}{changed}{f'; {patient} is closed' if patient else ''}"
+
+    def _labels(self, file: _File, together: list[_File]) -> str:
+        parameters: Any = self._logic.parameters
+        patient, key = self._patient.name, _OWN if file.has_image else _NEW
+        if self._patient.is_of_user and not file.has_image:
+            choices = [self._new()]
+            if parameters.mri is not None:
+                choices.append(Choice(_OWN, f"Tissues of {patient}", "In place of its tissues; the MRI stays"))
+            if parameters.mri is not None and parameters.segmentation.contrast == CT:
+                choices.append(_organs_of(patient))
+            key = self._ask_what(file, choices)
+        if key == _ORGANS:
+            return self._organs(file)
+        return self._take_labels(file, patient, are_of_patient=key == _OWN)
+
+    def _take_labels(self, file: _File, patient: str, *, are_of_patient: bool) -> str:
+        table = self._numbering(file)
+        node, found = self._read(file, lambda path: self._nodes.labels(path, table))
+        self._patient.take_labels(node, found, are_of_patient=are_of_patient)
+        if are_of_patient:
+            return f"tissues of {patient}"
+        return f"a new patient{f'; {patient} is closed' if patient else ''}"
+
+    def _numbering(self, file: _File) -> LabelTable | None:
+        """The table of its labels, or the numbering that the user says where several fit."""
+        schemes = {scheme.key: scheme for scheme in file.content.schemes}
+        if file.table is not None or not schemes:
+            return file.table
+        choices = [
+            Choice(key, scheme.title, ", ".join(f"{n} {name}" for n, name in islice(scheme.names.items(), 4)))
+            for key, scheme in schemes.items()
+        ]
+        key = self._ask(f"Numbers of {file.name}?", f"{file.name} is {file.content.what}.", choices)
+        return LabelTable(schemes[key].title, mapping=LabelMapping(scheme=key))
+
+    def _organs(self, file: _File) -> str:
+        self._patient.take_organs(*self._read(file, self._nodes.organs))
+        return f"organs of the CT {self._patient.name}; Segment uses them"
+
+    def _mask(self, file: _File, together: list[_File]) -> str:
+        """A mask, or lesions: of the patient, or a label map."""
+        parameters: Any = self._logic.parameters
+        patient = self._patient.name
+        if not patient or file.table is not None:  # whose table says what its labels are
+            return self._labels(file, together)
+        tip = f"Laid over the tissues of {patient}"
+        choices = [Choice(f"{_AS}{name}", f"Add as {name}", tip) for name in LESIONS if name != _SEVERAL]
+        if file.kind is Kind.LESIONS:
+            choices.insert(0, Choice(f"{_AS}{_SEVERAL}", "Add its lesions by their names or numbers", tip))
+        contrast = parameters.segmentation.contrast
+        if parameters.mri is not None and file.kind is Kind.MASK and has_brain_mask(contrast):
+            tip = f"Segment makes the tissues of {patient} anew, inside the mask"
+            choices.append(Choice(_BRAIN, "Use as brain mask", tip))
+        if file.kind is Kind.MASK and parameters.labels is not None:
+            choices.append(Choice(_OPENING, "Use as opening of the skull", "Chosen for Open skull"))
+        if parameters.mri is not None and contrast == CT:
+            choices.append(_organs_of(patient))
+        choices.append(Choice(_NEW, "Label map of a new patient", self._closed()))
+        key = self._ask_what(file, choices)
+        if key == _NEW:
+            return self._take_labels(file, patient, are_of_patient=False)
+        if key == _ORGANS:
+            return self._organs(file)
+        if key == _BRAIN:
+            parameters.mask = self._read(file, lambda path: self._nodes.brain_mask(path, parameters.mri))
+            is_segmented = self._patient.segment()
+            return f"brain mask of {patient}, {'whose tissues are made anew' if is_segmented else 'without tissues'}"
+        if key == _OPENING:
+            parameters.opening = self._read(file, self._nodes.opening)
+            return f"opening of {patient}, used by Open skull"
+        tissue = key.removeprefix(_AS)
+        self._patient.lay(self._read(file, self._nodes.lesions), tissue, file.name)
+        return f"{'its lesions' if tissue == _SEVERAL else tissue} of {patient}, over the tissues"
+
+    # ---- ultrasound and settings -------------------------------------------------------------------------------
+
+    def _sequence(self, file: _File, together: list[_File]) -> str:
+        recording = self._registration.read(file.path)
+        self._registration.take(recording)
+        if not recording.is_calibrated:
+            return f"{recording.what}: its calibration is asked for in Tracked ultrasound"
+        return f"{recording.what}: compared with {self._patient.name or 'the patient who is opened next'}"
+
+    def _transform(self, file: _File, together: list[_File]) -> str:
+        """A calibration, a registration or a pose: of these only two files say which they are."""
+        known = {".xml": _CALIBRATION, ".tag": _REGISTRATION}
+        key = known.get(Path(file.name).suffix.lower())
+        if key is None:
+            later = "" if self._registration.recording is not None else "; of the one that is opened next"
+            choices = [
+                Choice(_CALIBRATION, "Calibration", f"Of tracked ultrasound: from pixels to its probe{later}"),
+                Choice(_REGISTRATION, "Registration", f"Of tracked ultrasound: from its frame to the patient{later}"),
+            ]
+            if self._logic.parameters.labels is not None and self._is_pose(file):
+                tip = f"The simulated probe is moved there, on {self._patient.name}"
+                choices.append(Choice(_POSE, "Pose of the probe", tip))
+            key = self._ask_what(file, choices)
+        return self._pose(file, together) if key == _POSE else self._transform_as(file, key)
+
+    def _is_pose(self, file: _File) -> bool:
+        try:
+            self._tasks.doAside(lambda: read_pose(file.path))
+        except Cancelled:
+            raise
+        except SimulationError:
+            return False
+        return True
+
+    def _transform_as(self, file: _File, key: str) -> str:
+        use = self._registration.calibrate if key == _CALIBRATION else self._registration.register
+        of_next = self._registration.recording is None
+        self._read(file, use)
+        return f"{key} of the tracked ultrasound{' that is opened next' if of_next else ''}"
+
+    def _sheets(self, file: _File, together: list[_File]) -> str:
+        self._logic.parameters.sheets = self._read(file, self._nodes.sheets)
+        return "shown in the images"
+
+    def _preset(self, file: _File, together: list[_File]) -> str:
+        preset = self._tasks.doAside(lambda: Preset.read(file.path))
+        self._presenter.values.takePreset(preset)
+        moves = "" if preset.probe_to_ras is None else "; the probe is moved to its pose"
+        return f"in place of the settings of before{moves}"
+
+    def _pose(self, file: _File, together: list[_File]) -> str:
+        self._poses.set(self._tasks.doAside(lambda: read_pose(file.path)))
+        return "the probe is moved there"
+
+    def _points(self, file: _File, together: list[_File]) -> str:
+        path, parameters = file.path, self._logic.parameters
+        kind, points = self._tasks.doAside(lambda: markup_points(path, POLYGONS, "a closed curve or a list of points"))
+        require(len(points) > 0, f"{file.name}: has no point that was placed, expected one or more")
+        if kind == "Fiducial":
+            parameters.seed = self._nodes.points(path, points)
+            return "the last one is chosen as the point of a lesion; Craniotomy has them, too, for an opening"
+        parameters.opening = self._read(file, self._nodes.opening)
+        return "chosen as the opening of a craniotomy"
+
+    def _scene(self, file: _File, together: list[_File]) -> str:
+        before = self._patient.name
+        if self._patient.is_of_user:
+            self._ask_what(file, [Choice(_NEW, "The patient of the scene", self._closed())])
+        self._scenes.open(file.path)
+        return f"shown as it was{f'; {before} is closed' if before else ''}"
+
+    # ---- questions ---------------------------------------------------------------------------------------------
+
+    def _new(self) -> Choice:
+        return Choice(_NEW, "New patient", self._closed())
+
+    def _closed(self) -> str:
+        """What becomes of the patient who is open, and what of him is lost then."""
+        unsaved = self._patient.unsaved
+        lost = f"; not saved: {', '.join(unsaved)}" if unsaved else ""
+        return f"{self._patient.name} is closed, with all that belongs to it{lost}"
+
+    def _ask_what(self, file: _File, choices: list[Choice]) -> str:
+        return self._ask(f"Open {file.name} as?", f"{file.name} is {file.content.what}.", choices)
+
+    def _ask(self, title: str, text: str, choices: list[Choice]) -> str:
+        """The key of the answer. Raises SimulationError if the patient about whom was asked is not open any more."""
+        patient = self._patient.name
+        key = self._questions.ask(title, self._nodes.as_known(text), choices)
+        now = self._patient.name
+        require(now == patient, f"{patient or 'no patient'} was open for this question, and now {now or 'none'} is")
+        return key
+
+
+def _organs_of(patient: str) -> Choice:
+    return Choice(_ORGANS, f"Organs of the CT {patient}", "They replace muscle and blood when Segment is pressed")
+
+
+def _tables_of(found: Mapping[Path, Content]) -> tuple[set[Path], dict[Path, Path]]:
+    """(tables of labels, {label map: its table}) of files that are opened together.
+
+    A table is called as its label map, or there is one of each. Raises SimulationError for a table of nothing.
+    """
+    tables = [path for path, content in found.items() if content.kind is Kind.TABLE]
+    maps = [path for path, content in found.items() if content.kind in (Kind.LABELS, Kind.MASK, Kind.LESIONS)]
     pairs: dict[Path, Path] = {}
     for table in tables:
         own = [path for path in maps if tissues_beside(path).stem == table.stem] or maps
         require(
             len(own) == 1 and own[0] not in pairs,
-            f"{called}: {'are tables' if len(tables) > 1 else 'is a table'} of {len(maps)} label "
-            f"map{'s' * (len(maps) > 1)}, expected one for each, called as its label map",
+            f"{table.name} is a table of labels and was opened with {len(maps)} label maps, expected one for each "
+            "table: open a label map and its table together, both of one name if there are several",
         )
         pairs[own[0]] = table
-    return pairs
-
-
-def _of_dicom(parcel: Parcel) -> Path:
-    """The folder of the only series of a parcel."""
-    series = parcel.series()
-    require(len(series) == 1, f"has {len(series)} DICOM series, expected one of a mask")
-    return parcel.take(series[0], series)
-
-
-def _file_of(node) -> str:
-    """The file of a node; for a node without one, that in which a user would save it."""
-    return node.GetAttribute(FILE) or f"{node.GetName()}.nrrd"
-
-
-def _segments_of(lesions_node) -> tuple:
-    """A key that changes with the number of segments of a node."""
-    return lesions_node.GetID(), lesions_node.GetSegmentation().GetNumberOfSegments()
-
-
-def _voxels_of(labels_node) -> tuple:
-    """A key that changes with the voxels of a label map."""
-    image = labels_node.GetImageData() if labels_node.IsA("vtkMRMLVolumeNode") else None
-    return labels_node.GetID(), None if image is None else image.GetMTime()
-
-
-# ---- files of the patient that a page has sent, kept as long as the patient is open, for scripts ---------------------
-
-
-class SentFiles:
-    """Keeps files by name in a temporary folder, which is for this user alone and goes with the program.
-
-    The name of a folder, such as a DICOM series, is that of all files in it. Files that are read together, such as
-    probability maps of three tissues, are in a folder, of which the name of one of them means all.
-    """
-
-    def __init__(self) -> None:
-        self._folder = TemporaryDirectory(prefix="ussim-sent-")
-        self._files: dict[str, Path] = {}
-        self._number = 0
-
-    @property
-    def files(self) -> Mapping[str, Path]:
-        """{name: where it is}; names of files in folders have slashes."""
-        return dict(self._files)
-
-    def has(self, name: str) -> bool:
-        """Whether a file or folder of this name is kept."""
-        return bool(self._meant([name]))
-
-    def name_for(self, path: Path, others: Sequence[Path] = ()) -> str:
-        """The name under which a file or folder would be kept: its own, or "name (2).nii.gz" beside one called so.
-
-        `others` are read together with it.
-        """
-        stem, dot, suffix = (path.stem.partition(".")[0], "", "") if others else path.name.partition(".")
-        name, number = f"{stem}{dot}{suffix}", 1
-        while self._is_another(name, path, others):
-            number += 1
-            name = f"{stem} ({number}){dot}{suffix}"
-        return f"{name}/{path.name}" if others else name
-
-    def keep(self, name: str, path: Path, others: Sequence[Path] = ()) -> None:
-        """Keep a file or folder under a name of name_for, with `others`; they are moved from where they were."""
-        folder = str(PurePosixPath(name).parent) if others else name
-        for part, file in _parts(path, others).items():
-            key = f"{folder}/{part}" if part else folder
-            if key not in self._files:
-                self._number += 1
-                place = Path(self._folder.name) / str(self._number)
-                shutil.move(file, place)
-                self._files[key] = place
-
-    def forget(self, kept: Iterable[str] = ()) -> None:
-        """Remove those of the last patient; the names `kept` are of the next one, too."""
-        for name in self._files.keys() - self._meant(kept):
-            self._files.pop(name).unlink(missing_ok=True)
-
-    def bundle(self, script: str, names: Iterable[str], progress: Callable[[float], None]) -> bytes:
-        """A .zip with a script, and the files of these names beside it; `progress` may raise Cancelled."""
-        files = {name: self._files[name] for name in sorted(self._meant(names))}
-        return zipped(files, progress, {"image.py": script})
-
-    def _meant(self, names: Iterable[str]) -> set[str]:
-        """The kept files that names of files and folders mean."""
-        wanted = {str(PurePosixPath(name).parent) if "/" in name else name for name in names if name}
-        return {name for name in self._files if name in wanted or name.partition("/")[0] in wanted}
-
-    def _is_another(self, name: str, path: Path, others: Sequence[Path]) -> bool:
-        """Whether this is the name of other files than these."""
-        known = {key: self._files[key] for key in self._meant([name])}
-        parts = {f"{name}/{part}" if part else name: file for part, file in _parts(path, others).items()}
-        if not known:
-            return False
-        return known.keys() != parts.keys() or not all(
-            filecmp.cmp(known[key], file, shallow=False) for key, file in parts.items()
-        )
-
-
-def _parts(path: Path, others: Sequence[Path]) -> dict[str, Path]:
-    """{name below that under which they are kept: file} of a folder, of files that are read together, or of one."""
-    if path.is_dir():
-        return {file.name: file for file in sorted(path.iterdir())}
-    return {file.name: file for file in (path, *others)} if others else {"": path}
+    return set(tables), pairs

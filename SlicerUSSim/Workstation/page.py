@@ -18,25 +18,18 @@ from trame_server import Server
 from trame_slicer.core import LayoutManager
 from trame_slicer.views import AbstractView
 
-from SlicerUSSim.Logic.mri.pathology import LESIONS
 from SlicerUSSim.Widget.image_presenter import FROZEN
 from SlicerUSSim.Widget.interface import Control, Section
 from SlicerUSSim.Widget.tissue_presenter import TISSUE_COLUMNS
 from SlicerUSSim.Workstation.browser_panel import BrowserPanel
-from SlicerUSSim.Workstation.page_parts import (
-    keep_session,
-    pose_numbers,
-    question_dialog,
-    registration_section,
-    session_offer,
-)
-from SlicerUSSim.Workstation.state import NAMES, ORGANS, PLANES, SLICE_VIEWS, ComparisonMode, value_of
+from SlicerUSSim.Workstation.page_parts import offer, pose_numbers, question_dialog, registration_section
+from SlicerUSSim.Workstation.state import NAMES, PLANES, SLICE_VIEWS, ComparisonMode, value_of
 
 _STATIC = Path(__file__).parent / "static"
 #: Files that the page loads in addition to those of trame.
 MODULE = {
     "serve": {"ussim": str(_STATIC)},
-    "scripts": ["ussim/overlay.js", "ussim/workstation.js", "ussim/session.js"],
+    "scripts": ["ussim/overlay.js", "ussim/workstation.js"],
     "styles": ["ussim/workstation.css"],
 }
 #: Controls of the panel that are not on the page: its slice views follow the probe, it compares the fit in the
@@ -52,7 +45,6 @@ _IN_PAGE = {
 }
 #: What is at the top of the drawer
 _FIRST_SECTION, _FIRST_CONTROLS = "Ultrasound", ("gainSlider", "depthSlider")
-_LESION_TEXTS = {"brats": "labels by their names, or a BraTS map"}
 #: Colours of the marks beside the slice views' planes.
 _STRIPES = {"Red": "red", "Yellow": "yellow", "Green": "green"}
 
@@ -82,7 +74,7 @@ POSE_SLIDERS = (
 _EXPORTS = {
     "png": "Image (PNG)", ".nrrd": "Image with geometry (NRRD)", ".mha": "Image with geometry (MHA)",
     ".vti": "Image with geometry (VTI)", "gif": "Cine of the last images (GIF)", "mrb": "Scene for 3D Slicer (MRB)",
-    "json": "Settings (JSON)", "zip": "Python script with its files (ZIP)",
+    "json": "Settings (JSON)",
 }  # fmt: skip
 
 #: In the browser's tab
@@ -105,7 +97,7 @@ def build_page(server: Server, panel: BrowserPanel, layout: LayoutManager, keys:
             _drawer(panel)
         with v3.VMain(style="height: 100vh"), html.Div(classes="ussim-main"):
             with html.Div(classes="ussim-image"):
-                session_offer()
+                offer()
                 _tools()
                 _screens(keys)
                 _player()
@@ -113,7 +105,6 @@ def build_page(server: Server, panel: BrowserPanel, layout: LayoutManager, keys:
             with html.Div(classes="ussim-anatomy"):
                 layout.initialize_layout_grid(page)
         _messages()
-        _script_dialog()
         question_dialog()
 
 
@@ -195,18 +186,6 @@ def _open_file() -> None:
         "Close patient", size="small", classes="mb-1", id="close-patient", click="trigger('close_patient')",
         title="Nothing of the patient stays on the page, in the scene or in memory; settings stay",
         disabled=(f"{NAMES.title} === ''",),
-    )  # fmt: skip
-    keep_session()
-    options = "".join(f'<option value="{name}">{_LESION_TEXTS.get(name, name)}</option>' for name in (*LESIONS, ORGANS))
-    html.Div(
-        f"""<label for="added-as">Add a mask as</label>
-        <select id="added-as" v-model="{NAMES.added_as}">{options}</select>""",
-        classes="ussim-line", title="Tissue that is laid over the labels where the mask is not 0",
-    )  # fmt: skip
-    html.Div(
-        f"""<label for="add-file">Mask to add</label><input type="file" id="add-file"
-        @change="window.ussim.send($event.target, {{for: 'add', as: {NAMES.added_as}}})">""",
-        classes="ussim-line", title="On any grid",
     )  # fmt: skip
 
 
@@ -373,7 +352,6 @@ def _tools() -> None:
             with v3.VList(density="compact"):
                 for kind, words in _EXPORTS.items():
                     v3.VListItem(title=words, click=f"window.ussim.save('{kind}')", id=f"export-{kind.strip('.')}")
-                v3.VListItem(title="Copy as Python", click="trigger('script')", id="export-python")
 
 
 def _screens(keys: tuple[str, ...]) -> None:
@@ -401,14 +379,7 @@ def _screens(keys: tuple[str, ...]) -> None:
         with html.Div(classes="ussim-screen", v_show=f"{there} && {beside}"):
             html.Div(f"Real, {{{{ {NAMES.sequence.name} }}}}", classes="ussim-caption")
             with html.Div(classes="ussim-frame", id="real"):
-                html.Div(
-                    f"""<canvas data-stream="real"
-                    :class="{{picking: {NAMES.registration.picking} === 'ultrasound'}}"
-                    @click="window.ussim.pickLandmark($event)"></canvas>
-                    <template v-for="(mark, n) in {NAMES.registration.landmarks}">
-                    <div v-if="mark.place && mark.image === {NAMES.sequence.name}" class="ussim-landmark"
-                    :style="{{left: mark.place[0] + '%', top: mark.place[1] + '%'}}">{{{{ n + 1 }}}}</div></template>"""
-                )
+                html.Div('<canvas data-stream="real"></canvas>')
 
 
 def _player() -> None:
@@ -484,19 +455,3 @@ def _messages() -> None:
             density="compact", closable=True, classes="mb-1 ussim-error",
             update_modelValue="trigger('dismiss', [n])",
         )  # fmt: skip
-
-
-def _script_dialog() -> None:
-    script = NAMES.script
-    with v3.VDialog(v_model=(script.is_open,), max_width=900), v3.VCard(title="This image as a Python script"):
-        with v3.VCardText():
-            html.Div(f'<textarea id="ussim-script" class="ussim-script" readonly :value="{script.text}"></textarea>')
-        with v3.VCardActions():
-            html.Div(
-                "It reads files that were opened in the page, expected beside it", v_if=script.needs_files,
-                id="script-files", classes="text-caption",
-            )  # fmt: skip
-            v3.VSpacer()
-            v3.VBtn("Save with its files", v_if=script.needs_files, click="window.ussim.save('zip')", id="save-script")
-            v3.VBtn("Copy", click=f"window.ussim.copy({script.text})", id="copy-script")
-            v3.VBtn("Close", click=f"{script.is_open} = false")

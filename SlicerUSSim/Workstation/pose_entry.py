@@ -1,20 +1,17 @@
-"""PoseEntry: poses of the probe that are typed, opened from files and saved."""
+"""PoseEntry: poses of the probe that are typed and saved."""
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from SlicerUSSim.Logic.base.errors import SimulationError, require, required
-from SlicerUSSim.Logic.base.reading import untrusted_folder
+from SlicerUSSim.Logic.base.errors import require, required
 from SlicerUSSim.Logic.base.transforms import angles_of_pose
-from SlicerUSSim.Logic.tracked.pose_files import pose_of_text, read_pose, write_pose
+from SlicerUSSim.Logic.tracked.pose_files import pose_of_text, write_pose
 from SlicerUSSim.Workstation.browser_panel import BrowserPanel
-from SlicerUSSim.Workstation.uploads import require_whole_files
 
 #: Suffixes of files of poses
 POSE_SUFFIXES = (".json", ".tfm", ".h5", ".mat", ".txt")
@@ -22,7 +19,7 @@ _NO_PROBE = "there is no probe yet, expected a patient; open an MRI or labels"
 
 
 class PoseEntry:
-    """Sets the pose of the probe from texts and files.
+    """Sets the pose of the probe from texts, and saves it.
 
     Parameters
     ----------
@@ -33,7 +30,7 @@ class PoseEntry:
     def __init__(
         self, panel: BrowserPanel, pose: Callable[[], np.ndarray | None], move: Callable[[np.ndarray], None]
     ) -> None:
-        self._shared, self._tasks, self._presenter = panel.shared, panel.tasks, panel.presenter
+        self._shared, self._presenter = panel.shared, panel.presenter
         self._pose, self._move = pose, move
 
     def show(self) -> None:
@@ -50,17 +47,6 @@ class PoseEntry:
         """Set the pose from six or sixteen numbers; called in a task."""
         with self._presenter.shown():
             self.set(pose_of_text(text))
-
-    def open(self, name: str, content: bytes) -> None:
-        """Set the pose from a file that a page has sent; called in a task."""
-        with self._presenter.shown(), untrusted_folder() as folder:
-            require_whole_files({name: content})
-            path = Path(folder) / name
-            path.write_bytes(content)
-            try:
-                self.set(self._tasks.doAside(lambda: read_pose(path)))
-            except SimulationError as error:
-                raise SimulationError(str(error).replace(f"{folder}{os.sep}", "")) from None
 
     def file(self, suffix: str) -> tuple[str, bytes]:
         """(name, content) of a file with the pose. Raises SimulationError without a probe, or for another suffix."""

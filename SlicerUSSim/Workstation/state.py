@@ -15,7 +15,6 @@ from typing import cast
 from trame_server.state import State
 from trame_server.utils.typed_state import TypedState
 
-from SlicerUSSim.Logic.mri.pathology import LESIONS
 from SlicerUSSim.Logic.probe.surface import SurfacePose
 
 #: Planes in which a slice view follows the probe: image plane, plane across it, and anatomical planes.
@@ -23,10 +22,6 @@ IN_PLANE, ACROSS = "In plane", "Across"
 PLANES = (IN_PLANE, ACROSS, "Axial", "Coronal", "Sagittal")
 #: Initial planes of the slice views, by Slicer's names of the views.
 SLICE_VIEWS = {"Red": IN_PLANE, "Yellow": ACROSS, "Green": "Axial"}
-
-
-#: What a file can be added as besides a lesion: the label map of organs of a CT
-ORGANS = "organs of the CT"
 
 
 class ComparisonMode(Enum):
@@ -76,18 +71,6 @@ class Choice:
     #: On its button, and what it does
     title: str
     tip: str = ""
-
-
-@dataclass(frozen=True)
-class LandmarkLine:
-    """A pair of landmarks, and what remains between them after the fit."""
-
-    ultrasound: str
-    patient: str
-    remaining: str
-    #: Name of its image, and where it is in it as it is shown: percent from the left and from the top
-    image: str = ""
-    place: list[float] | None = None
 
 
 # ---- shared state, by topic ------------------------------------------------------------------------------------------
@@ -176,16 +159,6 @@ class FitState:
 
 
 @dataclass
-class ScriptState:
-    """The dialog with the image as a Python script."""
-
-    text: str = ""
-    is_open: bool = False
-    #: Whether it needs files that a page has sent
-    needs_files: bool = False
-
-
-@dataclass
 class RegistrationState:
     """Calibration and registration of the tracked ultrasound."""
 
@@ -196,17 +169,9 @@ class RegistrationState:
     frames: list[str] = field(default_factory=list)
     #: Name of the transform that is given as calibration
     name: str = "ImageToProbe"
-    #: Where calibration and registration are from, and their 16 numbers by rows
+    #: Where calibration and registration are from
     calibration: str = ""
-    calibration_text: str = ""
     registration: str = ""
-    registration_text: str = ""
-    landmarks: list[LandmarkLine] = field(default_factory=list)
-    #: What the next click gives a landmark: "ultrasound", "patient" or ""
-    picking: str = ""
-    #: A landmark that is typed: column and row in the image, R, A and S in the patient
-    typed_pixel: str = ""
-    typed_point: str = ""
 
 
 @dataclass
@@ -227,17 +192,10 @@ class PageState:
 
     #: Name of the patient: the file with the labels, or with the MRI from which they are
     title: str = ""
-    #: The question whether a session of before is to be restored; "": there is none
+    #: The question whether pose and settings of before are to be restored; "": there is none
     offer: str = ""
-    #: Whether this session is kept on the disk, and whether that is possible
-    keeps_session: bool = False
-    can_keep_session: bool = False
-    #: With which a page knows that a server is this one, see access.proof
-    proof_key: str = ""
     #: Titles of the panel's sections that are open
     open_sections: list[str] = field(default_factory=list)
-    #: The tissue that a mask is which is added
-    added_as: str = LESIONS[0]
     #: Whether there is an image that does not follow the probe
     is_frozen: bool = False
     #: Pose of the probe on the patient; None without a probe or a patient
@@ -255,7 +213,6 @@ class PageState:
     sequence: SequenceState = field(default_factory=SequenceState)
     simulated: SimulatedState = field(default_factory=SimulatedState)
     fit: FitState = field(default_factory=FitState)
-    script: ScriptState = field(default_factory=ScriptState)
     registration: RegistrationState = field(default_factory=RegistrationState)
     question: QuestionState = field(default_factory=QuestionState)
     #: What was opened last: what each file is, and what was done with it, one line each

@@ -23,19 +23,11 @@ class Receiver:
     ----------
     opened : called in the event loop with {name: content} of files to open, and what they are meant to be ("": not
         said).
-    added : called with the name and the content of a mask to add, and the tissue that it is.
-    posed : called with the name and the content of a file with a pose of the probe.
     refused : called with a line about files that were not taken.
     """
 
-    def __init__(
-        self,
-        opened: Callable[[dict[str, bytes], str], None],
-        added: Callable[[str, bytes, str], None],
-        refused: Callable[[str], None],
-        posed: Callable[[str, bytes], None] = lambda name, content: None,
-    ) -> None:
-        self._opened, self._added, self._refused, self._posed = opened, added, refused, posed
+    def __init__(self, opened: Callable[[dict[str, bytes], str], None], refused: Callable[[str], None]) -> None:
+        self._opened, self._refused = opened, refused
 
     def serve(self, app: web.Application) -> None:
         """Answer requests to an application, which is about to start."""
@@ -63,11 +55,7 @@ class Receiver:
                 content += piece
             parts.append((part.filename or "", bytes(content)))
         files = uploads.plain_names(parts)
-        if files and request.query.get("for") == "add":
-            self._added(*next(iter(files.items())), request.query.get("as", ""))
-        elif files and request.query.get("for") == "pose":
-            self._posed(*next(iter(files.items())))
-        elif files:
+        if files:
             self._opened(files, request.query.get("as", ""))
         return web.Response(status=204)
 

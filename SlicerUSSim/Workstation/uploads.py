@@ -1,4 +1,4 @@
-"""What a page may send: files that are whole by themselves, under plain names.
+"""What a page may send: files that are whole by themselves, under plain names, in a folder of their own.
 
 The name is a text from a browser, or from whoever has the token, and becomes a path; a header may name any other file
 of the server's user as its voxels, which would then be shown and saved with the scene.
@@ -6,12 +6,16 @@ of the server's user as its voxels, which would then be shown and saved with the
 
 from __future__ import annotations
 
+import logging
+import os
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
-from SlicerUSSim.Logic.base.errors import require
-from SlicerUSSim.Workstation.formats import is_metaimage
+from SlicerUSSim.Logic.base.dicom import Series, list_series
+from SlicerUSSim.Logic.base.errors import SimulationError, require
+
+_log = logging.getLogger(__name__)
 
 #: Bytes of the longest name that file systems take, less what is added to it
 _LONGEST_NAME = 200
@@ -23,8 +27,75 @@ _MOST_LISTED = 4
 MOST_FILES = 10_000
 #: Where headers end that name their voxels
 _HEADER_BYTES = 2**16
+#: First words of MetaImage headers, whose lines may come in any order
+_META = re.compile(rb"\s*(?:ObjectType|NDims|Comment|ObjectSubType|BinaryData)\s*=")
 _NRRD = re.compile(rb"^data ?file:\s*(.*)$", re.MULTILINE | re.IGNORECASE)
 _METAIMAGE = re.compile(rb"^ElementDataFile\s*=[ \t]*(.*)$", re.MULTILINE)
+#: Folder of the DICOM files, whose names may be those of others
+DICOM = "dicom"
+#: Endings of images of one file; beside DICOM files nothing else is opened, as from a CD with a viewer
+_IMAGES = (".nrrd", ".mha", ".nii", ".nii.gz", ".mgz", ".mgh", ".mnc", ".vti", ".vtp", ".mrb")
+
+
+class Sent:
+    """Files that a page has sent together. Nothing is read here in this process but their first bytes.
+
+    Parameters
+    ----------
+    folder : empty; see reading.untrusted_folder.
+    files : {name: content}.
+
+    Raises SimulationError as require_whole_files does, before anything is written.
+    """
+
+    def __init__(self, folder: str, files: Mapping[str, bytes]) -> None:
+        require_whole_files(files)
+        self._folder = Path(folder)
+        #: Those that are no DICOM images
+        self.paths: list[Path] = []
+        #: How many files beside DICOM files are none of an image
+        self.left_out = 0
+        dicom = {name for name, content in files.items() if _is_dicom(name, content)}
+        for name, content in files.items():
+            if name in dicom:
+                self._write(self._folder / DICOM / name, content)
+            elif dicom and not name.lower().endswith(_IMAGES):
+                self.left_out += 1
+            else:
+                self._write(self._folder / name, content)
+                self.paths.append(self._folder / name)
+
+    @property
+    def has_dicom(self) -> bool:
+        """Whether there are DICOM files, which `series` and `take` make into a volume."""
+        return (self._folder / DICOM).is_dir()
+
+    def series(self) -> list[Series]:
+        """The DICOM series; takes up to seconds."""
+        return list_series(self._folder / DICOM)
+
+    def take(self, chosen: Series, others: list[Series]) -> None:
+        """Make a folder with the images of one series the first of the paths; `others` are all series.
+
+        Files that are in no series stay with it: they may be damaged images of it, which its reader says.
+        """
+        folder = self._folder / chosen.title
+        if folder.exists():
+            folder = self._folder / f"{chosen.title} DICOM"
+        folder.mkdir()
+        taken = {Path(file) for series in others if series is not chosen for file in series.files}
+        for file in sorted((self._folder / DICOM).iterdir()):
+            if file not in taken:
+                os.replace(file, folder / file.name)
+        _log.info("DICOM: %s, %s", folder.name, chosen.images)
+        self.paths.insert(0, folder)
+
+    def _write(self, path: Path, content: bytes) -> None:
+        try:
+            path.parent.mkdir(exist_ok=True)
+            path.write_bytes(content)
+        except OSError as error:
+            raise SimulationError(f"{path.name}: cannot be stored ({error.strerror})") from None
 
 
 def require_whole_files(files: Mapping[str, bytes]) -> None:
@@ -75,10 +146,16 @@ def plain_names(parts: Iterable[tuple[str, bytes]]) -> dict[str, bytes]:
     return files
 
 
+def _is_dicom(name: str, content: bytes) -> bool:
+    """Whether a file is a DICOM image: by its prefix, or by the ending of older ones that lack it."""
+    has_prefix = content[128:132] == b"DICM" or name.lower().endswith((".dcm", ".ima"))
+    return has_prefix and name.upper() != "DICOMDIR"
+
+
 def _other_file(name: str, content: bytes) -> str | None:
     """The file that a header names as its voxels; None for a file that is whole."""
     lower, start = name.lower(), content[:4]
-    if lower.endswith((".mhd", ".mha")) or is_metaimage(content):
+    if lower.endswith((".mhd", ".mha")) or _META.match(content[:256]):
         # Of a sequence the line comes after the fields of all images
         found = _METAIMAGE.search(content)
         named = found[1].strip().decode("utf-8", "replace") if found else ""

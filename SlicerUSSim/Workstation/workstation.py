@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import asyncio
-import secrets
 from collections.abc import Callable
-from contextlib import suppress
 from functools import partial
 from pathlib import Path
-from time import perf_counter
 from typing import Any, cast
 
 import slicer
@@ -16,26 +13,23 @@ from trame.app import get_server
 from trame_server import Server
 from trame_slicer.core import SlicerApp
 
-from SlicerUSSim.Logic.base.errors import SimulationError
 from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic
-from SlicerUSSim.Workstation.access import proof_key
 from SlicerUSSim.Workstation.anatomy import AnatomyViews
-from SlicerUSSim.Workstation.autosave import Autosave
 from SlicerUSSim.Workstation.browser_panel import BrowserPanel, Observed
 from SlicerUSSim.Workstation.comparison import Comparison
 from SlicerUSSim.Workstation.export import Cine, Exports
+from SlicerUSSim.Workstation.file_nodes import FileNodes, Files
 from SlicerUSSim.Workstation.hand import KEYS
 from SlicerUSSim.Workstation.image_flow import ImageFlow, LatencyStamps
-from SlicerUSSim.Workstation.loading import Loading
-from SlicerUSSim.Workstation.opener import Files, Opener
-from SlicerUSSim.Workstation.opening import Opening
+from SlicerUSSim.Workstation.kept_state import KeptState
+from SlicerUSSim.Workstation.opener import Opener
 from SlicerUSSim.Workstation.page import build_page, view_tools
+from SlicerUSSim.Workstation.patient import OpenPatient
 from SlicerUSSim.Workstation.pose_entry import PoseEntry
 from SlicerUSSim.Workstation.pose_registration import Registration
 from SlicerUSSim.Workstation.probe_control import ProbeControl
 from SlicerUSSim.Workstation.questions import Questions
-from SlicerUSSim.Workstation.restoring import Restoring
-from SlicerUSSim.Workstation.session_store import OwnSession, SessionStore
+from SlicerUSSim.Workstation.scenes import Scenes
 from SlicerUSSim.Workstation.simulated import SimulatedSequence
 from SlicerUSSim.Workstation.state import NAMES, SharedState
 from SlicerUSSim.Workstation.tasks import Tasks
@@ -53,10 +47,10 @@ class Workstation:
     ----------
     files : files and options at the start.
     device : see opencl.devices.choose_device.
-    sessions : where sessions are kept; None: nowhere.
+    state_file : where pose and settings are kept, see kept_state.state_file; None: nowhere.
     """
 
-    def __init__(self, files: Files, device: str | None = None, sessions: SessionStore | None = None) -> None:
+    def __init__(self, files: Files, device: str | None = None, state_file: Path | None = None) -> None:
         self.server = cast(Server, get_server("ussim", client_type="vue3"))
         self._files = files
         self._shared = shared = SharedState(self.server.state)
@@ -77,89 +71,48 @@ class Workstation:
         self._tracker = Tracker(shared, tasks, probe.move)
         self._images = ImageFlow(panel, self._views, comparison, cine, self._tracker, stamps)
         self._simulated = SimulatedSequence(panel, comparison, probe.move)
-        opener = Opener(app.scene, logic, tasks, files)
-        presenter.segmenting.maskFile, presenter.segmenting.sheetsFile = opener.mask_file, opener.sheets_file
+        nodes = FileNodes(logic, tasks, files)
+        presenter.segmenting.maskFile, presenter.segmenting.sheetsFile = nodes.mask_file, nodes.sheets_file
         panel.pick = probe.hand.pick
-        self._exports = Exports(app, panel, opener, cine)
-        self._registration = registration = Registration(panel, opener, comparison, probe.hand)
-        self._loading = loading = Loading(panel, opener, self._views, probe, comparison, registration)
+        self._registration = registration = Registration(panel, nodes, comparison)
+        self._patient = patient = OpenPatient(panel, nodes, self._views, probe, comparison, registration)
+        self._exports = Exports(app, panel, cine, patient.saved)
         self._questions = Questions(shared, tasks)
-        self._opening = Opening(panel, opener, loading, registration, self._questions, self._poses)
-
-        self._session = self._begun_session(sessions)
-        self._autosave = Autosave(self._session, panel, opener, cine, probe.pose, lambda: registration.landmarks)
-        self._restoring = Restoring(
-            sessions if self._session is not None else None, panel, opener, loading, registration, probe, cine,
-            self._autosave.when_kept, perf_counter,
+        self._scenes = Scenes(panel, nodes, patient, registration)
+        self._opener = opener = Opener(
+            panel, nodes, patient, self._scenes, registration, self._questions, self._poses
         )  # fmt: skip
-        self._opening.open_scene = self._restoring.open_scene
+        self._kept = KeptState(state_file, panel, patient, opener, probe)
 
         self._following = False
-        self._probe_node = Observed("TransformModifiedEvent", probe.moved)
+        self._probe_node = Observed("TransformModifiedEvent", self._probe_moved)
         self._image_node = Observed("ImageDataModifiedEvent", self._images.image_changed)
         self._parameter_node = Observed("ModifiedEvent", self._parameters_changed)
         self._parameter_node.watch(logic.parameters.node)
         segmenting, lesions, placing = presenter.segmenting, presenter.lesions, presenter.placing
         panel.own_actions |= {
-            segmenting.segment: loading.segment,
-            segmenting.undoSegment: loading.undo_segment,
-            lesions.addTissues: partial(loading.lay, lesions.addTissues),
-            placing.openCraniotomy: loading.open_craniotomy,
-            placing.closeCraniotomy: loading.close_craniotomy,
-            placing.placeProbe: partial(loading.place, placing.placeProbe),
-            placing.placeAtView: partial(loading.place, placing.placeAtView),
+            segmenting.undoSegment: patient.undo_segment,
+            placing.placeProbe: partial(patient.place, placing.placeProbe),
+            placing.placeAtView: partial(patient.place, placing.placeAtView),
         }
+        for action in (segmenting.segment, lesions.addTissues, placing.openCraniotomy, placing.closeCraniotomy):
+            panel.own_actions[action] = partial(patient.then_show, action)
         self._answer_pages(stamps)
         self._follow_pages()
-        opened, added = partial(self._then_refresh, self._opening.open), partial(self._then_refresh, loading.add)
-        receiver = Receiver(
-            self._in_task(opened), self._in_task(added), panel.showError, self._in_task(self._poses.open)
-        )  # fmt: skip
+        receiver = Receiver(self._in_task(partial(self._then_refresh, opener.open_sent)), panel.showError)
         self.server.controller.on_server_bind.add(lambda wslink: receiver.serve(wslink.app))
         self.server.controller.on_server_bind.add(lambda wslink: Sender(self._export).serve(wslink.app))
         self.server.controller.on_server_ready.add(self._ready)
         self.server.controller.on_server_exited.add(self.close)
         build_page(self.server, panel, self._views.layout, (*KEYS, "Escape"))
 
-    def take_token(self, port: int) -> str:
-        """The token of the last server at this port, if it was killed, so that its pages go on; otherwise a new one."""
-        kept = None if self._sessions is None or port == 0 else self._sessions.token_of(port)
-        token = kept or secrets.token_urlsafe(24)
-        with self._shared.changing() as now:
-            now.proof_key = proof_key(token)
-        return token
-
-    def keep_token(self, port: int, token: str) -> None:
-        """Keep the token, in case this server is killed; called once it listens at this port."""
-        if self._session is not None and self._shared.now.keeps_session:
-            with suppress(SimulationError):  # the page then says that a new address is to be opened
-                self._session.keep_address(port, token)
-
     @property
     def is_computing(self) -> bool:
         """Whether a thread computes something for the page."""
         return self._tasks.are_computing
 
-    def end_session(self) -> None:
-        """Called when the server ends as it should; what was kept of the patient stays."""
-        if self._session is not None:
-            self._session.end()
-            self._session = None
-
-    def _begun_session(self, sessions: SessionStore | None) -> OwnSession | None:
-        self._sessions, session = sessions, None
-        if sessions is not None:
-            try:
-                session = sessions.begin()
-            except SimulationError as error:
-                self._panel.showError(f"this session is not kept: {error}")
-        with self._shared.changing() as now:
-            now.keeps_session = now.can_keep_session = session is not None
-        return session
-
     def close(self, **_: object) -> None:
         """Close the connection to the tracker and cancel waiting tasks."""
-        self._autosave.end()
         self._logic.stopLiveUpdate()
         self._tracker.stop()
         self._tasks.stop()
@@ -172,7 +125,7 @@ class Workstation:
         triggers: dict[str, Callable[..., object]] = {
             "set": self._panel.set,
             "press": self._panel.press,
-            "close_patient": self._in_task(self._loading.close_patient),
+            "close_patient": self._in_task(self._opener.close_patient),
             "set_tissue": self._in_task(self._presenter.tissues.setTissue),
             "set_free": self._in_task(self._presenter.fits.setFree),
             "set_pose": probe.set_pose,
@@ -186,20 +139,11 @@ class Workstation:
             "show_simulated": self._in_task(self._simulated.show),
             "show_number": comparison.show,
             "answer": self._questions.answer,
-            "calibrate": self._in_task(registration.calibrate),
-            "register": self._in_task(registration.register),
             "choose_frame": self._in_task(registration.choose_frame),
-            "pick_landmark": registration.pick,
-            "landmark_in_image": registration.picked_in_image,
-            "add_landmark": registration.add_typed,
-            "remove_landmark": registration.remove_landmark,
-            "fit_landmarks": self._in_task(registration.fit),
             "cancel": self._panel.cancel,
             "dismiss": self._panel.dismiss,
-            "script": self._show_script,
-            "restore_session": self._in_task(partial(self._then_refresh, self._restoring.restore)),
-            "discard_session": self._in_task(self._restoring.discard),
-            "session_kept": self._session_kept,
+            "restore": self._in_task(partial(self._then_refresh, self._kept.restore)),
+            "discard": self._in_task(self._kept.discard),
             "stamp": stamps.receive,
             "page_opened": self._images.show_again,
             "at_rest": self._at_rest,
@@ -244,19 +188,6 @@ class Workstation:
         self._simulated.stop()
         self._comparison.play()
 
-    def _show_script(self) -> None:
-        with self._presenter.shown(), self._shared.changing() as now:
-            (now.script.text, now.script.needs_files), now.script.is_open = self._exports.script(), True
-
-    async def _session_kept(self) -> bool:
-        """Wait until the present state is kept on the disk; returns whether it is. For programs that control a page."""
-        while not (self._is_at_rest and self._autosave.is_done):
-            await asyncio.sleep(_LOOK_EVERY_S)
-        self._autosave.look()
-        while not self._autosave.is_done:
-            await asyncio.sleep(_LOOK_EVERY_S)
-        return self._autosave.has_kept
-
     async def _at_rest(self) -> dict[str, int]:
         """Wait until all requests of pages and trackers are done; returns the number of the last image by stream.
 
@@ -278,7 +209,6 @@ class Workstation:
         for stream in self._images.streams:
             self.server.controller.rc_area_register(stream)
         self._tasks.start(self._begin)
-        self._autosave.begin()
 
     def _begin(self) -> None:
         files = self._files
@@ -286,14 +216,18 @@ class Workstation:
             with self._presenter.shown():
                 self._tracker.start(files.tracker, files.tracker_device)
         if files.scene is not None:
-            self._restoring.show_scene(files.scene, files.scene_name)
-        else:
-            self._loading.begin(files)
-        if files.also_open is not None:
             with self._presenter.shown():
-                self._opening.open({Path(files.also_open).name: Path(files.also_open).read_bytes()})
-        self._restoring.offer()  # not before: what is restored takes the place of this patient
+                self._scenes.show(files.scene, files.scene_name)
+        else:
+            self._patient.begin(files)
+        if files.also_open is not None:
+            self._opener.open_paths([files.also_open])
+        self._kept.offer()  # not before: it is about the patient who is open
         self._panel.refresh()
+
+    def _probe_moved(self) -> None:
+        self._probe.moved()
+        self._kept.changed()
 
     def _parameters_changed(self) -> None:
         if not self._following:
@@ -304,7 +238,7 @@ class Workstation:
         """Observe, draw and simulate the nodes that the scene's parameters refer to."""
         self._following = False
         parameters = self._logic.parameters
-        self._loading.show_title()
+        self._patient.show_title()
         self._probe_node.watch(parameters.probe_transform)
         taken = self._logic.taken
         if self._image_node.watch(parameters.output) and taken is not None and taken.node is parameters.output:
@@ -315,3 +249,4 @@ class Workstation:
             with self._presenter.shown():
                 self._probe.update_surface()
         self._presenter.parametersChanged()
+        self._kept.changed()

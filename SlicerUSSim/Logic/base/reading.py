@@ -24,7 +24,7 @@ from dataclasses import dataclass, is_dataclass
 from enum import Enum
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, BinaryIO, ParamSpec, TypeVar
+from typing import Any, ParamSpec, TypeVar
 
 from SlicerUSSim.Logic.base.errors import (
     Cancelled,
@@ -246,22 +246,6 @@ class _Safe(pickle.Unpickler):
             if is_value or (isinstance(found, type) and is_dataclass(found)):
                 return found
         raise pickle.UnpicklingError(f"{module}.{name} is no value that is read from files")
-
-
-def write_values(file: BinaryIO, values: Any) -> None:
-    """Write numbers, texts and values of this package, for read_values; large arrays are not copied."""
-    pickle.dump(values, file, protocol=5)
-
-
-def read_values(file: BinaryIO) -> Any:
-    """What write_values wrote. Nothing else is made and nothing is called, whatever the file holds.
-
-    Raises SimulationError for another file, and for one of a version whose values were others.
-    """
-    try:
-        return _Safe(file).load()
-    except (pickle.UnpicklingError, EOFError, AttributeError, ValueError, TypeError, ImportError, KeyError) as error:
-        raise SimulationError(f"is damaged, or of another version ({error})") from None
 
 
 def _size(path: Path) -> int:

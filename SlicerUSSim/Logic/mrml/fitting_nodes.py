@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from SlicerUSSim.Logic.mrml.landmark_nodes import is_landmarks
 from SlicerUSSim.Logic.mrml.own_results import IMAGE, OUTLINE, SEQUENCE, is_own, kind_of_result
 from SlicerUSSim.Logic.mrml.parameter_node import NODE_PARAMETERS, SceneParameters
 from SlicerUSSim.Logic.mrml.sheet_nodes import holds_sheets
@@ -60,7 +59,6 @@ _RULES: dict[str, Callable[[Any], bool]] = {
     "mri": _is_anatomy,
     "second_mri": _is_anatomy,
     "sheets": holds_sheets,
-    "seed": lambda node: not is_landmarks(node),
     "probe_transform": lambda node: kind_of_result(node) is None,
     "output": lambda node: not node.IsA("vtkMRMLLabelMapVolumeNode") and is_own(node, IMAGE),
     "outline": lambda node: is_own(node, OUTLINE),

@@ -1,12 +1,12 @@
 """SceneRecord: a patient, the choices and the probe of a scene as plain values, apart from the scene.
 
-An autosave writes one, and a scene file is read into one by a child process; both are put into a scene in the same way.
+A scene file is read into one by a child process.
 Taking a record copies no voxels: it shares those of the nodes, which are replaced and not changed by this package.
 """
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -23,7 +23,6 @@ from SlicerUSSim.Logic.mri.sheets.polydata import as_polydata, surfels_of
 from SlicerUSSim.Logic.mrml.craniotomy_nodes import closed_labels, set_closed_labels, show_flap
 from SlicerUSSim.Logic.mrml.fit_nodes import sequence_of
 from SlicerUSSim.Logic.mrml.label_nodes import colour_table, node_labels, read_mask, set_colour_table
-from SlicerUSSim.Logic.mrml.landmark_nodes import Landmark, landmarks_of
 from SlicerUSSim.Logic.mrml.lesion_nodes import tag_of
 from SlicerUSSim.Logic.mrml.nodes import (
     control_points,
@@ -95,14 +94,6 @@ class NodeRecord:
     #: (n, 3) of markups, in the world
     points: np.ndarray | None = None
 
-    @property
-    def voxels(self) -> int:
-        """Bytes of its data."""
-        arrays = [*(segment.mask.array for segment in self.segments)]
-        arrays += [] if self.volume is None else [self.volume.array]
-        arrays += [] if self.corners is None else [self.corners] * 3
-        return sum(array.nbytes for array in arrays)
-
 
 @dataclass(frozen=True, eq=False)
 class SequenceRecord:
@@ -132,19 +123,10 @@ class SceneRecord:
     sequence: SequenceRecord | None = None
     #: Names of nodes with data that have no role and are left out
     left_out: tuple[str, ...] = ()
-    #: Of the registration of the sequence
-    landmarks: tuple[Landmark, ...] = ()
     #: Images of Simulate sequence
     simulated: SimulatedRecord | None = None
     #: The simulated image, if it is not the one of the probe's pose
     frozen: FrozenRecord | None = None
-
-    @property
-    def size(self) -> int:
-        """Bytes of voxels and images."""
-        images = 0 if self.sequence is None else self.sequence.sequence.images.nbytes
-        images += 0 if self.simulated is None else sum(image.nbytes for image in self.simulated.images)
-        return images + sum(node.voxels for node in self.nodes.values())
 
 
 # ---- from a scene ----------------------------------------------------------------------------------------------------
@@ -179,11 +161,6 @@ def record_nodes(parameters: SceneParameters, roles: Iterable[str] = ROLES) -> d
     return found
 
 
-def nodes_version(parameters: SceneParameters, roles: Iterable[str] = ROLES) -> Hashable:
-    """A value that changes with what record_nodes returns."""
-    return tuple((role, _version(getattr(parameters, role))) for role in roles)
-
-
 def recorded_values(parameters: SceneParameters) -> dict[str, str]:
     """{name: text} of the scene's values and preset that are not the default."""
     texts = parameters.texts
@@ -201,7 +178,6 @@ def record_scene(scene) -> SceneRecord:
         sequence = _real_images(real)
     transform = parameters.probe_transform
     pose = None if transform is None else probe_pose(transform)
-    landmarks = () if sequence is None else landmarks_of(scene)
     others = tuple(_others(scene, parameters))
     frozen = record_frozen(parameters.output)
     if frozen is not None:
@@ -210,7 +186,7 @@ def record_scene(scene) -> SceneRecord:
             is_live = pose is not None and np.allclose(frozen.pose, pose, atol=1e-4)
         frozen = None if is_live else frozen
     return SceneRecord(
-        nodes, recorded_values(parameters), pose, sequence, others, landmarks, record_taken(parameters.image_sequence),
+        nodes, recorded_values(parameters), pose, sequence, others, record_taken(parameters.image_sequence),
         frozen,
     )  # fmt: skip
 
@@ -248,25 +224,6 @@ def _others(scene, parameters: SceneParameters) -> Iterable[str]:
             is_own = is_own or (node.GetName() or "").endswith("Volume Slice")
             if node.GetID() not in chosen and not is_own and node.GetSaveWithScene():
                 yield node.GetName() or node.GetID()
-
-
-def _version(node) -> Hashable:
-    if node is None or node.IsA("vtkMRMLSequenceNode"):
-        return None
-    version = [node.GetID(), node.GetName(), node.GetParentTransformNode() and node_to_world(node).tobytes()]
-    version += sorted(_attributes(node).items())
-    if node.IsA("vtkMRMLVolumeNode"):
-        image = node.GetImageData()
-        version += [None if image is None else image.GetMTime(), ijk_to_ras(node).tobytes()]
-        shares = shares_node(node)
-        version += [None if shares is None or shares is node else _version(shares)]
-    elif node.IsA(_SEGMENTS):
-        version.append(node.GetSegmentation().GetMTime())
-    elif node.IsA(_MODEL):
-        version.append(None if node.GetPolyData() is None else node.GetPolyData().GetMTime())
-    else:
-        version.append(node.GetMTime())
-    return tuple(version)
 
 
 def _recorded(node) -> NodeRecord:
@@ -379,7 +336,7 @@ def put_values(parameters: SceneParameters, values: Mapping[str, str]) -> list[s
 def _put(scene, entry: NodeRecord, extra: list[Any]):
     known = (_VOLUME, _LABELS, _SEGMENTS, _MODEL, "vtkMRMLMarkupsFiducialNode", "vtkMRMLMarkupsClosedCurveNode")
     kind = entry.kind if entry.kind in known or entry.points is None else "vtkMRMLMarkupsClosedCurveNode"
-    require(kind in known, f"{entry.name!r} is a {entry.kind}, which is not kept in sessions")
+    require(kind in known, f"{entry.name!r} is a {entry.kind}, which is not kept")
     node = scene.AddNewNodeByClass(kind, entry.name)
     try:
         if not np.array_equal(entry.to_world, np.eye(4)):

@@ -155,12 +155,9 @@ class SequenceLogic:
     def showFrozen(self, record: FrozenRecord, output_node) -> TakenImage:
         """Write an image of a scene that was saved into a scalar volume node, where it was taken; it stays there.
 
-        The chosen labels and sheets are those of the scene, if the record is of them. Ends live update.
-        Raises SimulationError for a damaged record, and for an output that this module did not make.
+        Ends live update. Raises SimulationError for a damaged record, and for an output that this module did not make.
         """
-        labels = self._patient.parameters.labels if record.is_of_tissues else None
-        anatomy = None if labels is None else self._patient.anatomyOf(labels)
-        return self._show_frozen(lambda: replace(taken_of(record, output_node), anatomy=anatomy), output_node)
+        return self._show_frozen(lambda: taken_of(record, output_node), output_node)
 
     def _show_frozen(self, read: Callable[[], TakenImage], output_node) -> TakenImage:
         require_node(output_node, "vtkMRMLScalarVolumeNode", use="output")

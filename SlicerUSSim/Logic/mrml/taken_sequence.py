@@ -35,7 +35,7 @@ def write_taken(images_node, index: SequenceIndex, taken: Sequence[TakenImage]) 
         preset = about.pop("preset")
         if preset not in presets:  # one for all, as a rule
             presets.append(preset)  # type: ignore[arg-type]
-        pose = image.probe_to_world.tolist()  # all digits: scripts make the same pixels again
+        pose = image.probe_to_world.tolist()  # all digits: the noise of an image follows from them
         is_of = {"preset": presets.index(preset), "probe_to_ras": pose, "is_empty": image.is_empty}  # type: ignore[arg-type]
         lines.append({**about, **is_of})
     images_node.SetAttribute(_ABOUT, json.dumps({"presets": presets, "images": lines}))
@@ -102,8 +102,6 @@ class FrozenRecord:
     about: Mapping[str, Any]
     #: (rows, columns) uint8
     image: np.ndarray
-    #: Whether it shows labels and sheets as they were when it was kept
-    is_of_tissues: bool = False
 
     @property
     def number(self) -> int | None:
@@ -120,16 +118,9 @@ class FrozenRecord:
             return np.full((4, 4), np.nan)
 
 
-def version_frozen(volume_node: Any) -> Hashable:
-    """A value that changes with what record_frozen returns; None if there is nothing."""
-    if volume_node is None or volume_node.GetImageData() is None or not is_frozen(volume_node):
-        return None
-    return volume_node.GetID(), volume_node.GetImageData().GetMTime()
-
-
 def record_frozen(volume_node: Any) -> FrozenRecord | None:
     """The image in a volume node, if it is one of this module that stays where it was taken."""
-    if version_frozen(volume_node) is None:
+    if volume_node is None or volume_node.GetImageData() is None or not is_frozen(volume_node):
         return None
     about = about_image(volume_node)
     array = Volume.from_vtk(volume_node.GetImageData(), ijk_to_ras(volume_node)).array
@@ -157,8 +148,6 @@ class SimulatedRecord:
     index: SequenceIndex
     #: (rows, columns) uint8 of each
     images: tuple[np.ndarray, ...]
-    #: Whether they show labels and sheets as they were when they were kept
-    are_of_tissues: bool = False
 
 
 def version_taken(images_node: Any) -> Hashable:

@@ -184,12 +184,6 @@
     sendFiles([...plain, ...found.flat()], { for: "open" });
   });
 
-  workstation.pickLandmark = (event) => {
-    const box = event.target.getBoundingClientRect();
-    const at = [(event.clientX - box.left) / box.width, (event.clientY - box.top) / box.height];
-    window.trame.trigger("landmark_in_image", at);
-  };
-
   // Over HTTP: on the web socket keys and Cancel would wait until the file is there.
   workstation.save = async (kind) => {
     workstation.exporting += 1;
@@ -206,22 +200,21 @@
     }
   };
 
-  workstation.copy = async (text) => {
-    try {
-      await navigator.clipboard.writeText(text); // not available over plain http from another computer
-    } catch {
-      const area = document.getElementById("ussim-script");
-      area?.focus();
-      area?.select();
-      document.execCommand("copy");
-    }
-  };
-
   // For screen readers, what trame's own parts lack: names of the rendered views, and leave to zoom.
   function nameViews() {
     for (const image of document.querySelectorAll("img.image-display-area:not([alt])")) image.alt = "View of the anatomy";
     const viewport = document.querySelector("meta[name=viewport]");
     if (viewport?.content.includes("maximum-scale")) viewport.content = "width=device-width, initial-scale=1";
+  }
+
+  // A new server has a new token, so that its address is to be opened.
+  function lost() {
+    if (document.getElementById("connection-lost")) return;
+    const note = document.createElement("div");
+    note.id = "connection-lost";
+    note.setAttribute("role", "alert");
+    note.textContent = "The connection to the server is lost. Start ussim serve again, and open the address that it prints.";
+    document.body.append(note);
   }
 
   function connect() {
@@ -230,6 +223,8 @@
       setTimeout(connect, 50);
       return;
     }
+    window.trame.client.onConnectionClose(lost);
+    window.trame.client.onConnectionError(lost);
     connection.subscribe("trame.rca.topic.stream", draw);
     workstation.connected = true;
     window.trame.trigger("page_opened");

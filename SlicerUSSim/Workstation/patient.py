@@ -1,0 +1,383 @@
+"""OpenPatient: the patient on the page: replaced, added to, segmented, closed, and what of him is not saved."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Hashable, Iterable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from SlicerUSSim.Logic.base.errors import SimulationError
+from SlicerUSSim.Logic.base.volume import Volume
+from SlicerUSSim.Logic.mri.given_mask import follows
+from SlicerUSSim.Logic.mrml.label_nodes import labels_version
+from SlicerUSSim.Logic.mrml.lesion_nodes import add_lesion
+from SlicerUSSim.Logic.mrml.nodes import nodes_of_class, read_volume
+from SlicerUSSim.Logic.mrml.taken_image import patient_of
+from SlicerUSSim.Logic.mrml.taken_sequence import FrozenRecord, version_taken
+from SlicerUSSim.Logic.tissue.label_maps import LabelledTissues
+from SlicerUSSim.Workstation.anatomy import AnatomyViews
+from SlicerUSSim.Workstation.browser_panel import BrowserPanel
+from SlicerUSSim.Workstation.comparison import Comparison
+from SlicerUSSim.Workstation.file_nodes import FILE, FileNodes, Files
+from SlicerUSSim.Workstation.pose_registration import Recording, Registration
+from SlicerUSSim.Workstation.probe_control import ProbeControl
+
+#: Roles of nodes of a patient
+_OF_PATIENT = (
+    "mri", "labels", "mask", "second_mri", "lesions", "organs", "sheets", "seed", "opening", "real",
+    "transform_sequence", "image_sequence",
+)  # fmt: skip
+#: What is of a patient: images, labels, surfaces, points, recordings, the costs of a fit
+_PATIENT_CLASSES = (
+    "vtkMRMLSequenceBrowserNode", "vtkMRMLSequenceNode", "vtkMRMLVolumeNode", "vtkMRMLSegmentationNode",
+    "vtkMRMLModelNode", "vtkMRMLMarkupsNode", "vtkMRMLTransformNode", "vtkMRMLPlotChartNode", "vtkMRMLPlotSeriesNode",
+    "vtkMRMLTableNode",
+)  # fmt: skip
+
+
+class OpenPatient:
+    """Replaces the patient, or adds data of the same patient. All methods run in a task."""
+
+    def __init__(
+        self, panel: BrowserPanel, nodes: FileNodes, views: AnatomyViews, probe: ProbeControl, comparison: Comparison,
+        registration: Registration,
+    ) -> None:  # fmt: skip
+        self._shared, self._logic, self._scene, self._tasks = panel.shared, panel.logic, panel.logic.scene, panel.tasks
+        self._panel, self._presenter, self._nodes = panel, panel.presenter, nodes
+        self._views, self._probe, self._comparison = views, probe, comparison
+        self._registration = registration
+        self._is_new = False  # a patient was opened, on whom the probe is not yet
+        #: {what was made here: its version in the last scene that was saved or opened}
+        self._saved: dict[str, Hashable] = {}
+
+    def begin(self, files: Files) -> None:
+        """Load the files with which the workstation was started, and show the first image."""
+        parameters = self._logic.parameters
+        with self._presenter.shown():
+            if files.preset is not None:
+                self._logic.preset = replace(files.preset, probe_to_ras=None)
+            parameters.segmentation = replace(
+                parameters.segmentation, contrast=files.contrast, skull_strip=files.skull_strip, outside=files.outside
+            )
+            if files.mri is not None or files.labels is None:
+                self._choose_mri(self._nodes.mri(files.mri))
+            if files.mask is not None:
+                parameters.mask = self._nodes.mask(files.mask)
+            for contrast, path in list(files.also.items())[:1]:  # the panel has one
+                self.take_second(self._nodes.second_mri(path), contrast)
+            if files.organs is not None:
+                self.take_organs(*self._nodes.organs(files.organs, files.maps))
+            parameters.sheet = files.sheet_settings
+            if files.sheets is not None:
+                parameters.sheets = self._nodes.sheets(files.sheets)
+            for tissue, path in files.additions:
+                self._add_lesions(self._nodes.lesions(path), tissue, path)
+            if files.labels is not None:
+                self.take_labels(*self._nodes.labels(files.labels), are_of_patient=True)
+                if files.additions:
+                    self.then_show(self._presenter.lesions.addTissues)
+            else:
+                self.segment()
+            self._open_at_start(files)
+            if files.sequence is not None:
+                recording = Recording(files.sequence, files.sequence_name, files.transform)
+                self._registration.take(recording, files.to_ras)
+            elif files.preset is not None and files.preset.probe_to_ras is not None:
+                self._presenter.values.takePreset(files.preset)
+
+    @property
+    def name(self) -> str:
+        """Name of the patient of the chosen labels, or of the MRI if there are none; "" without either."""
+        labels, mri = self._logic.parameters.labels, self._logic.parameters.mri
+        if labels is not None:
+            return patient_of(labels)
+        return "" if mri is None else patient_of(mri)
+
+    @property
+    def is_of_user(self) -> bool:
+        """Whether a patient is open, other than the demo brain as it is."""
+        parameters: Any = self._logic.parameters
+        is_demo = parameters.mri is not None and parameters.mri.GetAttribute(FILE) == ""
+        mine = (parameters.lesions, parameters.mask, parameters.second_mri)
+        is_untouched = all(node is None or self._logic.isOwnBrain(node) for node in mine)
+        return bool(self.name) and not (is_demo and is_untouched)
+
+    # ---- what is not saved -------------------------------------------------------------------------------------
+
+    @property
+    def unsaved(self) -> tuple[str, ...]:
+        """What was made on the page, and is in no file and no saved scene."""
+        return tuple(what for what, version in self._made().items() if version != self._saved.get(what))
+
+    def saved(self) -> None:
+        """Called when all that was made on the page is in a file."""
+        self._saved = self._made()
+
+    def _made(self) -> dict[str, Hashable]:
+        """{what is made on the page: a value that changes with it} of what there is."""
+        parameters: Any = self._logic.parameters
+        labels, lesions, images = parameters.labels, parameters.lesions, version_taken(parameters.image_sequence)
+        made: dict[str, Hashable] = {}
+        if lesions is not None and lesions.GetSegmentation().GetNumberOfSegments():
+            made["lesions"] = lesions.GetID(), tuple(lesions.GetSegmentation().GetSegmentIDs())
+        if labels is not None and self._logic.closedLabels(labels) is not labels:
+            made["the opening of the skull"] = labels_version(labels)
+        if images is not None:
+            made["the images of Simulate sequence"] = images
+        return made
+
+    # ---- a new patient, and more of the same one ---------------------------------------------------------------
+
+    def take_mri(self, node: Any, contrast: str, then_segment: bool) -> bool:
+        """Take the MRI or CT of a new patient; whether the tissues are known, if they are to be found."""
+        parameters = self._logic.parameters
+        self._panel.clearErrors()
+        self._choose_mri(node)
+        if parameters.segmentation.contrast != contrast:
+            parameters.segmentation = replace(parameters.segmentation, contrast=contrast)
+        return not then_segment or self.segment()
+
+    def show_image(self, node: Any) -> None:
+        """Take the MRI or CT of a patient of whom only labels are open."""
+        self._logic.parameters.mri = node
+        self._views.show_volume(node)
+
+    def take_second(self, node: Any, contrast: str) -> None:
+        """Take a second MRI of the patient."""
+        parameters = self._logic.parameters
+        parameters.second_mri = node
+        parameters.panel = replace(parameters.panel, second_contrast=contrast)
+
+    def take_labels(self, node: Any, found: LabelledTissues, *, are_of_patient: bool) -> None:
+        """Take a label map: of the patient, whose MRI stays, or of a new one."""
+        parameters: Any = self._logic.parameters
+        lines = [f"{node.GetName()}: {found.message}", *(f"Check: {warning}" for warning in found.warnings)]
+        if are_of_patient and parameters.mri is not None:
+            name, volume = parameters.mri.GetName(), read_volume(parameters.mri)
+            if not self._tasks.doAside(lambda: follows(volume, found.labels)):
+                lines.append(f"Check: the intensities of {name} do not follow the labels (of another patient?)")
+        elif not are_of_patient:
+            self.begin_patient(node)
+        if parameters.mri is None:
+            self._views.show_volume(node)
+        parameters.labels = node
+        self._presenter.notes.set(*lines)
+        for warning in found.warnings:
+            self._panel.showError(warning)
+        self.labels_ready()
+
+    def take_organs(self, node: Any, found: LabelledTissues) -> None:
+        """Choose the label map of organs of a CT, which Segment uses."""
+        self._logic.parameters.organs = node
+        self._presenter.notes.set(f"{node.GetName()}: {found.message}; Segment uses it with the contrast ct")
+
+    def lay(self, mask: Volume, tissue: str, name: str) -> None:
+        """Add a mask of a file to the lesions, and lay them over the tissues; without tissues Segment does so."""
+        parameters: Any = self._logic.parameters
+        before = parameters.lesions
+        undo = self._add_lesions(mask, tissue, name)
+        try:
+            if parameters.labels is not None:
+                self.then_show(self._presenter.lesions.layLesions)
+        except SimulationError:
+            undo()
+            parameters.lesions = before
+            raise
+
+    def _add_lesions(self, mask: Volume, tissue: str, name: str) -> Callable[[], None]:
+        """Add a mask of a file to the lesions; returns a function that takes it out of them again."""
+        parameters: Any = self._logic.parameters
+        before = parameters.lesions
+        node = before or self._scene.AddNewNodeByClass("vtkMRMLSegmentationNode", "Lesions")
+        is_saved = "lesions" not in self.unsaved
+
+        def undo(ids: Iterable[str] = ()) -> None:
+            for segment_id in ids:
+                node.GetSegmentation().RemoveSegment(segment_id)
+            if before is None:
+                self._scene.RemoveNode(node)
+
+        try:
+            ids = add_lesion(node, mask, tissue, name)
+        except SimulationError:
+            undo()
+            raise
+        parameters.lesions = node
+        if is_saved:
+            self._saved["lesions"] = self._made().get("lesions")
+        return lambda: undo(ids)
+
+    # ---- actions of the panel ----------------------------------------------------------------------------------
+
+    def segment(self) -> bool:
+        """Segment the MRI into tissues, and place a probe on the patient if there is none; whether that was done."""
+        return self.then_show(self._presenter.segmenting.segment)
+
+    def undo_segment(self) -> None:
+        """Go back to the tissues from before the last Segment; others that were chosen since stay as they are."""
+        chosen = self._logic.parameters.labels
+        self.then_show(self._presenter.segmenting.undoSegment)
+        if chosen is not None and self._logic.parameters.labels is None:
+            self._logic.clearImage(self._logic.parameters.output)
+            self._probe.forget_patient()
+            self._views.show_volume(self._logic.parameters.mri)
+        self.show_title()
+
+    def then_show(self, action: Callable[[], None]) -> bool:
+        """Run an action, and show the image of the labels if it has changed them; whether it has."""
+
+        def version() -> Hashable:
+            labels = self._logic.parameters.labels
+            return None if labels is None else labels_version(labels)
+
+        before = version()
+        action()
+        is_changed = version() not in (before, None)
+        if is_changed:
+            self.labels_ready()
+        return is_changed
+
+    def place(self, action: Callable[[], None]) -> None:
+        """Run an action that places the probe, and look at it."""
+        action()
+        self._probe.look()
+
+    def show_title(self) -> None:
+        """Show the name of the patient on the page."""
+        title = self.name
+        if self._shared.now.title != title:
+            with self._shared.changing() as now:
+                now.title = title
+
+    def _open_at_start(self, files: Files) -> None:
+        """Open what --craniotomy asks for, and place the probe on the brain in it, as commands do."""
+        parameters: Any = self._logic.parameters
+        if files.craniotomy == "none" or parameters.labels is None:
+            return
+        parameters.panel = replace(parameters.panel, craniotomy_mm=files.craniotomy_mm)
+        placing = self._presenter.placing
+        if files.craniotomy not in ("auto", "disc:"):
+            parameters.opening = self._nodes.opening(files.craniotomy)
+            self.then_show(placing.openCraniotomy)
+            self.place(placing.placeProbe)
+            return
+        self._logic.placeProbe(parameters.labels, parameters.probe_transform, will_open=True)
+        self.then_show(placing.openCraniotomy)
+
+    # ---- the patient before ------------------------------------------------------------------------------------
+
+    def close(self) -> None:
+        """Close the patient: nothing of him stays on the page, in the scene or in memory; settings stay."""
+        parameters = self._logic.parameters
+        with self._presenter.acting():
+            self._panel.clearErrors()
+            self._forget()
+            parameters.mri = parameters.labels = parameters.mask = parameters.second_mri = None
+            self._presenter.notes.set()
+            self.show_title()
+
+    def begin_patient(self, *nodes: Any) -> None:
+        """Close the patient before; `nodes` are all of the next one."""
+        self._panel.clearErrors()
+        self._forget(*nodes)
+
+    def _choose_mri(self, node: Any) -> None:
+        self._forget(node)
+        self._logic.parameters.mri = node
+        self._presenter.notes.set()
+        self.show_title()
+        self._views.show_volume(node)
+
+    def _forget(self, *new: Any) -> None:
+        """Show, choose and keep nothing of the patient before, when another one is opened; `new` are nodes of his."""
+        parameters = self._logic.parameters
+        self._logic.stopLiveUpdate()
+        self._logic.clearImage(parameters.output)
+        self._logic.clearOutline(parameters.outline)
+        # Ultrasound that was opened before any patient of the user's is of this one
+        kept = [] if self.is_of_user else self._registration.nodes
+        if self.is_of_user:
+            self.forget_ultrasound()
+        self._probe.forget_patient()
+        if parameters.probe_transform is not None and self._registration.recording is None:
+            self._probe.move(np.eye(4))  # it is placed on the next one; a saved scene has no pose of the one before
+        self._presenter.forgetPatient()
+        self._saved = {}
+        kept += [parameters.output, parameters.outline, parameters.probe_transform, *new]
+        for role in _OF_PATIENT:
+            node: Any = getattr(parameters, role)
+            if node not in kept:
+                setattr(parameters, role, None)
+        _remove_patient_nodes(self._scene, kept)
+        with self._shared.changing() as now:
+            now.fit.curve, now.fit.costs = [], ""
+        self._is_new = True
+
+    def forget_ultrasound(self) -> None:
+        """Forget the tracked ultrasound, also what was opened before the patient."""
+        self._comparison.drop()
+        self._registration.forget()
+
+    # ---- the first image ---------------------------------------------------------------------------------------
+
+    def show_restored(self, *, is_placed: bool, frozen: FrozenRecord | None = None) -> None:
+        """Show the nodes that were chosen, and a `frozen` image; the probe `is_placed`, or is now if there are tissues.
+
+        Without such an image live ones begin.
+        """
+        parameters: Any = self._logic.parameters
+        self._views.show_volume(parameters.labels if parameters.mri is None else parameters.mri)
+        self.show_title()
+        if parameters.labels is not None:
+            self.labels_ready(is_placed=is_placed, frozen=frozen)
+        self.saved()
+
+    def labels_ready(self, *, is_placed: bool = False, frozen: FrozenRecord | None = None) -> None:
+        """Show the image of new labels, or a `frozen` one of them.
+
+        The probe `is_placed`, or is placed now if they are of a new patient.
+        """
+        if self._logic.parameters.probe_transform is None or (self._is_new and not is_placed):
+            self._presenter.placing.placeProbe()
+        self._is_new = False
+        self.show_title()
+        if frozen is not None:
+            self._presenter.images.showFrozen(frozen)
+        elif not self._logic.isLive:
+            self._presenter.images.setLive(True)
+        self._probe.update_surface()  # after the start of live images, which do not need it
+        self._probe.look()
+
+
+def _remove_patient_nodes(scene, kept: Iterable[Any]) -> None:
+    """Remove all nodes of these classes, with what displays and stores them, except those that are kept.
+
+    Nodes that are not saved with the scene belong to the views and stay. The scene is the workstation's own: nobody
+    else puts nodes into it.
+    """
+    ids = {node.GetID() for node in kept if node is not None}
+    for name in _PATIENT_CLASSES:
+        for node in nodes_of_class(scene, name):
+            # One may be gone together with another one before
+            if node.GetSaveWithScene() and node.GetScene() is not None and node.GetID() not in ids and _is_data(node):
+                for helper in _helpers(node):
+                    scene.RemoveNode(helper)
+                scene.RemoveNode(node)
+
+
+def _is_data(node) -> bool:
+    """Not a model of a slice view, which Slicer makes and needs."""
+    is_shares = node.GetAttribute("SlicerUSSim.sharesOf") is not None
+    return (not (node.GetName() or "").endswith("Volume Slice") and not node.GetHideFromEditors()) or is_shares
+
+
+def _helpers(node) -> list[Any]:
+    """Display and storage nodes, and the colours of labels."""
+    displays = range(node.GetNumberOfDisplayNodes()) if node.IsA("vtkMRMLDisplayableNode") else ()
+    stores = range(node.GetNumberOfStorageNodes()) if node.IsA("vtkMRMLStorableNode") else ()
+    found = [node.GetNthDisplayNode(number) for number in displays]
+    found += [node.GetNthStorageNode(number) for number in stores]
+    found.append(node.GetNodeReference("tissueColors"))
+    return [helper for helper in found if helper is not None]
