@@ -18,7 +18,7 @@ from SlicerUSSim.Logic.mrml.share_nodes import read_shares, write_shares
 from SlicerUSSim.Logic.mrml.taken_image import PATIENT
 from SlicerUSSim.Logic.tissue.table import TissueTable
 from SlicerUSSim.Logic.tissue.texture import Texture
-from SlicerUSSim.Widget.interface import PanelHost
+from SlicerUSSim.Widget.interface import PanelHost, _
 from SlicerUSSim.Widget.notes import Notes, checks
 
 
@@ -71,12 +71,18 @@ class SegmentPresenter:
 
     def canSegment(self) -> tuple[bool, str]:
         """(whether Segment is enabled, the reason if not)"""
-        return self._panel.ready((self._panel.parameters.mri, "Choose an MRI first"))
+        return self._panel.ready((self._panel.parameters.mri, _("Choose an MRI first")))
+
+    def canEdit(self) -> tuple[bool, str]:
+        """(whether the Segment Editor can edit the tissues, the reason if not)"""
+        labels: Any = self._panel.parameters.labels
+        is_segmentation = labels is not None and labels.IsA("vtkMRMLSegmentationNode")
+        return self._panel.ready((is_segmentation, _("Segment the MRI, or choose a segmentation of its tissues")))
 
     def segment(self) -> None:
         """Segment the MRI into the chosen label map or segmentation, or into a new node (see replaceable)."""
         panel, notes, parameters = self._panel, self._notes, self._panel.parameters
-        with panel.acting(), panel.working("Segment") as progress:
+        with panel.acting(), panel.working(_("Segment")) as progress:
             mri = required(parameters.mri, "no MRI chosen, expected a scalar volume")
             if notes.segmented not in (None, mri.GetID()):  # also if this fails: they are about another patient
                 notes.set()
@@ -132,18 +138,19 @@ class SegmentPresenter:
     def canUndoSegment(self) -> tuple[bool, str]:
         """(whether the last Segment can be undone, the reason if not)"""
         last, chosen, logic = self._last, self._panel.parameters.labels, self._panel.logic
-        can, why_not = self._panel.ready((last, "Nothing was segmented since the scene was opened"))
+        can, why_not = self._panel.ready((last, _("Nothing was segmented since the scene was opened")))
         if not can or last is None:
             return can, why_not
         if last.labels.GetScene() is None:
-            return False, "The tissues of the last Segment were removed from the scene"
+            return False, _("The tissues of the last Segment were removed from the scene")
         name = repr(last.labels.GetName())
         if chosen is not None and chosen is not last.labels and logic.closedLabels(chosen) is last.labels:
-            return False, f"The skull was opened in {name} after Segment; close it first"
+            return False, _("The skull was opened in {name} after Segment; close it first").format(name=name)
         if content_as_made(last.labels) != last.content:
-            return False, f"{name} was changed after Segment, as by lesions laid over it, and is kept"
+            text = _("{name} was changed after Segment, as by lesions laid over it, and is kept")
+            return False, text.format(name=name)
         if not logic.mayReplace(last.labels):
-            return False, f"{name} was edited after Segment, and is kept"
+            return False, _("{name} was edited after Segment, and is kept").format(name=name)
         return True, ""
 
     def undoSegment(self) -> None:

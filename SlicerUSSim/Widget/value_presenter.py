@@ -30,8 +30,6 @@ SCENE = "scene"
 CUSTOM_PROBE = "custom"
 #: {option of the probe preset: name in PROBES}
 SHOWN_PROBES: dict[str, str] = {name.replace("_", " "): name for name in PROBES}
-#: The choices of a parameter that is true, false or none
-OPTIONAL = {"automatic": None, "on": True, "off": False}
 
 
 class ValuePresenter:
@@ -160,8 +158,6 @@ def value_parameter(name: str) -> Parameter:
 
 def to_shown(declared: Parameter, found: Any) -> Any:
     """The displayed form of a value; None if nothing is displayed."""
-    if declared.type is bool and declared.can_be_none:
-        return next(text for text, value in OPTIONAL.items() if value is found)
     return declared.shown.number(found) if isinstance(declared.shown, Shown) else found
 
 
@@ -170,8 +166,6 @@ def from_shown(declared: Parameter, entered: Any) -> Any:
 
     Values of type int are rounded, since widgets hold them as floats.
     """
-    if declared.type is bool and declared.can_be_none:
-        return OPTIONAL.get(entered, entered)
     is_number = isinstance(entered, int | float) and not isinstance(entered, bool) and math.isfinite(entered)
     if not is_number or not isinstance(declared.shown, Shown):
         return entered
@@ -188,11 +182,7 @@ def _in_words_of(declared: Parameter, entered: Any) -> Iterator[None]:
         _, is_about_it, rest = str(error).partition(f"{declared.name} is ")
         if not is_about_it:
             raise
-        as_db = isinstance(declared.shown, Shown) and declared.shown.as_db
-        unit = "dB" if as_db else declared.unit
         is_number = isinstance(entered, int | float) and not isinstance(entered, bool)
-        what = f"{entered:g} {unit}".rstrip() if is_number else short(entered)
+        what = f"{entered:g} {declared.unit}".rstrip() if is_number else short(entered)
         expected = rest.rpartition(", expected ")[2]
-        if as_db and declared.bounds is not None:
-            expected = f"at most {20.0 * math.log10(declared.bounds[1]):.4g} dB"
         raise SimulationError(f"{declared.label} is {what}, expected {expected}") from error

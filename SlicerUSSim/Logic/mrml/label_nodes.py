@@ -21,6 +21,7 @@ from SlicerUSSim.Logic.mrml.nodes import (
     ijk_to_ras,
     named,
     node_to_world,
+    put_beside,
     read_volume,
     require_node,
     write_volume,
@@ -246,6 +247,7 @@ def write_labels(labels_node, labels: Volume, names: Iterable[str], like_node) -
     node of volumes or labels. Tissues that the node already has keep their colours, which may be the user's."""
     parent = like_node.GetParentTransformNode()
     labels_node.SetAndObserveTransformNodeID(None if parent is None else parent.GetID())
+    put_beside(labels_node, like_node)
     if labels_node.IsA("vtkMRMLSegmentationNode"):
         if like_node.IsA("vtkMRMLVolumeNode"):
             # After the transform, since the node converts the reference geometry to its own frame.
@@ -341,14 +343,19 @@ def _write_segmentation(segmentation_node, labels: Volume, names: tuple[str, ...
     kept = {segment.GetName(): segment.GetColor() for segment in segments}
     segmentation.RemoveAllSegments()
     segmentation_node.SetSourceRepresentationToBinaryLabelmap()
+    representation = slicer.vtkSegmentationConverter.GetSegmentationBinaryLabelmapRepresentationName()
+    layer = slicer.vtkOrientedImageData()  # one for all segments, as none overlap
+    voxels = labels.array.astype(np.uint8 if len(names) < 256 else np.int16)  # a copy, which users may edit
+    layer.ShallowCopy(Volume(voxels, np.eye(4)).to_vtk())
+    layer.SetImageToWorldMatrix(vtk_matrix(labels.ijk_to_ras))
     for label, name in enumerate(names, 1):
-        mask = slicer.vtkOrientedImageData()
-        mask.ShallowCopy(Volume(labels.array == label, np.eye(4)).to_vtk())
-        mask.SetImageToWorldMatrix(vtk_matrix(labels.ijk_to_ras))
-        segment_id = segmentation_node.AddSegmentFromBinaryLabelmapRepresentation(
-            mask, name, kept.get(name) or colour_of(name), name
-        )  # fmt: skip
+        segment = slicer.vtkSegment()
+        segment.SetName(name)
+        segment.SetColor(kept.get(name) or colour_of(name))
+        segment.SetLabelValue(label)
+        segment.AddRepresentation(representation, layer)
         if entry := terminology_entry(name):
-            segmentation.GetSegment(segment_id).SetTerminology(entry)
+            segment.SetTerminology(entry)
+        segmentation.AddSegment(segment, name)
     segmentation_node.EndModify(was_modifying)
     display_of(segmentation_node)

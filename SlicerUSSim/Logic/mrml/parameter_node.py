@@ -32,11 +32,15 @@ class PanelSettings(Declared):
     """Other saved choices of the panel."""
 
     show_in_slice: bool = parameter(
-        True, "Show the image in this slice view",
+        True, "Slice view",
         "Move the slice view to the image plane and overlay the image, with every new image", shown=True,
     )  # fmt: skip
+    show_in_3d: bool = parameter(
+        True, "3D", "Show the slice view with the image in the 3D views as well", shown=True
+    )
+    show_probe: bool = parameter(True, "Probe", "Show a model of the probe in the 3D views", shown=True)
     second_contrast: str = parameter(
-        "none", "Its contrast", "Contrast of the second MRI, which is classified together with the first",
+        "none", "Second contrast", "Contrast of the second MRI, which is classified together with the first",
         choices=("none", *MRI_CONTRASTS), shown=True,
     )  # fmt: skip
     gel: bool = parameter(
@@ -45,19 +49,19 @@ class PanelSettings(Declared):
         shown=True,
     )  # fmt: skip
     craniotomy_mm: float | None = parameter(
-        None, "Diameter", "Diameter of the disc under the probe that is opened; none: as wide as its face needs",
+        None, "Craniotomy", "Diameter of the disc under the probe that is opened; none: as wide as its face needs",
         unit="mm", bounds=(5.0, 150.0), shown=Shown(4.0, 150.0, 1.0, none_at=4.0), can_be_none=True,
     )  # fmt: skip
     lesion_as: str = parameter(
-        BY_LOOK, "As", "What the lesion at the point is; by its look: what the MRI shows there",
+        BY_LOOK, "Lesion is", "What the lesion at the point is; by its look: what the MRI shows there",
         choices=(BY_LOOK, *LESION_TISSUES), shown=True,
     )  # fmt: skip
     lesion_size: str = parameter(
-        SMALLER, "Size", "smaller: to half of its contrast; larger: to the foot of its border, up to 3 mm farther out",
-        choices=(SMALLER, LARGER), shown=True,
+        SMALLER, "Lesion size", "smaller: to half of its contrast; larger: to the foot of its border, up to 3 mm "
+        "farther out", choices=(SMALLER, LARGER), shown=True,
     )  # fmt: skip
     view: str = parameter(
-        next(iter(VIEWS)), "View", "; ".join(f"{name}: {view.tip}" for name, view in VIEWS.items()),
+        next(iter(VIEWS)), "Standard view", "; ".join(f"{name}: {view.tip}" for name, view in VIEWS.items()),
         choices=tuple(VIEWS), shown=True,
     )  # fmt: skip
     preset_pose: bool = parameter(
