@@ -78,10 +78,11 @@ class ImagePresenter:
 
     def showIn3D(self) -> None:
         """Show the slice view of the image and the probe's model in the 3D views, or hide them, as chosen."""
-        parameters, view = self._panel.parameters, self._panel.view.sliceNode()
+        parameters = self._panel.parameters
         outline: Any = parameters.outline
         if parameters.output is None or outline is None or not self._placing.handles:
             return
+        view = self._panel.view.sliceNode()
         if self._in_3d not in (None, view):
             self._in_3d.SetSliceVisible(False)
         self._in_3d = view

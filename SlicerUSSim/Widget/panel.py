@@ -310,6 +310,7 @@ class Panel:
             item = qt.QTableWidgetItem(heading)
             item.setToolTip(_(tip))
             table.setHorizontalHeaderItem(column, item)
+        table.horizontalHeader().setSectionResizeMode(0, qt.QHeaderView.ResizeToContents)
 
     def _show_tissues(self) -> None:
         rows = self.presenter.tissues.rows()

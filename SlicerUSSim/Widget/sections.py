@@ -19,9 +19,9 @@ from SlicerUSSim.Logic.mrml.fit_nodes import COMPARED
 from SlicerUSSim.Logic.mrml.parameter_node import SceneParameters
 from SlicerUSSim.Logic.probe.arrays import PROBES
 from SlicerUSSim.Logic.tissue.presets import TISSUES
-from SlicerUSSim.Logic.tissue.tissue import TISSUE_PARAMETERS
 from SlicerUSSim.Widget.interface import Can, Control, Kind, Row, Section, _
 from SlicerUSSim.Widget.presenter import PanelPresenter
+from SlicerUSSim.Widget.tissue_presenter import COLUMN_PARAMETERS
 from SlicerUSSim.Widget.value_presenter import CUSTOM_PROBE, SCENE, SHOWN_PROBES, value_parameter
 
 #: Values that are adjusted while viewing the image
@@ -41,8 +41,8 @@ def panel_sections(panel: PanelPresenter) -> tuple[Section, ...]:
         Section(_("Patient"), True, _patient(panel)),
         Section(_("Probe"), True, _probe(panel)),
         Section(_("Ultrasound"), True, _ultrasound(panel)),
-        Section(_("Lesions, skull and other images"), False, _other_images(panel)),
-        Section(_("Beam and display"), False, (*_of_preset("display"), *_of_preset("probe"))),
+        Section(_("Lesions and other images"), False, _other_images(panel)),
+        Section(_("Beam and display"), False, (*_of_preset("probe"), *_of_preset("display"))),
         Section(_("Tissues"), False, _tissues(panel)),
         Section(_("Tracked ultrasound"), False, _tracked(panel)),
         Section(_("Fit to real ultrasound"), False, _fit(panel)),
@@ -113,7 +113,7 @@ def _probe(panel: PanelPresenter) -> tuple[Row, ...]:
             button(
                 "openCraniotomy", _("Open skull"),
                 _("Replace skin, scalp and skull in the opening by the coupling medium, in new labels; the tissues "
-                  "need skin and skull: tick their box below Lesions, skull and other images before Segment"),
+                  "need skin and skull: tick their box below Lesions and other images before Segment"),
                 placing.openCraniotomy, placing.canOpenCraniotomy,
             ),
             button(
@@ -217,7 +217,7 @@ def _other_images(panel: PanelPresenter) -> tuple[Row, ...]:
 
 
 def _tissues(panel: PanelPresenter) -> tuple[Row, ...]:
-    columns = [f"{entry.symbol} [{entry.unit}]" if entry.unit else entry.symbol for entry in TISSUE_PARAMETERS]
+    columns = [f"{entry.symbol} [{entry.unit}]" if entry.unit else entry.symbol for entry in COLUMN_PARAMETERS]
     tip = _("Acoustic and scatterer parameters of each tissue: {columns}; double-click to edit; a value's tool tip is "
             "its source")  # fmt: skip
     return (

@@ -14,10 +14,12 @@ from SlicerUSSim.Logic.tissue.table import TissueTable
 from SlicerUSSim.Logic.tissue.tissue import TISSUE_PARAMETERS, Tissue
 from SlicerUSSim.Widget.interface import PanelHost, _
 
+#: What the table shows, up to the scatterers; the texture of a tissue is in preset files alone
+COLUMN_PARAMETERS = TISSUE_PARAMETERS[:6]
 #: Columns of the tissue table: parameter, heading, tool tip.
 TISSUE_COLUMNS = tuple(
     (entry.name, entry.symbol or entry.label, f"{entry.tip} [{entry.unit}]" if entry.unit else entry.tip)
-    for entry in TISSUE_PARAMETERS
+    for entry in COLUMN_PARAMETERS
 )
 
 

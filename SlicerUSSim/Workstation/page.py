@@ -20,16 +20,17 @@ from trame_slicer.views import AbstractView
 
 from SlicerUSSim.Logic.mri.pathology import LESIONS
 from SlicerUSSim.Widget.image_presenter import FROZEN
-from SlicerUSSim.Widget.interface import Control, Section
+from SlicerUSSim.Widget.interface import Control
 from SlicerUSSim.Widget.tissue_presenter import TISSUE_COLUMNS
 from SlicerUSSim.Workstation.browser_panel import BrowserPanel
 from SlicerUSSim.Workstation.page_parts import (
     keep_session,
     pose_numbers,
     question_dialog,
-    registration_section,
+    registration,
     session_offer,
 )
+from SlicerUSSim.Workstation.pose_registration import SECTION
 from SlicerUSSim.Workstation.state import NAMES, ORGANS, PLANES, SLICE_VIEWS, ComparisonMode, value_of
 
 _STATIC = Path(__file__).parent / "static"
@@ -39,19 +40,17 @@ MODULE = {
     "scripts": ["ussim/overlay.js", "ussim/workstation.js", "ussim/session.js"],
     "styles": ["ussim/workstation.css"],
 }
-#: Controls of the panel that are not on the page: its slice views follow the probe, it compares the fit in the
-#: ultrasound view, and it has a button of its own to place the probe.
+#: Controls of the panel that are not on the page: its views follow the probe and show it, it compares the fit in the
+#: ultrasound view, it has a button of its own to place the probe, and no editor of segments.
 NOT_SHOWN = {
-    "sliceViewComboBox", "showInSliceCheckBox", "compareComboBox", "compareNumberComboBox", "blinkCheckBox",
-    "statusLabel", "placeButton",
+    "sliceViewComboBox", "showInSliceCheckBox", "showIn3dCheckBox", "showProbeCheckBox", "layoutButton",
+    "compareComboBox", "compareNumberComboBox", "blinkCheckBox", "statusLabel", "placeButton", "editTissuesButton",
 }  # fmt: skip
 #: JavaScript of buttons that act on the page, by widget name.
 _IN_PAGE = {
     "savePresetButton": "window.ussim.save('json')",
     "loadPresetButton": "window.document.getElementById('open-file').click()",
 }
-#: What is at the top of the drawer
-_FIRST_SECTION, _FIRST_CONTROLS = "Ultrasound", ("gainSlider", "depthSlider")
 _LESION_TEXTS = {"brats": "labels by their names, or a BraTS map"}
 #: Colours of the marks beside the slice views' planes.
 _STRIPES = {"Red": "red", "Yellow": "yellow", "Green": "green"}
@@ -144,14 +143,15 @@ def _drawer(panel: BrowserPanel) -> None:
     html.Div("Ultrasound Simulator", classes="text-subtitle-1 px-4 pt-2")
     html.Div(f"{{{{ {NAMES.title} }}}}", classes="text-caption px-4 pb-1 text-medium-emphasis", id="title")
     with v3.VExpansionPanels(multiple=True, v_model=(NAMES.open_sections,), variant="accordion"):
-        for section in _in_order(panel.sections):
-            if section.title.startswith("Fit"):
-                registration_section()
+        # First what is used while one looks at the image
+        for section in sorted(panel.sections, key=lambda section: section.title != "Ultrasound"):
             with v3.VExpansionPanel(value=section.title):
                 v3.VExpansionPanelTitle(section.title, style="min-height: 36px; font-size: 13px")
                 with v3.VExpansionPanelText(eager=True, id=f"section-{section.title.replace(' ', '-').lower()}"):
-                    if section.title == "Inputs":
+                    if section.title == "Patient":
                         _open_file()
+                    if section.title == SECTION:
+                        registration()
                     for control in section.controls:
                         if control.widget not in NOT_SHOWN:
                             _control(control, panel)
@@ -160,16 +160,6 @@ def _drawer(panel: BrowserPanel) -> None:
                         pose_numbers()
                     if section.title.startswith("Fit"):
                         _cost_curve()
-
-
-def _in_order(sections: tuple[Section, ...]) -> list[Section]:
-    """The sections with what is used while one looks at the image first: gain and depth are not below the fold."""
-    ordered = sorted(sections, key=lambda section: section.title != _FIRST_SECTION)
-    first = list(ordered[0].controls) if ordered[0].title == _FIRST_SECTION else []
-    if first:
-        first.sort(key=lambda control: control.widget not in _FIRST_CONTROLS)
-        ordered[0] = Section(_FIRST_SECTION, True, tuple(first))
-    return ordered
 
 
 def _open_file() -> None:
@@ -270,8 +260,8 @@ def _control(control: Control, panel: BrowserPanel) -> None:
         html.Div(
             f"""<div style="font-size: 12px">{control.label}</div><div class="ussim-free" id="{name}">
             <label v-for="entry in {NAMES.fit.free}" style="display: block"><input type="checkbox" :checked="entry.on"
-            :aria-label="entry.name" @change="trigger('set_free', [entry.name, $event.target.checked])">
-            {{{{ entry.name }}}}</label></div>""",
+            :aria-label="entry.label" @change="trigger('set_free', [entry.name, $event.target.checked])">
+            {{{{ entry.label }}}}</label></div>""",
             title=control.tip,
         )
 

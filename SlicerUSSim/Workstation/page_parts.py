@@ -5,7 +5,7 @@ from __future__ import annotations
 from trame.widgets import html, vuetify3 as v3
 
 from SlicerUSSim.Workstation.pose_entry import POSE_SUFFIXES
-from SlicerUSSim.Workstation.pose_registration import PICK_IMAGE, PICK_PATIENT, SECTION
+from SlicerUSSim.Workstation.pose_registration import PICK_IMAGE, PICK_PATIENT
 from SlicerUSSim.Workstation.state import NAMES
 
 #: Names of transforms that calibrations usually are
@@ -106,22 +106,18 @@ def pose_numbers() -> None:
     )  # fmt: skip
 
 
-def registration_section() -> None:
-    """The section with calibration, registration and landmarks of the tracked ultrasound."""
+def registration() -> None:
+    """Calibration, registration and landmarks of the tracked ultrasound."""
     state = NAMES.registration
-    there = f"{state.recording} !== ''"
-    with v3.VExpansionPanel(value=SECTION):
-        v3.VExpansionPanelTitle(SECTION, style="min-height: 36px; font-size: 13px")
-        with v3.VExpansionPanelText(eager=True, id="section-tracked-ultrasound"):
-            html.Div(
-                f"{{{{ {state.recording} || 'none: open a file with tracked ultrasound' }}}}", id="recording",
-                classes="ussim-opened",
-            )  # fmt: skip
-            with html.Div(v_show=there):
-                _frame()
-                _calibration()
-                _registration()
-                _landmarks()
+    html.Div(
+        f"{{{{ {state.recording} || 'none: open a file with tracked ultrasound' }}}}", id="recording",
+        classes="ussim-opened",
+    )  # fmt: skip
+    with html.Div(v_show=f"{state.recording} !== ''"):
+        _frame()
+        _calibration()
+        _registration()
+        _landmarks()
 
 
 def _frame() -> None:

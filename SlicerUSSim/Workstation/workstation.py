@@ -108,6 +108,7 @@ class Workstation:
             placing.closeCraniotomy: loading.close_craniotomy,
             placing.placeProbe: partial(loading.place, placing.placeProbe),
             placing.placeAtView: partial(loading.place, placing.placeAtView),
+            placing.approach: partial(loading.place, placing.approach),
         }
         self._answer_pages(stamps)
         self._follow_pages()

@@ -35,9 +35,7 @@ class PanelSettings(Declared):
         True, "Slice view",
         "Move the slice view to the image plane and overlay the image, with every new image", shown=True,
     )  # fmt: skip
-    show_in_3d: bool = parameter(
-        True, "3D", "Show the slice view with the image in the 3D views as well", shown=True
-    )
+    show_in_3d: bool = parameter(True, "3D", "Show the slice view with the image in the 3D views as well", shown=True)
     show_probe: bool = parameter(True, "Probe", "Show a model of the probe in the 3D views", shown=True)
     second_contrast: str = parameter(
         "none", "Second contrast", "Contrast of the second MRI, which is classified together with the first",
