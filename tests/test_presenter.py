@@ -241,17 +241,6 @@ def test_a_bug_of_ours_is_not_swallowed(presenter, monkeypatch):
     assert presenter.logic.scene.GetFirstNodeByName("Head tissues") is None and presenter.segmenting.canSegment()[0]
 
 
-def test_only_values_of_the_chosen_transmission_are_offered(presenter):
-    presenter.values.setValue("probe.transmit", "focus")
-    assert (
-        presenter.values.value("probe.focal_zones") is None and presenter.values.value("probe.transmit_angles") is None
-    )
-    presenter.values.setValue("probe.transmit", "zones")
-    presenter.values.setValue("probe.focal_zones", 5)
-    assert presenter.values.value("probe.focal_zones") == 5 and presenter.values.value("probe.transmit_angles") is None
-    assert not presenter.view.errors
-
-
 def test_the_notes_say_what_the_shown_labels_were_recognised_as(presenter):
     """They stayed those of the segmentation before; what labels are was in the log alone."""
     from tests.test_label_maps import ASEG, numbered
@@ -418,21 +407,3 @@ def test_lesions_that_were_laid_over_the_tissues_after_segment_end_undo(presente
     assert presenter.segmenting.canUndoSegment() == (True, "")
     presenter.segmenting.undoSegment()
     assert content_of(parameters.labels) == content
-
-
-def test_settings_come_back_with_undo_or_it_says_so(presenter):
-    presenter.segmenting.segment()
-    thin, notes = presenter.values.value("scene.thin_sulci"), presenter.notes.text()
-    presenter.values.setValue("scene.thin_sulci", not thin)
-    presenter.segmenting.segment()
-    presenter.segmenting.undoSegment()
-    assert presenter.values.value("scene.thin_sulci") == thin and presenter.notes.text() == notes
-    presenter.values.setValue("scene.thin_sulci", not thin)
-    presenter.segmenting.segment()
-    presenter.values.setValue("scene.classes", 4)  # the user's since, and kept
-    presenter.segmenting.undoSegment()
-    assert presenter.values.value("scene.thin_sulci") != thin and presenter.values.value("scene.classes") == 4
-    assert (
-        presenter.notes.text()
-        == f"{notes}\nUndo left the settings of Segment as they are, since they were changed after it"
-    )

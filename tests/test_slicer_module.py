@@ -644,7 +644,7 @@ def with_real_image(session, gain_db: float = 9.0):
     session.ui.fitEvaluationsSpinBox.setValue(40)
     for n in range(session.ui.freeList.count()):
         item = session.ui.freeList.item(n)
-        item.setCheckState(stand_in.QtCore.Qt.Checked if item.text() == "gain_db" else stand_in.QtCore.Qt.Unchecked)
+        item.setCheckState(stand_in.QtCore.Qt.Checked if item.text() == "Gain" else stand_in.QtCore.Qt.Unchecked)
     return session
 
 
@@ -658,7 +658,7 @@ def test_the_panel_fits_compares_applies_and_reverts(session):
     before = session.logic.preset
     ui.fitButton.click()
     assert not session.app.errors
-    assert "cost" in ui.fitLabel.text() and "gain_db: 0" in ui.fitLabel.text()
+    assert "cost" in ui.fitLabel.text() and "Gain: 0 → " in ui.fitLabel.text()
     assert session.logic.preset == before  # until Apply
     # What can be compared lies in the scene, and the slice view shows it before the real image.
     composite = session.scene.GetFirstNodeByClass("vtkMRMLSliceCompositeNode")
@@ -739,20 +739,85 @@ def test_reloading_the_module_brings_new_code(module):
         module.__dict__.update(again.__dict__ | {"app": module.app})
 
 
-@pytest.mark.slow
-def test_every_control_of_the_open_panel_is_visible(session):
+def test_what_a_first_image_needs_is_one_screen_of_440_pixels(session):
     session.segmented()
-    for button in session.parent.findChildren(stand_in.CollapsibleButton):
-        button.setCollapsed(False)
-    session.parent.resize(520, 1500)
+    session.ui.liveCheckBox.setChecked(True)
     session.parent.show()
+    session.process()
+    session.panel.refresh()  # results take as many lines as they need in this width
+    session.parent.resize(440, session.parent.sizeHint().height())
+    session.process()
+    sections = session.parent.findChildren(stand_in.CollapsibleButton)
+    opened = [section for section in sections if not section.property("collapsed")]
+    assert [section.property("text") for section in opened] == ["Patient", "Probe", "Ultrasound"]
+    last = opened[-1]
+    assert last.y() + last.height() <= 700 and session.parent.width() == 440 and len(session.panel._controls) < 110
+    for section in sections:
+        section.setCollapsed(False)
     session.process()
     kinds = stand_in.QtWidgets.QAbstractButton | stand_in.SliderWidget | stand_in.NodeComboBox
     for widget in vars(session.ui).values():
         if isinstance(widget, kinds) and widget.objectName() != "cancelButton":
-            assert widget.isVisible() and widget.width() > 40 and widget.height() >= 12, widget.objectName()
+            assert widget.isVisible() and widget.width() >= widget.minimumSizeHint().width(), widget.objectName()
+    table = session.ui.tissueTable
+    assert table.horizontalHeader().length() <= table.viewport().width() and not session.app.errors
     if folder := os.environ.get("USSIM_PICTURES"):
+        for section in sections:
+            section.setCollapsed(section not in opened)
+        session.process()
+        session.parent.resize(440, session.parent.sizeHint().height())
+        session.process()
         session.parent.grab().toImage().save(str(Path(folder) / "slicer-panel.png"))
+
+
+def test_image_and_probe_are_in_the_3d_views_until_switched_off(session):
+    session.segmented()
+    session.ui.simulateButton.click()
+    view = session.panel.sliceNode()
+    probe = session.scene.GetFirstNodeByName("Ultrasound probe")
+    assert view.GetSliceVisible() and probe.GetDisplayNode().GetVisibility()
+    assert probe.GetParentTransformNode() is session.parameters.probe_transform
+    width = probe.GetPolyData().GetBounds()[1]
+    session.ui.probePresetComboBox.setCurrentText("abdominal")
+    session.ui.simulateButton.click()
+    assert probe.GetPolyData().GetBounds()[1] > width
+    session.ui.sliceViewComboBox.setCurrentText("Yellow")
+    assert not view.GetSliceVisible() and session.panel.sliceNode().GetSliceVisible()
+    session.ui.showIn3dCheckBox.setChecked(False)
+    session.ui.showProbeCheckBox.setChecked(False)
+    assert not session.panel.sliceNode().GetSliceVisible() and not probe.GetDisplayNode().GetVisibility()
+    assert not session.app.errors
+
+
+def test_the_layout_for_ultrasound_comes_and_goes_with_the_module(session):
+    session.ui.layoutButton.click()  # as without a main window
+    views = session.add("Layout", "views")
+    views.SetViewArrangement(views.SlicerLayoutFourUpView)
+    session.ui.layoutButton.click()
+    ours = views.GetViewArrangement()
+    assert ours != views.SlicerLayoutFourUpView and "vtkMRMLViewNode" in views.GetLayoutDescription(ours)
+    session.ui.layoutButton.click()
+    assert views.GetViewArrangement() == views.SlicerLayoutFourUpView
+    session.ui.layoutButton.click()
+    session.widget.exit()
+    assert views.GetViewArrangement() == views.SlicerLayoutFourUpView
+    session.widget.enter()
+    session.ui.layoutButton.click()
+    views.SetViewArrangement(views.SlicerLayoutConventionalView)  # the user's, since
+    session.widget.exit()
+    assert views.GetViewArrangement() == views.SlicerLayoutConventionalView and not session.app.errors
+
+
+def test_tissues_are_edited_in_the_segment_editor(session, monkeypatch):
+    edited: list = []
+    editor = types.SimpleNamespace(setSegmentationNode=edited.append, setSourceVolumeNode=edited.append)
+    module = types.SimpleNamespace(widgetRepresentation=lambda: types.SimpleNamespace(self=lambda: holder))
+    holder = types.SimpleNamespace(editor=editor)
+    monkeypatch.setattr(slicer, "modules", types.SimpleNamespace(segmenteditor=module), raising=False)
+    monkeypatch.setattr(slicer.util, "selectModule", edited.append, raising=False)
+    assert not session.ui.editTissuesButton.isEnabled()
+    session.segmented().ui.editTissuesButton.click()
+    assert edited == ["SegmentEditor", session.parameters.labels, session.parameters.mri]
 
 
 @pytest.fixture
@@ -900,7 +965,6 @@ def test_selectors_offer_only_what_fits(session):
     assert offered(ui.secondMriSelector) == ["None", "FLAIR", "empty"]
     assert offered(ui.realSelector) == ["None", "FLAIR", "empty"]
     assert offered(ui.outputSelector) == ["None", "Ultrasound", "empty"]
-    assert offered(ui.outlineSelector) == ["None", "Ultrasound outline"]
     assert offered(ui.sheetsSelector) == ["None"]
     assert offered(ui.probeTransformSelector) == ["None", "Probe"]
 

@@ -92,11 +92,6 @@ class Control:
         return max(self.range.decimals, 0 if is_whole or self.kind == "slider" else 1)
 
     @property
-    def hint(self) -> str:
-        """Meaning of an empty text field: the part of the tool tip after "empty for ", or ""."""
-        return self.tip.partition("empty for ")[2]
-
-    @property
     def node_classes(self) -> tuple[str, ...]:
         """Classes of the nodes that can be selected."""
         return NODE_PARAMETERS[self.node]

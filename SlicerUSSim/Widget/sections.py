@@ -340,7 +340,7 @@ def value(name: str) -> Control:
     elif declared.type is bool:
         kind = "tick"
     widget = _camel_case(_without_unit(declared))
-    decides = ("probe.kind", "probe.transmit") if name.startswith("probe.") else ()  # which values the probe has
+    decides = ("probe.kind",) if name.startswith("probe.") else ()  # which values the probe has
     label, tip = _(declared.label), _(declared.tip)
     result = Control(widget, kind, label, tip, name, declared, choices=declared.choices, depends=(name, *decides))
     if isinstance(declared.shown, Shown):

@@ -11,7 +11,6 @@ from typing import Any
 from SlicerUSSim.Logic.base.errors import SimulationError, require, required
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.mri.segmentation import Segmentation
-from SlicerUSSim.Logic.mri.segmentation_settings import SegmentationSettings
 from SlicerUSSim.Logic.mrml.label_nodes import empty, read_labels, write_labels
 from SlicerUSSim.Logic.mrml.own_results import SHEETS, content_as_made, content_of, mark_as_made, mark_as_result
 from SlicerUSSim.Logic.mrml.share_nodes import read_shares, write_shares
@@ -44,7 +43,6 @@ class _LastSegment:
     content: str | None
     #: {role: chosen node}
     nodes: dict[str, Any]
-    settings: SegmentationSettings
 
 
 class SegmentPresenter:
@@ -66,8 +64,6 @@ class SegmentPresenter:
     def forget(self) -> None:
         """Forget the last Segment, which is of another patient."""
         self._last: _LastSegment | None = None
-        #: {content of labels, see own_results.content_of: settings by which Segment made them}
-        self._made_by: dict[str | None, SegmentationSettings] = {}
 
     def canSegment(self) -> tuple[bool, str]:
         """(whether Segment is enabled, the reason if not)"""
@@ -112,8 +108,7 @@ class SegmentPresenter:
                 told.append(f"the brain mask is {brain.GetName()!r}, which Segment uses from now on; edit it as needed")
             notes.add(*told, *untold)
             content = content_as_made(labels)
-            self._last = _LastSegment(before, labels, content, self._chosen(), settings)
-            self._made_by[content] = settings
+            self._last = _LastSegment(before, labels, content, self._chosen())
 
     @contextmanager
     def replaceable(self, name: str, source: Any) -> Iterator[Any]:
@@ -154,10 +149,10 @@ class SegmentPresenter:
         return True, ""
 
     def undoSegment(self) -> None:
-        """Go back to the tissues, mask, sheets, settings and notes from before the last Segment.
+        """Go back to the tissues, mask, sheets and notes from before the last Segment.
 
-        What the user chose or set since then stays, whatever it is; only the node into which Segment wrote is changed,
-        or removed if Segment made it.
+        Settings, and what the user chose since then, stay, whatever it is; only the node into which Segment wrote is
+        changed, or removed if Segment made it.
         """
         panel, parameters = self._panel, self._panel.parameters
         with panel.acting():
@@ -184,22 +179,6 @@ class SegmentPresenter:
             if are_its_notes:
                 self._notes.set(*before.notes)
                 self._notes.checks = []
-            self._notes.add(*self._settings_undone(last))
-
-    def _settings_undone(self, last: _LastSegment) -> list[str]:
-        """Go back to the settings by which the tissues before `last` were made; a line about it if they stay."""
-        parameters, before = self._panel.parameters, last.before
-        labels: Any = parameters.labels
-        if labels is None or labels is not before.nodes["labels"]:
-            return []
-        known = self._made_by.get(content_as_made(labels))
-        if known == parameters.segmentation:
-            return []
-        if known is not None and parameters.segmentation == last.settings:
-            parameters.segmentation = known
-            return []
-        why = "they were changed after it" if known is not None else "those of these tissues are not known"
-        return [f"Undo left the settings of Segment as they are, since {why}"]
 
     # ---- what Segment finds chosen -----------------------------------------------------------------------------
 

@@ -21,7 +21,6 @@ from SlicerUSSim.Logic.imaging.preset import Preset, preset_parameters
 from SlicerUSSim.Logic.mrml.nodes import probe_pose, set_node_to_world
 from SlicerUSSim.Logic.mrml.parameter_node import NODE_PARAMETERS, VALUE_PARAMETERS
 from SlicerUSSim.Logic.probe.arrays import PROBES, Probe
-from SlicerUSSim.Logic.probe.beam import TRANSMIT_OF
 from SlicerUSSim.Widget.interface import PanelHost
 from SlicerUSSim.Widget.placement_presenter import PlacementPresenter
 
@@ -41,10 +40,7 @@ class ValuePresenter:
         self._known: dict[str, Any] = {}
 
     def value(self, name: str) -> Any:
-        """The displayed form of a value; None if the probe has no such value.
-
-        The same for a value of another transmission than the probe's, which it would refuse.
-        """
+        """The displayed form of a value; None if the probe has no such value."""
         declared = value_parameter(name)
         section, attribute = name.split(".")
         if section == SCENE:
@@ -53,8 +49,6 @@ class ValuePresenter:
             except SimulationError:  # an invalid value in the scene: the error is shown when it is used
                 return to_shown(declared, declared.default)
         owner = getattr(self._panel.preset, section)
-        if section == "probe" and attribute in TRANSMIT_OF and owner.transmit != TRANSMIT_OF[attribute]:
-            return None
         return to_shown(declared, getattr(owner, attribute)) if hasattr(owner, attribute) else None
 
     def setValue(self, name: str, shown: Any) -> None:

@@ -26,6 +26,7 @@ def build(sections: tuple[Section, ...], column: Any) -> SimpleNamespace:
     ui = SimpleNamespace(**{name: _widget(control) for name, control in by_widget(sections).items()})
     for name, widget in vars(ui).items():
         widget.setObjectName(name)
+    column.setContentsMargins(0, 0, 0, 0)  # the module's own layout has margins
     for section in sections:
         column.addWidget(_section(section, ui))
     _add_progress(column, ui)
@@ -115,12 +116,6 @@ def _node(control: Control) -> Any:
     return result
 
 
-def _text(control: Control) -> Any:
-    result = qt.QLineEdit()
-    result.setProperty("placeholderText", control.hint)
-    return result
-
-
 def _words(control: Control) -> Any:
     result = qt.QLabel("")
     result.setProperty("wordWrap", True)
@@ -158,7 +153,7 @@ _MAKERS = {
     "number": _number,
     "tick": lambda control: qt.QCheckBox(control.label),
     "choice": _choice,
-    "text": _text,
+    "text": lambda control: qt.QLineEdit(),
     "node": _node,
     "button": lambda control: qt.QPushButton(control.label),
     "words": _words,

@@ -215,7 +215,7 @@ def _control(control: Control, panel: BrowserPanel) -> None:
         value = "Number($event.target.value)" if kind == "number" else "$event.target.value"
         shown = f"{key} === null ? '' : +Number({key}).toFixed({control.decimals})" if kind == "number" else key
         limits = f'min="{low:.10g}" max="{high:.10g}" step="{control.range.step:g}"'
-        limits = limits if kind == "number" else f'placeholder="{escape(control.hint)}"'
+        limits = limits if kind == "number" else ""
         none_at = control.range.none_at
         if kind == "number" and none_at is not None:  # an empty field, and not a number that means it
             limits += ' placeholder="none"'

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Generic, TypeVar, overload
 from SlicerUSSim.Logic.base.declaration import Declared, Parameter, Shown, parameter, parameters_of
 from SlicerUSSim.Logic.base.errors import SimulationError, require
 from SlicerUSSim.Logic.fitting.fit_settings import FitSettings
-from SlicerUSSim.Logic.imaging.preset import AS_ONE, Preset
+from SlicerUSSim.Logic.imaging.preset import Preset
 from SlicerUSSim.Logic.mri.lesions.seeded import LESION_TISSUES
 from SlicerUSSim.Logic.mri.segmentation_settings import MRI_CONTRASTS, SegmentationSettings, SheetSettings
 from SlicerUSSim.Logic.placement.views import VIEWS
@@ -144,14 +144,14 @@ class SettingsParameter(Generic[S]):
 
 def preset_texts(texts: Mapping[str, str]) -> dict[str, str]:
     """Those of a scene's {name: text} that are of its preset, see Preset.to_texts."""
-    sections = ("probe", "display", "settings", "tissues", "membrane", AS_ONE)
+    sections = ("probe", "display", "settings", "tissues", "membrane")
     return {name: text for name, text in texts.items() if text and name.split(".")[0] in sections}
 
 
 class PresetParameter:
     """Probe, display, settings and tissues; each value is a parameter, see Preset.to_texts.
 
-    A pose is not kept. The text AS_ONE of older scenes is replaced when it is read.
+    A pose is not kept.
     """
 
     def __get__(self, parameters: SceneParameters, owner: type | None = None) -> Preset:
@@ -160,8 +160,6 @@ class PresetParameter:
             texts = preset_texts(parameters.texts)
             preset = known[2] if known and known[1] == texts else Preset.from_texts(texts, "the scene's preset")
             vars(parameters)["_preset"] = version, texts, preset
-            if AS_ONE in texts:
-                self.__set__(parameters, preset)
         return vars(parameters)["_preset"][2]
 
     def __set__(self, parameters: SceneParameters, preset: Preset) -> None:
