@@ -25,7 +25,7 @@ class CollapsibleButton(QtWidgets.QGroupBox):
 
     def __init__(self, parent=None) -> None:
         super().__init__(parent)
-        self._text, self._collapsed = "", False
+        self._text, self._collapsed, self._hidden = "", False, []
         self.setStyleSheet(
             "QGroupBox { border: 1px solid #c0c0c0; margin-top: 20px } QGroupBox::title { subcontrol-origin: margin; "
             "subcontrol-position: top left; padding: 3px 900px 3px 4px; background: #dcdcdc; font-weight: bold }"
@@ -36,11 +36,17 @@ class CollapsibleButton(QtWidgets.QGroupBox):
         self.setTitle(f"{'▸' if self._collapsed else '▾'} {text}")
 
     def setCollapsed(self, collapsed: bool) -> None:
+        if collapsed == self._collapsed:
+            return
         self._collapsed = collapsed
         self._set_text(self._text)
         self.setMaximumHeight(22 if collapsed else 16_777_215)
-        for child in self.findChildren(QtWidgets.QWidget, options=QtCore.Qt.FindDirectChildrenOnly):
-            child.setVisible(not collapsed)
+        children = self.findChildren(QtWidgets.QWidget, options=QtCore.Qt.FindDirectChildrenOnly)
+        if collapsed:
+            self._hidden = [child for child in children if child.isHidden()]  # these stay so
+        for child in children:
+            if child not in self._hidden:
+                child.setVisible(not collapsed)
 
     def childEvent(self, event) -> None:
         super().childEvent(event)

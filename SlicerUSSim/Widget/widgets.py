@@ -119,6 +119,7 @@ def _node(control: Control) -> Any:
 def _words(control: Control) -> Any:
     result = qt.QLabel("")
     result.setProperty("wordWrap", True)
+    result.setAlignment(qt.Qt.AlignTop)
     return result
 
 
