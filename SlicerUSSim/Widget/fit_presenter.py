@@ -12,7 +12,7 @@ from SlicerUSSim.Logic.mrml.fit_nodes import COMPARED, CostPlot
 from SlicerUSSim.Logic.mrml.nodes import composite_of, require_node
 from SlicerUSSim.Logic.mrml.own_results import result_called
 from SlicerUSSim.Logic.tracked.sequence import checked_apart, frame_numbers
-from SlicerUSSim.Widget.interface import PanelHost, _
+from SlicerUSSim.Widget.interface import PanelHost, tr as _
 from SlicerUSSim.Widget.tissue_presenter import TissuePresenter
 from SlicerUSSim.Widget.value_presenter import ValuePresenter
 

@@ -10,7 +10,7 @@ from SlicerUSSim.Logic.mrml.nodes import nodes_of_class, put_beside
 from SlicerUSSim.Logic.mrml.parameter_node import SceneParameters
 from SlicerUSSim.Logic.mrml.sequence_nodes import MADE_FROM
 from SlicerUSSim.Logic.mrml.taken_sequence import FrozenRecord
-from SlicerUSSim.Widget.interface import PanelHost, _
+from SlicerUSSim.Widget.interface import PanelHost, tr as _
 from SlicerUSSim.Widget.notes import Notes
 from SlicerUSSim.Widget.placement_presenter import PlacementPresenter
 
@@ -87,8 +87,8 @@ class ImagePresenter:
             self._in_3d.SetSliceVisible(False)
         self._in_3d = view
         if view is not None:
-            view.SetSliceVisible(parameters.show_in_3d)
-        self._panel.logic.showProbe(outline, parameters.show_probe)
+            view.SetSliceVisible(parameters.panel.show_in_3d)
+        self._panel.logic.showProbe(outline, parameters.panel.show_probe)
 
     def followChoices(self) -> None:
         """Begin live update anew if other nodes or another slice view were chosen."""

@@ -18,12 +18,15 @@ from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic
 from SlicerUSSim.Logic.mrml.parameter_node import NODE_PARAMETERS, SceneParameters
 
 try:
-    from slicer.i18n import tr as _
+    from slicer.i18n import tr as tr
 except ImportError:  # outside of 3D Slicer
 
-    def _(text: str) -> str:
+    def tr(text: str) -> str:
+        """The text in the user's language."""
         return text
 
+
+_ = tr  # the name that Slicer's tools look for
 
 Kind = Literal["slider", "number", "tick", "choice", "text", "node", "button", "words", "table", "list"]
 #: Suffix of the widget's name, by kind of control.

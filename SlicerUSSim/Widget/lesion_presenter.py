@@ -7,7 +7,7 @@ from typing import Any
 from SlicerUSSim.Logic.base.errors import require, required
 from SlicerUSSim.Logic.mrml.nodes import display_of
 from SlicerUSSim.Logic.mrml.parameter_node import BY_LOOK, LARGER
-from SlicerUSSim.Widget.interface import PanelHost, _
+from SlicerUSSim.Widget.interface import PanelHost, tr as _
 from SlicerUSSim.Widget.notes import GROWN, Notes, checks
 from SlicerUSSim.Widget.segment_presenter import SegmentPresenter
 

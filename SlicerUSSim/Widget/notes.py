@@ -7,7 +7,7 @@ from typing import Any
 
 from SlicerUSSim.Logic.base.errors import SimulationError
 from SlicerUSSim.Logic.mri.segmentation_settings import GEL_MM
-from SlicerUSSim.Widget.interface import PanelHost, _
+from SlicerUSSim.Widget.interface import PanelHost, tr as _
 
 #: Begin of the lines that a user should check
 CHECK = "Check: "

@@ -17,7 +17,7 @@ from SlicerUSSim.Logic.base.errors import Cancelled, SimulationError, required
 from SlicerUSSim.Logic.mrml.fitting_nodes import offered
 from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic
 from SlicerUSSim.Logic.mrml.nodes import nodes_of_class
-from SlicerUSSim.Widget.interface import Control, _, by_widget
+from SlicerUSSim.Widget.interface import Control, by_widget, tr as _
 from SlicerUSSim.Widget.notes import CHECK
 from SlicerUSSim.Widget.presenter import PanelPresenter
 from SlicerUSSim.Widget.sections import panel_sections

@@ -6,7 +6,7 @@ from typing import Any
 
 from SlicerUSSim.Logic.base.errors import require, required
 from SlicerUSSim.Logic.mrml.nodes import display_of
-from SlicerUSSim.Widget.interface import PanelHost, _
+from SlicerUSSim.Widget.interface import PanelHost, tr as _
 from SlicerUSSim.Widget.notes import OPENED, PLACED, VIEW, Notes, checks
 
 

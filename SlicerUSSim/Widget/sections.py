@@ -19,7 +19,7 @@ from SlicerUSSim.Logic.mrml.fit_nodes import COMPARED
 from SlicerUSSim.Logic.mrml.parameter_node import SceneParameters
 from SlicerUSSim.Logic.probe.arrays import PROBES
 from SlicerUSSim.Logic.tissue.presets import TISSUES
-from SlicerUSSim.Widget.interface import Can, Control, Kind, Row, Section, _
+from SlicerUSSim.Widget.interface import Can, Control, Kind, Row, Section, tr as _
 from SlicerUSSim.Widget.presenter import PanelPresenter
 from SlicerUSSim.Widget.tissue_presenter import COLUMN_PARAMETERS
 from SlicerUSSim.Widget.value_presenter import CUSTOM_PROBE, SCENE, SHOWN_PROBES, value_parameter

@@ -12,7 +12,7 @@ from SlicerUSSim.Logic.tissue.names import same_name
 from SlicerUSSim.Logic.tissue.presets import TISSUES
 from SlicerUSSim.Logic.tissue.table import TissueTable
 from SlicerUSSim.Logic.tissue.tissue import TISSUE_PARAMETERS, Tissue
-from SlicerUSSim.Widget.interface import PanelHost, _
+from SlicerUSSim.Widget.interface import PanelHost, tr as _
 
 #: What the table shows, up to the scatterers; the texture of a tissue is in preset files alone
 COLUMN_PARAMETERS = TISSUE_PARAMETERS[:6]

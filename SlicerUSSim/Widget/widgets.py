@@ -13,7 +13,7 @@ import ctk
 import qt
 import slicer
 
-from SlicerUSSim.Widget.interface import Control, Section, _, by_widget
+from SlicerUSSim.Widget.interface import Control, Section, by_widget, tr as _
 
 _PAGE_STEPS = 10
 _TABLE_HEIGHT, _LIST_HEIGHT = 220, 140

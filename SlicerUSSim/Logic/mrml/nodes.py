@@ -61,9 +61,9 @@ def put_beside(node, patient_node) -> None:
     A node at the top, as a volume that was loaded from a file, gets a folder of its name; one of DICOM has a study.
     """
     hierarchy = patient_node.GetScene().GetFirstNodeByClass("vtkMRMLSubjectHierarchyNode")
-    patient = 0 if hierarchy is None else hierarchy.GetItemByDataNode(patient_node)
-    if not patient:
+    if hierarchy is None or not hierarchy.GetItemByDataNode(patient_node):
         return
+    patient = hierarchy.GetItemByDataNode(patient_node)
     folder = hierarchy.GetItemParent(patient)
     if folder == hierarchy.GetSceneItemID():
         folder = hierarchy.CreateFolderItem(folder, f"{patient_node.GetName()} ultrasound")
