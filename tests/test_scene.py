@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import gc
 import inspect
-import json
 import weakref
 from dataclasses import replace
 from datetime import datetime, timezone
@@ -794,9 +793,6 @@ def test_the_mri_is_never_the_output_and_other_wrong_content_is_refused(bench):
     write_labels(hollow, cyst().with_array(np.zeros_like(cyst().array)), ("speckle",), bench.grid())
     with pytest.raises(SimulationError, match="'hollow' is empty, expected a segment with voxels"):
         bench.logic.simulate(hollow, bench.probe, bench.image)
-    bench.logic.parameters.node.SetParameter("tissues.2", "{gain: 3}")
-    with pytest.raises(SimulationError, match=r"the scene's preset: tissues.2 is '\{gain: 3\}', which is not JSON"):
-        bench.simulate()
 
 
 # ---- what the scene remembers ----------------------------------------------------------------------------------------
@@ -911,22 +907,6 @@ def test_an_invalid_value_in_a_scene_is_named(bench, name, text, message):
     with pytest.raises(SimulationError) as caught:
         bench.simulate()
     assert str(caught.value).startswith("the scene's preset: ") and message in str(caught.value)
-
-
-def test_a_scene_of_before_with_its_preset_as_one_text_is_read(bench, tmp_path):
-    before = replace(PRESET, tissues=PRESET.tissues.with_membrane(None)).changed("settings", contact_gap_mm=1.0)
-    bench.logic.parameters.labels = bench.labels
-    bench.logic.preset = Preset()
-    bench.logic.parameters.node.SetParameter("preset", json.dumps(before.to_dict()))
-    save_scene(bench.scene, (bench.labels,), tmp_path)
-    scene = slicer.vtkMRMLScene()
-    scene.SetURL(str(tmp_path / "scene.mrml"))
-    assert scene.Connect()
-    logic = UltrasoundSceneLogic(scene)
-    assert logic.preset == before
-    node = logic.parameters.node
-    assert not node.GetParameter("preset") and node.GetParameter("settings.contact_gap_mm") == "1.0"
-    assert UltrasoundSceneLogic(scene).preset == before
 
 
 def test_segment_takes_settings_and_single_values(bench, monkeypatch):

@@ -380,28 +380,6 @@ def test_a_wrong_value_in_a_scene_is_shown_and_can_be_mended(session):
     assert session.parameters.segmentation.contrast == "t2"
 
 
-def test_a_new_display_parameter_is_in_the_panel_by_its_declaration_alone(module, monkeypatch):
-    import dataclasses
-
-    declaration = importlib.import_module("SlicerUSSim.Logic.base.declaration")
-    settings = importlib.import_module("SlicerUSSim.Logic.base.settings")
-    preset = importlib.import_module("SlicerUSSim.Logic.imaging.preset")
-    sharpness = declaration.parameter(
-        1.0, "Sharpness", "How sharp edges are", bounds=(0, 9), shown=declaration.Shown(0, 5, 0.1, is_slider=True)
-    )
-    new = dataclasses.make_dataclass(
-        "DisplaySettings", [("sharpness", float, sharpness)], bases=(settings.DisplaySettings,), frozen=True
-    )
-    monkeypatch.setitem(preset.SECTIONS, "display", new)
-    session = Session(module)
-    try:
-        session.logic.preset = dataclasses.replace(preset.Preset(), display=new())
-        session.ui.sharpnessSlider.setValue(3.5)
-        assert session.logic.preset.display.sharpness == 3.5 and not session.app.errors
-    finally:
-        session.close()
-
-
 # ---- working with it -------------------------------------------------------------------------------------------------
 
 
