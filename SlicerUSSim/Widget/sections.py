@@ -258,7 +258,7 @@ def _fit(panel: PanelPresenter) -> tuple[Row, ...]:
         ),
         *values(*(f"{SCENE}.{name}" for name in SceneParameters.fit.values)),
         Control(
-            "free", "list", _("Free"),
+            "free", "list", _("Parameters"),
             _("Parameters that the fit varies; its result marks those that the images do not determine"),
             depends=("tissues", "scene.fit_free", *_DRAWN),
         ),
