@@ -213,8 +213,10 @@ class USSimWidget(ScriptedLoadableModuleWidget, VTKObservationMixin):
         self.initializeParameterNode()
 
     def exit(self) -> None:
-        """Called each time the user opens another module; live update goes on."""
+        """Called each time the user opens another module; live update goes on, the user's layout comes back."""
         self.setParameterNode(None)
+        if self.panel is not None:
+            self.panel.restoreLayout()
 
     def onSceneStartChange(self, caller, event) -> None:
         """Called just before the scene is closed or imported; disconnects the panel from it."""

@@ -21,23 +21,39 @@ from vtkmodules.vtkCommonCore import VTK_OBJECT
 
 
 class CollapsibleButton(QtWidgets.QGroupBox):
-    """ctkCollapsibleButton: hides what is in it while collapsed."""
+    """ctkCollapsibleButton: a bar with an arrow and its text, which hides what is in it while collapsed."""
 
     def __init__(self, parent=None) -> None:
         super().__init__(parent)
-        self._collapsed = False
+        self._text, self._collapsed, self._hidden = "", False, []
+        self.setStyleSheet(
+            "QGroupBox { border: 1px solid #c0c0c0; margin-top: 20px } QGroupBox::title { subcontrol-origin: margin; "
+            "subcontrol-position: top left; padding: 3px 900px 3px 4px; background: #dcdcdc; font-weight: bold }"
+        )
+
+    def _set_text(self, text: str) -> None:
+        self._text = text
+        self.setTitle(f"{'▸' if self._collapsed else '▾'} {text}")
 
     def setCollapsed(self, collapsed: bool) -> None:
+        if collapsed == self._collapsed:
+            return
         self._collapsed = collapsed
-        for child in self.findChildren(QtWidgets.QWidget, options=QtCore.Qt.FindDirectChildrenOnly):
-            child.setVisible(not collapsed)
+        self._set_text(self._text)
+        self.setMaximumHeight(22 if collapsed else 16_777_215)
+        children = self.findChildren(QtWidgets.QWidget, options=QtCore.Qt.FindDirectChildrenOnly)
+        if collapsed:
+            self._hidden = [child for child in children if child.isHidden()]  # these stay so
+        for child in children:
+            if child not in self._hidden:
+                child.setVisible(not collapsed)
 
     def childEvent(self, event) -> None:
         super().childEvent(event)
         if event.added() and event.child().isWidgetType() and self._collapsed:
             event.child().setVisible(False)
 
-    text = QtCore.Property(str, lambda self: self.title(), lambda self, text: self.setTitle(text))
+    text = QtCore.Property(str, lambda self: self._text, _set_text)
     collapsed = QtCore.Property(bool, lambda self: self._collapsed, setCollapsed)
 
 
@@ -65,6 +81,7 @@ class SliderWidget(QtWidgets.QWidget):
         layout.addWidget(self._slider, 1)
         layout.addWidget(self._box)
         self._slider.setRange(0, 1000)
+        self._box.setFixedWidth(132)  # as synchronizeSiblings makes them
         self._slider.valueChanged.connect(self._slid)
         self._box.valueChanged.connect(self._typed)
 
@@ -94,6 +111,7 @@ class SliderWidget(QtWidgets.QWidget):
     minimum = QtCore.Property(float, lambda self: self._box.minimum(), _set_minimum)
     maximum = QtCore.Property(float, lambda self: self._box.maximum(), _set_maximum)
     singleStep = QtCore.Property(float, lambda self: self._box.singleStep(), lambda self, v: self._box.setSingleStep(v))
+    synchronizeSiblings = QtCore.Property(int, lambda self: 1, lambda self, v: None)
     pageStep = QtCore.Property(float, lambda self: 1.0, lambda self, v: None)
     decimals = QtCore.Property(int, lambda self: self._box.decimals(), lambda self, v: self._box.setDecimals(v))
     suffix = QtCore.Property(str, lambda self: self._box.suffix(), lambda self, v: self._box.setSuffix(v))

@@ -431,10 +431,10 @@ def test_a_changed_value_brings_the_page_no_other_values(monkeypatch):
     presenter.parametersChanged()  # as for every change of the scene's parameters
     assert set(read) == {"display.gain_db"} and sent == {value_of("gainSlider"): 7.0}
     read.clear(), sent.clear()
-    panel.set("transmitComboBox", "zones")
+    panel.set("kindComboBox", "convex")
     presenter.parametersChanged()
-    assert all(name.startswith("probe.") for name in read) and "probe.focal_zones" in read
-    assert sent[value_of("transmitComboBox")] == "zones" and value_of("gainSlider") not in sent
+    assert all(name.startswith("probe.") for name in read) and "probe.radius_mm" in read
+    assert sent[value_of("kindComboBox")] == "convex" and value_of("gainSlider") not in sent
     monkeypatch.undo()
     presenter.logic.scene.AddNewNodeByClass("vtkMRMLScalarVolumeNode", "head")
     presenter.parametersChanged()

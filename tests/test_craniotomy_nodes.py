@@ -84,16 +84,16 @@ def test_a_disc_is_opened_in_labels_of_its_own_and_closed_again(head):  # noqa: 
     gone = (after != before) & (before == 2)
     assert not after[after != before].any() and (after == 1).sum() == (before == 1).sum()
     assert gone.sum() * head.voxel_ml == pytest.approx(expected(head, TOP, 30.0), rel=1e-6)
-    assert "craniotomy: a disc of 30 mm under the probe; " in bench.presenter.notes.text()
+    assert "craniotomy: a disc of 30 mm under the probe; " in bench.presenter.notes.aboutProbe()
     node = bench.labels
     bench.move(pose_looking_at((0.0, 80.0, 0.0), (0.0, 0.0, 0.0)))
     bench.presenter.placing.openCraniotomy()  # there, and closed again where it was
     assert bench.labels is node and len(nodes_of_class(bench.scene, "vtkMRMLModelNode")) == 1
-    assert (bench.tissues(bench.labels)[gone] == 2).mean() > 0.9 and bench.presenter.notes.text().count(
+    assert (bench.tissues(bench.labels)[gone] == 2).mean() > 0.9 and bench.presenter.notes.aboutProbe().count(
         "craniotomy: "
     ) == 1
     bench.presenter.placing.closeCraniotomy()
-    assert bench.labels is bench.whole and "craniotomy: " not in bench.presenter.notes.text()
+    assert bench.labels is bench.whole and "craniotomy: " not in bench.presenter.notes.aboutProbe()
     assert not bench.presenter.placing.canCloseCraniotomy()[0] and not bench.view.errors
 
 
@@ -185,7 +185,7 @@ def test_the_labels_are_no_opening_and_edits_are_not_lost_unsaid(head):  # noqa:
     first.GetImageData().SetScalarComponentFromDouble(42, 42, 42, 0, 2.0)
     first.GetImageData().Modified()
     bench.presenter.placing.openCraniotomy()
-    assert bench.labels is not first and "what was edited in LabelMapVolume" in bench.presenter.notes.text()
+    assert bench.labels is not first and "what was edited in LabelMapVolume" in bench.presenter.notes.aboutProbe()
 
 
 @pytest.mark.slow
@@ -194,20 +194,22 @@ def test_gel_is_between_skin_and_probe_unless_the_user_says_otherwise(head):  # 
     bench.move(pose_looking_at((0.0, 0.0, 88.0), (0.0, 0.0, 0.0)))  # 10 mm off the skin
     image = bench.add("ScalarVolume", "image")
     gel = bench.logic.simulate(bench.whole, bench.probe, image).image.copy()
-    assert "gel fills gaps of up to 3 mm between skin and probe" in bench.presenter.notes.text()
+    assert "gel fills gaps of up to 3 mm between skin and probe" in bench.presenter.notes.aboutProbe()
     plain = bench.logic.preset
     bench.logic.preset = plain.changed("settings", contact_gap_mm=3.0)
     np.testing.assert_array_equal(bench.logic.simulate(bench.whole, bench.probe, image).image, gel)
     bench.logic.preset = plain.changed("settings", contact_gap_mm=1.0)
-    assert bench.logic.settings(bench.whole).contact_gap_mm == 1.0 and "gel " not in bench.presenter.notes.text()
+    assert bench.logic.settings(bench.whole).contact_gap_mm == 1.0 and "gel " not in bench.presenter.notes.aboutProbe()
     bench.logic.preset = plain
     bench.presenter.values.setValue("scene.gel", False)
     immersed = bench.logic.simulate(bench.whole, bench.probe, image).image
     assert gel.mean() < 0.5 * immersed.mean() and immersed.max() > gel.max() + 50
-    assert "gel " not in bench.presenter.notes.text()
+    assert "gel " not in bench.presenter.notes.aboutProbe()
     bench.presenter.values.setValue("scene.gel", True)
     bench.presenter.placing.openCraniotomy()  # filled with saline
-    assert bench.logic.settings(bench.labels).contact_gap_mm is None and "gel " not in bench.presenter.notes.text()
+    assert (
+        bench.logic.settings(bench.labels).contact_gap_mm is None and "gel " not in bench.presenter.notes.aboutProbe()
+    )
     bench.presenter.placing.closeCraniotomy()
     assert bench.logic.settings(bench.labels).contact_gap_mm == 3.0
     brain = Bench(head.with_array(np.where(head.array == 2, 2, 0).astype(np.uint8)))
@@ -240,15 +242,15 @@ def test_the_notes_say_that_no_part_of_the_face_touches_the_patient(head):  # no
     nothing = "0% of the probe's face touches the patient (contact gap: 3 mm): the image is black"
     bench = Bench(head)
     bench.presenter.placing.placeProbe()
-    assert "face touches" not in bench.presenter.notes.text()
+    assert "face touches" not in bench.presenter.notes.aboutProbe()
     bench.presenter.images.setLive(True)
     refreshed = bench.view.refreshed
     bench.move(pose_looking_at((0.0, 0.0, 88.0), (0.0, 0.0, 0.0)))
     bench.view.waiting.pop()()
-    assert bench.view.refreshed == refreshed + 1 and bench.presenter.notes.text().count(nothing) == 1
+    assert bench.view.refreshed == refreshed + 1 and bench.presenter.notes.aboutProbe().count(nothing) == 1
     bench.presenter.images.setLive(False)
     bench.logic.parameters.panel = replace(bench.logic.parameters.panel, gel=False)  # it lies in the coupling medium
-    assert "face touches" not in bench.presenter.notes.text() and not bench.view.errors
+    assert "face touches" not in bench.presenter.notes.aboutProbe() and not bench.view.errors
 
 
 @pytest.mark.slow
@@ -256,20 +258,26 @@ def test_the_notes_follow_the_probe_over_bone_and_openings(head):  # noqa: F811
     closed, misfit = "the skull is closed in front of the probe", "does not fit the opening"
     bench = Bench(head)
     bench.presenter.placing.placeProbe()
-    assert bench.presenter.notes.text().count(closed) == 1 and "Open skull in 3D Slicer" in bench.presenter.notes.text()
+    assert (
+        bench.presenter.notes.aboutProbe().count(closed) == 1
+        and "Open skull in 3D Slicer" in bench.presenter.notes.aboutProbe()
+    )
     bench.presenter.placing.openCraniotomy()
     bench.presenter.placing.placeProbe()
-    assert closed not in bench.presenter.notes.text() and misfit not in bench.presenter.notes.text()
+    assert closed not in bench.presenter.notes.aboutProbe() and misfit not in bench.presenter.notes.aboutProbe()
     bench.logic.preset = bench.logic.preset.changed("probe", aperture_mm=40.0)
-    assert "is 40 mm wide and does not fit the opening" in bench.presenter.notes.text()
+    assert "is 40 mm wide and does not fit the opening" in bench.presenter.notes.aboutProbe()
     bench.logic.preset = bench.logic.preset.changed("probe", aperture_mm=12.0)
     bench.presenter.images.setLive(True)
-    assert misfit not in bench.presenter.notes.text() and not bench.view.errors
+    assert misfit not in bench.presenter.notes.aboutProbe() and not bench.view.errors
     refreshed = bench.view.refreshed
     bench.move(pose_looking_at((78.5, 0.0, 0.0), (0.0, 0.0, 0.0), (0.0, 1.0, 0.0)))
     bench.view.waiting.pop()()  # the image there
     assert bench.view.refreshed == refreshed + 1  # so that the notes are shown anew
-    assert closed in bench.presenter.notes.text() and "the opening is elsewhere" in bench.presenter.notes.text()
+    assert (
+        closed in bench.presenter.notes.aboutProbe()
+        and "the opening is elsewhere" in bench.presenter.notes.aboutProbe()
+    )
     bench.presenter.images.setLive(False)
     assert not [line for line in bench.presenter.notes.lines if closed in line]
 
@@ -287,12 +295,12 @@ def test_a_view_is_placed_in_an_opening_or_said_to_be_elsewhere(head):  # noqa: 
     bench.presenter.placing.openCraniotomy()
     bench.presenter.placing.placeAtView()
     assert radius() == pytest.approx(60.0, abs=2.0) and not bench.view.errors
-    assert "the view fontanelle is seen through the opening" in bench.presenter.notes.text()
+    assert "the view fontanelle is seen through the opening" in bench.presenter.notes.aboutProbe()
     bench.presenter.values.setValue("scene.view", "temporal")
     bench.presenter.placing.placeAtView()
-    assert radius() == pytest.approx(78.0, abs=2.0) and bench.presenter.notes.text().count("view: ") == 1
+    assert radius() == pytest.approx(78.0, abs=2.0) and bench.presenter.notes.aboutProbe().count("view: ") == 1
     assert "the opening is not where the view temporal is seen from: the probe stands on the skin" in (
-        bench.presenter.notes.text()
+        bench.presenter.notes.aboutProbe()
     )
 
 
@@ -311,7 +319,7 @@ def test_hidden_segments_of_an_opening_stay_closed_and_are_said_to(head):  # noq
     assert not bench.view.errors
     before, after = bench.tissues(bench.whole), bench.tissues(bench.labels)
     np.testing.assert_array_equal((after != before) & (before == 2), both.array == 1)
-    notes = bench.presenter.notes.text()
+    notes = bench.presenter.notes.aboutProbe()
     assert "with left; " in notes and "what is hidden is not opened: right" in notes
     opening.GetDisplayNode().SetSegmentVisibility(first, False)
     bench.presenter.placing.openCraniotomy()

@@ -52,7 +52,7 @@ def test_a_parameter_has_a_label_a_tip_and_the_unit_of_its_name():
     for _, entry in DECLARED:
         for text in (entry.label, entry.tip):
             assert text and text == text.strip() and "\n" not in text, entry.name
-        assert entry.label[0].isupper() and not entry.label.endswith("."), entry.label
+        assert not entry.label[0].islower() and not entry.label.endswith("."), entry.label
         # Formula signs and names of choices begin as they are written.
         assert entry.tip[0].isupper() or not entry.tip[0].isalpha() or re.match(r"\w+: |n in ", entry.tip), entry.tip
         for text in (entry.tip, entry.note, entry.source):

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
-
 import numpy as np
 import pytest
 import slicer
@@ -205,27 +203,6 @@ def paint(segmentation_node, segment_id: str, mask: Volume) -> None:
     image.ShallowCopy(Volume((mask.array > 0).astype(np.uint8), np.eye(4)).to_vtk())
     image.SetImageToWorldMatrix(vtk_matrix(mask.ijk_to_ras))
     slicer.vtkSlicerSegmentationsModuleLogic.SetBinaryLabelmapToSegment(image, segmentation_node, segment_id, 0)
-
-
-def content_by_earlier_versions(labels_node) -> str:
-    """content_of as it was when only the topmost segment of a voxel counted."""
-    volume, names = node_labels(labels_node)
-    found = np.argwhere(volume.array)
-    low, high = found.min(axis=0), found.max(axis=0) + 1
-    part = volume.array[tuple(slice(a, b) for a, b in zip(low, high, strict=True))]
-    place = volume.ijk_to_ras.copy()
-    place[:3, 3] = (volume.ijk_to_ras @ [*low[::-1], 1])[:3]
-    content = hashlib.sha256(repr((part.shape, (place.round(3) + 0.0).tolist(), sorted(names.items()))).encode())
-    content.update(part.astype(np.int32).tobytes())
-    return content.hexdigest()
-
-
-@pytest.mark.parametrize("kind", ["LabelMapVolume", "Segmentation"])
-def test_labels_of_earlier_versions_are_known_again(kind):
-    bench = Bench(kind)
-    mark_as_made(bench.labels)
-    bench.labels.SetAttribute("SlicerUSSim.made", content_by_earlier_versions(bench.labels))
-    assert bench.logic.mayReplace(bench.labels)
 
 
 def test_voxels_of_a_user_below_a_later_segment_are_seen(tmp_path):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import gc
 import inspect
-import json
 import weakref
 from dataclasses import replace
 from datetime import datetime, timezone
@@ -36,7 +35,7 @@ from SlicerUSSim.Logic.base.vtk_data import vtk_matrix  # noqa: E402
 from SlicerUSSim.Logic.fitting.fit_settings import FitSettings  # noqa: E402
 from SlicerUSSim.Logic.mri.samples import head_mri  # noqa: E402
 from SlicerUSSim.Logic.mri.segmentation_settings import SegmentationSettings  # noqa: E402
-from SlicerUSSim.Logic.mrml.label_nodes import read_labels, write_labels  # noqa: E402
+from SlicerUSSim.Logic.mrml.label_nodes import node_labels, read_labels, write_labels  # noqa: E402
 from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic  # noqa: E402
 from SlicerUSSim.Logic.mrml.nodes import (  # noqa: E402
     ijk_to_ras,
@@ -399,6 +398,24 @@ def test_codes_of_slicers_terminologies_are_written_and_read(bench):
             colours.SetColorName(1, "Gewebe")
         assert "^389080008^" in entries[0] and "^10200004^" in entries[1] and "^389080008^" not in entries[2]
         assert read_labels(node, TissueTable.brain()).names == ("white matter", "liver", "gel")
+
+
+def test_tissues_are_one_layer_in_the_folder_of_the_patient(bench):
+    hierarchy = slicer.vtkMRMLSubjectHierarchyNode.GetSubjectHierarchyNode(bench.scene)
+    study = hierarchy.CreateStudyItem(hierarchy.GetSceneItemID(), "of DICOM")
+    voxels = Volume(np.repeat(np.arange(4, dtype=np.uint8), 16).reshape(4, 4, 4), np.eye(4))
+    for parent, folder in ((hierarchy.GetSceneItemID(), "MRI ultrasound"), (study, "of DICOM")):
+        mri, tissues = add(bench.scene, "ScalarVolume", "MRI"), add(bench.scene, "Segmentation", "tissues")
+        write_volume(mri, voxels)
+        hierarchy.CreateItem(parent, mri)
+        for _ in range(2):  # a second Segment moves nothing
+            write_labels(tissues, voxels, ("csf", "grey matter", "white matter"), mri)
+        parents = [hierarchy.GetItemParent(hierarchy.GetItemByDataNode(node)) for node in (mri, tissues)]
+        assert parents[0] == parents[1] and hierarchy.GetItemName(parents[0]) == folder
+        segmentation = tissues.GetSegmentation()
+        assert segmentation.GetNumberOfSegments() == 3 and segmentation.GetNumberOfLayers() == 1
+        np.testing.assert_array_equal(node_labels(tissues)[0].array, voxels.array)
+    assert hierarchy.GetNumberOfItems() == 6  # two patients with a folder and two nodes each
 
 
 def test_slicers_default_colours_do_not_make_bone_of_grey_matter(bench):
@@ -807,9 +824,6 @@ def test_the_mri_is_never_the_output_and_other_wrong_content_is_refused(bench):
     write_labels(hollow, cyst().with_array(np.zeros_like(cyst().array)), ("speckle",), bench.grid())
     with pytest.raises(SimulationError, match="'hollow' is empty, expected a segment with voxels"):
         bench.logic.simulate(hollow, bench.probe, bench.image)
-    bench.logic.parameters.node.SetParameter("preset", "{gain: 3}")
-    with pytest.raises(SimulationError, match=r"the scene's preset: preset is '\{gain: 3\}', which is not JSON"):
-        bench.simulate()
 
 
 # ---- what the scene remembers ----------------------------------------------------------------------------------------
@@ -924,22 +938,6 @@ def test_an_invalid_value_in_a_scene_is_named(bench, name, text, message):
     with pytest.raises(SimulationError) as caught:
         bench.simulate()
     assert str(caught.value).startswith("the scene's preset: ") and message in str(caught.value)
-
-
-def test_a_scene_of_before_with_its_preset_as_one_text_is_read(bench, tmp_path):
-    before = replace(PRESET, tissues=PRESET.tissues.with_membrane(None)).changed("settings", contact_gap_mm=1.0)
-    bench.logic.parameters.labels = bench.labels
-    bench.logic.preset = Preset()
-    bench.logic.parameters.node.SetParameter("preset", json.dumps(before.to_dict()))
-    save_scene(bench.scene, (bench.labels,), tmp_path)
-    scene = slicer.vtkMRMLScene()
-    scene.SetURL(str(tmp_path / "scene.mrml"))
-    assert scene.Connect()
-    logic = UltrasoundSceneLogic(scene)
-    assert logic.preset == before
-    node = logic.parameters.node
-    assert not node.GetParameter("preset") and node.GetParameter("settings.contact_gap_mm") == "1.0"
-    assert UltrasoundSceneLogic(scene).preset == before
 
 
 def test_segment_takes_settings_and_single_values(bench, monkeypatch):

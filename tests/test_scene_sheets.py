@@ -208,27 +208,33 @@ def test_a_point_in_a_view_grows_a_lesion_that_is_removed_or_laid_on():
     lesions.pickSeed()
     assert "segment this MRI first" in presenter.view.errors.pop()
     bench.logic.growth.segmented(bench.mri, brain("low")[0])
-    assert lesions.canGrow()[0] and lesions.canGrowAtPoint() == (False, "Choose a point in the lesion")
+    assert lesions.canGrow()[0]
     lesions.pickSeed()
     node, picked = presenter.view.picking
     assert node is parameters.seed and not lesions.canRemove()[0]
     node.AddControlPointWorld(0.0, 0.0, 300.0)
     picked()
-    assert "300" not in presenter.notes.text() and "mm outside the image" in presenter.view.errors.pop()
+    assert "300" not in presenter.notes.aboutLesions() and "mm outside the image" in presenter.view.errors.pop()
     assert parameters.lesions is None
     node.AddControlPointWorld(*CENTRE)
     picked()
     grown = parameters.lesions.GetSegmentation()
     assert not presenter.view.errors and list(grown.GetSegmentIDs()) and lesions.canRemove()[0]
-    assert "grown: tumour" in presenter.notes.text() and "add it to the tissues" in presenter.notes.text()
+    assert (
+        "grown: tumour" in presenter.notes.aboutLesions() and "add it to the tissues" in presenter.notes.aboutLesions()
+    )
     assert parameters.lesions.GetDisplayNode().GetVisibility()
     with pytest.raises(ValueError, match="not in tuple"):  # nothing is laid over the tissues
         bench.voxels("tumour", parameters.labels)
     lesions.removeGrown()
-    assert not list(grown.GetSegmentIDs()) and not lesions.canRemove()[0] and "grown: " not in presenter.notes.text()
+    assert (
+        not list(grown.GetSegmentIDs())
+        and not lesions.canRemove()[0]
+        and "grown: " not in presenter.notes.aboutLesions()
+    )
     lesions.growAtPoint()
     lesions.addTissues()
-    assert not presenter.view.errors and "grown: " not in presenter.notes.text()
+    assert not presenter.view.errors and "grown: " not in presenter.notes.aboutLesions()
     laid = bench.voxels("tumour", parameters.labels)
     assert 0.6 * true.sum() < laid < 1.4 * true.sum()
     parameters.panel = replace(parameters.panel, lesion_size="larger")

@@ -702,16 +702,15 @@ def test_a_craniotomy_is_opened_and_closed_in_the_page(browser, tmp_path):
         page = opened(browser, address)
         settled(page)
         shut = np.asarray(Image.open(download(page, "png")), float)
-        assert shown(page, "notesLabel").count(closed) == 1 and "Open skull" in shown(page, "notesLabel")
-        open_section(page, "Craniotomy")
+        assert shown(page, "probeNotesLabel").count(closed) == 1 and "Open skull" in shown(page, "probeNotesLabel")
         assert page.locator("#closeCraniotomyButton").is_disabled()
-        pressed_until(page, "#openCraniotomyButton", lambda: "craniotomy: a disc of" in shown(page, "notesLabel"))
+        pressed_until(page, "#openCraniotomyButton", lambda: "craniotomy: a disc of" in shown(page, "probeNotesLabel"))
         settled(page)
         page.evaluate("window.trame.trigger('press', ['placeButton'])")  # on the brain, in the middle of the opening
         settled(page)
-        assert not errors(page) and "craniotomy: a disc of" in shown(page, "notesLabel")
-        assert closed not in shown(page, "notesLabel") and misfit not in shown(page, "notesLabel")
-        assert "probe: " not in shown(page, "notesLabel")  # there is no lesion to aim at
+        assert not errors(page) and "craniotomy: a disc of" in shown(page, "probeNotesLabel")
+        assert closed not in shown(page, "probeNotesLabel") and misfit not in shown(page, "probeNotesLabel")
+        assert "probe: " not in shown(page, "probeNotesLabel")  # there is no lesion to aim at
         through = np.asarray(Image.open(download(page, "png")), float)
         assert through.mean() > shut.mean() + 5.0
         click(page, "#close-patient")
@@ -720,11 +719,11 @@ def test_a_craniotomy_is_opened_and_closed_in_the_page(browser, tmp_path):
         page.keyboard.press("Escape")
         page.locator("#question").wait_for(state="detached")
         page.evaluate("window.trame.trigger('set', ['probePresetComboBox', 'abdominal'])")
-        eventually(page, lambda: f"the face of the probe is 69 {misfit}" in shown(page, "notesLabel"))
-        pressed_until(page, "#closeCraniotomyButton", lambda: "craniotomy: " not in shown(page, "notesLabel"))
+        eventually(page, lambda: f"the face of the probe is 69 {misfit}" in shown(page, "probeNotesLabel"))
+        pressed_until(page, "#closeCraniotomyButton", lambda: "craniotomy: " not in shown(page, "probeNotesLabel"))
         settled(page)
-        assert not errors(page) and "craniotomy: " not in shown(page, "notesLabel")
-        assert misfit not in shown(page, "notesLabel")
+        assert not errors(page) and "craniotomy: " not in shown(page, "probeNotesLabel")
+        assert misfit not in shown(page, "probeNotesLabel")
         assert page.locator("#closeCraniotomyButton").is_disabled()
         page.close()
 
@@ -740,7 +739,7 @@ def test_a_click_grows_a_lesion_that_is_added_to_the_tissues(browser, tmp_path):
     with serving(*arguments) as address:
         page = opened(browser, address)
         settled(page)
-        open_section(page, "Lesions")
+        open_section(page, "Lesions and other images")
         before = shown(page, "notesLabel")
         assert page.locator("#removeGrownButton").is_disabled()
         axial = views(page)[3]
@@ -757,7 +756,7 @@ def test_a_click_grows_a_lesion_that_is_added_to_the_tissues(browser, tmp_path):
         pose_before = pose(page)
         with heard(page):
             page.mouse.click(*in_view(axial, 0.352, 0.507))
-        eventually(page, lambda: "grown: tumour" in shown(page, "notesLabel"))
+        eventually(page, lambda: "grown: tumour" in shown(page, "lesionNotesLabel"))
         settled(page)
         assert not errors(page) and pose(page) == pose_before
         drawn(page)
@@ -778,12 +777,12 @@ def test_the_workstation_finds_sheets_and_images_show_them(browser, tmp_path):
         page = opened(browser, address)
         settled(page)
         notes = shown(page, "notesLabel")
-        assert "sulcus: " in notes and "ependyma: " not in notes and not errors(page)
-        assert (tmp_path / "head.sheets.npz").is_file() and not shown(page, "sheetEpendymaCheckBox")
+        assert "sulcus: " in notes and "ependyma: " not in notes
+        assert (tmp_path / "head.sheets.npz").is_file() and not errors(page)
         expected = np.asarray(Image.open(download(page, "png")))
-        open_section(page, "Sheets and vessels")
+        open_section(page, "Lesions and other images")
         with new_image(page):
-            click(page, "#sheetSulcusCheckBox")
+            page.select_option("#sheetsSelector", "")
         assert not np.array_equal(np.asarray(Image.open(download(page, "png"))), expected)
         page.close()
 
@@ -905,7 +904,6 @@ def test_an_opened_patient_takes_the_place_of_title_notes_and_warnings(page, tmp
 
     notes = opened_as(tmp_path / "crop.nii.gz", "Tissues of head.nii.gz")
     assert "crop.nii.gz: FreeSurfer: 8 labels to 3 tissues" in notes and "share" not in notes
-    assert "Check: crop.nii.gz: a part of a brain of 1048 ml, cut off at the front" in notes
     assert "Check: the intensities of head.nii.gz do not follow the labels (of another patient?)" in notes
     assert errors(page) == [line.removeprefix("Check: ") for line in notes.splitlines() if "cut off" in line]
     assert "/tmp" not in page.locator("body").inner_text()

@@ -157,7 +157,7 @@ def test_a_pose_is_saved_and_opened_again(page, tmp_path):
 
 @pytest.mark.long
 def test_axe_finds_nothing_wrong(page):
-    for title in ("Probe", "Tissues", "Rays", "Tracked ultrasound", "Fit to real ultrasound"):
+    for title in ("Probe", "Tissues", "Advanced", "Tracked ultrasound", "Fit to real ultrasound"):
         open_section(page, title)
     page.evaluate("window.trame.trigger('set', ['classesSpinBox', 99])")
     shown_errors(page)
@@ -168,7 +168,7 @@ def test_axe_finds_nothing_wrong(page):
         for entry in found.response["violations"]
         for node in entry["nodes"]
     ]
-    for title in ("Tissues", "Rays", "Tracked ultrasound", "Fit to real ultrasound"):
+    for title in ("Tissues", "Advanced", "Tracked ultrasound", "Fit to real ultrasound"):
         page.get_by_role("button", name=title, exact=True).click()
     assert not wrong, "\n".join(map(str, wrong[:30]))
 

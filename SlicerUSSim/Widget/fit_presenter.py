@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from SlicerUSSim.Logic.base.errors import SimulationError, require, required
 from SlicerUSSim.Logic.base.settings import DisplaySettings
-from SlicerUSSim.Logic.fitting.parameters import FreeParameters, all_names
+from SlicerUSSim.Logic.fitting.parameters import FreeParameters, all_names, declaration_of
 from SlicerUSSim.Logic.fitting.search import Progress
 from SlicerUSSim.Logic.fitting.tracked_fit import Fit
 from SlicerUSSim.Logic.imaging.preset import Preset
@@ -12,7 +12,7 @@ from SlicerUSSim.Logic.mrml.fit_nodes import COMPARED, CostPlot
 from SlicerUSSim.Logic.mrml.nodes import composite_of, require_node
 from SlicerUSSim.Logic.mrml.own_results import result_called
 from SlicerUSSim.Logic.tracked.sequence import checked_apart, frame_numbers
-from SlicerUSSim.Widget.interface import PanelHost
+from SlicerUSSim.Widget.interface import PanelHost, tr as _
 from SlicerUSSim.Widget.tissue_presenter import TissuePresenter
 from SlicerUSSim.Widget.value_presenter import ValuePresenter
 
@@ -37,14 +37,14 @@ class FitPresenter:
 
     # ---- free parameters ---------------------------------------------------------------------------------------
 
-    def freeParameters(self) -> list[tuple[str, bool]]:
-        """(name, whether it is free) of each parameter that a fit can vary, for the tissues in use."""
+    def freeParameters(self) -> list[tuple[str, str, bool]]:
+        """(name, label, whether it is free) of each parameter that a fit can vary, for the tissues in use."""
         tissues, free = self._tissues.table(), set(self._free())
-        return [(name, name in free) for name in all_names(tissues)]
+        return [(name, label_of(name), name in free) for name in all_names(tissues)]
 
     def setFree(self, name: str, on: bool) -> None:
         """Called when the user ticks or unticks a parameter."""
-        names = [known for known, is_free in self.freeParameters() if (on if known == name else is_free)]
+        names = [known for known, _label, is_free in self.freeParameters() if (on if known == name else is_free)]
         self._values.setValue(_FREE, ", ".join(names) or "none")  # an empty text means the default
 
     def _free(self) -> list[str]:
@@ -68,13 +68,13 @@ class FitPresenter:
         """(whether Fit is enabled, the reason if not)"""
         can, why_not = self._panel.canSimulate()
         if can and self._panel.parameters.real is None:
-            return False, "Choose real images first"
+            return False, _("Choose real images first")
         return can, why_not
 
     def fit(self) -> None:
         """Fit to the chosen real images; the preset does not change until apply()."""
         panel, parameters = self._panel, self._panel.parameters
-        with panel.acting(), panel.working("Fit") as progress:
+        with panel.acting(), panel.working(_("Fit")) as progress:
             require(parameters.real is not None, "no real images chosen, expected a sequence or a volume")
             free = list(self._groups())  # "tissues" as such: the fit looks which the images show
             require(bool(free), "nothing is free, tick at least one parameter")
@@ -133,7 +133,7 @@ class FitPresenter:
         """Restore the values from before apply(), except those that were changed since, which the summary names."""
         with self._panel.acting():
             before = required(self._before, "nothing to revert to, apply a fit first")
-            found, _ = required(self._fit, "nothing to revert, fit first")
+            found = required(self._fit, "nothing to revert, fit first")[0]
             kept = self._panel.logic.revertFit(found, before)
             self._before, self.summary = None, _in_words(found)
             if kept:
@@ -173,6 +173,12 @@ class FitPresenter:
             logic.showFitInSlice(view, found, labels, nodes[kind], nodes["real"], number)
 
 
+def label_of(name: str) -> str:
+    """What users call a parameter of a fit, with its tissue before it."""
+    tissue, label = name.rpartition(".")[0], _(declaration_of(name).label)
+    return f"{tissue}: {label[0].lower()}{label[1:]}" if tissue else label
+
+
 def _in_words(found: Fit) -> str:
     result = found.appearance
     lines = [f"cost {result.cost_before:.3f} → {result.cost_after:.3f}, {len(found.tracked.images)} images"]
@@ -182,7 +188,7 @@ def _in_words(found: Fit) -> str:
         lines += found.prediction.lines()
     for name, value in result.after.items():
         spread = result.identifiability[name]
-        line = f"{name}: {result.before[name]:.3g} → {value:.3g}"
+        line = f"{label_of(name)}: {result.before[name]:.3g} → {value:.3g} {declaration_of(name).unit}".rstrip()
         if name in result.at_bounds:
             line += " (at its bound)"
         elif spread.is_determined is False:

@@ -6,11 +6,11 @@ from time import perf_counter
 from typing import Any
 
 from SlicerUSSim.Logic.base.errors import require
-from SlicerUSSim.Logic.mrml.nodes import nodes_of_class
+from SlicerUSSim.Logic.mrml.nodes import nodes_of_class, put_beside
 from SlicerUSSim.Logic.mrml.parameter_node import SceneParameters
 from SlicerUSSim.Logic.mrml.sequence_nodes import MADE_FROM
 from SlicerUSSim.Logic.mrml.taken_sequence import FrozenRecord
-from SlicerUSSim.Widget.interface import PanelHost
+from SlicerUSSim.Widget.interface import PanelHost, tr as _
 from SlicerUSSim.Widget.notes import Notes
 from SlicerUSSim.Widget.placement_presenter import PlacementPresenter
 
@@ -25,6 +25,9 @@ class ImagePresenter:
         self._panel, self._notes, self._placing = panel, notes, placing
         self._last_image: float | None = None
         self._followed: tuple = ()  # the nodes of the live update
+        self._in_3d: Any = None  # slice view that this shows in the 3D views
+        #: Result of the last simulateSequence, as text
+        self.sequenceDone = ""
 
     def simulate(self) -> None:
         """Simulate one image, into the chosen volume or a new one."""
@@ -39,6 +42,7 @@ class ImagePresenter:
             logic.showOutline(nodes.outline, nodes.probe_transform)
             if view.sliceNode() is not None:
                 logic.showInSlice(view.sliceNode(), nodes.output, nodes.probe_transform)
+            self.showIn3D()
             if not logic.isLive:
                 logic.holdImage(nodes.output)
 
@@ -70,6 +74,21 @@ class ImagePresenter:
                 *self._followed, schedule=self._panel.view.schedule, report=self._reported, stopped=self._stopped
             )
             self._notes.recognise(self._panel.parameters.labels)
+            self.showIn3D()
+
+    def showIn3D(self) -> None:
+        """Show the slice view of the image and the probe's model in the 3D views, or hide them, as chosen."""
+        parameters = self._panel.parameters
+        outline: Any = parameters.outline
+        if parameters.output is None or outline is None or not self._placing.handles:
+            return
+        view = self._panel.view.sliceNode()
+        if self._in_3d not in (None, view):
+            self._in_3d.SetSliceVisible(False)
+        self._in_3d = view
+        if view is not None:
+            view.SetSliceVisible(parameters.panel.show_in_3d)
+        self._panel.logic.showProbe(outline, parameters.panel.show_probe)
 
     def followChoices(self) -> None:
         """Begin live update anew if other nodes or another slice view were chosen."""
@@ -84,7 +103,8 @@ class ImagePresenter:
     def _reported(self, message: str) -> None:
         now = perf_counter()
         if not message and self._last_image is not None and now - self._last_image < 1.0:
-            message = f"{1.0 / max(now - self._last_image, 1e-3):.0f} images per second"
+            rate = 1.0 / max(now - self._last_image, 1e-3)
+            message = _("{rate:.0f} images per second").format(rate=rate)
         self._panel.view.showStatus(message)
         self._last_image = now
         if self._notes.probeSaysOther():
@@ -102,7 +122,7 @@ class ImagePresenter:
         panel, parameters = self._panel, self._panel.parameters
         transforms_node: Any = parameters.transform_sequence
         images_node: Any = parameters.image_sequence
-        with panel.acting(), panel.working("Simulate sequence") as progress:
+        with panel.acting(), panel.working(_("Simulate sequence")) as progress:
             require(transforms_node is not None, "no sequence of transforms chosen, expected a Sequence node")
             own = (None, transforms_node.GetID())
             if images_node is not None and images_node.GetNodeReferenceID(MADE_FROM) not in own:
@@ -114,7 +134,7 @@ class ImagePresenter:
                 )
             images.SetNodeReferenceID(MADE_FROM, transforms_node.GetID())
             parameters.image_sequence = images  # in place of which the next ones come
-            panel.view.showStatus(f"{count} images in {images.GetName()!r}")
+            self.sequenceDone = _("{count} images in {name!r}").format(count=count, name=images.GetName())
 
     def sweepAlongPath(self) -> None:
         """Simulate the images of a probe that moves along the chosen path, and compound them to a volume."""
@@ -163,6 +183,7 @@ class ImagePresenter:
         if chosen is not None and self._panel.logic.mayReplaceResult(chosen):
             return chosen
         node = self._panel.add(kind, name)
+        put_beside(node, self._panel.parameters.labels)
         if chosen is not None:
             self._notes.add(f"{chosen.GetName()!r} has data of others and is kept; the result is {node.GetName()!r}")
         return node

@@ -18,6 +18,15 @@ from SlicerUSSim.Logic.imaging.preset import Preset
 from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic
 from SlicerUSSim.Logic.mrml.parameter_node import NODE_PARAMETERS, SceneParameters
 
+try:
+    from slicer.i18n import tr as _in_slicer
+except ImportError:  # outside of 3D Slicer
+    _in_slicer = str
+
+#: The text in the user's language; Slicer's own function, which looks at the file that calls it
+tr: Callable[[str], str] = _in_slicer
+_ = tr  # the name that Slicer's tools look for
+
 Kind = Literal["slider", "number", "tick", "choice", "text", "node", "button", "words", "table", "list"]
 #: Suffix of the widget's name, by kind of control.
 _WIDGETS: dict[Kind, str] = {
@@ -51,7 +60,7 @@ class Control:
     shows: Callable[[], Any] | None = None
     sets: Callable[[Any], object] | None = None
     #: Called when a button is pressed, unless the view has an action of its own in place of it
-    action: Callable[..., object] | None = None
+    action: Callable[[], object] | None = None
     #: Whether it can be used; None: always, and without additional packages
     enabled: Can | None = None
     #: Values, and sections of the preset, on which what it shows depends, besides chosen nodes and actions
@@ -71,8 +80,6 @@ class Control:
     @property
     def unit(self) -> str:
         """Unit of the displayed number."""
-        if self.range.as_db:
-            return "dB"
         return "" if self.parameter is None else self.parameter.unit
 
     @property
@@ -85,11 +92,6 @@ class Control:
         """Number of decimals; at least one in a spin box for a float."""
         is_whole = self.parameter is None or self.parameter.type is int
         return max(self.range.decimals, 0 if is_whole or self.kind == "slider" else 1)
-
-    @property
-    def hint(self) -> str:
-        """Meaning of an empty text field: the part of the tool tip after "empty for ", or ""."""
-        return self.tip.partition("empty for ")[2]
 
     @property
     def node_classes(self) -> tuple[str, ...]:
@@ -107,8 +109,8 @@ class Control:
         return can, why_not or self.tip
 
 
-#: A line of the panel: one control, or several side by side.
-Row: TypeAlias = Control | tuple[Control, ...]
+#: A line of the panel: one control, or several side by side, after a label or not
+Row: TypeAlias = Control | tuple[str | Control, ...]
 
 
 @dataclass(frozen=True)
@@ -123,7 +125,8 @@ class Section:
     def controls(self) -> Iterator[Control]:
         """All controls in order."""
         for row in self.rows:
-            yield from (row,) if isinstance(row, Control) else row
+            entries = (row,) if isinstance(row, Control) else row
+            yield from (entry for entry in entries if isinstance(entry, Control))
 
 
 def by_widget(sections: tuple[Section, ...]) -> dict[str, Control]:
@@ -217,12 +220,12 @@ class PanelHost:
 
     def ready(self, *needs: tuple[object, str]) -> tuple[bool, str]:
         """(whether no work is under way and no need is None or False, the reason of the first one if not)"""
-        needs = (not self._busy, "Wait until the work under way is done"), *needs
+        needs = (not self._busy, _("Wait until the work under way is done")), *needs
         return next(((False, why_not) for met, why_not in needs if met is None or met is False), (True, ""))
 
     def canSimulate(self) -> tuple[bool, str]:
         """(whether there are tissues of which an image can be simulated, the reason if not)"""
-        return self.ready((self.parameters.labels, "Segment the MRI, or choose a label map or segmentation"))
+        return self.ready((self.parameters.labels, _("Segment the MRI, or choose a label map or segmentation")))
 
     @contextmanager
     def shown(self) -> Iterator[None]:

@@ -7,12 +7,9 @@ from typing import Any
 from SlicerUSSim.Logic.base.errors import require, required
 from SlicerUSSim.Logic.mrml.nodes import display_of
 from SlicerUSSim.Logic.mrml.parameter_node import BY_LOOK, LARGER
-from SlicerUSSim.Widget.interface import PanelHost
-from SlicerUSSim.Widget.notes import Notes, checks
+from SlicerUSSim.Widget.interface import PanelHost, tr as _
+from SlicerUSSim.Widget.notes import GROWN, Notes, checks
 from SlicerUSSim.Widget.segment_presenter import SegmentPresenter
-
-#: Begin of the lines about what was grown last
-_GROWN = "grown: "
 
 
 class LesionPresenter:
@@ -26,7 +23,7 @@ class LesionPresenter:
         """(whether lesions can be laid over the tissues, the reason if not)"""
         can, why_not = self._panel.canSimulate()
         if can and self._panel.parameters.lesions is None:
-            return False, "Choose a segmentation with segments called tumour, oedema, ..."
+            return False, _("Choose a segmentation with segments called tumour, oedema, ...")
         return can, why_not
 
     def addTissues(self) -> None:
@@ -37,14 +34,14 @@ class LesionPresenter:
     def layLesions(self) -> None:
         """As addTissues, but raises errors."""
         parameters = self._panel.parameters
-        with self._panel.working("Add to tissues"):
+        with self._panel.working(_("Add to tissues")):
             require(parameters.labels is not None, "no label map chosen; segment the MRI first")
             before: Any = parameters.labels
             if not self._notes.isAbout(before):
                 self._notes.checks = []
             with self._segmenting.replaceable(f"{before.GetName()} with lesions", before) as labels:
                 self._panel.logic.addTissues(before, parameters.lesions, labels)
-            self._notes.drop(_GROWN)
+            self._notes.drop(GROWN)
             self._notes.add(*self._notes.checks)
 
     # ---- growth from a point -----------------------------------------------------------------------------------
@@ -53,19 +50,12 @@ class LesionPresenter:
         """(whether a lesion can be grown on the MRI, the reason if not)"""
         can, why_not = self._segmenting.canSegment()
         if can and not self._panel.logic.growth.knows(self._panel.parameters.mri):
-            return False, "Segment this MRI first"
-        return can, why_not
-
-    def canGrowAtPoint(self) -> tuple[bool, str]:
-        """(whether a lesion can be grown at the point, the reason if not)"""
-        can, why_not = self.canGrow()
-        if can and self._panel.parameters.seed is None:
-            return False, "Choose a point in the lesion"
+            return False, _("Segment this MRI first")
         return can, why_not
 
     def canRemove(self) -> tuple[bool, str]:
         """(whether the lesion that was grown last is there to be removed, the reason if not)"""
-        return self._panel.ready((bool(self._last_grown()), "No lesion was grown"))
+        return self._panel.ready((bool(self._last_grown()), _("No lesion was grown")))
 
     def pickSeed(self) -> None:
         """Let the user show a point in the lesion in a view; then grow the lesion there."""
@@ -80,7 +70,7 @@ class LesionPresenter:
     def growAtPoint(self) -> None:
         """Add the lesion around the last point of the chosen markups to the lesions; the tissues stay as they are."""
         parameters, growth = self._panel.parameters, self._panel.logic.growth
-        with self._panel.acting(), self._panel.working("Grow lesion"):
+        with self._panel.acting(), self._panel.working(_("Grow lesion")):
             chosen = parameters.panel
             tissue, larger = None if chosen.lesion_as == BY_LOOK else chosen.lesion_as, chosen.lesion_size == LARGER
             seed = required(parameters.seed, "no point chosen, expected one in the lesion")
@@ -90,14 +80,14 @@ class LesionPresenter:
             if display_of(lesions) is not None:
                 display_of(lesions).SetVisibility(True)
             after = f"look at {lesions.GetName()!r} over the MRI, and add it to the tissues, or remove it"
-            self._notes.say(_GROWN, *growth.notes, *checks(growth.warnings), after)
+            self._notes.say(GROWN, *growth.notes, *checks(growth.warnings), after)
 
     def removeGrown(self) -> None:
         """Take the segments that were grown last out of the lesions."""
         with self._panel.acting():
             for segment_id in self._last_grown():
                 self._grown[0].GetSegmentation().RemoveSegment(segment_id)
-            self._notes.drop(_GROWN)
+            self._notes.drop(GROWN)
 
     def _last_grown(self) -> list[str]:
         """IDs of the segments that were grown last and are still among the chosen lesions."""

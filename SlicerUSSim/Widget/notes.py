@@ -7,10 +7,14 @@ from typing import Any
 
 from SlicerUSSim.Logic.base.errors import SimulationError
 from SlicerUSSim.Logic.mri.segmentation_settings import GEL_MM
-from SlicerUSSim.Widget.interface import PanelHost, in_panel
+from SlicerUSSim.Widget.interface import PanelHost, in_panel, tr as _
 
 #: Begin of the lines that a user should check
-_CHECK = "Check: "
+CHECK = "Check: "
+#: Begins of the lines about what was grown last, about an opening, and about where the probe was placed: in an opening,
+#: or at a standard view
+GROWN, OPENED, PLACED, VIEW = "grown: ", "craniotomy: ", "probe: ", "view: "
+_PROBE = (OPENED, PLACED, VIEW)
 
 
 class Notes:
@@ -28,9 +32,18 @@ class Notes:
         self._about_probe: tuple[str, ...] = ()
 
     def text(self) -> str:
-        """All lines, with those that follow from the present choices."""
+        """The lines about the tissues: of Segment, of a file, of lesions that were laid over them."""
+        return _text(line for line in self._lines if not line.startswith((*_PROBE, GROWN)))
+
+    def aboutLesions(self) -> str:
+        """The lines about what was grown last."""
+        return _text(line for line in self._lines if line.startswith(GROWN))
+
+    def aboutProbe(self) -> str:
+        """The lines about opening and place of the probe, with those that follow from where it is now."""
         self._about_probe = self._found_about_probe()
-        return in_panel("\n".join([*self._lines, *self._gel(), *self._about_probe]))
+        lines = [line for line in self._lines if line.startswith(_PROBE)]
+        return _text([*lines, *self._gel(), *checks(self._about_probe)])
 
     @property
     def lines(self) -> tuple[str, ...]:
@@ -40,7 +53,7 @@ class Notes:
     def set(self, *lines: str) -> None:
         """Replace them by lines about another patient, whose labels are chosen; by none, to forget them."""
         self._lines, self.segmented = list(lines), None
-        self.checks = [line for line in lines if line.startswith(_CHECK)]
+        self.checks = [line for line in lines if line.startswith(CHECK)]
         self.areAbout(self._panel.parameters.labels)
 
     def add(self, *lines: str) -> None:
@@ -92,7 +105,7 @@ class Notes:
             is_there = labels is not None and self._panel.logic.settings(labels) != self._panel.preset.settings
         except SimulationError:  # an empty node, or unknown names: the error is shown when an image is simulated
             return []
-        return [f"gel fills gaps of up to {GEL_MM:g} mm between skin and probe (Gel on the skin)"] if is_there else []
+        return [_("gel fills gaps of up to {mm:g} mm between skin and probe").format(mm=GEL_MM)] if is_there else []
 
     def _found_about_probe(self) -> tuple[str, ...]:
         """Lines about the probe where it is now: its contact with the patient, and bone before it."""
@@ -107,4 +120,9 @@ class Notes:
 
 def checks(warnings: Iterable[str]) -> list[str]:
     """Warnings as lines of the notes."""
-    return [f"{_CHECK}{warning}" for warning in warnings]
+    return [f"{CHECK}{warning}" for warning in warnings]
+
+
+def _text(lines: Iterable[str]) -> str:
+    """Lines as text; those to check come first."""
+    return in_panel("\n".join(sorted(lines, key=lambda line: CHECK not in line)))

@@ -17,11 +17,12 @@ from SlicerUSSim.Logic.base.errors import Cancelled, SimulationError, required
 from SlicerUSSim.Logic.mrml.fitting_nodes import offered
 from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic
 from SlicerUSSim.Logic.mrml.nodes import nodes_of_class
-from SlicerUSSim.Widget.interface import Control, by_widget
+from SlicerUSSim.Widget.interface import Control, by_widget, tr as _
+from SlicerUSSim.Widget.notes import CHECK
 from SlicerUSSim.Widget.presenter import PanelPresenter
 from SlicerUSSim.Widget.sections import panel_sections
 from SlicerUSSim.Widget.tissue_presenter import TISSUE_COLUMNS, TissueRow
-from SlicerUSSim.Widget.widgets import build
+from SlicerUSSim.Widget.widgets import WORDS_HEIGHT, build
 
 #: Property that holds a widget's value, and the signal of its change. The first property that the widget has applies.
 _VALUES = (
@@ -29,6 +30,18 @@ _VALUES = (
     ("text", "editingFinished"),
 )  # fmt: skip
 _BLINK_MS = 500
+#: Style of results, and of those with something to check
+_RESULT = "QLabel { background: #e8f4e8; color: #202020; padding: 2px }"
+_TO_CHECK = "QLabel { background: #fff7df; color: #202020; padding: 2px }"
+#: Number of the layout for ultrasound, as modules choose one, and its views: a slice beside 3D and another slice
+_LAYOUT = 7301
+_SLICE = """<item><view class="vtkMRMLSliceNode" singletontag="{name}"><property name="orientation" action="default">
+{orientation}</property><property name="viewlabel" action="default">{name[0]}</property></view></item>"""
+_LAYOUT_VIEWS = (
+    '<layout type="horizontal" split="true">' + _SLICE.format(name="Red", orientation="Axial") + "<item>"
+    '<layout type="vertical" split="true"><item><view class="vtkMRMLViewNode" singletontag="1"/></item>'
+    + _SLICE.format(name="Yellow", orientation="Sagittal") + "</layout></item></layout>"
+)  # fmt: skip
 
 
 class Panel:
@@ -56,12 +69,12 @@ class Panel:
         self._removed: Any = None  # node that is being removed from the scene
         #: Controls with their widgets
         self._controls = [(control, getattr(self.ui, name)) for name, control in by_widget(sections).items()]
-        #: Actions that use widgets or dialogs of the panel, in place of those of buttons
-        self._own_actions: dict[Callable[..., object] | None, Callable[[], None]] = {
-            presenter.tissues.assignTissue: self._assign_tissue,
-            presenter.values.loadPreset: self._load_preset,
-            presenter.values.savePreset: self._save_preset,
-        }
+        #: {button: its action}, of those that use widgets, dialogs or views of Slicer
+        self._own_actions: dict[str, Callable[[], None]] = {
+            "assignTissue": self._assign_tissue, "loadPreset": self._load_preset, "savePreset": self._save_preset,
+            "editTissues": self._edit_tissues, "layout": self._toggle_layout,
+        }  # fmt: skip
+        self._layout_before: int | None = None  # that of the user, while ours is used
         self._show(self.ui.compareComboBox, "after")
         self._prepare_table()
         self._connect()
@@ -73,7 +86,7 @@ class Panel:
         slicer.util.errorDisplay(message)
 
     def showStatus(self, message: str) -> None:
-        self.ui.statusLabel.setText(message)
+        self._show_words(self.ui.statusLabel, message)
 
     def schedule(self, function: Callable[[], None]) -> None:
         qt.QTimer.singleShot(0, function)
@@ -87,7 +100,7 @@ class Panel:
     def pickPoint(self, points_node, picked: Callable[[], None]) -> None:
         """Slicer's mouse mode for placing one control point; the next point ends it."""
         markups = getattr(getattr(slicer, "modules", None), "markups", None)  # missing without a main window
-        markups = required(markups, f"place a point of {points_node.GetName()!r}, and press Grow at point")
+        markups = required(markups, "a point can only be placed in Slicer's main window")
         self._stop_picking()
         tag = points_node.AddObserver(points_node.PointPositionDefinedEvent, lambda *_: self._picked(picked))
         self._picking = points_node, tag
@@ -155,6 +168,8 @@ class Panel:
             self._show_tissues()
         elif control.kind == "list":
             self._show_free()
+        elif control.kind == "words" and control.shows:
+            self._show_words(widget, control.shows())
         elif control.shows:
             self._show(widget, control.shows())
 
@@ -225,7 +240,7 @@ class Panel:
             self._do(control, partial(control.sets, widget.property(_property_of(widget))))
 
     def _press(self, control: Control, widget: Any) -> None:
-        action = self._own_actions.get(control.action, control.action)
+        action = self._own_actions.get(control.name, control.action)
         if action:
             self._do(control, action)
 
@@ -244,28 +259,58 @@ class Panel:
         self._cancelled = True
 
     def _load_preset(self) -> None:
-        self._with_file(qt.QFileDialog.getOpenFileName, "Load preset", "", self.presenter.values.loadPreset)
+        self._with_file(qt.QFileDialog.getOpenFileName, _("Load preset"), "", self.presenter.values.loadPreset)
 
     def _save_preset(self) -> None:
         save = self.presenter.values.savePreset
-        self._with_file(qt.QFileDialog.getSaveFileName, "Save preset", "preset.json", save)
+        self._with_file(qt.QFileDialog.getSaveFileName, _("Save preset"), "preset.json", save)
 
     @staticmethod
     def _with_file(ask, title: str, proposal: str, action: Callable[[str], None]) -> None:
-        path = ask(None, title, proposal, "Presets (*.json)")
+        path = ask(None, title, proposal, _("Presets (*.json)"))
         path = path if isinstance(path, str) else path[0]  # other Qt bindings return (path, filter)
         if path:
             action(path)
+
+    def _edit_tissues(self) -> None:
+        parameters = self.logic.parameters
+        slicer.util.selectModule("SegmentEditor")
+        editor = slicer.modules.segmenteditor.widgetRepresentation().self().editor
+        editor.setSegmentationNode(parameters.labels)
+        editor.setSourceVolumeNode(parameters.mri)
+
+    # ---- layout of the views -----------------------------------------------------------------------------------
+
+    def _toggle_layout(self) -> None:
+        layout = self.logic.scene.GetFirstNodeByClass("vtkMRMLLayoutNode")
+        if layout is None:  # Slicer runs without a main window
+            return
+        if self._layout_before is not None:
+            self.restoreLayout()
+            return
+        if not layout.IsLayoutDescription(_LAYOUT):
+            layout.AddLayoutDescription(_LAYOUT, _LAYOUT_VIEWS)
+        self._layout_before = layout.GetViewArrangement()
+        layout.SetViewArrangement(_LAYOUT)
+
+    def restoreLayout(self) -> None:
+        """Give the views the layout from before the button Layout, unless the user has chosen another one since."""
+        layout, before = self.logic.scene.GetFirstNodeByClass("vtkMRMLLayoutNode"), self._layout_before
+        self._layout_before = None
+        if layout is not None and before is not None and layout.GetViewArrangement() == _LAYOUT:
+            layout.SetViewArrangement(before)
 
     # ---- the tissue table --------------------------------------------------------------------------------------
 
     def _prepare_table(self) -> None:
         table = self.ui.tissueTable
         table.setColumnCount(1 + len(TISSUE_COLUMNS))
-        for column, (_, heading, tip) in enumerate((("", "Tissue", "Name of the tissue"), *TISSUE_COLUMNS)):
+        first = "", _("Tissue"), _("Name of the tissue")
+        for column, (_name, heading, tip) in enumerate((first, *TISSUE_COLUMNS)):
             item = qt.QTableWidgetItem(heading)
-            item.setToolTip(tip)
+            item.setToolTip(_(tip))
             table.setHorizontalHeaderItem(column, item)
+        table.horizontalHeader().setSectionResizeMode(0, qt.QHeaderView.ResizeToContents)
 
     def _show_tissues(self) -> None:
         rows = self.presenter.tissues.rows()
@@ -283,7 +328,6 @@ class Panel:
                     item = qt.QTableWidgetItem(f"{value:.6g}")
                     item.setToolTip(source)
                     table.setItem(line, column, item)
-            table.resizeColumnsToContents()
 
     def _tissue_changed(self, line: int, column: int) -> None:
         row, name = self._rows[line], TISSUE_COLUMNS[column - 1][0]
@@ -304,17 +348,18 @@ class Panel:
     def _show_free(self) -> None:
         ui, free = self.ui, self.presenter.fits.freeParameters()
         with _silent(ui.freeList):
-            if [ui.freeList.item(n).text() for n in range(ui.freeList.property("count"))] != [name for name, _ in free]:
+            labels = [label for _name, label, _on in free]
+            if [ui.freeList.item(n).text() for n in range(ui.freeList.property("count"))] != labels:
                 ui.freeList.clear()
-                for name, _ in free:
-                    ui.freeList.addItem(name)
-            for n, (_, on) in enumerate(free):
+                ui.freeList.addItems(labels)
+            for n, (name, _label, on) in enumerate(free):
                 item = ui.freeList.item(n)
+                item.setData(qt.Qt.UserRole, name)
                 item.setFlags(qt.Qt.ItemIsUserCheckable | qt.Qt.ItemIsEnabled | qt.Qt.ItemIsSelectable)
                 item.setCheckState(qt.Qt.Checked if on else qt.Qt.Unchecked)
 
     def _free_changed(self, item) -> None:
-        self.presenter.fits.setFree(item.text(), item.checkState() == qt.Qt.Checked)
+        self.presenter.fits.setFree(item.data(qt.Qt.UserRole), item.checkState() == qt.Qt.Checked)
 
     def _compare(self, *_) -> None:
         number = self.ui.compareNumberComboBox.property("currentText")
@@ -346,6 +391,16 @@ class Panel:
                     combo.addItem(name)
 
     @staticmethod
+    def _show_words(label, text: str) -> None:
+        """Show a result, or with another colour what to check, in as many lines as it needs; longer ones scroll."""
+        label.setText(text)
+        label.setStyleSheet(_TO_CHECK if CHECK in text else _RESULT)
+        area = label.parentWidget().parentWidget()
+        area.setVisible(bool(text))
+        if text:
+            area.setFixedHeight(min(label.heightForWidth(area.property("width")), WORDS_HEIGHT))
+
+    @staticmethod
     def _show(widget, value) -> None:
         prop = _property_of(widget)
         with _silent(widget):
@@ -363,7 +418,7 @@ class Panel:
 
 def _property_of(widget) -> str:
     """Name of the property that holds a widget's value."""
-    return next(name for name, _ in _VALUES if widget.property(name) is not None)
+    return next(name for name, _signal in _VALUES if widget.property(name) is not None)
 
 
 def _signal_of(widget):

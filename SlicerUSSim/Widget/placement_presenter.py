@@ -6,11 +6,8 @@ from typing import Any
 
 from SlicerUSSim.Logic.base.errors import require, required
 from SlicerUSSim.Logic.mrml.nodes import display_of
-from SlicerUSSim.Widget.interface import PanelHost
-from SlicerUSSim.Widget.notes import Notes
-
-#: Begins of the lines about an opening, and about where the probe was placed: in an opening, or at a standard view
-_OPENED, _PLACED, _VIEW = "craniotomy: ", "probe: ", "view: "
+from SlicerUSSim.Widget.interface import PanelHost, tr as _
+from SlicerUSSim.Widget.notes import OPENED, PLACED, VIEW, Notes, checks
 
 
 class PlacementPresenter:
@@ -22,33 +19,41 @@ class PlacementPresenter:
     """
 
     def __init__(self, panel: PanelHost, notes: Notes, handles: bool) -> None:
-        self._panel, self._notes, self._handles = panel, notes, handles
+        self._panel, self._notes, self.handles = panel, notes, handles
 
     def placeProbe(self) -> None:
         """Place the probe on the surface in the slice view, or at a craniotomy; create its transform if needed."""
         with self._panel.acting():
-            self._place(_PLACED, slice_node=self._panel.view.sliceNode())
+            self._place(PLACED, slice_node=self._panel.view.sliceNode())
 
     def placeAtView(self) -> None:
         """Place the probe where the chosen standard view is seen from; create its transform if needed."""
         with self._panel.acting():
-            self._place(_VIEW, view=self._panel.parameters.panel.view)
+            self._place(VIEW, view=self._panel.parameters.panel.view)
+
+    def approach(self) -> None:
+        """Place the probe on the brain, where the skull is to be opened or is open, over a lesion if there is one."""
+        with self._panel.acting():
+            self._place(PLACED, will_open=True)
 
     def _place(self, what: str, **where: Any) -> None:
         require(self._panel.parameters.labels is not None, "no label map chosen, expected one to put the probe on")
         line = self.put(**where)
-        self._notes.drop(_VIEW, _PLACED)
+        self._notes.drop(VIEW, PLACED)
         self._notes.add(*[f"{what}{line}"] if line else [])
 
-    def put(self, slice_node: Any = None, view: str | None = None) -> str:
-        """Place the probe's transform, or a new one if none is selected; a line about where, or ""."""
+    def put(self, **where: Any) -> str:
+        """Place the probe's transform, or a new one if none is selected; a line about where, or "".
+
+        See UltrasoundSceneLogic.placeProbe for `where`.
+        """
         parameters = self._panel.parameters
         with self._panel.made(parameters.probe_transform, "LinearTransform", "Probe") as probe:
-            line = self._panel.logic.placeProbe(parameters.labels, probe, slice_node, view=view)
+            line = self._panel.logic.placeProbe(parameters.labels, probe, **where)
         parameters.probe_transform = probe
         display = display_of(probe)
         if display is not None:
-            display.SetEditorVisibility(self._handles)
+            display.SetEditorVisibility(self.handles)
         return line
 
     # ---- craniotomy --------------------------------------------------------------------------------------------
@@ -58,14 +63,14 @@ class PlacementPresenter:
         can, why_not = self._panel.canSimulate()
         parameters = self._panel.parameters
         if can and parameters.opening is None and parameters.probe_transform is None:
-            return False, "Place the probe over the brain, or choose an opening"
+            return False, _("Place the probe over the brain, or choose an opening")
         return can, why_not
 
     def canCloseCraniotomy(self) -> tuple[bool, str]:
         """(whether there are labels before the opening, the reason if not)"""
         labels: Any = self._panel.parameters.labels
         is_open = labels is not None and self._panel.logic.closedLabels(labels) is not labels
-        return self._panel.ready((is_open, "These labels have no opening, or those before it are gone"))
+        return self._panel.ready((is_open, _("These labels have no opening, or those before it are gone")))
 
     def openCraniotomy(self) -> None:
         """Open skin and skull under the probe, or where the chosen node says, in labels of their own.
@@ -73,7 +78,7 @@ class PlacementPresenter:
         Labels that were opened are opened anew, from those before: an opening follows the probe when it is moved.
         """
         panel, logic, parameters = self._panel, self._panel.logic, self._panel.parameters
-        with panel.acting(), panel.working("Open skull"):
+        with panel.acting(), panel.working(_("Open skull")):
             chosen: Any = required(parameters.labels, "no label map chosen; segment the MRI first")
             closed = logic.closedLabels(chosen)
             again = chosen if closed is not chosen and logic.mayReplace(chosen) else None
@@ -84,7 +89,7 @@ class PlacementPresenter:
                     diameter_mm=parameters.panel.craniotomy_mm,
                 )  # fmt: skip
             self._choose(node)
-            self._notes.addOfLogic()
+            self._notes.add(*logic.notes, *(f"{OPENED}{line}" for line in checks(logic.warnings)))
 
     def closeCraniotomy(self) -> None:
         """Choose the labels without the opening again."""
@@ -98,5 +103,5 @@ class PlacementPresenter:
 
     def _choose(self, labels: Any) -> None:
         self._panel.parameters.labels = labels
-        self._notes.drop(_OPENED, _PLACED)
+        self._notes.drop(OPENED, PLACED)
         self._notes.areAbout(labels)

@@ -11,14 +11,13 @@ from typing import Any
 from SlicerUSSim.Logic.base.errors import SimulationError, require, required
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.mri.segmentation import Segmentation
-from SlicerUSSim.Logic.mri.segmentation_settings import SegmentationSettings
 from SlicerUSSim.Logic.mrml.label_nodes import empty, read_labels, write_labels
 from SlicerUSSim.Logic.mrml.own_results import SHEETS, content_as_made, content_of, mark_as_made, mark_as_result
 from SlicerUSSim.Logic.mrml.share_nodes import read_shares, write_shares
 from SlicerUSSim.Logic.mrml.taken_image import PATIENT
 from SlicerUSSim.Logic.tissue.table import TissueTable
 from SlicerUSSim.Logic.tissue.texture import Texture
-from SlicerUSSim.Widget.interface import PanelHost
+from SlicerUSSim.Widget.interface import PanelHost, tr as _
 from SlicerUSSim.Widget.notes import Notes, checks
 
 
@@ -44,7 +43,6 @@ class _LastSegment:
     content: str | None
     #: {role: chosen node}
     nodes: dict[str, Any]
-    settings: SegmentationSettings
 
 
 class SegmentPresenter:
@@ -66,17 +64,21 @@ class SegmentPresenter:
     def forget(self) -> None:
         """Forget the last Segment, which is of another patient."""
         self._last: _LastSegment | None = None
-        #: {content of labels, see own_results.content_of: settings by which Segment made them}
-        self._made_by: dict[str | None, SegmentationSettings] = {}
 
     def canSegment(self) -> tuple[bool, str]:
         """(whether Segment is enabled, the reason if not)"""
-        return self._panel.ready((self._panel.parameters.mri, "Choose an MRI first"))
+        return self._panel.ready((self._panel.parameters.mri, _("Choose an MRI first")))
+
+    def canEdit(self) -> tuple[bool, str]:
+        """(whether the Segment Editor can edit the tissues, the reason if not)"""
+        labels: Any = self._panel.parameters.labels
+        is_segmentation = labels is not None and labels.IsA("vtkMRMLSegmentationNode")
+        return self._panel.ready((is_segmentation, _("Segment the MRI, or choose a segmentation of its tissues")))
 
     def segment(self) -> None:
         """Segment the MRI into the chosen label map or segmentation, or into a new node (see replaceable)."""
         panel, notes, parameters = self._panel, self._notes, self._panel.parameters
-        with panel.acting(), panel.working("Segment") as progress:
+        with panel.acting(), panel.working(_("Segment")) as progress:
             mri = required(parameters.mri, "no MRI chosen, expected a scalar volume")
             if notes.segmented not in (None, mri.GetID()):  # also if this fails: they are about another patient
                 notes.set()
@@ -106,8 +108,7 @@ class SegmentPresenter:
                 told.append(f"the brain mask is {brain.GetName()!r}, which Segment uses from now on; edit it as needed")
             notes.add(*told, *untold)
             content = content_as_made(labels)
-            self._last = _LastSegment(before, labels, content, self._chosen(), settings)
-            self._made_by[content] = settings
+            self._last = _LastSegment(before, labels, content, self._chosen())
 
     @contextmanager
     def replaceable(self, name: str, source: Any) -> Iterator[Any]:
@@ -132,25 +133,26 @@ class SegmentPresenter:
     def canUndoSegment(self) -> tuple[bool, str]:
         """(whether the last Segment can be undone, the reason if not)"""
         last, chosen, logic = self._last, self._panel.parameters.labels, self._panel.logic
-        can, why_not = self._panel.ready((last, "Nothing was segmented since the scene was opened"))
+        can, why_not = self._panel.ready((last, _("Nothing was segmented since the scene was opened")))
         if not can or last is None:
             return can, why_not
         if last.labels.GetScene() is None:
-            return False, "The tissues of the last Segment were removed from the scene"
+            return False, _("The tissues of the last Segment were removed from the scene")
         name = repr(last.labels.GetName())
         if chosen is not None and chosen is not last.labels and logic.closedLabels(chosen) is last.labels:
-            return False, f"The skull was opened in {name} after Segment; close it first"
+            return False, _("The skull was opened in {name} after Segment; close it first").format(name=name)
         if content_as_made(last.labels) != last.content:
-            return False, f"{name} was changed after Segment, as by lesions laid over it, and is kept"
+            text = _("{name} was changed after Segment, as by lesions laid over it, and is kept")
+            return False, text.format(name=name)
         if not logic.mayReplace(last.labels):
-            return False, f"{name} was edited after Segment, and is kept"
+            return False, _("{name} was edited after Segment, and is kept").format(name=name)
         return True, ""
 
     def undoSegment(self) -> None:
-        """Go back to the tissues, mask, sheets, settings and notes from before the last Segment.
+        """Go back to the tissues, mask, sheets and notes from before the last Segment.
 
-        What the user chose or set since then stays, whatever it is; only the node into which Segment wrote is changed,
-        or removed if Segment made it.
+        Settings, and what the user chose since then, stay, whatever it is; only the node into which Segment wrote is
+        changed, or removed if Segment made it.
         """
         panel, parameters = self._panel, self._panel.parameters
         with panel.acting():
@@ -177,22 +179,6 @@ class SegmentPresenter:
             if are_its_notes:
                 self._notes.set(*before.notes)
                 self._notes.checks = []
-            self._notes.add(*self._settings_undone(last))
-
-    def _settings_undone(self, last: _LastSegment) -> list[str]:
-        """Go back to the settings by which the tissues before `last` were made; a line about it if they stay."""
-        parameters, before = self._panel.parameters, last.before
-        labels: Any = parameters.labels
-        if labels is None or labels is not before.nodes["labels"]:
-            return []
-        known = self._made_by.get(content_as_made(labels))
-        if known == parameters.segmentation:
-            return []
-        if known is not None and parameters.segmentation == last.settings:
-            parameters.segmentation = known
-            return []
-        why = "they were changed after it" if known is not None else "those of these tissues are not known"
-        return [f"Undo left the settings of Segment as they are, since {why}"]
 
     # ---- what Segment finds chosen -----------------------------------------------------------------------------
 

@@ -12,12 +12,14 @@ from SlicerUSSim.Logic.tissue.names import same_name
 from SlicerUSSim.Logic.tissue.presets import TISSUES
 from SlicerUSSim.Logic.tissue.table import TissueTable
 from SlicerUSSim.Logic.tissue.tissue import TISSUE_PARAMETERS, Tissue
-from SlicerUSSim.Widget.interface import PanelHost
+from SlicerUSSim.Widget.interface import PanelHost, tr as _
 
+#: What the table shows, up to the scatterers; the texture of a tissue is in preset files alone
+COLUMN_PARAMETERS = TISSUE_PARAMETERS[:6]
 #: Columns of the tissue table: parameter, heading, tool tip.
 TISSUE_COLUMNS = tuple(
     (entry.name, entry.symbol or entry.label, f"{entry.tip} [{entry.unit}]" if entry.unit else entry.tip)
-    for entry in TISSUE_PARAMETERS
+    for entry in COLUMN_PARAMETERS
 )
 
 
@@ -42,8 +44,8 @@ class TissuePresenter:
         """The tissues of the chosen labels, or of the preset without labels; coupling medium first, membrane last."""
         rows: dict[str, TissueRow] = {}
         for tissue in self.table().all_tissues():
-            values = tuple(getattr(tissue, parameter) for parameter, _, _ in TISSUE_COLUMNS)
-            sources = tuple(tissue.sources.get(parameter, "set by hand") for parameter, _, _ in TISSUE_COLUMNS)
+            values = tuple(getattr(tissue, column[0]) for column in TISSUE_COLUMNS)
+            sources = tuple(tissue.sources.get(column[0], _("set by hand")) for column in TISSUE_COLUMNS)
             rows.setdefault(tissue.name, TissueRow(tissue.name, values, sources))
         return list(rows.values())
 

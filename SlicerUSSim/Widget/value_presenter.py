@@ -21,7 +21,6 @@ from SlicerUSSim.Logic.imaging.preset import Preset, preset_parameters
 from SlicerUSSim.Logic.mrml.nodes import probe_pose, set_node_to_world
 from SlicerUSSim.Logic.mrml.parameter_node import NODE_PARAMETERS, VALUE_PARAMETERS
 from SlicerUSSim.Logic.probe.arrays import PROBES, Probe
-from SlicerUSSim.Logic.probe.beam import TRANSMIT_OF
 from SlicerUSSim.Widget.interface import PanelHost
 from SlicerUSSim.Widget.placement_presenter import PlacementPresenter
 
@@ -30,8 +29,6 @@ SCENE = "scene"
 CUSTOM_PROBE = "custom"
 #: {option of the probe preset: name in PROBES}
 SHOWN_PROBES: dict[str, str] = {name.replace("_", " "): name for name in PROBES}
-#: The choices of a parameter that is true, false or none
-OPTIONAL = {"automatic": None, "on": True, "off": False}
 
 
 class ValuePresenter:
@@ -43,10 +40,7 @@ class ValuePresenter:
         self._known: dict[str, Any] = {}
 
     def value(self, name: str) -> Any:
-        """The displayed form of a value; None if the probe has no such value.
-
-        The same for a value of another transmission than the probe's, which it would refuse.
-        """
+        """The displayed form of a value; None if the probe has no such value."""
         declared = value_parameter(name)
         section, attribute = name.split(".")
         if section == SCENE:
@@ -55,8 +49,6 @@ class ValuePresenter:
             except SimulationError:  # an invalid value in the scene: the error is shown when it is used
                 return to_shown(declared, declared.default)
         owner = getattr(self._panel.preset, section)
-        if section == "probe" and attribute in TRANSMIT_OF and owner.transmit != TRANSMIT_OF[attribute]:
-            return None
         return to_shown(declared, getattr(owner, attribute)) if hasattr(owner, attribute) else None
 
     def setValue(self, name: str, shown: Any) -> None:
@@ -160,8 +152,6 @@ def value_parameter(name: str) -> Parameter:
 
 def to_shown(declared: Parameter, found: Any) -> Any:
     """The displayed form of a value; None if nothing is displayed."""
-    if declared.type is bool and declared.can_be_none:
-        return next(text for text, value in OPTIONAL.items() if value is found)
     return declared.shown.number(found) if isinstance(declared.shown, Shown) else found
 
 
@@ -170,8 +160,6 @@ def from_shown(declared: Parameter, entered: Any) -> Any:
 
     Values of type int are rounded, since widgets hold them as floats.
     """
-    if declared.type is bool and declared.can_be_none:
-        return OPTIONAL.get(entered, entered)
     is_number = isinstance(entered, int | float) and not isinstance(entered, bool) and math.isfinite(entered)
     if not is_number or not isinstance(declared.shown, Shown):
         return entered
@@ -188,11 +176,7 @@ def _in_words_of(declared: Parameter, entered: Any) -> Iterator[None]:
         _, is_about_it, rest = str(error).partition(f"{declared.name} is ")
         if not is_about_it:
             raise
-        as_db = isinstance(declared.shown, Shown) and declared.shown.as_db
-        unit = "dB" if as_db else declared.unit
         is_number = isinstance(entered, int | float) and not isinstance(entered, bool)
-        what = f"{entered:g} {unit}".rstrip() if is_number else short(entered)
+        what = f"{entered:g} {declared.unit}".rstrip() if is_number else short(entered)
         expected = rest.rpartition(", expected ")[2]
-        if as_db and declared.bounds is not None:
-            expected = f"at most {20.0 * math.log10(declared.bounds[1]):.4g} dB"
         raise SimulationError(f"{declared.label} is {what}, expected {expected}") from error

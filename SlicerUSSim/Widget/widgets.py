@@ -13,10 +13,12 @@ import ctk
 import qt
 import slicer
 
-from SlicerUSSim.Widget.interface import Control, Section, by_widget
+from SlicerUSSim.Widget.interface import Control, Section, by_widget, tr as _
 
 _PAGE_STEPS = 10
 _TABLE_HEIGHT, _LIST_HEIGHT = 220, 140
+#: The most that a result or warning takes; the rest is scrolled
+WORDS_HEIGHT = 72
 
 
 def build(sections: tuple[Section, ...], column: Any) -> SimpleNamespace:
@@ -24,6 +26,7 @@ def build(sections: tuple[Section, ...], column: Any) -> SimpleNamespace:
     ui = SimpleNamespace(**{name: _widget(control) for name, control in by_widget(sections).items()})
     for name, widget in vars(ui).items():
         widget.setObjectName(name)
+    column.setContentsMargins(0, 0, 0, 0)  # the module's own layout has margins
     for section in sections:
         column.addWidget(_section(section, ui))
     _add_progress(column, ui)
@@ -42,18 +45,22 @@ def _section(section: Section, ui: SimpleNamespace) -> Any:
         beside = qt.QWidget()
         line = qt.QHBoxLayout(beside)
         line.setContentsMargins(0, 0, 0, 0)
-        for control in row:
-            line.addWidget(getattr(ui, control.widget))
-        form.addRow(beside)
+        for entry in row:
+            if isinstance(entry, Control):
+                line.addWidget(getattr(ui, entry.widget), 1)
+        form.addRow(*(f"{entry}:" for entry in row[:1] if isinstance(entry, str)), beside)
     result.setProperty("collapsed", not section.is_open)
     return result
 
 
 def _add_row(form: Any, control: Control, widget: Any) -> None:
-    if control.kind in ("button", "table", "words"):
+    if control.kind == "words":
+        form.addRow(_scrolled(widget))
+        return
+    if control.kind in ("button", "table", "tick"):
         form.addRow(widget)
         return
-    label = qt.QLabel("" if control.kind == "tick" else f"{control.label}:")
+    label = qt.QLabel(f"{control.label}:")
     label.setToolTip(control.tip)
     form.addRow(label, widget)
 
@@ -67,6 +74,7 @@ def _widget(control: Control) -> Any:
 def _slider(control: Control) -> Any:
     result = _with_range(ctk.ctkSliderWidget(), control)
     result.setProperty("pageStep", _PAGE_STEPS * control.range.step)
+    result.setProperty("synchronizeSiblings", 1)  # ctkSliderWidget.SynchronizeWidth: sliders of a section end alike
     return result
 
 
@@ -75,7 +83,7 @@ def _number(control: Control) -> Any:
     result = _with_range(qt.QDoubleSpinBox(), control)
     result.setProperty("keyboardTracking", False)
     if control.range.none_at == control.range.low:  # the lowest number stands for none
-        result.setProperty("specialValueText", "none")
+        result.setProperty("specialValueText", _("none"))
     return result
 
 
@@ -108,15 +116,20 @@ def _node(control: Control) -> Any:
     return result
 
 
-def _text(control: Control) -> Any:
-    result = qt.QLineEdit()
-    result.setProperty("placeholderText", control.hint)
-    return result
-
-
 def _words(control: Control) -> Any:
     result = qt.QLabel("")
     result.setProperty("wordWrap", True)
+    result.setAlignment(qt.Qt.AlignTop)
+    return result
+
+
+def _scrolled(label: Any) -> Any:
+    result = qt.QScrollArea()
+    result.setProperty("widgetResizable", True)
+    result.setHorizontalScrollBarPolicy(qt.Qt.ScrollBarAlwaysOff)
+    result.setFrameShape(qt.QFrame.NoFrame)
+    result.setWidget(label)
+    result.setVisible(False)
     return result
 
 
@@ -124,6 +137,8 @@ def _table(control: Control) -> Any:
     result = qt.QTableWidget()
     result.setMinimumHeight(_TABLE_HEIGHT)
     result.setAlternatingRowColors(True)
+    result.verticalHeader().setVisible(False)
+    result.horizontalHeader().setSectionResizeMode(qt.QHeaderView.Stretch)
     return result
 
 
@@ -139,7 +154,7 @@ _MAKERS = {
     "number": _number,
     "tick": lambda control: qt.QCheckBox(control.label),
     "choice": _choice,
-    "text": _text,
+    "text": lambda control: qt.QLineEdit(),
     "node": _node,
     "button": lambda control: qt.QPushButton(control.label),
     "words": _words,
@@ -150,9 +165,9 @@ _MAKERS = {
 
 def _add_progress(column: Any, ui: SimpleNamespace) -> None:
     ui.progressWidget = qt.QWidget()
-    ui.progressBar, ui.cancelButton = qt.QProgressBar(), qt.QPushButton("Cancel")
-    ui.progressBar.setToolTip("Progress [%]")
-    ui.cancelButton.setToolTip("Stop the work without changing anything")
+    ui.progressBar, ui.cancelButton = qt.QProgressBar(), qt.QPushButton(_("Cancel"))
+    ui.progressBar.setToolTip(_("Progress [%]"))
+    ui.cancelButton.setToolTip(_("Stop the work without changing anything"))
     line = qt.QHBoxLayout(ui.progressWidget)
     line.setContentsMargins(0, 0, 0, 0)
     for name in ("progressBar", "cancelButton"):

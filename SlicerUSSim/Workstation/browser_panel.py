@@ -108,9 +108,7 @@ class BrowserPanel:
         self.sections = panel_sections(self.presenter)
         self._controls = by_widget(self.sections)
         #: Actions of the page in place of those of buttons
-        self.own_actions: dict[Callable[..., object] | None, Callable[[], object]] = {
-            self.presenter.tissues.assignTissue: self._assign_tissue
-        }
+        self.own_actions: dict[Callable[[], object], Callable[[], object]] = {}
         with shared.changing() as now:
             now.open_sections = [section.title for section in self.sections if section.is_open]
             now.panel.choices = {name: list(control.choices) for name, control in self._controls.items()}
@@ -176,7 +174,7 @@ class BrowserPanel:
             if any(control.kind == "table" for control in stale.values()):
                 panel.tissues = [_line(row) for row in self.presenter.tissues.rows()]
             if any(control.kind == "list" for control in stale.values()):
-                now.fit.free = [FreeParameter(name, on) for name, on in self.presenter.fits.freeParameters()]
+                now.fit.free = [FreeParameter(*entry) for entry in self.presenter.fits.freeParameters()]
             length = count_taken(self.logic.parameters.image_sequence)
             if now.simulated.length != length:
                 now.simulated.length, now.simulated.number = length, 0
@@ -245,7 +243,10 @@ class BrowserPanel:
     def press(self, name: str) -> None:
         """Called when the user presses a button."""
         action = self._controls[name].action
-        self.tasks.start(self.own_actions.get(action) or required(action, f"{name} is no button"))
+        if name == "assignTissueButton":
+            action = self._assign_tissue
+        action = required(action, f"{name} is no button of the page")
+        self.tasks.start(self.own_actions.get(action, action))
 
     def _changed(self, control: Control, value: Any) -> None:
         presenter, parameters = self.presenter, self.logic.parameters

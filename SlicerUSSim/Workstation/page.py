@@ -19,10 +19,11 @@ from trame_slicer.core import LayoutManager
 from trame_slicer.views import AbstractView
 
 from SlicerUSSim.Widget.image_presenter import FROZEN
-from SlicerUSSim.Widget.interface import Control, Section
+from SlicerUSSim.Widget.interface import Control
 from SlicerUSSim.Widget.tissue_presenter import TISSUE_COLUMNS
 from SlicerUSSim.Workstation.browser_panel import BrowserPanel
-from SlicerUSSim.Workstation.page_parts import offer, pose_numbers, question_dialog, registration_section
+from SlicerUSSim.Workstation.page_parts import offer, pose_numbers, question_dialog, registration
+from SlicerUSSim.Workstation.pose_registration import SECTION
 from SlicerUSSim.Workstation.state import NAMES, PLANES, SLICE_VIEWS, ComparisonMode, value_of
 
 _STATIC = Path(__file__).parent / "static"
@@ -32,19 +33,17 @@ MODULE = {
     "scripts": ["ussim/overlay.js", "ussim/workstation.js"],
     "styles": ["ussim/workstation.css"],
 }
-#: Controls of the panel that are not on the page: its slice views follow the probe, it compares the fit in the
-#: ultrasound view, and it has a button of its own to place the probe.
+#: Controls of the panel that are not on the page: its views follow the probe and show it, it compares the fit in the
+#: ultrasound view, it has a button of its own to place the probe, and no editor of segments.
 NOT_SHOWN = {
-    "sliceViewComboBox", "showInSliceCheckBox", "compareComboBox", "compareNumberComboBox", "blinkCheckBox",
-    "statusLabel", "placeButton",
+    "sliceViewComboBox", "showInSliceCheckBox", "showIn3dCheckBox", "showProbeCheckBox", "layoutButton",
+    "compareComboBox", "compareNumberComboBox", "blinkCheckBox", "statusLabel", "placeButton", "editTissuesButton",
 }  # fmt: skip
 #: JavaScript of buttons that act on the page, by widget name.
 _IN_PAGE = {
     "savePresetButton": "window.ussim.save('json')",
     "loadPresetButton": "window.document.getElementById('open-file').click()",
 }
-#: What is at the top of the drawer
-_FIRST_SECTION, _FIRST_CONTROLS = "Ultrasound", ("gainSlider", "depthSlider")
 #: Colours of the marks beside the slice views' planes.
 _STRIPES = {"Red": "red", "Yellow": "yellow", "Green": "green"}
 
@@ -135,14 +134,15 @@ def _drawer(panel: BrowserPanel) -> None:
     html.Div("Ultrasound Simulator", classes="text-subtitle-1 px-4 pt-2")
     html.Div(f"{{{{ {NAMES.title} }}}}", classes="text-caption px-4 pb-1 text-medium-emphasis", id="title")
     with v3.VExpansionPanels(multiple=True, v_model=(NAMES.open_sections,), variant="accordion"):
-        for section in _in_order(panel.sections):
-            if section.title.startswith("Fit"):
-                registration_section()
+        # First what is used while one looks at the image
+        for section in sorted(panel.sections, key=lambda section: section.title != "Ultrasound"):
             with v3.VExpansionPanel(value=section.title):
                 v3.VExpansionPanelTitle(section.title, style="min-height: 36px; font-size: 13px")
                 with v3.VExpansionPanelText(eager=True, id=f"section-{section.title.replace(' ', '-').lower()}"):
-                    if section.title == "Inputs":
+                    if section.title == "Patient":
                         _open_file()
+                    if section.title == SECTION:
+                        registration()
                     for control in section.controls:
                         if control.widget not in NOT_SHOWN:
                             _control(control, panel)
@@ -151,16 +151,6 @@ def _drawer(panel: BrowserPanel) -> None:
                         pose_numbers()
                     if section.title.startswith("Fit"):
                         _cost_curve()
-
-
-def _in_order(sections: tuple[Section, ...]) -> list[Section]:
-    """The sections with what is used while one looks at the image first: gain and depth are not below the fold."""
-    ordered = sorted(sections, key=lambda section: section.title != _FIRST_SECTION)
-    first = list(ordered[0].controls) if ordered[0].title == _FIRST_SECTION else []
-    if first:
-        first.sort(key=lambda control: control.widget not in _FIRST_CONTROLS)
-        ordered[0] = Section(_FIRST_SECTION, True, tuple(first))
-    return ordered
 
 
 def _open_file() -> None:
@@ -204,7 +194,7 @@ def _control(control: Control, panel: BrowserPanel) -> None:
         value = "Number($event.target.value)" if kind == "number" else "$event.target.value"
         shown = f"{key} === null ? '' : +Number({key}).toFixed({control.decimals})" if kind == "number" else key
         limits = f'min="{low:.10g}" max="{high:.10g}" step="{control.range.step:g}"'
-        limits = limits if kind == "number" else f'placeholder="{escape(control.hint)}"'
+        limits = limits if kind == "number" else ""
         none_at = control.range.none_at
         if kind == "number" and none_at is not None:  # an empty field, and not a number that means it
             limits += ' placeholder="none"'
@@ -249,8 +239,8 @@ def _control(control: Control, panel: BrowserPanel) -> None:
         html.Div(
             f"""<div style="font-size: 12px">{control.label}</div><div class="ussim-free" id="{name}">
             <label v-for="entry in {NAMES.fit.free}" style="display: block"><input type="checkbox" :checked="entry.on"
-            :aria-label="entry.name" @change="trigger('set_free', [entry.name, $event.target.checked])">
-            {{{{ entry.name }}}}</label></div>""",
+            :aria-label="entry.label" @change="trigger('set_free', [entry.name, $event.target.checked])">
+            {{{{ entry.label }}}}</label></div>""",
             title=control.tip,
         )
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 from trame.widgets import html, vuetify3 as v3
 
 from SlicerUSSim.Workstation.pose_entry import POSE_SUFFIXES
-from SlicerUSSim.Workstation.pose_registration import SECTION
 from SlicerUSSim.Workstation.state import NAMES
 
 #: Names of transforms that calibrations usually are
@@ -86,21 +85,17 @@ def pose_numbers() -> None:
     )  # fmt: skip
 
 
-def registration_section() -> None:
-    """The section with calibration and registration of the tracked ultrasound."""
+def registration() -> None:
+    """Calibration and registration of the tracked ultrasound."""
     state = NAMES.registration
-    there = f"{state.recording} !== ''"
-    with v3.VExpansionPanel(value=SECTION):
-        v3.VExpansionPanelTitle(SECTION, style="min-height: 36px; font-size: 13px")
-        with v3.VExpansionPanelText(eager=True, id="section-tracked-ultrasound"):
-            html.Div(
-                f"{{{{ {state.recording} || 'none: open a file with tracked ultrasound' }}}}", id="recording",
-                classes="ussim-opened",
-            )  # fmt: skip
-            with html.Div(v_show=there):
-                _frame()
-                _calibration()
-                _registration()
+    html.Div(
+        f"{{{{ {state.recording} || 'none: open a file with tracked ultrasound' }}}}", id="recording",
+        classes="ussim-opened",
+    )  # fmt: skip
+    with html.Div(v_show=f"{state.recording} !== ''"):
+        _frame()
+        _calibration()
+        _registration()
 
 
 def _frame() -> None:

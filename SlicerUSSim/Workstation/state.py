@@ -57,9 +57,10 @@ class TissueLine:
 
 @dataclass(frozen=True)
 class FreeParameter:
-    """A parameter that a fit can vary."""
+    """A parameter that a fit can vary, and what users call it."""
 
     name: str
+    label: str
     on: bool
 
 

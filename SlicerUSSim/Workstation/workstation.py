@@ -94,6 +94,7 @@ class Workstation:
             segmenting.undoSegment: patient.undo_segment,
             placing.placeProbe: partial(patient.place, placing.placeProbe),
             placing.placeAtView: partial(patient.place, placing.placeAtView),
+            placing.approach: partial(patient.place, placing.approach),
         }
         for action in (segmenting.segment, lesions.addTissues, placing.openCraniotomy, placing.closeCraniotomy):
             panel.own_actions[action] = partial(patient.then_show, action)

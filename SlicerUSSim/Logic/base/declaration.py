@@ -38,8 +38,6 @@ class Shown:
     step: float = 1.0
     #: Whether there is a slider next to the number
     is_slider: bool = False
-    #: Whether an amplitude is shown as its level in dB
-    as_db: bool = False
     #: Numbers up to this one mean None
     none_at: float | None = None
 
@@ -49,16 +47,14 @@ class Shown:
         return max(0, -int(log10(self.step) // 1))
 
     def number(self, value: float | None) -> float | None:
-        """The number shown for a value."""
-        if value is None:
-            return self.none_at
-        return 20.0 * log10(value) if self.as_db else value
+        """The number shown for a value, in its unit."""
+        return self.none_at if value is None else value
 
     def value(self, number: float) -> float | None:
         """The value of an entered number."""
         if self.none_at is not None and number <= self.none_at:
             return None
-        return 10.0 ** (number / 20.0) if self.as_db else number
+        return number
 
 
 @dataclass(frozen=True)

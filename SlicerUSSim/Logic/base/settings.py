@@ -25,16 +25,16 @@ class SimulationSettings(Declared):
         shown=Shown(0, 999_999), option="seed",
     )  # fmt: skip
     max_ray_depth: int = parameter(
-        6, "Reflections", "Largest number of reflections along one path", bounds=(0, 16), shown=Shown(0, 16),
+        6, "Reflections", "Largest number of reflections along one path", bounds=(0, 16),
         note="Refractions are not counted, so rays can cross many weak borders",
     )  # fmt: skip
     intensity_threshold: float = parameter(
         1e-6, "Ray threshold", "A ray ends when its two-way amplitude, including attenuation, falls below this value",
-        bounds=(1e-12, 1), shown=Shown(-200, -20, is_slider=True, as_db=True),
+        bounds=(1e-12, 1),
     )  # fmt: skip
     reflection_threshold: float = parameter(
         2e-2, "Reflection threshold", "Smallest weight of a reflected ray that is followed; higher is faster",
-        bounds=(1e-9, 1), shown=Shown(-120, -6, is_slider=True, as_db=True), note="The weight excludes attenuation",
+        bounds=(1e-9, 1), note="The weight excludes attenuation",
     )  # fmt: skip
     reflection_spreading: bool = parameter(
         True, "Reflections spread", "Convex surfaces spread the reflected beam",
@@ -42,7 +42,6 @@ class SimulationSettings(Declared):
     )  # fmt: skip
     reference_speed_m_s: float = parameter(
         1540.0, "Scanner's speed of sound", "Speed of sound that the scanner assumes", unit="m/s", bounds=(300, 6000),
-        shown=Shown(1000, 2000),
     )  # fmt: skip
     beam: str = parameter(
         "aperture", "Beam",
@@ -55,12 +54,12 @@ class SimulationSettings(Declared):
     frequency_downshift: bool = parameter(
         True, "Frequency downshift",
         "Attenuation takes more of the high frequencies of a pulse: its centre falls with depth, and the beam widens",
-        shown=True, source="Off in the paper",
+        source="Off in the paper",
     )  # fmt: skip
     wavefront_curvature: bool = parameter(
         True, "Wavefront curvature",
         "The phase of the beam is curved across it: away from the transmit focus speckle has finer grains",
-        shown=True, note="The echo of a point is as wide with it as without", source="Off in the paper",
+        note="The echo of a point is as wide with it as without", source="Off in the paper",
     )  # fmt: skip
     reflections: bool = parameter(
         True, "Reflected rays", "Simulate mirror images and reverberation by following reflected rays", shown=True
@@ -72,7 +71,7 @@ class SimulationSettings(Declared):
         note="Their level and width follow from the probe's apertures and apodisation",
     )  # fmt: skip
     ring_down: bool = parameter(
-        True, "Ring-down", "Reverberation between the probe's face and the skin, as the probe has it", shown=True
+        True, "Ring-down", "Reverberation between the probe's face and the skin, as the probe has it"
     )
     contact_gap_mm: float | None = parameter(
         None, "Contact gap",
@@ -94,14 +93,14 @@ class SimulationSettings(Declared):
         None, "Partial volume",
         "Mix the scatterers of tissues by the probabilities of the segmentation, which requires segmenting the MRI "
         "first; none: where they are at hand",
-        shown=True, option="partial-volume/hard-labels",
+        option="partial-volume/hard-labels",
         note="A scene of 3D Slicer or the page keeps them beside labels that Segment wrote, until somebody edits these",
         source="Off in the paper; images are more like real ones with it, see optimization.md",
     )  # fmt: skip
     mri_modulation_db: float = parameter(
         0.0, "MRI modulation",
         "Scatterer level per standard deviation of MRI intensity within a tissue; requires segmenting the MRI first",
-        unit="dB", bounds=(-6, 6), shown=Shown(-6, 6, 0.1, is_slider=True), option="mri-modulation",
+        unit="dB", bounds=(-6, 6), option="mri-modulation",
         note="Negative if bright tissue is hypoechoic", source="0 in the paper",
     )  # fmt: skip
     beam_cutoff: float = parameter(
@@ -145,7 +144,7 @@ class SimulationSettings(Declared):
 def _depth_gain(number: int) -> Any:
     """One of eight sliders."""
     return parameter(
-        0.0, f"Gain at depth {number}", f"Slider {number} of 8 of the gain by depth, from the face to the image depth",
+        0.0, f"TGC {number} of 8", f"Slider {number} of 8 of the gain by depth, from the face to the image depth",
         unit="dB", bounds=(-60, 60), shown=Shown(-30, 30, 0.5, is_slider=True),
         fit=Fit(-15, 15, tolerance=2.0, on_request=True),
     )  # fmt: skip
@@ -154,7 +153,7 @@ def _depth_gain(number: int) -> Any:
 def _line_gain(number: int) -> Any:
     """One of five knots across the field."""
     return parameter(
-        0.0, f"Gain of lines {number}",
+        0.0, f"Lateral gain {number} of 5",
         f"Knot {number} of 5 of the gain by scan line, from the left to the right: poor contact is dark", unit="dB",
         bounds=(-60, 60), shown=Shown(-30, 30, 0.5, is_slider=True), fit=Fit(-15, 15, tolerance=2.0, on_request=True),
     )  # fmt: skip
@@ -163,8 +162,8 @@ def _line_gain(number: int) -> Any:
 def _map_slope(where: str) -> Any:
     return parameter(
         1.0, f"Map at {where}", f"Slope of the grey map at {where}, relative to that at half of white",
-        bounds=(0.02, 8), shown=Shown(0.05, 4, 0.05, is_slider=True),
-        fit=Fit(0.1, 3, tolerance=0.15, is_logarithmic=True, on_request=True), note="Multiplies that of grey_map",
+        bounds=(0.02, 8), fit=Fit(0.1, 3, tolerance=0.15, is_logarithmic=True, on_request=True),
+        note="Multiplies that of grey_map",
     )  # fmt: skip
 
 
@@ -195,7 +194,7 @@ class DisplaySettings(Declared):
     tgc_reach: float = parameter(
         1.0, "TGC reach",
         "Part of the image depth over which TGC rises; from there on it stays, as an amplifier has a largest gain",
-        bounds=(0, 1), shown=Shown(0, 1, 0.01, is_slider=True), option="tgc-reach",
+        bounds=(0, 1), option="tgc-reach",
         fit=Fit(0.1, 1.0, tolerance=0.1, on_request=True),
     )  # fmt: skip
     near_gain_db: float = parameter(
@@ -214,19 +213,18 @@ class DisplaySettings(Declared):
     smoothing_axial_mm: float = parameter(
         0.0, "Smoothing along lines",
         "Sigma of a Gaussian along the lines that smooths the envelope before compression",
-        unit="mm", bounds=(0, 3), shown=Shown(0, 1, 0.01, is_slider=True),
-        fit=Fit(0.0, 0.3, tolerance=0.03, on_request=True), note="0.06 to 0.1 is as good as 3 to 5 compounded looks",
+        unit="mm", bounds=(0, 3), fit=Fit(0.0, 0.3, tolerance=0.03, on_request=True),
+        note="0.06 to 0.1 is as good as 3 to 5 compounded looks",
     )  # fmt: skip
     smoothing_lateral_deg: float = parameter(
         0.0, "Smoothing across lines",
         "Sigma of a Gaussian across the lines that smooths the envelope: an angle at the apex of a sector, and on a "
         "linear array seen from the focal depth",
-        unit="°", bounds=(0, 5), shown=Shown(0, 2, 0.01, is_slider=True),
-        fit=Fit(0.0, 0.8, tolerance=0.06, on_request=True),
+        unit="°", bounds=(0, 5), fit=Fit(0.0, 0.8, tolerance=0.06, on_request=True),
     )  # fmt: skip
     edge_enhancement: float = parameter(
         0.0, "Edge enhancement", "Part of the difference of grey levels to their mean within half a millimetre, added",
-        bounds=(0, 4), shown=Shown(0, 2, 0.05, is_slider=True), fit=Fit(0.0, 1.5, tolerance=0.1, on_request=True),
+        bounds=(0, 4), fit=Fit(0.0, 1.5, tolerance=0.1, on_request=True),
     )  # fmt: skip
     persistence: float = parameter(
         0.0, "Persistence",

@@ -25,7 +25,7 @@ class FitSettings(Declared):
         shown=True,
     )  # fmt: skip
     register: bool = parameter(
-        False, "Register as well",
+        False, "Also register",
         "Also fit a rigid transform of the real ultrasound to the MRI; takes longer", shown=True,
         option="register/no-register",
     )  # fmt: skip
@@ -38,7 +38,7 @@ class FitSettings(Declared):
         bounds=(0, 100), option="restarts",
     )  # fmt: skip
     speckle: bool = parameter(
-        False, "Fit the speckle as well",
+        False, "Also fit the speckle",
         "Also take the grey map from the real images, and fit the smoothing of the envelope and the tissues' texture "
         "to the size and number of speckle's grains",
         shown=True, option="speckle/no-speckle",
@@ -47,7 +47,7 @@ class FitSettings(Declared):
         "", "Predict",
         "Images of the sequence that are not fitted but predicted, such as 2,6: the cost on them, beside one uniform "
         "tissue fitted in the same way and the images' real neighbours; empty: none",
-        shown=True, option="validate",
+        option="validate",
     )  # fmt: skip
 
     @property

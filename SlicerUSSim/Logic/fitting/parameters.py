@@ -50,6 +50,14 @@ ECHOGENICITY = Declaration(
 ATTENUATION = "attenuation_db_cm_mhz"
 
 
+def declaration_of(name: str) -> Declaration:
+    """The declaration of the parameter of a display or tissue with this full name."""
+    tissue, _, attribute = name.rpartition(".")
+    if attribute == ECHOGENICITY.name:
+        return ECHOGENICITY
+    return (TISSUE_PARAMETERS if tissue else DISPLAY_PARAMETERS)[attribute]
+
+
 @dataclass(frozen=True)
 class Parameter:
     """One free parameter. Raises SimulationError for bounds that are not finite or in the wrong order."""
@@ -78,9 +86,7 @@ class Parameter:
     @property
     def declaration(self) -> Declaration:
         """Its declaration, with the default bounds."""
-        if self.attribute == ECHOGENICITY.name:
-            return ECHOGENICITY
-        return (TISSUE_PARAMETERS if self.tissue else DISPLAY_PARAMETERS)[self.attribute]
+        return declaration_of(self.name)
 
     @property
     def fit(self) -> Fit:

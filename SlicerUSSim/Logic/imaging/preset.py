@@ -31,8 +31,6 @@ _POSE = "probe_to_ras"
 _KIND = "probe.kind"
 #: Objects of keys that the command alone has (Command/options.py)
 _OF_COMMAND = ("segmentation", "fit", "patient", "recording", "results")
-#: Name in Preset.from_texts of the whole as JSON, as scenes had it
-AS_ONE = "preset"
 #: Tissues of segment_mri with thin sulci.
 _BRAIN = ("csf", "grey matter", "white matter", "leptomeninges")
 
@@ -137,12 +135,7 @@ class Preset:
 
     @classmethod
     def from_texts(cls, texts: Mapping[str, str], source: str = "preset") -> Preset:
-        """The inverse of to_texts. Raises SimulationError that names `source` and the invalid value.
-
-        With AS_ONE, the whole as one JSON text, other names are ignored.
-        """
-        if AS_ONE in texts:
-            return cls.from_dict(_from_json(AS_ONE, texts[AS_ONE], source), source)
+        """The inverse of to_texts. Raises SimulationError that names `source` and the invalid value."""
         declared = {name: replace(entry, name=name) for name, entry in preset_parameters().items()}
         kind = declared[_KIND].from_text(source, texts.get(_KIND, probe_kind().default))
         values, nested = _flat_default(kind), {"tissues": {}}

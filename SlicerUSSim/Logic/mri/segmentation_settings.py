@@ -35,7 +35,7 @@ class SegmentationSettings(Declared):
     )  # fmt: skip
     thin_sulci: bool = parameter(
         True, "Label thin sulci",
-        "Label sulci too narrow to reach CSF intensity as leptomeninges, one voxel thick", shown=True,
+        "Label sulci too narrow to reach CSF intensity as leptomeninges, one voxel thick",
         option="thin-sulci/no-thin-sulci",
     )  # fmt: skip
     outside: bool = parameter(
@@ -45,7 +45,7 @@ class SegmentationSettings(Declared):
     )  # fmt: skip
     bias_correction: bool | None = parameter(
         None, "Correct the bias field", "Remove the bias field, for scans with an intensity gradient; none: decided "
-        "from the image", shown=True, option="bias-correction/no-bias-correction",
+        "from the image", option="bias-correction/no-bias-correction",
     )  # fmt: skip
     filter_radius: int = parameter(
         1, "Filter radius", "Radius of the guided filter; 0: none", unit="voxels", bounds=(0, 64), option="radius"
@@ -74,23 +74,23 @@ class SheetSettings(Declared):
     """What a scene looks for with sheets.find_sheets, and what its images show of it."""
 
     find: bool = parameter(
-        False, "Find sheets and vessels", "Segment also looks for what is ticked below, in a T1 or T2 (about a "
-        "minute); off: images have the lines of the labels, as the paper's model", shown=True,
+        False, "Find sheets and vessels", "Segment also looks for sulci, falx, tentorium, walls of the ventricles, "
+        "corpus callosum, choroid plexus and vessels, in a T1 or T2 (about a minute); off: images have the lines of "
+        "the labels, as the paper's model", shown=True,
     )  # fmt: skip
-    sulcus: bool = parameter(True, "Sulci", "Sulci as thin sheets, also closed ones", shown=True)
-    falx: bool = parameter(True, "Falx", "Falx as a thin sheet", shown=True)
-    tentorium: bool = parameter(True, "Tentorium", "Tentorium as a thin sheet", shown=True)
-    ependyma: bool = parameter(True, "Ependyma", "Walls of the ventricles as thin sheets", shown=True)
+    sulcus: bool = parameter(True, "Sulci", "Sulci as thin sheets, also closed ones")
+    falx: bool = parameter(True, "Falx", "Falx as a thin sheet")
+    tentorium: bool = parameter(True, "Tentorium", "Tentorium as a thin sheet")
+    ependyma: bool = parameter(True, "Ependyma", "Walls of the ventricles as thin sheets")
     corpus_callosum: bool = parameter(
-        True, "Corpus callosum", "Corpus callosum as a tissue of its own, from the next Segment on", shown=True
+        True, "Corpus callosum", "Corpus callosum as a tissue of its own, from the next Segment on"
     )
     choroid_plexus: bool = parameter(
         True, "Choroid plexus", "Choroid plexus as enhancing tissue, in a T1 with contrast agent alone; from the next "
-        "Segment on", shown=True,
+        "Segment on",
     )  # fmt: skip
     vessels: bool = parameter(
         True, "Vessels", "Vessels as enhancing tissue, in a T1 with contrast agent alone; from the next Segment on",
-        shown=True,
     )  # fmt: skip
 
     @property

@@ -15,8 +15,10 @@ from SlicerUSSim.Logic.imaging.frame import Frame
 from SlicerUSSim.Logic.imaging.noise import seed_of_pose
 from SlicerUSSim.Logic.imaging.simulator import EmptyViewWarning
 from SlicerUSSim.Logic.mrml.craniotomy_nodes import flap_centre, is_opened
+from SlicerUSSim.Logic.mrml.fitting_nodes import mark_as_drawn
 from SlicerUSSim.Logic.mrml.label_nodes import labels_version
 from SlicerUSSim.Logic.mrml.nodes import (
+    display_of,
     named,
     pose_in_labels,
     probe_pose,
@@ -33,6 +35,10 @@ from SlicerUSSim.Logic.placement.bone_before_probe import about_bone
 from SlicerUSSim.Logic.placement.craniotomy import default_pose
 from SlicerUSSim.Logic.placement.views import opened_view_pose, view_pose
 from SlicerUSSim.Logic.probe.poses import pose_in_slice
+from SlicerUSSim.Logic.probe.shape import probe_polydata
+
+#: Reference of an outline to the model of the probe's body
+_BODY = "SlicerUSSim.body"
 
 
 class ImageLogic:
@@ -223,6 +229,25 @@ class ImageLogic:
         require_result(model_node, "outline")
         write_outline(model_node, self._parameters.preset.probe, probe_transform_node)
         mark_as_result(model_node, OUTLINE)
+        self._write_body(model_node)
+
+    def showProbe(self, outline_node, is_shown: bool) -> None:
+        """Show or hide a model of the probe's body, which belongs to the outline of its imaged field."""
+        body = outline_node.GetNodeReference(_BODY)
+        if body is None and is_shown:
+            body = outline_node.GetScene().AddNewNodeByClass("vtkMRMLModelNode", "Ultrasound probe")
+            mark_as_drawn(body)
+            outline_node.SetNodeReferenceID(_BODY, body.GetID())
+            self._write_body(outline_node)
+        if body is not None and display_of(body) is not None:
+            display_of(body).SetVisibility(is_shown)
+
+    def _write_body(self, outline_node) -> None:
+        """The model of the probe's body, if there is one, of the present probe and where its outline is."""
+        body = outline_node.GetNodeReference(_BODY)
+        if body is not None:
+            body.SetAndObservePolyData(probe_polydata(self._parameters.preset.probe))
+            body.SetAndObserveTransformNodeID(outline_node.GetTransformNodeID())
 
     def showInSlice(self, slice_node, output_node, probe_transform_node, fit: bool = True) -> None:
         """Move a slice view to the image plane and overlay the image."""

@@ -7,7 +7,6 @@ from collections.abc import Collection, Hashable, Iterable
 
 import numpy as np
 import slicer
-from scipy import ndimage
 from vtkmodules.vtkCommonCore import vtkIntArray, vtkStringArray
 from vtkmodules.vtkCommonMath import vtkMatrix4x4
 
@@ -21,6 +20,7 @@ from SlicerUSSim.Logic.mrml.nodes import (
     ijk_to_ras,
     named,
     node_to_world,
+    put_beside,
     read_volume,
     require_node,
     write_volume,
@@ -133,51 +133,20 @@ def node_labels(labels_node, without: Collection[str] = ()) -> tuple[Volume, dic
     return volume, {label: colours.GetColorName(label) if 0 < label < known else "" for label in present}
 
 
-def overlapping_segments(segmentation_node) -> list[Volume]:
-    """The mask of every segment of a segmentation with binary label maps, in their order; none if no two overlap.
-
-    Segments whose voxels lie on several grids are returned as well, as it is not said whether these overlap.
-    """
+def layered_segments(segmentation_node) -> list[Volume]:
+    """The mask of every segment with a binary label map, in their order; none of a segmentation with one layer."""
     segmentation = segmentation_node.GetSegmentation()
     name = slicer.vtkSegmentationConverter.GetSegmentationBinaryLabelmapRepresentationName()
-    if segmentation.GetNumberOfLayers(name) < 2:  # segments of one image
-        return []
     masks = []
-    for segment_id in segmentation.GetSegmentIDs():
-        segment = segmentation.GetSegment(segment_id)
+    for segment in map(segmentation.GetSegment, segmentation.GetSegmentIDs()):
         image = segment.GetRepresentation(name)
-        if image is None or min(image.GetDimensions()) < 1:
-            masks.append(Volume(np.zeros((1, 1, 1), np.uint8), np.eye(4)))
+        if segmentation.GetNumberOfLayers(name) < 2 or image is None or min(image.GetDimensions()) < 1:
             continue
         matrix = vtkMatrix4x4()
         image.GetImageToWorldMatrix(matrix)
         voxels = Volume.from_vtk(image, matrix_array(matrix))
         masks.append(voxels.with_array((voxels.array == segment.GetLabelValue()).astype(np.uint8)))
-    return masks if _overlap([mask for mask in masks if mask.array.any()]) else []
-
-
-def _overlap(masks: list[Volume]) -> bool:
-    """Whether masks have a voxel in common, or lie on several grids."""
-    if len(masks) < 2:
-        return False
-    to_first = masks[0].ras_to_ijk
-    found: list[tuple[np.ndarray, np.ndarray]] = []
-    for mask in masks:
-        to_grid = to_first @ mask.ijk_to_ras
-        first = to_grid[:3, 3].round().astype(int)
-        if not np.allclose(to_grid[:3, :3], np.eye(3), atol=1e-4) or not np.allclose(to_grid[:3, 3], first, atol=1e-2):
-            return True
-        (box,) = ndimage.find_objects(mask.array)
-        found.append((first[::-1] + [side.start for side in box], mask.array[box]))
-    low = np.min([corner for corner, _ in found], axis=0)
-    high = np.max([corner + part.shape for corner, part in found], axis=0)
-    taken = np.zeros(high - low, bool)
-    for corner, part in found:
-        there = taken[tuple(slice(a, a + n) for a, n in zip(corner - low, part.shape, strict=True))]
-        if (there & (part > 0)).any():
-            return True
-        there |= part > 0
-    return False
+    return masks
 
 
 def _require_segments(segmentation_node, use: str) -> None:
@@ -246,6 +215,7 @@ def write_labels(labels_node, labels: Volume, names: Iterable[str], like_node) -
     node of volumes or labels. Tissues that the node already has keep their colours, which may be the user's."""
     parent = like_node.GetParentTransformNode()
     labels_node.SetAndObserveTransformNodeID(None if parent is None else parent.GetID())
+    put_beside(labels_node, like_node)
     if labels_node.IsA("vtkMRMLSegmentationNode"):
         if like_node.IsA("vtkMRMLVolumeNode"):
             # After the transform, since the node converts the reference geometry to its own frame.
@@ -341,14 +311,19 @@ def _write_segmentation(segmentation_node, labels: Volume, names: tuple[str, ...
     kept = {segment.GetName(): segment.GetColor() for segment in segments}
     segmentation.RemoveAllSegments()
     segmentation_node.SetSourceRepresentationToBinaryLabelmap()
+    representation = slicer.vtkSegmentationConverter.GetSegmentationBinaryLabelmapRepresentationName()
+    layer = slicer.vtkOrientedImageData()  # one for all segments, as none overlap
+    voxels = labels.array.astype(np.uint8 if len(names) < 256 else np.int16)  # a copy, which users may edit
+    layer.ShallowCopy(Volume(voxels, np.eye(4)).to_vtk())
+    layer.SetImageToWorldMatrix(vtk_matrix(labels.ijk_to_ras))
     for label, name in enumerate(names, 1):
-        mask = slicer.vtkOrientedImageData()
-        mask.ShallowCopy(Volume(labels.array == label, np.eye(4)).to_vtk())
-        mask.SetImageToWorldMatrix(vtk_matrix(labels.ijk_to_ras))
-        segment_id = segmentation_node.AddSegmentFromBinaryLabelmapRepresentation(
-            mask, name, kept.get(name) or colour_of(name), name
-        )  # fmt: skip
+        segment = slicer.vtkSegment()
+        segment.SetName(name)
+        segment.SetColor(kept.get(name) or colour_of(name))
+        segment.SetLabelValue(label)
+        segment.AddRepresentation(representation, layer)
         if entry := terminology_entry(name):
-            segmentation.GetSegment(segment_id).SetTerminology(entry)
+            segment.SetTerminology(entry)
+        segmentation.AddSegment(segment, name)
     segmentation_node.EndModify(was_modifying)
     display_of(segmentation_node)

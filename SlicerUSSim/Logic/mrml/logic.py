@@ -75,6 +75,7 @@ class UltrasoundSceneLogic:
     lastImage, placeProbe = _Of("images", ImageLogic.lastImage), _Of("images", ImageLogic.placeProbe)
     aboutBone, aboutContact = _Of("images", ImageLogic.aboutBone), _Of("images", ImageLogic.aboutContact)
     showOutline, showInSlice = _Of("images", ImageLogic.showOutline), _Of("images", ImageLogic.showInSlice)
+    showProbe = _Of("images", ImageLogic.showProbe)
     startLiveUpdate, stopLiveUpdate = _Of("live", LiveLogic.startLiveUpdate), _Of("live", LiveLogic.stopLiveUpdate)
     simulateSequence = _Of("sequences", SequenceLogic.simulateSequence)
     followPath = _Of("sequences", SequenceLogic.followPath)

@@ -55,6 +55,26 @@ def display_of(node):
     return node.GetDisplayNode()
 
 
+def put_beside(node, patient_node) -> None:
+    """Put a node into the folder of a patient's node in the subject hierarchy, if the scene has one.
+
+    A node at the top, as a volume that was loaded from a file, gets a folder of its name; one of DICOM has a study.
+    """
+    hierarchy = patient_node.GetScene().GetFirstNodeByClass("vtkMRMLSubjectHierarchyNode")
+    if hierarchy is None or not hierarchy.GetItemByDataNode(patient_node):
+        return
+    patient = hierarchy.GetItemByDataNode(patient_node)
+    folder = hierarchy.GetItemParent(patient)
+    if folder == hierarchy.GetSceneItemID():
+        folder = hierarchy.CreateFolderItem(folder, f"{patient_node.GetName()} ultrasound")
+        hierarchy.SetItemParent(patient, folder)
+    item = hierarchy.GetItemByDataNode(node)
+    if item:
+        hierarchy.SetItemParent(item, folder)
+    else:
+        hierarchy.CreateItem(folder, node)
+
+
 # ---- positions of nodes ----------------------------------------------------------------------------------------------
 
 

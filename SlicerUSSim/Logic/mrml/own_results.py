@@ -24,12 +24,12 @@ from vtkmodules.util.numpy_support import vtk_to_numpy
 from SlicerUSSim.Logic.base.errors import SimulationError, require
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.base.vtk_data import matrix_array
-from SlicerUSSim.Logic.mrml.label_nodes import node_labels, overlapping_segments
+from SlicerUSSim.Logic.mrml.label_nodes import layered_segments, node_labels
 from SlicerUSSim.Logic.mrml.nodes import named, nodes_of_class
 
 #: Role of the reference of a node to itself; saved with the scene
 OWN = "SlicerUSSim.own"
-#: Attributes of a node, saved with the scene: kind of result ("1" by earlier versions), and a hash of its data
+#: Attributes of a node, saved with the scene: kind of result, and a hash of its data
 _RESULT, _DATA = "SlicerUSSim.result", "SlicerUSSim.resultData"
 #: The same of a node with labels: a hash of voxels, place and names as Segment wrote them
 _MADE = "SlicerUSSim.made"
@@ -85,7 +85,7 @@ def may_replace_result(node) -> bool:
 def is_own(node, kind: str) -> bool:
     """Whether a node is empty, or holds a result of this kind that may be replaced."""
     if is_empty(node):
-        return kind_of_result(node) in (None, kind, "1")
+        return kind_of_result(node) in (None, kind)
     # Items of a sequence are compared when it is replaced
     may_be = is_claimed if node.IsA("vtkMRMLSequenceNode") else may_replace_result
     return kind_of_result(node) == kind and may_be(node)
@@ -174,9 +174,8 @@ def may_replace(labels_node) -> bool:
 def content_of(labels_node) -> str:
     """A hash of voxels, position and names, the same after saving and loading; "" if no voxel has a label.
 
-    Where segments overlap, the voxels of each count, since those below others are as much somebody's work. Without
-    overlaps, as Segment writes its results, the hash is that of earlier versions, which knew the topmost segment of
-    every voxel only: what these made is known again. What they made with overlaps is taken for its user's, and kept.
+    Where segments lie in several layers and may overlap, the voxels of each count, since those below others are as
+    much somebody's work. Segment writes one layer.
     """
     try:
         volume, names = node_labels(labels_node)
@@ -187,7 +186,7 @@ def content_of(labels_node) -> str:
     content = hashlib.sha256()
     _add(content, volume, sorted(names.items()))
     if labels_node.IsA("vtkMRMLSegmentationNode"):
-        for number, segment in enumerate(overlapping_segments(labels_node)):
+        for number, segment in enumerate(layered_segments(labels_node)):
             _add(content, segment, number)
     return content.hexdigest()
 

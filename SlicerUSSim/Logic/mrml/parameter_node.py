@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Generic, TypeVar, overload
 from SlicerUSSim.Logic.base.declaration import Declared, Parameter, Shown, parameter, parameters_of
 from SlicerUSSim.Logic.base.errors import SimulationError, require
 from SlicerUSSim.Logic.fitting.fit_settings import FitSettings
-from SlicerUSSim.Logic.imaging.preset import AS_ONE, Preset
+from SlicerUSSim.Logic.imaging.preset import Preset
 from SlicerUSSim.Logic.mri.lesions.seeded import LESION_TISSUES
 from SlicerUSSim.Logic.mri.segmentation_settings import MRI_CONTRASTS, SegmentationSettings, SheetSettings
 from SlicerUSSim.Logic.placement.views import VIEWS
@@ -32,11 +32,13 @@ class PanelSettings(Declared):
     """Other saved choices of the panel."""
 
     show_in_slice: bool = parameter(
-        True, "Show the image in this slice view",
+        True, "Slice view",
         "Move the slice view to the image plane and overlay the image, with every new image", shown=True,
     )  # fmt: skip
+    show_in_3d: bool = parameter(True, "3D", "Show the slice view with the image in the 3D views as well", shown=True)
+    show_probe: bool = parameter(True, "Probe", "Show a model of the probe in the 3D views", shown=True)
     second_contrast: str = parameter(
-        "none", "Its contrast", "Contrast of the second MRI, which is classified together with the first",
+        "none", "Second contrast", "Contrast of the second MRI, which is classified together with the first",
         choices=("none", *MRI_CONTRASTS), shown=True,
     )  # fmt: skip
     gel: bool = parameter(
@@ -45,19 +47,19 @@ class PanelSettings(Declared):
         shown=True,
     )  # fmt: skip
     craniotomy_mm: float | None = parameter(
-        None, "Diameter", "Diameter of the disc under the probe that is opened; none: as wide as its face needs",
+        None, "Craniotomy", "Diameter of the disc under the probe that is opened; none: as wide as its face needs",
         unit="mm", bounds=(5.0, 150.0), shown=Shown(4.0, 150.0, 1.0, none_at=4.0), can_be_none=True,
     )  # fmt: skip
     lesion_as: str = parameter(
-        BY_LOOK, "As", "What the lesion at the point is; by its look: what the MRI shows there",
+        BY_LOOK, "Lesion is", "What the lesion at the point is; by its look: what the MRI shows there",
         choices=(BY_LOOK, *LESION_TISSUES), shown=True,
     )  # fmt: skip
     lesion_size: str = parameter(
-        SMALLER, "Size", "smaller: to half of its contrast; larger: to the foot of its border, up to 3 mm farther out",
-        choices=(SMALLER, LARGER), shown=True,
+        SMALLER, "Lesion size", "smaller: to half of its contrast; larger: to the foot of its border, up to 3 mm "
+        "farther out", choices=(SMALLER, LARGER), shown=True,
     )  # fmt: skip
     view: str = parameter(
-        next(iter(VIEWS)), "View", "; ".join(f"{name}: {view.tip}" for name, view in VIEWS.items()),
+        next(iter(VIEWS)), "Standard view", "; ".join(f"{name}: {view.tip}" for name, view in VIEWS.items()),
         choices=tuple(VIEWS), shown=True,
     )  # fmt: skip
     preset_pose: bool = parameter(
@@ -142,14 +144,14 @@ class SettingsParameter(Generic[S]):
 
 def preset_texts(texts: Mapping[str, str]) -> dict[str, str]:
     """Those of a scene's {name: text} that are of its preset, see Preset.to_texts."""
-    sections = ("probe", "display", "settings", "tissues", "membrane", AS_ONE)
+    sections = ("probe", "display", "settings", "tissues", "membrane")
     return {name: text for name, text in texts.items() if text and name.split(".")[0] in sections}
 
 
 class PresetParameter:
     """Probe, display, settings and tissues; each value is a parameter, see Preset.to_texts.
 
-    A pose is not kept. The text AS_ONE of older scenes is replaced when it is read.
+    A pose is not kept.
     """
 
     def __get__(self, parameters: SceneParameters, owner: type | None = None) -> Preset:
@@ -158,8 +160,6 @@ class PresetParameter:
             texts = preset_texts(parameters.texts)
             preset = known[2] if known and known[1] == texts else Preset.from_texts(texts, "the scene's preset")
             vars(parameters)["_preset"] = version, texts, preset
-            if AS_ONE in texts:
-                self.__set__(parameters, preset)
         return vars(parameters)["_preset"][2]
 
     def __set__(self, parameters: SceneParameters, preset: Preset) -> None:

@@ -179,12 +179,7 @@ def record_scene(scene) -> SceneRecord:
     transform = parameters.probe_transform
     pose = None if transform is None else probe_pose(transform)
     others = tuple(_others(scene, parameters))
-    frozen = record_frozen(parameters.output)
-    if frozen is not None:
-        is_live = was_live(parameters.output)
-        if is_live is None:  # scenes of before do not tell a live image, which was left where it was taken, too
-            is_live = pose is not None and np.allclose(frozen.pose, pose, atol=1e-4)
-        frozen = None if is_live else frozen
+    frozen = None if parameters.output is None or was_live(parameters.output) else record_frozen(parameters.output)
     return SceneRecord(
         nodes, recorded_values(parameters), pose, sequence, others, record_taken(parameters.image_sequence),
         frozen,

@@ -140,7 +140,7 @@ class SegmentLogic:
             write_sheets(sheets_node, found.surfels, mri_node)
         sheet_notes = () if found is None else found.notes
         recognised = () if line is None else (line,)
-        self.notes = (*recognised, *result.notes, *sheet_notes, *result.table().splitlines(), *added.messages)
+        self.notes = (*recognised, *result.notes, *sheet_notes, _shares(added), *added.messages)
         self.warnings = (*result.warnings, *skipped, *added.warnings)
         return result
 
@@ -321,6 +321,13 @@ class SegmentLogic:
     def _note_laid(self, labels_node, added: Added, told: Told, before: Volume) -> None:
         version = labels_version(labels_node)
         self._laid, self._patient.lesion_place = (version, told), (version, added.centre_ras(before))
+
+
+def _shares(found: Added) -> str:
+    """How much of the labels each tissue is, the largest first."""
+    counts = np.bincount(found.labels.array.ravel(), minlength=len(found.tissue_names) + 1)[1:]
+    order = [n for n in np.argsort(-counts, kind="stable") if counts[n]]
+    return ", ".join(f"{found.tissue_names[n]} {counts[n] / counts.sum():.0%}" for n in order)
 
 
 def _in_frame_of(volume_node, node) -> Volume:

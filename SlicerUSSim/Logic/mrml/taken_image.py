@@ -25,7 +25,7 @@ from SlicerUSSim.Logic.probe.image_grid import ImageGrid
 PATIENT = "SlicerUSSim.patient"
 #: Attributes of the image's volume node: what it is of, as JSON, and whether it stays where it was taken
 _ABOUT, _FROZEN = "SlicerUSSim.image", "SlicerUSSim.frozen"
-#: Texts of _FROZEN: of an image that stays, and of a live one while its scene is saved; both were "1" before
+#: Texts of _FROZEN: of an image that stays, and of a live one while its scene is saved
 _STAYS, _WHILE_SAVED = "stays", "while saved"
 
 
@@ -113,9 +113,9 @@ def is_frozen(volume_node) -> bool:
     return volume_node.GetAttribute(_FROZEN) is not None
 
 
-def was_live(volume_node) -> bool | None:
-    """Whether a frozen image of a scene that was saved was live, and frozen while that was done only; None: unknown."""
-    return {_STAYS: False, _WHILE_SAVED: True}.get(volume_node.GetAttribute(_FROZEN))
+def was_live(volume_node) -> bool:
+    """Whether a frozen image of a scene that was saved was live, and frozen while that was done only."""
+    return volume_node.GetAttribute(_FROZEN) == _WHILE_SAVED
 
 
 def freeze(taken: TakenImage, *, while_saved: bool = False) -> None:

@@ -306,11 +306,11 @@ class LinearProbe(Probe):
     depth_mm: float = _depth_mm()
     steering_deg: float = parameter(
         0.0, "Steering", "Angle of all scan lines to the normal of the face, positive to the right", unit="°",
-        bounds=(-45, 45), shown=Shown(-30, 30), kw_only=True,
+        bounds=(-45, 45), kw_only=True,
     )  # fmt: skip
     trapezoid_deg: float = parameter(
         0.0, "Trapezoid", "Angle of the outermost scan lines to the normal of the face, by which the field opens to "
-        "both sides; 0: parallel lines", unit="°", bounds=(0, 45), shown=Shown(0, 30), kw_only=True,
+        "both sides; 0: parallel lines", unit="°", bounds=(0, 45), kw_only=True,
     )  # fmt: skip
 
     def __post_init__(self) -> None:

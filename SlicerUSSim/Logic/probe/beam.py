@@ -68,15 +68,14 @@ class Beam(Declared):
     )  # fmt: skip
     focal_zones: int = parameter(
         3, "Focal zones", "Number of foci with zones, evenly over twice the focal depth", bounds=(2, MOST_ZONES),
-        shown=Shown(2, MOST_ZONES), note="Their f-number is at least that of reception",
+        note="Their f-number is at least that of reception",
     )  # fmt: skip
     transmit_angles: int = parameter(
         5, "Angles", "Number of waves that are compounded with angles; 1: one wave, without focus", bounds=(1, 255),
-        shown=Shown(1, 99),
     )  # fmt: skip
     largest_angle_deg: float = parameter(
         10.0, "Largest angle", "Of these waves to the axis; as large as the aperture they replace is seen from a depth",
-        unit="°", bounds=(0.1, 60), shown=Shown(1, 45),
+        unit="°", bounds=(0.1, 60),
     )  # fmt: skip
     aperture_mm: float = parameter(
         12.0, "Aperture", "Lateral size of the fully open aperture", unit="mm", bounds=(0.5, 200)
