@@ -74,9 +74,8 @@ class USSim(ScriptedLoadableModule):
         ).format(home=_HOME)
         self.parent.acknowledgementText = _(
             "Implements Salehi et al., Patient-specific 3D Ultrasound Simulation Based on Convolutional Ray-tracing "
-            "and Appearance Optimization, MICCAI 2015. The sample MRI is the ICBM 152 2009a template (© 1993-2009 "
-            "Louis Collins, McConnell Brain Imaging Centre, Montreal Neurological Institute), as distributed "
-            "with nilearn."
+            "and Appearance Optimization, MICCAI 2015. The sample MRI and the brain atlas are the ICBM 152 2009a template (© 1993-2009 "
+            "Louis Collins, McConnell Brain Imaging Centre, Montreal Neurological Institute)."
         )
         slicer.app.connect("startupCompleted()", registerSampleData)
 

@@ -1,6 +1,5 @@
 """The brain in an MRI: recognition, extraction, kept masks, DICOM series."""
 
-import importlib.util
 import os
 import sys
 from pathlib import Path
@@ -25,8 +24,6 @@ from SlicerUSSim.Logic.mri.no_data import ends_at_edge, no_data, without_blank
 from SlicerUSSim.Logic.mri.recognition import recognise
 from SlicerUSSim.Logic.mri.samples import head_mri
 from tests.conftest import SHARED, needs_shared
-
-needs_nilearn = pytest.mark.skipif(importlib.util.find_spec("nilearn") is None, reason="nilearn is not installed")
 
 COLIN = Path("/usr/share/mricron/templates/ch2.nii.gz")
 COLIN_BRAIN = COLIN.with_name("ch2bet.nii.gz")
@@ -130,7 +127,6 @@ def test_what_is_no_mri_is_reported(change, message):
 
 
 @pytest.mark.long
-@needs_nilearn
 def test_voxels_without_data_are_left_out_with_a_warning(head, found):
     (mri, _), value = head, -3.0
     inside = found.result.mask.array > 0
@@ -154,7 +150,6 @@ def test_a_blank_within_the_image_has_data():
     assert blank[radius > 1.1].all() and not blank[radius < 0.9].any()
 
 
-@needs_nilearn
 @pytest.mark.slow
 def test_a_turned_head_is_used_with_a_warning(head):
     turned = Volume(np.ascontiguousarray(np.swapaxes(head[0].array, 0, 1)), head[0].ijk_to_ras)
@@ -172,7 +167,6 @@ def test_none_takes_everything_brighter_than_the_background():
 # ---- extraction ------------------------------------------------------------------------------------------------------
 
 
-@needs_nilearn
 def test_the_atlas_finds_the_brain_of_a_nodding_head(head, found):
     result, shares = found.result, found.shares
     assert result.method == "atlas"
@@ -181,7 +175,6 @@ def test_the_atlas_finds_the_brain_of_a_nodding_head(head, found):
     assert shares == sorted(shares) and shares[-1] == 1.0 and len(shares) > 20
 
 
-@needs_nilearn
 def test_a_cancelled_alignment_stops(head):
     def progress(share):
         if share > 0.03:
@@ -203,7 +196,6 @@ def on_other_voxels(mri, inside, spacing):
 
 
 @pytest.mark.slow
-@needs_nilearn
 def test_the_atlas_finds_the_brain_in_a_stack_of_thick_sagittal_slices(head):
     mri, inside = on_other_voxels(*head, (5.0, 1.2, 1.2))
     result = find_brain(mri, "atlas")
@@ -268,14 +260,6 @@ def test_a_program_that_fails_is_named_with_its_last_line(tmp_path, monkeypatch)
         extractors.robex(head_mri(4.0), lambda share: None)
 
 
-def test_a_head_without_any_program_gets_the_remedy(monkeypatch):
-    monkeypatch.setattr(brain_module, "mni152", lambda: None)
-    monkeypatch.setattr(extractors, "robex_folder", lambda: None)
-    monkeypatch.setattr(extractors, "has_deepbet", lambda: False)
-    with pytest.raises(SimulationError, match=r"whole head.*SlicerUSSim\[head\]"):
-        brain_module._candidates("auto")
-
-
 # ---- kept masks ------------------------------------------------------------------------------------------------------
 
 
@@ -286,7 +270,6 @@ def test_the_mask_has_the_name_of_its_mri(tmp_path, name, mask):
     assert mask_beside(tmp_path / name) == tmp_path / mask
 
 
-@needs_nilearn
 def test_a_kept_mask_is_read_instead_of_extracted_again(head, found):
     result, place = found.result, found.place
     again = find_brain(head[0], keep_at=place)
@@ -304,7 +287,6 @@ def save_edited(place, array, path):
     sitk.WriteImage(edited, str(path))
 
 
-@needs_nilearn
 @pytest.mark.slow
 def test_an_edited_kept_mask_is_used_and_reported_and_never_overwritten(head, found, tmp_path, own_cache):
     array = found.result.mask.array.copy()
@@ -401,7 +383,6 @@ def test_several_labels_in_a_mask_are_reported(head):
     assert "the mask holds 2 values (1, 2), expected one; the brain is taken where it is not 0" in line
 
 
-@needs_nilearn
 def test_a_vertex_outside_the_image_is_reported_and_a_tight_image_is_not(head):
     mri, brain = head
     filled = np.argwhere(brain)
@@ -565,7 +546,6 @@ def test_images_of_two_patients_with_one_series_number_are_refused(tmp_path):
 
 
 @pytest.mark.slow
-@needs_nilearn
 @pytest.mark.skipif(not COLIN.exists(), reason="Debian's mricron-data is not installed")
 def test_the_atlas_finds_colin_as_his_own_mask_does():
     mri = Volume.read(COLIN)
@@ -576,7 +556,6 @@ def test_the_atlas_finds_colin_as_his_own_mask_does():
 
 @pytest.mark.long
 @needs_shared
-@needs_nilearn
 def test_the_mask_of_a_t1_has_the_gyri_of_the_vertex_that_its_t2_shows():
     """In the T2 tissue is dark between bright CSF and dark bone; both images lie in one frame."""
     t1, t2 = (Volume.read(SHARED / f"remind022/{name}.nii.gz") for name in ("t1_contrast", "t2"))
@@ -596,7 +575,6 @@ def test_the_mask_of_a_t1_has_the_gyri_of_the_vertex_that_its_t2_shows():
     assert millilitres < 1.5  # 3.9 ml with one border of tissue everywhere
 
 
-@needs_nilearn
 def test_the_alignment_finds_the_size_and_the_nod_of_the_brain(found):
     linear = found.alignment.template_to_ras[:3, :3]
     assert np.cbrt(np.linalg.det(linear)) == pytest.approx(0.93, abs=0.02)

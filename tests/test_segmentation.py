@@ -298,10 +298,7 @@ def test_the_field_found_with_the_tissues_is_the_one_that_was_applied():
     k, j, i = (np.linspace(-1, 1, n) for n in head.array.shape)
     log = 0.25 * k[:, None, None] * j[:, None] + 0.18 * i + 0.15 * (i**2 - 0.4)
     shaded = np.where(inside, head.array * np.exp(log), 0).astype(np.float32)
-    atlas = mni152()
-    if atlas is None:
-        pytest.skip("needs nilearn's MNI152")
-    prior = register_atlas(head, inside, atlas).prior(head, inside)
+    prior = register_atlas(head, inside, mni152()).prior(head, inside)
     found = estimate_field(shaded, inside, head.spacing_mm, "t1", prior)
     tissue = inside & (head.array > 60)
     left = np.log(found.factor[tissue]) - log[tissue]
@@ -427,8 +424,6 @@ def test_a_registration_is_the_same_every_time():
     from SlicerUSSim.Logic.mri import atlas_registration
 
     atlas, head = mni152(), head_mri(4.0)
-    if atlas is None:
-        pytest.skip("needs nilearn's MNI152")
     found = set()
     for _ in range(2):
         atlas_registration._known.clear()
@@ -443,8 +438,8 @@ def test_a_fifth_of_the_field_of_one_persons_phantom_is_left_at_most():
     """Colin27, whose grey and white matter differ from place to place."""
     maps = tissue_maps("colin27")
     atlas = mni152()
-    if maps is None or atlas is None:
-        pytest.skip("needs Colin27 and nilearn's MNI152")
+    if maps is None:
+        pytest.skip("needs Colin27")
     case = phantom(maps, noise=0.03, bias=0.2)
     inside = case.mask.array > 0
     fit = register_atlas(case.mri, inside, atlas)

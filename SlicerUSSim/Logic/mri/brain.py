@@ -10,11 +10,9 @@ from time import perf_counter
 import numpy as np
 
 from SlicerUSSim.Logic.base.declaration import parameter_of
-from SlicerUSSim.Logic.base.errors import Cancelled, SimulationError, require
+from SlicerUSSim.Logic.base.errors import Cancelled, SimulationError, require, required
 from SlicerUSSim.Logic.base.volume import LARGEST_MM, Volume
 from SlicerUSSim.Logic.mri import extractors
-from SlicerUSSim.Logic.mri.alignment import Alignment
-from SlicerUSSim.Logic.mri.atlas import mni152
 from SlicerUSSim.Logic.mri.extractors import Report
 from SlicerUSSim.Logic.mri.given_mask import checked_mask, label_doubts, mask_doubts, volume_warnings
 from SlicerUSSim.Logic.mri.kept_mask import keep, read_kept
@@ -94,7 +92,8 @@ def find_brain(
         if method != "auto":
             message += f"; {_NAMES[method]} is not asked, as there is no skull to strip"
         return BrainMask(mask, "stripped", message, volume_warnings(millilitres), perf_counter() - start)
-    found = _extracted(mri, alignment, method, lambda share: report(0.6 + 0.35 * share))
+    expected = required(alignment, "a head has no fitted atlas").brain_on(mri)
+    found = _extracted(mri, expected, method, lambda share: report(0.6 + 0.35 * share))
     inside, blank = without_blank(mri, found.inside)
     millilitres = _millilitres(inside, mri)
     warnings = (
@@ -104,9 +103,10 @@ def find_brain(
         *ends_at_edge(mri, inside),
     )
     seconds = perf_counter() - start
-    message = f"whole head: brain extracted by {_NAMES[found.method]} in {seconds:.0f} s, {millilitres:.0f} ml"
-    if found.overlap is not None:
-        message += f", overlap with the registered atlas {found.overlap:.2f}"
+    message = (
+        f"whole head: brain extracted by {_NAMES[found.method]} in {seconds:.0f} s, {millilitres:.0f} ml, overlap with "
+        f"the registered atlas {_dice(found.inside, expected < 0.0):.2f}"
+    )
     mask = mri.with_array(inside.astype(np.uint8)).along(given)
     if keep_at is not None:
         note = keep(keep_at, given, mask.array, found.method, seconds, warnings)
@@ -142,15 +142,15 @@ def left_out(mask: Volume, lesion: Volume) -> float:
 class _Extracted:
     inside: np.ndarray
     method: str
-    #: Dice of the mask with the aligned template's, 0 to 1; None if there is no alignment
-    overlap: float | None
     warnings: tuple[str, ...] = ()
 
 
-def _extracted(mri: Volume, alignment: Alignment | None, method: str, report: Report) -> _Extracted:
-    """The brain by `method`, or by the first of the available ones whose result has the volume of one."""
+def _extracted(mri: Volume, expected: np.ndarray, method: str, report: Report) -> _Extracted:
+    """The brain by `method`, or by the first of the available ones whose result has the volume of one.
+
+    `expected` (k, j, i) is the distance to the aligned template's brain.
+    """
     failures: list[str] = []
-    expected = None if alignment is None else alignment.brain_on(mri)
     for name in _candidates(method):
         try:
             inside = _by(name, mri, expected, report)
@@ -165,8 +165,7 @@ def _extracted(mri: Volume, alignment: Alignment | None, method: str, report: Re
             failures.append(str(error))
             _log.warning("%s", error)
             continue
-        overlap = None if expected is None else _dice(inside, expected < 0.0)
-        return _Extracted(inside, name, overlap, tuple(failures))
+        return _Extracted(inside, name, tuple(failures))
     raise SimulationError(f"no brain was found in this head: {'; '.join(failures)}; give a brain mask (--mask)")
 
 
@@ -187,28 +186,13 @@ def _candidates(method: str) -> list[str]:
     """Methods to try, in the order of their measured quality (docs/brain.md)."""
     if method != "auto":
         return [method]
-    available = {
-        "atlas": mni152() is not None,
-        "deepbet": extractors.has_deepbet(),
-        "robex": extractors.robex_folder() is not None,
-    }
-    found = [name for name, is_available in available.items() if is_available]
-    require(
-        bool(found),
-        "image shows a whole head, and no program for brain extraction is installed; install one with: "
-        'pip install "SlicerUSSim[head]", or give a brain mask (--mask)',
-    )
-    return found
+    available = {"deepbet": extractors.has_deepbet(), "robex": extractors.robex_folder() is not None}
+    return ["atlas", *(name for name, is_available in available.items() if is_available)]
 
 
-def _by(name: str, mri: Volume, expected: np.ndarray | None, report: Report) -> np.ndarray:
-    """(k, j, i) the brain by one method, with its border moved to the dark valley outside the cortex.
-
-    `expected` (k, j, i) is the distance to the aligned template's brain, which the atlas needs.
-    """
+def _by(name: str, mri: Volume, expected: np.ndarray, report: Report) -> np.ndarray:
+    """(k, j, i) the brain by one method, with its border moved to the dark valley outside the cortex."""
     if name == "atlas":
-        if expected is None:
-            raise SimulationError("the brain atlas needs nilearn; install it with: pip install nilearn")
         return refined(mri, expected, core_mm=8.0, reach_mm=12.0, keep_mm=3.0)
     program = extractors.robex if name == "robex" else extractors.deepbet
     inside = program(mri, lambda share: report(0.9 * share))

@@ -11,7 +11,6 @@ from scipy import ndimage
 from SlicerUSSim.Logic.base.errors import SimulationError, require, require_kind
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.mri.alignment import Alignment, align_template
-from SlicerUSSim.Logic.mri.atlas import mni152
 from SlicerUSSim.Logic.mri.atlas_registration import WHOLE_BRAIN_ML
 from SlicerUSSim.Logic.mri.coarse import largest_component
 from SlicerUSSim.Logic.mri.ct_unit import looks_like_ct
@@ -39,7 +38,7 @@ def recognise(
     check_intensities(mri)
     require_no_ct(mri)
     stripped = stripped_brain(mri)
-    if stripped is not None or mni152() is None:
+    if stripped is not None:
         return stripped, None
     alignment = align_template(mri, progress)
     share = alignment.explained
