@@ -74,8 +74,8 @@ class USSim(ScriptedLoadableModule):
         ).format(home=_HOME)
         self.parent.acknowledgementText = _(
             "Implements Salehi et al., Patient-specific 3D Ultrasound Simulation Based on Convolutional Ray-tracing "
-            "and Appearance Optimization, MICCAI 2015. The sample MRI and the brain atlas are the ICBM 152 2009a template (© 1993-2009 "
-            "Louis Collins, McConnell Brain Imaging Centre, Montreal Neurological Institute)."
+            "and Appearance Optimization, MICCAI 2015. The sample MRI and the brain atlas are the ICBM 152 2009a "
+            "template (© 1993-2009 Louis Collins, McConnell Brain Imaging Centre, Montreal Neurological Institute)."
         )
         slicer.app.connect("startupCompleted()", registerSampleData)
 
@@ -187,6 +187,7 @@ class USSimWidget(ScriptedLoadableModuleWidget, VTKObservationMixin):
             self.addObserver(scene, event, self.onSceneStartChange)
         for event in (scene.EndCloseEvent, scene.EndImportEvent):
             self.addObserver(scene, event, self.onSceneEndChange)
+        self.addObserver(scene, scene.NodeAddedEvent, self.onNodeAdded)
         self.addObserver(scene, scene.NodeAboutToBeRemovedEvent, self.onNodeAboutToBeRemoved, priority=1000.0)
         self.addObserver(scene, scene.NodeRemovedEvent, self.onNodeRemoved)
 
@@ -213,6 +214,12 @@ class USSimWidget(ScriptedLoadableModuleWidget, VTKObservationMixin):
         """Called just after the scene was closed or imported; connects the panel to it."""
         if self.parent.isEntered:
             self.initializeParameterNode()
+
+    @vtk.calldata_type(vtk.VTK_OBJECT)
+    def onNodeAdded(self, caller, event, node) -> None:
+        """Called after a node was added to the scene."""
+        if self.panel is not None and self.panel.isConnected:
+            self.panel.presenter.nodeAdded(node)
 
     @vtk.calldata_type(vtk.VTK_OBJECT)
     def onNodeAboutToBeRemoved(self, caller, event, node) -> None:

@@ -151,7 +151,7 @@ def test_start_up_imports_nothing_that_takes_time_or_may_be_missing():
         from importlib import metadata
         os.environ["QT_QPA_PLATFORM"] = "offscreen"
         missing = ("pyopencl", "nlopt", "skimage", "platformdirs", "PIL", "tqdm", "click", "matplotlib", "nrrd",
-                  , "nibabel")
+                   "nibabel")
         class Finder:
             def find_spec(self, name, path=None, target=None):
                 if name.split(".")[0] in missing:
@@ -583,6 +583,11 @@ def test_a_sequence_is_simulated_and_its_browser_plays_it(session):
     images = session.scene.GetFirstNodeByName("sweep ultrasound")
     assert images.GetNumberOfDataNodes() == 3 and browser.IsSynchronizedSequenceNode(images, True)
     assert session.ui.statusLabel.text() == "3 images in 'sweep ultrasound'"
+    # It is shown, as bright as live images are.
+    shown, composite = browser.GetProxyNode(images), session.scene.GetFirstNodeByClass("vtkMRMLSliceCompositeNode")
+    display = shown.GetDisplayNode()
+    assert (display.GetWindow(), display.GetLevel(), display.GetAutoWindowLevel()) == (255, 127.5, 0)
+    assert composite.GetForegroundVolumeID() == shown.GetID()
     # The next ones take their place; of other transforms they are others.
     session.ui.simulateSequenceButton.click()
     assert session.parameters.image_sequence is images and not session.app.errors
@@ -719,6 +724,39 @@ def test_closing_the_scene_and_leaving_the_module_is_survived(session):
     session.ui.segmentButton.click()
     assert not session.app.errors
     assert session.parameters.labels is not None
+
+
+def test_closing_the_scene_forgets_the_patient(session):
+    """Nodes of the next scene have the IDs of those before: a fit to patient A set the gain of patient B."""
+    with_real_image(session)
+    ui = session.ui
+    ui.fitButton.click()
+    session.parameters.labels, fitted = None, session.parameters.labels
+    assert not ui.applyFitButton.isEnabled() and "Head tissues" in ui.applyFitButton.toolTip()  # two in one scene
+    session.parameters.labels = fitted
+    ui.liveCheckBox.setChecked(True)
+    ui.liveCheckBox.setChecked(False)
+    assert ui.applyFitButton.isEnabled() and "Head" in ui.notesLabel.text() and "FROZEN" in ui.statusLabel.text()
+    session.scene.Clear(0)
+    session.process()
+    assert not ui.notesLabel.text() and not ui.fitLabel.text() and not ui.statusLabel.text()
+    assert session.logic.taken is None and not session.logic.notes
+    session.head()
+    session.widget.enter()
+    session.process()
+    for button in (ui.applyFitButton, ui.revertFitButton, ui.undoSegmentButton, ui.growAtPointButton):
+        assert not button.isEnabled(), button.objectName()
+    session.panel.presenter.fits.apply()
+    assert session.app.errors == ["Fit to real images first"] and session.logic.preset.display.gain_db == 0.0
+
+
+def test_a_volume_that_is_loaded_is_the_mri_if_none_is(session):
+    head = session.head()
+    session.process()
+    assert session.parameters.mri is head and session.ui.mriSelector.currentNode() is head
+    session.head()
+    session.process()
+    assert session.parameters.mri is head
 
 
 def test_reloading_the_module_brings_new_code(module):

@@ -100,7 +100,7 @@ class TissueMaps:
 
 
 def tissue_maps(name: str) -> TissueMaps | None:
-    """The maps of a brain: "mni152" or "colin27"; None if Debian's mricron-data, which has the latter, is not installed.
+    """The maps of a brain: "mni152" or "colin27"; None without Debian's mricron-data, which has the latter.
 
     mni152: the published maps of the MNI152 2009a template (Fonov et al., NeuroImage 54(1), 2011).
 

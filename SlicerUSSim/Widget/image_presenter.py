@@ -107,13 +107,20 @@ class ImagePresenter:
             own = (None, transforms_node.GetID())
             if images_node is not None and images_node.GetNodeReferenceID(MADE_FROM) not in own:
                 images_node = None  # those of other transforms stay
-            with panel.made(images_node, "Sequence", f"{transforms_node.GetName()} ultrasound") as images:
-                browser = self._browser_of(transforms_node)
+            name = transforms_node.GetName()
+            with (
+                panel.made(images_node, "Sequence", f"{name} ultrasound") as images,
+                panel.made(self._browser_of(transforms_node), "SequenceBrowser", f"{name} browser") as browser,
+            ):
+                browser.AddSynchronizedSequenceNode(transforms_node)
                 count = panel.logic.simulateSequence(
                     parameters.labels, transforms_node, images, browser_node=browser, progress=progress
                 )
             images.SetNodeReferenceID(MADE_FROM, transforms_node.GetID())
             parameters.image_sequence = images  # in place of which the next ones come
+            shown, probe = browser.GetProxyNode(images), browser.GetProxyNode(transforms_node)
+            if panel.view.sliceNode() is not None and shown is not None:
+                panel.logic.showInSlice(panel.view.sliceNode(), shown, probe)
             panel.view.showStatus(f"{count} images in {images.GetName()!r}")
 
     def _browser_of(self, sequence_node: Any) -> Any:

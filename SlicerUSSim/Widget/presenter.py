@@ -6,9 +6,11 @@ page in the browser, and the view of the tests. Errors caused by the user are no
 
 from __future__ import annotations
 
+from typing import Any
+
 from SlicerUSSim.Logic.mrml.fitting_nodes import fits
 from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic
-from SlicerUSSim.Logic.mrml.nodes import nodes_of_class
+from SlicerUSSim.Logic.mrml.nodes import nodes_of_class, observe
 from SlicerUSSim.Widget.fit_presenter import FitPresenter
 from SlicerUSSim.Widget.image_presenter import ImagePresenter
 from SlicerUSSim.Widget.interface import PanelHost, PanelView
@@ -39,6 +41,7 @@ class PanelPresenter(PanelHost):
         self.values = ValuePresenter(self, self.placing)
         self.images = ImagePresenter(self, self.notes, self.placing)
         self.fits = FitPresenter(self, self.values, self.tissues)
+        observe(logic.scene, logic.scene.EndCloseEvent, self._closed)
 
     def chooseDefaultNodes(self) -> None:
         """Select the first volume of the scene as the MRI, if none is selected."""
@@ -49,6 +52,11 @@ class PanelPresenter(PanelHost):
             if fits("mri", node) and node not in (parameters.output, parameters.real):
                 parameters.mri = node
                 return
+
+    def nodeAdded(self, node: Any) -> None:
+        """Called after a node was added to the scene: a volume that is loaded becomes the MRI, if none is selected."""
+        if node.IsA("vtkMRMLScalarVolumeNode") and self.parameters.mri is None:
+            self.view.schedule(self.chooseDefaultNodes)  # when it has its voxels, and the role for which it was made
 
     def parametersChanged(self) -> None:
         """Update the view and the nodes of live update after a change of the scene's parameters or slice view."""
@@ -61,4 +69,10 @@ class PanelPresenter(PanelHost):
         self.view.showStatus("")
         self.fits.forget()
         self.segmenting.forget()
+        self.lesions.forget()
         self.notes.set()
+
+    def _closed(self) -> None:
+        """Called after the scene was closed."""
+        self.forgetPatient()
+        self.view.refresh()

@@ -5,7 +5,10 @@ Uses only nodes, and nothing of the `slicer` namespace.
 
 from __future__ import annotations
 
+import weakref
+from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from vtkmodules.vtkCommonMath import vtkMatrix4x4
@@ -46,6 +49,20 @@ def node_called(scene, kind: str, name: str):
     """The first vtkMRML`kind`Node with this name, or a new one."""
     known = (node for node in nodes_of_class(scene, f"vtkMRML{kind}Node") if node.GetName() == name)
     return next(known, None) or scene.AddNewNodeByClass(f"vtkMRML{kind}Node", name)
+
+
+def observe(subject: Any, event: Any, method: Callable, call_data: str | None = None, priority: float = 0.0) -> int:
+    """Call a bound method at an event until its object is gone, which the observer does not keep alive; its tag."""
+    weak = weakref.WeakMethod(method)
+
+    def callback(_subject, _event, *data):
+        alive = weak()
+        if alive is not None:
+            alive(*data)
+
+    if call_data is not None:
+        setattr(callback, "CallDataType", call_data)  # noqa: B010, where VTK looks for it
+    return subject.AddObserver(event, callback, priority)
 
 
 def display_of(node):
@@ -153,7 +170,9 @@ def write_slice(volume_node, in_probe: Volume, transform_node=None) -> None:
     _, rows, columns = in_probe.array.shape
     if image is None or image.GetDimensions() != (columns, rows, 1) or image.GetScalarTypeAsString() != "unsigned char":
         write_volume(volume_node, in_probe)
-        _show_all_greys(volume_node)
+        display = None if volume_node.GetScene() is None else display_of(volume_node)  # not of an item of a sequence
+        if display is not None and display.GetAutoWindowLevel():  # and not after the user has chosen a window
+            show_all_greys(volume_node)
     else:
         if not np.array_equal(ijk_to_ras(volume_node), in_probe.ijk_to_ras):
             volume_node.SetIJKToRASMatrix(vtk_matrix(in_probe.ijk_to_ras))
@@ -164,12 +183,10 @@ def write_slice(volume_node, in_probe: Volume, transform_node=None) -> None:
     volume_node.EndModify(was_modifying)
 
 
-def _show_all_greys(volume_node) -> None:
+def show_all_greys(volume_node) -> None:
     """Black at 0 and white at 255, as on a scanner; an automatic window would change the brightness between frames."""
-    if volume_node.GetScene() is None:  # an item of a sequence
-        return
     display = display_of(volume_node)
-    if display is not None and display.GetAutoWindowLevel():
+    if display is not None:
         display.SetAutoWindowLevel(False)
         display.SetWindowLevelMinMax(0, 255)
 

@@ -12,7 +12,7 @@ from SlicerUSSim.Logic.base.errors import require, required, warn_again
 from SlicerUSSim.Logic.base.transforms import check_rigid
 from SlicerUSSim.Logic.mrml.image_logic import ImageLogic
 from SlicerUSSim.Logic.mrml.live import LiveLogic
-from SlicerUSSim.Logic.mrml.nodes import named, node_to_world, require_node
+from SlicerUSSim.Logic.mrml.nodes import named, node_to_world, require_node, show_all_greys
 from SlicerUSSim.Logic.mrml.own_results import require_result
 from SlicerUSSim.Logic.mrml.patient_logic import PatientLogic
 from SlicerUSSim.Logic.mrml.sequence_nodes import SequenceIndex
@@ -75,9 +75,12 @@ class SequenceLogic:
         same = {image.anatomy for image in images}
         self._last = (images_node.GetID(), images[0].anatomy if len(same) == 1 else None)
         if browser_node is not None:
-            if not browser_node.IsSynchronizedSequenceNode(images_node, True):
+            is_new = not browser_node.IsSynchronizedSequenceNode(images_node, True)
+            if is_new:
                 browser_node.AddSynchronizedSequenceNode(images_node)
             shown = browser_node.GetProxyNode(images_node)
+            if shown is not None and is_new:
+                show_all_greys(shown)
             if shown is not None and proxy is not None:
                 shown.SetAndObserveTransformNodeID(proxy.GetID())
         return count
