@@ -31,6 +31,7 @@ if sys.version_info < (3, 10):  # noqa: UP036, older versions of Slicer can also
 
 _HERE = Path(__file__).absolute().parent
 _RESOURCES = _HERE / "Resources"
+_REQUIREMENTS = _RESOURCES / "USSim" / "requirements.txt"
 _HOME = "https://github.com/SlicerUSSim/SlicerUSSim"
 
 
@@ -99,12 +100,11 @@ def registerSampleData() -> None:
 def ensurePackages() -> None:
     """Install the packages that Slicer's Python lacks, after the user has confirmed; on first use, not at start-up.
 
-    Raises SimulationError if packages are still missing, or if Slicer must be restarted after the installation.
+    Raises SimulationError if packages are still missing.
     """
-    from SlicerUSSim.Widget.packages import ensure_packages, offer_opencl_runtime
+    from SlicerUSSim.Widget.packages import ensure_packages
 
-    ensure_packages(_RESOURCES / "USSim" / "requirements.txt")
-    offer_opencl_runtime()
+    ensure_packages(_REQUIREMENTS)
 
 
 @functools.cache
@@ -146,6 +146,7 @@ class USSimWidget(ScriptedLoadableModuleWidget, VTKObservationMixin):
         VTKObservationMixin.__init__(self)
         self.logic = None
         self.panel = None
+        self.devices = None
         self._parameterNode = None
 
     def setup(self) -> None:
@@ -173,14 +174,22 @@ class USSimWidget(ScriptedLoadableModuleWidget, VTKObservationMixin):
 
     def showPanel(self) -> None:
         """Create the panel. Raises ImportError if a package is missing."""
+        from SlicerUSSim.Widget.device_bar import DeviceBar
+        from SlicerUSSim.Widget.packages import are_installed
         from SlicerUSSim.Widget.panel import Panel
 
         self.logic = USSimLogic()
         self.initializeParameterNode()
         widget = qt.QWidget()
         self.layout.addWidget(widget)
-        self.panel = Panel(qt.QVBoxLayout(widget), self.logic.ultrasound, ensurePackages)
+        column = qt.QVBoxLayout(widget)
+        above = qt.QVBoxLayout()
+        column.addLayout(above)
+        self.panel = Panel(column, self.logic.ultrasound, self.prepare)
         self.ui = self.panel.ui
+        self.devices = DeviceBar(above, self.panel.presenter)
+        if are_installed(_REQUIREMENTS):
+            self.devices.begin()
         self.panel.presenter.chooseDefaultNodes()
         scene = slicer.mrmlScene
         for event in (scene.StartCloseEvent, scene.StartImportEvent):
@@ -191,8 +200,15 @@ class USSimWidget(ScriptedLoadableModuleWidget, VTKObservationMixin):
         self.addObserver(scene, scene.NodeAboutToBeRemovedEvent, self.onNodeAboutToBeRemoved, priority=1000.0)
         self.addObserver(scene, scene.NodeRemovedEvent, self.onNodeRemoved)
 
+    def prepare(self) -> None:
+        """Called before actions that need packages. Raises SimulationError if any are missing afterwards."""
+        ensurePackages()
+        self.devices.begin()
+
     def cleanup(self) -> None:
         """Called when the application closes or the module is reloaded."""
+        if self.devices is not None:
+            self.devices.stop()
         if self.logic is not None:
             self.logic.ultrasound.stopLiveUpdate()
         self.setParameterNode(None)

@@ -43,6 +43,8 @@ def module():
         del sys.modules[name]
     loaded = load_source_as_module("USSim", MODULE_FILE)
     loaded.app = app
+    trials = importlib.import_module("SlicerUSSim.Logic.imaging.device_trials")
+    trials.DeviceTrials = tried(trials.TriedDevice("0:0", "a processor", "some platform", "CPU", 20.0))
     yield loaded
     logging.getLogger("SlicerUSSim").setLevel(logging.NOTSET)
     for name in set(sys.modules) - set(before):
@@ -58,6 +60,28 @@ def module():
 def test_slicers_log_gets_choices_once_and_nothing_for_each_live_image(module):
     ours = logging.getLogger("SlicerUSSim")
     assert ours.level == logging.INFO and not ours.handlers and ours.propagate
+
+
+def tried(*devices, error: str = "", waits: int = 0):
+    """DeviceTrials in place of the ones in child processes, with these results after some calls of progress."""
+
+    class Tried:
+        used = property(lambda self: devices[0] if devices and self.count >= waits else None)
+        isDone = property(lambda self: self.count >= waits)
+
+        def __init__(self, known, chosen) -> None:
+            self.known, self.chosen, self.count = known, chosen, 0
+            self.devices, self.error = sorted(devices, key=lambda device: device.key != chosen), error
+
+        def wait(self, progress) -> None:
+            while not self.isDone:
+                self.count += 1
+                progress(self.count / waits)
+
+        def stop(self) -> None:
+            pass
+
+    return Tried
 
 
 class Session:
@@ -854,33 +878,77 @@ def test_a_slicer_that_has_pip_ensure_is_left_to_it(bare_slicer, simulation_erro
     assert requester == "SlicerUSSim" and requirements == ["pyopencl>=2023.1"] and "numpy==2.0.2" in constraints
 
 
-def test_on_windows_without_a_device_intels_runtime_is_offered(bare_slicer, simulation_error, monkeypatch):
-    """Untested on Windows: this tests only the questions and actions of the module."""
-    app = bare_slicer.app
-    app.installed = ["pyopencl"]
-    absent, known = ["intel-opencl-rt"], importlib.metadata.version
+@pytest.fixture
+def panel_with(module, monkeypatch):
+    """The panel on a computer with these devices."""
+    sessions = []
 
-    def version(name: str) -> str:
-        if name in absent:
-            raise importlib.metadata.PackageNotFoundError(name)
-        return known(name)
+    def opened(*devices, **options) -> Session:
+        trials = tried(*devices, **options)
+        monkeypatch.setattr(importlib.import_module("SlicerUSSim.Widget.device_bar"), "DeviceTrials", trials)
+        sessions.append(Session(module))
+        return sessions[-1]
 
-    monkeypatch.setattr(importlib.metadata, "version", version)
-    monkeypatch.setattr(importlib.import_module("SlicerUSSim.Logic.opencl.devices"), "list_devices", list)
-    bare_slicer.ensure()
-    assert not app.questions  # not where Linux is
-    monkeypatch.setattr(sys, "platform", "win32")
-    app.answer = False
-    bare_slicer.ensure()  # the work goes on, and says that there is no device
-    assert "intel-opencl-rt" in app.questions[0] and app.installed == ["pyopencl"]
-    app.answer = True
-    with pytest.raises(simulation_error(), match="restart Slicer"):
-        bare_slicer.ensure()
-    assert app.installed == ["pyopencl", "intel-opencl-rt"] and "numpy==2.0.2" in app.constraints
-    app.questions.clear()
-    absent.clear()  # installed, and no device all the same
-    bare_slicer.ensure()
-    assert not app.questions
+    yield opened
+    for session in sessions:
+        session.close()
+
+
+@pytest.mark.parametrize(
+    ("system", "machine", "offered"),
+    [
+        ("linux", "x86_64", ["Install Intel's runtime for processors (1000 MB)"]),  # PoCL is installed here
+        ("win32", "AMD64", ["Install Intel's runtime for processors (120 MB)"]),
+        ("linux", "aarch64", []),
+        ("darwin", "arm64", []),
+    ],
+)
+def test_without_a_device_the_panel_says_so_and_offers_a_runtime(panel_with, monkeypatch, system, machine, offered):
+    """Untested on Windows: this tests only what is offered."""
+    monkeypatch.setattr(sys, "platform", system)
+    monkeypatch.setattr("platform.machine", lambda: machine)
+    monkeypatch.setattr(slicer.app, "installed", [])
+    monkeypatch.setitem(sys.modules, "pyopencl", types.ModuleType("pyopencl"))  # loaded without the runtime
+    session = panel_with(error="no OpenCL device found; install one")
+    bar = session.widget.devices
+    assert bar.label.text() == "No OpenCL device found; install one" and not bar.devices.isVisibleTo(session.parent)
+    buttons = [button for button in bar.buttons.values() if button.isVisibleTo(session.parent)]
+    assert [button.text() for button in buttons] == offered
+    for button in buttons:
+        button.click()
+        assert session.app.errors.pop() == "Intel's runtime is installed; restart Slicer to use it"
+        assert session.app.installed[0] == "intel-opencl-rt" and "numpy==" in session.app.constraints
+    assert not session.app.errors
+
+
+def test_the_chosen_device_is_remembered(panel_with, module):
+    kind = importlib.import_module("SlicerUSSim.Logic.imaging.device_trials").TriedDevice
+    fast, slow = (kind(f"{n}:0", f"device {n}", "any", "GPU", 10.0 + n) for n in range(2))
+    broken = kind("2:0", "device 2", "any", "GPU", None, "its runtime ended the process (-6)")
+    session = panel_with(fast, broken, slow)
+    combo = session.widget.devices.devices
+    assert [combo.itemText(n) for n in range(combo.count())] == [
+        "device 0 (any): 10 ms per image", "device 1 (any): 11 ms per image",
+    ]  # fmt: skip
+    assert session.widget.devices.label.text() == "device 2 cannot be used: its runtime ended the process (-6)"
+    assert session.logic.device == fast.key
+    combo.setCurrentIndex(1)
+    assert session.logic.device == slow.key
+    again = panel_with(fast, broken, slow)
+    assert again.widget.devices.trials.chosen == slow.key
+    assert again.widget.devices.trials.known == {fast.key: 10.0, slow.key: 11.0}
+    module.app.settings.clear()
+
+
+def test_the_first_image_says_that_it_waits_for_kernels(panel_with):
+    kind = importlib.import_module("SlicerUSSim.Logic.imaging.device_trials").TriedDevice
+    session = panel_with(kind("0:0", "a processor", "some platform", "CPU", 20.0), waits=3).segmented()
+    session.logic.device = None
+    shown, bar = [], session.ui.progressBar
+    bar.valueChanged.connect(lambda value: shown.append((bar.isVisibleTo(session.parent), bar.format(), value)))
+    session.ui.liveCheckBox.setChecked(True)
+    assert (True, "Build kernels, once on this computer %p%", 33) in shown and session.logic.isLive
+    assert not session.app.errors
 
 
 @pytest.mark.slow

@@ -30,6 +30,7 @@ class ImagePresenter:
         """Simulate one image, into the chosen volume or a new one."""
         logic, view = self._panel.logic, self._panel.view
         with self._panel.acting():
+            self._panel.awaitKernels()
             nodes = self._nodes()
             start = perf_counter()
             caught: list[Warning] = []
@@ -63,6 +64,7 @@ class ImagePresenter:
             logic.stopLiveUpdate()
             return
         with self._panel.acting():
+            self._panel.awaitKernels()
             self._nodes()
             self._last_image = None
             self._followed = self._live_nodes()

@@ -54,7 +54,7 @@ class UltrasoundSceneLogic:
     """
 
     def __init__(self, scene, device: str | None = None, work: AtOnce | None = None) -> None:
-        self.scene, self.device = scene, device
+        self.scene = scene
         self.patients = patients = PatientLogic(scene, device, work or AtOnce())
         self.images = images = ImageLogic(patients)
         self.live = LiveLogic(patients, images)
@@ -97,6 +97,15 @@ class UltrasoundSceneLogic:
     @preset.setter
     def preset(self, preset: Preset) -> None:
         self.parameters.preset = preset
+
+    @property
+    def device(self) -> str | None:
+        """The choice of the OpenCL device, see opencl.devices.choose_device."""
+        return self.patients.device
+
+    @device.setter
+    def device(self, device: str | None) -> None:
+        self.patients.device = device
 
     @property
     def growth(self) -> LesionGrowth:
