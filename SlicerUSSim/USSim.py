@@ -203,7 +203,8 @@ class USSimWidget(ScriptedLoadableModuleWidget, VTKObservationMixin):
     def prepare(self) -> None:
         """Called before actions that need packages. Raises SimulationError if any are missing afterwards."""
         ensurePackages()
-        self.devices.begin()
+        if self.devices is not None:
+            self.devices.begin()
 
     def cleanup(self) -> None:
         """Called when the application closes or the module is reloaded."""

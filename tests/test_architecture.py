@@ -43,12 +43,12 @@ HEAVY = {
 #: Lines of Python that a room, or a folder beside the product, may have. Raising one is a decision: the commit says
 #: what users get for it.
 BUDGETS = {
-    "base": 3290, "opencl": 1250, "probe": 1470, "tissue": 2085, "tracked": 2155, "mri": 8500, "placement": 815,
-    "imaging": 4810, "fitting": 4390, "vtk": 530, "mrml": 4490, "Widget": 2640, "Workstation": 7765, "Command": 3030,
-    "module": 370, "validation": 6030, "benchmarks": 3750, "tests": 30785, "tests/reference": 500,
+    "base": 3290, "opencl": 1290, "probe": 1470, "tissue": 2085, "tracked": 2155, "mri": 8475, "placement": 815,
+    "imaging": 4970, "fitting": 4390, "vtk": 530, "mrml": 4515, "Widget": 2820, "Workstation": 7765, "Command": 3030,
+    "module": 355, "validation": 6030, "benchmarks": 3750, "tests": 30785, "tests/reference": 500,
 }  # fmt: skip
 #: Lines of all of SlicerUSSim/, and of kernels/
-LARGEST_PRODUCT, LARGEST_KERNELS = 47_500, 5_600
+LARGEST_PRODUCT, LARGEST_KERNELS = 47_900, 5_600
 #: Packages of the checkout that use the product and are not installed with it
 CHECKOUT = {"validation", "benchmarks", "tests", "examples"}
 

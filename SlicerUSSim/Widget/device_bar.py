@@ -38,7 +38,7 @@ class DeviceBar:
         self.label, self.devices = qt.QLabel(""), qt.QComboBox()
         self.label.setProperty("wordWrap", True)
         self.devices.setToolTip(_("The OpenCL device that computes images, with its time for one image"))
-        self.devices.currentIndexChanged.connect(self._choose)
+        self.devices.currentTextChanged.connect(self._choose)
         #: {name of a runtime: its button}
         self.buttons = {runtime.name: self._button(runtime) for runtime in runtimes_to_install()}
         for widget in (self.label, self.devices, *self.buttons.values()):
@@ -112,6 +112,8 @@ class DeviceBar:
             slicer.util.errorDisplay(str(error))
             return
         self.buttons.pop(runtime.name).setVisible(False)
+        self._settings.remove(_DEVICE)
+        self._presenter.logic.device = None
         self.stop()
         self.begin()
 

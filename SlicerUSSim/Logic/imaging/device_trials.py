@@ -18,12 +18,20 @@ import numpy as np
 
 from SlicerUSSim.Logic.base.errors import SimulationError
 from SlicerUSSim.Logic.base.reading import child_command
+from SlicerUSSim.Logic.base.settings import SimulationSettings
 from SlicerUSSim.Logic.imaging.self_check import frame_ms, golden_scene
 from SlicerUSSim.Logic.imaging.simulator import UltrasoundSimulator
+from SlicerUSSim.Logic.mri.samples import head_mri
+from SlicerUSSim.Logic.mri.segmentation import segment_mri
 from SlicerUSSim.Logic.opencl.devices import choose_device, list_devices
+from SlicerUSSim.Logic.probe.arrays import PROBES
+from SlicerUSSim.Logic.probe.poses import craniotomy_pose
+from SlicerUSSim.Logic.tissue.table import TissueTable
 
 #: Of a trial, for its progress, and between two looks at it
 _USUAL_SECONDS, _POLL_SECONDS = 40.0, 0.1
+#: Voxels of the patient, in which thin sulci have a label of their own
+_PATIENT_MM = 1.5
 #: Before the line of a child that is its answer
 _ANSWER = "ussim: "
 
@@ -132,8 +140,12 @@ def print_devices() -> None:
 
 
 def print_ms(index: str) -> None:
-    """Milliseconds per image of a device, after its kernels were built."""
+    """Milliseconds per image of a device, after the kernels of a patient were built, from segmentation to image."""
     try:
+        found, probe = segment_mri(head_mri(_PATIENT_MM), skull_strip="none", device=index), PROBES["phased"]
+        tissues, settings = TissueTable.brain(found.tissue_names), SimulationSettings()
+        patient = UltrasoundSimulator(found.labels, tissues, settings, index, found.texture())
+        patient.simulate(probe, craniotomy_pose(found.labels, probe))
         _answer(ms=frame_ms(UltrasoundSimulator(*golden_scene(), device=index)))
     except SimulationError as error:
         _answer(error=str(error))

@@ -22,6 +22,7 @@ import sys
 import threading
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -111,7 +112,7 @@ def self_test() -> None:
     """Compute with vectors of 16 floats; in a child process, which PoCL ends where it cannot build that."""
     from SlicerUSSim.Logic.opencl.devices import choose_device
 
-    cl = load_pyopencl()
+    cl: Any = load_pyopencl()
     context = cl.Context([choose_device("pocl")[0].handle])
     queue = cl.CommandQueue(context)
     flags, values = cl.mem_flags, np.arange(16, dtype=np.float32)
