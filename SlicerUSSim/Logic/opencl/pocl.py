@@ -110,10 +110,9 @@ def _passes_self_test(what: str) -> bool:
 
 def self_test() -> None:
     """Compute with vectors of 16 floats; in a child process, which PoCL ends where it cannot build that."""
-    from SlicerUSSim.Logic.opencl.devices import choose_device
-
     cl: Any = load_pyopencl()
-    context = cl.Context([choose_device("pocl")[0].handle])
+    platform = next(one for one in cl.get_platforms() if "Portable Computing Language" in one.name)
+    context = cl.Context(platform.get_devices()[:1])
     queue = cl.CommandQueue(context)
     flags, values = cl.mem_flags, np.arange(16, dtype=np.float32)
     buffer = cl.Buffer(context, flags.READ_WRITE | flags.COPY_HOST_PTR, hostbuf=values)
