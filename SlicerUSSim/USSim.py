@@ -194,8 +194,8 @@ class USSimWidget(ScriptedLoadableModuleWidget, VTKObservationMixin):
         scene = slicer.mrmlScene
         for event in (scene.StartCloseEvent, scene.StartImportEvent):
             self.addObserver(scene, event, self.onSceneStartChange)
-        for event in (scene.EndCloseEvent, scene.EndImportEvent):
-            self.addObserver(scene, event, self.onSceneEndChange)
+        self.addObserver(scene, scene.EndCloseEvent, self.onSceneEndClose)
+        self.addObserver(scene, scene.EndImportEvent, self.onSceneEndChange)
         self.addObserver(scene, scene.NodeAddedEvent, self.onNodeAdded)
         self.addObserver(scene, scene.NodeAboutToBeRemovedEvent, self.onNodeAboutToBeRemoved, priority=1000.0)
         self.addObserver(scene, scene.NodeRemovedEvent, self.onNodeRemoved)
@@ -226,6 +226,12 @@ class USSimWidget(ScriptedLoadableModuleWidget, VTKObservationMixin):
     def onSceneStartChange(self, caller, event) -> None:
         """Called just before the scene is closed or imported; disconnects the panel from it."""
         self.setParameterNode(None)
+
+    def onSceneEndClose(self, caller, event) -> None:
+        """Called just after the scene was closed; nodes of the next one have the IDs of those that were known."""
+        if self.panel is not None:
+            self.panel.presenter.forgetPatient()
+        self.onSceneEndChange(caller, event)
 
     def onSceneEndChange(self, caller, event) -> None:
         """Called just after the scene was closed or imported; connects the panel to it."""

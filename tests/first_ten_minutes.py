@@ -123,6 +123,7 @@ def main(head_file: Path) -> None:
         save(scene, saved)
     with step("close"):
         scene.Clear(0)
+        presenter.forgetPatient()  # as USSimWidget does then
     FOUND["after close"] = [presenter.notes.text(), view.status, presenter.fits.canApply()[0], presenter.logic.isLive]
     with step("load"):
         load(scene, saved)

@@ -10,7 +10,7 @@ from typing import Any
 
 from SlicerUSSim.Logic.mrml.fitting_nodes import fits
 from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic
-from SlicerUSSim.Logic.mrml.nodes import nodes_of_class, observe
+from SlicerUSSim.Logic.mrml.nodes import nodes_of_class
 from SlicerUSSim.Widget.fit_presenter import FitPresenter
 from SlicerUSSim.Widget.image_presenter import ImagePresenter
 from SlicerUSSim.Widget.interface import PanelHost, PanelView
@@ -41,7 +41,6 @@ class PanelPresenter(PanelHost):
         self.values = ValuePresenter(self, self.placing)
         self.images = ImagePresenter(self, self.notes, self.placing)
         self.fits = FitPresenter(self, self.values, self.tissues)
-        observe(logic.scene, logic.scene.EndCloseEvent, self._closed)
 
     def chooseDefaultNodes(self) -> None:
         """Select the first volume of the scene as the MRI, if none is selected."""
@@ -71,8 +70,3 @@ class PanelPresenter(PanelHost):
         self.segmenting.forget()
         self.lesions.forget()
         self.notes.set()
-
-    def _closed(self) -> None:
-        """Called after the scene was closed."""
-        self.forgetPatient()
-        self.view.refresh()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import weakref
 from collections.abc import Callable, Hashable
 from time import perf_counter
 from typing import Any, NamedTuple
@@ -13,7 +14,7 @@ from vtkmodules.vtkCommonCore import VTK_OBJECT, vtkCommand
 from SlicerUSSim.Logic.base.errors import user_message
 from SlicerUSSim.Logic.mrml.image_logic import ImageLogic
 from SlicerUSSim.Logic.mrml.label_nodes import labels_version
-from SlicerUSSim.Logic.mrml.nodes import node_to_world, observe, show_in_slice
+from SlicerUSSim.Logic.mrml.nodes import node_to_world, show_in_slice
 from SlicerUSSim.Logic.mrml.patient_logic import PatientLogic
 
 _log = logging.getLogger(__name__)
@@ -101,8 +102,17 @@ class LiveUpdate:
         self._stopped = self._nodes = None
         self.stop()
 
-    def _observe(self, subject, event, method, **options) -> None:
-        self._observed.append((subject, observe(subject, event, method, **options)))
+    def _observe(self, subject, event, method, call_data=None, priority=0.0) -> None:
+        weak = weakref.WeakMethod(method)  # a strong reference would keep this object alive as long as the scene
+
+        def callback(_subject, _event, *data):
+            alive = weak()
+            if alive is not None:
+                alive(*data)
+
+        if call_data is not None:
+            setattr(callback, "CallDataType", call_data)  # noqa: B010, where VTK looks for it
+        self._observed.append((subject, subject.AddObserver(event, callback, priority)))
 
     def _node_goes(self, node) -> None:
         if any(node is mine for mine in self._nodes or ()):

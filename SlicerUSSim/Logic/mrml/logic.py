@@ -12,7 +12,6 @@ from SlicerUSSim.Logic.mrml.fit_logic import FitLogic
 from SlicerUSSim.Logic.mrml.grown_nodes import LesionGrowth
 from SlicerUSSim.Logic.mrml.image_logic import ImageLogic
 from SlicerUSSim.Logic.mrml.live import LiveLogic
-from SlicerUSSim.Logic.mrml.nodes import observe
 from SlicerUSSim.Logic.mrml.own_results import may_replace_result
 from SlicerUSSim.Logic.mrml.patient_logic import AtOnce as AtOnce, PatientLogic
 from SlicerUSSim.Logic.mrml.segment_logic import SegmentLogic
@@ -62,8 +61,6 @@ class UltrasoundSceneLogic:
         self.sequences = SequenceLogic(patients, images, self.live)
         self.fits = FitLogic(patients)
         self.parameters = patients.parameters
-        # Nodes of the next scene may have the IDs of those that are known
-        observe(scene, scene.EndCloseEvent, self.forgetPatient)
 
     tissues, settings = _Of("patients", PatientLogic.tissues), _Of("patients", PatientLogic.settings)
     recognised, anatomyOf = _Of("patients", PatientLogic.recognised), _Of("patients", PatientLogic.anatomyOf)

@@ -5,10 +5,7 @@ Uses only nodes, and nothing of the `slicer` namespace.
 
 from __future__ import annotations
 
-import weakref
-from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 from vtkmodules.vtkCommonMath import vtkMatrix4x4
@@ -49,20 +46,6 @@ def node_called(scene, kind: str, name: str):
     """The first vtkMRML`kind`Node with this name, or a new one."""
     known = (node for node in nodes_of_class(scene, f"vtkMRML{kind}Node") if node.GetName() == name)
     return next(known, None) or scene.AddNewNodeByClass(f"vtkMRML{kind}Node", name)
-
-
-def observe(subject: Any, event: Any, method: Callable, call_data: str | None = None, priority: float = 0.0) -> int:
-    """Call a bound method at an event until its object is gone, which the observer does not keep alive; its tag."""
-    weak = weakref.WeakMethod(method)
-
-    def callback(_subject, _event, *data):
-        alive = weak()
-        if alive is not None:
-            alive(*data)
-
-    if call_data is not None:
-        setattr(callback, "CallDataType", call_data)  # noqa: B010, where VTK looks for it
-    return subject.AddObserver(event, callback, priority)
 
 
 def display_of(node):
