@@ -43,8 +43,7 @@ def module():
         del sys.modules[name]
     loaded = load_source_as_module("USSim", MODULE_FILE)
     loaded.app = app
-    trials = importlib.import_module("SlicerUSSim.Logic.imaging.device_trials")
-    trials.DeviceTrials = tried(trials.TriedDevice("0:0", "a processor", "some platform", "CPU", 20.0))
+    importlib.import_module("SlicerUSSim.Logic.imaging.device_trials").DeviceTrials = tried(own_device())
     yield loaded
     logging.getLogger("SlicerUSSim").setLevel(logging.NOTSET)
     for name in set(sys.modules) - set(before):
@@ -60,6 +59,13 @@ def module():
 def test_slicers_log_gets_choices_once_and_nothing_for_each_live_image(module):
     ours = logging.getLogger("SlicerUSSim")
     assert ours.level == logging.INFO and not ours.handlers and ours.propagate
+
+
+def own_device():
+    """The device of this computer, as if it had been tried."""
+    info = importlib.import_module("SlicerUSSim.Logic.opencl.devices").choose_device()[0]
+    kind = importlib.import_module("SlicerUSSim.Logic.imaging.device_trials").TriedDevice
+    return kind(info.index, info.name, info.platform, info.kind, 20.0)
 
 
 def tried(*devices, error: str = "", waits: int = 0):
@@ -941,9 +947,7 @@ def test_the_chosen_device_is_remembered(panel_with, module):
 
 
 def test_the_first_image_says_that_it_waits_for_kernels(panel_with):
-    kind = importlib.import_module("SlicerUSSim.Logic.imaging.device_trials").TriedDevice
-    session = panel_with(kind("0:0", "a processor", "some platform", "CPU", 20.0), waits=3).segmented()
-    session.logic.device = None
+    session = panel_with(own_device(), waits=3).segmented()
     shown, bar = [], session.ui.progressBar
     bar.valueChanged.connect(lambda value: shown.append((bar.isVisibleTo(session.parent), bar.format(), value)))
     session.ui.liveCheckBox.setChecked(True)
