@@ -31,6 +31,7 @@ if sys.version_info < (3, 10):  # noqa: UP036, older versions of Slicer can also
 
 _HERE = Path(__file__).absolute().parent
 _RESOURCES = _HERE / "Resources"
+_REQUIREMENTS = _RESOURCES / "USSim" / "requirements.txt"
 _HOME = "https://github.com/SlicerUSSim/SlicerUSSim"
 
 
@@ -74,9 +75,9 @@ class USSim(ScriptedLoadableModule):
         ).format(home=_HOME)
         self.parent.acknowledgementText = _(
             "Implements Salehi et al., Patient-specific 3D Ultrasound Simulation Based on Convolutional Ray-tracing "
-            "and Appearance Optimization, MICCAI 2015. The sample MRI is the ICBM 152 2009a template (© 1993-2009 "
-            "Louis Collins, McConnell Brain Imaging Centre, Montreal Neurological Institute), as distributed "
-            "with nilearn. The sample head is MRHead, a sample of 3D Slicer."
+            "and Appearance Optimization, MICCAI 2015. The sample brain and the brain atlas are the ICBM 152 2009a "
+            "template (© 1993-2009 Louis Collins, McConnell Brain Imaging Centre, Montreal Neurological Institute). "
+            "The sample head is MRHead, a sample of 3D Slicer."
         )
         slicer.app.connect("startupCompleted()", registerSampleData)
 
@@ -110,12 +111,11 @@ def registerSampleData() -> None:
 def ensurePackages() -> None:
     """Install the packages that Slicer's Python lacks, after the user has confirmed; on first use, not at start-up.
 
-    Raises SimulationError if packages are still missing, or if Slicer must be restarted after the installation.
+    Raises SimulationError if packages are still missing.
     """
-    from SlicerUSSim.Widget.packages import ensure_packages, offer_opencl_runtime
+    from SlicerUSSim.Widget.packages import ensure_packages
 
-    ensure_packages(_RESOURCES / "USSim" / "requirements.txt")
-    offer_opencl_runtime()
+    ensure_packages(_REQUIREMENTS)
 
 
 @functools.cache
@@ -157,6 +157,7 @@ class USSimWidget(ScriptedLoadableModuleWidget, VTKObservationMixin):
         VTKObservationMixin.__init__(self)
         self.logic = None
         self.panel = None
+        self.devices = None
         self._parameterNode = None
 
     def setup(self) -> None:
@@ -184,25 +185,42 @@ class USSimWidget(ScriptedLoadableModuleWidget, VTKObservationMixin):
 
     def showPanel(self) -> None:
         """Create the panel. Raises ImportError if a package is missing."""
+        from SlicerUSSim.Widget.device_bar import DeviceBar
+        from SlicerUSSim.Widget.packages import are_installed
         from SlicerUSSim.Widget.panel import Panel
 
         self.logic = USSimLogic()
         self.initializeParameterNode()
         widget = qt.QWidget()
         self.layout.addWidget(widget)
-        self.panel = Panel(qt.QVBoxLayout(widget), self.logic.ultrasound, ensurePackages)
+        column = qt.QVBoxLayout(widget)
+        above = qt.QVBoxLayout()
+        column.addLayout(above)
+        self.panel = Panel(column, self.logic.ultrasound, self.prepare)
         self.ui = self.panel.ui
+        self.devices = DeviceBar(above, self.panel.presenter)
+        if are_installed(_REQUIREMENTS):
+            self.devices.begin()
         self.panel.presenter.chooseDefaultNodes()
         scene = slicer.mrmlScene
         for event in (scene.StartCloseEvent, scene.StartImportEvent):
             self.addObserver(scene, event, self.onSceneStartChange)
-        for event in (scene.EndCloseEvent, scene.EndImportEvent):
-            self.addObserver(scene, event, self.onSceneEndChange)
+        self.addObserver(scene, scene.EndCloseEvent, self.onSceneEndClose)
+        self.addObserver(scene, scene.EndImportEvent, self.onSceneEndChange)
+        self.addObserver(scene, scene.NodeAddedEvent, self.onNodeAdded)
         self.addObserver(scene, scene.NodeAboutToBeRemovedEvent, self.onNodeAboutToBeRemoved, priority=1000.0)
         self.addObserver(scene, scene.NodeRemovedEvent, self.onNodeRemoved)
 
+    def prepare(self) -> None:
+        """Called before actions that need packages. Raises SimulationError if any are missing afterwards."""
+        ensurePackages()
+        if self.devices is not None:
+            self.devices.begin()
+
     def cleanup(self) -> None:
         """Called when the application closes or the module is reloaded."""
+        if self.devices is not None:
+            self.devices.stop()
         if self.logic is not None:
             self.logic.ultrasound.stopLiveUpdate()
         self.setParameterNode(None)
@@ -222,10 +240,22 @@ class USSimWidget(ScriptedLoadableModuleWidget, VTKObservationMixin):
         """Called just before the scene is closed or imported; disconnects the panel from it."""
         self.setParameterNode(None)
 
+    def onSceneEndClose(self, caller, event) -> None:
+        """Called just after the scene was closed; nodes of the next one have the IDs of those that were known."""
+        if self.panel is not None:
+            self.panel.presenter.forgetPatient()
+        self.onSceneEndChange(caller, event)
+
     def onSceneEndChange(self, caller, event) -> None:
         """Called just after the scene was closed or imported; connects the panel to it."""
         if self.parent.isEntered:
             self.initializeParameterNode()
+
+    @vtk.calldata_type(vtk.VTK_OBJECT)
+    def onNodeAdded(self, caller, event, node) -> None:
+        """Called after a node was added to the scene."""
+        if self.panel is not None and self.panel.isConnected:
+            self.panel.presenter.nodeAdded(node)
 
     @vtk.calldata_type(vtk.VTK_OBJECT)
     def onNodeAboutToBeRemoved(self, caller, event, node) -> None:

@@ -4,7 +4,7 @@
 
 Above, lines are single rays (`beam="ray"`, as in the paper) and the membrane is an even layer of a millimetre, as in
 tables from before it was a rough sheet; below are the defaults. From the left: a layer oblique to the voxels, a cyst,
-and of Colin27 (Debian's mricron-data) and the MNI152 template (nilearn) a coronal view of the ventricles and a random
+and of Colin27 (Debian's mricron-data) and the MNI152 template a coronal view of the ventricles and a random
 view each. What is not installed is left out. With --sheet also 24 random views of Colin27, with the defaults.
 """
 

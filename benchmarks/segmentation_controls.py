@@ -41,7 +41,7 @@ def plain_mixture(case: BrainPhantom, contrast: str, seed: int = 0) -> tuple[np.
     """
     from skimage.filters import threshold_multiotsu
 
-    require(importlib.util.find_spec("sklearn") is not None, "plain mixture needs scikit-learn (comes with nilearn)")
+    require(importlib.util.find_spec("sklearn") is not None, "plain mixture needs the package scikit-learn")
     mixture = importlib.import_module("sklearn.mixture")
     values = case.mri.array[case.mask.array > 0]
     some = np.random.default_rng(seed).choice(values, min(values.size, 200_000), replace=False)

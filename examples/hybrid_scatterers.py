@@ -2,7 +2,7 @@
 
     python examples/hybrid_scatterers.py [-o hybrid.png]
 
-Top: one image each of the MNI152 brain (nilearn). Bottom: the mean of 24 patients that differ only in their scatterers,
+Top: one image each of the MNI152 brain. Bottom: the mean of 24 patients that differ only in their scatterers,
 which shows the expected echo level.
 """
 

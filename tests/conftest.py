@@ -25,6 +25,7 @@ from SlicerUSSim.Logic import (
     Volume,
     segment_mri,
 )
+from SlicerUSSim.Logic.mri.atlas import mni152
 from SlicerUSSim.Logic.mri.samples import head_mri
 from SlicerUSSim.Logic.probe.image_grid import ImageGrid
 from SlicerUSSim.Logic.probe.poses import craniotomy_pose, tilt_sweep
@@ -119,12 +120,10 @@ def segmented_once():
 
 @pytest.fixture(scope="session")
 def mni():
-    """(T1, grey map, white map) of the MNI152 template that nilearn carries."""
-    nilearn = pytest.importorskip("nilearn", reason="the MNI152 brain comes with nilearn: pip install '.[demo]'")
-    folder = Path(nilearn.__file__).parent / "datasets" / "data"
-    return tuple(
-        Volume.read(folder / f"mni_icbm152_{kind}_tal_nlin_sym_09a_converted.nii.gz") for kind in ("t1", "gm", "wm")
-    )
+    """(T1, grey map, white map) of the MNI152 template, 0 to 255."""
+    atlas = mni152()
+    maps = (volume.with_array(np.rint(255 * volume.array).astype(np.uint8)) for volume in (atlas.grey, atlas.white))
+    return atlas.t1, *maps
 
 
 def name_labels(path: Path, names: Iterable[str]) -> None:

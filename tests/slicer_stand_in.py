@@ -12,6 +12,7 @@ import types
 import typing
 import unittest
 from pathlib import Path
+from tempfile import mkdtemp
 
 import slicer
 from PySide6 import QtCore, QtGui, QtWidgets
@@ -334,11 +335,15 @@ class Application:
         #: Arguments of pip: packages, and the content of the file of constraints
         self.installed: list[str] = []
         self.constraints = ""
+        self.settings = QtCore.QSettings(str(Path(mkdtemp()) / "Slicer.ini"), QtCore.QSettings.IniFormat)
         #: --testing, in which message boxes answer themselves
         self.testing = False
 
     def testingEnabled(self) -> bool:
         return self.testing
+
+    def userSettings(self) -> QtCore.QSettings:
+        return self.settings
 
     def connect(self, signal: str, function) -> None:
         assert signal == "startupCompleted()"

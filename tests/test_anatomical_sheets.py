@@ -98,13 +98,10 @@ def folded_head(gap_mm: float) -> Head:
     image = 100.0 + 40.0 * white - 80.0 * fluid * (1 - white)
     image += np.random.default_rng(1).normal(0.0, 3.0, image.shape)
     brain = (np.hypot(x, y) < 36.0) & (z > 3) & (z < 62)
-    atlas = mni152()
-    if atlas is None:
-        pytest.skip("nilearn is not installed")
     to_atlas = np.eye(4)
     to_atlas[2, 3] = 10.0
     volume = Volume(image.astype(np.float32), np.eye(4))
-    return Head(volume, brain, 20.0, 100.0, 140.0, 4.0, False, AtlasFit(to_atlas, 1.0, atlas))
+    return Head(volume, brain, 20.0, 100.0, 140.0, 4.0, False, AtlasFit(to_atlas, 1.0, mni152()))
 
 
 def sulcus_error(found: Surfels) -> np.ndarray:
@@ -413,9 +410,7 @@ def test_what_cannot_be_found_is_reported_before_the_search():
 @cache
 def template_head() -> tuple[Volume, Segmentation]:
     """MNI152 without every other voxel, 2 mm, and its segmentation."""
-    mri, source = demo_mri()
-    if "nilearn" not in source:
-        pytest.skip("nilearn is not installed")
+    mri, _ = demo_mri()
     step = slice(None, None, 2)
     coarse = Volume(mri.array[step, step, step].astype(np.float32), mri.ijk_to_ras @ np.diag([2.0, 2.0, 2.0, 1.0]))
     return coarse, segment_mri(coarse, thin_sulci=False)

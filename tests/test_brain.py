@@ -1,6 +1,5 @@
 """The brain in an MRI: recognition, extraction, kept masks, DICOM series."""
 
-import importlib.util
 from pathlib import Path
 from typing import NamedTuple
 
@@ -15,7 +14,7 @@ from SlicerUSSim.Command.cli import main
 from SlicerUSSim.Logic import SimulationError, Volume
 from SlicerUSSim.Logic.base.errors import Cancelled
 from SlicerUSSim.Logic.base.files import mask_beside
-from SlicerUSSim.Logic.mri import alignment, atlas, kept_mask, recognition, refinement
+from SlicerUSSim.Logic.mri import kept_mask, recognition, refinement
 from SlicerUSSim.Logic.mri.alignment import Alignment, align_template
 from SlicerUSSim.Logic.mri.atlas import mni152
 from SlicerUSSim.Logic.mri.brain import BrainMask, find_brain, given_brain
@@ -23,8 +22,6 @@ from SlicerUSSim.Logic.mri.edges import ends_at_edge
 from SlicerUSSim.Logic.mri.recognition import recognise
 from SlicerUSSim.Logic.mri.samples import head_mri
 from tests.conftest import SHARED, needs_shared
-
-needs_nilearn = pytest.mark.skipif(importlib.util.find_spec("nilearn") is None, reason="nilearn is not installed")
 
 COLIN = Path("/usr/share/mricron/templates/ch2.nii.gz")
 COLIN_BRAIN = COLIN.with_name("ch2bet.nii.gz")
@@ -137,7 +134,6 @@ def test_none_takes_everything_brighter_than_the_background():
 # ---- extraction ------------------------------------------------------------------------------------------------------
 
 
-@needs_nilearn
 def test_the_atlas_finds_the_brain_of_a_nodding_head(head, found):
     result, shares = found.result, found.shares
     assert result.method == "atlas"
@@ -146,7 +142,6 @@ def test_the_atlas_finds_the_brain_of_a_nodding_head(head, found):
     assert shares == sorted(shares) and shares[-1] == 1.0 and len(shares) > 20
 
 
-@needs_nilearn
 def test_a_cancelled_alignment_stops(head):
     def progress(share):
         if share > 0.03:
@@ -168,7 +163,6 @@ def on_other_voxels(mri, inside, spacing):
 
 
 @pytest.mark.slow
-@needs_nilearn
 def test_the_atlas_finds_the_brain_in_a_stack_of_thick_sagittal_slices(head):
     mri, inside = on_other_voxels(*head, (5.0, 1.2, 1.2))
     result = find_brain(mri, "atlas")
@@ -185,13 +179,6 @@ def test_a_command_that_is_interrupted_says_so_in_one_line(monkeypatch, tmp_path
     assert result.exit_code == 130 and result.stderr == "ussim: interrupted\n"
 
 
-def test_a_head_without_the_atlas_gets_the_remedy(monkeypatch, head):
-    monkeypatch.setattr(atlas, "mni152", lambda: None)
-    alignment.template.cache_clear()
-    with pytest.raises(SimulationError, match=r"whole head needs the brain atlas of nilearn: pip install nilearn"):
-        recognise(head[0])
-
-
 # ---- kept masks ------------------------------------------------------------------------------------------------------
 
 
@@ -202,7 +189,6 @@ def test_the_mask_has_the_name_of_its_mri(tmp_path, name, mask):
     assert mask_beside(tmp_path / name) == tmp_path / mask
 
 
-@needs_nilearn
 def test_a_kept_mask_is_read_and_never_replaced(head, found, tmp_path):
     mri, place = head[0], tmp_path / "head.brain-mask.nrrd"
     assert f"the brain mask is kept in {found.place}" in found.result.message
@@ -245,7 +231,6 @@ def test_several_labels_in_a_mask_are_reported(head):
     assert "the mask holds the labels 1, 2, expected one; the brain is taken where any of them is" in line
 
 
-@needs_nilearn
 def test_a_vertex_outside_the_image_is_reported_and_a_tight_image_is_not(head):
     mri, brain = head
     filled = np.argwhere(brain)
@@ -307,7 +292,6 @@ def test_errors_about_a_mask_name_its_file_and_count_voxels_as_viewers_do(tmp_pa
 
 
 @pytest.mark.slow
-@needs_nilearn
 @pytest.mark.skipif(not COLIN.exists(), reason="Debian's mricron-data is not installed")
 def test_the_atlas_finds_colin_as_his_own_mask_does():
     mri = Volume.read(COLIN)
@@ -318,7 +302,6 @@ def test_the_atlas_finds_colin_as_his_own_mask_does():
 
 @pytest.mark.long
 @needs_shared
-@needs_nilearn
 def test_the_mask_of_a_t1_has_the_gyri_of_the_vertex_that_its_t2_shows():
     """In the T2 tissue is dark between bright CSF and dark bone; both images lie in one frame."""
     t1, t2 = (Volume.read(SHARED / f"remind022/{name}.nii.gz") for name in ("t1_contrast", "t2"))
@@ -339,7 +322,6 @@ def test_the_mask_of_a_t1_has_the_gyri_of_the_vertex_that_its_t2_shows():
     assert millilitres < 1.5  # 3.9 ml with one border of tissue everywhere
 
 
-@needs_nilearn
 def test_the_alignment_finds_the_size_and_the_nod_of_the_brain(found):
     linear = found.alignment.template_to_ras[:3, :3]
     assert np.cbrt(np.linalg.det(linear)) == pytest.approx(0.93, abs=0.02)

@@ -11,7 +11,8 @@ from click.testing import CliRunner
 from SlicerUSSim.Command.cli import main
 from SlicerUSSim.Logic import UltrasoundSimulator
 from SlicerUSSim.Logic.base.errors import Cancelled
-from SlicerUSSim.Logic.imaging import self_check
+from SlicerUSSim.Logic.imaging import device_trials, self_check
+from SlicerUSSim.Logic.imaging.device_trials import DeviceTrials
 from SlicerUSSim.Logic.imaging.self_check import Finding, SelfCheck, check_devices
 from SlicerUSSim.Logic.opencl.device import Device
 from SlicerUSSim.Logic.opencl.devices import choose_device
@@ -117,3 +118,24 @@ def test_the_check_reports_progress_and_can_be_cancelled(info, monkeypatch):
 def test_a_device_that_does_not_exist_exits_with_two():
     result = ussim_check("--device", "no such device")
     assert result.exit_code == 2 and "no OpenCL device fits 'no such device'" in result.stderr
+
+
+def test_a_trial_in_a_child_process_measures_a_device():
+    trials, shares = DeviceTrials(), []
+    trials.wait(shares.append)
+    assert trials.used is not None and 0 < trials.used.ms < 60_000 and not trials.used.error
+    assert choose_device(trials.used.key)[0] == choose_device()[0]
+    assert shares == sorted(shares) and shares[-1] < 1.0
+
+
+def test_a_runtime_that_ends_its_process_ends_the_trial_alone(monkeypatch):
+    child_command = device_trials.child_command
+
+    def failing(code):
+        return child_command(code.replace("print_ms", "import os; os.abort() or "))
+
+    monkeypatch.setattr(device_trials, "child_command", failing)
+    trials = DeviceTrials()
+    trials.wait(lambda share: None)
+    assert trials.used is None and trials.isDone and trials.devices
+    assert {device.error for device in trials.devices} == {"its runtime ended the process (-6)"}

@@ -88,6 +88,8 @@ def test_the_module_its_resources_and_one_folder_are_installed(build, installed)
     data = {
         "Logic/fitting/report.html",
         "Logic/imaging/golden/convex.png",
+        "Logic/mri/mni152.npz",
+        "Logic/mri/mni152.txt",
         "Logic/py.typed",
         "Logic/tissue/labels/spm.csv",
     }

@@ -12,12 +12,10 @@ from click.testing import CliRunner
 from SlicerUSSim.Command.cli import main
 from SlicerUSSim.Command.seeds import split_seeds
 from SlicerUSSim.Logic import Segmentation, SimulationError, Volume, grow_lesion, segment_mri
-from SlicerUSSim.Logic.mri.atlas import mni152
 from validation.brain_phantoms import phantom, tissue_maps, with_low_grade_tumour, with_ring_tumour
 
 from .shared_data import SHARED
 
-needs_atlas = pytest.mark.skipif(mni152() is None, reason="the atlas comes with nilearn")
 CENTRE = (28.0, -22.0, 28.0)
 
 
@@ -43,7 +41,6 @@ def brain(kind: str) -> tuple[Segmentation, np.ndarray]:
     return segment_mri(image.mri, contrast=contrast, mask=image.mask, thin_sulci=False), true
 
 
-@needs_atlas
 @pytest.mark.parametrize("kind", ["low", pytest.param("ring", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("aside_mm", [0.0, 9.0])
 def test_one_seed_grows_the_lesion_and_a_larger_version(kind, aside_mm):
@@ -72,7 +69,6 @@ def test_a_tumour_in_thick_slices_grows_from_its_ends_too():
 
 
 @pytest.mark.slow
-@needs_atlas
 @pytest.mark.parametrize(
     ("seed", "words"),
     [
@@ -88,7 +84,6 @@ def test_a_seed_from_which_nothing_grows_says_why(seed, words):
 
 
 @pytest.mark.slow
-@needs_atlas
 def test_a_user_is_taken_at_his_word_and_otherwise_warned():
     segmentation, _ = brain("healthy")
     ventricle = (4.0, 8.0, 16.0)
@@ -101,7 +96,6 @@ def test_a_user_is_taken_at_his_word_and_otherwise_warned():
 
 
 @pytest.mark.slow
-@needs_atlas
 def test_a_part_of_a_lesion_is_grown_by_its_name():
     ring, _ = brain("ring")
     free = grow_lesion(ring, CENTRE)
@@ -119,7 +113,6 @@ def test_only_lesions_are_grown(name):
     assert f"--seed 1,2,3={name}: " in str(error.value) and "\n" not in str(error.value)
 
 
-@needs_atlas
 @pytest.mark.long
 def test_a_refused_seed_costs_neither_the_labels_nor_the_other_seeds(tmp_path):
     maps = tissue_maps("mni152")

@@ -23,8 +23,6 @@ _AAL = {"putamen": (73, 74), "thalamus": (77, 78)}
 def bright_nuclei() -> tuple[TissueMaps, np.ndarray, np.ndarray]:
     """(maps of a bent and turned MNI152 at 2 mm whose nuclei are nearly white, the nuclei, as bright white matter)."""
     maps = tissue_maps("mni152")
-    if maps is None:
-        pytest.skip("nilearn is not installed")
     nuclei = (np.sum(nuclear_maps(mni152()), axis=0) > 0.6).astype(np.float32)
     # In the frontal white matter, as large as a thalamus and as far from the midline as the putamen
     k, j, i = np.ogrid[tuple(map(slice, nuclei.shape))]

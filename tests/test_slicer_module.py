@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import importlib
 import importlib.metadata
 import json
@@ -36,17 +35,16 @@ RESOURCES = ROOT / "SlicerUSSim" / "Resources"
 
 @pytest.fixture(scope="module")
 def module():
-    """USSim.py, loaded as Slicer does, without nilearn's atlas; afterwards everything is imported as it was."""
+    """USSim.py, loaded as Slicer does, afterwards everything is imported as it was."""
     before = dict(sys.modules)
     own = slicer.__dict__.copy(), slicer.util.__dict__.copy()
     app = stand_in.start()
     for name in [name for name in sys.modules if name.split(".")[0] == "SlicerUSSim"]:
         del sys.modules[name]
-    sys.modules["nilearn"] = None
     loaded = load_source_as_module("USSim", MODULE_FILE)
     loaded.app = app
+    importlib.import_module("SlicerUSSim.Logic.imaging.device_trials").DeviceTrials = tried(own_device())
     yield loaded
-    del sys.modules["nilearn"]
     logging.getLogger("SlicerUSSim").setLevel(logging.NOTSET)
     for name in set(sys.modules) - set(before):
         if name.split(".")[0] in ("USSim", "SlicerUSSim", "qt", "ctk") or name.startswith("slicer."):
@@ -61,6 +59,35 @@ def module():
 def test_slicers_log_gets_choices_once_and_nothing_for_each_live_image(module):
     ours = logging.getLogger("SlicerUSSim")
     assert ours.level == logging.INFO and not ours.handlers and ours.propagate
+
+
+def own_device():
+    """The device of this computer, as if it had been tried."""
+    info = importlib.import_module("SlicerUSSim.Logic.opencl.devices").choose_device()[0]
+    kind = importlib.import_module("SlicerUSSim.Logic.imaging.device_trials").TriedDevice
+    return kind(info.index, info.name, info.platform, info.kind, 20.0)
+
+
+def tried(*devices, error: str = "", waits: int = 0):
+    """DeviceTrials in place of the ones in child processes, with these results after some calls of progress."""
+
+    class Tried:
+        used = property(lambda self: devices[0] if devices and self.count >= waits else None)
+        isDone = property(lambda self: self.count >= waits)
+
+        def __init__(self, known, chosen) -> None:
+            self.known, self.chosen, self.count = known, chosen, 0
+            self.devices, self.error = sorted(devices, key=lambda device: device.key != chosen), error
+
+        def wait(self, progress) -> None:
+            while not self.isDone:
+                self.count += 1
+                progress(self.count / waits)
+
+        def stop(self) -> None:
+            pass
+
+    return Tried
 
 
 class Session:
@@ -153,8 +180,8 @@ def test_start_up_imports_nothing_that_takes_time_or_may_be_missing():
         import os, sys
         from importlib import metadata
         os.environ["QT_QPA_PLATFORM"] = "offscreen"
-        missing = ("pyopencl", "nlopt", "skimage", "platformdirs", "PIL", "tqdm", "click", "matplotlib", "nilearn",
-                   "nrrd", "nibabel")
+        missing = ("pyopencl", "nlopt", "skimage", "platformdirs", "PIL", "tqdm", "click", "matplotlib", "nrrd",
+                   "nibabel")
         class Finder:
             def find_spec(self, name, path=None, target=None):
                 if name.split(".")[0] in missing:
@@ -248,10 +275,6 @@ def test_sample_data_is_registered_with_a_checksum_and_a_thumbnail(module, monke
     assert Path(registered["thumbnailFileName"]).exists()
     assert re.fullmatch(r"SHA256:[0-9a-f]{64}", registered["checksums"])
     assert registered["uris"].startswith("https://") and registered["fileNames"].endswith(".nii.gz")
-    monkeypatch.delitem(sys.modules, "nilearn")
-    nilearn = pytest.importorskip("nilearn")
-    brain = Path(nilearn.__file__).parent / "datasets/data" / registered["uris"].rsplit("/", 1)[1]
-    assert hashlib.sha256(brain.read_bytes()).hexdigest() == registered["checksums"].split(":")[1]
 
 
 def test_slicer_and_module_read_what_the_other_wrote_in_the_parameter_node(session):
@@ -517,9 +540,8 @@ def test_cancel_stops_the_segmentation_and_leaves_nothing(session):
 
 @pytest.mark.long  # the extraction of a brain
 @needs_shared
-def test_the_brain_of_a_whole_head_is_a_mask_node_and_can_be_cancelled(session, monkeypatch):
+def test_the_brain_of_a_whole_head_is_a_mask_node_and_can_be_cancelled(session):
     """ReMIND-022's T1 with the skull, at 4 mm (../shared/data)."""
-    monkeypatch.delitem(sys.modules, "nilearn")  # the atlas makes it fast
     volume = session.logic_module("base.volume").Volume
     whole = volume.read(SHARED / "remind022" / "t1_contrast.nii.gz")
     coarse = volume(np.ascontiguousarray(whole.array[::4, ::4, ::4]), whole.ijk_to_ras @ np.diag([4.0, 4.0, 4.0, 1.0]))
@@ -571,6 +593,11 @@ def test_a_sequence_is_simulated_and_its_browser_plays_it(session):
     images = session.scene.GetFirstNodeByName("sweep ultrasound")
     assert images.GetNumberOfDataNodes() == 3 and browser.IsSynchronizedSequenceNode(images, True)
     assert session.ui.sequenceLabel.text() == "3 images in 'sweep ultrasound'"
+    # It is shown, as bright as live images are.
+    shown, composite = browser.GetProxyNode(images), session.scene.GetFirstNodeByClass("vtkMRMLSliceCompositeNode")
+    display = shown.GetDisplayNode()
+    assert (display.GetWindow(), display.GetLevel(), display.GetAutoWindowLevel()) == (255, 127.5, 0)
+    assert composite.GetForegroundVolumeID() == shown.GetID()
     # The next ones take their place; of other transforms they are others.
     session.ui.simulateSequenceButton.click()
     assert session.parameters.image_sequence is images and not session.app.errors
@@ -707,6 +734,39 @@ def test_closing_the_scene_and_leaving_the_module_is_survived(session):
     session.ui.segmentButton.click()
     assert not session.app.errors
     assert session.parameters.labels is not None
+
+
+def test_closing_the_scene_forgets_the_patient(session):
+    """Nodes of the next scene have the IDs of those before: a fit to patient A set the gain of patient B."""
+    with_real_image(session)
+    ui = session.ui
+    ui.fitButton.click()
+    session.parameters.labels, fitted = None, session.parameters.labels
+    assert not ui.applyFitButton.isEnabled() and "Head tissues" in ui.applyFitButton.toolTip()  # two in one scene
+    session.parameters.labels = fitted
+    ui.liveCheckBox.setChecked(True)
+    ui.liveCheckBox.setChecked(False)
+    assert ui.applyFitButton.isEnabled() and "Head" in ui.notesLabel.text() and "FROZEN" in ui.statusLabel.text()
+    session.scene.Clear(0)
+    session.process()
+    assert not ui.notesLabel.text() and not ui.fitLabel.text() and not ui.statusLabel.text()
+    assert session.logic.taken is None and not session.logic.notes
+    session.head()
+    session.widget.enter()
+    session.process()
+    for button in (ui.applyFitButton, ui.revertFitButton, ui.undoSegmentButton, ui.growAtPointButton):
+        assert not button.isEnabled(), button.objectName()
+    session.panel.presenter.fits.apply()
+    assert session.app.errors == ["Fit to real images first"] and session.logic.preset.display.gain_db == 0.0
+
+
+def test_a_volume_that_is_loaded_is_the_mri_if_none_is(session):
+    head = session.head()
+    session.process()
+    assert session.parameters.mri is head and session.ui.mriSelector.currentNode() is head
+    session.head()
+    session.process()
+    assert session.parameters.mri is head
 
 
 def test_reloading_the_module_brings_new_code(module):
@@ -869,33 +929,75 @@ def test_a_slicer_that_has_pip_ensure_is_left_to_it(bare_slicer, simulation_erro
     assert requester == "SlicerUSSim" and requirements == ["pyopencl>=2023.1"] and "numpy==2.0.2" in constraints
 
 
-def test_on_windows_without_a_device_intels_runtime_is_offered(bare_slicer, simulation_error, monkeypatch):
-    """Untested on Windows: this tests only the questions and actions of the module."""
-    app = bare_slicer.app
-    app.installed = ["pyopencl"]
-    absent, known = ["intel-opencl-rt"], importlib.metadata.version
+@pytest.fixture
+def panel_with(module, monkeypatch):
+    """The panel on a computer with these devices."""
+    sessions = []
 
-    def version(name: str) -> str:
-        if name in absent:
-            raise importlib.metadata.PackageNotFoundError(name)
-        return known(name)
+    def opened(*devices, **options) -> Session:
+        trials = tried(*devices, **options)
+        monkeypatch.setattr(importlib.import_module("SlicerUSSim.Widget.device_bar"), "DeviceTrials", trials)
+        sessions.append(Session(module))
+        return sessions[-1]
 
-    monkeypatch.setattr(importlib.metadata, "version", version)
-    monkeypatch.setattr(importlib.import_module("SlicerUSSim.Logic.opencl.devices"), "list_devices", list)
-    bare_slicer.ensure()
-    assert not app.questions  # not where Linux is
-    monkeypatch.setattr(sys, "platform", "win32")
-    app.answer = False
-    bare_slicer.ensure()  # the work goes on, and says that there is no device
-    assert "intel-opencl-rt" in app.questions[0] and app.installed == ["pyopencl"]
-    app.answer = True
-    with pytest.raises(simulation_error(), match="restart Slicer"):
-        bare_slicer.ensure()
-    assert app.installed == ["pyopencl", "intel-opencl-rt"] and "numpy==2.0.2" in app.constraints
-    app.questions.clear()
-    absent.clear()  # installed, and no device all the same
-    bare_slicer.ensure()
-    assert not app.questions
+    yield opened
+    for session in sessions:
+        session.close()
+
+
+@pytest.mark.parametrize(
+    ("system", "machine", "offered"),
+    [
+        ("linux", "x86_64", ["Install Intel's runtime for processors (1000 MB)"]),  # PoCL is installed here
+        ("win32", "AMD64", ["Install Intel's runtime for processors (120 MB)"]),
+        ("linux", "aarch64", []),
+        ("darwin", "arm64", []),
+    ],
+)
+def test_without_a_device_the_panel_says_so_and_offers_a_runtime(panel_with, monkeypatch, system, machine, offered):
+    """Untested on Windows: this tests only what is offered."""
+    monkeypatch.setattr(sys, "platform", system)
+    monkeypatch.setattr("platform.machine", lambda: machine)
+    monkeypatch.setattr(slicer.app, "installed", [])
+    monkeypatch.setitem(sys.modules, "pyopencl", types.ModuleType("pyopencl"))  # loaded without the runtime
+    session = panel_with(error="no OpenCL device found; install one")
+    bar = session.widget.devices
+    assert bar.label.text() == "No OpenCL device found; install one" and not bar.devices.isVisibleTo(session.parent)
+    buttons = [button for button in bar.buttons.values() if button.isVisibleTo(session.parent)]
+    assert [button.text() for button in buttons] == offered
+    for button in buttons:
+        button.click()
+        assert session.app.errors.pop() == "Intel's runtime is installed; restart Slicer to use it"
+        assert session.app.installed[0] == "intel-opencl-rt" and "numpy==" in session.app.constraints
+    assert not session.app.errors
+
+
+def test_the_chosen_device_is_remembered(panel_with, module):
+    kind = importlib.import_module("SlicerUSSim.Logic.imaging.device_trials").TriedDevice
+    fast, slow = (kind(f"{n}:0", f"device {n}", "any", "GPU", 10.0 + n) for n in range(2))
+    broken = kind("2:0", "device 2", "any", "GPU", None, "its runtime ended the process (-6)")
+    session = panel_with(fast, broken, slow)
+    combo = session.widget.devices.devices
+    assert [combo.itemText(n) for n in range(combo.count())] == [
+        "device 0 (any): 10 ms per image", "device 1 (any): 11 ms per image",
+    ]  # fmt: skip
+    assert session.widget.devices.label.text() == "device 2 cannot be used: its runtime ended the process (-6)"
+    assert session.logic.device == fast.key
+    combo.setCurrentIndex(1)
+    assert session.logic.device == slow.key
+    again = panel_with(fast, broken, slow)
+    assert again.widget.devices.trials.chosen == slow.key
+    assert again.widget.devices.trials.known == {fast.key: 10.0, slow.key: 11.0}
+    module.app.settings.clear()
+
+
+def test_the_first_image_says_that_it_waits_for_kernels(panel_with):
+    session = panel_with(own_device(), waits=3).segmented()
+    shown, bar = [], session.ui.progressBar
+    bar.valueChanged.connect(lambda value: shown.append((bar.isVisibleTo(session.parent), bar.format(), value)))
+    session.ui.liveCheckBox.setChecked(True)
+    assert (True, "Build kernels, once on this computer %p%", 33) in shown and session.logic.isLive
+    assert not session.app.errors
 
 
 @pytest.mark.slow

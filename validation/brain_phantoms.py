@@ -100,9 +100,9 @@ class TissueMaps:
 
 
 def tissue_maps(name: str) -> TissueMaps | None:
-    """The maps of a brain: "mni152" or "colin27"; None if the package that carries it is not installed.
+    """The maps of a brain: "mni152" or "colin27"; None without Debian's mricron-data, which has the latter.
 
-    mni152: the published maps of the MNI152 2009a template (Fonov et al., NeuroImage 54(1), 2011), from nilearn.
+    mni152: the published maps of the MNI152 2009a template (Fonov et al., NeuroImage 54(1), 2011).
 
     colin27: an average of 27 scans of one person (Holmes et al., J. Comput. Assist. Tomogr. 22(2), 1998), from Debian's
     mricron-data. No share maps are published with it, so that they come from its intensity, which has little noise:
@@ -116,8 +116,6 @@ def tissue_maps(name: str) -> TissueMaps | None:
     if name == "colin27":
         return _colin27()
     atlas = mni152()
-    if atlas is None:
-        return None
     shares = np.stack([atlas.csf.array, atlas.grey.array, atlas.white.array])
     return TissueMaps("MNI152", shares, atlas.t1.array > 0, atlas.t1.ijk_to_ras)
 

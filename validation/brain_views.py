@@ -31,13 +31,11 @@ class EvenBrain:
 
 
 def even_brains(device=None, **acoustics: float) -> list[EvenBrain]:
-    """The brains on this machine: the MNI152 template of nilearn and Colin27 of Debian's mricron-data.
+    """The MNI152 template and, if Debian's mricron-data is installed, Colin27.
 
-    What is not installed is left out; without nilearn, the synthetic head takes the place of the template. There is no
-    membrane. `acoustics` are further values for all tissues, such as attenuation_db_cm_mhz=0.0.
+    There is no membrane. `acoustics` are further values for all tissues, such as attenuation_db_cm_mhz=0.0.
     """
-    mri, source = demo_mri()
-    mris = {"MNI152" if source.startswith("MNI152") else "synthetic head": mri}
+    mris = {"MNI152": demo_mri()[0]}
     colin27 = COLIN27 / "ch2bet.nii.gz"
     if colin27.exists():
         mris["Colin27"] = Volume.read(colin27)

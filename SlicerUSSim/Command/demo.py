@@ -33,9 +33,7 @@ from SlicerUSSim.Logic.base.settings import SimulationSettings
 class DemoOptions(MriOptions):
     """Patient and probe of the demo."""
 
-    mri: str | None = declared(
-        "--mri", type=click.Path(), help="MRI of a head or a brain (default: the MNI152 brain of nilearn)."
-    )
+    mri: str | None = declared("--mri", type=click.Path(), help="MRI of a head or a brain (default: the MNI152 brain).")
     probe: str = declared(
         "--probe", default="phased", show_default=True, metavar="NAME|PATH", help="Name of a probe, or one as JSON."
     )

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from SlicerUSSim.Logic.base.errors import SimulationError, require, required
 from SlicerUSSim.Logic.base.settings import DisplaySettings
 from SlicerUSSim.Logic.fitting.parameters import FreeParameters, all_names, declaration_of
@@ -112,17 +114,26 @@ class FitPresenter:
 
     # ---- apply and revert --------------------------------------------------------------------------------------
 
-    def canApply(self) -> bool:
-        return self._fit is not None and self._before is None
+    def canApply(self) -> tuple[bool, str]:
+        """(whether the fit can be applied, the reason if not)"""
+        return self._canChange(self._before is None, "The fit is applied already")
 
-    def canRevert(self) -> bool:
-        return self._before is not None
+    def canRevert(self) -> tuple[bool, str]:
+        """(whether the values from before Apply can be restored, the reason if not)"""
+        return self._canChange(self._before is not None, "Apply a fit first")
+
+    def _canChange(self, met: bool, why_not: str) -> tuple[bool, str]:
+        labels: Any = None if self._fit is None else self._fit[1]
+        is_chosen = labels is not None and labels is self._panel.parameters.labels
+        other = "" if labels is None else f"The fit is of {labels.GetName()!r}; choose these tissues"
+        return self._panel.ready((self._fit, "Fit to real images first"), (is_chosen, other), (met, why_not))
 
     def apply(self) -> None:
         """Write the result to the preset, and a registration to a transform node, the future parent of the tracking."""
         panel = self._panel
         with panel.acting():
-            found, labels = required(self._fit, "nothing to apply, fit first")
+            require(*self.canApply())
+            found, labels = required(self._fit, "fit first")
             before = panel.logic.applyFit(found)
             if found.registration is not None:
                 transform = result_called(self._panel.logic.scene, "LinearTransform", _REGISTRATION)
@@ -132,6 +143,7 @@ class FitPresenter:
     def revert(self) -> None:
         """Restore the values from before apply(), except those that were changed since, which the summary names."""
         with self._panel.acting():
+            require(*self.canRevert())
             before = required(self._before, "nothing to revert to, apply a fit first")
             found = required(self._fit, "nothing to revert, fit first")[0]
             kept = self._panel.logic.revertFit(found, before)

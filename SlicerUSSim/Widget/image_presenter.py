@@ -33,6 +33,7 @@ class ImagePresenter:
         """Simulate one image, into the chosen volume or a new one."""
         logic, view = self._panel.logic, self._panel.view
         with self._panel.acting():
+            self._panel.awaitKernels()
             nodes = self._nodes()
             start = perf_counter()
             caught: list[Warning] = []
@@ -67,6 +68,7 @@ class ImagePresenter:
             logic.stopLiveUpdate()
             return
         with self._panel.acting():
+            self._panel.awaitKernels()
             self._nodes()
             self._last_image = None
             self._followed = self._live_nodes()
@@ -127,13 +129,18 @@ class ImagePresenter:
             own = (None, transforms_node.GetID())
             if images_node is not None and images_node.GetNodeReferenceID(MADE_FROM) not in own:
                 images_node = None  # those of other transforms stay
-            with panel.made(images_node, "Sequence", f"{transforms_node.GetName()} ultrasound") as images:
-                browser = self._browser_of(transforms_node)
+            name = transforms_node.GetName()
+            with (
+                panel.made(images_node, "Sequence", f"{name} ultrasound") as images,
+                panel.made(self._browser_of(transforms_node), "SequenceBrowser", f"{name} browser") as browser,
+            ):
+                browser.AddSynchronizedSequenceNode(transforms_node)
                 count = panel.logic.simulateSequence(
                     parameters.labels, transforms_node, images, browser_node=browser, progress=progress
                 )
             images.SetNodeReferenceID(MADE_FROM, transforms_node.GetID())
             parameters.image_sequence = images  # in place of which the next ones come
+            self._show_played(browser, images, transforms_node)
             self.sequenceDone = _("{count} images in {name!r}").format(count=count, name=images.GetName())
 
     def sweepAlongPath(self) -> None:
@@ -146,12 +153,9 @@ class ImagePresenter:
             try:
                 with panel.made(None, "Sequence", f"{path_node.GetName()} ultrasound") as images:
                     count = panel.logic.simulateSequence(
-                        parameters.labels,
-                        transforms,
-                        images,
-                        browser_node=browser,
+                        parameters.labels, transforms, images, browser_node=browser,
                         progress=lambda share: progress(0.95 * share),
-                    )
+                    )  # fmt: skip
                     with panel.made(None, "ScalarVolume", f"{path_node.GetName()} volume") as volume:
                         panel.logic.compoundSequence(images, volume)
             except BaseException:
@@ -160,7 +164,16 @@ class ImagePresenter:
                 raise
             images.SetNodeReferenceID(MADE_FROM, transforms.GetID())
             parameters.transform_sequence, parameters.image_sequence = transforms, images
-            panel.view.showStatus(f"{count} images in {images.GetName()!r}, compounded to {volume.GetName()!r}")
+            self._show_played(browser, images, transforms)
+            self.sequenceDone = _("{count} images in {name!r}, compounded to {volume!r}").format(
+                count=count, name=images.GetName(), volume=volume.GetName()
+            )
+
+    def _show_played(self, browser: Any, images: Any, transforms: Any) -> None:
+        """Show the image of a sequence that its browser plays in the chosen slice view."""
+        slice_node, shown = self._panel.view.sliceNode(), browser.GetProxyNode(images)
+        if slice_node is not None and shown is not None:
+            self._panel.logic.showInSlice(slice_node, shown, browser.GetProxyNode(transforms))
 
     def _browser_of(self, sequence_node: Any) -> Any:
         browsers = nodes_of_class(self._panel.logic.scene, "vtkMRMLSequenceBrowserNode")

@@ -14,6 +14,7 @@ from typing import Any, Literal, Protocol, TypeAlias
 
 from SlicerUSSim.Logic.base.declaration import Parameter, Shown
 from SlicerUSSim.Logic.base.errors import Cancelled, SimulationError, require, user_message
+from SlicerUSSim.Logic.imaging.device_trials import DeviceTrials
 from SlicerUSSim.Logic.imaging.preset import Preset
 from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic
 from SlicerUSSim.Logic.mrml.parameter_node import NODE_PARAMETERS, SceneParameters
@@ -199,6 +200,8 @@ class PanelHost:
         self.logic = logic
         self.view = view
         self._busy = False
+        #: In which devices build the kernels of images
+        self.trials: DeviceTrials | None = None
 
     @property
     def parameters(self) -> SceneParameters:
@@ -258,6 +261,12 @@ class PanelHost:
                 yield progress
         finally:
             self._busy = False
+
+    def awaitKernels(self) -> None:
+        """Show progress while the kernels of images are built, which takes a minute the first time."""
+        if self.trials is not None and self.trials.used is None:
+            with self.working("Build kernels, once on this computer") as progress:
+                self.trials.wait(progress)
 
     def add(self, kind: str, name: str) -> Any:
         """A new node vtkMRML{kind}Node."""

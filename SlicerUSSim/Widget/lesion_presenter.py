@@ -17,7 +17,11 @@ class LesionPresenter:
 
     def __init__(self, panel: PanelHost, notes: Notes, segmenting: SegmentPresenter) -> None:
         self._panel, self._notes, self._segmenting = panel, notes, segmenting
-        self._grown: tuple[Any, list[str]] = (None, [])  # node and IDs of the segments that were grown last
+        self.forget()
+
+    def forget(self) -> None:
+        """Forget the lesion that was grown last, which is of another patient."""
+        self._grown: tuple[Any, list[str]] = (None, [])  # node and IDs of the segments
 
     def canAddTissues(self) -> tuple[bool, str]:
         """(whether lesions can be laid over the tissues, the reason if not)"""

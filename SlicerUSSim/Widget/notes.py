@@ -25,9 +25,9 @@ class Notes:
         self._lines: list[str] = []
         #: Those of the lines that are about the tissues under the lesions
         self.checks: list[str] = []
-        #: ID of the MRI node that was segmented
-        self.segmented: str | None = None
-        self._labels: str | None = None  # ID of the labels that the notes are about
+        #: The MRI node that was segmented
+        self.segmented: Any = None
+        self._labels: Any = None  # that the notes are about
         #: The lines about contact and bone before the probe that the notes had when they were shown last
         self._about_probe: tuple[str, ...] = ()
 
@@ -71,11 +71,11 @@ class Notes:
 
     def areAbout(self, labels: Any) -> None:
         """Remember that they are about these labels."""
-        self._labels = None if labels is None else labels.GetID()
+        self._labels = labels
 
     def isAbout(self, labels: Any) -> bool:
         """Whether they are about these labels."""
-        return self._labels == labels.GetID()
+        return self._labels is labels
 
     def recognise(self, labels: Any) -> None:
         """Replace them by what labels were recognised as, if they are about others."""

@@ -21,6 +21,7 @@ from packaging.version import InvalidVersion, Version
 from slicer.i18n import tr as _
 
 from SlicerUSSim.Logic.base.errors import SimulationError, require
+from SlicerUSSim.Logic.opencl.devices import Runtime, runtimes
 
 _NAME = "SlicerUSSim"
 
@@ -46,26 +47,20 @@ def ensure_packages(requirements_file: Path) -> None:
     require(not still, _not_installed(", ".join(map(str, still))))
 
 
-def offer_opencl_runtime() -> None:
-    """On Windows without an OpenCL device, offer to install Intel's runtime for processors.
+def are_installed(requirements_file: Path) -> bool:
+    """Whether no package of a requirements file is missing."""
+    return not _missing(requirements_file)
 
-    Not tested on Windows. Does nothing on other systems: on Linux PoCL is a requirement, and macOS includes OpenCL.
-    Raises SimulationError after an installation, since Slicer must be restarted, and if pip fails.
-    """
-    if sys.platform != "win32" or slicer.app.testingEnabled():
-        return
-    from SlicerUSSim.Logic.opencl.devices import list_devices
-    from SlicerUSSim.Logic.opencl.runtimes import INTEL_RUNTIME
 
-    if _installed_version(INTEL_RUNTIME) is not None or list_devices():
-        return
-    question = _(
-        "{name} found no OpenCL device. The driver of a graphics card provides one. Intel's runtime for processors "
-        "is another (Python package {package}, 120 MB). Install it now?"
-    )
-    if slicer.util.confirmOkCancelDisplay(question.format(name=_NAME, package=INTEL_RUNTIME)):
-        _install([Requirement(INTEL_RUNTIME)])
-        raise SimulationError("Intel's OpenCL runtime is installed; restart Slicer to use it")
+def runtimes_to_install() -> list[Runtime]:
+    """The OpenCL runtimes for processors that pip can install on this computer and has not installed."""
+    return [runtime for runtime in runtimes() if _installed_version(runtime.packages[0]) is None]
+
+
+def install_runtime(runtime: Runtime) -> None:
+    """Install an OpenCL runtime. Raises SimulationError if pip fails, and if Slicer must be restarted to use it."""
+    _install([Requirement(name) for name in runtime.packages])
+    require("pyopencl" not in sys.modules, f"{runtime.name} is installed; restart Slicer to use it")
 
 
 def _ask_and_install(missing: list[Requirement]) -> None:

@@ -6,6 +6,8 @@ page in the browser, and the view of the tests. Errors caused by the user are no
 
 from __future__ import annotations
 
+from typing import Any
+
 from SlicerUSSim.Logic.mrml.fitting_nodes import fits
 from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic
 from SlicerUSSim.Logic.mrml.nodes import nodes_of_class
@@ -50,6 +52,11 @@ class PanelPresenter(PanelHost):
                 parameters.mri = node
                 return
 
+    def nodeAdded(self, node: Any) -> None:
+        """Called after a node was added to the scene: a volume that is loaded becomes the MRI, if none is selected."""
+        if node.IsA("vtkMRMLScalarVolumeNode") and self.parameters.mri is None:
+            self.view.schedule(self.chooseDefaultNodes)  # when it has its voxels, and the role for which it was made
+
     def parametersChanged(self) -> None:
         """Update the view and the nodes of live update after a change of the scene's parameters or slice view."""
         self.images.followChoices()
@@ -62,4 +69,5 @@ class PanelPresenter(PanelHost):
         self.view.showStatus("")
         self.fits.forget()
         self.segmenting.forget()
+        self.lesions.forget()
         self.notes.set()

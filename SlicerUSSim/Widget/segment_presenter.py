@@ -80,7 +80,7 @@ class SegmentPresenter:
         panel, notes, parameters = self._panel, self._notes, self._panel.parameters
         with panel.acting(), panel.working(_("Segment")) as progress:
             mri = required(parameters.mri, "no MRI chosen, expected a scalar volume")
-            if notes.segmented not in (None, mri.GetID()):  # also if this fails: they are about another patient
+            if notes.segmented not in (None, mri):  # also if this fails: they are about another patient
                 notes.set()
             nodes, lines, settings = self._chosen(), notes.lines, parameters.segmentation
             told = self._forget_other_brain(mri) + self._closed_again()
@@ -98,7 +98,7 @@ class SegmentPresenter:
                     keep_mask_at=self.maskFile(mri), keep_sheets_at=self.sheetsFile(mri), progress=progress,
                 )  # fmt: skip
             told += self._take_sheets(sheets)
-            notes.segmented, notes.checks = mri.GetID(), checks(result.warnings)
+            notes.segmented, notes.checks = mri, checks(result.warnings)
             if (
                 parameters.mask is None
                 and isinstance(result, Segmentation)  # and not of a CT
@@ -216,7 +216,7 @@ class SegmentPresenter:
     def _forget_other_brain(self, mri: Any) -> list[str]:
         """Deselect the mask that Segment extracted from another MRI; a line about it."""
         mask: Any = self._panel.parameters.mask
-        if self._panel.logic.brainOf(mask) in (None, mri.GetID()):
+        if self._panel.logic.isBrainOf(mask, mri) is not False:
             return []
         self._panel.parameters.mask = None
         return [f"{mask.GetName()!r} is the mask of another MRI and was not used"]

@@ -188,13 +188,12 @@ def _in_child(function: Callable, args: tuple, kwargs: dict[str, Any], path: Pat
             (seconds, limits.memory_or_default),
             level,
         )
-        environment = {name: value for name, value in os.environ.items() if name != UNTRUSTED} | _ONE_THREAD
-        environment["PYTHONPATH"] = os.pathsep.join(filter(None, sys.path))
+        command, environment = child_command(f"from {__name__} import answer_parent; answer_parent()")
+        environment = {name: value for name, value in environment.items() if name != UNTRUSTED} | _ONE_THREAD
         try:
             ended = subprocess.run(
-                [_python(), "-c", f"from {__name__} import answer_parent; answer_parent()"],
-                input=pickle.dumps(task), capture_output=True, timeout=seconds, env=environment, check=False,
-            )  # fmt: skip
+                command, input=pickle.dumps(task), capture_output=True, timeout=seconds, env=environment, check=False
+            )
         except subprocess.TimeoutExpired:
             raise SimulationError(
                 f"{shown_path(path)}: is not read after {seconds:.0f} s, expected less for {_size(path)} bytes"
@@ -217,9 +216,21 @@ def _in_child(function: Callable, args: tuple, kwargs: dict[str, Any], path: Pat
     return value
 
 
-def _python() -> str:
-    """The interpreter, also in 3D Slicer, whose executable is the application."""
-    return shutil.which("PythonSlicer") or sys.executable
+def child_command(code: str) -> tuple[list[str], dict[str, str]]:
+    """(command, environment) of a Python that runs `code` and imports what this process does.
+
+    In 3D Slicer, whose executable is the application, it is PythonSlicer. The package has the same place there, which
+    need not be on sys.path, see USSim.bindPackage.
+    """
+    package = __name__.split(".")[0]
+    bound = (
+        "import importlib.machinery, importlib.util, sys; "
+        f"spec = importlib.machinery.ModuleSpec({package!r}, None, is_package=True); "
+        f"spec.submodule_search_locations = {list(sys.modules[package].__path__)!r}; "
+        f"sys.modules[{package!r}] = importlib.util.module_from_spec(spec); "
+    )
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+    return [shutil.which("PythonSlicer") or sys.executable, "-c", bound + code], environment
 
 
 def _ending(code: int) -> str:

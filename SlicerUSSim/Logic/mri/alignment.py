@@ -17,7 +17,7 @@ from scipy import ndimage
 
 from SlicerUSSim.Logic.base.neighbourhood import distance_to
 from SlicerUSSim.Logic.base.volume import Volume
-from SlicerUSSim.Logic.mri.atlas import required_atlas
+from SlicerUSSim.Logic.mri.atlas import mni152
 from SlicerUSSim.Logic.mri.coarse import CoarseImage, resampled_to_ras
 
 #: Nodding of the head in degrees and size of the brain in log percent of the template, at which the search starts
@@ -46,7 +46,7 @@ class Alignment:
 
 
 def align_template(mri: Volume, progress: Callable[[float], None] | None = None) -> Alignment:
-    """The template's brain in the MRI of a head. Raises SimulationError if nilearn is not installed.
+    """The template's brain in the MRI of a head.
 
     If the fit is doubtful, fat is set to air and the fit repeated; the better one is taken.
     """
@@ -208,7 +208,7 @@ class Template:
     """The MNI152 T1 at 5 mm: points for the search, and the distance to its brain."""
 
     def __init__(self) -> None:
-        t1 = required_atlas().t1
+        t1 = mni152().t1
         step = slice(None, None, TEMPLATE_MM)
         brain = t1.array > 0
         # Its voxels are of 1 mm.
@@ -252,7 +252,7 @@ _SCORE_MM, _WINDOW_MM = 3, 20.0
 def _tissues() -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """(inside (k, j, i), (n, 3) RAS points in it, weight (k, j, i), (n, 2) maps of CSF and white matter)."""
     step = slice(None, None, _SCORE_MM)
-    atlas = required_atlas()
+    atlas = mni152()
     inside = template().distance.array[step, step, step] < -2.0
     points = _SCORE_MM * np.argwhere(inside)[:, ::-1] @ atlas.t1.ijk_to_ras[:3, :3].T + atlas.t1.ijk_to_ras[:3, 3]
     weight = np.maximum(ndimage.gaussian_filter(inside.astype(np.float32), _WINDOW_MM / _SCORE_MM), 1e-3)

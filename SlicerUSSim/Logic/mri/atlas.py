@@ -1,16 +1,18 @@
-"""The atlas: the MNI152 template and its tissue maps, which nilearn carries."""
+"""The atlas: the MNI152 template and its tissue maps, in mni152.npz; mni152.txt has its copyright notice."""
 
 from __future__ import annotations
 
-import importlib.util
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
 import numpy as np
 
-from SlicerUSSim.Logic.base.errors import required
 from SlicerUSSim.Logic.base.volume import Volume
+
+_FILE = Path(__file__).with_name("mni152.npz")
+#: RAS mm of its first voxel
+_ORIGIN = (-98.0, -134.0, -72.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,23 +28,17 @@ class Atlas:
 
 
 @cache
-def mni152() -> Atlas | None:
-    """The MNI152 2009a template at 1 mm (Fonov et al., NeuroImage 54(1), 2011); None if nilearn is not installed."""
-    package = importlib.util.find_spec("nilearn")
-    if package is None or package.origin is None:
-        return None
-    folder = Path(package.origin).parent / "datasets/data"
-    t1, grey, white = (
-        Volume.read(folder / f"mni_icbm152_{name}_tal_nlin_sym_09a_converted.nii.gz") for name in ("t1", "gm", "wm")
-    )
-    inside = t1.array > 0
-    shares = [np.where(inside, volume.array.astype(np.float32) / 255.0, 0.0) for volume in (grey, white)]
-    csf = np.where(inside, np.clip(1.0 - shares[0] - shares[1], 0.0, 1.0), 0.0)
-    return Atlas(t1, *(t1.with_array(share.astype(np.float32)) for share in (csf, *shares)))
+def mni152() -> Atlas:
+    """The MNI152 2009a template at 1 mm (Fonov et al., NeuroImage 54(1), 2011); the file has the left half of it."""
+    with np.load(_FILE) as halves:
+        t1, *counts = (_both_sides(halves[name]) for name in ("t1", "grey", "white"))
+    grey, white = (count.astype(np.float32) / 255.0 for count in counts)
+    csf = np.where(t1 > 0, np.clip(1.0 - grey - white, 0.0, 1.0), np.float32(0.0))
+    ijk_to_ras = np.eye(4)
+    ijk_to_ras[:3, 3] = _ORIGIN
+    return Atlas(*(Volume(array, ijk_to_ras) for array in (t1, csf, grey, white)))
 
 
-def required_atlas() -> Atlas:
-    """As mni152. Raises SimulationError, with the remedy, if nilearn is not installed."""
-    return required(
-        mni152(), "a whole head needs the brain atlas of nilearn: pip install nilearn, or give a brain mask (--mask)"
-    )
+def _both_sides(half: np.ndarray) -> np.ndarray:
+    """(k, j, 2 i - 1) of (k, j, i) up to and with the plane of symmetry."""
+    return np.concatenate([half, half[:, :, -2::-1]], axis=2)

@@ -54,8 +54,8 @@ def find_brain(
     keep_at : file in which the mask of a whole head is kept and from which it is read again; see mask_beside.
     progress : called with the fraction done, 0 to 1; may raise errors.Cancelled, which ends the extraction at once.
 
-    Raises SimulationError if the image shows neither a head nor a brain, if nilearn is not installed, and for a kept
-    mask that would be refused if it were given.
+    Raises SimulationError if the image shows neither a head nor a brain, and for a kept mask that
+    would be refused if it were given.
     """
     method = parameter_of(SegmentationSettings, "skull_strip").checked("segmentation", method)
     start, report = perf_counter(), progress or (lambda share: None)

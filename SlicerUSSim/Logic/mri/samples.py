@@ -1,28 +1,16 @@
-"""Sample MRIs: the MNI152 brain from nilearn, and a synthetic head."""
+"""Sample MRIs: the MNI152 brain, and a synthetic head."""
 
 from __future__ import annotations
-
-import importlib.util
-import logging
-from pathlib import Path
 
 import numpy as np
 
 from SlicerUSSim.Logic.base.volume import Volume
-
-_log = logging.getLogger(__name__)
+from SlicerUSSim.Logic.mri.atlas import mni152
 
 
 def demo_mri() -> tuple[Volume, str]:
-    """(MRI, source): the MNI152 T1 from nilearn, or a synthetic phantom if nilearn is not installed."""
-    package = importlib.util.find_spec("nilearn")
-    if package is not None and package.origin is not None:
-        path = Path(package.origin).parent / "datasets/data/mni_icbm152_t1_tal_nlin_sym_09a_converted.nii.gz"
-        if path.exists():
-            _log.info("demo MRI: the MNI152 brain that nilearn carries")
-            return Volume.read(path), "MNI152 2009a T1 (nilearn)"
-    _log.info("demo MRI: the synthetic phantom, since nilearn is not installed")
-    return head_mri(), 'synthetic head phantom (install "SlicerUSSim[demo]" for the MNI152 brain)'
+    """(MRI, source): the skull-stripped MNI152 T1 (see atlas.mni152)."""
+    return mni152().t1, "MNI152 2009a T1"
 
 
 def head_mri(spacing_mm: float = 1.0, seed: int = 0) -> Volume:

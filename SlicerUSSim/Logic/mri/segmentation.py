@@ -151,7 +151,7 @@ def segment_mri(
     progress: Callable[[float], None] | None = None,
     **values: Any,
 ) -> Segmentation:
-    """Label the tissues of a brain MRI by intensity, led by an atlas where nilearn and a whole brain are there.
+    """Label the tissues of a brain MRI by intensity, led by an atlas in a whole brain.
 
     Parameters
     ----------

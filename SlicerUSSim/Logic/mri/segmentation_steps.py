@@ -82,10 +82,7 @@ def atlas_of(part: BrainPart, report: Callable[[float], None]) -> tuple[AtlasFit
     reason = is_whole_brain(part.images[0], part.inside)
     if reason:
         return None, f"without an atlas, since {reason}", None
-    atlas = mni152()
-    if atlas is None:
-        return None, 'without an atlas; install "SlicerUSSim[demo]" for one', None
-    fit = register_atlas(part.images[0], part.inside, atlas, lambda share: report(0.05 + 0.35 * share))
+    fit = register_atlas(part.images[0], part.inside, mni152(), lambda share: report(0.05 + 0.35 * share))
     share = explained(part.images[0], np.linalg.inv(fit.patient_to_atlas))
     if not fit.is_good:
         return None, f"without an atlas, since MNI152 covers the brain with a Dice of {fit.dice:.2f} only", share

@@ -53,7 +53,7 @@ class UltrasoundSceneLogic:
     """
 
     def __init__(self, scene, device: str | None = None, work: AtOnce | None = None) -> None:
-        self.scene, self.device = scene, device
+        self.scene = scene
         self.patients = patients = PatientLogic(scene, device, work or AtOnce())
         self.images = images = ImageLogic(patients)
         self.live = LiveLogic(patients, images)
@@ -67,7 +67,7 @@ class UltrasoundSceneLogic:
     renewSimulator = _Of("patients", PatientLogic.renewSimulator)
     segment, mayReplace = _Of("labels", SegmentLogic.segment), _Of("labels", SegmentLogic.mayReplace)
     addTissues, writeBrain = _Of("labels", SegmentLogic.addTissues), _Of("labels", SegmentLogic.writeBrain)
-    isOwnBrain, brainOf = _Of("labels", SegmentLogic.isOwnBrain), _Of("labels", SegmentLogic.brainOf)
+    isOwnBrain, isBrainOf = _Of("labels", SegmentLogic.isOwnBrain), _Of("labels", SegmentLogic.isBrainOf)
     openCraniotomy, closedLabels = _Of("labels", SegmentLogic.openCraniotomy), _Of("labels", SegmentLogic.closedLabels)
     hideOpening, mayReplaceResult = staticmethod(hide_flap), staticmethod(may_replace_result)
     simulate, holdImage = _Of("images", ImageLogic.simulate), _Of("images", ImageLogic.holdImage)
@@ -97,6 +97,15 @@ class UltrasoundSceneLogic:
     @preset.setter
     def preset(self, preset: Preset) -> None:
         self.parameters.preset = preset
+
+    @property
+    def device(self) -> str | None:
+        """The choice of the OpenCL device, see opencl.devices.choose_device."""
+        return self.patients.device
+
+    @device.setter
+    def device(self, device: str | None) -> None:
+        self.patients.device = device
 
     @property
     def growth(self) -> LesionGrowth:

@@ -181,7 +181,9 @@ def write_slice(volume_node, in_probe: Volume, transform_node=None) -> None:
     _, rows, columns = in_probe.array.shape
     if image is None or image.GetDimensions() != (columns, rows, 1) or image.GetScalarTypeAsString() != "unsigned char":
         write_volume(volume_node, in_probe)
-        show_all_greys(volume_node)
+        display = None if volume_node.GetScene() is None else display_of(volume_node)  # not of an item of a sequence
+        if display is not None and display.GetAutoWindowLevel():  # and not after the user has chosen a window
+            show_all_greys(volume_node)
     else:
         if not np.array_equal(ijk_to_ras(volume_node), in_probe.ijk_to_ras):
             volume_node.SetIJKToRASMatrix(vtk_matrix(in_probe.ijk_to_ras))
@@ -194,10 +196,8 @@ def write_slice(volume_node, in_probe: Volume, transform_node=None) -> None:
 
 def show_all_greys(volume_node) -> None:
     """Black at 0 and white at 255, as on a scanner; an automatic window would change the brightness between frames."""
-    if volume_node.GetScene() is None:  # an item of a sequence
-        return
     display = display_of(volume_node)
-    if display is not None and display.GetAutoWindowLevel():
+    if display is not None:
         display.SetAutoWindowLevel(False)
         display.SetWindowLevelMinMax(0, 255)
 

@@ -42,7 +42,7 @@ from SlicerUSSim.Logic.tissue.label_maps import LabelledTissues
 from SlicerUSSim.Logic.tissue.table import TissueTable
 from SlicerUSSim.Logic.tissue.texture import Texture
 
-#: Attribute of a mask node: the ID of the MRI node from which it was extracted
+#: Attribute of a mask node that was extracted, and role of its reference to the MRI node
 _BRAIN_OF = "SlicerUSSim.brainOf"
 #: Share of the time in which tissues are segmented, if sheets are looked for after that
 _SEGMENTED = 0.4
@@ -151,21 +151,24 @@ class SegmentLogic:
         """
         scene, name = self._patient.scene, f"{mri_node.GetName()} brain"
         known = nodes_of_class(scene, "vtkMRMLLabelMapVolumeNode")
-        node = next((one for one in known if self.brainOf(one) == mri_node.GetID() and may_replace(one)), None)
+        node = next((one for one in known if self.isBrainOf(one, mri_node) and may_replace(one)), None)
         if node is None:
             node = scene.AddNewNodeByClass("vtkMRMLLabelMapVolumeNode", scene.GenerateUniqueName(name))
         write_labels(node, result.brain.mask, ("brain",), mri_node)
-        node.SetAttribute(_BRAIN_OF, mri_node.GetID())
+        node.SetAttribute(_BRAIN_OF, "1")
+        node.SetNodeReferenceID(_BRAIN_OF, mri_node.GetID())
         mark_as_made(node)
         return node
 
     def isOwnBrain(self, mask_node) -> bool:
         """Whether a mask is one that writeBrain wrote, and nobody has edited it."""
-        return self.brainOf(mask_node) is not None and may_replace(mask_node)
+        return self.isBrainOf(mask_node, None) is not None and may_replace(mask_node)
 
-    def brainOf(self, mask_node) -> str | None:
-        """The ID of the MRI node from which writeBrain's mask is, whether edited or not; None for other masks."""
-        return None if mask_node is None else mask_node.GetAttribute(_BRAIN_OF)
+    def isBrainOf(self, mask_node, mri_node) -> bool | None:
+        """Whether writeBrain's mask, edited since or not, is from this MRI node; None for other masks."""
+        if mask_node is None or mask_node.GetAttribute(_BRAIN_OF) is None:
+            return None
+        return mask_node.GetNodeReference(_BRAIN_OF) is mri_node
 
     def mayReplace(self, labels_node) -> bool:
         """Whether segment() may write into a node: if it is empty, or has what segment() wrote and nobody edited."""

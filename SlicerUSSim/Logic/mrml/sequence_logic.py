@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Hashable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -39,8 +40,8 @@ class SequenceLogic:
 
     def forget(self) -> None:
         """Release what is kept in memory of the last patient."""
-        #: ID of the last simulated sequence, and what its images show of the patient
-        self._last: tuple[str, Hashable] = ("", None)
+        #: Node of the last simulated sequence, and what its images show of the patient
+        self._last: tuple[Any, Hashable] = (None, None)
 
     def simulateSequence(
         self, labels_node, transforms_node, images_node, *, browser_node=None,
@@ -83,11 +84,14 @@ class SequenceLogic:
 
         write_taken(images_node, SequenceIndex.of_node(transforms_node), images)
         same = {image.anatomy for image in images}
-        self._last = (images_node.GetID(), images[0].anatomy if len(same) == 1 else None)
+        self._last = (images_node, images[0].anatomy if len(same) == 1 else None)
         if browser_node is not None:
-            if not browser_node.IsSynchronizedSequenceNode(images_node, True):
+            is_new = not browser_node.IsSynchronizedSequenceNode(images_node, True)
+            if is_new:
                 browser_node.AddSynchronizedSequenceNode(images_node)
             shown = browser_node.GetProxyNode(images_node)
+            if shown is not None and is_new:
+                show_all_greys(shown)
             if shown is not None and proxy is not None:
                 shown.SetAndObserveTransformNodeID(proxy.GetID())
         return count
@@ -141,8 +145,8 @@ class SequenceLogic:
         Raises SimulationError for a sequence of something else.
         """
         require_node(images_node, "vtkMRMLSequenceNode", use="sequence of images")
-        node_id, anatomy = self._last
-        return read_taken(images_node, number, anatomy if node_id == images_node.GetID() else None)
+        last, anatomy = self._last
+        return read_taken(images_node, number, anatomy if last is images_node else None)
 
     def showSequenceImage(self, images_node, number: int, output_node) -> TakenImage:
         """Write an image that simulateSequence made into a scalar volume node, where it was taken; it stays there.
@@ -199,11 +203,11 @@ class SequenceLogic:
         labels, images = self._patient.parameters.labels, self._patient.parameters.image_sequence
         if labels is None:
             return False, False
-        now, (node_id, in_sequence) = self._patient.anatomyOf(labels), self._last
-        taken, is_known = self._images.taken, images is not None and images.GetID() == node_id
+        now, (last, in_sequence) = self._patient.anatomyOf(labels), self._last
+        taken, is_known = self._images.taken, images is not None and images is last
         return taken is not None and taken.anatomy == now, is_known and in_sequence == now
 
     def sequenceIsOfTissues(self, images_node) -> None:
         """Take the images of a sequence for those of the chosen labels and sheets, with which it was restored."""
         labels = required(self._patient.parameters.labels, "no label map is chosen, expected that of the images")
-        self._last = images_node.GetID(), self._patient.anatomyOf(labels)
+        self._last = images_node, self._patient.anatomyOf(labels)

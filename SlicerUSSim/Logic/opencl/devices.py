@@ -26,8 +26,23 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 
 _EMULATOR_RANK = 9
-#: Packages of Intel's runtime for processors, by sys.platform; there are wheels for x86-64 only.
-_INTEL_PACKAGES = {"linux": f"{INTEL_RUNTIME} intel-cmplr-lib-rt", "win32": INTEL_RUNTIME}
+
+
+@dataclass(frozen=True)
+class Runtime:
+    """A runtime for processors that pip installs: its name, packages, and megabytes on the disk."""
+
+    name: str
+    packages: tuple[str, ...]
+    megabytes: int
+
+
+_POCL = Runtime("PoCL", ("pocl-binary-distribution",), 140)
+#: {sys.platform: runtimes, the fastest first}; there are wheels for x86-64 only.
+_RUNTIMES = {
+    "linux": (Runtime("Intel's runtime", (INTEL_RUNTIME, "intel-cmplr-lib-rt"), 1000), _POCL),
+    "win32": (Runtime("Intel's runtime", (INTEL_RUNTIME,), 120),),
+}
 
 
 @dataclass(frozen=True)
@@ -119,7 +134,7 @@ def choose_device(device: str | DeviceInfo | None = None) -> tuple[DeviceInfo, s
     _log.debug("OpenCL devices: %s", "; ".join(map(str, devices)) or "none")
     if not devices:
         why = lack_of_address_space() or (lack_of_cache(cache_folder()) if _has_pocl() else None)
-        raise SimulationError(f"no OpenCL device found; {why or _how_to_get_one()}")
+        raise SimulationError(f"no OpenCL device found; {why or how_to_get_one()}")
     for choice, source in (
         (device, "argument"),
         (os.environ.get("PYOPENCL_CTX"), "PYOPENCL_CTX"),
@@ -150,30 +165,27 @@ def devices_to_measure(device: str | None = None) -> list[DeviceInfo]:
     return chosen if device else [info for info in list_devices() if not info.is_emulator] or chosen
 
 
+def runtimes() -> tuple[Runtime, ...]:
+    """The runtimes for processors that pip can install on this computer, the fastest first."""
+    return _RUNTIMES.get(sys.platform, ()) if platform.machine().lower() in ("x86_64", "amd64") else ()
+
+
 def faster_hint(device: DeviceInfo) -> str | None:
     """The pip command that would install a faster device than `device` on this computer, or None."""
-    return _intel_hint() if device.kind == "CPU" and "Intel" not in device.platform else None
+    is_slow = device.kind == "CPU" and "Intel" not in device.platform
+    return f"pip install {' '.join(runtimes()[0].packages)}" if is_slow and runtimes() else None
 
 
-def _intel_hint() -> str | None:
-    packages = _INTEL_PACKAGES.get(sys.platform)
-    return None if packages is None or not _is_x86_64() else f"pip install {packages}"
+def how_to_get_one() -> str:
+    """How to get an OpenCL device on this computer; names only packages that there are for it."""
+    if sys.platform == "darwin":
+        return "macOS computes on its graphics processor only, and this Mac offers none to this program"
+    if sys.platform == "linux" and not runtimes():
+        return "install the system's OpenCL runtime, which Debian and Ubuntu have in the package pocl-opencl-icd"
+    known = " or ".join(f"{runtime.name} ({', '.join(runtime.packages)})" for runtime in runtimes())
+    return f"install the driver of a graphics card, or with pip for the processor {known}"
 
 
 def _has_pocl() -> bool:
     """Whether PoCL is installed, by pip or in the system."""
     return pocl_of_pip() is not None or any(Path("/etc/OpenCL/vendors").glob("pocl*.icd"))
-
-
-def _is_x86_64() -> bool:
-    return platform.machine().lower() in ("x86_64", "amd64")
-
-
-def _how_to_get_one() -> str:
-    """How to get an OpenCL device on this computer; names only packages that pip can find for it."""
-    if sys.platform == "linux" and _is_x86_64():
-        return f"run: pip install pocl-binary-distribution (or, faster: {_intel_hint()})"
-    if sys.platform == "linux":
-        return "install the system's OpenCL runtime; on Debian and Ubuntu run: sudo apt-get install pocl-opencl-icd"
-    intel = _intel_hint()
-    return "install the graphics driver" + ("" if intel is None else f", or for the processor run: {intel}")

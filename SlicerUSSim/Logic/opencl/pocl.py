@@ -1,14 +1,11 @@
 """Workarounds for PoCL 3.0: a processor name that its compiler supports, signals, checks for a linker and of its cache.
 
 PoCL builds kernels for the processor that LLVM 14 takes this one for, and links a library of built-in functions, which
-it selects by the processor's flags and which was built for an older processor. Three things go wrong. LLVM calls a
-processor it does not know "generic" (AMD Zen 5, for instance), which clang rejects: "unknown target CPU 'generic'"
-(pocl/pocl issue 1049, open since 2022). Zen 4 it takes for Zen 3, which has no AVX-512: vectors of 16 floats then end
-the process while they are compiled. And LLVM inlines a function only into one of a processor with all its
-instructions, even those that it does not use: on Sapphire Rapids, taken for Rocket Lake, which lacks CLWB, and on Zen 1
-and 2, which lack INVPCID, every fma, floor and vload of a kernel is a call, and an image takes half again as long. PoCL
-3.0 has no setting for the name, but stores it as a C string that is read at every build. This module replaces the
-string by the name of the processor that the library was built for.
+it selects by the processor's flags and which was built for an older processor. LLVM calls a processor it does not know
+"generic" (AMD Zen 5, for instance), which clang rejects: "unknown target CPU 'generic'" (pocl/pocl issue 1049, open
+since 2022). Zen 4 it takes for Zen 3, which has no AVX-512: vectors of 16 floats then end the process while they are
+compiled. PoCL 3.0 has no setting for the name, but stores it as a C string that is read at every build. Where a child
+process cannot compute, this module replaces the string by the name of the processor that the library was built for.
 """
 
 from __future__ import annotations
@@ -20,11 +17,18 @@ import re
 import shutil
 import signal
 import struct
+import subprocess
 import sys
 import threading
+from contextlib import suppress
 from pathlib import Path
+from typing import Any
+
+import numpy as np
 
 from SlicerUSSim.Logic.base.errors import require
+from SlicerUSSim.Logic.base.reading import child_command
+from SlicerUSSim.Logic.opencl.runtimes import load_pyopencl
 
 _log = logging.getLogger(__name__)
 
@@ -40,36 +44,37 @@ _KNOWN_PROCESSORS = (
 _UNKNOWN = "generic"
 # Names that LLVM 14 also gives to later processors, which have AVX-512
 _WITHOUT_AVX512 = ("znver1", "znver2", "znver3")
-# Bulldozer and its successors, for which PoCL has a library of their own
-_OWN_LIBRARY = "fma4"
 _DEVICE_STRUCT_BYTES = 4096
 _NOTHING = "__kernel void nothing() {}"
-_NOT_NAMED = "PoCL's compiler calls this processor %s, and that cannot be changed: %s; kernels may %s"
+_NOT_NAMED = "PoCL's compiler calls this processor %s, and that cannot be changed: %s; kernels may not build"
+_SELF_TEST = """__kernel void self_test(__global float *values) {
+  vstore16(floor(fma(vload16(0, values), 2.0f, 0.5f)), 0, values);
+}"""
+_SELF_TEST_SECONDS = 120
 
 
 def name_processor(handle) -> str | None:
-    """Give PoCL the processor name of its kernel library. Returns the name, or None if nothing was changed.
+    """Give PoCL the processor name of its kernel library, if it fails with its own. Returns the name, or None.
 
-    Of other versions than 3.0 only one that its compiler rejects, or that ends the process, is changed. `handle` is the
-    pyopencl Device. Nothing is written unless a pointer to exactly the string that is its name now, in a heap block
-    large enough for the new name, is found in the device's own structure.
+    `handle` is the pyopencl Device. Nothing is written unless a child process fails without it, and a pointer to
+    exactly the string that is its name now, in a heap block large enough for the new name, is found in the device's own
+    structure.
     """
     flags = _processor_flags()
     called = handle.version.rsplit("-", 1)[-1]
-    fails = called == _UNKNOWN or (called in _WITHOUT_AVX512 and "avx512f" in flags)
-    if not fails and re.match(r"3\.0\b", handle.driver_version) is None:
+    if called != _UNKNOWN and not (called in _WITHOUT_AVX512 and "avx512f" in flags):
+        return None
+    if _passes_self_test(f"{handle.driver_version} {called}"):
         return None
     name = next((name for name, needed in _KNOWN_PROCESSORS if needed <= flags), None)
-    if name is None and called == _UNKNOWN:
+    if name is None:
         _log.warning("PoCL's compiler does not know this processor, and no older one is like it: kernels may not build")
-    if name in (None, called) or (_OWN_LIBRARY in flags and not fails):
         return None
-    level, otherwise = (logging.WARNING, "not build") if fails else (logging.INFO, "be slow")
     try:
         # Reading a wrong pointer through /proc/self/mem is an error; dereferencing it would end the process.
         memory = os.open("/proc/self/mem", os.O_RDONLY)
     except OSError as error:
-        _log.log(level, _NOT_NAMED, called, f"its memory cannot be read ({error.strerror})", otherwise)
+        _log.warning(_NOT_NAMED, called, f"its memory cannot be read ({error.strerror})")
         return None
     try:
         address = _find_string(memory, handle.int_ptr, called.encode() + b"\0")
@@ -78,28 +83,61 @@ def name_processor(handle) -> str | None:
     finally:
         os.close(memory)
     if address is None or _usable_bytes(address) <= len(name):
-        _log.log(level, _NOT_NAMED, called, "the name is not where PoCL 3.0 has it", otherwise)
+        _log.warning(_NOT_NAMED, called, "the name is not where PoCL 3.0 has it")
         return None
     ctypes.memmove(address, name.encode() + b"\0", len(name) + 1)
     _log.info("PoCL's compiler calls this processor %s; kernels are built for %s", called, name)
     return name
 
 
+def _passes_self_test(what: str) -> bool:
+    """Whether a child process computes with PoCL as it is. The answer is kept beside PoCL's programs, for `what`."""
+    kept, text = cache_folder() / "ussim-self-test", ""
+    with suppress(OSError):
+        text = kept.read_text()
+    if not text.startswith(f"{what}\n"):
+        command, environment = child_command(f"from {__name__} import self_test; self_test()")
+        try:
+            subprocess.run(command, env=environment, capture_output=True, check=True, timeout=_SELF_TEST_SECONDS)
+            text = f"{what}\npassed"
+        except subprocess.SubprocessError as error:
+            _log.info("PoCL fails on this processor: %s", error)
+            text = f"{what}\nfailed"
+        with suppress(OSError):
+            kept.write_text(text)
+    return text.endswith("passed")
+
+
+def self_test() -> None:
+    """Compute with vectors of 16 floats; in a child process, which PoCL ends where it cannot build that."""
+    cl: Any = load_pyopencl()
+    platform = next(one for one in cl.get_platforms() if "Portable Computing Language" in one.name)
+    context = cl.Context(platform.get_devices()[:1])
+    queue = cl.CommandQueue(context)
+    flags, values = cl.mem_flags, np.arange(16, dtype=np.float32)
+    buffer = cl.Buffer(context, flags.READ_WRITE | flags.COPY_HOST_PTR, hostbuf=values)
+    cl.Program(context, _SELF_TEST).build(cache_dir=False).self_test(queue, (1,), (1,), buffer)
+    found = np.empty_like(values)
+    cl.enqueue_copy(queue, found, buffer)
+    require(np.array_equal(found, 2 * values), f"PoCL computes {found}, expected {2 * values}")
+
+
 def require_linker(version: str) -> None:
     """Raise SimulationError if PoCL cannot link kernels, which would end the process: up to version 5 it links every
-    kernel with `ld` against libgcc and libc, and aborts if they are missing, as on a minimal Debian. `version` is that
-    of the OpenCL platform."""
+    kernel with `ld` of PATH against libgcc and libc, and aborts if they are missing, as on a minimal Debian. `version`
+    is that of the OpenCL platform."""
     found = re.search(r"PoCL (\d+)", version, re.IGNORECASE)
     if found is None or int(found.group(1)) > 5 or sys.platform != "linux":
         return
-    search = os.pathsep.join([os.environ.get("PATH", ""), "/usr/bin", "/bin"])
-    has_libraries = any(shutil.which(name, path=search) for name in ("gcc", "cc")) or any(
-        any(Path("/usr").glob(f"{place}/gcc/*/*/libgcc.a")) for place in ("lib", "lib64")
+    require(
+        shutil.which("ld", path=os.environ.get("PATH", "")) is not None,
+        "PoCL, the OpenCL runtime in use, links its kernels with `ld`, which is not in a folder of PATH "
+        f"({os.environ.get('PATH')}); add its folder, mostly /usr/bin, or install Debian's package binutils",
     )
     require(
-        shutil.which("ld", path=search) is not None and has_libraries,
-        "PoCL, the OpenCL runtime in use, links its kernels with `ld` and libgcc, which are not installed; on Debian "
-        "and Ubuntu run: sudo apt-get install gcc libc6-dev",
+        any(any(Path("/usr").glob(f"{place}/gcc/*/*/libgcc.a")) for place in ("lib", "lib64")),
+        "PoCL, the OpenCL runtime in use, links its kernels with libgcc, which is not in /usr/lib/gcc; install "
+        "Debian's packages gcc and libc6-dev",
     )
 
 

@@ -186,17 +186,16 @@ def head_axes(brain: Volume, names: Sequence[str]) -> tuple[np.ndarray, str]:
 
     `brain` are labels 1, 2, ... called `names`, of a brain without what is around it. The axes are those of MNI152,
     registered to the labels with the brightness that tissues have in a T1; those of the image where that is not to be
-    trusted: without the atlas, in a part of a brain, where the two do not agree. Takes about two seconds, and ten for a
+    trusted: in a part of a brain, where the two do not agree. Takes about two seconds, and ten for a
     head that lies turned by more than a scanner's nod.
     """
     inside = brain.array > 0
     reason = is_whole_brain(brain, inside)
-    atlas = mni152()
-    if reason or atlas is None:
-        return np.eye(3), f"the view follows the image's axes, since {reason or 'there is no atlas (nilearn)'}"
+    if reason:
+        return np.eye(3), f"the view follows the image's axes, since {reason}"
     brightness = np.array([0.0, *(_BRIGHTNESS.get(name, _OTHERS) for name in names)], np.float32)
     image = brain.with_array(brightness[brain.array])
-    fit, correlation = _found(image, inside, atlas)
+    fit, correlation = _found(image, inside, mni152())
     if not fit.is_good or correlation < _LEAST_CORRELATION:
         return np.eye(3), (
             f"the view follows the image's axes, since MNI152 covers the brain with a Dice of {fit.dice:.2f} and "

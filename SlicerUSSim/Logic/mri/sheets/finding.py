@@ -100,7 +100,7 @@ def find_sheets(
     notes, asked = [], wanted
     if segmentation.atlas is None:
         wanted = tuple(kind for kind in wanted if kind in _WITHOUT_ATLAS)
-        lacking = "without an atlas, which needs a whole brain and nilearn"
+        lacking = "without an atlas, which needs a whole brain"
         require(wanted, f"{', '.join(asked)} cannot be found {lacking}")
         if len(wanted) < len(asked):
             notes.append(f"only {' and '.join(wanted)} are looked for {lacking}")

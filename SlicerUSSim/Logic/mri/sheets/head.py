@@ -106,8 +106,7 @@ class Head:
         """Raises SimulationError without one."""
         return required(
             self.registered,
-            "this needs the atlas, which did not lead the segmentation (see its notes), expected a whole brain and "
-            "nilearn",
+            "this needs the atlas, which did not lead the segmentation (see its notes), expected a whole brain",
         )
 
     @property
