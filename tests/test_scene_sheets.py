@@ -21,7 +21,7 @@ from SlicerUSSim.Logic.tissue import KINDS, Surfels  # noqa: E402
 from tests.conftest import coarse_chest  # noqa: E402
 from tests.remembered import segment_once  # noqa: E402
 from tests.test_craniotomy_nodes import TURN  # noqa: E402
-from tests.test_grown_lesions import CENTRE, brain, needs_atlas  # noqa: E402
+from tests.test_grown_lesions import CENTRE, brain  # noqa: E402
 from tests.test_lesion_nodes import Scene  # noqa: E402
 
 pytestmark = pytest.mark.usefixtures("segmented_once")
@@ -200,7 +200,6 @@ def growing() -> tuple[Scene, object, np.ndarray]:
     return bench, presenter, true
 
 
-@needs_atlas
 def test_a_point_in_a_view_grows_a_lesion_that_is_removed_or_laid_on():
     bench, presenter, true = growing()
     parameters, lesions = bench.logic.parameters, presenter.lesions

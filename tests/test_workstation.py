@@ -30,7 +30,7 @@ from SlicerUSSim.Logic.mri.samples import head_mri  # noqa: E402
 from SlicerUSSim.Logic.probe.poses import pose_looking_at  # noqa: E402
 from SlicerUSSim.Workstation.state import NAMES, value_of  # noqa: E402
 from tests.served import Served, refused  # noqa: E402
-from tests.test_grown_lesions import CENTRE, needs_atlas  # noqa: E402
+from tests.test_grown_lesions import CENTRE  # noqa: E402
 from tests.test_label_maps import head  # noqa: E402
 from validation.brain_phantoms import phantom, tissue_maps, with_low_grade_tumour  # noqa: E402
 
@@ -728,7 +728,6 @@ def test_a_craniotomy_is_opened_and_closed_in_the_page(browser, tmp_path):
         page.close()
 
 
-@needs_atlas
 @pytest.mark.long
 def test_a_click_grows_a_lesion_that_is_added_to_the_tissues(browser, tmp_path):
     maps = with_low_grade_tumour(required(tissue_maps("mni152"), "no atlas"), CENTRE, 14.0).coarser(2)
