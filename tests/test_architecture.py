@@ -43,12 +43,12 @@ HEAVY = {
 #: Lines of Python that a room, or a folder beside the product, may have. Raising one is a decision: the commit says
 #: what users get for it.
 BUDGETS = {
-    "base": 3290, "opencl": 1250, "probe": 1470, "tissue": 2085, "tracked": 1935, "mri": 8500, "placement": 815,
-    "imaging": 4455, "fitting": 3630, "vtk": 465, "mrml": 4490, "Widget": 2640, "Workstation": 7765, "Command": 3030,
-    "module": 370, "validation": 6055, "benchmarks": 3690, "tests": 29490, "tests/reference": 500,
+    "base": 3225, "opencl": 1290, "probe": 1505, "tissue": 2070, "tracked": 1935, "mri": 7435, "placement": 815,
+    "imaging": 4605, "fitting": 3635, "vtk": 465, "mrml": 4450, "Widget": 2960, "Workstation": 5795, "Command": 2835,
+    "module": 430, "validation": 6055, "benchmarks": 3695, "tests": 28225, "tests/reference": 460,
 }  # fmt: skip
 #: Lines of all of SlicerUSSim/, and of kernels/
-LARGEST_PRODUCT, LARGEST_KERNELS = 46_100, 5_600
+LARGEST_PRODUCT, LARGEST_KERNELS = 43_400, 5_600
 #: Packages of the checkout that use the product and are not installed with it
 CHECKOUT = {"validation", "benchmarks", "tests", "examples"}
 
