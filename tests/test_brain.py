@@ -114,7 +114,7 @@ def test_a_stripped_brain_is_recognised_and_taken_whole():
         (lambda a: np.where(a > 100, np.nan, a), "not finite numbers"),
         (lambda a: np.full_like(a, 7.0), "constant (7)"),
         (lambda a: (a > 0).astype(np.uint8), "2 different values"),
-        (lambda a: np.where(a == 0, -1000.0, 40.0 + 0.1 * a), "CT has (Hounsfield"),
+        (lambda a: np.where(a == 0, -1000.0, 40.0 + 0.1 * a), "is a CT (its values are Hounsfield units)"),
     ],
 )
 def test_what_is_no_mri_is_reported(change, message):

@@ -476,6 +476,7 @@ def test_keys_and_sliders_move_the_probe(page):
     with new_image(page):
         page.mouse.click(box["x"] + 0.5 * box["width"], box["y"] + 0.5 * box["height"])
     assert pose(page)["lift_mm"] == pytest.approx(10, abs=2)  # the middle of -10 to 30
+    open_section(page, "Beam and display")
     page.locator("#fieldOfViewSpinBox").click()
     before = pose(page)
     page.keyboard.press("w")  # what is typed into a field is not a key for the probe
@@ -540,6 +541,7 @@ def test_gain_probe_and_depth_change_the_image(page):
         page.locator("#probePresetComboBox").select_option("linear")
     assert shown(page, "kindComboBox") == "linear" and shown(page, "radiusSpinBox") is None
     assert page.locator("#radiusSpinBox").is_disabled() and probe == "custom" and gain > 5
+    open_section(page, "Beam and display")
     page.locator("#widthSpinBox").fill("-5")
     page.locator("#widthSpinBox").blur()
     assert "Width is -5 mm, expected a number between" in shown_errors(page)

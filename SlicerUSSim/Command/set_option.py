@@ -120,10 +120,10 @@ def _hint(name: str, section: str, of_preset: dict[str, Parameter], of_tissue: d
     from SlicerUSSim.Logic.tissue.presets import TISSUES
 
     attribute = name.rpartition(".")[2]
-    own = [known for known in of_preset if known.startswith(f"{section}.")]
+    everything = [*of_preset, *(f"{tissue}.{known}" for tissue in TISSUES for known in of_tissue)]
+    own = [known for known in everything if known.startswith(f"{section}.")]
     if own:
         return either(get_close_matches(name, own, n=3) or own)
-    everything = [*of_preset, *(f"{tissue}.{known}" for tissue in TISSUES for known in of_tissue)]
     last = {known: known.rpartition(".")[2] for known in everything}
     parts = dict.fromkeys(last.values())
     near = [part for part in parts if attribute in part] or get_close_matches(attribute, parts, n=3)

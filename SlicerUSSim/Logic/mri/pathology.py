@@ -13,7 +13,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import ndimage
-from scipy.spatial import KDTree
 
 from SlicerUSSim.Logic.base.errors import SimulationError, either, require
 from SlicerUSSim.Logic.base.volume import Volume
@@ -258,6 +257,8 @@ def _label_of(tissue: str, array: np.ndarray, names: Sequence[str]) -> tuple[int
 
 def _mm_outside(patient: np.ndarray, grid: Volume, masks: Masks) -> float:
     """Least distance of what is inside the masks from the patient, bool (k, j, i) on a grid."""
+    from scipy.spatial import KDTree  # not needed for an image without masks
+
     points = masks.union.ijk_to_ras[:3, :3] @ np.argwhere(masks.inside)[:, ::-1].T + masks.union.ijk_to_ras[:3, 3:]
     surface = np.argwhere(patient & ~ndimage.binary_erosion(patient))  # type: ignore[operator]
     places = surface[:, ::-1] @ grid.ijk_to_ras[:3, :3].T + grid.ijk_to_ras[:3, 3]
