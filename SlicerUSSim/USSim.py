@@ -198,7 +198,7 @@ class USSimWidget(ScriptedLoadableModuleWidget, VTKObservationMixin):
         column.addLayout(above)
         self.panel = Panel(column, self.logic.ultrasound, self.prepare)
         self.ui = self.panel.ui
-        self.devices = DeviceBar(above, self.panel.presenter)
+        self.devices = DeviceBar(above, self.panel.advanced, self.panel.presenter)
         if are_installed(_REQUIREMENTS):
             self.devices.begin()
         self.panel.presenter.chooseDefaultNodes()

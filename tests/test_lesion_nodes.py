@@ -136,7 +136,6 @@ def test_transforms_of_tissues_and_of_lesions_are_followed():
     [
         ([], "is empty, expected segments called tumour, oedema"),
         ([(lesion(8.0), "Segment_1")], "segment 'Segment 1' of 'Lesions' is not added: no tissue is called so;"),
-        ([(moved(lesion(8.0), 300, 0, 0), "tumour")], r"^tumour\.nii \(segment 'tumour'\): lies 2.. mm outside"),
     ],
 )
 def test_lesions_that_cannot_be_added_are_one_line_and_change_nothing(paint, message):
@@ -152,6 +151,17 @@ def test_lesions_that_cannot_be_added_are_one_line_and_change_nothing(paint, mes
         with pytest.raises(SimulationError, match=message) as caught:
             call()
         assert "\n" not in str(caught.value) and bench.labels.GetImageData().GetMTime() == before
+
+
+def test_a_lesion_of_another_place_leaves_the_segmentation_and_a_warning():
+    bench = Scene("LabelMapVolume")
+    bench.paint(moved(lesion(8.0), 300, 0, 0), "tumour")
+    bench.logic.segment(bench.mri, bench.labels, lesions_node=bench.lesions)
+    assert "no lesion was added: tumour.nii (segment 'tumour'): lies 2" in bench.logic.warnings[-1]
+    before = bench.labels.GetImageData().GetMTime()
+    with pytest.raises(SimulationError, match=r"^tumour\.nii \(segment 'tumour'\): lies 2.. mm outside"):
+        bench.logic.addTissues(bench.labels, bench.lesions)
+    assert bench.labels.GetImageData().GetMTime() == before
 
 
 def test_doubts_about_a_file_of_lesions_are_told_every_time():

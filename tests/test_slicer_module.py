@@ -754,7 +754,7 @@ def test_closing_the_scene_forgets_the_patient(session):
     session.head()
     session.widget.enter()
     session.process()
-    for button in (ui.applyFitButton, ui.revertFitButton, ui.undoSegmentButton, ui.growAtPointButton):
+    for button in (ui.applyFitButton, ui.revertFitButton, ui.undoSegmentButton, ui.pickSeedButton):
         assert not button.isEnabled(), button.objectName()
     session.panel.presenter.fits.apply()
     assert session.app.errors == ["Fit to real images first"] and session.logic.preset.display.gain_db == 0.0

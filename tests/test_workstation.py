@@ -923,7 +923,6 @@ def test_an_opened_patient_takes_the_place_of_title_notes_and_warnings(page, tmp
         (["--igtl", "nowhere"], "--igtl is 'nowhere', expected HOST:PORT"),
         (["--igtl", "listen:203.0.113.7:18944"], "cannot wait for a tracker at 203.0.113.7:18944"),
         (["--host", "203.0.113.7"], "cannot listen at 203.0.113.7"),
-        (["{head}", "--add", "tumour={far}"], "far.nii.gz: lies "),
         (["--labels", "{head}", "--contrast", "t2"], "head.nii.gz: is a label map, and --contrast is for an MRI"),
         (["{head}", "--set", "patient.no_sheets=falx"], "no_sheets leaves out some of --sheets; give --sheets, too"),
     ],

@@ -1,4 +1,4 @@
-"""DeviceBar: the OpenCL devices in Slicer, above the panel."""
+"""DeviceBar: the OpenCL devices in Slicer, in the panel's section Advanced, with a message above the panel."""
 
 from __future__ import annotations
 
@@ -26,12 +26,13 @@ class DeviceBar:
 
     Parameters
     ----------
-    column : QVBoxLayout to which it is added.
+    above : QVBoxLayout for messages, and for what remedies a computer without a device.
+    advanced : QFormLayout for the choice of the device and of faster runtimes.
     presenter : gets the trials and the chosen device.
     """
 
-    def __init__(self, column: Any, presenter: PanelPresenter) -> None:
-        self._presenter = presenter
+    def __init__(self, above: Any, advanced: Any, presenter: PanelPresenter) -> None:
+        self._above, self._presenter = above, presenter
         self._settings = slicer.app.userSettings()
         self._shown: list[str] = []  # keys of the devices in the list
         self.trials: DeviceTrials | None = None
@@ -41,9 +42,13 @@ class DeviceBar:
         self.devices.currentTextChanged.connect(self._choose)
         #: {name of a runtime: its button}
         self.buttons = {runtime.name: self._button(runtime) for runtime in runtimes_to_install()}
+        self.devices.setSizePolicy(qt.QSizePolicy.Ignored, qt.QSizePolicy.Fixed)  # names of processors are long
+        above.addWidget(self.label)
+        advanced.addRow(_("Device:"), self.devices)
         for widget in (self.label, self.devices, *self.buttons.values()):
             widget.setVisible(False)
-            column.addWidget(widget)
+        for button in self.buttons.values():
+            advanced.addRow(button)
 
     def begin(self) -> None:
         """Try the devices, if the packages for that are installed; once."""
@@ -91,6 +96,8 @@ class DeviceBar:
         self.label.setVisible(bool(text))
         has_gpu = any(device.kind == "GPU" for device in tried)
         for button in self.buttons.values():
+            if trials.isDone and not tried:
+                self._above.addWidget(button)
             button.setVisible(trials.isDone and not has_gpu)
 
     def _choose(self, *_unused) -> None:

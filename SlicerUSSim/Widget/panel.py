@@ -58,7 +58,7 @@ class Panel:
         self.logic = logic
         self.presenter = presenter = PanelPresenter(logic, self)
         sections = panel_sections(presenter)
-        self.ui = build(sections, column)
+        self.ui, self.advanced = build(sections, column)
         #: Whether changes of widgets are written to the scene: not while it is closed or loaded, nor in other modules
         self.isConnected = True
         self._ensure_packages = ensure_packages

@@ -21,20 +21,23 @@ _TABLE_HEIGHT, _LIST_HEIGHT = 220, 140
 WORDS_HEIGHT = 72
 
 
-def build(sections: tuple[Section, ...], column: Any) -> SimpleNamespace:
-    """Create the widgets of all controls in a QVBoxLayout, with a progress bar below them."""
+def build(sections: tuple[Section, ...], column: Any) -> tuple[SimpleNamespace, Any]:
+    """(widgets of all controls in a QVBoxLayout with a progress bar below them, QFormLayout of the last section)."""
     ui = SimpleNamespace(**{name: _widget(control) for name, control in by_widget(sections).items()})
     for name, widget in vars(ui).items():
         widget.setObjectName(name)
     column.setContentsMargins(0, 0, 0, 0)  # the module's own layout has margins
+    form = None
     for section in sections:
-        column.addWidget(_section(section, ui))
+        button, form = _section(section, ui)
+        column.addWidget(button)
     _add_progress(column, ui)
     column.addStretch(1)
-    return ui
+    return ui, form
 
 
-def _section(section: Section, ui: SimpleNamespace) -> Any:
+def _section(section: Section, ui: SimpleNamespace) -> tuple[Any, Any]:
+    """(ctkCollapsibleButton, QFormLayout in it)."""
     result = ctk.ctkCollapsibleButton()
     result.setProperty("text", section.title)
     form = qt.QFormLayout(result)
@@ -50,7 +53,7 @@ def _section(section: Section, ui: SimpleNamespace) -> Any:
                 line.addWidget(getattr(ui, entry.widget), 1)
         form.addRow(*(f"{entry}:" for entry in row[:1] if isinstance(entry, str)), beside)
     result.setProperty("collapsed", not section.is_open)
-    return result
+    return result, form
 
 
 def _add_row(form: Any, control: Control, widget: Any) -> None:

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Iterable, Mapping
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from SlicerUSSim.Logic.base.errors import require
+from SlicerUSSim.Logic.base.errors import Cancelled, SimulationError, require
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.mri.ct import CtSegmentation
 from SlicerUSSim.Logic.mri.ct_unit import settings_for
@@ -124,9 +125,14 @@ class SegmentLogic:
             if masks:
                 laid = self._work.do(lambda: add_tissues(labels, names, masks, has_brain_mask=True))
                 labels, names = laid.labels, laid.tissue_names
-        added, told = self._work.do(
-            lambda: with_lesions(labels, names, lesions, also=own, before={}, has_brain_mask=is_of_brain)
-        )
+        lay = partial(with_lesions, labels, names, also=own, before={}, has_brain_mask=is_of_brain)
+        try:
+            added, told = self._work.do(lambda: lay(lesions))
+        except Cancelled:
+            raise
+        except SimulationError as error:  # the segmentation is kept: it took much longer
+            added, told = lay([])
+            skipped = [*skipped, f"no lesion was added: {error}"]
         shares = self._work.do(lambda: texture_below(result.texture(), mri, result.labels, added.labels))
         require_node(labels_node, *LABEL_CLASSES, use="output of Segment")
         self._write(labels_node, added, mri_node, shares)
