@@ -979,7 +979,7 @@ def test_the_chosen_device_is_remembered(panel_with, module):
     session = panel_with(fast, broken, slow)
     combo = session.widget.devices.devices
     assert [combo.itemText(n) for n in range(combo.count())] == [
-        "device 0 (any): 10 ms per image", "device 1 (any): 11 ms per image",
+        "10 ms per image: device 0 (any)", "11 ms per image: device 1 (any)",
     ]  # fmt: skip
     assert session.widget.devices.label.text() == "device 2 cannot be used: its runtime ended the process (-6)"
     assert session.logic.device == fast.key

@@ -82,7 +82,7 @@ class DeviceBar:
             self.devices.clear()
             for device in tried:
                 self.devices.addItem(
-                    _("{name} ({platform}): {ms:.0f} ms per image").format(
+                    _("{ms:.0f} ms per image: {name} ({platform})").format(
                         name=device.name, platform=device.platform, ms=device.ms
                     )
                 )

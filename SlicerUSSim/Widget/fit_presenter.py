@@ -15,6 +15,7 @@ from SlicerUSSim.Logic.mrml.nodes import composite_of, require_node
 from SlicerUSSim.Logic.mrml.own_results import result_called
 from SlicerUSSim.Logic.tracked.sequence import checked_apart, frame_numbers
 from SlicerUSSim.Widget.interface import PanelHost, tr as _
+from SlicerUSSim.Widget.notes import CHECK
 from SlicerUSSim.Widget.tissue_presenter import TissuePresenter
 from SlicerUSSim.Widget.value_presenter import ValuePresenter
 
@@ -194,6 +195,8 @@ def label_of(name: str) -> str:
 def _in_words(found: Fit) -> str:
     result = found.appearance
     lines = [f"cost {result.cost_before:.3f} → {result.cost_after:.3f}, {len(found.tracked.images)} images"]
+    if result.cost_after >= result.cost_before:
+        lines.insert(0, f"{CHECK}the fit is no better than before: give more evaluations, or free fewer parameters")
     if found.registration is not None:
         lines.append(f"moved by {found.registration.shift_mm:.1f} mm and {found.registration.turn_deg:.1f}°")
     if found.prediction is not None:

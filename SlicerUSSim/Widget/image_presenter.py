@@ -41,8 +41,8 @@ class ImagePresenter:
             self._notes.recognise(nodes.labels)
             view.showStatus("; ".join(map(str, caught)) or f"{(perf_counter() - start) * 1e3:.0f} ms")
             logic.showOutline(nodes.outline, nodes.probe_transform)
-            if view.sliceNode() is not None:
-                logic.showInSlice(view.sliceNode(), nodes.output, nodes.probe_transform)
+            if (slice_node := self._slice_node()) is not None:
+                logic.showInSlice(slice_node, nodes.output, nodes.probe_transform)
             self.showIn3D()
             if not logic.isLive:
                 logic.holdImage(nodes.output)
@@ -84,7 +84,7 @@ class ImagePresenter:
         outline: Any = parameters.outline
         if parameters.output is None or outline is None or not self._placing.handles:
             return
-        view = self._panel.view.sliceNode()
+        view = self._slice_node()
         if self._in_3d not in (None, view):
             self._in_3d.SetSliceVisible(False)
         self._in_3d = view
@@ -100,7 +100,7 @@ class ImagePresenter:
 
     def _live_nodes(self) -> tuple:
         nodes = self._panel.parameters
-        return nodes.labels, nodes.probe_transform, nodes.output, nodes.outline, self._panel.view.sliceNode()
+        return nodes.labels, nodes.probe_transform, nodes.output, nodes.outline, self._slice_node()
 
     def _reported(self, message: str) -> None:
         now = perf_counter()
@@ -171,13 +171,17 @@ class ImagePresenter:
 
     def _show_played(self, browser: Any, images: Any, transforms: Any) -> None:
         """Show the image of a sequence that its browser plays in the chosen slice view."""
-        slice_node, shown = self._panel.view.sliceNode(), browser.GetProxyNode(images)
+        slice_node, shown = self._slice_node(), browser.GetProxyNode(images)
         if slice_node is not None and shown is not None:
             self._panel.logic.showInSlice(slice_node, shown, browser.GetProxyNode(transforms))
 
     def _browser_of(self, sequence_node: Any) -> Any:
         browsers = nodes_of_class(self._panel.logic.scene, "vtkMRMLSequenceBrowserNode")
         return next((node for node in browsers if node.IsSynchronizedSequenceNode(sequence_node, True)), None)
+
+    def _slice_node(self) -> Any:
+        """The chosen slice view, if images are shown in it; None otherwise."""
+        return self._panel.view.sliceNode() if self._panel.parameters.panel.show_in_slice else None
 
     # ---- nodes -------------------------------------------------------------------------------------------------
 

@@ -93,8 +93,6 @@ class Panel:
 
     def sliceNode(self):
         wanted = self.ui.sliceViewComboBox.property("currentText")
-        if not self.presenter.values.value("scene.show_in_slice"):
-            return None
         return next((node for node in self._slice_nodes() if node.GetLayoutName() == wanted), None)
 
     def pickPoint(self, points_node, picked: Callable[[], None]) -> None:

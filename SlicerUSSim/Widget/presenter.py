@@ -67,6 +67,7 @@ class PanelPresenter(PanelHost):
         """Release what is kept in memory of the last patient, with notes and fit; nodes stay."""
         self.logic.forgetPatient()
         self.view.showStatus("")
+        self.images.sequenceDone = ""
         self.fits.forget()
         self.segmenting.forget()
         self.lesions.forget()

@@ -14,11 +14,15 @@ from SlicerUSSim.Logic.mri.segmentation import Segmentation
 from SlicerUSSim.Logic.mrml.label_nodes import empty, read_labels, write_labels
 from SlicerUSSim.Logic.mrml.own_results import SHEETS, content_as_made, content_of, mark_as_made, mark_as_result
 from SlicerUSSim.Logic.mrml.share_nodes import read_shares, write_shares
-from SlicerUSSim.Logic.mrml.taken_image import PATIENT
+from SlicerUSSim.Logic.mrml.taken_image import PATIENT, mri_of
 from SlicerUSSim.Logic.tissue.table import TissueTable
 from SlicerUSSim.Logic.tissue.texture import Texture
 from SlicerUSSim.Widget.interface import PanelHost, tr as _
 from SlicerUSSim.Widget.notes import Notes, checks
+
+#: Roles of nodes that are of the patient whose tissues are chosen, and those that Segment may deselect
+_BESIDE = ("lesions", "second_mri", "organs", "opening")
+_FORGOTTEN = (*_BESIDE, "labels", "mask")
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,12 +87,14 @@ class SegmentPresenter:
             if notes.segmented not in (None, mri):  # also if this fails: they are about another patient
                 notes.set()
             nodes, lines, settings = self._chosen(), notes.lines, parameters.segmentation
-            told = self._forget_other_brain(mri) + self._closed_again()
+            chosen = {role: getattr(parameters, role) for role in _FORGOTTEN}
+            told = self._forget_other_brain(mri) + self._forget_other_patient(mri) + self._closed_again()
             before = _BeforeSegment(self._labels_before(), nodes, _data_of(parameters.sheets), lines)
             others, untold = self._second_mri()
             kinds = parameters.sheet.kinds if parameters.sheet.find else ()
             own_sheets = parameters.sheets if kinds and self._are_own_sheets() else None
             with (
+                self._chosen_again_on_failure(chosen),
                 panel.made(own_sheets, "Model", f"{mri.GetName()} sheets", wanted=bool(kinds)) as sheets,
                 self.replaceable(f"{mri.GetName()} tissues", mri) as labels,
             ):
@@ -117,16 +123,17 @@ class SegmentPresenter:
         Afterwards the notes are those of the logic, about the node `source`.
         """
         panel, chosen = self._panel, self._panel.parameters.labels
-        kept = None if chosen is None or panel.logic.mayReplace(chosen) else str(chosen.GetName())
+        kept, is_of_other = None, chosen is not None and self._are_of_other(chosen, source)
+        if chosen is not None and (is_of_other or not panel.logic.mayReplace(chosen)):
+            kept = str(chosen.GetName())
         kind = "LabelMapVolume" if self._label_maps else "Segmentation"
         with panel.made(chosen if kept is None else None, kind, name) as node:
             yield node
         panel.parameters.labels = node
         self._notes.replaceByLogic(source, node)
         if kept is not None:
-            self._notes.add(
-                f"{kept!r} was not made by Segment, or edited since, and is kept; the result is {node.GetName()!r}"
-            )
+            why = "is of another MRI" if is_of_other else "was not made by Segment, or edited since"
+            self._notes.add(f"{kept!r} {why}, and is kept; the result is {node.GetName()!r}")
 
     # ---- undo --------------------------------------------------------------------------------------------------
 
@@ -159,6 +166,8 @@ class SegmentPresenter:
             can, why_not = self.canUndoSegment()
             require(can, why_not)
             last = required(self._last, why_not)
+            if last.before.nodes["labels"] is None:  # nothing is left of which there are images
+                panel.logic.stopLiveUpdate()
             before, self._last = last.before, None
             are_its_notes = self._notes.isAbout(last.labels)
             before.labels.restore()
@@ -220,6 +229,34 @@ class SegmentPresenter:
             return []
         self._panel.parameters.mask = None
         return [f"{mask.GetName()!r} is the mask of another MRI and was not used"]
+
+    @contextmanager
+    def _chosen_again_on_failure(self, chosen: dict[str, Any]) -> Iterator[None]:
+        try:
+            yield
+        except BaseException:
+            for role, node in chosen.items():
+                setattr(self._panel.parameters, role, node)
+            raise
+
+    @staticmethod
+    def _are_of_other(labels: Any, source: Any) -> bool:
+        """Whether labels are known to be of another volume than that which is now segmented."""
+        return source.IsA("vtkMRMLScalarVolumeNode") and mri_of(labels) not in (None, source, mri_of(source))
+
+    def _forget_other_patient(self, mri: Any) -> list[str]:
+        """Deselect what was chosen beside the tissues of another MRI; lines about it."""
+        parameters, lines = self._panel.parameters, []
+        if parameters.labels is None or not self._are_of_other(parameters.labels, mri):
+            return []
+        for role in _BESIDE:
+            node: Any = getattr(parameters, role)
+            if node is not None:
+                setattr(parameters, role, None)
+                lines.append(
+                    f"{node.GetName()!r} was chosen for another MRI and was not used; choose it if it is of this"
+                )
+        return lines
 
     def _closed_again(self) -> list[str]:
         """Choose the labels before the opening, into which Segment writes; a line about it."""

@@ -22,16 +22,16 @@ WORDS_HEIGHT = 72
 
 
 def build(sections: tuple[Section, ...], column: Any) -> tuple[SimpleNamespace, Any]:
-    """(widgets of all controls in a QVBoxLayout with a progress bar below them, QFormLayout of the last section)."""
+    """(widgets of all controls in a QVBoxLayout with a progress bar above them, QFormLayout of the last section)."""
     ui = SimpleNamespace(**{name: _widget(control) for name, control in by_widget(sections).items()})
     for name, widget in vars(ui).items():
         widget.setObjectName(name)
     column.setContentsMargins(0, 0, 0, 0)  # the module's own layout has margins
+    _add_progress(column, ui)  # where it is in sight, whatever is open below
     form = None
     for section in sections:
         button, form = _section(section, ui)
         column.addWidget(button)
-    _add_progress(column, ui)
     column.addStretch(1)
     return ui, form
 

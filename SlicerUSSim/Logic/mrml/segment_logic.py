@@ -37,7 +37,7 @@ from SlicerUSSim.Logic.mrml.own_results import mark_as_made, may_replace, requir
 from SlicerUSSim.Logic.mrml.patient_logic import KnownLabels, PatientLogic
 from SlicerUSSim.Logic.mrml.share_nodes import read_shares, write_shares
 from SlicerUSSim.Logic.mrml.sheet_nodes import write_sheets
-from SlicerUSSim.Logic.mrml.taken_image import PATIENT, patient_of
+from SlicerUSSim.Logic.mrml.taken_image import MRI, PATIENT, mri_of, patient_of
 from SlicerUSSim.Logic.placement.craniotomy import disc_diameter_mm, disc_opening, opened
 from SlicerUSSim.Logic.tissue.label_maps import LabelledTissues
 from SlicerUSSim.Logic.tissue.table import TissueTable
@@ -322,6 +322,9 @@ class SegmentLogic:
         write_labels(labels_node, added.labels, added.tissue_names, like_node)
         mark_as_made(labels_node)
         labels_node.SetAttribute(PATIENT, patient_of(like_node))
+        mri = mri_of(like_node) if like_node.IsA("vtkMRMLLabelMapVolumeNode") else like_node
+        mri = mri if mri is None or mri.IsA("vtkMRMLScalarVolumeNode") else mri_of(like_node)
+        labels_node.SetNodeReferenceID(MRI, None if mri is None else mri.GetID())
         set_closed_labels(labels_node, None)
         if texture is not None:
             write_shares(labels_node, added.labels, added.tissue_names, texture)

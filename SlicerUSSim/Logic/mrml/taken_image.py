@@ -23,6 +23,8 @@ from SlicerUSSim.Logic.probe.image_grid import ImageGrid
 
 #: Attribute of a node with an MRI or labels: the name of the patient; without it the node's own name is
 PATIENT = "SlicerUSSim.patient"
+#: Reference of labels to the volume of which they were made
+MRI = "SlicerUSSim.mri"
 #: Attributes of the image's volume node: what it is of, as JSON, and whether it stays where it was taken
 _ABOUT, _FROZEN = "SlicerUSSim.image", "SlicerUSSim.frozen"
 #: Texts of _FROZEN: of an image that stays, and of a live one while its scene is saved
@@ -68,6 +70,11 @@ class TakenImage:
         """Patient, time, pose and preset, as JSON can hold them."""
         pose, preset = self.probe_to_world.round(6).tolist(), self.preset.to_dict()
         return {"patient": self.patient, "time": self.time, "probe_to_ras": pose, "preset": preset}
+
+
+def mri_of(labels_node) -> Any:
+    """The volume node of which labels were made, also after lesions were laid over them; None if that is not known."""
+    return labels_node.GetNodeReference(MRI)
 
 
 def patient_of(node) -> str:

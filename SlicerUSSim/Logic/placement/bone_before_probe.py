@@ -44,6 +44,13 @@ def about_bone(
     """
     if "skull" not in names:
         return ()
+    behind = np.arange(-_BRAIN_MM, 0.0, _COVER_STEP_MM)[:, None] * [0.0, 1.0, 0.0]
+    bone_mm = (_kinds(names)[_labels_at(labels, probe_to_ras, behind)] == _BONE).sum() * _COVER_STEP_MM
+    if bone_mm >= _COVERED_MM:
+        return (
+            f"the probe is below the closed skull, with {bone_mm:.0f} mm of bone behind its face: open the skull "
+            f"({_OPEN_IT}), or move the probe to the skin",
+        )
     found = _bone_mm_and_db(labels, names, tissues, probe, probe_to_ras)
     if found is not None and (found[2] or not is_open):
         thick, loss, is_closed = found
@@ -57,8 +64,8 @@ def about_bone(
             return (
                 f"{line}the opening is elsewhere (--pose auto is in it; the model of the removed piece shows where)",
             )
-        through = "for an image through the temple, the probe transcranial at the view temporal (--pose temporal)"
-        return (f"{line}choose a craniotomy ({_OPEN_IT}); {through}",)
+        through = "or image through the temple, with the probe transcranial at the view temporal (--pose temporal)"
+        return (f"{line}open the skull ({_OPEN_IT}), {through}",)
     line = _misfit(labels, names, probe, probe_to_ras) if is_open else ""
     return (line,) if line else ()
 
