@@ -806,10 +806,9 @@ def test_what_a_first_image_needs_is_one_screen_of_440_pixels(session):
     if folder := os.environ.get("USSIM_PICTURES"):
         for section in sections:
             section.setCollapsed(section not in opened)
-        session.logic_module("mrml.nodes").write_volume(
-            session.parameters.mri, session.logic_module("mri.samples").demo_mri()[0]
-        )
-        session.parameters.mri.SetName("MNI152")
+        brain = session.add("ScalarVolume", "MNI152")
+        session.logic_module("mrml.nodes").write_volume(brain, session.logic_module("mri.samples").demo_mri()[0])
+        session.parameters.mri = brain
         session.ui.probePresetComboBox.setCurrentText("convex")
         session.ui.gainSlider.setValue(6)
         session.ui.segmentButton.click()
