@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import slicer
@@ -57,8 +58,9 @@ def main(folder: Path) -> None:
     threed = ThreeDView(scene, app.app_logic, "1", NoScheduleRendering())
     for view in (red, threed):
         view.render_window().SetSize(560, 470)
-    threed.get_view_node().SetBoxVisible(False)
-    threed.get_view_node().SetAxisLabelsVisible(False)
+    threed_node: Any = threed.get_view_node()
+    threed_node.SetBoxVisible(False)
+    threed_node.SetAxisLabelsVisible(False)
 
     logic = UltrasoundSceneLogic(scene)
     nodes = logic.parameters
@@ -87,12 +89,12 @@ def main(folder: Path) -> None:
     red.set_foreground_opacity(1.0)
     red.set_orientation("Sagittal")
     red.fit_view_to_content()
-    red.get_view_node().JumpSliceByOffsetting(*SWEEP[0])
+    red.set_slice_value(SWEEP[0][0])
     nodes.labels.CreateClosedSurfaceRepresentation()
     for segment in ("csf", "white matter", "leptomeninges"):
         tissues.SetSegmentVisibility3D(segment, False)
     threed.render()
-    camera = threed.get_camera_node()
+    camera: Any = threed.get_camera_node()
     camera.SetFocalPoint(10.0, -5.0, 30.0)
     camera.SetPosition(240.0, 300.0, 270.0)
     camera.SetViewUp(0.0, 0.0, 1.0)

@@ -107,7 +107,7 @@ def _lofted(rings: list[np.ndarray], color: tuple[int, int, int]) -> vtkPolyData
     polydata = vtkPolyData()
     polydata.SetPoints(points)
     polydata.SetPolys(cells)
-    scalars = numpy_to_vtk(np.tile(np.uint8(color), (cells.GetNumberOfCells(), 1)), deep=True)
+    scalars = numpy_to_vtk(np.tile(np.array(color, np.uint8), (cells.GetNumberOfCells(), 1)), deep=True)
     scalars.SetName("Color")
     polydata.GetCellData().SetScalars(scalars)
     return polydata
