@@ -58,6 +58,7 @@ def main(folder: Path) -> None:
     threed = ThreeDView(scene, app.app_logic, "1", NoScheduleRendering())
     for view in (red, threed):
         view.render_window().SetSize(560, 470)
+    red_node: Any = red.get_view_node()
     threed_node: Any = threed.get_view_node()
     threed_node.SetBoxVisible(False)
     threed_node.SetAxisLabelsVisible(False)
@@ -89,7 +90,7 @@ def main(folder: Path) -> None:
     red.set_foreground_opacity(1.0)
     red.set_orientation("Sagittal")
     red.fit_view_to_content()
-    red.set_slice_value(SWEEP[0][0])
+    red_node.JumpSliceByOffsetting(*SWEEP[0])
     nodes.labels.CreateClosedSurfaceRepresentation()
     for segment in ("csf", "white matter", "leptomeninges"):
         tissues.SetSegmentVisibility3D(segment, False)
@@ -104,7 +105,7 @@ def main(folder: Path) -> None:
     scene.RemoveNode(curve)
     tissues.SetVisibility3D(False)
     logic.placeProbe(nodes.labels, nodes.probe_transform)
-    logic.startLiveUpdate(nodes.labels, nodes.probe_transform, nodes.output, nodes.outline, red.get_view_node())
+    logic.startLiveUpdate(nodes.labels, nodes.probe_transform, nodes.output, nodes.outline, red_node)
     first = grab(red)
     red.set_foreground_volume_id(None)
     mri = grab(red)
