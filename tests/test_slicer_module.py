@@ -806,6 +806,13 @@ def test_what_a_first_image_needs_is_one_screen_of_440_pixels(session):
     if folder := os.environ.get("USSIM_PICTURES"):
         for section in sections:
             section.setCollapsed(section not in opened)
+        brain = session.add("ScalarVolume", "MNI152")
+        session.logic_module("mrml.nodes").write_volume(brain, session.logic_module("mri.samples").demo_mri()[0])
+        session.parameters.mri = brain
+        session.ui.probePresetComboBox.setCurrentText("convex")
+        session.ui.gainSlider.setValue(6)
+        session.ui.segmentButton.click()
+        session.ui.liveCheckBox.setChecked(True)
         session.process()
         session.parent.resize(440, session.parent.sizeHint().height())
         session.process()

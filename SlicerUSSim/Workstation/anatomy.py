@@ -27,10 +27,10 @@ from vtkmodules.vtkCommonExecutionModel import vtkTrivialProducer
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.base.vtk_data import vtk_matrix
 from SlicerUSSim.Logic.mrml.fitting_nodes import mark_as_drawn
-from SlicerUSSim.Logic.mrml.nodes import composite_of, display_of, node_called, show_in_slice, write_slice
+from SlicerUSSim.Logic.mrml.nodes import composite_of, display_of, node_called, show_in_slice, write_body, write_slice
 from SlicerUSSim.Logic.mrml.taken_image import TakenImage
 from SlicerUSSim.Logic.probe.arrays import Probe
-from SlicerUSSim.Logic.probe.shape import field_polydata, probe_polydata
+from SlicerUSSim.Logic.probe.shape import field_polydata
 from SlicerUSSim.Logic.probe.surface import PatientSurface
 from SlicerUSSim.Workstation.state import ACROSS, IN_PLANE, SLICE_VIEWS
 
@@ -47,7 +47,7 @@ _LAYOUT = "Anatomy"
 _PATIENT, _BODY, _FIELD, _SEEN = "Patient surface", "Probe body", "Ultrasound field", "Ultrasound as shown"
 #: Name of the transform of what is shown of the image: the pose at which it was taken, which the probe may have left
 _POSE = "Pose of the image"
-_SKIN_COLOR, _BODY_COLOR, _RIDGE_COLOR = (0.92, 0.8, 0.72), (0.82, 0.86, 0.9), (1.0, 0.62, 0.18)
+_SKIN_COLOR = (0.92, 0.8, 0.72)
 
 
 class AnatomyViews:
@@ -172,22 +172,11 @@ class AnatomyViews:
     def show_probe(self, probe: Probe, transform_node) -> None:
         """Show the probe's body under its transform, and prepare its imaged field, which has the image as texture."""
         body, field = self._model(_BODY), self._model(_FIELD)
-        body.SetAndObservePolyData(probe_polydata(probe))
+        write_body(body, probe)
         field.SetAndObservePolyData(field_polydata(probe))
         body.SetAndObserveTransformNodeID(transform_node.GetID())
         field.SetAndObserveTransformNodeID(self._pose.GetID())
-        colors = node_called(self._app.scene, "ColorTable", _BODY)
-        colors.SetSaveWithScene(False)
-        colors.SetTypeToUser()
-        colors.SetNumberOfColors(2)
-        colors.SetColor(0, "body", *_BODY_COLOR)
-        colors.SetColor(1, "ridge", *_RIDGE_COLOR)
         display = display_of(body)
-        display.SetActiveScalar("Part", 1)  # of the cells
-        display.SetAndObserveColorNodeID(colors.GetID())
-        display.SetScalarRangeFlag(display.UseManualScalarRange)
-        display.SetScalarRange(0.0, 1.0)
-        display.SetScalarVisibility(True)
         display.SetVisibility(True)
         display.SetVisibility2D(True)
         display.SetSliceIntersectionThickness(1)

@@ -25,6 +25,7 @@ from SlicerUSSim.Logic.mrml.nodes import (
     require_node,
     set_node_to_world,
     show_in_slice,
+    write_body,
     write_outline,
 )
 from SlicerUSSim.Logic.mrml.own_results import OUTLINE, mark_as_result, may_replace_result, require_result
@@ -35,7 +36,6 @@ from SlicerUSSim.Logic.placement.bone_before_probe import about_bone
 from SlicerUSSim.Logic.placement.craniotomy import default_pose
 from SlicerUSSim.Logic.placement.views import opened_view_pose, view_pose
 from SlicerUSSim.Logic.probe.poses import pose_in_slice
-from SlicerUSSim.Logic.probe.shape import probe_polydata
 
 #: Reference of an outline to the model of the probe's body
 _BODY = "SlicerUSSim.body"
@@ -246,7 +246,7 @@ class ImageLogic:
         """The model of the probe's body, if there is one, of the present probe and where its outline is."""
         body = outline_node.GetNodeReference(_BODY)
         if body is not None:
-            body.SetAndObservePolyData(probe_polydata(self._parameters.preset.probe))
+            write_body(body, self._parameters.preset.probe)
             body.SetAndObserveTransformNodeID(outline_node.GetTransformNodeID())
 
     def showInSlice(self, slice_node, output_node, probe_transform_node, fit: bool = True) -> None:

@@ -15,7 +15,7 @@ from SlicerUSSim.Logic.base.transforms import check_rigid
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.base.vtk_data import matrix_array, vtk_matrix
 from SlicerUSSim.Logic.probe.arrays import Probe
-from SlicerUSSim.Logic.probe.shape import outline_polydata
+from SlicerUSSim.Logic.probe.shape import outline_polydata, probe_polydata
 
 
 def named(node) -> str:
@@ -215,6 +215,16 @@ def write_outline(model_node, probe: Probe, transform_node) -> None:
         display.SetLighting(False)
         display.SetVisibility2D(True)
         display.SetSliceDisplayModeToProjection()
+
+
+def write_body(model_node, probe: Probe) -> None:
+    """Write the probe's body into a model node, in its own colors."""
+    model_node.SetAndObservePolyData(probe_polydata(probe))
+    display = display_of(model_node)
+    if display is not None:
+        display.SetActiveScalar("Color", 1)  # of the cells
+        display.SetScalarRangeFlag(display.UseDirectMapping)
+        display.SetScalarVisibility(True)
 
 
 def show_in_slice(slice_node, volume_node, probe_to_world: np.ndarray, probe: Probe, fit: bool, behind=None) -> None:

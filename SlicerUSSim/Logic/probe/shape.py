@@ -19,6 +19,8 @@ _STRAIGHT_MM = 16.0
 #: The ridge that marks one side: start and end behind the face, half width, half thickness, mm.
 _RIDGE = (5.0, 30.0, 2.6, 1.8)
 _RING_POINTS = 48
+#: Red, green, blue of the body and of its ridge
+_BODY_COLOR, _RIDGE_COLOR = (209, 219, 230), (255, 158, 46)
 
 
 def outline_polydata(probe: Probe) -> vtkPolyData:
@@ -58,7 +60,7 @@ def field_polydata(probe: Probe) -> vtkPolyData:
 def probe_polydata(probe: Probe) -> vtkPolyData:
     """A probe's body behind its face, in the probe frame (mm), with a ridge on the side that is left in the image.
 
-    For display only; the simulation does not use it. Cell scalars "Part" are 1 on the ridge.
+    For display only; the simulation does not use it. Cell scalars "Color" are red, green and blue.
     """
     near = probe.outline_mm()[: len(probe.outline_mm()) // 2, 0]
     half_face = max(float(np.abs(near).max()) + _HOUSING_MM, _LEAST_HALF_WIDTH_MM)
@@ -71,8 +73,8 @@ def probe_polydata(probe: Probe) -> vtkPolyData:
     first, last, width, thickness = _RIDGE
     ridge = [_ring(width, thickness) - [half_face, behind, 0.0] for behind in (first, last)]
     joined = vtkAppendPolyData()
-    joined.AddInputData(_lofted([face, housing, *handle], 0))
-    joined.AddInputData(_lofted(ridge, 1))
+    joined.AddInputData(_lofted([face, housing, *handle], _BODY_COLOR))
+    joined.AddInputData(_lofted(ridge, _RIDGE_COLOR))
     normals = vtkPolyDataNormals()
     normals.SetInputConnection(joined.GetOutputPort())
     normals.SetFeatureAngle(50.0)
@@ -88,7 +90,7 @@ def _ring(half_width: float, half_thickness: float) -> np.ndarray:
     return np.stack([half_width * x, 0.0 * x, half_thickness * z], axis=1)
 
 
-def _lofted(rings: list[np.ndarray], part: int) -> vtkPolyData:
+def _lofted(rings: list[np.ndarray], color: tuple[int, int, int]) -> vtkPolyData:
     """Rings of (points, 3), joined by quadrilaterals and closed at both ends."""
     points = vtkPoints()
     points.SetData(numpy_to_vtk(np.ascontiguousarray(np.concatenate(rings)), deep=True))
@@ -105,7 +107,7 @@ def _lofted(rings: list[np.ndarray], part: int) -> vtkPolyData:
     polydata = vtkPolyData()
     polydata.SetPoints(points)
     polydata.SetPolys(cells)
-    scalars = numpy_to_vtk(np.full(cells.GetNumberOfCells(), part, np.uint8), deep=True)
-    scalars.SetName("Part")
+    scalars = numpy_to_vtk(np.tile(np.array(color, np.uint8), (cells.GetNumberOfCells(), 1)), deep=True)
+    scalars.SetName("Color")
     polydata.GetCellData().SetScalars(scalars)
     return polydata
