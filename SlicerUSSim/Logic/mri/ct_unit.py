@@ -55,7 +55,10 @@ def settings_for(image: Volume, settings: SegmentationSettings) -> tuple[Segment
     why = None if settings.contrast == CT else why_ct(image)
     if why is None:
         return settings, None
-    return SegmentationSettings.of(settings, contrast=CT), f"taken as a CT: {why}"
+    line = f"taken as a CT: {why}"
+    if settings.contrast != SegmentationSettings().contrast:
+        line += f"; the contrast {settings.contrast} is not used"
+    return SegmentationSettings.of(settings, contrast=CT), line
 
 
 def _offset_of(values: np.ndarray) -> float | None:

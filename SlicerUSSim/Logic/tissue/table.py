@@ -262,9 +262,12 @@ def write_label_files(path: Path, labels: Volume, tissues: TissueTable) -> Path:
     Raises SimulationError if one of the files cannot be written.
     """
     beside = tissues_beside(path)
-    names = {label: tissue.name for label, tissue in tissues.items() if label}
-    is_nrrd = path.suffix.lower() in (".nrrd", ".nhdr")
-    about = segments_header(names, labels.array.shape[::-1]) if is_nrrd else None
-    replace(labels, label_names=names).write(path, about)
+    write_named_labels(path, labels, {label: tissue.name for label, tissue in tissues.items() if label})
     tissues.write(beside)
     return beside
+
+
+def write_named_labels(path: Path, labels: Volume, names: Mapping[int, str]) -> None:
+    """Write a label map with its names, if it is NIfTI, or NRRD, which has 3D Slicer's segments with their codes."""
+    about = segments_header(names, labels.array.shape[::-1]) if path.suffix.lower() == ".nrrd" else None
+    replace(labels, label_names=dict(names)).write(path, about)

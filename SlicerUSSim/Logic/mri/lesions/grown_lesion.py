@@ -11,6 +11,7 @@ from scipy import ndimage
 
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.tissue.names import labels_of
+from SlicerUSSim.Logic.tissue.table import write_named_labels
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,8 +64,8 @@ class GrownLesion:
         files = {}
         for tissue in self.tissues:
             smaller, larger = (Path(labels_path).with_name(f"{stem}{tissue}{end}{suffix}") for end in ("", "_larger"))
-            self.mask(tissue).write(smaller)
-            (self.larger or self).mask(tissue).write(larger)
+            for lesion, path in ((self, smaller), (self.larger or self, larger)):
+                write_named_labels(path, lesion.mask(tissue), {1: tissue})
             files[tissue] = smaller, larger
         return files
 
