@@ -166,7 +166,7 @@ def test_a_closed_skull_that_leaves_no_signal_is_told(head):  # noqa: F811
     (line,) = notes_of(head, probe, pose, is_open=False, names=NAMES)
     assert line.startswith("the skull is closed in front of the probe, and 7 mm of bone take ")  # 6 mm obliquely
     assert float(line.split("take ")[1].split(" dB")[0]) > CLOSED_DB
-    assert "choose a craniotomy (--craniotomy auto, disc:MM or a file; Open skull" in line
+    assert "open the skull (--craniotomy auto, disc:MM or a file; Open skull" in line
     labels, _ = with_disc(head, 30.0)
     assert notes_of(labels, probe, ON_SKIN, is_open=True) == ()
     elsewhere = pose_looking_at((78.5, 0.0, 0.0), (0.0, 0.0, 0.0), (0.0, 1.0, 0.0))
@@ -190,3 +190,12 @@ def test_a_skull_is_not_said_to_be_closed_where_the_brain_is_seen(head):  # noqa
     assert notes_of(head, PROBES["phased"], ON_SKIN, is_open=False, names=no_skull) == ()
     labels, _ = with_disc(head, 10.0)  # of a wide face: the lines of a quarter of it see the brain
     assert not any("closed" in line for line in notes_of(labels, LinearProbe(38, 60), ON_SKIN, is_open=True))
+
+
+def test_a_probe_below_a_closed_skull_is_told_of(head):  # noqa: F811
+    below = TOP.copy()
+    below[:3, 3] += 25.0 * TOP[:3, 1]
+    (line,) = notes_of(head, PROBES["phased"], below, is_open=False, names=NAMES)
+    assert line.startswith("the probe is below the closed skull, with ") and "open the skull" in line
+    opened_there = with_disc(head, 60.0)[0]
+    assert notes_of(opened_there, PROBES["phased"], below, is_open=True) == ()

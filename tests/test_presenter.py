@@ -90,6 +90,22 @@ def test_from_mri_to_live_image(presenter):
     assert not presenter.images.isLive()
 
 
+def test_the_tissues_of_another_patient_in_the_scene_stay(presenter):
+    """Segment wrote the second patient into the first one's node, with the first one's lesions."""
+    parameters, scene = presenter.logic.parameters, presenter.logic.scene
+    presenter.segmenting.segment()
+    first, content = parameters.labels, content_of(parameters.labels)
+    parameters.lesions = scene.AddNewNodeByClass("vtkMRMLSegmentationNode", "Lesions")
+    other = scene.AddNewNodeByClass("vtkMRMLScalarVolumeNode", "Other")
+    write_volume(other, head_mri(4.5))
+    parameters.mri = other
+    presenter.segmenting.segment()
+    assert not presenter.view.errors and parameters.labels is not first and parameters.lesions is None
+    assert parameters.labels.GetName() == "Other tissues" and content_of(first) == content
+    assert "'Head tissues' is of another MRI, and is kept" in presenter.notes.text()
+    assert "'Lesions' was chosen for another MRI and was not used" in presenter.notes.text()
+
+
 def test_presets_carry_the_pose_if_it_is_wanted(presenter, tmp_path):
     view, parameters = presenter.view, presenter.logic.parameters
     presenter.values.setValue("scene.preset_pose", True)

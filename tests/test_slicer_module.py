@@ -436,7 +436,7 @@ def test_the_first_image_takes_a_volume_and_two_clicks(session):
     ids = {c.GetLayoutName(): c.GetForegroundVolumeID() for c in composites}
     assert ids["Yellow"] == session.parameters.output.GetID() and ids["Red"] is None
     session.ui.showInSliceCheckBox.setChecked(False)
-    assert session.panel.sliceNode() is None and session.parameters.show_in_slice is False
+    assert session.parameters.show_in_slice is False and session.panel.presenter.images._slice_node() is None
 
 
 def test_the_image_follows_the_probe_and_the_controls_from_the_event_loop(session):
