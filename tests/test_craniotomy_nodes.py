@@ -259,8 +259,7 @@ def test_the_notes_follow_the_probe_over_bone_and_openings(head):  # noqa: F811
     bench = Bench(head)
     bench.presenter.placing.placeProbe()
     assert (
-        bench.presenter.notes.aboutProbe().count(closed) == 1
-        and "Open skull in 3D Slicer" in bench.presenter.notes.aboutProbe()
+        bench.presenter.notes.aboutProbe().count(closed) == 1 and "open the skull" in bench.presenter.notes.aboutProbe()
     )
     bench.presenter.placing.openCraniotomy()
     bench.presenter.placing.placeProbe()

@@ -49,6 +49,10 @@ def write_volume(path: Path) -> None:
     Volume(array, np.diag([1.0, 1.0, 2.0, 1.0])).write(path)
 
 
+def write_minc(path: Path) -> None:
+    sitk.WriteImage(sitk.GetImageFromArray(np.arange(1320, dtype=np.float32).reshape(12, 11, 10)), str(path))
+
+
 def write_mgh(path: Path) -> None:
     nibabel = pytest.importorskip("nibabel")
     nibabel.MGHImage(np.arange(60, dtype=np.float32).reshape(5, 4, 3), np.eye(4)).to_filename(path)
@@ -142,7 +146,7 @@ FORMATS = {
     "vti": Format("v.vti", write_volume, Volume.read, 1200, in_child=True),
     "mgz": Format("v.mgz", write_mgh, Volume.read, 400),
     "mgh": Format("v.mgh", write_mgh, Volume.read, 284),
-    "mnc": Format("v.mnc", write_volume, Volume.read, 9000, in_child=True),
+    "mnc": Format("v.mnc", write_minc, Volume.read, 9000, in_child=True),
     "dcm": Format("v.dcm", write_dicom, Volume.read, 900),
     "IM": Format("IM1", write_bare_dicom, Volume.read, 900),
     "j2k": Format("j.dcm", write_compressed_dicom, read_image_file, 900, in_child=True),

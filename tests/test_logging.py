@@ -240,7 +240,7 @@ def test_segment_prints_its_tissues_alone(files, tmp_path):
     result = ussim("segment", files / "head.nii.gz", "-o", tmp_path / "labels.nii.gz", "-vv")
     lines = [line.split() for line in result.stdout.splitlines()]
     assert [line[0] for line in lines] == ["label", "1", "2", "3", "4"] and lines[1][1] == "csf"
-    assert "wrote" in result.stderr and "ussim: debug: segmentation: " in result.stderr
+    assert "wrote" in result.stderr and "ussim: info: " in result.stderr
 
 
 @pytest.mark.slow

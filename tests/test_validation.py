@@ -138,17 +138,14 @@ def test_the_command_exits_with_zero_if_all_is_well_two_for_a_wrong_name(tmp_pat
 
 
 @pytest.mark.slow
-def test_the_command_replaces_only_its_own_reports(tmp_path):
-    def run_it(*only):
-        return CliRunner().invoke(main, ["--out", str(tmp_path), *(f"--only={text}" for text in only)])
+def test_the_command_replaces_a_report_only_with_overwrite(tmp_path):
+    def run_it(*options):
+        return CliRunner().invoke(main, ["--out", str(tmp_path), *options])
 
-    assert run_it("thin sheet").exit_code == 0
-    (picture,) = tmp_path.glob("*.png")
-    assert run_it("sub-voxel").exit_code == 0
-    (tmp_path / "report.json").unlink()
-    result = run_it("thin sheet")
-    assert result.exit_code == 2 and "report.md: exists, and without report.json the folder" in result.stderr
-    assert picture.exists()
+    assert run_it("--only=thin sheet").exit_code == 0
+    result = run_it("--only=sub-voxel")
+    assert result.exit_code == 2 and "exists; give another name, or --overwrite to replace it" in result.stderr
+    assert list(tmp_path.glob("*.png")) and run_it("--only=sub-voxel", "--overwrite").exit_code == 0
 
 
 def test_a_report_that_cannot_be_written_is_one_clear_error(tmp_path):
