@@ -45,7 +45,7 @@ HEAVY = {
 BUDGETS = {
     "base": 3225, "opencl": 1290, "probe": 1505, "tissue": 2070, "tracked": 1935, "mri": 7440, "placement": 820,
     "imaging": 4605, "fitting": 3635, "vtk": 465, "mrml": 4475, "Widget": 3015, "Workstation": 5785, "Command": 2835,
-    "module": 430, "validation": 6055, "benchmarks": 3695, "tests": 28240, "tests/reference": 460,
+    "module": 430, "validation": 6055, "benchmarks": 3695, "tests": 28270, "tests/reference": 460,
 }  # fmt: skip
 #: Lines of all of SlicerUSSim/, and of kernels/
 LARGEST_PRODUCT, LARGEST_KERNELS = 43_450, 5_600
