@@ -145,7 +145,7 @@ class SegmentationFilter(_ImageFilter):
         self._warnings: tuple[str, ...] = ()
 
     def SetSettings(self, settings: SegmentationSettings) -> None:
-        """What is segmented and how; default: SegmentationSettings()."""
+        """What is segmented and how; by default what SegmentationSettings has."""
         self._change("_settings", settings)
 
     def SetOtherData(self, contrast: str, image: vtkImageData | None) -> None:
