@@ -177,11 +177,12 @@ class PanelView(Protocol):
 
 #: Options of the command in messages, and what a panel has for them
 _IN_PANEL = (
+    (r"label the whole head \(--outside\)", "tick Label what is outside the brain and press Segment"),
     (r" ?\((?:--|ussim )[^()]*\)", ""),
     (r"--map (\d+)=TISSUE", r"the name of a tissue for \1 in its colour table"),
     (r"--map [^\s=]+=(?:'[^']*'|\S+)(?: --map [^\s=]+=(?:'[^']*'|\S+))*", "names of its tissues"),
     (r"--map (\S+)", r"names of \1"), (r"--add [^\s,;]+", "Add to tissues"), (r"--skull-strip", "Brain extraction"),
-    (r"--contrast", "Contrast"), (r"--mask", "Mask"), (r"--organs", "Organs of a CT"),
+    (r"--contrast", "Contrast"), (r"--mask", "Brain mask"), (r"--organs", "Organs of a CT"),
     (r"--outside", "Label what is outside the brain"), (r"--craniotomy", "Open skull"),
 )  # fmt: skip
 
