@@ -44,8 +44,10 @@ def about_bone(
     """
     if "skull" not in names:
         return ()
-    behind = np.arange(-_BRAIN_MM, 0.0, _COVER_STEP_MM)[:, None] * [0.0, 1.0, 0.0]
-    bone_mm = (_kinds(names)[_labels_at(labels, probe_to_ras, behind)] == _BONE).sum() * _COVER_STEP_MM
+    depth = np.arange(-_BRAIN_MM, 3.0, _COVER_STEP_MM)
+    kinds = _kinds(names)[_labels_at(labels, probe_to_ras, depth[:, None] * [0.0, 1.0, 0.0])]
+    is_in_brain = bool((kinds[depth >= 0.0] == _BRAIN).any())  # a face that looks away from the skin is not
+    bone_mm = (kinds[depth < 0.0] == _BONE).sum() * _COVER_STEP_MM if is_in_brain else 0.0
     if bone_mm >= _COVERED_MM:
         return (
             f"the probe is below the closed skull, with {bone_mm:.0f} mm of bone behind its face: open the skull "
