@@ -43,12 +43,12 @@ HEAVY = {
 #: Lines of Python that a room, or a folder beside the product, may have. Raising one is a decision: the commit says
 #: what users get for it.
 BUDGETS = {
-    "base": 3225, "opencl": 1290, "probe": 1505, "tissue": 2070, "tracked": 1935, "mri": 7440, "placement": 820,
-    "imaging": 4605, "fitting": 3635, "vtk": 465, "mrml": 4475, "Widget": 3015, "Workstation": 5785, "Command": 2835,
-    "module": 430, "validation": 6055, "benchmarks": 3695, "tests": 28270, "tests/reference": 460,
+    "base": 3225, "opencl": 1290, "probe": 1505, "tissue": 2070, "tracked": 1935, "mri": 7440, "placement": 825,
+    "imaging": 4605, "fitting": 3635, "vtk": 465, "mrml": 4480, "Widget": 3025, "Workstation": 5785, "Command": 2835,
+    "module": 430, "validation": 6055, "benchmarks": 3695, "tests": 28290, "tests/reference": 460,
 }  # fmt: skip
 #: Lines of all of SlicerUSSim/, and of kernels/
-LARGEST_PRODUCT, LARGEST_KERNELS = 43_450, 5_600
+LARGEST_PRODUCT, LARGEST_KERNELS = 43_460, 5_600
 #: Packages of the checkout that use the product and are not installed with it
 CHECKOUT = {"validation", "benchmarks", "tests", "examples"}
 

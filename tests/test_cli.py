@@ -343,7 +343,7 @@ def test_the_demo_replaces_its_files_only_with_overwrite(head, tmp_path):
     assert ussim("demo", "--mri", head, "-o", out).exit_code == 0
     assert ussim("demo", "--mri", head, "-o", out, "--overwrite").exit_code == 0
     assert not list(out.glob(".results-*")) and (out / "notes.txt").read_text() == "mine"
-    result = ussim("demo", "--mri", out / "labels.nii.gz", "--out", out)
+    result = ussim("demo", "--mri", out / "labels.nii.gz", "--out", out, "--overwrite")
     assert result.exit_code == 2 and "labels.nii.gz is an input, which it would replace" in result.stderr
 
 

@@ -106,6 +106,27 @@ def test_the_tissues_of_another_patient_in_the_scene_stay(presenter):
     assert "'Lesions' was chosen for another MRI and was not used" in presenter.notes.text()
 
 
+def test_a_sweep_along_a_path_is_a_sequence_and_a_volume(presenter):
+    parameters, scene = presenter.logic.parameters, presenter.logic.scene
+    sequences = slicer.vtkSlicerSequencesLogic()
+    sequences.SetMRMLScene(scene)  # registers browsers
+    presenter.segmenting.segment()
+    presenter.placing.placeProbe()
+    presenter.values.setValue("probe.scan_lines", 48)
+    parameters.path = scene.AddNewNodeByClass("vtkMRMLMarkupsLineNode", "Path")
+    presenter.images.sweepAlongPath()
+    assert "has 0 points, expected two or more" in presenter.view.errors.pop()
+    here = probe_pose(parameters.probe_transform)[:3, 3]
+    for step in (-2.0, 2.0):
+        parameters.path.AddControlPointWorld(*(here + [0, step, 0]))
+    presenter.images.sweepAlongPath()
+    images, volume = parameters.image_sequence, scene.GetFirstNodeByName("Path volume")
+    assert images.GetName() == "Path ultrasound" and images.GetNumberOfDataNodes() >= 4 and not presenter.view.errors
+    assert presenter.images.sequenceDone.endswith("images in 'Path ultrasound', compounded to 'Path volume'")
+    assert slicer.util.arrayFromVolume(volume).max() > 100
+    assert parameters.transform_sequence.GetNumberOfDataNodes() == images.GetNumberOfDataNodes()
+
+
 def test_presets_carry_the_pose_if_it_is_wanted(presenter, tmp_path):
     view, parameters = presenter.view, presenter.logic.parameters
     presenter.values.setValue("scene.preset_pose", True)

@@ -245,9 +245,7 @@ def _placed(
     labels, names, settings, probe = added.labels, added.tissue_names, preset.settings, preset.probe
     at, is_open, line = None, craniotomy.is_wanted, ""
     if isinstance(pose, str):
-        from SlicerUSSim.Logic.placement.aiming import opening_pose  # a pose from a file does not wait for surfaces
-        from SlicerUSSim.Logic.placement.craniotomy import default_pose, middle_of
-        from SlicerUSSim.Logic.placement.views import opened_view_pose, view_pose
+        from SlicerUSSim.Logic.placement.craniotomy import default_pose, middle_of  # a pose from a file does not wait
 
         if craniotomy.is_file:
             labels = craniotomy.on(added.labels, names, probe, None)

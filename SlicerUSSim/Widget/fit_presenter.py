@@ -117,17 +117,18 @@ class FitPresenter:
 
     def canApply(self) -> tuple[bool, str]:
         """(whether the fit can be applied, the reason if not)"""
-        return self._canChange(self._before is None, "The fit is applied already")
+        return self._canChange(self._before is None, _("The fit is applied already"))
 
     def canRevert(self) -> tuple[bool, str]:
         """(whether the values from before Apply can be restored, the reason if not)"""
-        return self._canChange(self._before is not None, "Apply a fit first")
+        return self._canChange(self._before is not None, _("Apply a fit first"))
 
     def _canChange(self, met: bool, why_not: str) -> tuple[bool, str]:
         labels: Any = None if self._fit is None else self._fit[1]
         is_chosen = labels is not None and labels is self._panel.parameters.labels
-        other = "" if labels is None else f"The fit is of {labels.GetName()!r}; choose these tissues"
-        return self._panel.ready((self._fit, "Fit to real images first"), (is_chosen, other), (met, why_not))
+        text = _("The fit is of {name!r}; choose these tissues")
+        other = "" if labels is None else text.format(name=labels.GetName())
+        return self._panel.ready((self._fit, _("Fit to real images first")), (is_chosen, other), (met, why_not))
 
     def apply(self) -> None:
         """Write the result to the preset, and a registration to a transform node, the future parent of the tracking."""

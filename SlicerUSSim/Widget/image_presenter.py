@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from time import perf_counter
 from typing import Any
 
@@ -129,45 +131,54 @@ class ImagePresenter:
             own = (None, transforms_node.GetID())
             if images_node is not None and images_node.GetNodeReferenceID(MADE_FROM) not in own:
                 images_node = None  # those of other transforms stay
-            name = transforms_node.GetName()
-            with (
-                panel.made(images_node, "Sequence", f"{name} ultrasound") as images,
-                panel.made(self._browser_of(transforms_node), "SequenceBrowser", f"{name} browser") as browser,
-            ):
-                browser.AddSynchronizedSequenceNode(transforms_node)
-                count = panel.logic.simulateSequence(
-                    parameters.labels, transforms_node, images, browser_node=browser, progress=progress
-                )
-            images.SetNodeReferenceID(MADE_FROM, transforms_node.GetID())
-            parameters.image_sequence = images  # in place of which the next ones come
-            self._show_played(browser, images, transforms_node)
+            with self._images_at(transforms_node, transforms_node.GetName(), images_node, progress) as (images, count):
+                pass
             self.sequenceDone = _("{count} images in {name!r}").format(count=count, name=images.GetName())
 
     def sweepAlongPath(self) -> None:
         """Simulate the images of a probe that moves along the chosen path, and compound them to a volume."""
         panel, parameters = self._panel, self._panel.parameters
         path_node: Any = parameters.path
-        with panel.acting(), panel.working("Sweep along path") as progress:
+        with panel.acting(), panel.working(_("Sweep along path")) as progress:
             require(path_node is not None, "no path chosen, expected a curve or a line of Markups on the patient")
             browser, transforms = panel.logic.followPath(parameters.labels, path_node)
             try:
-                with panel.made(None, "Sequence", f"{path_node.GetName()} ultrasound") as images:
-                    count = panel.logic.simulateSequence(
-                        parameters.labels, transforms, images, browser_node=browser,
-                        progress=lambda share: progress(0.95 * share),
-                    )  # fmt: skip
-                    with panel.made(None, "ScalarVolume", f"{path_node.GetName()} volume") as volume:
-                        panel.logic.compoundSequence(images, volume)
+                name, report = path_node.GetName(), lambda share: progress(0.95 * share)
+                with (
+                    self._images_at(transforms, name, None, report) as (images, count),
+                    panel.made(None, "ScalarVolume", f"{name} volume") as volume,
+                ):
+                    panel.logic.compoundSequence(images, volume)
             except BaseException:
                 panel.logic.scene.RemoveNode(browser)
                 panel.logic.scene.RemoveNode(transforms)
                 raise
-            images.SetNodeReferenceID(MADE_FROM, transforms.GetID())
-            parameters.transform_sequence, parameters.image_sequence = transforms, images
-            self._show_played(browser, images, transforms)
+            parameters.transform_sequence = transforms
             self.sequenceDone = _("{count} images in {name!r}, compounded to {volume!r}").format(
                 count=count, name=images.GetName(), volume=volume.GetName()
             )
+
+    @contextmanager
+    def _images_at(
+        self, transforms_node: Any, name: str, images_node: Any, progress: Callable[[float], None]
+    ) -> Iterator[tuple[Any, int]]:
+        """(sequence node of the images at transforms, their number); it is chosen and shown if the block succeeds.
+
+        `images_node` is filled; None: a new one, called after `name`. A browser for both is made if there is none.
+        """
+        panel, parameters = self._panel, self._panel.parameters
+        with (
+            panel.made(images_node, "Sequence", f"{name} ultrasound") as images,
+            panel.made(self._browser_of(transforms_node), "SequenceBrowser", f"{name} browser") as browser,
+        ):
+            browser.AddSynchronizedSequenceNode(transforms_node)
+            count = panel.logic.simulateSequence(
+                parameters.labels, transforms_node, images, browser_node=browser, progress=progress
+            )
+            yield images, count
+        images.SetNodeReferenceID(MADE_FROM, transforms_node.GetID())
+        parameters.image_sequence = images  # in place of which the next ones come
+        self._show_played(browser, images, transforms_node)
 
     def _show_played(self, browser: Any, images: Any, transforms: Any) -> None:
         """Show the image of a sequence that its browser plays in the chosen slice view."""

@@ -266,7 +266,7 @@ class PanelHost:
     def awaitKernels(self) -> None:
         """Show progress while the kernels of images are built, which takes a minute the first time."""
         if self.trials is not None and self.trials.used is None:
-            with self.working("Build kernels, once on this computer") as progress:
+            with self.working(_("Build kernels, once on this computer")) as progress:
                 self.trials.wait(progress)
 
     def add(self, kind: str, name: str) -> Any:

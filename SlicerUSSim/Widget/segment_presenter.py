@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,9 +20,9 @@ from SlicerUSSim.Logic.tissue.texture import Texture
 from SlicerUSSim.Widget.interface import PanelHost, tr as _
 from SlicerUSSim.Widget.notes import Notes, checks
 
-#: Roles of nodes that are of the patient whose tissues are chosen, and those that Segment may deselect
+#: Roles of nodes that Segment chooses, and of those beside them that are of the patient whose tissues are chosen
+_OF_SEGMENT = ("labels", "mask", "sheets")
 _BESIDE = ("lesions", "second_mri", "organs", "opening")
-_FORGOTTEN = (*_BESIDE, "labels", "mask")
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,15 +86,15 @@ class SegmentPresenter:
             mri = required(parameters.mri, "no MRI chosen, expected a scalar volume")
             if notes.segmented not in (None, mri):  # also if this fails: they are about another patient
                 notes.set()
-            nodes, lines, settings = self._chosen(), notes.lines, parameters.segmentation
-            chosen = {role: getattr(parameters, role) for role in _FORGOTTEN}
+            chosen, lines, settings = self._chosen(_BESIDE), notes.lines, parameters.segmentation
+            nodes = self._chosen()
             told = self._forget_other_brain(mri) + self._forget_other_patient(mri) + self._closed_again()
             before = _BeforeSegment(self._labels_before(), nodes, _data_of(parameters.sheets), lines)
             others, untold = self._second_mri()
             kinds = parameters.sheet.kinds if parameters.sheet.find else ()
             own_sheets = parameters.sheets if kinds and self._are_own_sheets() else None
             with (
-                self._chosen_again_on_failure(chosen),
+                self._chosen_again_on_failure(chosen | nodes),
                 panel.made(own_sheets, "Model", f"{mri.GetName()} sheets", wanted=bool(kinds)) as sheets,
                 self.replaceable(f"{mri.GetName()} tissues", mri) as labels,
             ):
@@ -191,9 +191,9 @@ class SegmentPresenter:
 
     # ---- what Segment finds chosen -----------------------------------------------------------------------------
 
-    def _chosen(self) -> dict[str, Any]:
-        """{role: chosen node} of the nodes that Segment chooses."""
-        return {role: getattr(self._panel.parameters, role) for role in ("labels", "mask", "sheets")}
+    def _chosen(self, roles: Iterable[str] = _OF_SEGMENT) -> dict[str, Any]:
+        """{role: chosen node} of some roles, by default those that Segment chooses."""
+        return {role: getattr(self._panel.parameters, role) for role in roles}
 
     def _labels_before(self) -> LabelsBefore:
         labels: Any = self._panel.parameters.labels
@@ -249,8 +249,7 @@ class SegmentPresenter:
         parameters, lines = self._panel.parameters, []
         if parameters.labels is None or not self._are_of_other(parameters.labels, mri):
             return []
-        for role in _BESIDE:
-            node: Any = getattr(parameters, role)
+        for role, node in self._chosen(_BESIDE).items():
             if node is not None:
                 setattr(parameters, role, None)
                 lines.append(

@@ -43,7 +43,7 @@ from SlicerUSSim.Logic.tissue.label_maps import LabelledTissues
 from SlicerUSSim.Logic.tissue.table import TissueTable
 from SlicerUSSim.Logic.tissue.texture import Texture
 
-#: Attribute of a mask node that was extracted, and role of its reference to the MRI node
+#: Attribute of a mask node that was extracted
 _BRAIN_OF = "SlicerUSSim.brainOf"
 #: Share of the time in which tissues are segmented, if sheets are looked for after that
 _SEGMENTED = 0.4
@@ -162,7 +162,7 @@ class SegmentLogic:
             node = scene.AddNewNodeByClass("vtkMRMLLabelMapVolumeNode", scene.GenerateUniqueName(name))
         write_labels(node, result.brain.mask, ("brain",), mri_node)
         node.SetAttribute(_BRAIN_OF, "1")
-        node.SetNodeReferenceID(_BRAIN_OF, mri_node.GetID())
+        node.SetNodeReferenceID(MRI, mri_node.GetID())
         mark_as_made(node)
         return node
 
@@ -174,7 +174,7 @@ class SegmentLogic:
         """Whether writeBrain's mask, edited since or not, is from this MRI node; None for other masks."""
         if mask_node is None or mask_node.GetAttribute(_BRAIN_OF) is None:
             return None
-        return mask_node.GetNodeReference(_BRAIN_OF) is mri_node
+        return mri_of(mask_node) is mri_node
 
     def mayReplace(self, labels_node) -> bool:
         """Whether segment() may write into a node: if it is empty, or has what segment() wrote and nobody edited."""
@@ -322,8 +322,7 @@ class SegmentLogic:
         write_labels(labels_node, added.labels, added.tissue_names, like_node)
         mark_as_made(labels_node)
         labels_node.SetAttribute(PATIENT, patient_of(like_node))
-        mri = mri_of(like_node) if like_node.IsA("vtkMRMLLabelMapVolumeNode") else like_node
-        mri = mri if mri is None or mri.IsA("vtkMRMLScalarVolumeNode") else mri_of(like_node)
+        mri = mri_of(like_node) if any(map(like_node.IsA, LABEL_CLASSES)) else like_node
         labels_node.SetNodeReferenceID(MRI, None if mri is None else mri.GetID())
         set_closed_labels(labels_node, None)
         if texture is not None:

@@ -129,8 +129,7 @@ def add_sequence(
     images, transforms = _sequence_node(scene, name), _sequence_node(scene, f"{name} transforms")
     index.fill(images, (_image(name, sequence, number) for number in numbers))
     index.fill(transforms, (_transform(f"{name} transform", to_ras @ matrix) for matrix in matrices))
-    browser = scene.AddNewNodeByClass("vtkMRMLSequenceBrowserNode", scene.GenerateUniqueName(f"{name} browser"))
-    browser.SetAndObserveMasterSequenceNodeID(transforms.GetID())
+    browser = _browser(scene, name, transforms)
     browser.AddSynchronizedSequenceNodeID(images.GetID())
     placed = scene.AddNewNodeByClass("vtkMRMLLinearTransformNode", f"{name} transform")
     placed.SetMatrixTransformToParent(vtk_matrix(to_ras @ matrices[0]))
@@ -149,20 +148,24 @@ def add_sequence(
     return browser, images
 
 
-def add_poses(scene, poses: Sequence[np.ndarray], name: str, probe_transform_node=None):
+def add_poses(scene, poses: Sequence[np.ndarray], name: str):
     """(browser, transforms): a vtkMRMLSequenceBrowserNode with the poses (4, 4) as a vtkMRMLSequenceNode.
 
-    The index is the number of the pose. `probe_transform_node`, or a new one, follows the browser.
+    The index is the number of the pose. A new linear transform node follows the browser.
     """
     transforms = _sequence_node(scene, name)
     numbers = SequenceIndex(tuple(str(number) for number in range(len(poses))), "pose", "")
     numbers.fill(transforms, (_transform(name, pose) for pose in poses))
+    browser = _browser(scene, name, transforms)
+    browser.AddProxyNode(scene.AddNewNodeByClass("vtkMRMLLinearTransformNode", name), transforms, False)
+    return browser, transforms
+
+
+def _browser(scene, name: str, transforms: Any):
+    """A browser whose master sequence is that of the transforms."""
     browser = scene.AddNewNodeByClass("vtkMRMLSequenceBrowserNode", scene.GenerateUniqueName(f"{name} browser"))
     browser.SetAndObserveMasterSequenceNodeID(transforms.GetID())
-    if probe_transform_node is None:
-        probe_transform_node = scene.AddNewNodeByClass("vtkMRMLLinearTransformNode", name)
-    browser.AddProxyNode(probe_transform_node, transforms, False)
-    return browser, transforms
+    return browser
 
 
 def _sequence_node(scene, name: str):

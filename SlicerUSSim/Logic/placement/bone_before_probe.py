@@ -45,7 +45,7 @@ def about_bone(
     if "skull" not in names:
         return ()
     depth = np.arange(-_BRAIN_MM, 3.0, _COVER_STEP_MM)
-    kinds = _kinds(names)[_labels_at(labels, probe_to_ras, depth[:, None] * [0.0, 1.0, 0.0])]
+    (kinds,) = _kinds_below(labels, names, probe_to_ras, np.zeros((1, 3)), depth)
     is_in_brain = bool((kinds[depth >= 0.0] == _BRAIN).any())  # a face that looks away from the skin is not
     bone_mm = (kinds[depth < 0.0] == _BONE).sum() * _COVER_STEP_MM if is_in_brain else 0.0
     if bone_mm >= _COVERED_MM:
@@ -120,9 +120,16 @@ def _misfit(labels: Volume, names: Sequence[str], probe: Probe, pose: np.ndarray
 def _under(labels: Volume, names: Sequence[str], pose: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """(bone covers it, there is brain below), each (n,) bool, of (n, 3) places of a face."""
     depth = np.arange(-_BEHIND_MM, _BRAIN_MM, _COVER_STEP_MM)
-    kinds = _kinds(names)[_labels_at(labels, pose, points[:, None] + depth[:, None] * [0.0, 1.0, 0.0])]
+    kinds = _kinds_below(labels, names, pose, points, depth)
     is_covered = _bone_before_brain(kinds).sum(axis=1) * _COVER_STEP_MM >= _COVERED_MM
     return is_covered, (kinds == _BRAIN).any(axis=1)
+
+
+def _kinds_below(
+    labels: Volume, names: Sequence[str], pose: np.ndarray, points: np.ndarray, depth: np.ndarray
+) -> np.ndarray:
+    """(n, depths) kinds at depths in mm, negative behind the face, below (n, 3) places of a face."""
+    return _kinds(names)[_labels_at(labels, pose, points[:, None] + depth[:, None] * [0.0, 1.0, 0.0])]
 
 
 def _kinds(names: Sequence[str]) -> np.ndarray:
