@@ -106,6 +106,22 @@ def test_the_tissues_of_another_patient_in_the_scene_stay(presenter):
     assert "'Lesions' was chosen for another MRI and was not used" in presenter.notes.text()
 
 
+def test_tissues_follow_the_chosen_mri_and_live_images_stop(presenter):
+    """Live went on with the tissues of the MRI before."""
+    parameters, scene = presenter.logic.parameters, presenter.logic.scene
+    presenter.segmenting.segment()
+    presenter.images.setLive(True)
+    presenter.parametersChanged()
+    first, of_first = parameters.mri, parameters.labels
+    parameters.mri = scene.AddNewNodeByClass("vtkMRMLScalarVolumeNode", "Other")
+    presenter.parametersChanged()
+    assert parameters.labels is None and not presenter.images.isLive()
+    assert presenter.view.status[-1].startswith("FROZEN: Head") and not presenter.view.errors
+    parameters.mri = first
+    presenter.parametersChanged()
+    assert parameters.labels is of_first and not presenter.images.isLive()
+
+
 def test_a_sweep_along_a_path_is_a_sequence_and_a_volume(presenter):
     parameters, scene = presenter.logic.parameters, presenter.logic.scene
     sequences = slicer.vtkSlicerSequencesLogic()

@@ -132,8 +132,7 @@ class ImagePresenter:
             if images_node is not None and images_node.GetNodeReferenceID(MADE_FROM) not in own:
                 images_node = None  # those of other transforms stay
             with self._images_at(transforms_node, transforms_node.GetName(), images_node, progress) as (images, count):
-                pass
-            self.sequenceDone = _("{count} images in {name!r}").format(count=count, name=images.GetName())
+                self.sequenceDone = _("{count} images in {name!r}").format(count=count, name=images.GetName())
 
     def sweepAlongPath(self) -> None:
         """Simulate the images of a probe that moves along the chosen path, and compound them to a volume."""

@@ -102,6 +102,6 @@ class PlacementPresenter:
             self._choose(closed)
 
     def _choose(self, labels: Any) -> None:
-        self._panel.parameters.labels = labels
         self._notes.drop(OPENED, PLACED)
-        self._notes.areAbout(labels)
+        self._notes.areAbout(labels)  # before live images begin anew, which recognise what the notes are not about
+        self._panel.parameters.labels = labels

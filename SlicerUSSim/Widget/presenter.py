@@ -59,6 +59,7 @@ class PanelPresenter(PanelHost):
 
     def parametersChanged(self) -> None:
         """Update the view and the nodes of live update after a change of the scene's parameters or slice view."""
+        self.segmenting.followMri()
         self.images.followChoices()
         self.images.showIn3D()
         self.view.refresh(self.values.changes())

@@ -11,7 +11,8 @@ from typing import Any
 from SlicerUSSim.Logic.base.errors import SimulationError, require, required
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.mri.segmentation import Segmentation
-from SlicerUSSim.Logic.mrml.label_nodes import empty, read_labels, write_labels
+from SlicerUSSim.Logic.mrml.label_nodes import LABEL_CLASSES, empty, read_labels, write_labels
+from SlicerUSSim.Logic.mrml.nodes import nodes_of_class
 from SlicerUSSim.Logic.mrml.own_results import SHEETS, content_as_made, content_of, mark_as_made, mark_as_result
 from SlicerUSSim.Logic.mrml.share_nodes import read_shares, write_shares
 from SlicerUSSim.Logic.mrml.taken_image import PATIENT, mri_of
@@ -68,6 +69,23 @@ class SegmentPresenter:
     def forget(self) -> None:
         """Forget the last Segment, which is of another patient."""
         self._last: _LastSegment | None = None
+        self._mri: Any = None  # as it was chosen when followMri was called last
+
+    def followMri(self) -> None:
+        """Choose the tissues of the MRI if another MRI was chosen: those that are in the scene, or none."""
+        parameters, before = self._panel.parameters, self._mri
+        self._mri = mri = parameters.mri
+        if None in (before, mri) or before is mri:
+            return
+        if parameters.labels is not None and not self._are_of_other(parameters.labels, mri):
+            return
+        told = self._forget_other_patient(mri)
+        labels = [node for kind in LABEL_CLASSES for node in nodes_of_class(self._panel.logic.scene, kind)]
+        own = [node for node in labels if mri_of(node) is mri]
+        if not own:
+            self._panel.logic.stopLiveUpdate()  # images of the patient before stay, as FROZEN
+        parameters.labels = own[-1] if own else None
+        self._notes.set(*told)
 
     def canSegment(self) -> tuple[bool, str]:
         """(whether Segment is enabled, the reason if not)"""

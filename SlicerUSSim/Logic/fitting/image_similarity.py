@@ -225,6 +225,6 @@ def target_comparisons(
     return comparisons
 
 
-def mean_cost(similarities: Iterable[Similarity]) -> float:
+def mean_total(similarities: Iterable[Similarity]) -> float:
     """The mean cost of several images."""
     return float(np.mean([one.total for one in similarities]))

@@ -26,7 +26,7 @@ from SlicerUSSim.Logic.fitting.identifiability import (
     equal_variance_draws,
     quantities_of,
 )
-from SlicerUSSim.Logic.fitting.image_similarity import Similarity, SimilaritySettings, mean_cost, target_comparisons
+from SlicerUSSim.Logic.fitting.image_similarity import Similarity, SimilaritySettings, mean_total, target_comparisons
 from SlicerUSSim.Logic.fitting.parameters import ECHOGENICITY, Bounds, FreeParameters
 from SlicerUSSim.Logic.fitting.search import (
     GLOBAL_ALGORITHM,
@@ -150,7 +150,7 @@ class AppearanceCost:
     def __call__(self, units: np.ndarray) -> float:
         """The mean cost at (parameters,) positions, 0 to 1 between the bounds."""
         tissues, display = self.parameters.apply(units, self.tissues, self.display)
-        return mean_cost(self.of_each(tissues, display))
+        return mean_total(self.of_each(tissues, display))
 
     def anchor(self, units: np.ndarray) -> None:
         """Recompute what the model approximates, so that it is exact here."""
@@ -266,8 +266,8 @@ def optimize_appearance(
         parameters=parameters,
         before=dict(zip(parameters.names, parameters.current(tissues, display).tolist(), strict=True)),
         after=describe(best),
-        cost_before=mean_cost(before),
-        cost_after=mean_cost(after),
+        cost_before=mean_total(before),
+        cost_after=mean_total(after),
         similarity_before=before,
         similarity_after=after,
         history=search.history,

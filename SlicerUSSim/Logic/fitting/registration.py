@@ -19,7 +19,7 @@ from SlicerUSSim.Logic.base.transforms import check_rigid
 from SlicerUSSim.Logic.fitting.image_similarity import (
     PatchComparison,
     SimilaritySettings,
-    mean_cost,
+    mean_total,
     target_comparisons,
 )
 from SlicerUSSim.Logic.fitting.search import Evaluation, Progress, Search
@@ -190,7 +190,7 @@ class _PoseCost:
         try:
             for pose, comparison in zip(self.poses, self.comparisons, strict=True):
                 comparison.run(self.simulator.render(self.probe, matrix @ pose, self.display, self.grid))
-            return mean_cost(comparison.result() for comparison in self.comparisons)
+            return mean_total(comparison.result() for comparison in self.comparisons)
         finally:
             self.simulator.settings = before
 
