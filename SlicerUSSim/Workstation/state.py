@@ -121,6 +121,8 @@ class ViewState:
     follow: bool = True
     #: Whether the tissues are coloured
     show_tissues: bool = False
+    #: MRI value, tissue and RAS of the point under the mouse
+    under_mouse: str = ""
 
 
 @dataclass
@@ -155,6 +157,14 @@ class ImageState:
     focus: str = ""
     gain: str = ""
     dynamic_range: str = ""
+
+
+@dataclass
+class AdviceState:
+    """What a user should know or do first, and what its button does ("": no button)."""
+
+    text: str = ""
+    remedy: str = ""
 
 
 @dataclass
@@ -221,8 +231,6 @@ class PageState:
     title: str = ""
     #: The question whether pose and settings of before are to be restored; "": there is none
     offer: str = ""
-    #: Titles of the panel's sections that are open
-    open_sections: list[str] = field(default_factory=list)
     #: Pose of the probe on the patient; None without a probe or a patient
     pose: SurfacePose | None = None
     #: The same as texts: position and angles, and matrix, as pose_files.pose_of_text reads them; "" without a probe
@@ -237,6 +245,7 @@ class PageState:
     views: ViewState = field(default_factory=ViewState)
     sequence: SequenceState = field(default_factory=SequenceState)
     image: ImageState = field(default_factory=ImageState)
+    advice: AdviceState = field(default_factory=AdviceState)
     cine: CineState = field(default_factory=CineState)
     fit: FitState = field(default_factory=FitState)
     registration: RegistrationState = field(default_factory=RegistrationState)
