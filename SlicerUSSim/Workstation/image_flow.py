@@ -63,7 +63,6 @@ class ImageFlow:
             self._comparison.sees_nothing(taken.grid)
         else:
             self._comparison.compare(taken.image, taken.grid)
-        self._panel.tellFrozen()
 
     def clear(self) -> None:
         """Show no image anywhere, since that of before is not of this patient or pose."""
@@ -71,7 +70,6 @@ class ImageFlow:
         self._cine.clear()
         self._views.hide_image()
         self._comparison.sees_nothing(None)
-        self._panel.tellFrozen()
 
     def show_again(self) -> None:
         """Send the current images again, for a page that has just opened."""

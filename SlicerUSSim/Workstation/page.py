@@ -15,7 +15,6 @@ import numpy as np
 from trame.ui.vuetify3 import VAppLayout
 from trame.widgets import html, vuetify3 as v3
 from trame_server import Server
-from trame_slicer.core import LayoutManager
 
 from SlicerUSSim.Logic.probe.arrays import PROBES, Probe
 from SlicerUSSim.Widget.interface import Control, by_widget
@@ -24,14 +23,15 @@ from SlicerUSSim.Workstation.browser_panel import BrowserPanel
 from SlicerUSSim.Workstation.controls import control_html, range_html, slider_html, upright_html
 from SlicerUSSim.Workstation.page_parts import HELP, offer, pose_numbers, question_dialog, registration
 from SlicerUSSim.Workstation.pose_registration import SECTION
-from SlicerUSSim.Workstation.state import NAMES, ComparisonMode, value_of
+from SlicerUSSim.Workstation.state import IMAGE, NAMES, ComparisonMode, value_of
+from SlicerUSSim.Workstation.view_tools import anatomy_column, cross_hair
 
 _STATIC = Path(__file__).parent / "static"
 #: Files that the page loads in addition to those of trame.
 MODULE = {
     "serve": {"ussim": str(_STATIC)},
-    "scripts": [f"ussim/{name}.js" for name in ("screen", "measure", "workstation")],
-    "styles": ["ussim/workstation.css"],
+    "scripts": [f"ussim/{name}.js" for name in ("screen", "measure", "workstation", "views")],
+    "styles": ["ussim/workstation.css", "ussim/views.css"],
 }
 #: Controls of the panel that are not on the page: its views follow the probe and show it, it compares the fit in the
 #: ultrasound view, it has a button of its own to place the probe, and no editor of segments.
@@ -96,8 +96,8 @@ _SHARED_WITH_SCRIPTS = [
 _PROGRAM = "SlicerUSSim"
 
 
-def build_page(server: Server, panel: BrowserPanel, layout: LayoutManager, keys: tuple[str, ...]) -> None:
-    """Build the page of a server. `layout` is that of the anatomy views, `keys` are the keys sent to the server."""
+def build_page(server: Server, panel: BrowserPanel, keys: tuple[str, ...]) -> None:
+    """Build the page of a server; `keys` are the keys that are sent to it."""
     server.enable_module(MODULE)
     server.state.trame__title = _PROGRAM
 
@@ -120,7 +120,7 @@ def build_page(server: Server, panel: BrowserPanel, layout: LayoutManager, keys:
                     html.Div(_player(), classes="ussim-bars")
                 html.Div(_console(controls), classes="ussim-console")
                 with html.Div(classes="ussim-anatomy"):
-                    layout.initialize_layout_grid(page)
+                    anatomy_column(server)
             html.Div(_foot(), classes="ussim-foot")
             with html.Div(classes="ussim-drawer", id="drawer", raw_attrs=['aria-label="Settings"', 'role="region"']):
                 _drawer(panel)
@@ -244,22 +244,25 @@ def _screens(keys: tuple[str, ...]) -> str:
     image = NAMES.image
     values = (image.depth, image.focus, image.gain, image.dynamic_range)
     lines = "".join(f"<div>{{{{ {value} }}}}</div>" for value in values)
+    outline = f"""<svg v-if="{NAMES.sequence.mask}" class="ussim-mask" :viewBox="{NAMES.sequence.box}"
+        preserveAspectRatio="none"><path :d="{NAMES.sequence.mask}"/></svg>"""
+    frame = f'<div class="ussim-frame">{outline}{cross_hair(IMAGE)}</div>'
     screen = """<div class="ussim-screen" data-screen="{name}" {more}>{canvas}<svg class="ussim-overlay"
-        role="img" aria-label="Ruler and measurements of the {name} image"></svg>{words}</div>"""
+        role="img" aria-label="Ruler and measurements of the {name} image"></svg>{frame}{words}</div>"""
     return (
         screen.format(
-            name="simulated", more="",
+            name="simulated", more="", frame=frame,
             canvas=f"""<canvas data-stream="simulated" data-keys="{escape(" ".join(keys))}"></canvas>
             <canvas data-stream="real-over" v-show="{there} && ({blink} || {over})"
             :class="{{blink: {blink}, difference: {over}}}"></canvas>""",
             words=f'<div class="ussim-corner" id="image-values">{lines}</div>',
         )
         + screen.format(
-            name="real", more=f'v-show="{there} && {beside}"', canvas='<canvas data-stream="real"></canvas>',
+            name="real", frame=frame, more=f'v-show="{there} && {beside}"', canvas='<canvas data-stream="real"></canvas>',
             words=f'<div class="ussim-corner">Real, {{{{ {NAMES.sequence.name} }}}}</div>',
         )
         + screen.format(
-            name="kept", more="hidden", canvas='<canvas data-stream="kept"></canvas>',
+            name="kept", frame="", more="hidden", canvas='<canvas data-stream="kept"></canvas>',
             words='<div class="ussim-corner" id="kept-caption"></div>',
         )
         + """<div class="ussim-mmode" id="mmode" hidden><canvas data-stream="mmode"></canvas>

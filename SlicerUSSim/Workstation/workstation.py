@@ -14,6 +14,7 @@ from trame_server import Server
 from trame_slicer.core import SlicerApp
 
 from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic
+from SlicerUSSim.Workstation.advice import Advice
 from SlicerUSSim.Workstation.anatomy import AnatomyViews
 from SlicerUSSim.Workstation.browser_panel import BrowserPanel, Observed
 from SlicerUSSim.Workstation.comparison import Comparison
@@ -23,7 +24,7 @@ from SlicerUSSim.Workstation.hand import KEYS
 from SlicerUSSim.Workstation.image_flow import ImageFlow, LatencyStamps
 from SlicerUSSim.Workstation.kept_state import KeptState
 from SlicerUSSim.Workstation.opener import Opener
-from SlicerUSSim.Workstation.page import build_page, view_tools
+from SlicerUSSim.Workstation.page import build_page
 from SlicerUSSim.Workstation.patient import OpenPatient
 from SlicerUSSim.Workstation.pose_entry import PoseEntry
 from SlicerUSSim.Workstation.pose_registration import Registration
@@ -35,6 +36,7 @@ from SlicerUSSim.Workstation.state import NAMES, SharedState
 from SlicerUSSim.Workstation.tasks import Tasks
 from SlicerUSSim.Workstation.tracker import Tracker
 from SlicerUSSim.Workstation.transfer import Receiver, Sender
+from SlicerUSSim.Workstation.view_tools import view_tools
 
 #: Seconds between two checks whether all work is done.
 _LOOK_EVERY_S = 0.02
@@ -82,6 +84,8 @@ class Workstation:
         self._opener = opener = Opener(
             panel, nodes, patient, self._scenes, registration, self._questions, self._poses
         )  # fmt: skip
+        self._advice = advice = Advice(panel, registration)
+        panel.refreshed = advice.update
         self._kept = KeptState(state_file, panel, patient, opener, probe)
 
         self._following = False
@@ -105,7 +109,7 @@ class Workstation:
         self.server.controller.on_server_bind.add(lambda wslink: Sender(self._export).serve(wslink.app))
         self.server.controller.on_server_ready.add(self._ready)
         self.server.controller.on_server_exited.add(self.close)
-        build_page(self.server, panel, self._views.layout, (*KEYS, "Escape"))
+        build_page(self.server, panel, (*KEYS, "Escape"))
 
     @property
     def is_computing(self) -> bool:
@@ -141,6 +145,8 @@ class Workstation:
             "show_number": comparison.show,
             "answer": self._questions.answer,
             "choose_frame": self._in_task(registration.choose_frame),
+            "remedy": self._in_task(self._advice.follow),
+            "compare_next": comparison.compare_next,
             "cancel": self._panel.cancel,
             "dismiss": self._panel.dismiss,
             "restore": self._in_task(partial(self._then_refresh, self._kept.restore)),
@@ -245,7 +251,6 @@ class Workstation:
         if self._image_node.watch(parameters.output) and taken is not None and taken.node is parameters.output:
             self._images.image_changed()  # it is in there already, as the frozen one of a scene at the start
         self._probe.draw()
-        self._panel.tellFrozen()
         if self._logic.isLive:
             with self._presenter.shown():
                 self._probe.update_surface()

@@ -75,7 +75,14 @@
       context.setTransform(sx * dense, 0, 0, sy * dense, origin[0] * dense, origin[1] * dense);
       context.drawImage(image.bitmap, ruler.x, ruler.y, ruler.w, ruler.h);
     }
-    if (name === stream) overlay(name);
+    if (name !== stream) return;
+    overlay(name);
+    const frame = screenOf(name).querySelector(".ussim-frame");
+    if (!frame || !place) return;
+    const { left, top, right, bottom } = place.edges;
+    Object.assign(frame.style, { left: `${left}px`, top: `${top}px`, width: `${right - left}px`, height: `${bottom - top}px` });
+    frame.classList.toggle("mirrored-x", view.flipX);
+    frame.classList.toggle("mirrored-y", view.flipY);
   };
 
   screens.redraw = () => Object.keys(images).forEach(screens.draw);
