@@ -30,7 +30,7 @@ _STATIC = Path(__file__).parent / "static"
 #: Files that the page loads in addition to those of trame.
 MODULE = {
     "serve": {"ussim": str(_STATIC)},
-    "scripts": [f"ussim/{name}.js" for name in ("screen", "measure", "workstation", "views")],
+    "module_scripts": ["ussim/workstation.js"],
     "styles": ["ussim/workstation.css", "ussim/views.css"],
 }
 #: Controls of the panel that are not on the page: its views follow the probe and show it, it compares the fit in the
@@ -207,27 +207,28 @@ def _console(controls: dict[str, Control]) -> str:
     beside = "".join(slider_html(controls[name]) for name in _BESIDE)
     tgc = "".join(upright_html(controls[name]) for name in _TGC)
     names = ",".join(_TGC)
-    return f"""{beside}
+    return f"""<div class="ussim-buttons">
+    <button class="ussim-button wide" id="live" :aria-pressed="!{live}" title="Freeze or live (space, F)"
+      :disabled="{NAMES.panel.can}.liveCheckBox === false" @click="trigger('freeze')">
+      {{{{ {live} ? 'Freeze' : 'Live' }}}}</button>
+    <details class="ussim-menu" id="measure"><summary>Measure</summary><div>{tools}</div></details>
+    <button class="ussim-button" id="compare" title="Real ultrasound beside, blinking or subtracted (C)"
+      :disabled="{NAMES.sequence.length} === 0" @click="trigger('compare_next')">Compare</button></div>
+    {beside}
     <div class="ussim-tgc" role="group" aria-label="TGC at eight depths">{tgc}
       <input type="range" class="ussim-upright master" id="tgc-master" min="-20" max="20" step="1" value="0"
       aria-label="TGC master" title="All eight together" data-names="{names}"
       @input="window.ussim.tgcMaster($event.target)" @change="$event.target.value = 0"></div>
     {"".join(control_html(controls[name]) for name in _BELOW_TGC)}
     <div class="ussim-buttons">
-    <button class="ussim-button wide" id="live" :aria-pressed="!{live}" title="Freeze or live (space, F)"
-      :disabled="{NAMES.panel.can}.liveCheckBox === false" @click="trigger('freeze')">
-      {{{{ {live} ? 'Freeze' : 'Live' }}}}</button>
-    <details class="ussim-menu up" id="measure"><summary>Measure</summary><div>{tools}</div></details>
-    <button class="ussim-button" id="dual" title="Keep this image beside the live one (D held in Shift)"
-      aria-label="Dual image" @click="window.ussim.dual()" :disabled="!{image.status}">Dual</button>
-    <button class="ussim-button" id="compare" title="Real ultrasound beside, blinking or subtracted (C)"
-      :disabled="{NAMES.sequence.length} === 0" @click="trigger('compare_next')">Compare</button>
+    <button class="ussim-button" id="dual" title="Keep this image beside the next ones"
+      @click="window.ussim.dual()" :disabled="!{image.status}">Dual</button>
+    <button class="ussim-button" id="fit-view" title="Whole image: no zoom, not moved (0)"
+      @click="window.ussim.fitView()">Whole</button>
     <button class="ussim-button" id="flip" title="Left and right exchanged" @click="window.ussim.flip('x')">Flip ⇄
       </button>
     <button class="ussim-button" id="flip-depth" title="Upside down" @click="window.ussim.flip('y')">Flip ⇅</button>
-    <button class="ussim-button" id="fit-view" title="Whole image: no zoom, not moved (0)"
-      @click="window.ussim.fitView()">Whole</button></div>
-    <div class="ussim-buttons"><button class="ussim-button wide" id="place" :title="{NAMES.panel.tips}.placeButton"
+    <button class="ussim-button wide" id="place" :title="{NAMES.panel.tips}.placeButton"
       :disabled="{NAMES.panel.can}.placeButton === false" @click="trigger('press', ['placeButton'])">
       Place at craniotomy</button></div>"""
 

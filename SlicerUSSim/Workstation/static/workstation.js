@@ -1,5 +1,8 @@
 // Client side of the page: draws the images from streams.py, forwards keys, and measures the latency from a mouse event
 // to the new image on the screen.
+import "./screen.js";
+import "./measure.js";
+
 (() => {
   const client = Math.random().toString(36).slice(2);
   const measured = []; // milliseconds from an event to the image that shows its effect
@@ -9,6 +12,7 @@
 
   const workstation = { measured, shown, measuring: false, images: 0, image: null, uploading: 0, exporting: 0, connected: false };
   window.ussim = workstation;
+  import("./views.js"); // which adds to it
 
   const screens = window.ussimScreens;
   const measure = window.ussimMeasure;
