@@ -20,7 +20,6 @@ from SlicerUSSim.Logic.base.errors import Cancelled, SimulationError, require, r
 from SlicerUSSim.Logic.mrml.fitting_nodes import offered
 from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic
 from SlicerUSSim.Logic.mrml.nodes import nodes_of_class
-from SlicerUSSim.Logic.mrml.taken_sequence import count_taken
 from SlicerUSSim.Widget.interface import Control, by_widget
 from SlicerUSSim.Widget.presenter import PanelPresenter
 from SlicerUSSim.Widget.sections import panel_sections
@@ -95,6 +94,8 @@ class BrowserPanel:
         self.shared, self.logic, self.tasks = shared, logic, tasks
         self._about_to_compute = about_to_compute
         self._thread = threading.get_ident()
+        #: Called after values were shown
+        self.refreshed: Callable[[], None] = lambda: None
         #: Calls a function with the point (3,), in the world, of the next click in a slice view, or None
         self.pick: Callable[[Callable[[np.ndarray | None], None]], None] = lambda clicked: None
         #: The work under way: its title, whether it is cancelled, and the task that does it. The last is shown
@@ -175,15 +176,7 @@ class BrowserPanel:
                 panel.tissues = [_line(row) for row in self.presenter.tissues.rows()]
             if any(control.kind == "list" for control in stale.values()):
                 now.fit.free = [FreeParameter(*entry) for entry in self.presenter.fits.freeParameters()]
-            length = count_taken(self.logic.parameters.image_sequence)
-            if now.simulated.length != length:
-                now.simulated.length, now.simulated.number = length, 0
-        self.tellFrozen()
-
-    def tellFrozen(self) -> None:
-        """Mark an image that does not follow the probe, since live images ended or wait for other work."""
-        with self.shared.changing() as now:
-            now.is_frozen = self.logic.taken is not None and (not self.logic.isLive or self.presenter.isBusy)
+        self.refreshed()
 
     @contextmanager
     def progress(self, title: str) -> Iterator[Callable[[float], None]]:

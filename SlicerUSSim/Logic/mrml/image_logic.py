@@ -53,7 +53,7 @@ class ImageLogic:
         self._patient, self._parameters = patient, patient.parameters
         #: The last image with all that it is of; None if there is none, or the last one failed
         self.taken: TakenImage | None = None
-        self._held: TakenImage | None = None  # where holdOutline left the outline
+        self._held = ""  # time of the image at which holdOutline left the outline
 
     def simulate(
         self, labels_node, probe_transform_node, output_node, *, warned: Callable[[Warning], None] = warn_again
@@ -274,11 +274,12 @@ class ImageLogic:
         taken, model = self.taken, self._parameters.outline
         if taken is None or model is None or not may_replace_result(model):
             return
-        if model.GetTransformNodeID() is not None or self._held is not taken:
-            self._held = taken
+        if model.GetTransformNodeID() is not None or self._held != taken.time:
+            self._held = taken.time
             model.SetAndObserveTransformNodeID(None)
             model.SetAndObservePolyData(outline_polydata(taken.preset.probe))
             model.ApplyTransformMatrix(vtk_matrix(taken.probe_to_world))
+            mark_as_result(model, OUTLINE)
 
     def showProbe(self, outline_node, is_shown: bool) -> None:
         """Show or hide a model of the probe's body, which belongs to the outline of its imaged field."""
