@@ -94,6 +94,8 @@ class BrowserPanel:
         self.shared, self.logic, self.tasks = shared, logic, tasks
         self._about_to_compute = about_to_compute
         self._thread = threading.get_ident()
+        #: Called after values were shown
+        self.refreshed: Callable[[], None] = lambda: None
         #: Calls a function with the point (3,), in the world, of the next click in a slice view, or None
         self.pick: Callable[[Callable[[np.ndarray | None], None]], None] = lambda clicked: None
         #: The work under way: its title, whether it is cancelled, and the task that does it. The last is shown
