@@ -15,8 +15,6 @@ from pathlib import Path
 from trame.ui.vuetify3 import VAppLayout
 from trame.widgets import html, vuetify3 as v3
 from trame_server import Server
-from trame_slicer.core import LayoutManager
-from trame_slicer.views import AbstractView
 
 from SlicerUSSim.Widget.image_presenter import FROZEN
 from SlicerUSSim.Widget.interface import Control
@@ -24,14 +22,15 @@ from SlicerUSSim.Widget.tissue_presenter import TISSUE_COLUMNS
 from SlicerUSSim.Workstation.browser_panel import BrowserPanel
 from SlicerUSSim.Workstation.page_parts import offer, pose_numbers, question_dialog, registration
 from SlicerUSSim.Workstation.pose_registration import SECTION
-from SlicerUSSim.Workstation.state import NAMES, PLANES, SLICE_VIEWS, ComparisonMode, value_of
+from SlicerUSSim.Workstation.state import IMAGE, NAMES, ComparisonMode, value_of
+from SlicerUSSim.Workstation.view_tools import anatomy_column, cross_hair
 
 _STATIC = Path(__file__).parent / "static"
 #: Files that the page loads in addition to those of trame.
 MODULE = {
     "serve": {"ussim": str(_STATIC)},
-    "scripts": ["ussim/overlay.js", "ussim/workstation.js"],
-    "styles": ["ussim/workstation.css"],
+    "scripts": ["ussim/overlay.js", "ussim/workstation.js", "ussim/views.js"],
+    "styles": ["ussim/workstation.css", "ussim/views.css"],
 }
 #: Controls of the panel that are not on the page: its views follow the probe and show it, it compares the fit in the
 #: ultrasound view, it has a button of its own to place the probe, and no editor of segments.
@@ -44,8 +43,6 @@ _IN_PAGE = {
     "savePresetButton": "window.ussim.save('json')",
     "loadPresetButton": "window.document.getElementById('open-file').click()",
 }
-#: Colours of the marks beside the slice views' planes.
-_STRIPES = {"Red": "red", "Yellow": "yellow", "Green": "green"}
 
 
 @dataclass(frozen=True)
@@ -80,8 +77,8 @@ _EXPORTS = {
 _PROGRAM = "SlicerUSSim"
 
 
-def build_page(server: Server, panel: BrowserPanel, layout: LayoutManager, keys: tuple[str, ...]) -> None:
-    """Build the page of a server. `layout` is that of the anatomy views, `keys` are the keys sent to the server."""
+def build_page(server: Server, panel: BrowserPanel, keys: tuple[str, ...]) -> None:
+    """Build the page of a server. `keys` are the keys sent to the server."""
     server.enable_module(MODULE)
     server.state.trame__title = _PROGRAM
 
@@ -95,36 +92,16 @@ def build_page(server: Server, panel: BrowserPanel, layout: LayoutManager, keys:
         with v3.VNavigationDrawer(permanent=True, width=376, disable_resize_watcher=True, disable_route_watcher=True):
             _drawer(panel)
         with v3.VMain(style="height: 100vh"), html.Div(classes="ussim-main"):
-            with html.Div(classes="ussim-image"):
+            with html.Div(classes="ussim-stage"):
                 offer()
                 _tools()
                 _screens(keys)
                 _player()
                 _status(panel)
             with html.Div(classes="ussim-anatomy"):
-                layout.initialize_layout_grid(page)
+                anatomy_column(server)
         _messages()
         question_dialog()
-
-
-def view_tools(_server: Server, _view_id: str, view: AbstractView) -> None:
-    """Tools over a view: a selector of its plane for slice views, a camera button for the 3D view."""
-    name = view.get_singleton_tag()
-    with html.Div(classes="ussim-view-tool"):
-        if name in SLICE_VIEWS:
-            html.Div(classes=f"ussim-stripe bg-{_STRIPES[name]}")
-            options = "".join(f"<option>{plane}</option>" for plane in PLANES)
-            html.Div(
-                f"""<select :value="{NAMES.views.planes}['{name}']" id="plane-{name}"
-                    aria-label="Plane of the {_STRIPES[name]} view"
-                    @change="trigger('plane', ['{name}', $event.target.value])">{options}</select>"""
-            )
-        else:
-            with v3.VBtn(
-                icon=True, size="x-small", variant="text", click="trigger('look')", id="look",
-                title="Turn the camera to the probe", raw_attrs=['aria-label="Turn the camera to the probe"'],
-            ):  # fmt: skip
-                v3.VIcon("mdi-camera-flip-outline")
 
 
 # ---- left ------------------------------------------------------------------------------------------------------------
@@ -366,6 +343,7 @@ def _screens(keys: tuple[str, ...]) -> None:
                     v_show=f"{there} && ({blink} || {over})",
                 )
                 html.Div((_STATIC / "overlay.html").read_text())
+                cross_hair(IMAGE)
         with html.Div(classes="ussim-screen", v_show=f"{there} && {beside}"):
             html.Div(f"Real, {{{{ {NAMES.sequence.name} }}}}", classes="ussim-caption")
             with html.Div(classes="ussim-frame", id="real"):
@@ -434,6 +412,7 @@ def _status(panel: BrowserPanel) -> None:
         )
         html.Span(f"{{{{ {messages.status} }}}}", id="status")
         v3.VSpacer()
+        html.Span(f"{{{{ {NAMES.views.under_mouse} }}}}", id="under-mouse")
         html.Span(f"{{{{ {messages.tracker} }}}}", v_if=messages.tracker, id="tracker")
         html.Span(v_if=NAMES.show_latency, id="ussim-latency")  # workstation.js measures while it exists
 

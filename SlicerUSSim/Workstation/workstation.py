@@ -23,8 +23,9 @@ from SlicerUSSim.Workstation.hand import KEYS
 from SlicerUSSim.Workstation.image_flow import ImageFlow, LatencyStamps
 from SlicerUSSim.Workstation.kept_state import KeptState
 from SlicerUSSim.Workstation.opener import Opener
-from SlicerUSSim.Workstation.page import build_page, view_tools
+from SlicerUSSim.Workstation.page import build_page
 from SlicerUSSim.Workstation.patient import OpenPatient
+from SlicerUSSim.Workstation.pointer import Pointer
 from SlicerUSSim.Workstation.pose_entry import PoseEntry
 from SlicerUSSim.Workstation.pose_registration import Registration
 from SlicerUSSim.Workstation.probe_control import ProbeControl
@@ -35,6 +36,7 @@ from SlicerUSSim.Workstation.state import NAMES, SharedState
 from SlicerUSSim.Workstation.tasks import Tasks
 from SlicerUSSim.Workstation.tracker import Tracker
 from SlicerUSSim.Workstation.transfer import Receiver, Sender
+from SlicerUSSim.Workstation.view_tools import view_tools
 
 #: Seconds between two checks whether all work is done.
 _LOOK_EVERY_S = 0.02
@@ -65,6 +67,7 @@ class Workstation:
         self._presenter = presenter = panel.presenter
         self._views = AnatomyViews(app, self.server, view_tools)
         self._probe = probe = ProbeControl(panel, self._views, stamps.probe_moved)
+        self._pointer = Pointer(shared, logic, self._views, probe)
         self._poses = PoseEntry(panel, probe.pose, probe.move)
         probe.told = self._poses.show
         self._comparison = comparison = Comparison(shared, probe.move)
@@ -105,7 +108,7 @@ class Workstation:
         self.server.controller.on_server_bind.add(lambda wslink: Sender(self._export).serve(wslink.app))
         self.server.controller.on_server_ready.add(self._ready)
         self.server.controller.on_server_exited.add(self.close)
-        build_page(self.server, panel, self._views.layout, (*KEYS, "Escape"))
+        build_page(self.server, panel, (*KEYS, "Escape"))
 
     @property
     def is_computing(self) -> bool:
@@ -135,6 +138,7 @@ class Workstation:
             "plane": probe.choose_plane,
             "look": self._in_task(probe.look_again),
             "aim_image": probe.aim_image,
+            "point_at": self._pointer.at_image,
             "play": self._play,
             "play_simulated": self._in_task(self._simulated.play),
             "show_simulated": self._in_task(self._simulated.show),

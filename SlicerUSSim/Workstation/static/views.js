@@ -3,7 +3,7 @@
   const EVERY_MS = 40; // more points than the line under the mouse can be read
 
   // "fold" all views, or "max" or "swap" one; once more undoes it.
-  window.ussim.arrange = (kind, name) => {
+  const arrange = (kind, name) => {
     const body = document.body.classList;
     const wanted = kind === "fold" ? "ussim-folded" : `ussim-${kind}-${name}`;
     const is = body.contains(wanted);
@@ -16,12 +16,14 @@
   };
 
   // The point of a mouse event over the image, mm of the probe frame; the ruler's SVG follows zoom, pan and flips.
-  window.ussim.millimetres = (event) => {
+  const millimetres = (event) => {
     const matrix = document.getElementById("overlay")?.getScreenCTM?.();
     if (!matrix) return null;
     const { x, y } = new DOMPoint(event.clientX, event.clientY).matrixTransform(matrix.inverse());
     return [x, y];
   };
+
+  window.ussimViews = { arrange, millimetres };
 
   let told = 0;
   let waiting = 0;
@@ -41,9 +43,10 @@
     "pointermove",
     (event) => {
       const was = inside;
-      inside = Boolean(event.target.closest?.("#ultrasound")) && Boolean(window.ussim.image);
-      if (inside) point(window.ussim.millimetres(event));
-      else if (was) point(null);
+      const on = event.target.closest?.("#ultrasound, .ussim-view"); // views send their points themselves
+      inside = Boolean(on);
+      if (on?.id === "ultrasound" && window.ussim?.image) point(millimetres(event));
+      else if (was && !inside) point(null);
     },
     { passive: true },
   );
