@@ -27,6 +27,7 @@ from SlicerUSSim.Workstation.kept_state import KeptState
 from SlicerUSSim.Workstation.opener import Opener
 from SlicerUSSim.Workstation.page import build_page
 from SlicerUSSim.Workstation.patient import OpenPatient
+from SlicerUSSim.Workstation.pointer import Pointer
 from SlicerUSSim.Workstation.pose_entry import PoseEntry
 from SlicerUSSim.Workstation.pose_registration import Registration
 from SlicerUSSim.Workstation.probe_control import ProbeControl
@@ -67,6 +68,7 @@ class Workstation:
         self._presenter = presenter = panel.presenter
         self._views = AnatomyViews(app, self.server, view_tools)
         self._probe = probe = ProbeControl(panel, self._views, stamps.probe_moved)
+        self._pointer = Pointer(shared, logic, self._views, probe)
         self._poses = PoseEntry(panel, probe.pose, probe.move)
         probe.told = self._poses.show
         self._comparison = comparison = Comparison(shared, probe.move)
@@ -140,6 +142,7 @@ class Workstation:
             "plane": probe.choose_plane,
             "look": self._in_task(probe.look_again),
             "aim_image": probe.aim_image,
+            "point_at": self._pointer.at_image,
             "play": self._play,
             "freeze": self._in_task(partial(self._then_refresh, self._cine.freeze)),
             "cine_show": self._in_task(self._cine.show),

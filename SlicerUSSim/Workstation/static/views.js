@@ -3,7 +3,7 @@
   const EVERY_MS = 40; // more points than the line under the mouse can be read
 
   // "fold" all views, or "max" or "swap" one; once more undoes it.
-  window.ussim.arrange = (kind, name) => {
+  const arrange = (kind, name) => {
     const body = document.body.classList;
     const wanted = kind === "fold" ? "ussim-folded" : `ussim-${kind}-${name}`;
     const is = body.contains(wanted);
@@ -33,9 +33,9 @@
     "pointermove",
     (event) => {
       const [was, where] = [inside, window.ussimScreens.at(event)];
-      inside = Boolean(where?.isInside);
-      if (inside) point(where.mm);
-      else if (was) point(null);
+      inside = Boolean(where?.isInside || event.target.closest?.(".ussim-view")); // views send their points themselves
+      if (where?.isInside) point(where.mm);
+      else if (was && !inside) point(null);
     },
     { passive: true },
   );
