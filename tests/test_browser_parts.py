@@ -46,6 +46,7 @@ from SlicerUSSim.Logic.mrml.sequence_nodes import TIME, SequenceIndex, add_seque
 from SlicerUSSim.Logic.tracked.images import TrackedImages  # noqa: E402
 from SlicerUSSim.Workstation.browser_panel import BrowserPanel  # noqa: E402
 from SlicerUSSim.Workstation.comparison import Comparison, RealImages  # noqa: E402
+from SlicerUSSim.Workstation.image_flow import LatencyStamps  # noqa: E402
 from SlicerUSSim.Workstation.state import (  # noqa: E402
     NAMES,
     ComparisonMode,
@@ -54,6 +55,7 @@ from SlicerUSSim.Workstation.state import (  # noqa: E402
     TissueLine,
     value_of,
 )
+from SlicerUSSim.Workstation.streams import ImageStream  # noqa: E402
 from SlicerUSSim.Workstation.tasks import AtMost, Tasks  # noqa: E402
 
 
@@ -300,6 +302,32 @@ def test_a_probe_that_moves_during_the_first_live_image_is_followed(head):
         return np.allclose(moved, logic.lastFrame.grid.slice_to_probe, atol=1e-6)
 
     assert run_in_loop(scenario)
+
+
+def test_only_the_image_that_shows_a_movement_tells_its_latency():
+    """Images of minutes later had the time of the last event of the mouse: the read-out said 446,552 ms."""
+    stamps = LatencyStamps()
+    stamps.receive("page", 1.0)
+    stamps.image_begun()
+    assert stamps.computed is None  # of before the movement
+    stamps.probe_moved()
+    stamps.image_begun()
+    assert stamps.computed == ("page", 1.0)
+    stamps.image_begun()  # after a new value of the panel, say
+    stamps.probe_moved()  # by a key
+    stamps.image_begun()
+    assert stamps.computed is None
+
+    async def scenario() -> list[object]:
+        stream, sent = ImageStream("simulated"), []
+        stream.set_streamer(SimpleNamespace(push_content=lambda name, about, content: sent.append(about["stamp"])))
+        stream.send(np.zeros((8, 8), np.uint8), stamp=("page", 1.0))
+        while stream.is_sending:
+            await asyncio.sleep(0.01)
+        stream.send_again()  # another page has opened
+        return sent
+
+    assert run_in_loop(scenario) == [("page", 1.0), None]
 
 
 # ---- what page and control share -------------------------------------------------------------------------------------

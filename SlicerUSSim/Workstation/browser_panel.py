@@ -103,6 +103,8 @@ class BrowserPanel:
         self._status, self._status_until = "", 0.0
         self._table: Any = None  # vtkMRMLTableNode with the costs of a fit
         self._costs = Observed("ModifiedEvent", self._show_costs)
+        #: Called after the controls were refreshed
+        self.refreshed: Callable[[], None] = lambda: None
         self.presenter = PanelPresenter(
             logic, self, handles=False, label_maps=True
         )  # label maps: filled ten times as fast as segmentations, and usable as overlays of the slice views
@@ -111,7 +113,6 @@ class BrowserPanel:
         #: Actions of the page in place of those of buttons
         self.own_actions: dict[Callable[[], object], Callable[[], object]] = {}
         with shared.changing() as now:
-            now.open_sections = [section.title for section in self.sections if section.is_open]
             now.panel.choices = {name: list(control.choices) for name, control in self._controls.items()}
         shared.show_values({name: next(iter(control.choices), None) for name, control in self._controls.items()})
 
@@ -238,8 +239,12 @@ class BrowserPanel:
         action = self._controls[name].action
         if name == "assignTissueButton":
             action = self._assign_tissue
-        action = required(action, f"{name} is no button of the page")
-        self.tasks.start(self.own_actions.get(action, action))
+        action = required(action, f"{name} is not a button of the page")
+        self.tasks.start(lambda: self.act(action))
+
+    def act(self, action: Callable[[], object]) -> None:
+        """Run the action of a button, or that of the page in place of it; called in a task."""
+        self.own_actions.get(action, action)()
 
     def _changed(self, control: Control, value: Any) -> None:
         presenter, parameters = self.presenter, self.logic.parameters

@@ -189,9 +189,9 @@ class LatencyStamps:
         self._received = (page, milliseconds)
 
     def probe_moved(self) -> None:
-        """Called before the user moves the probe."""
-        self._applied = self._received
+        """Called before the user moves the probe: by the event of which the page has just sent the time, or by none."""
+        self._applied, self._received = self._received, None
 
     def image_begun(self) -> None:
-        """Called before an image of the current pose is computed."""
-        self.computed = self._applied
+        """Called before an image of the current pose is computed; only the first one shows the effect of the event."""
+        self.computed, self._applied = self._applied, None

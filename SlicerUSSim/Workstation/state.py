@@ -17,11 +17,13 @@ from trame_server.utils.typed_state import TypedState
 
 from SlicerUSSim.Logic.probe.surface import SurfacePose
 
+#: Name of the 3D view, and of the ultrasound image among the views that ViewState.cross marks
+THREED, IMAGE = "ThreeD", "image"
 #: Planes in which a slice view follows the probe: image plane, plane across it, and anatomical planes.
 IN_PLANE, ACROSS = "In plane", "Across"
 PLANES = (IN_PLANE, ACROSS, "Axial", "Coronal", "Sagittal")
 #: Initial planes of the slice views, by Slicer's names of the views.
-SLICE_VIEWS = {"Red": IN_PLANE, "Yellow": ACROSS, "Green": "Axial"}
+SLICE_VIEWS = {"Red": IN_PLANE, "Green": "Axial"}
 
 
 class ComparisonMode(Enum):
@@ -62,6 +64,20 @@ class FreeParameter:
     name: str
     label: str
     on: bool
+
+
+@dataclass(frozen=True)
+class FittedValue:
+    """The result of a fit for a parameter, as texts."""
+
+    label: str
+    before: str
+    after: str
+    unit: str
+    #: Whether the images determine it
+    is_determined: bool
+    #: What to know of it: at its bound, or the range that fits equally well
+    note: str
 
 
 @dataclass(frozen=True)
@@ -121,6 +137,13 @@ class ViewState:
     follow: bool = True
     #: Whether the tissues are coloured
     show_tissues: bool = False
+    #: Tissue, place, MRI and depth of the point under the mouse, one line; "": none
+    under_mouse: str = ""
+    #: That point in every view, by name (IMAGE, THREED, SLICE_VIEWS): shares of its width and height from the upper
+    #: left corner, and mm from the point to the plane of the view
+    cross: dict[str, list[float]] = field(default_factory=dict)
+    #: Sides of the patient at the left, right, upper and lower edge of a slice view, such as "R", or "RA" for oblique ones
+    letters: dict[str, list[str]] = field(default_factory=dict)
 
 
 @dataclass
@@ -129,9 +152,15 @@ class SequenceState:
 
     #: Number of images; 0 without a sequence
     length: int = 0
-    #: Index of the displayed image, from 0, and its name
+    #: Index of the displayed image among these, from 0; its name, which has its number in the file, and those of all
     number: int = 0
     name: str = ""
+    numbers: str = ""
+    #: Whether their place in the patient is known; else they can only be viewed
+    is_placed: bool = True
+    #: Outline of what is compared: viewBox and path (mm of the probe frame) of an SVG over an image; "" without
+    box: str = ""
+    mask: str = ""
     playing: bool = False
     comparison: ComparisonMode = ComparisonMode.BESIDE
     #: Cost between simulated and real image, as text
@@ -155,6 +184,14 @@ class ImageState:
     focus: str = ""
     gain: str = ""
     dynamic_range: str = ""
+
+
+@dataclass
+class AdviceState:
+    """What a user should know or do first, and what its button does ("": no button)."""
+
+    text: str = ""
+    remedy: str = ""
 
 
 @dataclass
@@ -183,6 +220,10 @@ class FitState:
     #: Best cost during the fit, and a summary as text
     curve: list[float] = field(default_factory=list)
     costs: str = ""
+    #: Caption of the best image so far (stream "best") while a fit runs; "" without
+    best: str = ""
+    #: What the last fit found
+    values: list[FittedValue] = field(default_factory=list)
 
 
 @dataclass
@@ -221,8 +262,6 @@ class PageState:
     title: str = ""
     #: The question whether pose and settings of before are to be restored; "": there is none
     offer: str = ""
-    #: Titles of the panel's sections that are open
-    open_sections: list[str] = field(default_factory=list)
     #: Pose of the probe on the patient; None without a probe or a patient
     pose: SurfacePose | None = None
     #: The same as texts: position and angles, and matrix, as pose_files.pose_of_text reads them; "" without a probe
@@ -237,6 +276,7 @@ class PageState:
     views: ViewState = field(default_factory=ViewState)
     sequence: SequenceState = field(default_factory=SequenceState)
     image: ImageState = field(default_factory=ImageState)
+    advice: AdviceState = field(default_factory=AdviceState)
     cine: CineState = field(default_factory=CineState)
     fit: FitState = field(default_factory=FitState)
     registration: RegistrationState = field(default_factory=RegistrationState)

@@ -54,7 +54,8 @@ class ImageStream:
     def send_again(self) -> None:
         """Send the last image once more, to pages that have just opened."""
         if self._last is not None:
-            self._push(*self._last)
+            content, about = self._last
+            self._push(content, {**about, "stamp": None})  # which is not shown to an event of before
 
     async def _encode_all(self) -> None:
         try:

@@ -14,6 +14,7 @@ from trame_server import Server
 from trame_slicer.core import SlicerApp
 
 from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic
+from SlicerUSSim.Workstation.advice import Advice
 from SlicerUSSim.Workstation.anatomy import AnatomyViews
 from SlicerUSSim.Workstation.browser_panel import BrowserPanel, Observed
 from SlicerUSSim.Workstation.cine import Cine
@@ -24,8 +25,9 @@ from SlicerUSSim.Workstation.hand import KEYS
 from SlicerUSSim.Workstation.image_flow import ImageFlow, LatencyStamps
 from SlicerUSSim.Workstation.kept_state import KeptState
 from SlicerUSSim.Workstation.opener import Opener
-from SlicerUSSim.Workstation.page import build_page, view_tools
+from SlicerUSSim.Workstation.page import build_page
 from SlicerUSSim.Workstation.patient import OpenPatient
+from SlicerUSSim.Workstation.pointer import Pointer
 from SlicerUSSim.Workstation.pose_entry import PoseEntry
 from SlicerUSSim.Workstation.pose_registration import Registration
 from SlicerUSSim.Workstation.probe_control import ProbeControl
@@ -35,6 +37,7 @@ from SlicerUSSim.Workstation.state import NAMES, SharedState
 from SlicerUSSim.Workstation.tasks import Tasks
 from SlicerUSSim.Workstation.tracker import Tracker
 from SlicerUSSim.Workstation.transfer import Receiver, Sender
+from SlicerUSSim.Workstation.view_tools import view_tools
 
 #: Seconds between two checks whether all work is done.
 _LOOK_EVERY_S = 0.02
@@ -65,6 +68,7 @@ class Workstation:
         self._presenter = presenter = panel.presenter
         self._views = AnatomyViews(app, self.server, view_tools)
         self._probe = probe = ProbeControl(panel, self._views, stamps.probe_moved)
+        self._pointer = Pointer(shared, logic, self._views, probe)
         self._poses = PoseEntry(panel, probe.pose, probe.move)
         probe.told = self._poses.show
         self._comparison = comparison = Comparison(shared, probe.move)
@@ -82,6 +86,8 @@ class Workstation:
         self._opener = opener = Opener(
             panel, nodes, patient, self._scenes, registration, self._questions, self._poses
         )  # fmt: skip
+        self._advice = advice = Advice(panel, registration)
+        panel.refreshed = advice.update
         self._kept = KeptState(state_file, panel, patient, opener, probe)
 
         self._following = False
@@ -106,7 +112,7 @@ class Workstation:
         self.server.controller.on_server_bind.add(lambda wslink: sender.serve(wslink.app))
         self.server.controller.on_server_ready.add(self._ready)
         self.server.controller.on_server_exited.add(self.close)
-        build_page(self.server, panel, self._views.layout, (*KEYS, "Escape"))
+        build_page(self.server, panel, (*KEYS, "Escape"))
 
     @property
     def is_computing(self) -> bool:
@@ -136,6 +142,7 @@ class Workstation:
             "plane": probe.choose_plane,
             "look": self._in_task(probe.look_again),
             "aim_image": probe.aim_image,
+            "point_at": self._pointer.at_image,
             "play": self._play,
             "freeze": self._in_task(partial(self._then_refresh, self._cine.freeze)),
             "cine_show": self._in_task(self._cine.show),
@@ -147,6 +154,8 @@ class Workstation:
             "show_number": comparison.show,
             "answer": self._questions.answer,
             "choose_frame": self._in_task(registration.choose_frame),
+            "remedy": self._in_task(self._advice.follow),
+            "compare_next": comparison.compare_next,
             "cancel": self._panel.cancel,
             "dismiss": self._panel.dismiss,
             "restore": self._in_task(partial(self._then_refresh, self._kept.restore)),
