@@ -401,7 +401,8 @@ def _status(panel: BrowserPanel) -> None:
         ):
             # Readers of files tell no share of what they have done
             percent = messages.progress_percent
-            html.Span(f"{{{{ {messages.progress_title} }}}} {{{{ {percent} ? {percent} + ' %' : '…' }}}}")
+            share = f"{{{{ {percent} ? {percent} + ' %' : '…' }}}}"
+            html.Span(f"{{{{ {messages.progress_title} }}}} {share} {{{{ {messages.progress_s} }}}} s")
             v3.VProgressLinear(
                 model_value=(percent,), indeterminate=(f"{percent} === 0",), color="orange", style="width: 140px"
             )
