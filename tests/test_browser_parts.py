@@ -1,10 +1,8 @@
-"""Parts of the workstation without a browser: tasks, cine loops, sequences as nodes, the probe's shape."""
+"""Parts of the workstation without a browser: tasks, sequences as nodes, the probe's shape."""
 
 from __future__ import annotations
 
 import asyncio
-import io
-import json
 import selectors
 import threading
 from concurrent.futures import ThreadPoolExecutor
@@ -13,7 +11,6 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from PIL import Image
 from vtkmodules.util.numpy_support import vtk_to_numpy
 from vtkmodules.vtkFiltersCore import vtkCleanPolyData, vtkFeatureEdges, vtkMassProperties, vtkTriangleFilter
 
@@ -21,7 +18,6 @@ from SlicerUSSim.Logic import (
     ConvexProbe,
     LinearProbe,
     PhasedProbe,
-    SimulationError,
     TissueTable,
     UltrasoundSimulator,
 )
@@ -50,7 +46,6 @@ from SlicerUSSim.Logic.mrml.sequence_nodes import TIME, SequenceIndex, add_seque
 from SlicerUSSim.Logic.tracked.images import TrackedImages  # noqa: E402
 from SlicerUSSim.Workstation.browser_panel import BrowserPanel  # noqa: E402
 from SlicerUSSim.Workstation.comparison import Comparison, RealImages  # noqa: E402
-from SlicerUSSim.Workstation.export import Cine, gif  # noqa: E402
 from SlicerUSSim.Workstation.image_flow import LatencyStamps  # noqa: E402
 from SlicerUSSim.Workstation.state import (  # noqa: E402
     NAMES,
@@ -390,34 +385,7 @@ def test_of_images_that_come_fast_the_last_is_compared(head):
     assert cost.startswith(f"cost {same:.3f} ") and same < 0.5 * RealImages(tracked).compared(0, image // 2, grid).total
 
 
-# ---- export ----------------------------------------------------------------------------------------------------------
-
-
-def test_a_cine_keeps_time_and_begins_anew_with_another_size():
-    cine = Cine()
-    with pytest.raises(SimulationError, match="has 0 images"):
-        gif(cine.images)
-    cine.add(np.zeros((10, 10), np.uint8), 0.0)
-    for number in range(4):
-        about = json.dumps({"time": number, "preset": {"gain": number // 2}}) if number else ""
-        cine.add(np.full((12, 16), 50 * number, np.uint8), 10.0 + 0.25 * number, about)
-    told: list[float] = []
-    loop = Image.open(io.BytesIO(gif(cine.images, told.append)))
-    assert loop.size == (16, 12) and loop.n_frames == 4 and len(cine.images) == 4 and told == [0.25, 0.5, 0.75]
-    for number in range(3):
-        loop.seek(number)
-        assert loop.info["duration"] == 250 and np.asarray(loop.convert("L"))[0, 0] == 50 * number
-    loop.seek(0)
-    assert json.loads(loop.info["comment"]) == {
-        "images": [{}, {"time": 1, "preset": 0}, {"time": 2, "preset": 1}, {"time": 3, "preset": 1}],
-        "presets": [{"gain": 0}, {"gain": 1}],
-    }
-
-    def cancelled(share: float) -> None:
-        raise Cancelled
-
-    with pytest.raises(Cancelled):
-        gif(cine.images, progress=cancelled)
+# ---- work under way --------------------------------------------------------------------------------------------------
 
 
 def test_of_tasks_at_once_the_last_is_shown_and_each_can_be_cancelled():

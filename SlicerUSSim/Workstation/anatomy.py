@@ -70,6 +70,7 @@ class AnatomyViews:
         self._fitted: set[str] = set()
         self._volume_id: str | None = None
         self._blend = 1.0
+        self._field_of: Probe | None = None  # the probe of the image whose field is shown
         #: Called after a slice view was turned, moved or zoomed
         self.turned: Callable[[], None] = lambda: None
         self._image = vtkTrivialProducer()
@@ -178,7 +179,6 @@ class AnatomyViews:
         """Show the probe's body under its transform, and prepare its imaged field, which has the image as texture."""
         body, field = self._model(_BODY), self._model(_FIELD)
         write_body(body, probe)
-        field.SetAndObservePolyData(field_polydata(probe))
         body.SetAndObserveTransformNodeID(transform_node.GetID())
         field.SetAndObserveTransformNodeID(self._pose.GetID())
         display = display_of(body)
@@ -198,7 +198,10 @@ class AnatomyViews:
 
         `field` (rows, columns) bool is the imaged field; outside it the MRI is unchanged.
         """
-        image = taken.image
+        image, probe = taken.image, taken.preset.probe
+        if probe != self._field_of:
+            self._field_of = probe
+            self._model(_FIELD).SetAndObservePolyData(field_polydata(probe))
         # A copy without zeros inside the field, so that the threshold removes only the pixels outside.
         seen = np.where(field, np.maximum(image, 1), 0).astype(np.uint8)
         shown, pose = self._seen, self._pose

@@ -118,6 +118,12 @@ class Comparison:
         for stream in self.streams:
             stream.send(image, ruler={"w": width, "h": height})
 
+    def compare_next(self) -> None:
+        """Compare in the next way of ComparisonMode."""
+        modes = list(ComparisonMode)
+        with self._shared.changing() as now:
+            now.sequence.comparison = modes[(modes.index(now.sequence.comparison) + 1) % len(modes)]
+
     def compare(self, simulated: np.ndarray, grid: ImageGrid) -> None:
         """Show the similarity of a simulated image to the real one; if images arrive too fast, some are skipped."""
         if grid != self._grid:

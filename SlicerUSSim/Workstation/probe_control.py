@@ -101,11 +101,11 @@ class ProbeControl:
 
     def aim_image(self, across: float, down: float) -> None:
         """Aim at a point of the image, given as fractions of its width and height."""
-        pose = self.pose()
-        left, right, top, bottom = self._logic.preset.probe.image_bounds_mm()
-        if pose is not None:
-            point = [left + across * (right - left), top + down * (bottom - top), 0.0, 1.0]
-            self.hand.aim((pose @ point)[:3])
+        taken = self._logic.taken
+        if taken is not None and self.pose() is not None:
+            rows, columns = taken.image.shape
+            point = [across * columns - 0.5, down * rows - 0.5, 0.0, 1.0]
+            self.hand.aim((taken.image_to_world @ point)[:3])
 
     def look_again(self) -> None:
         """As look, called in a task: a surface that was cancelled is made now."""
@@ -201,9 +201,9 @@ class ProbeControl:
             self.moved()
 
     def _turn_slices(self) -> None:
-        """Turn the slices to the probe while there are no live images, to which ImageFlow turns them."""
+        """Turn the slices to the probe while there is no image, to which ImageFlow turns them."""
         pose = self.pose()
-        if pose is not None and self.surface is not None and not self._logic.isLive:
+        if pose is not None and self.surface is not None and self._logic.taken is None:
             self._views.follow(pose, self._logic.preset.probe)
 
     def _tell_pose(self) -> None:

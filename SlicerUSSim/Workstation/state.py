@@ -169,13 +169,47 @@ class SequenceState:
 
 
 @dataclass
-class SimulatedState:
-    """The sequence of simulated images."""
+class ImageState:
+    """The shown image, from its record (TakenImage) alone, and whether the record is that of now."""
 
-    #: Number of images; 0 without a sequence
+    #: "LIVE", "OUTDATED" or "FROZEN"; "" without an image
+    status: str = ""
+    #: What of the record is not as it is now, as "pose, tissues"; "" if nothing
+    differs: str = ""
+    #: Texts for a banner, with units
+    patient: str = ""
+    time: str = ""
+    probe: str = ""
+    frequency: str = ""
+    depth: str = ""
+    focus: str = ""
+    gain: str = ""
+    dynamic_range: str = ""
+
+
+@dataclass
+class AdviceState:
+    """What a user should know or do first, and what its button does ("": no button)."""
+
+    text: str = ""
+    remedy: str = ""
+
+
+@dataclass
+class CineState:
+    """The cine: the last seconds of live images, or the images of Simulate sequence."""
+
+    #: "live" or "sequence", and how many images Simulate sequence has made
+    source: str = "live"
+    sequence_length: int = 0
+    #: Number of images
     length: int = 0
-    #: Index of that which is shown, or was last
-    number: int = 0
+    #: Index of the shown image, from 0, and its time after the first image, s
+    index: int = 0
+    seconds: float = 0.0
+    #: Indices of the first and the last image that are played and exported
+    first: int = 0
+    last: int = 0
     playing: bool = False
 
 
@@ -229,10 +263,6 @@ class PageState:
     title: str = ""
     #: The question whether pose and settings of before are to be restored; "": there is none
     offer: str = ""
-    #: Titles of the panel's sections that are open
-    open_sections: list[str] = field(default_factory=list)
-    #: Whether there is an image that does not follow the probe
-    is_frozen: bool = False
     #: Pose of the probe on the patient; None without a probe or a patient
     pose: SurfacePose | None = None
     #: The same as texts: position and angles, and matrix, as pose_files.pose_of_text reads them; "" without a probe
@@ -246,7 +276,9 @@ class PageState:
     messages: MessageState = field(default_factory=MessageState)
     views: ViewState = field(default_factory=ViewState)
     sequence: SequenceState = field(default_factory=SequenceState)
-    simulated: SimulatedState = field(default_factory=SimulatedState)
+    image: ImageState = field(default_factory=ImageState)
+    advice: AdviceState = field(default_factory=AdviceState)
+    cine: CineState = field(default_factory=CineState)
     fit: FitState = field(default_factory=FitState)
     registration: RegistrationState = field(default_factory=RegistrationState)
     question: QuestionState = field(default_factory=QuestionState)

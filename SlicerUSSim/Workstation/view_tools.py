@@ -51,16 +51,14 @@ def view_tools(_server: Server, _view_id: str, view: AbstractView) -> None:
         sides = ("left", "right", "top", "bottom")
         html.Div("".join(f'<b class="{side}">{{{{ {letters}?.[{n}] }}}}</b>' for n, side in enumerate(sides)),
                  classes="ussim-letters")  # fmt: skip
-    cross_hair(name)
+    html.Div(cross_hair(name))
 
 
-def cross_hair(name: str) -> None:
-    """The mark of the point under the mouse in a view; faint if the point is more than 1 mm beside its plane."""
+def cross_hair(name: str) -> str:
+    """HTML of the mark of the point under the mouse in a view; faint if the point is more than 1 mm beside its plane."""
     at = f"{NAMES.views.cross}['{name}']"
-    html.Div(
-        v_if=at, classes=(f"['ussim-cross', {{ beside: {at}?.[2] > 1 }}]",),
-        style=(f"{{ left: 100 * {at}?.[0] + '%', top: 100 * {at}?.[1] + '%' }}",),
-    )  # fmt: skip
+    return f"""<div v-if="{at}" class="ussim-cross" :class="{{beside: {at}?.[2] > 1}}"
+        :style="{{left: 100 * {at}?.[0] + '%', top: 100 * {at}?.[1] + '%'}}"></div>"""
 
 
 def _button(name: str, icon: str, tip: str, click: str) -> None:

@@ -15,16 +15,6 @@
     window.dispatchEvent(new Event("resize"));
   };
 
-  // The point of a mouse event over the image, mm of the probe frame; the ruler's SVG follows zoom, pan and flips.
-  const millimetres = (event) => {
-    const matrix = document.getElementById("overlay")?.getScreenCTM?.();
-    if (!matrix) return null;
-    const { x, y } = new DOMPoint(event.clientX, event.clientY).matrixTransform(matrix.inverse());
-    return [x, y];
-  };
-
-  window.ussimViews = { arrange, millimetres };
-
   let told = 0;
   let waiting = 0;
   function point(at) {
@@ -42,10 +32,9 @@
   window.addEventListener(
     "pointermove",
     (event) => {
-      const was = inside;
-      const on = event.target.closest?.("#ultrasound, .ussim-view"); // views send their points themselves
-      inside = Boolean(on);
-      if (on?.id === "ultrasound" && window.ussim?.image) point(millimetres(event));
+      const [was, where] = [inside, window.ussimScreens.at(event)];
+      inside = Boolean(where?.isInside || event.target.closest?.(".ussim-view")); // views send their points themselves
+      if (where?.isInside) point(where.mm);
       else if (was && !inside) point(null);
     },
     { passive: true },
