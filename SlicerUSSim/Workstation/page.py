@@ -160,6 +160,8 @@ def _banner() -> str:
       aria-label="Blend of image and MRI in the slice views" @input="{views.blend} = Number($event.target.value)"></label>
     <span v-if="{image.status}" class="ussim-status" :class="{image.status}.toLowerCase()" id="image-status"
       role="status">{{{{ {image.status} }}}}</span>
+    <button class="ussim-icon" id="fold" title="Fold the views of the anatomy" aria-label="Fold the views of the anatomy"
+      @click="window.ussim.arrange('fold')"><i class="mdi mdi-dock-right"></i></button>
     <details class="ussim-menu" id="save"><summary>Save</summary><div>{saves}</div></details>
     <button class="ussim-button" id="help-button" title="Keys and gestures (F1)"
       @click="window.ussim.help()">? F1</button>"""
