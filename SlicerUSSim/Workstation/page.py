@@ -166,6 +166,8 @@ def _banner() -> str:
       @click="window.ussimViews.arrange('fold')"><i class="mdi mdi-dock-right"></i></button>
     <span v-if="{image.status}" class="ussim-status" :class="{image.status}.toLowerCase()" id="image-status"
       role="status">{{{{ {image.status} }}}}</span>
+    <button class="ussim-icon" id="fold" title="Fold the views of the anatomy" aria-label="Fold the views of the anatomy"
+      @click="window.ussim.arrange('fold')"><i class="mdi mdi-dock-right"></i></button>
     <details class="ussim-menu" id="save"><summary>Save</summary><div>{saves}</div></details>
     <button class="ussim-button" id="help-button" title="Keys and gestures (F1)"
       @click="window.ussim.help()">? F1</button>"""
@@ -290,7 +292,7 @@ def _player() -> str:
       <input type="range" id="sequence-slider" min="0" :max="Math.max({sequence.length} - 1, 1)" step="1"
       :value="{sequence.number}" aria-label="Image of the sequence"
       @input="trigger('show_number', [Number($event.target.value)])">
-      <span id="sequence-text">Real {{{{ {sequence.number} + 1 }}}} of {{{{ {sequence.length} }}}}</span>
+      <span id="sequence-text">Real {{{{ {sequence.name} }}}} ({{{{ {sequence.numbers} }}}})</span>
       <span role="group" aria-label="Comparison" id="comparison">{modes}</span>
       <span id="similarity" title="Cost of the paper for the simulated and the real image; 0 if they are equal">
       {{{{ {sequence.similarity} }}}}</span></div>
@@ -314,7 +316,7 @@ def _player() -> str:
 def _foot() -> str:
     messages, percent = NAMES.messages, NAMES.messages.progress_percent
     return f"""<span v-if="{messages.progress_title}" id="progress">{{{{ {messages.progress_title} }}}}
-      {{{{ {percent} ? {percent} + ' %' : '…' }}}} <progress :value="{percent} || undefined" max="100"
+      {{{{ {percent} ? {percent} + ' %' : '…' }}}} {{{{ {messages.progress_s} }}}} s <progress :value="{percent} || undefined" max="100"
       aria-label="Progress"></progress> <button class="ussim-button" id="cancel" @click="trigger('cancel')">Cancel
       </button></span>
       <span id="upload" hidden><span id="upload-text"></span>

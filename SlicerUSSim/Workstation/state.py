@@ -118,9 +118,10 @@ class MessageState:
     errors: list[str] = field(default_factory=list)
     #: One line in the bar below the image
     status: str = ""
-    #: Title of the work under way ("": none), and its progress in percent
+    #: Title of the work under way ("": none), its progress in percent, and how long it has taken, s
     progress_title: str = ""
     progress_percent: int = 0
+    progress_s: int = 0
     #: State of the tracker's connection; "" without a tracker
     tracker: str = ""
 

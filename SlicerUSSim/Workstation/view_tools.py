@@ -45,7 +45,7 @@ def view_tools(_server: Server, _view_id: str, view: AbstractView) -> None:
             _button("look", "mdi-camera-flip-outline", "Turn the camera to the probe", "trigger('look')")
         v3.VSpacer()
         for kind, icon, tip in _ARRANGE:
-            _button(f"{kind}-{name}", icon, tip.format(_TITLES[name]), f"window.ussimViews.arrange('{kind}', '{name}')")
+            _button(f"{kind}-{name}", icon, tip.format(_TITLES[name]), f"window.ussim.arrange('{kind}', '{name}')")
     if name in SLICE_VIEWS:
         letters = f"{NAMES.views.letters}['{name}']"
         sides = ("left", "right", "top", "bottom")
