@@ -135,8 +135,8 @@ def build_page(server: Server, panel: BrowserPanel, keys: tuple[str, ...]) -> No
 def _banner() -> str:
     image = NAMES.image
     saves = "".join(
-        f"""<button class="ussim-item" id="save-{kind.strip('.').split('(')[0].split('.')[-1]}"
-        @click="{kind if '(' in kind else f"window.ussim.save('{kind}')"}">{words}</button>"""
+        f"""<button class="ussim-item" id="save-{kind.strip(".").split("(")[0].split(".")[-1]}"
+        @click="{kind if "(" in kind else f"window.ussim.save('{kind}')"}">{words}</button>"""
         for kind, words in _SAVES.items()
     )
     views = NAMES.views
