@@ -238,7 +238,7 @@ class Cine:
             return
         grid, times = images[0].taken.grid, np.array([kept.seconds for kept in images])
         length_mm = float(np.linalg.norm(self._line[1] - self._line[0]))
-        along = np.linspace(*self._line, max(round(length_mm / grid.pixel_spacing_mm[1]), 2))
+        along = np.linspace(self._line[0], self._line[1], max(round(length_mm / grid.pixel_spacing_mm[1]), 2))
         spots = (along - [grid.left_mm, grid.top_mm]) / grid.pixel_spacing_mm - 0.5
         last = np.searchsorted(times, np.linspace(times[0], times[-1], _COLUMNS), "right") - 1
         lines = {n: map_coordinates(images[n].taken.image, spots.T[::-1], order=1) for n in np.unique(last)}
