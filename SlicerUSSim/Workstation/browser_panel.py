@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 from greenlet import getcurrent, greenlet
+from trame_server.utils.asynchronous import get_event_loop
 
 from SlicerUSSim.Logic.base.errors import Cancelled, SimulationError, require, required, user_message
 from SlicerUSSim.Logic.mrml.fitting_nodes import offered
@@ -75,6 +76,7 @@ class _Work:
     title: str
     task: greenlet
     percent: int = 0
+    began: float = field(default_factory=perf_counter)
     #: Of this work alone: what is abandoned goes on to hear of it
     is_cancelled: threading.Event = field(default_factory=threading.Event)
 
@@ -183,7 +185,7 @@ class BrowserPanel:
     def progress(self, title: str) -> Iterator[Callable[[float], None]]:
         work = _Work(title, getcurrent())
         self._under_way.append(work)
-        self._show_work()
+        self._tick(work)
 
         def report(share: float) -> None:
             percent = int(100 * share)
@@ -325,6 +327,13 @@ class BrowserPanel:
         with self.shared.changing() as now:
             now.messages.progress_title = "" if work is None else work.title
             now.messages.progress_percent = 0 if work is None else work.percent
+            now.messages.progress_s = 0 if work is None else int(perf_counter() - work.began)
+
+    def _tick(self, work: _Work) -> None:
+        """Show how long work has taken, every second: it may be long until it reports its next share."""
+        if work in self._under_way:
+            self._show_work()
+            get_event_loop().call_later(1.0, self._tick, work)
 
     def _in_loop(self, function: Callable[[], None]) -> None:
         if threading.get_ident() == self._thread:

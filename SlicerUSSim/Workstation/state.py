@@ -118,9 +118,10 @@ class MessageState:
     errors: list[str] = field(default_factory=list)
     #: One line in the bar below the image
     status: str = ""
-    #: Title of the work under way ("": none), and its progress in percent
+    #: Title of the work under way ("": none), its progress in percent, and how long it has taken, s
     progress_title: str = ""
     progress_percent: int = 0
+    progress_s: int = 0
     #: State of the tracker's connection; "" without a tracker
     tracker: str = ""
 
@@ -142,7 +143,7 @@ class ViewState:
     #: That point in every view, by name (IMAGE, THREED, SLICE_VIEWS): shares of its width and height from the upper
     #: left corner, and mm from the point to the plane of the view
     cross: dict[str, list[float]] = field(default_factory=dict)
-    #: Sides of the patient at the left, right, upper and lower edge of a slice view, such as "R", or "RA" for oblique ones
+    #: Sides of the patient at the left, right, upper and lower edge of a slice view: "R", or "RA" if it is oblique
     letters: dict[str, list[str]] = field(default_factory=dict)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Hashable
 from dataclasses import replace
 from datetime import datetime, timezone
+from typing import Any
 
 import numpy as np
 
@@ -25,6 +26,7 @@ from SlicerUSSim.Logic.mrml.nodes import (
     node_to_world,
     pose_in_labels,
     probe_pose,
+    read_volume,
     require_node,
     set_node_to_world,
     show_in_slice,
@@ -33,9 +35,9 @@ from SlicerUSSim.Logic.mrml.nodes import (
 )
 from SlicerUSSim.Logic.mrml.own_results import OUTLINE, mark_as_result, may_replace_result, require_result
 from SlicerUSSim.Logic.mrml.patient_logic import PatientLogic
-from SlicerUSSim.Logic.mrml.taken_image import TakenImage, freeze, patient_of, remove_image, write_image
+from SlicerUSSim.Logic.mrml.taken_image import TakenImage, freeze, mri_of, patient_of, remove_image, write_image
 from SlicerUSSim.Logic.placement.aiming import opening_pose
-from SlicerUSSim.Logic.placement.bone_before_probe import about_bone
+from SlicerUSSim.Logic.placement.bone_before_probe import about_bone, about_missing_skull
 from SlicerUSSim.Logic.placement.craniotomy import default_pose
 from SlicerUSSim.Logic.placement.views import opened_view_pose, view_pose
 from SlicerUSSim.Logic.probe.image_grid import ImageGrid
@@ -53,6 +55,8 @@ class ImageLogic:
         self._patient, self._parameters = patient, patient.parameters
         #: The last image with all that it is of; None if there is none, or the last one failed
         self.taken: TakenImage | None = None
+        #: What about_missing_skull says, and of what
+        self._missing: tuple[Hashable, tuple[str, ...]] = None, ()
         self._held = ""  # time of the image at which holdOutline left the outline
 
     def simulate(
@@ -240,9 +244,17 @@ class ImageLogic:
     def aboutBone(self, labels_node, probe_transform_node) -> tuple[str, ...]:
         """Lines about bone before the probe at its pose: a closed skull, or an opening that its face does not fit.
 
-        See bone_before_probe.about_bone.
+        See bone_before_probe.about_bone, and about_missing_skull.
         """
         patient, preset = self._patient.patient(labels_node), self._parameters.preset
+        mri: Any = mri_of(labels_node) or self._parameters.mri
+        if "skull" not in patient.names and mri is not None and mri.GetImageData() is not None:
+            version = patient.version, mri.GetID(), mri.GetImageData().GetMTime()
+            if self._missing[0] != version:
+                image, to_patient = read_volume(mri), patient.world_to_patient @ node_to_world(mri)
+                placed = Volume(image.array, to_patient @ image.ijk_to_ras)
+                self._missing = version, about_missing_skull(patient.labels, patient.names, placed)
+            return self._missing[1]
         tissues = preset.tissues.for_names(patient.names).all_tissues()
         pose, is_open = patient.pose(probe_pose(probe_transform_node)), is_opened(labels_node)
         return about_bone(patient.labels, patient.names, tissues, preset.probe, pose, is_open=is_open)

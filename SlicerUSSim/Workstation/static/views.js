@@ -3,7 +3,7 @@
   const EVERY_MS = 40; // more points than the line under the mouse can be read
 
   // "fold" all views, or "max" or "swap" one; once more undoes it.
-  const arrange = (kind, name) => {
+  window.ussim.arrange = (kind, name) => {
     const body = document.body.classList;
     const wanted = kind === "fold" ? "ussim-folded" : `ussim-${kind}-${name}`;
     const is = body.contains(wanted);
@@ -14,6 +14,8 @@
     }
     window.dispatchEvent(new Event("resize"));
   };
+
+  window.ussimViews = { arrange };
 
   let told = 0;
   let waiting = 0;
