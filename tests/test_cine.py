@@ -8,12 +8,13 @@ import json
 from dataclasses import replace
 from types import SimpleNamespace
 
+import highdicom
 import numpy as np
+import pydicom
 import pytest
 from PIL import Image
 
 from SlicerUSSim.Logic import SimulationError
-from SlicerUSSim.Logic.imaging.frame import Echoes
 from SlicerUSSim.Logic.mri.samples import head_mri
 from SlicerUSSim.Logic.mri.segmentation import segment_mri
 from SlicerUSSim.Logic.probe.poses import turned
@@ -24,6 +25,7 @@ pytest.importorskip("trame_slicer", reason="the workstation comes with: pip inst
 
 from trame_server.state import State  # noqa: E402
 
+from SlicerUSSim.Logic.mrml import image_logic  # noqa: E402
 from SlicerUSSim.Logic.mrml.nodes import node_to_world, set_node_to_world  # noqa: E402
 from SlicerUSSim.Workstation import cine as cine_module, image_flow  # noqa: E402
 from SlicerUSSim.Workstation.browser_panel import BrowserPanel, Observed  # noqa: E402
@@ -164,3 +166,142 @@ def test_frozen_images_are_shown_again_where_they_were_taken(head):
         assert (bench.state.length, bench.state.first, bench.state.last) == (5, 0, 4)
 
     on_bench(head, scenario)
+
+
+def test_gain_acts_on_frozen_echoes_and_back_are_the_same_pixels(head):
+    async def scenario(bench) -> None:
+        await bench.frozen(2)
+        kept = bench.logic.taken
+        assert kept.frame is not None
+        seed = image_logic.seed_of_pose(kept.frame.probe_to_ras)
+        await bench.display(gain_db=6.0, depth_gain_7_db=8.0, grey_map="soft", persistence=0.5)
+        shown, display = bench.logic.taken, bench.logic.preset.display
+        assert bench.image.gain == "+6 dB" and shown.time == kept.time and bench.image.status == "FROZEN"
+        simulator = bench.logic.patients.simulator(bench.logic.patients.imaged(bench.logic.parameters.labels))
+        now = simulator.simulate(kept.preset.probe, kept.frame.probe_to_ras, replace(display, persistence=0.0),
+                                 noise_seed=seed).image  # fmt: skip
+        off, change = np.abs(shown.image.astype(int) - now), np.abs(now.astype(int) - kept.image)
+        assert (off > 1).mean() < 1e-3 and (change > 10).mean() > 0.1  # at the end of lines, smoothing reaches behind
+        await bench.run(bench.cine.step, -1)
+        assert bench.image.gain == "+6 dB" and bench.logic.taken.time < kept.time
+        await bench.run(bench.cine.step, 1)
+        await bench.move(rock_deg=5.0)
+        pose = node_to_world(bench.probe)
+        await bench.display(gain_db=0.0, depth_gain_7_db=0.0, grey_map="linear")
+        assert np.array_equal(bench.logic.taken.image, kept.image) and bench.image.gain == "+0 dB"
+        assert np.array_equal(node_to_world(bench.probe), pose)  # the image stays, and so does the probe
+
+    on_bench(head, scenario)
+
+
+def test_a_cine_has_ten_seconds_and_a_bounded_memory(head, monkeypatch):
+    clock = SimpleNamespace(now=0.0)
+    monkeypatch.setattr(cine_module, "perf_counter", lambda: clock.now)
+
+    async def scenario(bench) -> None:
+        await bench.run(bench.cine.freeze)
+        for _ in range(6):
+            clock.now += 3.0
+            await bench.move(rock_deg=1.0)
+        assert [kept.seconds for kept in bench.cine._kept] == [9.0, 12.0, 15.0, 18.0]
+        size = bench.logic.lastFrame.iq.nbytes // 2 + bench.logic.taken.image.nbytes
+        monkeypatch.setattr(cine_module, "_MOST_BYTES", 2 * size)
+        await bench.move(rock_deg=1.0)
+        assert [kept.seconds for kept in bench.cine._kept] == [18.0, 18.0]
+        assert 0.4 < bench.cine._kept[0].echoes.parts.nbytes / size < 1.0
+        bench.logic.preset = bench.logic.preset.changed("probe", depth_mm=50.0)
+        await bench.move(rock_deg=1.0)
+        assert {kept.taken.grid.rows * kept.taken.grid.pixel_spacing_mm[1] for kept in bench.cine._kept} == {50.0}
+
+    on_bench(head, scenario)
+
+
+def test_a_line_over_time_and_a_sequence_of_the_cine(head, tmp_path, monkeypatch):
+    clock, sent = SimpleNamespace(now=0.0), []
+    monkeypatch.setattr(cine_module, "perf_counter", lambda: clock.now)
+
+    async def scenario(bench) -> None:
+        monkeypatch.setattr(bench.cine.mmode, "send", lambda image, **about: sent.append((image, about)))
+        await bench.run(bench.cine.freeze)
+        for _ in range(2):
+            clock.now += 2.0
+            await bench.move(rock_deg=4.0)
+        await bench.run(bench.cine.freeze)
+        taken = [kept.taken for kept in bench.cine._kept]
+        grid = taken[0].grid
+        column, (dx, dy), top = grid.columns // 2, grid.pixel_spacing_mm, grid.top_mm
+        x = grid.left_mm + (column + 0.5) * dx
+        bench.cine.draw_mmode(x, top + 0.5 * dy, x, top + (grid.rows - 0.5) * dy)
+        image, about = sent[-1]
+        assert about["seconds"] == 4.0 and about["ruler"]["h"] == pytest.approx((grid.rows - 1) * dy)
+        for at, one in ((0, taken[0]), (image.shape[1] // 2 + 1, taken[1]), (-1, taken[2])):
+            down = np.linspace(0, grid.rows - 1, len(image)).round().astype(int)
+            assert np.abs(image[:, at].astype(int) - one.image[down, column]).mean() < 4
+        bench.cine.draw_mmode(None)
+        bench.cine.draw_mmode(0.0, 0.0, float("nan"), 1.0)
+        assert len(sent) == 1
+        bench.cine.trim(1, 2)
+        path = tmp_path / "cine.igs.mha"
+        path.write_bytes(sequence_file(list(bench.cine.displayed(lambda share: None))))
+        read = TrackedSequence.read(path)
+        assert read.is_simulated and read.timestamps.tolist() == [0.0, 2.0] and len(read) == 2
+        np.testing.assert_array_equal(read.images[1], taken[2].image)
+        np.testing.assert_allclose(
+            read.pose(1, "ImageToReference"), taken[2].probe_to_world @ grid.image_to_probe, atol=1e-5
+        )
+        assert json.loads(read.fields["SlicerUSSim"])["images"][0]["time"] == taken[1].time
+
+    on_bench(head, scenario)
+
+
+# ---- DICOM -----------------------------------------------------------------------------------------------------------
+
+ABOUT = {"x0": 40, "y0": 30, "x1": 340, "y1": 280, "mm_x": 0.21, "mm_y": 0.2, "frame_ms": 62.5}
+TAKEN = SimpleNamespace(patient="Müller=head^1\\.nii.gz", time="2026-11-29T14:47:38.123+00:00")
+
+
+def composed(frames: int, colour: bool = True, **about) -> dict[str, bytes]:
+    """What a page sends: a cross at the ends of a distance of 40 mm down the image."""
+    sent = {"": json.dumps(ABOUT | about).encode()}
+    for number in range(frames):
+        image = np.full((320, 400, 3), number, np.uint8)
+        image[50, 100] = image[250, 100] = (255, 255, 0) if colour else 255
+        buffer = io.BytesIO()
+        Image.fromarray(image).save(buffer, "PNG")
+        sent[f"{number}.png"] = buffer.getvalue()
+    return sent
+
+
+@pytest.mark.parametrize(("frames", "colour"), [(1, True), (1, False), (5, True)])
+def test_a_dicom_ultrasound_image_is_calibrated(frames, colour, tmp_path):
+    path = tmp_path / "ultrasound.dcm"
+    path.write_bytes(ultrasound_file(composed(frames, colour), TAKEN))
+    data = pydicom.dcmread(path)
+    assert data.SOPClassUID.name.startswith("Ultrasound ") and ("Multi" in data.SOPClassUID.name) == (frames > 1)
+    assert data.BurnedInAnnotation == "YES" and "Simulated" in data.SeriesDescription and data.ImageType[0] == "DERIVED"
+    assert str(data.PatientName) == "Müller head 1 .nii.gz" and (data.StudyDate, data.StudyTime) == (
+        "20261129",
+        "144738",
+    )
+    pixels = data.pixel_array.reshape(frames, 320, 400, -1)
+    assert pixels.shape[-1] == (3 if colour else 1) and np.array_equal(pixels[:, 0, 0, 0], np.arange(frames))
+    (region,) = data.SequenceOfUltrasoundRegions
+    ends = np.argwhere(pixels[0, ..., 0] == 255)
+    assert (region.RegionLocationMinX0, region.RegionLocationMaxX1, region.RegionLocationMaxY1) == (40, 339, 279)
+    down, across = np.diff(ends, axis=0)[0] * [region.PhysicalDeltaY, region.PhysicalDeltaX] * 10.0
+    assert region.PhysicalUnitsXDirection == region.PhysicalUnitsYDirection == 3
+    assert np.hypot(down, across) == pytest.approx(40.0, abs=0.3) and region.PhysicalDeltaX == 0.021
+    if frames > 1:
+        assert (data.NumberOfFrames, data.FrameTime, data.FrameIncrementPointer) == (5, 62.5, 0x00181063)
+    assert highdicom.imread(path).get_raw_frame(1)
+
+
+@pytest.mark.parametrize(
+    "sent",
+    [{}, composed(0), composed(1, x1=401), composed(1, mm_x=0), composed(1, y0="nan"), {"": b"[]", "a.png": b"GIF"},
+     composed(1) | {"b.png": composed(1)["0.png"][:60]}],
+)  # fmt: skip
+def test_frames_that_make_no_image_are_one_line(sent):
+    with pytest.raises(SimulationError, match="^the (frames|region) .*(expected|cannot be read)") as error:
+        ultrasound_file(sent, TAKEN)
+    assert "\n" not in str(error.value)

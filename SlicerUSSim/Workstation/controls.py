@@ -66,7 +66,16 @@ def slider_html(control: Control) -> str:
 
 
 def range_html(
-    key: str, name: str, label: str, tip: str, low: float, high: float, step: float, unit: str, decimals: int, event: str
+    key: str,
+    name: str,
+    label: str,
+    tip: str,
+    low: float,
+    high: float,
+    step: float,
+    unit: str,
+    decimals: int,
+    event: str,
 ) -> str:
     """A slider with a field for its value; `key` and `event` are JavaScript. Values of presets can exceed its range."""
     value = f"{key} === null ? '' : Number({key}).toFixed({decimals})"
@@ -92,7 +101,10 @@ def _field(control: Control) -> str:
     if control.kind == "text":
         value, entered, limits = key, "$event.target.value", ""
     else:
-        value, entered = f"{key} === null ? '' : +Number({key}).toFixed({control.decimals})", "Number($event.target.value)"
+        value, entered = (
+            f"{key} === null ? '' : +Number({key}).toFixed({control.decimals})",
+            "Number($event.target.value)",
+        )
         limits = f'min="{shown.low:.10g}" max="{shown.high:.10g}" step="{shown.step:g}"'
         if shown.none_at is not None:  # an empty field, and not a number that means it
             limits += ' placeholder="none"'

@@ -68,12 +68,13 @@ POSE_SLIDERS = (
     PoseSlider("tilt_deg", "Tilt", "Out of the image plane (keys W, S; Shift and drag)", -75, 75, 0.5, "°"),
     PoseSlider("lift_mm", "Lift", "Off the surface; negative: pressed in (keys +, -)", -10, 30, 0.5, "mm"),
 )
-#: What Save offers, by kind: those with a script are composed by the page, with banner, scale and measurements
-_SAVES = {
-    "window.ussim.savePicture()": "Picture with scale and measurements (PNG)",
-    "window.ussim.saveVideo()": "Cine with scale and measurements (WebM)",
-    "window.ussim.saveDicom(false)": "DICOM ultrasound image",
-    "window.ussim.saveDicom(true)": "DICOM ultrasound cine",
+#: What Save offers: pictures that the page composes, with banner, scale and measurements, and files of the server
+_COMPOSED = {
+    "picture": ("savePicture()", "Picture with scale and measurements (PNG)"),
+    "video": ("saveVideo()", "Cine with scale and measurements (WebM)"),
+    "dicom": ("saveDicom(false)", "DICOM ultrasound image"), "dicom-cine": ("saveDicom(true)", "DICOM ultrasound cine"),
+}  # fmt: skip
+_FILES = {
     "png": "Image alone (PNG)", ".nrrd": "Image with geometry (NRRD)", ".mha": "Image with geometry (MHA)",
     ".vti": "Image with geometry (VTI)", "cine": "Cine with poses (.igs.mha)", "mrb": "Scene for 3D Slicer (MRB)",
     "json": "Settings (JSON)",
@@ -92,6 +93,8 @@ _SHARED_WITH_SCRIPTS = [
         "cine-index": NAMES.cine.index, "cine-seconds": NAMES.cine.seconds,
     }.items()
 ]  # fmt: skip
+_MMODE = """<canvas data-stream="mmode"></canvas><button class="ussim-icon" title="Close M-mode"
+    aria-label="Close M-mode" @click="window.ussim.tool('mmode-off')"><i class="mdi mdi-close"></i></button>"""
 #: In the browser's tab
 _PROGRAM = "SlicerUSSim"
 
@@ -117,6 +120,7 @@ def build_page(server: Server, panel: BrowserPanel, keys: tuple[str, ...]) -> No
                     offer()
                     html.Div(_advice())
                     html.Div(_screens(keys), classes="ussim-screens", id="screens", raw_attrs=_SHARED_WITH_SCRIPTS)
+                    html.Div(_MMODE, classes="ussim-mmode", id="mmode", raw_attrs=["hidden"])
                     html.Div(_player(), classes="ussim-bars")
                 html.Div(_console(controls), classes="ussim-console")
                 with html.Div(classes="ussim-anatomy"):
@@ -134,10 +138,10 @@ def build_page(server: Server, panel: BrowserPanel, keys: tuple[str, ...]) -> No
 
 def _banner() -> str:
     image = NAMES.image
+    saved = _COMPOSED | {kind.strip("."): (f"save('{kind}')", words) for kind, words in _FILES.items()}
     saves = "".join(
-        f"""<button class="ussim-item" id="save-{kind.strip('.').split('(')[0].split('.')[-1]}"
-        @click="{kind if '(' in kind else f"window.ussim.save('{kind}')"}">{words}</button>"""
-        for kind, words in _SAVES.items()
+        f"""<button class="ussim-item" id="save-{name}" @click="window.ussim.{script}">{words}</button>"""
+        for name, (script, words) in saved.items()
     )
     views = NAMES.views
     toggles = "".join(
@@ -158,6 +162,8 @@ def _banner() -> str:
     <span class="ussim-space"></span>{toggles}
     <label class="ussim-blend">Blend <input type="range" id="blend" min="0" max="1" step="0.05" :value="{views.blend}"
       aria-label="Blend of image and MRI in the slice views" @input="{views.blend} = Number($event.target.value)"></label>
+    <button class="ussim-icon" id="fold" title="Hide or show the views of the anatomy" aria-label="Fold the views"
+      @click="window.ussimViews.arrange('fold')"><i class="mdi mdi-dock-right"></i></button>
     <span v-if="{image.status}" class="ussim-status" :class="{image.status}.toLowerCase()" id="image-status"
       role="status">{{{{ {image.status} }}}}</span>
     <button class="ussim-icon" id="fold" title="Fold the views of the anatomy" aria-label="Fold the views of the anatomy"
@@ -245,8 +251,8 @@ def _screens(keys: tuple[str, ...]) -> str:
         for chosen in (ComparisonMode.BESIDE, ComparisonMode.BLINK, ComparisonMode.DIFFERENCE)
     )
     image = NAMES.image
-    values = (image.depth, image.focus, image.gain, image.dynamic_range)
-    lines = "".join(f"<div>{{{{ {value} }}}}</div>" for value in values)
+    values = {"Depth": image.depth, "Focus": image.focus, "Gain": image.gain, "DR": image.dynamic_range}
+    lines = "".join(f'<div v-if="{value}">{words} {{{{ {value} }}}}</div>' for words, value in values.items())
     outline = f"""<svg v-if="{NAMES.sequence.mask}" class="ussim-mask" :viewBox="{NAMES.sequence.box}"
         preserveAspectRatio="none"><path :d="{NAMES.sequence.mask}"/></svg>"""
     frame = f'<div class="ussim-frame">{outline}{cross_hair(IMAGE)}</div>'
@@ -268,9 +274,6 @@ def _screens(keys: tuple[str, ...]) -> str:
             name="kept", frame="", more="hidden", canvas='<canvas data-stream="kept"></canvas>',
             words='<div class="ussim-corner" id="kept-caption"></div>',
         )
-        + """<div class="ussim-mmode" id="mmode" hidden><canvas data-stream="mmode"></canvas>
-        <button class="ussim-icon" title="Close M-mode" aria-label="Close M-mode" @click="window.ussim.tool('mmode-off')">
-        <i class="mdi mdi-close"></i></button></div>"""
     )  # fmt: skip
 
 

@@ -1,4 +1,4 @@
-"""Parts of the page: questions, what is offered, keys, the pose of the probe, and registration of tracked ultrasound."""
+"""Parts of the page: questions, what is offered, keys, pose of the probe, registration of tracked ultrasound."""
 
 from __future__ import annotations
 

@@ -143,7 +143,7 @@ class ViewState:
     #: That point in every view, by name (IMAGE, THREED, SLICE_VIEWS): shares of its width and height from the upper
     #: left corner, and mm from the point to the plane of the view
     cross: dict[str, list[float]] = field(default_factory=dict)
-    #: Sides of the patient at the left, right, upper and lower edge of a slice view, such as "R", or "RA" for oblique ones
+    #: Sides of the patient at the left, right, upper and lower edge of a slice view: "R", or "RA" if it is oblique
     letters: dict[str, list[str]] = field(default_factory=dict)
 
 

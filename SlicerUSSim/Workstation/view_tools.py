@@ -55,7 +55,7 @@ def view_tools(_server: Server, _view_id: str, view: AbstractView) -> None:
 
 
 def cross_hair(name: str) -> str:
-    """HTML of the mark of the point under the mouse in a view; faint if the point is more than 1 mm beside its plane."""
+    """HTML of the mark of the point under the mouse in a view; faint if it is more than 1 mm beside its plane."""
     at = f"{NAMES.views.cross}['{name}']"
     return f"""<div v-if="{at}" class="ussim-cross" :class="{{beside: {at}?.[2] > 1}}"
         :style="{{left: 100 * {at}?.[0] + '%', top: 100 * {at}?.[1] + '%'}}"></div>"""

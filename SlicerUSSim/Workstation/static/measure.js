@@ -97,7 +97,7 @@
   function showLine(points) {
     line = points;
     document.getElementById("mmode").hidden = !points;
-    trame().trigger("mmode", [points && points.flat()]);
+    trame().trigger("mmode", points ? points.flat() : [null]);
   }
 
   function clicked(event) {
@@ -276,7 +276,7 @@
       x0: left + within(edges.left, screen.width), x1: left + within(edges.right, screen.width),
       y0: top + within(edges.top, screen.height), y1: top + within(edges.bottom, screen.height),
       mm_x: 1 / scale, mm_y: 1 / scale,
-      frame_ms: times.length > 1 ? (1000 * (times[times.length - 1] - times[0])) / (times.length - 1) : 0,
+      frame_ms: times.length > 1 ? (1000 * (times[times.length - 1] - times[0])) / (times.length - 1) : 40,
     };
     form.append("about", JSON.stringify(about));
     await window.ussim.fetched("upload?for=dicom", { method: "POST", body: form });

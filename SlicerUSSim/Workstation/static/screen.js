@@ -70,12 +70,13 @@
     context.setTransform(1, 0, 0, 1, 0, 0);
     context.fillStyle = "#000";
     context.fillRect(0, 0, canvas.width, canvas.height);
+    if (image && !screenOf(name)) context.drawImage(image.bitmap, 0, 0, canvas.width, canvas.height); // M-mode: no ruler
     if (place) {
       const { ruler, sx, sy, origin } = place;
       context.setTransform(sx * dense, 0, 0, sy * dense, origin[0] * dense, origin[1] * dense);
       context.drawImage(image.bitmap, ruler.x, ruler.y, ruler.w, ruler.h);
     }
-    if (name !== stream) return;
+    if (!screenOf(stream)) return;
     overlay(name);
     const frame = screenOf(name).querySelector(".ussim-frame");
     if (!frame || !place) return;

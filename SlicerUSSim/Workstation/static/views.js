@@ -15,6 +15,8 @@
     window.dispatchEvent(new Event("resize"));
   };
 
+  window.ussimViews = { arrange };
+
   let told = 0;
   let waiting = 0;
   function point(at) {
