@@ -37,6 +37,13 @@ class Advice:
     def _found(self) -> tuple[str, str, Callable[[], object]]:
         placing, values = self._presenter.placing, self._presenter.values
         line = self._first("probeNotesLabel")
+        if line.startswith("no skull is labelled"):
+
+            def label() -> None:
+                values.setValue("scene.outside", True)
+                self._panel.act(self._presenter.segmenting.segment)
+
+            return line, "Label the whole head", label
         if line and "skull" in line and placing.canOpenCraniotomy()[0]:
             return line, "Open skull", placing.openCraniotomy
         if line:
