@@ -253,8 +253,8 @@ def _screens(keys: tuple[str, ...]) -> str:
     image = NAMES.image
     values = {"Depth": image.depth, "Focus": image.focus, "Gain": image.gain, "DR": image.dynamic_range}
     lines = "".join(f'<div v-if="{value}">{words} {{{{ {value} }}}}</div>' for words, value in values.items())
-    outline = f"""<svg v-if="{NAMES.sequence.mask}" class="ussim-mask" :viewBox="{NAMES.sequence.box}"
-        preserveAspectRatio="none"><path :d="{NAMES.sequence.mask}"/></svg>"""
+    outline = f"""<svg v-if="{NAMES.sequence.mask} && {mode} !== '{ComparisonMode.SIMULATED.value}'" class="ussim-mask"
+        :viewBox="{NAMES.sequence.box}" preserveAspectRatio="none"><path :d="{NAMES.sequence.mask}"/></svg>"""
     frame = f'<div class="ussim-frame">{outline}{cross_hair(IMAGE)}</div>'
     screen = """<div class="ussim-screen" data-screen="{name}" {more}>{canvas}<svg class="ussim-overlay"
         role="img" aria-label="Ruler and measurements of the {name} image"></svg>{frame}{words}</div>"""
