@@ -204,7 +204,9 @@ def test_a_probe_below_a_closed_skull_is_told_of(head):  # noqa: F811
 
 def test_a_head_whose_skull_is_not_labelled_is_told_of(head):  # noqa: F811
     """It was imaged straight through the skull without a word."""
-    mri = Volume(np.array([5.0, *(90.0 if "skull" not in name else 10.0 for name in NAMES)])[head.array], head.ijk_to_ras)
+    mri = Volume(
+        np.array([5.0, *(90.0 if "skull" not in name else 10.0 for name in NAMES)])[head.array], head.ijk_to_ras
+    )
     brain = without_outside(head, NAMES)
     (line,) = about_missing_skull(brain, NAMES[:2], mri)
     assert "tick Label what is outside the brain and press Segment" in in_panel(line)

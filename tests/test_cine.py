@@ -231,14 +231,14 @@ def test_a_line_over_time_and_a_sequence_of_the_cine(head, tmp_path, monkeypatch
         grid = taken[0].grid
         column, (dx, dy), top = grid.columns // 2, grid.pixel_spacing_mm, grid.top_mm
         x = grid.left_mm + (column + 0.5) * dx
-        bench.cine.draw_mmode(x, top + 0.5 * dy, x, top + (grid.rows - 0.5) * dy)
+        bench.cine.draw_mmode([x, top + 0.5 * dy, x, top + (grid.rows - 0.5) * dy])
         image, about = sent[-1]
-        assert about["seconds"] == 4.0 and about["ruler"]["h"] == pytest.approx((grid.rows - 1) * dy)
+        assert about["ruler"]["w"] == 4.0 and about["ruler"]["h"] == pytest.approx((grid.rows - 1) * dy)
         for at, one in ((0, taken[0]), (image.shape[1] // 2 + 1, taken[1]), (-1, taken[2])):
             down = np.linspace(0, grid.rows - 1, len(image)).round().astype(int)
             assert np.abs(image[:, at].astype(int) - one.image[down, column]).mean() < 4
         bench.cine.draw_mmode(None)
-        bench.cine.draw_mmode(0.0, 0.0, float("nan"), 1.0)
+        bench.cine.draw_mmode([0.0, 0.0, float("nan"), 1.0])
         assert len(sent) == 1
         bench.cine.trim(1, 2)
         path = tmp_path / "cine.igs.mha"
@@ -302,6 +302,6 @@ def test_a_dicom_ultrasound_image_is_calibrated(frames, colour, tmp_path):
      composed(1) | {"b.png": composed(1)["0.png"][:60]}],
 )  # fmt: skip
 def test_frames_that_make_no_image_are_one_line(sent):
-    with pytest.raises(SimulationError, match="^the (frames|region) .*(expected|cannot be read)") as error:
+    with pytest.raises(SimulationError, match=r"^the (frames|region) .*(expected|cannot be read)") as error:
         ultrasound_file(sent, TAKEN)
     assert "\n" not in str(error.value)

@@ -41,7 +41,7 @@ def ultrasound_file(sent: Mapping[str, bytes], taken: TakenImage) -> bytes:
     except (ValueError, LookupError, TypeError, UnidentifiedImageError, OSError) as error:
         raise SimulationError(f"the frames of the page cannot be read ({error})") from None
     is_region = 0 <= x0 < x1 <= width and 0 <= y0 < y1 <= height and all(map(math.isfinite, (x1, y1)))
-    is_scale = all(math.isfinite(value) and value > 0 for value in (mm_x, mm_y, frame_ms))
+    is_scale = all(math.isfinite(value) and value > 0 for value in (mm_x, mm_y, frame_ms if len(frames) > 1 else 1.0))
     require(is_region and is_scale, f"the region of the image is {about}, expected one within {width}x{height} pixels")
     return _file(frames, tuple(map(round, (x0, y0, x1 - 1, y1 - 1))), (mm_x, mm_y), frame_ms, taken)
 

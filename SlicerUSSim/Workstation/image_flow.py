@@ -103,12 +103,7 @@ class ImageFlow:
                 shown.status = FROZEN
                 self._logic.holdOutline()
             shown.differs = "" if shown.status == "LIVE" else ", ".join(differs)
-        now = self._panel.shared.now.image
-        changed = {name: text for name, text in asdict(shown).items() if getattr(now, name) != text}
-        if changed:
-            with self._panel.shared.changing() as now:
-                for name, text in changed.items():
-                    setattr(now.image, name, text)
+        self._panel.shared.put("image", asdict(shown))
 
     def show_again(self) -> None:
         """Send the current images again, for a page that has just opened."""

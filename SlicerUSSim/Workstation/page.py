@@ -162,11 +162,9 @@ def _banner() -> str:
     <span class="ussim-space"></span>{toggles}
     <label class="ussim-blend">Blend <input type="range" id="blend" min="0" max="1" step="0.05" :value="{views.blend}"
       aria-label="Blend of image and MRI in the slice views" @input="{views.blend} = Number($event.target.value)"></label>
-    <button class="ussim-icon" id="fold" title="Hide or show the views of the anatomy" aria-label="Fold the views"
-      @click="window.ussimViews.arrange('fold')"><i class="mdi mdi-dock-right"></i></button>
     <span v-if="{image.status}" class="ussim-status" :class="{image.status}.toLowerCase()" id="image-status"
       role="status">{{{{ {image.status} }}}}</span>
-    <button class="ussim-icon" id="fold" title="Fold the views of the anatomy" aria-label="Fold the views of the anatomy"
+    <button class="ussim-icon" id="fold" title="Hide or show the views" aria-label="Fold the views"
       @click="window.ussim.arrange('fold')"><i class="mdi mdi-dock-right"></i></button>
     <details class="ussim-menu" id="save"><summary>Save</summary><div>{saves}</div></details>
     <button class="ussim-button" id="help-button" title="Keys and gestures (F1)"

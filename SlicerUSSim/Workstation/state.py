@@ -305,6 +305,14 @@ class SharedState:
         with self._state:
             yield self.now
 
+    def put(self, part: str, values: Mapping[str, object]) -> None:
+        """Send pages what of these values of a part, such as "cine", has changed."""
+        changed = {name: value for name, value in values.items() if getattr(getattr(self.now, part), name) != value}
+        if changed:
+            with self.changing() as now:
+                for name, value in changed.items():
+                    setattr(getattr(now, part), name, value)
+
     def show_values(self, values: Mapping[str, object]) -> None:
         """Show these values of controls, by Control.widget."""
         with self._state:

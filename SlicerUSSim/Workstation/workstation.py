@@ -261,10 +261,10 @@ class Workstation:
         if self._image_node.watch(parameters.output) and taken is not None and taken.node is parameters.output:
             self._images.image_changed()  # it is in there already, as the frozen one of a scene at the start
         self._probe.draw()
-        with self._presenter.shown():
-            self._cine.follow_display()
         if self._logic.isLive:
             with self._presenter.shown():
                 self._probe.update_surface()
         self._presenter.parametersChanged()
         self._kept.changed()
+        with self._presenter.shown():
+            self._cine.follow_display()  # at the end, since it waits for the device

@@ -15,8 +15,6 @@
     window.dispatchEvent(new Event("resize"));
   };
 
-  window.ussimViews = { arrange };
-
   let told = 0;
   let waiting = 0;
   function point(at) {
