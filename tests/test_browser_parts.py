@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import io
 import selectors
 import threading
 from concurrent.futures import ThreadPoolExecutor
@@ -381,7 +382,7 @@ def test_of_images_that_come_fast_the_last_is_compared(head):
 
     async def scenario():
         shared, moved = SharedState(State(ready=True)), []
-        comparison = Comparison(shared, moved.append)
+        comparison = Comparison(shared, moved.append, lambda function: function())
         comparison.view(sequence.images, 1)  # before its place is known
         for stream in comparison.streams:
             stream.set_streamer(SimpleNamespace(push_content=lambda name, about, content: sent.append(name)))

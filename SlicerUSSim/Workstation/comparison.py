@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable
+from math import inf
+from time import perf_counter
 from typing import Any
 
 import numpy as np
@@ -12,6 +14,7 @@ from trame_server.utils.asynchronous import get_event_loop
 from SlicerUSSim.Logic.base.errors import SimulationError
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.fitting.image_similarity import Similarity, similarity
+from SlicerUSSim.Logic.fitting.search import Progress
 from SlicerUSSim.Logic.probe.image_grid import ImageGrid
 from SlicerUSSim.Logic.probe.poses import slice_under_probe
 from SlicerUSSim.Logic.tracked.images import TrackedImages
@@ -20,6 +23,8 @@ from SlicerUSSim.Workstation.streams import ImageStream
 
 #: Seconds between two images during playback of a sequence.
 _PLAY_EVERY_S = 0.1
+#: Seconds between two of the best images of a fit
+_BEST_EVERY_S = 0.5
 #: Difference of matrices up to which a pose is the same, mm: nodes and files keep some digits
 _SAME_POSE = 1e-3
 
@@ -94,10 +99,13 @@ class Comparison:
     Parameters
     ----------
     move : called with the pose (4, 4) of a real image.
+    tell : calls a function soon in the event loop, from another thread.
     """
 
-    def __init__(self, shared: SharedState, move: Callable[[np.ndarray], None]) -> None:
-        self._shared, self._move = shared, move
+    def __init__(
+        self, shared: SharedState, move: Callable[[np.ndarray], None], tell: Callable[[Callable[[], None]], None]
+    ) -> None:  # fmt: skip
+        self._shared, self._move, self._tell = shared, move, tell
         self._grid: ImageGrid | None = None  # of the simulated image
         self._real: RealImages | LooseImages | None = None
         self._browser: Any = None  # vtkMRMLSequenceBrowserNode
@@ -105,8 +113,9 @@ class Comparison:
         self._waiting: tuple[RealImages, int, np.ndarray, ImageGrid] | None = None  # to be compared
         self._comparing: asyncio.Task | None = None
         self._era = 0  # changes when a similarity of before must not be shown any more
-        #: For display next to the simulated image, and over it
-        self.streams = (ImageStream("real"), ImageStream("real-over"))
+        #: For display next to the simulated image, and over it; and the best image of a fit that runs
+        self.streams = (ImageStream("real"), ImageStream("real-over"), ImageStream("best"))
+        self._best = (inf, 0.0)  # its cost, and when it was sent
 
     @property
     def is_comparing(self) -> bool:
@@ -167,12 +176,32 @@ class Comparison:
         elif real is not None and grid is not None:
             image, _ = real.on_grid(sequence.number, grid)
             width, height = (n * mm for n, mm in zip((grid.columns, grid.rows), grid.pixel_spacing_mm, strict=True))
-            for stream in self.streams:
+            for stream in self.streams[:2]:
                 stream.send(image, ruler={"w": width, "h": height})
             box = f"{grid.left_mm:.3f} {grid.top_mm:.3f} {width:.3f} {height:.3f}"
             if (sequence.box, bool(sequence.mask)) != (box, True):
                 with self._shared.changing() as now:
                     now.sequence.box, now.sequence.mask = box, real.outline(grid)
+
+    def follow(self, step: Progress | None) -> None:
+        """Show the best image of a fit, at most twice a second; called in its thread, and with None at its end."""
+        if step is None:
+            self._tell(lambda: self._show_best(None, ""))
+        elif step.image is not None and step.best_cost != self._best[0] and perf_counter() > self._best[1] + _BEST_EVERY_S:
+            self._best, image = (step.best_cost, perf_counter()), step.image()
+            words = f"Best after {step.evaluations} evaluations: image {step.number}, cost {step.best_cost:.3f}"
+            self._tell(lambda: self._show_best(image, words))
+
+    def _show_best(self, image: np.ndarray | None, words: str) -> None:
+        real, grid = self._real, self._grid
+        if image is None:
+            self._best = (inf, 0.0)
+            self.streams[2].clear()
+        elif isinstance(real, RealImages) and grid is not None and image.shape == real.tracked.mask.shape:
+            placed = Volume(image[None].astype(np.float32), real.tracked.grid.slice_to_probe)
+            self.streams[2].send(slice_under_probe(placed, grid, np.eye(4)).round().astype(np.uint8))
+        with self._shared.changing() as now:
+            now.fit.best = words
 
     def compare_next(self) -> None:
         """Compare in the next way of ComparisonMode."""

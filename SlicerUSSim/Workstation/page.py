@@ -269,6 +269,10 @@ def _screens(keys: tuple[str, ...]) -> str:
             words=f'<div class="ussim-corner">Real, {{{{ {NAMES.sequence.name} }}}}</div>',
         )
         + screen.format(
+            name="best", frame="", more=f'v-show="{NAMES.fit.best}"', canvas='<canvas data-stream="best"></canvas>',
+            words=f'<div class="ussim-corner" id="best-caption">{{{{ {NAMES.fit.best} }}}}</div>',
+        )
+        + screen.format(
             name="kept", frame="", more="hidden", canvas='<canvas data-stream="kept"></canvas>',
             words='<div class="ussim-corner" id="kept-caption"></div>',
         )
@@ -299,7 +303,8 @@ def _player() -> str:
       @click="trigger('cine_play')"><i class="mdi" :class="{cine.playing} ? 'mdi-pause' : 'mdi-play'"></i></button>
       <input type="range" id="cine-slider" min="0" :max="{cine.length} - 1" step="1" :value="{cine.index}"
       aria-label="Image of the cine" @input="trigger('cine_show', [Number($event.target.value)])">
-      <span id="cine-text">{{{{ {cine.index} + 1 }}}} of {{{{ {cine.length} }}}}, {{{{ {cine.seconds}.toFixed(1) }}}} s
+      <span id="cine-text">{{{{ {cine.source} === 'live' ? {cine.index} + 1 + ' of ' + {cine.length} : 'Simulated image ' +
+      {cine.index} + ' (0 to ' + ({cine.length} - 1) + ')' }}}}, {{{{ {cine.seconds}.toFixed(1) }}}} s
       </span>
       <button class="ussim-button" id="cine-from" title="The cine begins here"
       @click="trigger('cine_trim', [{cine.index}, {cine.last}])">[ From</button>
