@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import io
 import selectors
 import threading
 from concurrent.futures import ThreadPoolExecutor
@@ -11,6 +12,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from PIL import Image
 from vtkmodules.util.numpy_support import vtk_to_numpy
 from vtkmodules.vtkFiltersCore import vtkCleanPolyData, vtkFeatureEdges, vtkMassProperties, vtkTriangleFilter
 
@@ -55,7 +57,7 @@ from SlicerUSSim.Workstation.state import (  # noqa: E402
     TissueLine,
     value_of,
 )
-from SlicerUSSim.Workstation.streams import ImageStream  # noqa: E402
+from SlicerUSSim.Workstation.streams import ImageStream, _jpeg  # noqa: E402
 from SlicerUSSim.Workstation.tasks import AtMost, Tasks  # noqa: E402
 
 
@@ -330,6 +332,15 @@ def test_only_the_image_that_shows_a_movement_tells_its_latency():
     assert run_in_loop(scenario) == [("page", 1.0), None]
 
 
+def test_an_image_takes_at_most_45_kb_and_looks_alike(head):
+    probe = PROBES["neonatal"]  # with the widest field
+    simulator = UltrasoundSimulator(head.labels, TissueTable.brain(head.tissue_names))
+    image = simulator.simulate(probe, craniotomy_pose(head.labels, probe)).image
+    content = _jpeg(image)
+    difference = np.abs(np.asarray(Image.open(io.BytesIO(content)), float) - image)
+    assert image.shape[0] == 512 and len(content) <= 45_000 and difference[image > 0].mean() < 6.0
+
+
 # ---- what page and control share -------------------------------------------------------------------------------------
 
 
@@ -360,9 +371,9 @@ def test_of_images_that_come_fast_the_last_is_compared(head):
     pose = craniotomy_pose(head.labels, probe)
     simulator = UltrasoundSimulator(head.labels, TissueTable.brain(head.tissue_names))
     image = simulator.simulate(probe, pose).image
-    sequence = TrackedSequence(
-        image[None], ({"ImageToProbe": grid.image_to_probe, "ProbeToReference": pose},), np.zeros(1)
-    )
+    known = {"ImageToProbe": grid.image_to_probe}
+    known, lost = {**known, "ProbeToReference": pose}, known
+    sequence = TrackedSequence(np.stack([image] * 3), (known, lost, known), np.arange(3.0))
     tracked = TrackedImages.of(sequence, path="ImageToReference", beam=probe, probe=probe)
 
     class Browser:
@@ -371,15 +382,30 @@ def test_of_images_that_come_fast_the_last_is_compared(head):
 
     async def scenario():
         shared, moved = SharedState(State(ready=True)), []
-        comparison = Comparison(shared, moved.append)
-        comparison.take(tracked, Browser())
+        comparison = Comparison(shared, moved.append, lambda function: function())
+        comparison.view(sequence.images, 1)  # before its place is known
+        for stream in comparison.streams:
+            stream.set_streamer(SimpleNamespace(push_content=lambda name, about, content: sent.append(name)))
+        assert shared.now.sequence.name == "image 1" and not (shared.now.sequence.is_placed or moved)
+        comparison.compare(image, grid)
+        while comparison.streams[0].is_sending:
+            await asyncio.sleep(0.01)
+        assert set(sent) == {"real"} and not shared.now.sequence.similarity
+        comparison.take(tracked, Browser(), 1)
+        shown = shared.now.sequence
+        assert (shown.name, shown.numbers, shown.length, shown.is_placed) == ("image 2", "0 to 2", 2, True)
         for simulated in (image // 2, np.zeros_like(image), image):  # one is compared while the others come
             comparison.compare(simulated, grid)
         while comparison.is_comparing or any(stream.is_sending for stream in comparison.streams):
             await asyncio.sleep(0.01)
         assert len(moved) == 1 and np.allclose(moved[0], pose)
+        corners = np.array([point.split(",") for point in shared.now.sequence.mask[2:-2].split()], float)
+        x, y = corners.T  # the outline of what is compared
+        area = 0.5 * abs(x @ np.roll(y, 1) - y @ np.roll(x, 1))
+        assert area == pytest.approx(tracked.mask.sum() * np.prod(tracked.grid.pixel_spacing_mm), rel=0.02)
         return shared.now.sequence.similarity
 
+    sent: list[str] = []
     cost = run_in_loop(scenario)
     same = RealImages(tracked).compared(0, image, grid).total
     assert cost.startswith(f"cost {same:.3f} ") and same < 0.5 * RealImages(tracked).compared(0, image // 2, grid).total

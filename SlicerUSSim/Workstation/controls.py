@@ -47,7 +47,8 @@ def control_html(control: Control) -> str:
         return f"""<button class="ussim-button" id="{name}" :disabled="{disabled}" @click="{pressed}"
             :title="{NAMES.panel.tips}.{name} ?? `{tip}`">{label}</button>"""
     if control.kind == "words":
-        return f"""<div id="{name}" class="ussim-words" title="{tip}">{{{{ {key} }}}}</div>"""
+        lines = f"""v-for="line in ({key} ?? '').split('\\n')" :class="{{faint: line.includes('(not determined')}}\""""
+        return f"""<div id="{name}" class="ussim-words" title="{tip}"><div {lines}>{{{{ line }}}}</div></div>"""
     if control.kind == "table":
         return _tissue_table(control)
     return f"""<div title="{tip}">{label}<div class="ussim-free" id="{name}">

@@ -134,7 +134,7 @@ def _description(taken: TakenImage) -> dict[str, object]:
         "patient": taken.patient,
         "time": taken.time,
         "pose": taken.probe_to_world.round(3).tolist(),
-        "sequence": None if taken.number is None else taken.number + 1,
+        "sequence": taken.number,
     }
 
 

@@ -251,8 +251,8 @@ def _screens(keys: tuple[str, ...]) -> str:
     image = NAMES.image
     values = {"Depth": image.depth, "Focus": image.focus, "Gain": image.gain, "DR": image.dynamic_range}
     lines = "".join(f'<div v-if="{value}">{words} {{{{ {value} }}}}</div>' for words, value in values.items())
-    outline = f"""<svg v-if="{NAMES.sequence.mask}" class="ussim-mask" :viewBox="{NAMES.sequence.box}"
-        preserveAspectRatio="none"><path :d="{NAMES.sequence.mask}"/></svg>"""
+    outline = f"""<svg v-if="{NAMES.sequence.mask} && {mode} !== '{ComparisonMode.SIMULATED.value}'" class="ussim-mask"
+        :viewBox="{NAMES.sequence.box}" preserveAspectRatio="none"><path :d="{NAMES.sequence.mask}"/></svg>"""
     frame = f'<div class="ussim-frame">{outline}{cross_hair(IMAGE)}</div>'
     screen = """<div class="ussim-screen" data-screen="{name}" {more}>{canvas}<svg class="ussim-overlay"
         role="img" aria-label="Ruler and measurements of the {name} image"></svg>{frame}{words}</div>"""
@@ -267,6 +267,10 @@ def _screens(keys: tuple[str, ...]) -> str:
         + screen.format(
             name="real", frame=frame, more=f'v-show="{there} && {beside}"', canvas='<canvas data-stream="real"></canvas>',
             words=f'<div class="ussim-corner">Real, {{{{ {NAMES.sequence.name} }}}}</div>',
+        )
+        + screen.format(
+            name="best", frame="", more=f'v-show="{NAMES.fit.best}"', canvas='<canvas data-stream="best"></canvas>',
+            words=f'<div class="ussim-corner" id="best-caption">{{{{ {NAMES.fit.best} }}}}</div>',
         )
         + screen.format(
             name="kept", frame="", more="hidden", canvas='<canvas data-stream="kept"></canvas>',
@@ -299,7 +303,8 @@ def _player() -> str:
       @click="trigger('cine_play')"><i class="mdi" :class="{cine.playing} ? 'mdi-pause' : 'mdi-play'"></i></button>
       <input type="range" id="cine-slider" min="0" :max="{cine.length} - 1" step="1" :value="{cine.index}"
       aria-label="Image of the cine" @input="trigger('cine_show', [Number($event.target.value)])">
-      <span id="cine-text">{{{{ {cine.index} + 1 }}}} of {{{{ {cine.length} }}}}, {{{{ {cine.seconds}.toFixed(1) }}}} s
+      <span id="cine-text">{{{{ {cine.source} === 'live' ? {cine.index} + 1 + ' of ' + {cine.length} : 'Simulated image ' +
+      {cine.index} + ' (0 to ' + ({cine.length} - 1) + ')' }}}}, {{{{ {cine.seconds}.toFixed(1) }}}} s
       </span>
       <button class="ussim-button" id="cine-from" title="The cine begins here"
       @click="trigger('cine_trim', [{cine.index}, {cine.last}])">[ From</button>

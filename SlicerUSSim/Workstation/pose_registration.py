@@ -179,6 +179,7 @@ class Registration:
         self.recording, self._calibration, self._to_ras = recording, calibration, to_ras
         if made is None:
             self._comparison.drop()
+            self._comparison.view(sequence.images, number)
             self._logic.parameters.real = self._field = None
         else:
             tracked, browser, images, _ = made

@@ -67,20 +67,6 @@ class FreeParameter:
 
 
 @dataclass(frozen=True)
-class FittedValue:
-    """The result of a fit for a parameter, as texts."""
-
-    label: str
-    before: str
-    after: str
-    unit: str
-    #: Whether the images determine it
-    is_determined: bool
-    #: What to know of it: at its bound, or the range that fits equally well
-    note: str
-
-
-@dataclass(frozen=True)
 class Choice:
     """One answer to a question."""
 
@@ -223,8 +209,6 @@ class FitState:
     costs: str = ""
     #: Caption of the best image so far (stream "best") while a fit runs; "" without
     best: str = ""
-    #: What the last fit found
-    values: list[FittedValue] = field(default_factory=list)
 
 
 @dataclass

@@ -71,7 +71,8 @@ class Workstation:
         self._pointer = Pointer(shared, logic, self._views, probe)
         self._poses = PoseEntry(panel, probe.pose, probe.move)
         probe.told = self._poses.show
-        self._comparison = comparison = Comparison(shared, probe.move)
+        self._comparison = comparison = Comparison(shared, probe.move, tasks.tell)
+        presenter.fits.following = comparison.follow
         self._tracker = Tracker(shared, tasks, probe.move)
         self._cine = cine = Cine(panel, comparison, probe.move)
         self._images = ImageFlow(panel, self._views, comparison, cine, self._tracker, stamps)

@@ -31,8 +31,8 @@ import "./measure.js";
     if (Number(canvas.dataset.number ?? 0) > meta.number && meta.number > 1) return; // overtaken while it was decoded
     canvas.dataset.number = meta.number;
     if (name === "simulated") workstation.image = meta.blank ? null : meta;
-    // One ruler: real images are on the pixels of the simulated one
-    const ruler = name === "simulated" ? meta.ruler : (workstation.image?.ruler ?? meta.ruler);
+    // One ruler: real images are on the pixels of the simulated one, unless their size is not known
+    const ruler = meta.ruler?.x !== undefined ? meta.ruler : (workstation.image?.ruler ?? meta.ruler);
     if (name === "simulated" && !isFrozen()) measure.unfrozen(); // they are of the image before
     screens.put(name, bitmap, { ...meta, ruler });
     if (name !== "simulated" || !bitmap) return;
