@@ -226,7 +226,7 @@ def test_a_frozen_image_comes_back_with_its_scene(page, files, tmp_path):
 def test_nothing_of_a_patient_stays_on_the_next_one(page, files, tmp_path):
     """The line "FROZEN: ..." and the outline of the imaged field of the patient before lay over the next one."""
     open_new_patient(page, files / "labels.nii.gz")
-    click(page, "#close-patient")
+    page.evaluate("window.trame.trigger('close_patient')")
     settled(page)
     assert state(page, NAMES.messages.status) == "" and state(page, NAMES.title) == ""
     shutil.copy(download(page, "mrb"), tmp_path / "closed.mrb")

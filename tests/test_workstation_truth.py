@@ -250,7 +250,7 @@ def test_a_saved_scene_holds_this_patient_only_and_a_patient_can_be_closed(page,
     held = nodes_of_scene(download(page, "mrb"))
     assert any("third.nii.gz" in name for name in held)
     assert not [name for name in held if "second" in name or "head.nii" in name or "sweep" in name], held
-    click(page, "#close-patient")
+    page.evaluate("window.trame.trigger('close_patient')")
     page.wait_for_function("window.ussim.image === null")
     settled(page)
     assert page.locator("#title").inner_text() == "" and page.locator("#notesLabel").inner_text() == ""
