@@ -9,7 +9,7 @@ import re
 from collections.abc import Mapping
 
 import numpy as np
-from PIL import Image, UnidentifiedImageError
+from PIL import Image
 
 from SlicerUSSim.Logic.base.errors import SimulationError, require
 from SlicerUSSim.Logic.base.version import __version__
@@ -19,6 +19,9 @@ from SlicerUSSim.Logic.mrml.taken_image import TakenImage
 _MOST_BYTES = 2**30
 #: Numbers that a page sends: edges of the image region in pixels (x1, y1 behind the last), mm per pixel, ms per frame
 _NAMES = ("x0", "y0", "x1", "y1", "mm_x", "mm_y", "frame_ms")
+#: What DICOM demands and is not known
+_UNKNOWN = ("PatientID", "PatientBirthDate", "PatientSex", "StudyID", "AccessionNumber", "ReferringPhysicianName",
+            "PatientOrientation")  # fmt: skip
 
 
 def ultrasound_file(sent: Mapping[str, bytes], taken: TakenImage) -> bytes:
@@ -34,69 +37,61 @@ def ultrasound_file(sent: Mapping[str, bytes], taken: TakenImage) -> bytes:
         sizes = {image.size for image in images}
         require(len(sizes) == 1, f"the frames have the sizes {sorted(sizes)}, expected one size")
         width, height = sizes.pop()
-        require(
-            3 * width * height * len(images) <= _MOST_BYTES, f"{len(images)} frames of {width}x{height} are too many"
-        )
+        require(3 * width * height * len(images) <= _MOST_BYTES, f"the frames are {len(images)}, expected fewer")
         frames = np.stack([np.asarray(image.convert("RGB")) for image in images])
-    except (ValueError, LookupError, TypeError, UnidentifiedImageError, OSError) as error:
+    except (ValueError, LookupError, TypeError, OSError) as error:
         raise SimulationError(f"the frames of the page cannot be read ({error})") from None
-    is_region = 0 <= x0 < x1 <= width and 0 <= y0 < y1 <= height and all(map(math.isfinite, (x1, y1)))
-    is_scale = all(math.isfinite(value) and value > 0 for value in (mm_x, mm_y, frame_ms if len(frames) > 1 else 1.0))
+    scale = mm_x, mm_y, frame_ms if len(images) > 1 else 1.0
+    is_scale = all(0 < value < math.inf for value in scale)
+    is_region = 0 <= x0 < x1 <= width and 0 <= y0 < y1 <= height
     require(is_region and is_scale, f"the region of the image is {about}, expected one within {width}x{height} pixels")
-    return _file(frames, tuple(map(round, (x0, y0, x1 - 1, y1 - 1))), (mm_x, mm_y), frame_ms, taken)
+    return _file(frames, tuple(map(round, (x0, y0, x1 - 1, y1 - 1))), scale, taken)
 
 
-def _file(
-    frames: np.ndarray, region: tuple[int, ...], mm: tuple[float, float], frame_ms: float, taken: TakenImage
-) -> bytes:
-    """Of (n, rows, columns, 3) uint8 frames, with (first column, first row, last column, last row) of the region."""
-    from pydicom.dataset import Dataset, FileMetaDataset
-    from pydicom.uid import (
-        ExplicitVRLittleEndian,
-        UltrasoundImageStorage,
-        UltrasoundMultiFrameImageStorage,
-        generate_uid,
-    )
+def _file(frames: np.ndarray, edges: tuple[int, ...], scale: tuple[float, ...], taken: TakenImage) -> bytes:
+    """Of (n, rows, columns, 3) uint8 frames; `edges` are the first column and row of the region, and the last ones."""
+    from pydicom import uid
+    from pydicom.dataset import FileMetaDataset
 
-    is_grey, is_single = bool((frames == frames[..., :1]).all()), len(frames) == 1
+    count, rows, columns, _ = frames.shape
+    mm_x, mm_y, frame_ms = scale
+    kind = uid.UltrasoundImageStorage if count == 1 else uid.UltrasoundMultiFrameImageStorage
+    of_study, of_series, of_image = (uid.generate_uid() for _ in range(3))
     date, time = taken.time[:10].replace("-", ""), taken.time[11:19].replace(":", "")
-    data = Dataset()
-    data.SpecificCharacterSet = "ISO_IR 192"
-    data.SOPClassUID = UltrasoundImageStorage if is_single else UltrasoundMultiFrameImageStorage
-    data.SOPInstanceUID, data.StudyInstanceUID, data.SeriesInstanceUID = (generate_uid() for _ in range(3))
-    data.PatientName = re.sub(r"[\\^=]", " ", taken.patient)[:64]
-    data.PatientID = data.PatientBirthDate = data.PatientSex = data.StudyID = ""
-    data.AccessionNumber = data.ReferringPhysicianName = data.PatientOrientation = ""
-    data.StudyDate = data.SeriesDate = data.ContentDate = date
-    data.StudyTime = data.SeriesTime = data.ContentTime = time
-    data.Modality, data.SeriesNumber, data.InstanceNumber = "US", 1, 1
-    data.SeriesDescription = "Simulated ultrasound (SlicerUSSim)"
-    data.DerivationDescription = "Simulated from images of the patient, not acquired by a scanner"
-    data.ImageType = ["DERIVED", "SECONDARY", "", "0001"]  # a two-dimensional image
-    data.Manufacturer, data.ManufacturerModelName, data.SoftwareVersions = "SlicerUSSim", "Simulator", __version__
-    data.BurnedInAnnotation, data.LossyImageCompression = "YES", "00"
-    data.SamplesPerPixel = 1 if is_grey else 3
-    data.PhotometricInterpretation = "MONOCHROME2" if is_grey else "RGB"
-    if not is_grey:
-        data.PlanarConfiguration = 0
-    if not is_single:
-        data.NumberOfFrames, data.FrameTime = len(frames), f"{frame_ms:.6g}"
-        data.FrameIncrementPointer = 0x00181063  # FrameTime
-        data.RecommendedDisplayFrameRate = max(round(1e3 / frame_ms), 1)
-    _, data.Rows, data.Columns, _ = frames.shape
-    data.BitsAllocated, data.BitsStored, data.HighBit, data.PixelRepresentation = 8, 8, 7, 0
-    place = Dataset()
-    place.RegionSpatialFormat, place.RegionDataType, place.RegionFlags = 1, 1, 0  # two-dimensional, tissue, opaque
-    place.RegionLocationMinX0, place.RegionLocationMinY0 = region[:2]
-    place.RegionLocationMaxX1, place.RegionLocationMaxY1 = region[2:]
-    place.PhysicalUnitsXDirection = place.PhysicalUnitsYDirection = 3  # cm
-    place.PhysicalDeltaX, place.PhysicalDeltaY = 0.1 * mm[0], 0.1 * mm[1]
-    data.SequenceOfUltrasoundRegions = [place]
-    pixels = np.ascontiguousarray(frames[..., 0] if is_grey else frames).tobytes()
-    data.PixelData = pixels + b"\0" * (len(pixels) % 2)
-    data.file_meta = meta = FileMetaDataset()
-    meta.TransferSyntaxUID = ExplicitVRLittleEndian
-    meta.MediaStorageSOPClassUID, meta.MediaStorageSOPInstanceUID = data.SOPClassUID, data.SOPInstanceUID
-    buffer = io.BytesIO()
+    pixels = frames.tobytes()
+    region = {
+        "RegionSpatialFormat": 1, "RegionDataType": 1, "RegionFlags": 0,  # two-dimensional, tissue, opaque
+        "RegionLocationMinX0": edges[0], "RegionLocationMinY0": edges[1], "RegionLocationMaxX1": edges[2],
+        "RegionLocationMaxY1": edges[3], "PhysicalUnitsXDirection": 3, "PhysicalUnitsYDirection": 3,  # cm
+        "PhysicalDeltaX": 0.1 * mm_x, "PhysicalDeltaY": 0.1 * mm_y,
+    }  # fmt: skip
+    values = {
+        "SpecificCharacterSet": "ISO_IR 192", "SOPClassUID": kind, "SOPInstanceUID": of_image,
+        "StudyInstanceUID": of_study, "SeriesInstanceUID": of_series, "SeriesNumber": 1, "InstanceNumber": 1,
+        "PatientName": re.sub(r"[\\^=]", " ", taken.patient)[:64], **dict.fromkeys(_UNKNOWN, ""),
+        "StudyDate": date, "SeriesDate": date, "ContentDate": date, "StudyTime": time, "SeriesTime": time,
+        "ContentTime": time, "Modality": "US", "SeriesDescription": "Simulated ultrasound (SlicerUSSim)",
+        "DerivationDescription": "Simulated from images of the patient, not acquired by a scanner",
+        "ImageType": ["DERIVED", "SECONDARY", "", "0001"],  # a two-dimensional image
+        "Manufacturer": "SlicerUSSim", "ManufacturerModelName": "Simulator", "SoftwareVersions": __version__,
+        "BurnedInAnnotation": "YES", "LossyImageCompression": "00", "SequenceOfUltrasoundRegions": [_dataset(region)],
+        "SamplesPerPixel": 3, "PhotometricInterpretation": "RGB", "PlanarConfiguration": 0, "Rows": rows,
+        "Columns": columns, "BitsAllocated": 8, "BitsStored": 8, "HighBit": 7, "PixelRepresentation": 0,
+        "PixelData": pixels + b"\0" * (len(pixels) % 2),
+    }  # fmt: skip
+    if count > 1:
+        values |= {"NumberOfFrames": count, "FrameTime": f"{frame_ms:.6g}", "FrameIncrementPointer": 0x00181063}
+    data, buffer = _dataset(values), io.BytesIO()
+    data.file_meta = FileMetaDataset()
+    data.file_meta.TransferSyntaxUID = uid.ExplicitVRLittleEndian
     data.save_as(buffer, enforce_file_format=True)
     return buffer.getvalue()
+
+
+def _dataset(values: Mapping[str, object]):
+    from pydicom.dataset import Dataset
+
+    made = Dataset()
+    for name, value in values.items():
+        setattr(made, name, value)
+    return made

@@ -52,27 +52,16 @@ def frame_file(taken: TakenImage, suffix: str) -> bytes:
         return path.read_bytes()
 
 
-def of_images(images: Sequence[TakenImage]) -> str:
-    """What images are of, as JSON {"images": one for each, "presets": once each, by the images' "preset"}.
-
-    See TakenImage.about.
-    """
-    presets: list[Any] = []
-    about = [image.about() for image in images]
-    for one in about:
-        if one["preset"] not in presets[-1:]:
-            presets.append(one["preset"])
-        one["preset"] = len(presets) - 1
-    return json.dumps({"images": about, "presets": presets})
-
-
 def sequence_file(images: Sequence[tuple[float, TakenImage]]) -> bytes:
-    """Images with their times in s as a sequence metafile (.igs.mha), with their places in the MRI (RAS, mm)."""
+    """Images with their times in s as a sequence metafile (.igs.mha), with their places in the MRI (RAS, mm).
+
+    The file says what the last one is of (TakenImage.about).
+    """
     seconds, taken = zip(*images, strict=True)
     transforms = tuple(
         {"ImageToProbe": image.grid.image_to_probe, "ProbeToReference": image.probe_to_world} for image in taken
     )
-    fields = {SIMULATED: "cine", ABOUT: of_images(taken)}
+    fields = {SIMULATED: "cine", ABOUT: json.dumps(taken[-1].about())}
     with TemporaryDirectory() as folder:
         path = Path(folder) / "cine.igs.mha"
         TrackedSequence(np.stack([image.image for image in taken]), transforms, np.array(seconds), fields=fields).write(
