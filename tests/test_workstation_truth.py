@@ -307,7 +307,7 @@ def test_simulated_sequences_are_shown_and_played_where_they_were_taken(head_pag
         page.evaluate("number => window.trame.trigger('show_simulated', [number])", number)
         settled(page)
         image = page.evaluate("window.ussim.image")
-        assert image["sequence"] == number + 1 and page.locator("#frozen").inner_text() == "FROZEN"
+        assert image["sequence"] == number and page.locator("#frozen").inner_text() == "FROZEN"
         caption = page.locator("#image-caption").inner_text()
         assert caption.startswith(f"Sequence no. {number + 1}, head.nii.gz, ")
         np.testing.assert_allclose(image["pose"], recorded.transforms[number]["ProbeToReference"], atol=0.05)

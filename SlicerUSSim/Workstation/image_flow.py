@@ -144,7 +144,7 @@ def _texts(taken: TakenImage) -> ImageState:
     name = next((name.replace("_", " ") for name, known in PROBES.items() if known == probe), probe.kind)
     return ImageState(
         patient=taken.patient, time=f"{taken.time[11:19]} UTC", probe=name, frequency=f"{probe.received_mhz:g} MHz",
-        depth=f"{probe.depth_mm:g} mm", focus=f"{probe.focus_mm:g} mm" if probe.focus_mm else "",
+        depth=f"{probe.depth_mm:.4g} mm", focus=f"{probe.focus_mm:g} mm" if probe.focus_mm else "",
         gain=f"{display.gain_db:+g} dB", dynamic_range=f"{display.dynamic_range_db:g} dB",
     )  # fmt: skip
 
