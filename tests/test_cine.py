@@ -15,8 +15,7 @@ import pytest
 from PIL import Image
 
 from SlicerUSSim.Logic import SimulationError
-from SlicerUSSim.Logic.mri.samples import head_mri
-from SlicerUSSim.Logic.mri.segmentation import segment_mri
+from SlicerUSSim.Logic.imaging.noise import seed_of_pose
 from SlicerUSSim.Logic.probe.poses import turned
 from SlicerUSSim.Logic.tracked.sequence import TrackedSequence
 
@@ -25,7 +24,6 @@ pytest.importorskip("trame_slicer", reason="the workstation comes with: pip inst
 
 from trame_server.state import State  # noqa: E402
 
-from SlicerUSSim.Logic.mrml import image_logic  # noqa: E402
 from SlicerUSSim.Logic.mrml.nodes import node_to_world, set_node_to_world  # noqa: E402
 from SlicerUSSim.Workstation import cine as cine_module, image_flow  # noqa: E402
 from SlicerUSSim.Workstation.browser_panel import BrowserPanel, Observed  # noqa: E402
@@ -35,43 +33,31 @@ from SlicerUSSim.Workstation.export import sequence_file  # noqa: E402
 from SlicerUSSim.Workstation.image_flow import ImageFlow, LatencyStamps  # noqa: E402
 from SlicerUSSim.Workstation.state import SharedState  # noqa: E402
 from SlicerUSSim.Workstation.tasks import Tasks  # noqa: E402
-from tests.test_browser_parts import live_scene, run_in_loop  # noqa: E402
+from tests.test_browser_parts import head as head, live_scene, run_in_loop  # noqa: E402
 
 
 class Bench:
-    """Live images of a head and their cine, with views, comparison and tracker that take note of what they get."""
+    """Live images of a head and their cine; what else gets images takes note of poses only."""
 
     def __init__(self, head) -> None:
         self.errors: list[Exception] = []
         self.tasks = Tasks(self.errors.append)
-        self.logic, labels, self.probe, self.output = live_scene(head, self.tasks)
+        self.logic, labels, self.probe, output = live_scene(head, self.tasks)
         parameters = self.logic.parameters
-        parameters.labels, parameters.probe_transform, parameters.output = labels, self.probe, self.output
-        probe = replace(self.logic.preset.probe, scan_lines=64, depth_mm=60.0)
-        self.logic.preset = replace(self.logic.preset, probe=probe)
-        self.shared = SharedState(State(ready=True))
-        self.panel = BrowserPanel(self.shared, self.logic, self.tasks, lambda: None)
-        self.followed: list[np.ndarray] = []
+        parameters.labels, parameters.probe_transform, parameters.output = labels, self.probe, output
+        self.logic.preset = self.logic.preset.changed("probe", scan_lines=64, depth_mm=60.0)
+        self.shared, self.followed, nothing = SharedState(State(ready=True)), [], lambda *ignored: None
+        panel = BrowserPanel(self.shared, self.logic, self.tasks, nothing)
         views = SimpleNamespace(
-            show_image=lambda *ignored: None, hide_image=lambda: None, follow=lambda pose, _: self.followed.append(pose)
+            show_image=nothing, hide_image=nothing, follow=lambda pose, _: self.followed.append(pose)
         )
-        comparison = SimpleNamespace(
-            streams=(), show_at=lambda pose: False, stop=lambda: None, compare=lambda *ignored: None,
-            sees_nothing=lambda grid: None,
-        )  # fmt: skip
-        self.cine = Cine(self.panel, comparison, lambda pose: set_node_to_world(self.probe, pose))
+        comparison = SimpleNamespace(show_at=nothing, stop=nothing, compare=nothing, sees_nothing=nothing)
+        self.cine = Cine(panel, comparison, lambda pose: set_node_to_world(self.probe, pose))
         tracker = SimpleNamespace(is_on=False)
-        self.flow = ImageFlow(self.panel, views, comparison, self.cine, tracker, LatencyStamps())
+        self.flow = ImageFlow(panel, views, comparison, self.cine, tracker, LatencyStamps())
         self.node = Observed("ImageDataModifiedEvent", self.flow.image_changed)
-        self.node.watch(self.output)
-
-    @property
-    def image(self):
-        return self.shared.now.image
-
-    @property
-    def state(self):
-        return self.shared.now.cine
+        self.node.watch(output)
+        self.image, self.state = self.shared.now.image, self.shared.now.cine
 
     async def run(self, method, *arguments) -> None:
         self.tasks.start(lambda: method(*arguments))
@@ -79,18 +65,32 @@ class Bench:
             await asyncio.sleep(0.005)
         assert not self.errors and not self.shared.now.messages.errors
 
-    async def move(self, **angles) -> None:
-        await self.run(lambda: set_node_to_world(self.probe, turned(node_to_world(self.probe), **angles)))
+    async def move(self, rock_deg: float = 2.0) -> None:
+        await self.run(set_node_to_world, self.probe, turned(node_to_world(self.probe), rock_deg=rock_deg))
 
     async def display(self, **values) -> None:
-        await self.run(lambda: setattr(self.logic, "preset", self.logic.preset.changed("display", **values)))
+        self.logic.preset = self.logic.preset.changed("display", **values)
         await self.run(self.cine.follow_display)
 
-    async def frozen(self, images: int) -> None:
+    async def frozen(self, images: int, each=lambda: None) -> list:
         await self.run(self.cine.freeze)
         for _ in range(images - 1):
-            await self.move(rock_deg=2.0)
+            each()
+            await self.move()
         await self.run(self.cine.freeze)
+        return [kept.taken for kept in self.cine._kept]
+
+    def tell(self) -> tuple[str, str]:
+        self.flow.tell()
+        return self.image.status, self.image.differs
+
+
+@pytest.fixture
+def clock(monkeypatch):
+    clock = SimpleNamespace(now=0.0)
+    for module in (cine_module, image_flow):
+        monkeypatch.setattr(module, "perf_counter", lambda: clock.now)
+    return clock
 
 
 def on_bench(head, scenario):
@@ -105,65 +105,54 @@ def on_bench(head, scenario):
     run_in_loop(run)
 
 
-@pytest.fixture(scope="module")
-def head():
-    return segment_mri(head_mri(3.5), thin_sulci=True)
-
-
-def test_an_image_is_live_only_while_its_record_is_that_of_now(head, monkeypatch):
+def test_an_image_is_live_only_while_its_record_is_that_of_now(head, clock):
     """After Segment the image of before stood unmarked for 9 s."""
-    clock = SimpleNamespace(now=0.0)
-    monkeypatch.setattr(image_flow, "perf_counter", lambda: clock.now)
 
     async def scenario(bench) -> None:
-        bench.flow.tell()
-        assert bench.image.status == ""
+        assert bench.tell() == ("", "")
         await bench.run(bench.cine.freeze)
-        record = bench.logic.taken.preset
-        assert bench.image.status == "LIVE" and bench.image.depth == "60 mm" and bench.image.gain == "+0 dB"
-        assert bench.image.time == f"{bench.logic.taken.time[11:19]} UTC" and record.probe.depth_mm == 60.0
+        assert bench.image.status == "LIVE" and (bench.image.depth, bench.image.gain) == ("60 mm", "+0 dB")
         bench.logic.parameters.labels.GetImageData().Modified()  # as Segment writes them; no image has come yet
-        bench.flow.tell()
+        assert bench.tell() == ("LIVE", "")
         clock.now = 0.45
-        bench.flow.tell()
-        assert bench.image.status == "LIVE"
+        assert bench.tell() == ("LIVE", "")
         clock.now = 0.55
-        bench.flow.tell()
-        assert (bench.image.status, bench.image.differs) == ("OUTDATED", "tissues")
-        await bench.move(rock_deg=3.0)
+        assert bench.tell() == ("OUTDATED", "tissues")
+        await bench.move()
         assert (bench.image.status, bench.image.differs) == ("LIVE", "")
         await bench.run(bench.cine.freeze)
         assert (bench.image.status, bench.image.differs) == ("FROZEN", "")
         seen, pose = len(bench.followed), bench.logic.taken.probe_to_world
-        await bench.move(rock_deg=3.0)
-        bench.flow.tell()
-        assert (bench.image.status, bench.image.differs) == ("FROZEN", "pose")
+        await bench.move()
+        assert bench.tell() == ("FROZEN", "pose")
         assert all(np.array_equal(one, pose) for one in bench.followed[seen:])
+        outline, probe = bench.logic.parameters.outline, bench.logic.preset.probe
+        middle = (pose @ [0.0, probe.depth_mm, 0.0, 1.0])[:3]
+        lines = [outline.GetPolyData().GetPoint(n) for n in range(outline.GetPolyData().GetNumberOfPoints())]
+        assert outline.GetTransformNodeID() is None and min(np.linalg.norm(lines - middle, axis=1)) < 1.0
 
     on_bench(head, scenario)
 
 
-def test_frozen_images_are_shown_again_where_they_were_taken(head):
+def test_frozen_images_are_shown_and_played_where_they_were_taken(head):
     async def scenario(bench) -> None:
-        await bench.frozen(4)
-        taken = [kept.taken for kept in bench.cine._kept]
-        assert (bench.state.length, bench.state.index, bench.state.first, bench.state.last) == (4, 3, 0, 3)
+        taken, state = await bench.frozen(4), bench.state
+        assert (state.length, state.index, state.first, state.last) == (4, 3, 0, 3) and state.seconds > 0
         await bench.run(bench.cine.show, 1)
-        assert bench.state.index == 1 and np.array_equal(bench.logic.taken.image, taken[1].image)
+        assert state.index == 1 and np.array_equal(bench.logic.taken.image, taken[1].image)
         np.testing.assert_allclose(node_to_world(bench.probe), taken[1].probe_to_world, atol=1e-9)
         assert bench.image.status == "FROZEN" and bench.image.time == f"{taken[1].time[11:19]} UTC"
-        await bench.run(bench.cine.step, 1)
         await bench.run(bench.cine.step, 9)
-        assert bench.state.index == 3
+        assert state.index == 3
         bench.cine.trim(2, 1)
         await bench.run(bench.cine.play)
         indices = set()
         while len(indices) < 2:
-            indices.add(bench.state.index)
+            indices.add(state.index)
             await asyncio.sleep(0.005)
         await bench.run(bench.cine.freeze)
-        assert indices == {1, 2} and not bench.state.playing and bench.image.status == "LIVE"
-        assert (bench.state.length, bench.state.first, bench.state.last) == (5, 0, 4)
+        assert indices == {1, 2} and not state.playing and bench.image.status == "LIVE"
+        assert (state.length, state.first, state.last) == (5, 0, 4)
 
     on_bench(head, scenario)
 
@@ -172,20 +161,18 @@ def test_gain_acts_on_frozen_echoes_and_back_are_the_same_pixels(head):
     async def scenario(bench) -> None:
         await bench.frozen(2)
         kept = bench.logic.taken
-        assert kept.frame is not None
-        seed = image_logic.seed_of_pose(kept.frame.probe_to_ras)
         await bench.display(gain_db=6.0, depth_gain_7_db=8.0, grey_map="soft", persistence=0.5)
-        shown, display = bench.logic.taken, bench.logic.preset.display
-        assert bench.image.gain == "+6 dB" and shown.time == kept.time and bench.image.status == "FROZEN"
+        shown, display = bench.logic.taken, replace(bench.logic.preset.display, persistence=0.0)
+        assert (bench.image.gain, shown.time, bench.image.status) == ("+6 dB", kept.time, "FROZEN")
         simulator = bench.logic.patients.simulator(bench.logic.patients.imaged(bench.logic.parameters.labels))
-        now = simulator.simulate(kept.preset.probe, kept.frame.probe_to_ras, replace(display, persistence=0.0),
-                                 noise_seed=seed).image  # fmt: skip
+        pose = kept.frame.probe_to_ras
+        now = simulator.simulate(kept.preset.probe, pose, display, noise_seed=seed_of_pose(pose)).image
         off, change = np.abs(shown.image.astype(int) - now), np.abs(now.astype(int) - kept.image)
-        assert (off > 1).mean() < 1e-3 and (change > 10).mean() > 0.1  # at the end of lines, smoothing reaches behind
+        assert (off > 1).mean() < 1e-3 and (change > 10).mean() > 0.1  # smoothing reaches behind the end of lines
         await bench.run(bench.cine.step, -1)
         assert bench.image.gain == "+6 dB" and bench.logic.taken.time < kept.time
         await bench.run(bench.cine.step, 1)
-        await bench.move(rock_deg=5.0)
+        await bench.move()
         pose = node_to_world(bench.probe)
         await bench.display(gain_db=0.0, depth_gain_7_db=0.0, grey_map="linear")
         assert np.array_equal(bench.logic.taken.image, kept.image) and bench.image.gain == "+0 dB"
@@ -194,48 +181,35 @@ def test_gain_acts_on_frozen_echoes_and_back_are_the_same_pixels(head):
     on_bench(head, scenario)
 
 
-def test_a_cine_has_ten_seconds_and_a_bounded_memory(head, monkeypatch):
-    clock = SimpleNamespace(now=0.0)
-    monkeypatch.setattr(cine_module, "perf_counter", lambda: clock.now)
-
+def test_a_cine_has_ten_seconds_and_a_bounded_memory(head, clock, monkeypatch):
     async def scenario(bench) -> None:
-        await bench.run(bench.cine.freeze)
-        for _ in range(6):
-            clock.now += 3.0
-            await bench.move(rock_deg=1.0)
-        assert [kept.seconds for kept in bench.cine._kept] == [9.0, 12.0, 15.0, 18.0]
-        size = bench.logic.lastFrame.iq.nbytes // 2 + bench.logic.taken.image.nbytes
+        await bench.frozen(7, lambda: setattr(clock, "now", clock.now + 3.0))
+        kept = bench.cine._kept
+        assert [one.seconds for one in kept] == [9.0, 12.0, 15.0, 18.0] and bench.state.seconds == 9.0
+        size = kept[0].echoes.parts.nbytes + kept[0].taken.image.nbytes
+        assert bench.logic.lastFrame.iq.nbytes == 2 * kept[0].echoes.parts.nbytes
         monkeypatch.setattr(cine_module, "_MOST_BYTES", 2 * size)
-        await bench.move(rock_deg=1.0)
-        assert [kept.seconds for kept in bench.cine._kept] == [18.0, 18.0]
-        assert 0.4 < bench.cine._kept[0].echoes.parts.nbytes / size < 1.0
+        assert len(await bench.frozen(2)) == 2
         bench.logic.preset = bench.logic.preset.changed("probe", depth_mm=50.0)
-        await bench.move(rock_deg=1.0)
-        assert {kept.taken.grid.rows * kept.taken.grid.pixel_spacing_mm[1] for kept in bench.cine._kept} == {50.0}
+        assert {one.preset.probe.depth_mm for one in await bench.frozen(2)} == {50.0}
 
     on_bench(head, scenario)
 
 
-def test_a_line_over_time_and_a_sequence_of_the_cine(head, tmp_path, monkeypatch):
-    clock, sent = SimpleNamespace(now=0.0), []
-    monkeypatch.setattr(cine_module, "perf_counter", lambda: clock.now)
+def test_a_line_over_time_and_the_cine_as_a_sequence(head, clock, tmp_path, monkeypatch):
+    sent = []
 
     async def scenario(bench) -> None:
         monkeypatch.setattr(bench.cine.mmode, "send", lambda image, **about: sent.append((image, about)))
-        await bench.run(bench.cine.freeze)
-        for _ in range(2):
-            clock.now += 2.0
-            await bench.move(rock_deg=4.0)
-        await bench.run(bench.cine.freeze)
-        taken = [kept.taken for kept in bench.cine._kept]
+        taken = await bench.frozen(3, lambda: setattr(clock, "now", clock.now + 2.0))
         grid = taken[0].grid
-        column, (dx, dy), top = grid.columns // 2, grid.pixel_spacing_mm, grid.top_mm
-        x = grid.left_mm + (column + 0.5) * dx
-        bench.cine.draw_mmode([x, top + 0.5 * dy, x, top + (grid.rows - 0.5) * dy])
+        (dx, dy), column = grid.pixel_spacing_mm, grid.columns // 2
+        x, y = grid.left_mm + (column + 0.5) * dx, grid.top_mm + 0.5 * dy
+        bench.cine.draw_mmode([x, y, x, y + (grid.rows - 1) * dy])
         image, about = sent[-1]
-        assert about["ruler"]["w"] == 4.0 and about["ruler"]["h"] == pytest.approx((grid.rows - 1) * dy)
-        for at, one in ((0, taken[0]), (image.shape[1] // 2 + 1, taken[1]), (-1, taken[2])):
-            down = np.linspace(0, grid.rows - 1, len(image)).round().astype(int)
+        assert about["ruler"] == {"w": 4.0, "h": pytest.approx((grid.rows - 1) * dy)}
+        down = np.linspace(0, grid.rows - 1, len(image)).round().astype(int)
+        for at, one in zip((0, image.shape[1] // 2 + 1, -1), taken, strict=True):
             assert np.abs(image[:, at].astype(int) - one.image[down, column]).mean() < 4
         bench.cine.draw_mmode(None)
         bench.cine.draw_mmode([0.0, 0.0, float("nan"), 1.0])
@@ -244,11 +218,10 @@ def test_a_line_over_time_and_a_sequence_of_the_cine(head, tmp_path, monkeypatch
         path = tmp_path / "cine.igs.mha"
         path.write_bytes(sequence_file(list(bench.cine.displayed(lambda share: None))))
         read = TrackedSequence.read(path)
-        assert read.is_simulated and read.timestamps.tolist() == [0.0, 2.0] and len(read) == 2
+        assert read.is_simulated and read.timestamps.tolist() == [0.0, 2.0]
         np.testing.assert_array_equal(read.images[1], taken[2].image)
-        np.testing.assert_allclose(
-            read.pose(1, "ImageToReference"), taken[2].probe_to_world @ grid.image_to_probe, atol=1e-5
-        )
+        place = taken[2].probe_to_world @ grid.image_to_probe
+        np.testing.assert_allclose(read.pose(1, "ImageToReference"), place, atol=1e-5)
         assert json.loads(read.fields["SlicerUSSim"])["images"][0]["time"] == taken[1].time
 
     on_bench(head, scenario)

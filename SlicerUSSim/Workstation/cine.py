@@ -98,6 +98,8 @@ class Cine:
             self._set(first=0, last=last, index=last if source == LIVE else min(now.index, last))
         is_playing = now.playing and length > 0 and not is_live
         self._set(source=source, sequence_length=count, length=length, playing=is_playing)
+        if source == LIVE and length:
+            self._set(seconds=round(self._kept[now.index].seconds - self._kept[0].seconds, 2))
 
     # ---- requests of pages -------------------------------------------------------------------------------------
 

@@ -63,9 +63,9 @@ class RealImages:
 
         _, mask = self.on_grid(0, grid)
         lines = find_contours(np.pad(mask, 1).astype(float), 0.5)
-        (dx, dy), points = grid.pixel_spacing_mm, [approximate_polygon(line, 0.7) - 0.5 for line in lines]
-        paths = (" ".join(f"{grid.left_mm + dx * x:.2f},{grid.top_mm + dy * y:.2f}" for y, x in line) for line in points)
-        return " ".join(f"M {path} Z" for path in paths)
+        scale, first = np.array(grid.pixel_spacing_mm), np.array([grid.left_mm, grid.top_mm])
+        shapes = [first + scale * (approximate_polygon(line, 0.7)[:, ::-1] - 0.5) for line in lines]
+        return " ".join("M " + " ".join(f"{x:.2f},{y:.2f}" for x, y in shape) + " Z" for shape in shapes)
 
     def compared(self, place: int, simulated: np.ndarray, grid: ImageGrid) -> Similarity:
         """The paper's cost between a simulated image and the real image with this index."""
@@ -127,7 +127,7 @@ class Comparison:
         self._use(RealImages(tracked), browser_node, number)
 
     def view(self, images: np.ndarray, number: int = 0) -> None:
-        """Show images (n, rows, columns) whose place is not known, beside the simulated ones, from index `number` on."""
+        """Show images (n, rows, columns) whose place is not known beside the simulated ones, that of index `number`."""
         self._use(LooseImages(images), None, number)
 
     def _use(self, real: RealImages | LooseImages, browser_node: Any, number: int) -> None:
@@ -187,8 +187,10 @@ class Comparison:
         """Show the best image of a fit, at most twice a second; called in its thread, and with None at its end."""
         if step is None:
             self._tell(lambda: self._show_best(None, ""))
-        elif step.image is not None and step.best_cost != self._best[0] and perf_counter() > self._best[1] + _BEST_EVERY_S:
-            self._best, image = (step.best_cost, perf_counter()), step.image()
+            return
+        is_new, seconds = step.best_cost != self._best[0], perf_counter()
+        if step.image is not None and is_new and seconds > self._best[1] + _BEST_EVERY_S:
+            self._best, image = (step.best_cost, seconds), step.image()
             words = f"Best after {step.evaluations} evaluations: image {step.number}, cost {step.best_cost:.3f}"
             self._tell(lambda: self._show_best(image, words))
 

@@ -265,7 +265,8 @@ def _screens(keys: tuple[str, ...]) -> str:
             words=f'<div class="ussim-corner" id="image-values">{lines}</div>',
         )
         + screen.format(
-            name="real", frame=frame.replace(">", f' v-show="{NAMES.sequence.is_placed}">', 1), more=f'v-show="{there} && {beside}"', canvas='<canvas data-stream="real"></canvas>',
+            name="real", frame=frame.replace(">", f' v-show="{NAMES.sequence.is_placed}">', 1),
+            more=f'v-show="{there} && {beside}"', canvas='<canvas data-stream="real"></canvas>',
             words=f'<div class="ussim-corner">Real, {{{{ {NAMES.sequence.name} }}}}</div>',
         )
         + screen.format(

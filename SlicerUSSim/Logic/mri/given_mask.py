@@ -119,8 +119,9 @@ def follows(mri: Volume, labels: Volume) -> bool:
 def _exactly(mri: Volume, labels: Volume) -> Volume:
     """An image on the grid of labels in which every tissue has its mean intensity in an MRI, and all else the least."""
     to_mri = mri.ras_to_ijk @ labels.ijk_to_ras
+    first = cast(float, to_mri[2::-1, 3])  # annotated as a number, takes one for each axis
     found = ndimage.affine_transform(
-        mri.array, to_mri[2::-1, 2::-1], to_mri[2::-1, 3], labels.array.shape, np.float32, order=0, mode="nearest"
+        mri.array, to_mri[2::-1, 2::-1], first, labels.array.shape, np.float32, order=0, mode="nearest"
     )
     names, numbers = np.unique(labels.array, return_inverse=True)
     means = np.bincount(numbers.ravel(), found.ravel()) / np.bincount(numbers.ravel())
