@@ -304,8 +304,8 @@ def _player() -> str:
       @click="trigger('cine_play')"><i class="mdi" :class="{cine.playing} ? 'mdi-pause' : 'mdi-play'"></i></button>
       <input type="range" id="cine-slider" min="0" :max="{cine.length} - 1" step="1" :value="{cine.index}"
       aria-label="Image of the cine" @input="trigger('cine_show', [Number($event.target.value)])">
-      <span id="cine-text">{{{{ {cine.source} === 'live' ? {cine.index} + 1 + ' of ' + {cine.length} : 'Simulated image ' +
-      {cine.index} + ' (0 to ' + ({cine.length} - 1) + ')' }}}}, {{{{ {cine.seconds}.toFixed(1) }}}} s
+      <span id="cine-text">{{{{ {cine.source} === 'live' ? {cine.index} + 1 + ' of ' + {cine.length} :
+      'Simulated image ' + {cine.index} + ' (0 to ' + ({cine.length} - 1) + ')' }}}}, {{{{ {cine.seconds}.toFixed(1) }}}} s
       </span>
       <button class="ussim-button" id="cine-from" title="The cine begins here"
       @click="trigger('cine_trim', [{cine.index}, {cine.last}])">[ From</button>
@@ -320,8 +320,8 @@ def _player() -> str:
 def _foot() -> str:
     messages, percent = NAMES.messages, NAMES.messages.progress_percent
     return f"""<span v-if="{messages.progress_title}" id="progress">{{{{ {messages.progress_title} }}}}
-      {{{{ {percent} ? {percent} + ' %' : '…' }}}} {{{{ {messages.progress_s} }}}} s <progress :value="{percent} || undefined" max="100"
-      aria-label="Progress"></progress> <button class="ussim-button" id="cancel" @click="trigger('cancel')">Cancel
+      {{{{ {percent} ? {percent} + ' %' : '…' }}}} {{{{ {messages.progress_s} }}}} s
+      <progress :value="{percent} || undefined" max="100" aria-label="Progress"></progress> <button class="ussim-button" id="cancel" @click="trigger('cancel')">Cancel
       </button></span>
       <span id="upload" hidden><span id="upload-text"></span>
       <button id="upload-cancel" class="ussim-button">Cancel</button></span>
