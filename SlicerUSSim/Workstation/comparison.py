@@ -183,27 +183,21 @@ class Comparison:
                 with self._shared.changing() as now:
                     now.sequence.box, now.sequence.mask = box, real.outline(grid)
 
-    def follow(self, step: Progress | None) -> None:
-        """Show the best image of a fit, at most twice a second; called in its thread, and with None at its end."""
-        if step is None:
-            self._tell(lambda: self._show_best(None, ""))
-            return
+    def follow(self, step: Progress) -> None:
+        """Show the best image of a fit, at most twice a second; called in its thread."""
         is_new, seconds = step.best_cost != self._best[0], perf_counter()
         if step.image is not None and is_new and seconds > self._best[1] + _BEST_EVERY_S:
             self._best, image = (step.best_cost, seconds), step.image()
             words = f"Best after {step.evaluations} evaluations: image {step.number}, cost {step.best_cost:.3f}"
             self._tell(lambda: self._show_best(image, words))
 
-    def _show_best(self, image: np.ndarray | None, words: str) -> None:
+    def _show_best(self, image: np.ndarray, words: str) -> None:
         real, grid = self._real, self._grid
-        if image is None:
-            self._best = (inf, 0.0)
-            self.streams[2].clear()
-        elif isinstance(real, RealImages) and grid is not None and image.shape == real.tracked.mask.shape:
+        if isinstance(real, RealImages) and grid is not None and image.shape == real.tracked.mask.shape:
             placed = Volume(image[None].astype(np.float32), real.tracked.grid.slice_to_probe)
             self.streams[2].send(slice_under_probe(placed, grid, np.eye(4)).round().astype(np.uint8))
-        with self._shared.changing() as now:
-            now.fit.best = words
+            with self._shared.changing() as now:
+                now.fit.best = words
 
     def compare_next(self) -> None:
         """Compare in the next way of ComparisonMode."""

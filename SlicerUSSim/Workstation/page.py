@@ -270,7 +270,8 @@ def _screens(keys: tuple[str, ...]) -> str:
             words=f'<div class="ussim-corner">Real, {{{{ {NAMES.sequence.name} }}}}</div>',
         )
         + screen.format(
-            name="best", frame="", more=f'v-show="{NAMES.fit.best}"', canvas='<canvas data-stream="best"></canvas>',
+            name="best", frame="", canvas='<canvas data-stream="best"></canvas>',
+            more=f'v-show="{NAMES.fit.best} && {NAMES.messages.progress_title} === `Fit`"',
             words=f'<div class="ussim-corner" id="best-caption">{{{{ {NAMES.fit.best} }}}}</div>',
         )
         + screen.format(
