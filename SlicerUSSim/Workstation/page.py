@@ -322,8 +322,8 @@ def _foot() -> str:
     messages, percent = NAMES.messages, NAMES.messages.progress_percent
     return f"""<span v-if="{messages.progress_title}" id="progress">{{{{ {messages.progress_title} }}}}
       {{{{ {percent} ? {percent} + ' %' : '…' }}}} {{{{ {messages.progress_s} }}}} s
-      <progress :value="{percent} || undefined" max="100" aria-label="Progress"></progress> <button class="ussim-button" id="cancel" @click="trigger('cancel')">Cancel
-      </button></span>
+      <progress :value="{percent} || undefined" max="100" aria-label="Progress"></progress>
+      <button class="ussim-button" id="cancel" @click="trigger('cancel')">Cancel</button></span>
       <span id="upload" hidden><span id="upload-text"></span>
       <button id="upload-cancel" class="ussim-button">Cancel</button></span>
       <span id="status">{{{{ {messages.status} }}}}</span>
