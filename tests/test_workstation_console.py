@@ -120,6 +120,58 @@ def test_the_image_has_most_of_the_window_and_nothing_is_cut(page, size):
     assert page.evaluate("[document.documentElement.scrollWidth, document.documentElement.scrollHeight]") == list(size)
 
 
+def area(page, selector: str) -> float:
+    box = page.locator(selector).bounding_box()
+    return 0.0 if box is None else box["width"] * box["height"]
+
+
+def test_views_fold_fill_the_column_and_change_places_with_the_image(page):
+    names = ("#view-ThreeD", "#view-Red", "#view-Green")
+    before = {name: area(page, name) for name in (*names, ".ussim-stage")}
+    assert min(before.values()) > 10_000
+    click(page, "#fold")
+    assert [area(page, name) for name in names] == [0.0] * 3 and area(page, ".ussim-stage") > before[".ussim-stage"]
+    click(page, "#fold")
+    click(page, "#max-Green")
+    assert area(page, "#view-Green") > 2.9 * before["#view-Green"] and area(page, "#view-Red") == 0.0
+    click(page, "#swap-Green")
+    assert area(page, "#view-Green") == pytest.approx(before[".ussim-stage"], rel=0.01)
+    assert area(page, ".ussim-stage") == pytest.approx(before["#view-Green"], rel=0.01)
+    click(page, "#swap-Green")
+    assert {name: area(page, name) for name in before} == pytest.approx(before)
+
+
+def test_the_point_under_the_mouse_is_told_and_marked_in_all_views(page):
+    page.mouse.move(*at(page, 5.0, 20.0))  # in the fluid
+    eventually(page, lambda: state(page, NAMES.views.under_mouse) != "")
+    page.mouse.move(*at(page, 6.0, 20.0))
+    told = "csf, R 6 A 0 S 20, 20.0 mm deep"
+    eventually(page, lambda: state(page, NAMES.views.under_mouse).replace("P 0", "A 0") == told)
+    assert page.locator("#under-mouse").inner_text().startswith("csf")
+    assert set(state(page, NAMES.views.cross)) == {"ThreeD", "Red", "Green"}
+    place = state(page, NAMES.views.cross)["Red"]
+    assert place[2] == pytest.approx(0.0, abs=1e-3) and page.locator("#view-Red .ussim-cross").count() == 1
+    box = page.locator("#view-Red").bounding_box()
+    page.mouse.move(box["x"] + place[0] * box["width"], box["y"] + place[1] * box["height"])
+    eventually(page, lambda: "image" in state(page, NAMES.views.cross))  # the same point from the other side
+    ruler, (across, down, _) = page.evaluate("window.ussim.image.ruler"), state(page, NAMES.views.cross)["image"]
+    assert ruler["x"] + across * ruler["w"] == pytest.approx(6.0, abs=0.6)
+    assert ruler["y"] + down * ruler["h"] == pytest.approx(20.0, abs=0.6)
+    assert state(page, NAMES.views.letters)["Red"] == ["L", "R", "S", "I"]
+    page.mouse.move(5, 5)
+    eventually(page, lambda: state(page, NAMES.views.under_mouse) == "" and not state(page, NAMES.views.cross))
+
+
+def test_the_tissue_table_fits_into_its_drawer(page):
+    open_section(page, "Tissues")
+    size = page.evaluate(
+        """() => { const [table, drawer] = ['.ussim-table', '#drawer'].map((name) => document.querySelector(name));
+        return [table.scrollWidth, table.getBoundingClientRect().right, drawer.scrollWidth,
+          drawer.getBoundingClientRect().right, drawer.clientWidth]; }"""
+    )
+    assert 0 < size[0] <= size[4] and size[1] <= size[3] and size[2] <= size[4]
+
+
 @pytest.mark.slow
 def test_a_caliper_across_the_fluid_reads_its_thickness(page):
     """The edges are where the mean of the lines crosses half of the level beside them."""

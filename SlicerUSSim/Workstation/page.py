@@ -265,11 +265,13 @@ def _screens(keys: tuple[str, ...]) -> str:
             words=f'<div class="ussim-corner" id="image-values">{lines}</div>',
         )
         + screen.format(
-            name="real", frame=frame, more=f'v-show="{there} && {beside}"', canvas='<canvas data-stream="real"></canvas>',
+            name="real", frame=frame.replace(">", f' v-show="{NAMES.sequence.is_placed}">', 1),
+            more=f'v-show="{there} && {beside}"', canvas='<canvas data-stream="real"></canvas>',
             words=f'<div class="ussim-corner">Real, {{{{ {NAMES.sequence.name} }}}}</div>',
         )
         + screen.format(
-            name="best", frame="", more=f'v-show="{NAMES.fit.best}"', canvas='<canvas data-stream="best"></canvas>',
+            name="best", frame="", canvas='<canvas data-stream="best"></canvas>',
+            more=f'v-show="{NAMES.fit.best} && {NAMES.messages.progress_title} === `Fit`"',
             words=f'<div class="ussim-corner" id="best-caption">{{{{ {NAMES.fit.best} }}}}</div>',
         )
         + screen.format(
@@ -303,8 +305,8 @@ def _player() -> str:
       @click="trigger('cine_play')"><i class="mdi" :class="{cine.playing} ? 'mdi-pause' : 'mdi-play'"></i></button>
       <input type="range" id="cine-slider" min="0" :max="{cine.length} - 1" step="1" :value="{cine.index}"
       aria-label="Image of the cine" @input="trigger('cine_show', [Number($event.target.value)])">
-      <span id="cine-text">{{{{ {cine.source} === 'live' ? {cine.index} + 1 + ' of ' + {cine.length} : 'Simulated image ' +
-      {cine.index} + ' (0 to ' + ({cine.length} - 1) + ')' }}}}, {{{{ {cine.seconds}.toFixed(1) }}}} s
+      <span id="cine-text">{{{{ {cine.source} === 'live' ? {cine.index} + 1 + ' of ' + {cine.length} :
+      'Simulated image ' + {cine.index} + ' (0 to ' + ({cine.length} - 1) + ')' }}}}, {{{{ {cine.seconds}.toFixed(1) }}}} s
       </span>
       <button class="ussim-button" id="cine-from" title="The cine begins here"
       @click="trigger('cine_trim', [{cine.index}, {cine.last}])">[ From</button>
@@ -319,9 +321,9 @@ def _player() -> str:
 def _foot() -> str:
     messages, percent = NAMES.messages, NAMES.messages.progress_percent
     return f"""<span v-if="{messages.progress_title}" id="progress">{{{{ {messages.progress_title} }}}}
-      {{{{ {percent} ? {percent} + ' %' : '…' }}}} {{{{ {messages.progress_s} }}}} s <progress :value="{percent} || undefined" max="100"
-      aria-label="Progress"></progress> <button class="ussim-button" id="cancel" @click="trigger('cancel')">Cancel
-      </button></span>
+      {{{{ {percent} ? {percent} + ' %' : '…' }}}} {{{{ {messages.progress_s} }}}} s
+      <progress :value="{percent} || undefined" max="100" aria-label="Progress"></progress>
+      <button class="ussim-button" id="cancel" @click="trigger('cancel')">Cancel</button></span>
       <span id="upload" hidden><span id="upload-text"></span>
       <button id="upload-cancel" class="ussim-button">Cancel</button></span>
       <span id="status">{{{{ {messages.status} }}}}</span>
