@@ -738,7 +738,7 @@ def test_closing_the_scene_and_leaving_the_module_is_survived(session):
 
 
 def test_visits_of_the_module_leave_no_observers_behind(session):
-    """The typed node of each visit went on reading all values: after 20 visits a change took four times as long."""
+    """The typed node of each visit went on reading all values: after 20 visits a change took 8 times as long."""
     for _ in range(3):
         session.widget.exit()
         session.widget.enter()
