@@ -174,24 +174,22 @@ def test_the_tissue_table_fits_into_its_drawer(page):
 
 @pytest.mark.slow
 def test_a_caliper_across_the_fluid_reads_its_thickness(page):
-    """The edges are where the mean of the lines crosses half of the level beside them."""
+    """From wall to wall: the echoes of its two surfaces are the brightest rows of the picture near them."""
     page.keyboard.press("f")
     status(page, "FROZEN")
-    image = pixels(page).astype(float)
-    ruler = page.evaluate("window.ussim.image.ruler")
-    profile = image[:, image.shape[1] // 4 : -image.shape[1] // 4].mean(axis=1)
-    depth = ruler["y"] + (np.arange(len(profile)) + 0.5) * ruler["h"] / len(profile)
-    level = profile[(depth > 5) & (depth < 9)].mean()
-    dark = depth[(profile < 0.5 * level) & (depth > 5) & (depth < 35)]
-    assert dark.min() == pytest.approx(FLUID_MM[0], abs=0.3) and dark.max() == pytest.approx(FLUID_MM[1], abs=0.3)
+    ruler, image = page.evaluate("window.ussim.image.ruler"), pixels(page).astype(float)
+    rows = image[:, image.shape[1] // 4 : -image.shape[1] // 4].mean(axis=1)
+    depth = ruler["y"] + (np.arange(len(rows)) + 0.5) * ruler["h"] / len(rows)
+    walls = [float(depth[np.argmax(np.where(np.abs(depth - wall) < 1.5, rows, 0.0))]) for wall in FLUID_MM]
+    assert walls == pytest.approx(FLUID_MM, abs=0.3)
     page.mouse.move(*at(page, 0.0, 20.0))
     page.keyboard.down("Control")
     page.mouse.wheel(0, -100)  # zoomed in, it reads the same
     page.keyboard.up("Control")
     eventually(page, lambda: page.evaluate("window.ussimScreens.view.zoom") > 1.1)
     page.keyboard.press("m")
-    page.mouse.click(*at(page, 0.0, float(dark.min())))
-    page.mouse.click(*at(page, 0.0, float(dark.max())))
+    page.mouse.click(*at(page, 0.0, walls[0]))
+    page.mouse.click(*at(page, 0.0, walls[1]))
     eventually(page, lambda: len(words(page)) == 1)
     assert float(words(page)[0].split()[0]) == pytest.approx(FLUID_MM[1] - FLUID_MM[0], abs=0.3)
     page.keyboard.press("0")
@@ -230,9 +228,10 @@ def test_frozen_echoes_take_gain_and_the_cine_goes_back(page):
         page.evaluate("window.trame.trigger('set', ['gainSlider', 0])")
     assert np.array_equal(pixels(page), last)  # an unchanged display shows the very same pixels
     status(page, "FROZEN")
-    page.keyboard.press("f")
+    with new_image(page):
+        page.keyboard.press("f")
     status(page, "LIVE")
-    assert page.evaluate("window.ussim.image.pose") != pose and not errors(page)
+    assert not errors(page)
 
 
 @pytest.mark.slow
