@@ -252,7 +252,7 @@ def test_the_example_writes_a_twin_that_optimize_reads(mni, tmp_path, monkeypatc
     assert "tracked.igs.mha" in capsys.readouterr().err
     done = ussim(
         "optimize", tmp_path / "labels.nii.gz", "--sequence", tmp_path / "tracked.igs.mha", "--probe",
-        tmp_path / "probe.json", "--frames", "1", "--free", "display", "--set", "fit.evaluations=30",
+        tmp_path / "probe.json", "--frames", "1", "--free", "display", "--set", "fit.evaluations=42",
         "--set", "fit.restarts=0", "-o", tmp_path / "result.json",
     )  # fmt: skip
     assert done.exit_code == 0, done.output
