@@ -272,7 +272,8 @@ class USSimWidget(ScriptedLoadableModuleWidget, VTKObservationMixin):
         """Ensure that the scene has a parameter node and that the panel shows it."""
         if self.logic is None:
             return  # the panel could not be created yet
-        self.setParameterNode(self.logic.getParameterNode())
+        # Not the typed node, which observes each of its values: addObserver would keep that of every visit.
+        self.setParameterNode(self.logic.getParameterNode().parameterNode)
         if self.panel is not None:
             self.panel.presenter.chooseDefaultNodes()
 
@@ -362,19 +363,18 @@ class USSimTest(ScriptedLoadableModuleTest):
         self.assertGreater(before.mean(), 5)
 
         self.delayDisplay("Move the probe")
-        moved = vtk.vtkTransform()
-        moved.SetMatrix(probe.GetMatrixTransformToParent())
-        moved.Translate(0, 0, 5)
-        probe.SetMatrixTransformToParent(moved.GetMatrix())
+        moved = np.eye(4)
+        moved[2, 3] = 5.0
+        pose = slicer.util.arrayFromTransformMatrix(probe) @ moved
+        slicer.util.updateTransformMatrixFromArray(probe, pose)
         self.assertTrue((slicer.util.arrayFromVolume(output) != before).mean() > 0.1)
         logic.stopLiveUpdate()
         self.assertFalse(logic.isLive)
 
         self.delayDisplay("Sweep along a line")
-        here = np.array(probe.GetMatrixTransformToParent().MultiplyPoint((0, 0, 0, 1)))[:3]
         path = slicer.mrmlScene.AddNewNodeByClass("vtkMRMLMarkupsLineNode", "Path")
         for step in (-3.0, 3.0):
-            path.AddControlPointWorld(*(here + [0, step, 0]))
+            path.AddControlPointWorld(*(pose[:3, 3] + [0, step, 0]))
         browser, transforms = logic.followPath(labels, path)
         images = slicer.mrmlScene.AddNewNodeByClass("vtkMRMLSequenceNode", "Images")
         self.assertGreater(logic.simulateSequence(labels, transforms, images, browser_node=browser), 4)

@@ -278,7 +278,7 @@ def parameter_node_wrapper(cls):
     cls.__init__ = init
     cls.AddObserver = lambda self, *arguments: self.parameterNode.AddObserver(*arguments)
     cls.RemoveObserver = lambda self, tag: self.parameterNode.RemoveObserver(tag)
-    cls.names = tuple(hints)
+    cls.allParameters = hints
     return cls
 
 

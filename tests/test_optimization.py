@@ -23,6 +23,7 @@ from SlicerUSSim.Logic import (
     segment_mri,
 )
 from SlicerUSSim.Logic.fitting.appearance import AppearanceModel
+from SlicerUSSim.Logic.fitting.fit_settings import FitSettings
 from SlicerUSSim.Logic.fitting.identifiability import variance_db
 from SlicerUSSim.Logic.fitting.image_similarity import SimilaritySettings
 from SlicerUSSim.Logic.fitting.optimization import (
@@ -190,6 +191,25 @@ def test_a_restart_that_stopped_above_the_fit_goes_on_along_its_axes():
     assert min(len(stage) for stage in stages) < 0.5 * max(len(stage) for stage in stages)
     as_good, stages = restarted_in_a_curved_valley(12)
     assert as_good < 4 and all(len(stage) <= 12 for stage in stages)
+
+
+def test_a_fit_takes_the_evaluations_that_are_given_and_shows_its_best_image(twin):
+    """It took more than twice as many: those of restarts came on top."""
+    settings, shown = FitSettings(evaluations=80, restarts=2), []
+
+    def told(step):
+        assert step.evaluations <= step.limit <= settings.evaluations
+        if step.stage == "polish":
+            shown.append((step.best_cost, step.image()))
+
+    found = optimise(twin, ["gain_db", "white matter"], max_evaluations=settings.of_search, restarts=2, progress=told)
+    assert settings.of_search < found.evaluations <= settings.evaluations
+    cost, image = min(shown, key=lambda entry: entry[0])
+    assert {entry.stage for entry in found.history} >= {"restart 1", "restart 2"}
+    with twin.simulator.with_tissues(found.tissues):
+        frame = twin.simulator.simulate(twin.probe, twin.poses[0], found.display)
+    difference = np.abs(frame.image.astype(float) - image)
+    assert image.dtype == np.uint8 and (found.cost_after < cost or difference.mean() < 2.0)
 
 
 def test_the_last_search_sees_what_whole_simulations_show(twin):

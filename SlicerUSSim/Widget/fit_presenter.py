@@ -33,8 +33,8 @@ class FitPresenter:
         self._before: Preset | None = None  # the preset that Apply replaced
         #: Result of the last fit, as text
         self.summary = ""
-        #: Called in the thread of a fit with its progress, and with None at its end
-        self.following: Callable[[Progress | None], None] = lambda step: None
+        #: Called in the thread of a fit with its progress
+        self.following: Callable[[Progress], None] = lambda step: None
 
     def forget(self) -> None:
         """Forget the last fit, which is of another patient."""
@@ -93,15 +93,12 @@ class FitPresenter:
                 progress(step.share)
 
             labels, settings = parameters.labels, parameters.fit
-            try:
-                found = panel.logic.optimize(
-                    labels, parameters.real, probe_transform_node=parameters.probe_transform, frames=self._frames(),
-                    validate=self._predicted(), free=free, register=settings.register,
-                    speckle=settings.speckle, estimate_geometry=settings.estimate,
-                    max_evaluations=settings.of_search, restarts=settings.restarts, plot=plot, progress=report,
-                )  # fmt: skip
-            finally:
-                self.following(None)
+            found = panel.logic.optimize(
+                labels, parameters.real, probe_transform_node=parameters.probe_transform, frames=self._frames(),
+                validate=self._predicted(), free=free, register=settings.register,
+                speckle=settings.speckle, estimate_geometry=settings.estimate, max_evaluations=settings.of_search,
+                restarts=settings.restarts, plot=plot, progress=report,
+            )  # fmt: skip
             self._fit, self._before = (found, labels), None
             self.summary = _in_words(found)
             panel.view.showStatus("")

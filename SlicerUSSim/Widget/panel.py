@@ -228,7 +228,8 @@ class Panel:
     def nodeGone(self) -> None:
         """Called after a node was removed from the scene."""
         self._removed = None
-        self.refresh()
+        if self.isConnected:  # else it is shown anew later; a closing scene removes all nodes, one by one
+            self.refresh()
 
     def _set_value(self, control: Control, widget: Any) -> None:
         self.presenter.values.setValue(control.value, widget.property(_property_of(widget)))

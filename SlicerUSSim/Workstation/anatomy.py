@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -82,17 +83,20 @@ class AnatomyViews:
                     interactive_quality=75, rca_event_throttle_s=_EVENTS_EVERY_S,
                 )
             )  # fmt: skip
-        made = [ViewLayoutDefinition.threed_view(name=THREED), ViewLayoutDefinition.axial_view()]
-        made.append(ViewLayoutDefinition.coronal_view())  # Red and Green of Slicer
-        for view in made:
-            app.view_manager.create_view(view)
-        app.view_manager.set_current_view_ids([view.singleton_tag for view in made])
+        definition = ViewLayoutDefinition
+        for made in (
+            definition.threed_view(),
+            definition.axial_view(),
+            definition.coronal_view(),
+        ):  # ThreeD, Red, Green
+            app.view_manager.create_view(made)
+        app.view_manager.set_current_view_ids([THREED, *SLICE_VIEWS])
         # Without a GPU these cost more than all other rendering, and depth peeling hides translucent objects.
         for view in (self.threed, *self.slices):
             view.render_window().SetMultiSamples(0)
         for view in self.slices:
             self._stand_in_plane(view)
-            view.interactor().AddObserver(vtkCommand.WindowResizeEvent, self._on_resize(view))
+            view.interactor().AddObserver(vtkCommand.WindowResizeEvent, partial(self._fit_soon, view))
             _node(view).SetRulerType(_node(view).RulerTypeThin)
             _node(view).AddObserver(vtkCommand.ModifiedEvent, lambda *_: self.turned())
         threed = _node(self.threed)
@@ -103,11 +107,8 @@ class AnatomyViews:
         self.threed.renderer().SetUseDepthPeeling(False)
         self.threed.renderer().SetUseDepthPeelingForVolumes(False)
 
-    def _on_resize(self, view: SliceView) -> Callable[..., None]:
-        def resized(*_: object) -> None:
-            get_event_loop().call_later(_RESIZED_S, self._fit_anew, view)
-
-        return resized
+    def _fit_soon(self, view: SliceView, *_: object) -> None:
+        get_event_loop().call_later(_RESIZED_S, self._fit_anew, view)
 
     def _fit_anew(self, view: SliceView) -> None:
         self._fitted.discard(view.get_singleton_tag())

@@ -161,7 +161,7 @@ class BrowserPanel:
         self._table = chart_node.GetNthPlotSeriesNode(0).GetTableNode()
         self._costs.watch(self._table)
         with self.shared.changing() as now:
-            now.fit.curve, now.fit.costs = [], ""
+            now.fit.curve, now.fit.costs, now.fit.best = [], "", ""
 
     def refresh(self, changed: Collection[str] | None = None) -> None:
         stale = {name: control for name, control in self._controls.items() if control.depends_on(changed)}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from math import inf
 from time import perf_counter
 from typing import Any
@@ -52,45 +52,20 @@ class RealImages:
             self._on_grid = (key, np.where(mask, image.round(), 0).astype(np.uint8), mask)
         return self._on_grid[1], self._on_grid[2]
 
-    @property
-    def numbers(self) -> list[int]:
-        """Numbers of the images in their file."""
-        return self.tracked.numbers
-
     def outline(self, grid: ImageGrid) -> str:
         """What is compared, as a path of an SVG in mm of the probe frame."""
         from skimage.measure import approximate_polygon, find_contours
 
         _, mask = self.on_grid(0, grid)
         lines = find_contours(np.pad(mask, 1).astype(float), 0.5)
-        (dx, dy), points = grid.pixel_spacing_mm, [approximate_polygon(line, 0.7) - 0.5 for line in lines]
-        paths = (" ".join(f"{grid.left_mm + dx * x:.2f},{grid.top_mm + dy * y:.2f}" for y, x in line) for line in points)
-        return " ".join(f"M {path} Z" for path in paths)
+        scale, first = np.array(grid.pixel_spacing_mm), np.array([grid.left_mm, grid.top_mm])
+        shapes = [first + scale * (approximate_polygon(line, 0.7)[:, ::-1] - 0.5) for line in lines]
+        return " ".join("M " + " ".join(f"{x:.2f},{y:.2f}" for x, y in shape) + " Z" for shape in shapes)
 
     def compared(self, place: int, simulated: np.ndarray, grid: ImageGrid) -> Similarity:
         """The paper's cost between a simulated image and the real image with this index."""
         real, mask = self.on_grid(place, grid)
         return similarity(simulated, real, grid.pixel_spacing_mm, mask=mask)
-
-
-class LooseImages:
-    """The images of a sequence whose place in the patient is not known; they can only be viewed.
-
-    Parameters
-    ----------
-    images : (n, rows, columns) numbers.
-    """
-
-    def __init__(self, images: np.ndarray) -> None:
-        self._images, self.numbers = images, list(range(len(images)))
-        self._low, self._high = (0, 255) if images.dtype == np.uint8 else (float(images.min()), float(images.max()))
-
-    def __len__(self) -> int:
-        return len(self._images)
-
-    def image(self, place: int) -> np.ndarray:
-        """(rows, columns) uint8 of the image with this index."""
-        return np.interp(self._images[place], (self._low, max(self._high, self._low + 1)), (0, 255)).astype(np.uint8)
 
 
 class Comparison:
@@ -107,7 +82,8 @@ class Comparison:
     ) -> None:  # fmt: skip
         self._shared, self._move, self._tell = shared, move, tell
         self._grid: ImageGrid | None = None  # of the simulated image
-        self._real: RealImages | LooseImages | None = None
+        self._real: RealImages | np.ndarray | None = None  # images whose place is not known are (n, rows, columns)
+        self._numbers: Sequence[int] = ()  # of the images in their file
         self._browser: Any = None  # vtkMRMLSequenceBrowserNode
         self._playing: asyncio.Task | None = None
         self._waiting: tuple[RealImages, int, np.ndarray, ImageGrid] | None = None  # to be compared
@@ -127,19 +103,19 @@ class Comparison:
         self._use(RealImages(tracked), browser_node, number)
 
     def view(self, images: np.ndarray, number: int = 0) -> None:
-        """Show images (n, rows, columns) whose place is not known, beside the simulated ones, from index `number` on."""
-        self._use(LooseImages(images), None, number)
+        """Show images (n, rows, columns) whose place is not known beside the simulated ones, that of index `number`."""
+        self._use(images, None, number)
 
-    def _use(self, real: RealImages | LooseImages, browser_node: Any, number: int) -> None:
-        self._real, self._browser = real, browser_node
-        if isinstance(real, LooseImages):
+    def _use(self, real: RealImages | np.ndarray, browser_node: Any, number: int) -> None:
+        self._real, self._browser, is_placed = real, browser_node, isinstance(real, RealImages)
+        self._numbers = real.tracked.numbers if isinstance(real, RealImages) else range(len(real))
+        if not is_placed:
             self.sees_nothing(None)
         with self._shared.changing() as now:
-            sequence, numbers = now.sequence, real.numbers
-            sequence.length, sequence.is_placed, sequence.mask = len(real), isinstance(real, RealImages), ""
-            sequence.numbers = f"{numbers[0]} to {numbers[-1]}"
-            if not sequence.is_placed:
-                sequence.comparison = ComparisonMode.BESIDE
+            sequence = now.sequence
+            sequence.length, sequence.is_placed, sequence.mask = len(real), is_placed, ""
+            sequence.numbers = f"{self._numbers[0]} to {self._numbers[-1]}"
+            sequence.comparison = sequence.comparison if is_placed else ComparisonMode.BESIDE
         self.show(number)
 
     def show(self, number: int) -> None:
@@ -149,7 +125,7 @@ class Comparison:
             return
         number = int(np.clip(number, 0, len(real) - 1))
         with self._shared.changing() as now:
-            now.sequence.number, now.sequence.name = number, f"image {real.numbers[number]}"
+            now.sequence.number, now.sequence.name = number, f"image {self._numbers[number]}"
         if isinstance(real, RealImages):
             self._browser.SetSelectedItemNumber(number)
             self._move(real.tracked.poses[number])
@@ -168,8 +144,8 @@ class Comparison:
         sequence, real, grid = self._shared.now.sequence, self._real, self._grid
         if sequence.comparison is ComparisonMode.SIMULATED:
             return
-        if isinstance(real, LooseImages):
-            image = real.image(sequence.number)
+        if isinstance(real, np.ndarray):
+            image = np.clip(real[sequence.number], 0, 255).astype(np.uint8)
             rows, columns = image.shape  # of a size that is not known: a ruler of its own, without marks
             about = {"x": 0, "y": 0, "w": columns, "h": rows, "ticks": [], "size": rows / 36, "focus": 0, "range": ""}
             self.streams[0].send(image, ruler=about)
@@ -183,25 +159,21 @@ class Comparison:
                 with self._shared.changing() as now:
                     now.sequence.box, now.sequence.mask = box, real.outline(grid)
 
-    def follow(self, step: Progress | None) -> None:
-        """Show the best image of a fit, at most twice a second; called in its thread, and with None at its end."""
-        if step is None:
-            self._tell(lambda: self._show_best(None, ""))
-        elif step.image is not None and step.best_cost != self._best[0] and perf_counter() > self._best[1] + _BEST_EVERY_S:
-            self._best, image = (step.best_cost, perf_counter()), step.image()
+    def follow(self, step: Progress) -> None:
+        """Show the best image of a fit, at most twice a second; called in its thread."""
+        is_new, seconds = step.best_cost != self._best[0], perf_counter()
+        if step.image is not None and is_new and seconds > self._best[1] + _BEST_EVERY_S:
+            self._best, image = (step.best_cost, seconds), step.image()
             words = f"Best after {step.evaluations} evaluations: image {step.number}, cost {step.best_cost:.3f}"
             self._tell(lambda: self._show_best(image, words))
 
-    def _show_best(self, image: np.ndarray | None, words: str) -> None:
+    def _show_best(self, image: np.ndarray, words: str) -> None:
         real, grid = self._real, self._grid
-        if image is None:
-            self._best = (inf, 0.0)
-            self.streams[2].clear()
-        elif isinstance(real, RealImages) and grid is not None and image.shape == real.tracked.mask.shape:
+        if isinstance(real, RealImages) and grid is not None and image.shape == real.tracked.mask.shape:
             placed = Volume(image[None].astype(np.float32), real.tracked.grid.slice_to_probe)
             self.streams[2].send(slice_under_probe(placed, grid, np.eye(4)).round().astype(np.uint8))
-        with self._shared.changing() as now:
-            now.fit.best = words
+            with self._shared.changing() as now:
+                now.fit.best = words
 
     def compare_next(self) -> None:
         """Compare in the next way of ComparisonMode."""

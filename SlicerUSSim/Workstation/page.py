@@ -161,7 +161,7 @@ def _banner() -> str:
       }}}}{{{{ {image.probe} }}}} {{{{ {image.frequency} }}}} {{{{ {image.time} ? '· ' + {image.time} : '' }}}}</span>
     <span class="ussim-space"></span>{toggles}
     <label class="ussim-blend">Blend <input type="range" id="blend" min="0" max="1" step="0.05" :value="{views.blend}"
-      aria-label="Blend of image and MRI in the slice views" @input="{views.blend} = Number($event.target.value)"></label>
+      aria-label="Blend of image and MRI" @input="{views.blend} = Number($event.target.value)"></label>
     <span v-if="{image.status}" class="ussim-status" :class="{image.status}.toLowerCase()" id="image-status"
       role="status">{{{{ {image.status} }}}}</span>
     <button class="ussim-icon" id="fold" title="Hide or show the views" aria-label="Fold the views"
@@ -177,7 +177,8 @@ def _advice() -> str:
     return f"""<div class="ussim-advice" id="advice" role="status" v-if="{is_outdated} || {advice.text}">
       <span>{{{{ {is_outdated} ? 'The image is outdated: ' + {image.differs} + ' changed' : {advice.text} }}}}</span>
       <button v-if="{is_outdated} || {advice.remedy}" class="ussim-button" id="remedy"
-      @click="trigger('remedy', [{is_outdated}])">{{{{ {is_outdated} ? 'Simulate' : {advice.remedy} }}}}</button></div>"""
+      @click="trigger('remedy', [{is_outdated}])">{{{{ {is_outdated} ? 'Simulate' : {advice.remedy} }}}}</button>
+      </div>"""
 
 
 # ---- beside the image ------------------------------------------------------------------------------------------------
@@ -265,11 +266,13 @@ def _screens(keys: tuple[str, ...]) -> str:
             words=f'<div class="ussim-corner" id="image-values">{lines}</div>',
         )
         + screen.format(
-            name="real", frame=frame, more=f'v-show="{there} && {beside}"', canvas='<canvas data-stream="real"></canvas>',
+            name="real", frame=frame.replace(">", f' v-show="{NAMES.sequence.is_placed}">', 1),
+            more=f'v-show="{there} && {beside}"', canvas='<canvas data-stream="real"></canvas>',
             words=f'<div class="ussim-corner">Real, {{{{ {NAMES.sequence.name} }}}}</div>',
         )
         + screen.format(
-            name="best", frame="", more=f'v-show="{NAMES.fit.best}"', canvas='<canvas data-stream="best"></canvas>',
+            name="best", frame="", canvas='<canvas data-stream="best"></canvas>',
+            more=f'v-show="{NAMES.fit.best} && {NAMES.messages.progress_title} === `Fit`"',
             words=f'<div class="ussim-corner" id="best-caption">{{{{ {NAMES.fit.best} }}}}</div>',
         )
         + screen.format(
@@ -303,8 +306,9 @@ def _player() -> str:
       @click="trigger('cine_play')"><i class="mdi" :class="{cine.playing} ? 'mdi-pause' : 'mdi-play'"></i></button>
       <input type="range" id="cine-slider" min="0" :max="{cine.length} - 1" step="1" :value="{cine.index}"
       aria-label="Image of the cine" @input="trigger('cine_show', [Number($event.target.value)])">
-      <span id="cine-text">{{{{ {cine.source} === 'live' ? {cine.index} + 1 + ' of ' + {cine.length} : 'Simulated image ' +
-      {cine.index} + ' (0 to ' + ({cine.length} - 1) + ')' }}}}, {{{{ {cine.seconds}.toFixed(1) }}}} s
+      <span id="cine-text">{{{{ {cine.source} === 'live' ? {cine.index} + 1 + ' of ' + {cine.length} :
+      'Simulated image ' + {cine.index} + ' (0 to ' + ({cine.length} - 1) + ')' }}}},
+      {{{{ {cine.seconds}.toFixed(1) }}}} s
       </span>
       <button class="ussim-button" id="cine-from" title="The cine begins here"
       @click="trigger('cine_trim', [{cine.index}, {cine.last}])">[ From</button>
@@ -319,9 +323,9 @@ def _player() -> str:
 def _foot() -> str:
     messages, percent = NAMES.messages, NAMES.messages.progress_percent
     return f"""<span v-if="{messages.progress_title}" id="progress">{{{{ {messages.progress_title} }}}}
-      {{{{ {percent} ? {percent} + ' %' : '…' }}}} {{{{ {messages.progress_s} }}}} s <progress :value="{percent} || undefined" max="100"
-      aria-label="Progress"></progress> <button class="ussim-button" id="cancel" @click="trigger('cancel')">Cancel
-      </button></span>
+      {{{{ {percent} ? {percent} + ' %' : '…' }}}} {{{{ {messages.progress_s} }}}} s
+      <progress :value="{percent} || undefined" max="100" aria-label="Progress"></progress>
+      <button class="ussim-button" id="cancel" @click="trigger('cancel')">Cancel</button></span>
       <span id="upload" hidden><span id="upload-text"></span>
       <button id="upload-cancel" class="ussim-button">Cancel</button></span>
       <span id="status">{{{{ {messages.status} }}}}</span>
@@ -355,8 +359,8 @@ def _drawer(panel: BrowserPanel) -> None:
 
 def _open_file() -> str:
     tip = (
-        "Also dropped on the page: MRI, CT, label map (with its table), mask, DICOM, tracked ultrasound, its calibration "
-        "or registration, sheets (.vtp), a scene (.mrb), preset, pose. What they are is recognised by their content"
+        "Also dropped on the page: MRI, CT, label map (with its table), mask, DICOM, tracked ultrasound, calibration, "
+        "registration, sheets (.vtp), scene (.mrb), preset, pose. What they are is recognised by their content"
     )
     sent = "window.ussim.send($event.target, {for: 'open'})"
     return f"""<div class="ussim-line" title="{tip}"><label for="open-file">Open files</label>
@@ -366,7 +370,8 @@ def _open_file() -> str:
       <div id="opened" class="ussim-opened" aria-live="polite">
       <div v-for="line in {NAMES.opened}">{{{{ line }}}}</div></div>
       <button class="ussim-button" id="close-patient" @click="trigger('close_patient')" :disabled="{NAMES.title} === ''"
-      title="Nothing of the patient stays on the page, in the scene or in memory; settings stay">Close patient</button>"""
+      title="Nothing of the patient stays on the page, in the scene or in memory; settings stay">Close patient
+      </button>"""
 
 
 def _pose_slider(slider: PoseSlider) -> str:

@@ -76,7 +76,7 @@ class Pointer:
         sides = zip(("RL", "AP", "SI"), point.tolist(), strict=True)
         words.append(" ".join(f"{side[value < 0]} {abs(value):.0f}" for side, value in sides))
         node = self._views.background
-        if node is not None and node.GetImageData() is not None:
+        if node is not None and node.GetImageData() is not None and not node.IsA("vtkMRMLLabelMapVolumeNode"):
             volume = Volume(read_volume(node).array, node_to_world(node) @ ijk_to_ras(node))
             value = _value(volume, point)
             of = "CT" if self._logic.parameters.segmentation.contrast == CT else "MRI"

@@ -207,7 +207,7 @@ class FitState:
     #: Best cost during the fit, and a summary as text
     curve: list[float] = field(default_factory=list)
     costs: str = ""
-    #: Caption of the best image so far (stream "best") while a fit runs; "" without
+    #: Caption of the best image so far (stream "best") of a fit, which is shown while it runs
     best: str = ""
 
 

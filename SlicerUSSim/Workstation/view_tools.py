@@ -1,8 +1,8 @@
 """The views of the anatomy on the page, with what is shown over them: tools, letters of the sides, linked cross-hair.
 
-static/views.js folds, maximises and swaps them, by classes of the body: `ussim-folded` (no views), `ussim-max-NAME` (one
-view fills the column), `ussim-swap-NAME` (a view and the ultrasound image have changed places). static/views.css does
-the rest, with .ussim-main as a grid of the areas rail, stage, console, and one per view.
+static/views.js folds, maximises and swaps them, by classes of the body: `ussim-folded` (no views), `ussim-max-NAME`
+(one view fills the column), `ussim-swap-NAME` (a view and the ultrasound image have changed places). static/views.css
+does the rest, with .ussim-main as a grid of the areas rail, stage, console, and one per view.
 """
 
 from __future__ import annotations

@@ -63,7 +63,7 @@ class FitSettings(Declared):
 
     @property
     def of_search(self) -> int:
-        """Evaluations of the search alone, such that with those of restarts there are at most `evaluations` (from 30 on)."""
+        """Evaluations of the search, such that with those of restarts there are at most `evaluations`, from 30 on."""
         share = 1.0 + (self.restarts * RESTART_SHARE + AGAIN_SHARE if self.restarts else 0.0)
         return max(int((self.evaluations - DRAWS - 2 * self.restarts) / share), self.evaluations // 4, 1)
 

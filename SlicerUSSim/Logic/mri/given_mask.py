@@ -11,6 +11,7 @@ from SlicerUSSim.Logic.base.errors import require, require_kind
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.mri.masks import several_segments
 from SlicerUSSim.Logic.mri.recognition import POSSIBLE_ML, USUAL_ML
+from SlicerUSSim.Logic.probe.poses import sample
 
 #: Labels of a segmentation count as inside too; an image has more values
 _MOST_MASK_VALUES = 128
@@ -106,7 +107,10 @@ def follows(mri: Volume, labels: Volume) -> bool:
     places = places[np.random.default_rng(0).integers(len(places), size=_SAMPLES)]
     tissues = labels.array[tuple(places.T)]
     points = places[:, ::-1] @ labels.ijk_to_ras[:3, :3].T + labels.ijk_to_ras[:3, 3]
-    exact = _exactly(mri, labels)
+    # An image in which every tissue has its mean intensity, and all else the least
+    lookup, values = np.full(int(tissues.max()) + 1, mri.array.min(), np.float32), sample(mri, points)
+    lookup[tissues] = (np.bincount(tissues, values) / np.maximum(np.bincount(tissues), 1))[tissues]
+    exact = labels.with_array(lookup[np.minimum(labels.array, len(lookup) - 1)])
     for moved_mm in _MOVED_MM:
         steps = [np.eye(3)[axis] * way * moved_mm for axis, way in itertools.product(range(3), (-1, 1))]
         telling = [step for step in steps if _explained(exact, points + step, tissues) < _MOST_ALIKE]
@@ -114,18 +118,6 @@ def follows(mri: Volume, labels: Volume) -> bool:
             beside = max(_explained(mri, points + step, tissues) for step in telling)
             return _explained(mri, points, tissues) > _LEAST_GAIN * beside
     return False
-
-
-def _exactly(mri: Volume, labels: Volume) -> Volume:
-    """An image on the grid of labels in which every tissue has its mean intensity in an MRI, and all else the least."""
-    to_mri = mri.ras_to_ijk @ labels.ijk_to_ras
-    found = ndimage.affine_transform(
-        mri.array, to_mri[2::-1, 2::-1], to_mri[2::-1, 3], labels.array.shape, np.float32, order=0, mode="nearest"
-    )
-    names, numbers = np.unique(labels.array, return_inverse=True)
-    means = np.bincount(numbers.ravel(), found.ravel()) / np.bincount(numbers.ravel())
-    means[names == 0] = mri.array.min()
-    return labels.with_array(means[numbers].reshape(labels.array.shape).astype(np.float32))
 
 
 def _explained(mri: Volume, points: np.ndarray, tissues: np.ndarray) -> float:

@@ -9,11 +9,9 @@ from time import perf_counter
 
 import numpy as np
 from vtkmodules.vtkCommonCore import vtkDoubleArray
-from vtkmodules.vtkCommonMath import vtkMatrix4x4
 
 from SlicerUSSim.Logic.base.errors import SimulationError, require, required
 from SlicerUSSim.Logic.base.volume import Volume
-from SlicerUSSim.Logic.base.vtk_data import matrix_array
 from SlicerUSSim.Logic.fitting.control_costs import neighbours_of
 from SlicerUSSim.Logic.fitting.search import Progress
 from SlicerUSSim.Logic.fitting.tracked_fit import Fit
@@ -22,6 +20,7 @@ from SlicerUSSim.Logic.mrml.nodes import (
     ijk_to_ras,
     named,
     node_called,
+    node_to_parent,
     node_to_world,
     nodes_of_class,
     read_volume,
@@ -108,14 +107,13 @@ def sequence_of(sequence_node) -> TrackedSequence:
 
 def _to_world_at(browser, transform_node, number: int, index: str) -> np.ndarray:
     """(4, 4) of a chain of transforms, each taken from its sequence in the browser at this index value."""
-    matrix, to_parent = np.eye(4), vtkMatrix4x4()
+    matrix = np.eye(4)
     while transform_node is not None:
         recorded = browser.GetSequenceNode(transform_node)
         item = transform_node if recorded is None else _recorded_at(recorded, number, index)
         if item is None or not item.IsA("vtkMRMLLinearTransformNode"):
             raise SimulationError(f"{named(transform_node)} has no linear transform at {index}")
-        item.GetMatrixTransformToParent(to_parent)
-        matrix = matrix_array(to_parent) @ matrix
+        matrix = node_to_parent(item) @ matrix
         transform_node = transform_node.GetParentTransformNode()
     return matrix
 

@@ -94,6 +94,13 @@ def node_to_world(node) -> np.ndarray:
     return matrix_array(matrix)
 
 
+def node_to_parent(transform_node) -> np.ndarray:
+    """(4, 4) of a linear transform node, without its parents."""
+    matrix = vtkMatrix4x4()
+    transform_node.GetMatrixTransformToParent(matrix)  # without an argument, it warns in Slicer's log
+    return matrix_array(matrix)
+
+
 def set_node_to_world(transform_node, matrix: np.ndarray) -> None:
     """Set a linear transform node so that it and its parents together are `matrix` (4, 4)."""
     parent = transform_node.GetParentTransformNode()

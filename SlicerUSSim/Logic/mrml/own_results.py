@@ -23,9 +23,8 @@ from vtkmodules.util.numpy_support import vtk_to_numpy
 
 from SlicerUSSim.Logic.base.errors import SimulationError, require
 from SlicerUSSim.Logic.base.volume import Volume
-from SlicerUSSim.Logic.base.vtk_data import matrix_array
 from SlicerUSSim.Logic.mrml.label_nodes import layered_segments, node_labels
-from SlicerUSSim.Logic.mrml.nodes import named, nodes_of_class
+from SlicerUSSim.Logic.mrml.nodes import named, node_to_parent, nodes_of_class
 
 #: Role of the reference of a node to itself; saved with the scene
 OWN = "SlicerUSSim.own"
@@ -113,7 +112,7 @@ def is_empty(node) -> bool:
     if node.IsA("vtkMRMLSequenceNode"):
         return node.GetNumberOfDataNodes() == 0
     if node.IsA("vtkMRMLLinearTransformNode"):
-        return bool(np.array_equal(matrix_array(node.GetMatrixTransformToParent()), np.eye(4)))
+        return bool(np.array_equal(node_to_parent(node), np.eye(4)))
     if node.IsA("vtkMRMLSegmentationNode"):
         return node.GetSegmentation().GetNumberOfSegments() == 0
     if node.IsA("vtkMRMLMarkupsNode"):
@@ -131,7 +130,7 @@ def _hash_of(node) -> str:
             found.update(f"{node.GetNthIndexValue(number)} {_hash_of(item)} ".encode())
     elif node.IsA("vtkMRMLTransformNode"):
         if node.IsA("vtkMRMLLinearTransformNode"):
-            found.update((matrix_array(node.GetMatrixTransformToParent()).round(5) + 0.0).tobytes())
+            found.update((node_to_parent(node).round(5) + 0.0).tobytes())
     elif node.IsA("vtkMRMLModelNode"):
         data = node.GetPolyData()
         if data is not None and data.GetNumberOfPoints():

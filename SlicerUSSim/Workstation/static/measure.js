@@ -102,7 +102,7 @@
 
   function clicked(event) {
     const where = screens.at(event);
-    if (!drawing || !where || event.button) return;
+    if (!drawing || !where?.isInMm || event.button) return;
     event.preventDefault();
     if (drawing.points.length && where.screen !== drawing.screen) return; // a distance is within one image
     drawing.screen = where.screen;

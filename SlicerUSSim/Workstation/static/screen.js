@@ -49,7 +49,8 @@
     const box = screen.getBoundingClientRect();
     const mm = place.toMm(event.clientX - box.left, event.clientY - box.top);
     const { x, y, w, h } = place.ruler;
-    return { screen: screen.dataset.screen, mm, isInside: mm[0] >= x && mm[0] <= x + w && mm[1] >= y && mm[1] <= y + h };
+    const isInMm = place.ruler.ticks?.length !== 0; // else the size of a pixel is not known
+    return { screen: screen.dataset.screen, mm, isInMm, isInside: mm[0] >= x && mm[0] <= x + w && mm[1] >= y && mm[1] <= y + h };
   };
 
   // Take a new image of a stream, or null for none, and draw it.

@@ -34,7 +34,7 @@
     (event) => {
       const [was, where] = [inside, window.ussimScreens.at(event)];
       inside = Boolean(where?.isInside || event.target.closest?.(".ussim-view")); // views send their points themselves
-      if (where?.isInside) point(where.mm);
+      if (where?.isInside && where.isInMm) point(where.mm);
       else if (was && !inside) point(null);
     },
     { passive: true },
