@@ -193,7 +193,7 @@ def test_a_restart_that_stopped_above_the_fit_goes_on_along_its_axes():
     assert as_good < 4 and all(len(stage) <= 12 for stage in stages)
 
 
-def test_a_fit_takes_the_evaluations_that_are_given_and_shows_its_best_image(twin):
+def test_a_fit_takes_the_evaluations_given_and_shows_its_best_image(twin):
     """It took more than twice as many: those of restarts came on top."""
     settings, shown = FitSettings(evaluations=80, restarts=2), []
 

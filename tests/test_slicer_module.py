@@ -651,7 +651,7 @@ def with_real_image(session, gain_db: float = 9.0):
     module.write_volume(real, volume(shown.array.copy(), place))
     session.logic.preset = preset
     session.parameters.real = real
-    session.ui.fitEvaluationsSpinBox.setValue(40)
+    session.ui.fitEvaluationsSpinBox.setValue(100)
     for n in range(session.ui.freeList.count()):
         item = session.ui.freeList.item(n)
         item.setCheckState(stand_in.QtCore.Qt.Checked if item.text() == "Gain" else stand_in.QtCore.Qt.Unchecked)
@@ -663,7 +663,7 @@ def test_the_panel_fits_compares_applies_and_reverts(session):
     assert not session.ui.fitButton.isEnabled() and "Segment" in session.ui.fitButton.toolTip()
     with_real_image(session)
     ui = session.ui
-    assert session.parameters.fit_free == "gain_db" and session.parameters.fit_evaluations == 40
+    assert session.parameters.fit_free == "gain_db" and session.parameters.fit_evaluations == 100
     assert ui.fitButton.isEnabled() and not ui.applyFitButton.isEnabled()
     before = session.logic.preset
     ui.fitButton.click()
