@@ -26,7 +26,6 @@ from playwright.sync_api import Page, sync_playwright  # noqa: E402
 from SlicerUSSim.Logic import TissueTable, Volume  # noqa: E402
 from SlicerUSSim.Logic.base.errors import required  # noqa: E402
 from SlicerUSSim.Logic.base.volume import read_image_file  # noqa: E402
-from SlicerUSSim.Logic.mri.samples import head_mri  # noqa: E402
 from SlicerUSSim.Logic.probe.poses import pose_looking_at  # noqa: E402
 from SlicerUSSim.Workstation.state import NAMES, value_of  # noqa: E402
 from tests.served import Served, refused  # noqa: E402
@@ -498,17 +497,13 @@ def test_keys_and_sliders_move_the_probe(page):
 def test_segment_labels_the_mri_anew_and_says_what_it_cannot(page):
     before = pixels(page)
     open_section(page, "Patient")
-    open_section(page, "Advanced")
-    for on in (False, True):
-        page.get_by_label("Label thin sulci").set_checked(on)
-        eventually(page, lambda on=on: shown(page, "thinSulciCheckBox") == on)
+    with new_image(page):
         click(page, "#segmentButton")
-        # Without sulci it is another image, with them the same again.
-        eventually(page, lambda on=on: np.array_equal(pixels(page), before) == on)
-        assert not errors(page) and pixels(page).mean() > 5
+    assert np.array_equal(pixels(page), before) and not errors(page)  # of the same image the same tissues
     page.evaluate("window.trame.trigger('set', ['classesSpinBox', 4])")
     click(page, "#segmentButton")
     assert "classes is 4, expected 3 for contrast t1" in shown_errors(page)
+    open_section(page, "Advanced")
     classes = page.locator("#classesSpinBox")
     classes.fill("")
     classes.blur()
@@ -708,7 +703,7 @@ def test_a_craniotomy_is_opened_and_closed_in_the_page(browser, tmp_path):
         settled(page)
         open_section(page, "Probe")
         shut = np.asarray(Image.open(download(page, "png")), float)
-        assert shown(page, "probeNotesLabel").count(closed) == 1 and "Open skull" in shown(page, "probeNotesLabel")
+        assert shown(page, "probeNotesLabel").count(closed) == 1
         assert page.locator("#closeCraniotomyButton").is_disabled()
         pressed_until(page, "#openCraniotomyButton", lambda: "craniotomy: a disc of" in shown(page, "probeNotesLabel"))
         settled(page)
@@ -773,23 +768,6 @@ def test_a_click_grows_a_lesion_that_is_added_to_the_tissues(browser, tmp_path):
         settled(page)
         assert not errors(page)
         assert "tumour" in [row["name"] for row in state(page, NAMES.panel.tissues)]
-        page.close()
-
-
-@pytest.mark.long
-def test_the_workstation_finds_sheets_and_images_show_them(browser, tmp_path):
-    head_mri(2.0).write(tmp_path / "head.nii.gz")
-    with serving(str(tmp_path / "head.nii.gz"), "--sheets", "auto", "--set", "patient.no_sheets=ependyma") as address:
-        page = opened(browser, address)
-        settled(page)
-        notes = shown(page, "notesLabel")
-        assert "sulcus: " in notes and "ependyma: " not in notes
-        assert (tmp_path / "head.sheets.npz").is_file() and not errors(page)
-        expected = np.asarray(Image.open(download(page, "png")))
-        open_section(page, "Lesions and other images")
-        with new_image(page):
-            page.select_option("#sheetsSelector", "")
-        assert not np.array_equal(np.asarray(Image.open(download(page, "png"))), expected)
         page.close()
 
 

@@ -235,6 +235,23 @@ def test_frozen_echoes_take_gain_and_the_cine_goes_back(page):
 
 
 @pytest.mark.slow
+def test_what_is_typed_stays_while_images_come(page):
+    """Vue set all fields to their values with every image."""
+    for name in ("gainSlider", "pose-numbers"):
+        open_section(page, "Probe")
+        field = page.locator(f"#{name}")
+        before = field.input_value()
+        field.fill("12")
+        with new_image(page):
+            page.evaluate("window.trame.trigger('set', ['dynamicRangeSlider', window.ussim.images % 2 ? 50 : 52])")
+        page.wait_for_function("document.getElementById('image-values').textContent.includes('DR 5')")
+        assert field.input_value() == "12"
+        field.fill(before)
+        field.blur()
+    settled(page)
+
+
+@pytest.mark.slow
 def test_pictures_and_dicom_have_scale_and_measurements(page):
     for _ in range(2):
         with new_image(page):

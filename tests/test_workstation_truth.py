@@ -125,7 +125,7 @@ def test_ruler_and_image_change_together(page):
         """() => { window.drawnWith = []; const draw = CanvasRenderingContext2D.prototype.drawImage;
         CanvasRenderingContext2D.prototype.drawImage = function (bitmap, ...rest) {
           if (this.canvas.dataset.stream === 'simulated') {
-            const [, , w, h] = document.getElementById('overlay').getAttribute('viewBox').split(' ').map(Number);
+            const { w, h } = window.ussimScreens.place('simulated').ruler;
             window.drawnWith.push([window.ussim.image.ruler.h, h, w / h, bitmap.width / bitmap.height]); }
           return draw.call(this, bitmap, ...rest); }; }"""
     )
@@ -217,7 +217,8 @@ def test_a_new_patient_clears_image_ruler_cost_and_pose_at_once(head_page, files
         """() => { window.cleared = [];
         const look = () => { const image = window.ussim.image;
           window.cleared.push([document.getElementById('title').textContent, image?.patient ?? null,
-            document.getElementById('overlay').children.length, document.getElementById('image-caption').textContent]);
+            document.querySelector('[data-screen=simulated] svg').children.length,
+            document.getElementById('image-caption').textContent.trim()]);
           if (window.looking) setTimeout(look, 5); };
         window.looking = true; look(); }"""
     )
@@ -253,7 +254,7 @@ def test_a_saved_scene_holds_this_patient_only_and_a_patient_can_be_closed(page,
     page.evaluate("window.trame.trigger('close_patient')")
     page.wait_for_function("window.ussim.image === null")
     settled(page)
-    assert page.locator("#title").inner_text() == "" and page.locator("#notesLabel").inner_text() == ""
+    assert state(page, NAMES.title) == "" == shown(page, "notesLabel")
     assert shown(page, "mriSelector") is None and not errors(page)
     assert not [name for name in nodes_of_scene(download(page, "mrb")) if "third" in name]
     page.set_input_files("#open-file", tmp_path / "second.nii.gz")

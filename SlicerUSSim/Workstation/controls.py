@@ -18,6 +18,14 @@ _IN_PAGE = {
 }
 
 
+def kept(*fields: object) -> str:
+    """Leaves what a user types alone until one of these fields changes, or an error is shown: then it is as before.
+
+    Without it Vue sets fields to their values whenever anything on the page changes.
+    """
+    return f'v-memo="[{", ".join(map(str, fields))}, {NAMES.messages.errors}]"'
+
+
 def control_html(control: Control) -> str:
     """The element of a control."""
     name, key = control.widget, value_of(control.widget)
@@ -81,7 +89,7 @@ def range_html(
     """A slider with a field for its value; `key` and `event` are JavaScript. Values of presets can exceed its range."""
     value = f"{key} === null ? '' : Number({key}).toFixed({decimals})"
     limits = f""":min="Math.min({low}, {key} ?? {low})" :max="Math.max({high}, {key} ?? {high})" step="{step:g}" """
-    return f"""<div class="ussim-slider" title="{escape(tip)}"><label for="{name}">{escape(label)}</label>
+    return f"""<div class="ussim-slider" title="{escape(tip)}" {kept(key)}><label for="{name}">{escape(label)}</label>
         <span><input type="number" id="{name}" min="{low:.10g}" max="{high:.10g}" step="{step:g}" :value="{value}"
         :disabled="{key} === null" @change="{event}"> {unit}</span>
         <input type="range" id="slider-{name}" aria-label="{escape(label)}" {limits} :value="{key} ?? {low}"
@@ -93,7 +101,7 @@ def upright_html(control: Control) -> str:
     name, key, shown = control.widget, value_of(control.widget), control.range
     return f"""<input type="range" class="ussim-upright" id="slider-{name}" min="{shown.low:g}" max="{shown.high:g}"
         step="{shown.step:g}" :value="{key} ?? 0" aria-label="{escape(control.label)}"
-        :title="`{escape(control.label)}: ${{{key}}} {control.unit}`"
+        :title="`{escape(control.label)}: ${{{key}}} {control.unit}`" {kept(key)}
         @input="trigger('set', ['{name}', Number($event.target.value)])">"""
 
 
@@ -111,7 +119,7 @@ def _field(control: Control) -> str:
             limits += ' placeholder="none"'
             value = f"{key} === null || {key} <= {shown.none_at:.10g} ? '' : +Number({key}).toFixed({control.decimals})"
             entered = "$event.target.value === '' ? null : Number($event.target.value)"
-    return f"""<input type="{control.kind}" id="{name}" {limits} :value="{value}" :disabled="{key} === null"
+    return f"""<input type="{control.kind}" id="{name}" {limits} :value="{value}" :disabled="{key} === null" {kept(key)}
         @change="trigger('set', ['{name}', {entered}])">"""
 
 
@@ -122,7 +130,9 @@ def _line(name: str, label: str, tip: str, element: str) -> str:
 def _tissue_table(control: Control) -> str:
     heads = "".join(f'<th title="{escape(tip)}">{head}</th>' for _, head, tip in TISSUE_COLUMNS)
     names = ", ".join(f"'{parameter}'" for parameter, _, _ in TISSUE_COLUMNS)
-    return f"""<table class="ussim-table" id="{control.widget}" title="{escape(control.tip)}"><tr><th>Tissue</th>{heads}
+    memo = kept(NAMES.panel.tissues, NAMES.panel.chosen_tissue)
+    return f"""<table class="ussim-table" id="{control.widget}" title="{escape(control.tip)}" {memo}>
+        <tr><th>Tissue</th>{heads}
         </tr><tr v-for="row in {NAMES.panel.tissues}" :class="{{chosen: row.name === {NAMES.panel.chosen_tissue}}}"
         @click="{NAMES.panel.chosen_tissue} = row.name">
         <td>{{{{ row.name }}}}</td>

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from trame.widgets import html, vuetify3 as v3
 
+from SlicerUSSim.Workstation.controls import kept
 from SlicerUSSim.Workstation.pose_entry import POSE_SUFFIXES
 from SlicerUSSim.Workstation.state import NAMES
 
@@ -83,12 +84,14 @@ def pose_numbers() -> None:
     html.Div(
         f"""<label for="pose-numbers">Pose</label>
         <input type="text" id="pose-numbers" :value="{NAMES.pose_numbers}" :disabled="{is_none}"
+        {kept(NAMES.pose_numbers)}
         @change="trigger('type_pose', [$event.target.value])">""",
         classes="ussim-line", title=_NUMBERS_TIP,
     )  # fmt: skip
     html.Div(
         f"""<label for="pose-matrix">Matrix</label>
         <textarea id="pose-matrix" rows="4" :value="{NAMES.pose_matrix}" :disabled="{is_none}" spellcheck="false"
+        {kept(NAMES.pose_matrix)}
         @change="trigger('type_pose', [$event.target.value])"></textarea>""",
         classes="ussim-line", title=_MATRIX_TIP,
     )  # fmt: skip

@@ -201,9 +201,11 @@ class ProbeControl:
             self.moved()
 
     def _turn_slices(self) -> None:
-        """Turn the slices to the probe while there is no image, to which ImageFlow turns them."""
-        pose = self.pose()
-        if pose is not None and self.surface is not None and self._logic.taken is None:
+        """Turn the slices to the frozen image, or to the probe if there is none; ImageFlow turns them to live ones."""
+        pose, taken = self.pose(), self._logic.taken
+        if taken is not None and not self._logic.isLive:
+            self._views.follow(taken.probe_to_world, taken.preset.probe)
+        elif pose is not None and self.surface is not None and taken is None:
             self._views.follow(pose, self._logic.preset.probe)
 
     def _tell_pose(self) -> None:

@@ -161,8 +161,9 @@
     screens.add(mark, "title", {}, "Transmit focus");
   }
 
-  function orientation(svg, { edges, height }) {
-    const x = view.flipX ? edges.right - 14 : edges.left + 14;
+  function orientation(svg, { edges, width, height }) {
+    const beside = 124; // the values in the corner
+    const x = view.flipX ? Math.min(edges.right - 14, width - beside) : Math.max(edges.left + 14, beside);
     const y = Math.min(Math.max(view.flipY ? edges.bottom - 14 : edges.top + 14, 14), height - 14);
     const mark = screens.add(svg, "circle", { class: "orientation-mark", cx: x, cy: y, r: 7, fill: "#ff9d2e" });
     screens.add(mark, "title", {}, "Side of the probe's ridge");
