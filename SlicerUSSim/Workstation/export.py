@@ -71,7 +71,7 @@ def sequence_file(images: Sequence[tuple[float, TakenImage]]) -> bytes:
 
 
 class Exports:
-    """The contents of the menu Export, by kind: png, .nrrd, .mha, .vti, cine, dicom, mrb, json.
+    """The files of the menu Save, by kind: png, .nrrd, .mha, .vti, cine, dicom, mrb, json.
 
     Each is (file name, content, MIME type). Raises SimulationError if there is nothing to export.
     """

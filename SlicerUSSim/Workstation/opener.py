@@ -118,7 +118,7 @@ class Opener:
         """Close the patient, after a question if something of him would be lost."""
         with self._presenter.shown():
             if self._patient.unsaved:
-                text = "Export, Scene for 3D Slicer (MRB), saves what was made here."
+                text = "Save, Scene for 3D Slicer (MRB), saves what was made here."
                 self._ask(f"Close {self._patient.name}?", text, [Choice("close", "Close", self._closed())])
             self._patient.close()
 
