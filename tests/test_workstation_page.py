@@ -64,7 +64,7 @@ def page(first_page):
 @pytest.mark.long
 def test_keys_change_the_slider_that_has_them_and_else_move_the_probe(page):
     before, gain = pose(page), shown(page, "gainSlider")
-    page.locator("#gainSlider, [aria-label='Gain']").first.focus()
+    page.locator("#slider-gainSlider").focus()
     page.keyboard.press("ArrowRight")
     settled(page)
     assert shown(page, "gainSlider") > gain and pose(page) == before
@@ -75,11 +75,11 @@ def test_keys_change_the_slider_that_has_them_and_else_move_the_probe(page):
     settled(page)
     assert pose(page)["rock_deg"] - before["rock_deg"] == pytest.approx(2, abs=0.6)
     open_section(page, "Probe")
-    probe = shown(page, "probePresetComboBox")
-    page.locator("#probePresetComboBox").focus()
+    view = shown(page, "viewComboBox")
+    page.locator("#viewComboBox").focus()
     page.keyboard.press("a")  # does not choose
     settled(page)
-    assert shown(page, "probePresetComboBox") == probe == page.locator("#probePresetComboBox").input_value()
+    assert shown(page, "viewComboBox") == view == page.locator("#viewComboBox").input_value()
     assert pose(page)["rock_deg"] - before["rock_deg"] == pytest.approx(4, abs=0.9)
     for _ in range(2):
         page.locator("#upright").click()  # a tick box
@@ -168,8 +168,6 @@ def test_axe_finds_nothing_wrong(page):
         for entry in found.response["violations"]
         for node in entry["nodes"]
     ]
-    for title in ("Tissues", "Advanced", "Tracked ultrasound", "Fit to real ultrasound"):
-        page.get_by_role("button", name=title, exact=True).click()
     assert not wrong, "\n".join(map(str, wrong[:30]))
 
 
@@ -200,51 +198,3 @@ def test_a_question_is_asked_of_everyone(page, files):
     settled(page)
     assert inside and not wrong and not errors(page) and state(page, NAMES.title) == "labels.nii.gz", wrong
     assert pose(page) == before
-
-
-# ---- room ------------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("size", SIZES, ids=lambda size: f"{size[0]}x{size[1]}")
-def test_nothing_is_cut_off(page, size):
-    width, height = size
-    page.set_viewport_size({"width": width, "height": height})
-    page.wait_for_timeout(700)
-    settled(page)
-    boxes = {}
-    for mark in ("depth-ruler", "grey-bar", "orientation-mark", "image-caption"):
-        boxes[mark] = page.locator(f"#{mark}").bounding_box()
-    for number in range(page.locator("#depth-ruler text").count()):
-        boxes[f"digits {number}"] = page.locator("#depth-ruler text").nth(number).bounding_box()
-    assert min(box["height"] for name, box in boxes.items() if name.startswith("digits")) >= 9
-    screen = page.locator(".ussim-screen").first.bounding_box()
-    for name, box in boxes.items():
-        assert box["x"] >= screen["x"] - 1 and box["x"] + box["width"] <= screen["x"] + screen["width"] + 1, name
-        assert box["y"] >= screen["y"] - 1 and box["y"] + box["height"] <= screen["y"] + screen["height"] + 1, name
-    image = page.locator(".ussim-image").bounding_box()
-    for name in [
-        "live",
-        "export",
-        "compare-simulated",
-        "compare-beside",
-        "compare-blink",
-        "compare-difference",
-        "play",
-    ]:
-        box = page.locator(f"#{name}").bounding_box()
-        assert box["x"] >= image["x"] and box["x"] + box["width"] <= image["x"] + image["width"] + 1, name
-        assert box["y"] >= 0 and box["y"] + box["height"] <= height, name
-        middle = [box["x"] + box["width"] / 2, box["y"] + box["height"] / 2]
-        inside = page.evaluate(
-            "([x, y, name]) => Boolean(document.elementFromPoint(x, y)?.closest('#' + name))", [*middle, name]
-        )
-        assert inside, f"{name} is covered"
-    wide = page.evaluate(
-        """() => [...document.querySelectorAll('.ussim-bar, .ussim-tool, .v-navigation-drawer__content')]
-        .filter((e) => e.scrollWidth > e.clientWidth + 1).map((e) => e.className)"""
-    )
-    assert not wide
-    for name in ("Gain", "Depth"):
-        box = page.locator(f"[role=slider][aria-label='{name}']").bounding_box()
-        assert box["y"] + box["height"] < height, f"{name} is below the fold"
