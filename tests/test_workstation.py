@@ -41,7 +41,7 @@ FLAGS = [
     "--disable-component-update", "--disable-sync",
 ]  # fmt: skip
 #: A state that has not come after so long never will, however busy the machine is.
-PATIENCE_S = 40
+PATIENCE_S = 180
 #: Trame's own messages that a page could not send since it was left are no faults of the page.
 LEAVING = """addEventListener("beforeunload", () =>
   addEventListener("unhandledrejection", rejection => rejection.preventDefault()));"""

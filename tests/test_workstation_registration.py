@@ -22,6 +22,7 @@ from tests.test_workstation import (
     eventually,
     first_page as first_page,
     open_new_patient,
+    open_section,
     opened,
     pytestmark as pytestmark,
     serving,
@@ -93,12 +94,14 @@ def test_ultrasound_without_a_calibration_asks_for_it(page, recording):
         "tracked ultrasound: 6 images of 624x512, transforms ProbeToTracker, ReferenceToTracker, StylusToTracker: its "
         "calibration is asked for in Tracked ultrasound"
     )
-    assert state(page, NAMES.sequence.length) == 0 and "Tracked ultrasound" in state(page, NAMES.open_sections)
+    assert state(page, NAMES.sequence.length) == 6 and not state(page, NAMES.sequence.is_placed)  # to be viewed only
+    assert "not calibrated" in page.locator("#advice").inner_text()
+    open_section(page, "Tracked ultrasound")
     assert "no path from Image to Reference" in page.locator("#calibration-from").inner_text()
     page.set_input_files("#calibration-file", recording["folder"] / "plus.xml")
     settled(page)
     assert page.locator("#calibration-from").inner_text() == "Calibration ImageToProbe of plus.xml"
-    assert state(page, NAMES.sequence.length) == 6 and not errors(page)
+    assert state(page, NAMES.sequence.is_placed) and not errors(page)
     assert "none: the frame of the ultrasound is taken" in page.locator("#registration-from").inner_text()
     page.set_input_files("#registration-file", recording["folder"] / "registration.txt")
     settled(page)
@@ -115,6 +118,7 @@ def test_wrong_calibrations_and_registrations_are_said_and_change_nothing(page, 
         page.set_input_files(f"#{name}-file", tmp_path / "matrix.txt")
         settled(page)
 
+    open_section(page, "Tracked ultrasound")
     sent("calibration", np.ones((1, 3)))
     assert "matrix.txt" in errors(page)[-1]
     page.fill("#calibration-name", "Image")
@@ -123,7 +127,7 @@ def test_wrong_calibrations_and_registrations_are_said_and_change_nothing(page, 
     page.fill("#calibration-name", "ImageToProbe")
     skewed = recording["calibration"] @ np.array([[1, 0.2, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
     sent("calibration", skewed)
-    assert "is skewed" in errors(page)[-1] and state(page, NAMES.sequence.length) == 0
+    assert "is skewed" in errors(page)[-1] and not state(page, NAMES.sequence.is_placed)
     sent("calibration", recording["calibration"])
     assert page.locator("#calibration-from").inner_text() == "Calibration ImageToProbe of matrix.txt"
     before = shown_pose(page, 2)
