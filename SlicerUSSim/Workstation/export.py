@@ -8,7 +8,6 @@ import zipfile
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
 
 import numpy as np
 from PIL import Image
@@ -16,7 +15,7 @@ from PIL.PngImagePlugin import PngInfo
 from trame_slicer.core import SlicerApp
 from vtkmodules.vtkCommonCore import vtkOutputWindow
 
-from SlicerUSSim.Logic.base.errors import SimulationError, require, required
+from SlicerUSSim.Logic.base.errors import require, required
 from SlicerUSSim.Logic.mrml.nodes import nodes_of_class
 from SlicerUSSim.Logic.mrml.taken_image import TakenImage
 from SlicerUSSim.Logic.tracked.sequence import SIMULATED, TrackedSequence
@@ -46,9 +45,14 @@ def frame_file(taken: TakenImage, suffix: str) -> bytes:
     Raises SimulationError if `suffix` is not one of FRAME_SUFFIXES.
     """
     require(suffix in FRAME_SUFFIXES, f"the file type is {suffix!r}, expected {', '.join(FRAME_SUFFIXES)}")
+    return written(suffix, lambda path: taken.volume().write(path, about={ABOUT: json.dumps(taken.about())}))
+
+
+def written(suffix: str, write: Callable[[Path], object]) -> bytes:
+    """The content of a file that `write` writes."""
     with TemporaryDirectory() as folder:
-        path = Path(folder) / f"frame{suffix}"
-        taken.volume().write(path, about={ABOUT: json.dumps(taken.about())})
+        path = Path(folder) / f"file{suffix}"
+        write(path)
         return path.read_bytes()
 
 
@@ -62,12 +66,8 @@ def sequence_file(images: Sequence[tuple[float, TakenImage]]) -> bytes:
         {"ImageToProbe": image.grid.image_to_probe, "ProbeToReference": image.probe_to_world} for image in taken
     )
     fields = {SIMULATED: "cine", ABOUT: json.dumps(taken[-1].about())}
-    with TemporaryDirectory() as folder:
-        path = Path(folder) / "cine.igs.mha"
-        TrackedSequence(np.stack([image.image for image in taken]), transforms, np.array(seconds), fields=fields).write(
-            path
-        )
-        return path.read_bytes()
+    array = np.stack([image.image for image in taken])
+    return written(".igs.mha", TrackedSequence(array, transforms, np.array(seconds), fields=fields).write)
 
 
 class Exports:
@@ -128,25 +128,19 @@ def write_bundle(app: SlicerApp, folder: Path) -> dict[str, Path]:
     """
     folder.mkdir()
     _remove_unused_stores(app.scene)
-    stores: dict[Any, Any] = {}
     for node in nodes_of_class(app.scene, "vtkMRMLStorableNode"):
         if node.GetSaveWithScene() and (node.GetStorageNode() is not None or node.AddDefaultStorageNode()):
             store = node.GetStorageNode()
             if store is not None:  # some are whole in the scene's own file
-                stores[store] = store.GetUseCompression()
+                store.SetUseCompression(False)
     window = vtkOutputWindow.GetInstance()
     window.SetDisplayModeToNever()  # VTK would report every file of the scene
     try:
-        for store in stores:
-            store.SetUseCompression(False)
         is_written = app.app_logic.SaveSceneToSlicerDataBundleDirectory(str(folder), None)
     finally:
-        for store, uses_compression in stores.items():
-            store.SetUseCompression(uses_compression)
         window.SetDisplayModeToAlwaysStdErr()
     scene = folder / f"{folder.name}.mrml"
-    if not is_written or not scene.exists():
-        raise SimulationError("the scene could not be written")
+    require(is_written and scene.exists(), "the scene could not be written")
     # What is saved from this scene again is compressed, as usual
     scene.write_text(scene.read_text("utf-8").replace('useCompression="0"', 'useCompression="1"'), "utf-8")
     return {path.relative_to(folder.parent).as_posix(): path for path in sorted(folder.rglob("*")) if path.is_file()}

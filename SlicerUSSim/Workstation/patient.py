@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Iterable
+from collections.abc import Callable, Hashable, Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any
 
@@ -64,7 +65,7 @@ class OpenPatient:
             if files.mri is not None or files.labels is None:
                 self._choose_mri(self._nodes.mri(files.mri))
             if files.mask is not None:
-                parameters.mask = self._nodes.mask(files.mask)
+                parameters.mask = self._nodes.brain_mask(files.mask, parameters.mri)
             for contrast, path in list(files.also.items())[:1]:  # the panel has one
                 self.take_second(self._nodes.second_mri(path), contrast)
             if files.organs is not None:
@@ -73,7 +74,8 @@ class OpenPatient:
             if files.sheets is not None:
                 parameters.sheets = self._nodes.sheets(files.sheets)
             for tissue, path in files.additions:
-                self._add_lesions(self._nodes.lesions(path), tissue, path)
+                with self._added(self._nodes.lesions(path), tissue, path):
+                    pass
             if files.labels is not None:
                 self.take_labels(*self._nodes.labels(files.labels), are_of_patient=True)
                 if files.additions:
@@ -175,39 +177,27 @@ class OpenPatient:
 
     def lay(self, mask: Volume, tissue: str, name: str) -> None:
         """Add a mask of a file to the lesions, and lay them over the tissues; without tissues Segment does so."""
-        parameters: Any = self._logic.parameters
-        before = parameters.lesions
-        undo = self._add_lesions(mask, tissue, name)
-        try:
-            if parameters.labels is not None:
+        with self._added(mask, tissue, name):
+            if self._logic.parameters.labels is not None:
                 self.then_show(self._presenter.lesions.layLesions)
-        except SimulationError:
-            undo()
-            parameters.lesions = before
-            raise
 
-    def _add_lesions(self, mask: Volume, tissue: str, name: str) -> Callable[[], None]:
-        """Add a mask of a file to the lesions; returns a function that takes it out of them again."""
+    @contextmanager
+    def _added(self, mask: Volume, tissue: str, name: str) -> Iterator[None]:
+        """Add a mask of a file to the lesions; after an error in the block it is taken out of them again."""
         parameters: Any = self._logic.parameters
-        before = parameters.lesions
-        node = before or self._scene.AddNewNodeByClass("vtkMRMLSegmentationNode", "Lesions")
-        is_saved = "lesions" not in self.unsaved
-
-        def undo(ids: Iterable[str] = ()) -> None:
-            for segment_id in ids:
-                node.GetSegmentation().RemoveSegment(segment_id)
-            if before is None:
-                self._scene.RemoveNode(node)
-
-        try:
+        before, is_saved = parameters.lesions, "lesions" not in self.unsaved
+        with self._presenter.made(before, "Segmentation", "Lesions") as node:
             ids = add_lesion(node, mask, tissue, name)
-        except SimulationError:
-            undo()
-            raise
-        parameters.lesions = node
+            try:
+                parameters.lesions = node
+                yield
+            except SimulationError:
+                parameters.lesions = before
+                for segment_id in ids:
+                    node.GetSegmentation().RemoveSegment(segment_id)
+                raise
         if is_saved:
             self._saved["lesions"] = self._made().get("lesions")
-        return lambda: undo(ids)
 
     # ---- actions of the panel ----------------------------------------------------------------------------------
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 import logging
 import os
 import re
+import tempfile
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
@@ -33,6 +34,10 @@ _NRRD = re.compile(rb"^data ?file:\s*(.*)$", re.MULTILINE | re.IGNORECASE)
 _METAIMAGE = re.compile(rb"^ElementDataFile\s*=[ \t]*(.*)$", re.MULTILINE)
 #: Folder of the DICOM files, whose names may be those of others
 DICOM = "dicom"
+#: Folder of what a page has sent, as reading.untrusted_folder calls it, in messages
+_SENT = re.compile(
+    rf"{re.escape(str(Path(tempfile.gettempdir()).resolve()))}[/\\\\]ussim-untrusted-\w+[/\\\\](?:{DICOM}[/\\\\])?"
+)
 #: Endings of images of one file; beside DICOM files nothing else is opened, as from a CD with a viewer
 _IMAGES = (".nrrd", ".mha", ".nii", ".nii.gz", ".mgz", ".mgh", ".mnc", ".vti", ".vtp", ".mrb")
 
@@ -53,15 +58,11 @@ class Sent:
         self._folder = Path(folder)
         #: Those that are no DICOM images
         self.paths: list[Path] = []
-        #: How many files beside DICOM files are none of an image
-        self.left_out = 0
         dicom = {name for name, content in files.items() if _is_dicom(name, content)}
         for name, content in files.items():
             if name in dicom:
                 self._write(self._folder / DICOM / name, content)
-            elif dicom and not name.lower().endswith(_IMAGES):
-                self.left_out += 1
-            else:
+            elif not dicom or name.lower().endswith(_IMAGES):
                 self._write(self._folder / name, content)
                 self.paths.append(self._folder / name)
 
@@ -103,9 +104,6 @@ def require_whole_files(files: Mapping[str, bytes]) -> None:
 
     `files` are {name: content} as a page sent them. Nothing has been written yet.
     """
-    size = sum(map(len, files.values()))
-    require(size <= MOST_BYTES, f"{listed(list(files))}: {size} bytes, expected at most {MOST_BYTES}")
-    require(len(files) <= MOST_FILES, f"{len(files)} files are sent at once, expected at most {MOST_FILES}")
     for name, content in files.items():
         require(
             bool(name) and name not in (".", "..") and not re.search(r"[/\\\0-\x1f\x7f]", name),
@@ -127,6 +125,11 @@ def require_whole_file(path: Path) -> None:
     """Raise SimulationError for a file of a bundle that is a header whose voxels are in another file."""
     other = _other_file(path.name, path.read_bytes())
     require(other is None, f"{path.name}: is a header whose voxels are in another file ({other}), expected one file")
+
+
+def as_known(text: str) -> str:
+    """A message with the names of files as the user knows them, without the folder of what a page has sent."""
+    return _SENT.sub("", text)
 
 
 def listed(names: Sequence[str]) -> str:
