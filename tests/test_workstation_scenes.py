@@ -158,7 +158,7 @@ def test_the_workstation_opens_the_scene_that_it_saved(page, files, tmp_path):
     assert np.array_equal(pixels(page), image)
     assert state(page, NAMES.sequence.length) == 6 and "saved.mrb: a scene" in shown(page, "notesLabel")
     assert shown(page, "depthSlider") == 45 and state(page, NAMES.image.status) == "LIVE"
-    assert state(page, NAMES.registration.registration) == "as it was kept"
+    assert state(page, NAMES.registration.registration) == "as it was given or saved"
     page.evaluate("window.trame.trigger('show_number', [1])")
     settled(page)
     now = state(page, NAMES.pose_matrix)

@@ -15,6 +15,7 @@ from SlicerUSSim.Logic.mri.given_mask import follows
 from SlicerUSSim.Logic.mrml.label_nodes import labels_version
 from SlicerUSSim.Logic.mrml.lesion_nodes import add_lesion
 from SlicerUSSim.Logic.mrml.nodes import nodes_of_class, read_volume
+from SlicerUSSim.Logic.mrml.scene_record import SequenceRecord
 from SlicerUSSim.Logic.mrml.taken_image import patient_of
 from SlicerUSSim.Logic.mrml.taken_sequence import FrozenRecord, version_taken
 from SlicerUSSim.Logic.tissue.label_maps import LabelledTissues
@@ -22,7 +23,7 @@ from SlicerUSSim.Workstation.anatomy import AnatomyViews
 from SlicerUSSim.Workstation.browser_panel import BrowserPanel
 from SlicerUSSim.Workstation.comparison import Comparison
 from SlicerUSSim.Workstation.file_nodes import FILE, FileNodes, Files
-from SlicerUSSim.Workstation.pose_registration import Recording, Registration
+from SlicerUSSim.Workstation.pose_registration import Registration
 from SlicerUSSim.Workstation.probe_control import ProbeControl
 
 #: Roles of nodes of a patient
@@ -84,8 +85,8 @@ class OpenPatient:
                 self.segment()
             self._open_at_start(files)
             if files.sequence is not None:
-                recording = Recording(files.sequence, files.sequence_name, files.transform)
-                self._registration.take(recording, files.to_ras)
+                sequence = SequenceRecord(files.sequence, files.sequence_name, files.transform, files.to_ras)
+                self._registration.take(sequence)
             elif files.preset is not None and files.preset.probe_to_ras is not None:
                 self._presenter.values.takePreset(files.preset)
 
@@ -185,7 +186,7 @@ class OpenPatient:
     def _added(self, mask: Volume, tissue: str, name: str) -> Iterator[None]:
         """Add a mask of a file to the lesions; after an error in the block it is taken out of them again."""
         parameters: Any = self._logic.parameters
-        before, is_saved = parameters.lesions, "lesions" not in self.unsaved
+        before = parameters.lesions
         with self._presenter.made(before, "Segmentation", "Lesions") as node:
             ids = add_lesion(node, mask, tissue, name)
             try:
@@ -196,8 +197,6 @@ class OpenPatient:
                 for segment_id in ids:
                     node.GetSegmentation().RemoveSegment(segment_id)
                 raise
-        if is_saved:
-            self._saved["lesions"] = self._made().get("lesions")
 
     # ---- actions of the panel ----------------------------------------------------------------------------------
 

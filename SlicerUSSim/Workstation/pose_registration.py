@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -26,37 +26,13 @@ _CALIBRATION, _REGISTRATION = "Calibration", "Registration"
 _NOT_REGISTERED = "none: the frame of the ultrasound is taken for the patient's"
 
 
-@dataclass(frozen=True, eq=False)
-class Recording:
-    """Tracked ultrasound as it was recorded."""
-
-    sequence: TrackedSequence
-    name: str
-    #: Transform from pixels to the frame that is fixed to the patient
-    path: str = f"{_IMAGE}To{_REFERENCE}"
-
-    @property
-    def what(self) -> str:
-        """Its images and transforms, in words."""
-        rows, columns = self.sequence.images.shape[1:]
-        count = len(self.sequence)
-        names = sorted({name for entry in self.sequence.transforms for name in entry})
-        transforms = f"transforms {', '.join(names)}" if names else "no transforms"
-        return f"{count} image{'s' * (count > 1)} of {columns}x{rows}, {transforms}"
-
-    @property
-    def is_calibrated(self) -> bool:
-        """Whether the place of at least one image is known."""
-        return any(self.sequence.has_pose(number, self.path) for number in range(len(self.sequence)))
-
-
 class Registration:
     """The tracked ultrasound of the page. Methods that change it run in a task."""
 
     def __init__(self, panel: BrowserPanel, file_nodes: FileNodes, comparison: Comparison) -> None:
         self._shared, self._logic, self._tasks = panel.shared, panel.logic, panel.tasks
         self._presenter, self._file_nodes, self._comparison = panel.presenter, file_nodes, comparison
-        self.recording: Recording | None = None
+        self.recording: SequenceRecord | None = None
         #: Of the recording, or of the next one if there is none
         self._calibration: dict[str, np.ndarray] = {}
         self._to_ras = np.eye(4)
@@ -66,12 +42,12 @@ class Registration:
 
     # ---- recording ---------------------------------------------------------------------------------------------
 
-    def read(self, path: str) -> Recording:
+    def read(self, path: str) -> SequenceRecord:
         """The recording of a file. Raises SimulationError if it cannot be read."""
         with self._presenter.view.progress(f"Open {Path(path).name}"):
             sequence = self._tasks.doAside(lambda: TrackedSequence.read(path))
         require(sequence.has_images, f"{Path(path).name}: has poses without images, expected tracked images")
-        return Recording(sequence, Path(path).name.split(".")[0])
+        return SequenceRecord(sequence, Path(path).name.split(".")[0])
 
     @property
     def is_waiting(self) -> bool:
@@ -83,25 +59,19 @@ class Registration:
         """The nodes of the recording in the scene."""
         return list(self._nodes)
 
-    def take(
-        self, recording: Recording, to_ras: np.ndarray | None = None, kept: SequenceRecord | None = None
-    ) -> None:  # fmt: skip
-        """Use a recording from now on, in the patient at `to_ras` (4, 4), if it is known; `kept` is as of _apply.
+    def take(self, recording: SequenceRecord) -> None:
+        """Use a recording from now on, in its place in the patient, if it is known.
 
         Its probe and poses are used once its calibration is known. Nothing changes if it cannot be used.
         """
         calibration, place, sources = self._calibration, self._to_ras, dict(self._from)
         if self.recording is not None:  # they are of that
             calibration, place, sources = {}, np.eye(4), {_CALIBRATION: "", _REGISTRATION: ""}
-        if to_ras is not None and not np.allclose(to_ras, np.eye(4)):
-            place, sources[_REGISTRATION] = to_ras, "given at the start" if kept is None else "as it was kept"
-        self._apply(recording, calibration, place, kept)
+        if recording.to_ras is not None and not np.allclose(recording.to_ras, np.eye(4)):
+            place, sources[_REGISTRATION] = recording.to_ras, "as it was given or saved"
+        self._apply(recording, calibration, place)
         self._from = sources
         self._tell()
-
-    def restore(self, record: SequenceRecord) -> None:
-        """Use what was kept of a recording, calibrated and in its place; its images are prepared if they can be."""
-        self.take(Recording(record.sequence, record.name, record.path), record.to_ras, record)
 
     def forget(self) -> None:
         """Forget the recording, which is of another patient; its nodes are removed with him."""
@@ -145,27 +115,22 @@ class Registration:
         self._calibration, self._to_ras, self._from[what] = calibration, to_ras, source
         self._tell()
 
-    def _apply(
-        self, recording: Recording, calibration: dict[str, np.ndarray], to_ras: np.ndarray,
-        kept: SequenceRecord | None = None,
-    ) -> None:  # fmt: skip
-        """Use these, or raise SimulationError and change nothing.
-
-        `kept` is what is known of the recording, if it is restored.
-        """
+    def _apply(self, recording: SequenceRecord, calibration: dict[str, np.ndarray], to_ras: np.ndarray) -> None:
+        """Use these, or raise SimulationError and change nothing."""
         sequence = recording.sequence.with_transforms(calibration) if calibration else recording.sequence
         before, made = self.recording or recording, None
         is_same = before.sequence is recording.sequence
         # Another place in the patient does not change the field of the images
         is_field_same = is_same and before.path == recording.path and calibration is self._calibration
-        field = self._field if is_field_same else None
-        record = kept or SequenceRecord(sequence, recording.name, recording.path, to_ras, field=field)
-        if replace(recording, sequence=sequence).is_calibrated:
+        field = self._field if self.recording is not None and is_field_same else recording.field
+        record = replace(recording, sequence=sequence, to_ras=to_ras, field=field)
+        if record.is_calibrated:
             with self._presenter.view.progress("Find the probe's field"):
                 made = self._file_nodes.sequence(record)
         number = self._shared.now.sequence.number if is_same else 0
         old, self._nodes = self._nodes, [] if made is None else made[3]
-        self.recording, self._calibration, self._to_ras = recording, calibration, to_ras
+        self.recording = replace(recording, tracked=None, field=None)  # which another calibration changes
+        self._calibration, self._to_ras = calibration, to_ras
         if made is None:
             self._comparison.drop()
             self._comparison.view(sequence.images, number)
@@ -208,7 +173,7 @@ class Registration:
             about.registration = self._from[_REGISTRATION] or (_NOT_REGISTERED if recording is not None else "")
         self._presenter.view.refresh()
 
-    def _calibration_line(self, recording: Recording | None) -> str:
+    def _calibration_line(self, recording: SequenceRecord | None) -> str:
         if recording is None:
             return ""
         known = replace(recording, sequence=recording.sequence.with_transforms(self._calibration))

@@ -63,25 +63,19 @@ class Transfer:
                 return web.Response(status=413, text="too much")
         files = uploads.plain_names(parts)
         if request.query.get("for") == DICOM:
-            return await _answer(request, await self._export(DICOM, files))
+            return _answer(await self._export(DICOM, files))
         if files:
             self._opened(files, request.query.get("as", ""))
         return web.Response(status=204)
 
     async def _send(self, request: web.Request) -> web.StreamResponse:
-        return await _answer(request, await self._export(request.query.get("kind", "")))
+        return _answer(await self._export(request.query.get("kind", "")))
 
 
-async def _answer(request: web.Request, found: tuple[str, bytes, str] | None) -> web.StreamResponse:
+def _answer(found: tuple[str, bytes, str] | None) -> web.StreamResponse:
     if found is None:
         return web.Response(status=204)
     name, content, mime = found
-    response = web.StreamResponse()
-    response.content_type, response.content_length = mime, len(content)
-    response.headers["Content-Disposition"] = f"attachment; filename*=UTF-8''{quote(name)}"
-    response.headers["Cache-Control"] = "no-store"
-    await response.prepare(request)
-    for start in range(0, len(content), _PIECE):
-        await response.write(content[start : start + _PIECE])
-    await response.write_eof()
-    return response
+    disposition = f"attachment; filename*=UTF-8''{quote(name)}"
+    headers = {"Content-Disposition": disposition, "Cache-Control": "no-store"}
+    return web.Response(body=content, content_type=mime, headers=headers)
