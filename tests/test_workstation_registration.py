@@ -22,6 +22,7 @@ from tests.test_workstation import (
     eventually,
     first_page as first_page,
     open_new_patient,
+    open_section,
     opened,
     pytestmark as pytestmark,
     serving,
@@ -93,7 +94,7 @@ def test_ultrasound_without_a_calibration_asks_for_it(page, recording):
         "tracked ultrasound: 6 images of 624x512, transforms ProbeToTracker, ReferenceToTracker, StylusToTracker: its "
         "calibration is asked for in Tracked ultrasound"
     )
-    assert state(page, NAMES.sequence.length) == 0 and "Tracked ultrasound" in state(page, NAMES.open_sections)
+    assert state(page, NAMES.sequence.length) == 6 and not state(page, NAMES.sequence.is_placed)
     assert "no path from Image to Reference" in page.locator("#calibration-from").inner_text()
     page.set_input_files("#calibration-file", recording["folder"] / "plus.xml")
     settled(page)
@@ -117,13 +118,14 @@ def test_wrong_calibrations_and_registrations_are_said_and_change_nothing(page, 
 
     sent("calibration", np.ones((1, 3)))
     assert "matrix.txt" in errors(page)[-1]
+    open_section(page, "Tracked ultrasound")
     page.fill("#calibration-name", "Image")
     sent("calibration", recording["calibration"])
-    assert errors(page)[-1] == "Its name is 'Image', expected two frames joined by To, such as ImageToProbe"
+    assert errors(page)[-1] == "transform is 'Image', expected two frames joined by To, such as ImageToReference"
     page.fill("#calibration-name", "ImageToProbe")
     skewed = recording["calibration"] @ np.array([[1, 0.2, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
     sent("calibration", skewed)
-    assert "is skewed" in errors(page)[-1] and state(page, NAMES.sequence.length) == 0
+    assert "is skewed" in errors(page)[-1] and not state(page, NAMES.sequence.is_placed)
     sent("calibration", recording["calibration"])
     assert page.locator("#calibration-from").inner_text() == "Calibration ImageToProbe of matrix.txt"
     before = shown_pose(page, 2)
