@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Iterable, Iterator
+from collections.abc import Callable, Hashable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any
@@ -14,7 +14,7 @@ from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.mri.given_mask import follows
 from SlicerUSSim.Logic.mrml.label_nodes import labels_version
 from SlicerUSSim.Logic.mrml.lesion_nodes import add_lesion
-from SlicerUSSim.Logic.mrml.nodes import nodes_of_class, read_volume
+from SlicerUSSim.Logic.mrml.nodes import read_volume, remove_patient_nodes
 from SlicerUSSim.Logic.mrml.scene_record import SequenceRecord
 from SlicerUSSim.Logic.mrml.taken_image import patient_of
 from SlicerUSSim.Logic.mrml.taken_sequence import FrozenRecord, version_taken
@@ -30,12 +30,6 @@ from SlicerUSSim.Workstation.probe_control import ProbeControl
 _OF_PATIENT = (
     "mri", "labels", "mask", "second_mri", "lesions", "organs", "sheets", "seed", "opening", "real",
     "transform_sequence", "image_sequence",
-)  # fmt: skip
-#: What is of a patient: images, labels, surfaces, points, recordings, the costs of a fit
-_PATIENT_CLASSES = (
-    "vtkMRMLSequenceBrowserNode", "vtkMRMLSequenceNode", "vtkMRMLVolumeNode", "vtkMRMLSegmentationNode",
-    "vtkMRMLModelNode", "vtkMRMLMarkupsNode", "vtkMRMLTransformNode", "vtkMRMLPlotChartNode", "vtkMRMLPlotSeriesNode",
-    "vtkMRMLTableNode",
 )  # fmt: skip
 
 
@@ -299,7 +293,7 @@ class OpenPatient:
             node: Any = getattr(parameters, role)
             if node not in kept:
                 setattr(parameters, role, None)
-        _remove_patient_nodes(self._scene, kept)
+        remove_patient_nodes(self._scene, kept)
         with self._shared.changing() as now:
             now.fit.curve, now.fit.costs = [], ""
         self._is_new = True
@@ -338,35 +332,3 @@ class OpenPatient:
             self._presenter.images.setLive(True)
         self._probe.update_surface()  # after the start of live images, which do not need it
         self._probe.look()
-
-
-def _remove_patient_nodes(scene, kept: Iterable[Any]) -> None:
-    """Remove all nodes of these classes, with what displays and stores them, except those that are kept.
-
-    Nodes that are not saved with the scene belong to the views and stay. The scene is the workstation's own: nobody
-    else puts nodes into it.
-    """
-    ids = {node.GetID() for node in kept if node is not None}
-    for name in _PATIENT_CLASSES:
-        for node in nodes_of_class(scene, name):
-            # One may be gone together with another one before
-            if node.GetSaveWithScene() and node.GetScene() is not None and node.GetID() not in ids and _is_data(node):
-                for helper in _helpers(node):
-                    scene.RemoveNode(helper)
-                scene.RemoveNode(node)
-
-
-def _is_data(node) -> bool:
-    """Not a model of a slice view, which Slicer makes and needs."""
-    is_shares = node.GetAttribute("SlicerUSSim.sharesOf") is not None
-    return (not (node.GetName() or "").endswith("Volume Slice") and not node.GetHideFromEditors()) or is_shares
-
-
-def _helpers(node) -> list[Any]:
-    """Display and storage nodes, and the colours of labels."""
-    displays = range(node.GetNumberOfDisplayNodes()) if node.IsA("vtkMRMLDisplayableNode") else ()
-    stores = range(node.GetNumberOfStorageNodes()) if node.IsA("vtkMRMLStorableNode") else ()
-    found = [node.GetNthDisplayNode(number) for number in displays]
-    found += [node.GetNthStorageNode(number) for number in stores]
-    found.append(node.GetNodeReference("tissueColors"))
-    return [helper for helper in found if helper is not None]

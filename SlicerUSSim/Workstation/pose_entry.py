@@ -8,9 +8,9 @@ import numpy as np
 
 from SlicerUSSim.Logic.base.errors import require, required
 from SlicerUSSim.Logic.base.transforms import angles_of_pose
+from SlicerUSSim.Logic.mrml.taken_files import written
 from SlicerUSSim.Logic.tracked.pose_files import pose_of_text, write_pose
 from SlicerUSSim.Workstation.browser_panel import BrowserPanel
-from SlicerUSSim.Workstation.export import written
 
 #: Suffixes of files of poses
 POSE_SUFFIXES = (".json", ".tfm", ".h5", ".mat", ".txt")
