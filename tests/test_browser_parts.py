@@ -25,6 +25,7 @@ from SlicerUSSim.Logic import (
 )
 from SlicerUSSim.Logic.base.errors import Cancelled
 from SlicerUSSim.Logic.base.volume import Volume
+from SlicerUSSim.Logic.fitting.image_similarity import RealImages
 from SlicerUSSim.Logic.mri.samples import head_mri
 from SlicerUSSim.Logic.mri.segmentation import segment_mri
 from SlicerUSSim.Logic.probe.arrays import PROBES
@@ -47,7 +48,7 @@ from SlicerUSSim.Logic.mrml.nodes import node_to_world, probe_pose, read_volume,
 from SlicerUSSim.Logic.mrml.sequence_nodes import TIME, SequenceIndex, add_sequence  # noqa: E402
 from SlicerUSSim.Logic.tracked.images import TrackedImages  # noqa: E402
 from SlicerUSSim.Workstation.browser_panel import BrowserPanel  # noqa: E402
-from SlicerUSSim.Workstation.comparison import Comparison, RealImages  # noqa: E402
+from SlicerUSSim.Workstation.comparison import Comparison  # noqa: E402
 from SlicerUSSim.Workstation.image_flow import LatencyStamps  # noqa: E402
 from SlicerUSSim.Workstation.state import (  # noqa: E402
     NAMES,
@@ -631,7 +632,7 @@ def test_a_frozen_image_stays_where_it_was_taken_in_3d_and_in_the_slices():
         body = node_called(app.scene, "Model", "Probe body")
         in_slices = node_to_world(seen) @ ijk_to_ras(seen)
         shown_ids = {view.get_foreground_volume_id() for view in views.slices}
-        views.hide_surface()  # an empty model
+        views.show_surface(None)  # an empty model
         for name in ("Ultrasound field", "Probe body", "Patient surface"):
             assert not any(fits(role, node_called(app.scene, "Model", name)) for role in ("sheets", "outline")), name
         assert not any(fits(role, seen) for role in ("mri", "second_mri", "real", "output"))

@@ -25,11 +25,11 @@ pytest.importorskip("trame_slicer", reason="the workstation comes with: pip inst
 from trame_server.state import State  # noqa: E402
 
 from SlicerUSSim.Logic.mrml.nodes import node_to_world, set_node_to_world  # noqa: E402
+from SlicerUSSim.Logic.mrml.taken_files import sequence_file  # noqa: E402
 from SlicerUSSim.Workstation import cine as cine_module, image_flow  # noqa: E402
 from SlicerUSSim.Workstation.browser_panel import BrowserPanel, Observed  # noqa: E402
 from SlicerUSSim.Workstation.cine import Cine  # noqa: E402
 from SlicerUSSim.Workstation.dicom_export import ultrasound_file  # noqa: E402
-from SlicerUSSim.Workstation.export import sequence_file  # noqa: E402
 from SlicerUSSim.Workstation.image_flow import ImageFlow, LatencyStamps  # noqa: E402
 from SlicerUSSim.Workstation.state import SharedState  # noqa: E402
 from SlicerUSSim.Workstation.tasks import Tasks  # noqa: E402

@@ -24,14 +24,10 @@ pyigtl = pytest.importorskip("pyigtl", reason="OpenIGTLink comes with pyigtl: pi
 from playwright.sync_api import Page, sync_playwright  # noqa: E402
 
 from SlicerUSSim.Logic import TissueTable, Volume  # noqa: E402
-from SlicerUSSim.Logic.base.errors import required  # noqa: E402
 from SlicerUSSim.Logic.base.volume import read_image_file  # noqa: E402
 from SlicerUSSim.Logic.probe.poses import pose_looking_at  # noqa: E402
 from SlicerUSSim.Workstation.state import NAMES, value_of  # noqa: E402
 from tests.served import Served, refused  # noqa: E402
-from tests.test_grown_lesions import CENTRE  # noqa: E402
-from tests.test_label_maps import head  # noqa: E402
-from validation.brain_phantoms import phantom, tissue_maps, with_low_grade_tumour  # noqa: E402
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="Chromium is missing: apt-get install chromium")
@@ -245,19 +241,6 @@ def eventually(page: Page, condition) -> None:
     while not condition():
         assert monotonic() < end, "it never became so"
         page.wait_for_timeout(100)
-
-
-def pressed_until(page: Page, selector: str, condition) -> None:
-    """Press a button until a condition is true: of a busy server's page a press can be lost while an image comes."""
-    end = monotonic() + PATIENCE_S
-    while not condition():
-        assert monotonic() < end, f"{selector} did nothing"
-        if page.locator(selector).is_enabled():
-            click(page, selector)
-        for _ in range(100):
-            if condition():
-                return
-            page.wait_for_timeout(100)
 
 
 def pixels(page: Page, stream: str = "simulated") -> np.ndarray:
@@ -493,24 +476,6 @@ def test_keys_and_sliders_move_the_probe(page):
 # ---- tissues, settings -----------------------------------------------------------------------------------------------
 
 
-@pytest.mark.long
-def test_segment_labels_the_mri_anew_and_says_what_it_cannot(page):
-    before = pixels(page)
-    open_section(page, "Patient")
-    with new_image(page):
-        click(page, "#segmentButton")
-    assert np.array_equal(pixels(page), before) and not errors(page)  # of the same image the same tissues
-    page.evaluate("window.trame.trigger('set', ['classesSpinBox', 4])")
-    click(page, "#segmentButton")
-    assert "classes is 4, expected 3 for contrast t1" in shown_errors(page)
-    open_section(page, "Advanced")
-    classes = page.locator("#classesSpinBox")
-    classes.fill("")
-    classes.blur()
-    eventually(page, lambda: shown(page, "classesSpinBox") == 2)  # which stands for none
-    assert classes.input_value() == ""
-
-
 @pytest.mark.slow
 def test_a_changed_tissue_changes_the_image_and_nonsense_is_refused(page):
     open_section(page, "Tissues")
@@ -694,83 +659,6 @@ def round_head(folder: Path) -> Volume:
     return labels
 
 
-@pytest.mark.long
-def test_a_craniotomy_is_opened_and_closed_in_the_page(browser, tmp_path):
-    closed, misfit = "the skull is closed in front of the probe", "mm wide and does not fit the opening"
-    round_head(tmp_path)
-    with serving("--labels", str(tmp_path / "labels.nii.gz")) as address:
-        page = opened(browser, address)
-        settled(page)
-        open_section(page, "Probe")
-        shut = np.asarray(Image.open(download(page, "png")), float)
-        assert shown(page, "probeNotesLabel").count(closed) == 1
-        assert page.locator("#closeCraniotomyButton").is_disabled()
-        pressed_until(page, "#openCraniotomyButton", lambda: "craniotomy: a disc of" in shown(page, "probeNotesLabel"))
-        settled(page)
-        page.evaluate("window.trame.trigger('press', ['placeButton'])")  # on the brain, in the middle of the opening
-        settled(page)
-        assert not errors(page) and "craniotomy: a disc of" in shown(page, "probeNotesLabel")
-        assert closed not in shown(page, "probeNotesLabel") and misfit not in shown(page, "probeNotesLabel")
-        assert "probe: " not in shown(page, "probeNotesLabel")  # there is no lesion to aim at
-        through = np.asarray(Image.open(download(page, "png")), float)
-        assert through.mean() > shut.mean() + 5.0
-        open_section(page, "Patient")
-        click(page, "#close-patient")
-        tip = page.locator("#question .ussim-choice").first
-        assert "not saved: the opening of the skull" in tip.inner_text()
-        page.keyboard.press("Escape")
-        page.locator("#question").wait_for(state="detached")
-        page.evaluate("window.trame.trigger('set', ['probePresetComboBox', 'abdominal'])")
-        eventually(page, lambda: f"the face of the probe is 69 {misfit}" in shown(page, "probeNotesLabel"))
-        pressed_until(page, "#closeCraniotomyButton", lambda: "craniotomy: " not in shown(page, "probeNotesLabel"))
-        settled(page)
-        assert not errors(page) and "craniotomy: " not in shown(page, "probeNotesLabel")
-        assert misfit not in shown(page, "probeNotesLabel")
-        assert page.locator("#closeCraniotomyButton").is_disabled()
-        page.close()
-
-
-@pytest.mark.long
-def test_a_click_grows_a_lesion_that_is_added_to_the_tissues(browser, tmp_path):
-    maps = with_low_grade_tumour(required(tissue_maps("mni152"), "no atlas"), CENTRE, 14.0).coarser(2)
-    image = phantom(maps, "flair", noise=0.03, bias=0.0)
-    image.mri.write(tmp_path / "flair.nii.gz")
-    image.mask.write(tmp_path / "mask.nii.gz")
-    arguments = [str(tmp_path / "flair.nii.gz"), "--contrast", "flair", "--mask", str(tmp_path / "mask.nii.gz")]
-    with serving(*arguments) as address:
-        page = opened(browser, address)
-        settled(page)
-        open_section(page, "Lesions and other images")
-        before = shown(page, "notesLabel")
-        assert page.locator("#removeGrownButton").is_disabled()
-        axial = views(page)[2]
-        click(page, "#pickSeedButton")
-        settled(page)  # the next live image may replace what the status says
-        with heard(page):
-            page.mouse.click(*in_view(axial, 0.05, 0.1))  # beside the head
-        eventually(page, lambda: bool(errors(page)))
-        assert re.search(r"mm outside the (brain|image)", errors(page)[0]), errors(page)
-        page.evaluate("window.trame.trigger('dismiss', [0])")
-        assert shown(page, "lesionsSelector") is None and shown(page, "notesLabel") == before
-        click(page, "#pickSeedButton")
-        settled(page)  # the next live image may replace what the status says
-        pose_before = pose(page)
-        with heard(page):
-            page.mouse.click(*in_view(axial, 0.352, 0.507))
-        eventually(page, lambda: "grown: tumour" in shown(page, "lesionNotesLabel"))
-        settled(page)
-        assert not errors(page) and pose(page) == pose_before
-        drawn(page)
-        seen = picture(page, required(axial.bounding_box(), "no view"))
-        assert (seen[..., 1] - seen[..., 0] > 15).sum() > 500  # it is shown, green
-        click(page, "#addTissuesButton")
-        eventually(page, lambda: "added over" in shown(page, "notesLabel"))
-        settled(page)
-        assert not errors(page)
-        assert "tumour" in [row["name"] for row in state(page, NAMES.panel.tissues)]
-        page.close()
-
-
 def test_a_saved_scene_opens_again_with_the_same_image(page, tmp_path):
     from slicer import vtkSlicerSequencesLogic
     from trame_slicer.core import SlicerApp
@@ -836,17 +724,6 @@ def test_two_tabs_show_and_drive_the_same_workstation(page, browser, url):
     assert pose(page)["rock_deg"] - before["rock_deg"] == pytest.approx(12, abs=0.9)
 
 
-@pytest.mark.long
-def test_a_reloaded_page_shows_what_there_was(page):
-    image = pixels(page)
-    page.reload()
-    loaded(page)
-    drawn(page)
-    assert np.array_equal(pixels(page), image)
-    for view in views(page):
-        assert picture(page, view.bounding_box()).std() > 10
-
-
 def test_a_file_that_cannot_be_read_is_said_and_changes_nothing(page):
     before = state(page, NAMES.title), shown(page, "kindComboBox"), shown(page, "mriSelector")
     broken = {"name": "broken.nii.gz", "mimeType": "application/octet-stream", "buffer": b"this is no image"}
@@ -857,30 +734,6 @@ def test_a_file_that_cannot_be_read_is_said_and_changes_nothing(page):
     assert (state(page, NAMES.title), shown(page, "kindComboBox"), shown(page, "mriSelector")) == before
     page.locator(".ussim-error button").first.click()
     eventually(page, lambda: not errors(page))
-
-
-@pytest.mark.long
-def test_an_opened_patient_takes_the_place_of_title_notes_and_warnings(page, tmp_path):
-    aseg = head()
-    aseg.write(tmp_path / "aseg.nii.gz")
-    Volume(aseg.array[:, :35].copy(), aseg.ijk_to_ras).write(tmp_path / "crop.nii.gz")
-
-    def opened_as(path: Path, title: str = "New patient") -> str:
-        with new_image(page):
-            page.set_input_files("#open-file", path)
-            answer_new_patient(page, title)
-        settled(page)
-        assert state(page, NAMES.title) == page.locator("#title").inner_text() == path.name
-        page.wait_for_function("title => document.title === title", arg=f"{path.name} - SlicerUSSim")
-        return page.locator("#notesLabel").inner_text()
-
-    notes = opened_as(tmp_path / "crop.nii.gz", "Tissues of head.nii.gz")
-    assert "crop.nii.gz: FreeSurfer: 8 labels to 3 tissues" in notes and "share" not in notes
-    assert "Check: the intensities of head.nii.gz do not follow the labels (of another patient?)" in notes
-    assert not errors(page) and "/tmp" not in page.locator("body").inner_text()
-    notes = opened_as(tmp_path / "aseg.nii.gz")
-    assert "aseg.nii.gz: FreeSurfer: 8 labels to 3 tissues" in notes
-    assert not errors(page) and "crop" not in notes and shown(page, "mriSelector") is None
 
 
 # ---- who may come in, and how it is started --------------------------------------------------------------------------

@@ -11,9 +11,12 @@ from PIL import Image
 
 pytest.importorskip("trame_slicer", reason="the workstation comes with: pip install '.[serve]'")
 pytest.importorskip("playwright", reason="browser tests need playwright: pip install '.[test]'")
+axe_of = pytest.importorskip("axe_playwright_python.sync_playwright", reason="it comes with: pip install '.[test]'")
 pydicom = pytest.importorskip("pydicom", reason="it comes with: pip install '.[test]'")
 
 from SlicerUSSim.Logic import TissueTable, Volume  # noqa: E402
+from SlicerUSSim.Logic.base.transforms import pose_of_angles  # noqa: E402
+from SlicerUSSim.Logic.tracked.pose_files import read_pose  # noqa: E402
 from SlicerUSSim.Workstation.state import NAMES  # noqa: E402
 from tests.test_workstation import (  # noqa: E402
     browser as browser,
@@ -295,3 +298,46 @@ def test_the_line_over_the_image_has_a_remedy(browser, tmp_path):
         open_section(page, "Probe")
         assert "craniotomy: a disc of" in page.locator("#probeNotesLabel").inner_text() and not errors(page)
         page.close()
+
+
+@pytest.mark.slow
+def test_axe_finds_nothing_wrong_with_the_page_and_its_sections(page):
+    for title in ("Patient", "Probe", "Tissues", "Advanced", "Tracked ultrasound", "Fit to real ultrasound"):
+        open_section(page, title)
+    found = axe_of.Axe().run(page, options={"runOnly": ["wcag2a", "wcag2aa", "cat.name-role-value"]})
+    wrong = [(entry["id"], node["html"][:150]) for entry in found.response["violations"] for node in entry["nodes"]]
+    assert not wrong, "\n".join(map(str, wrong[:30]))
+
+
+@pytest.mark.slow
+def test_a_pose_is_typed_saved_and_opened_again(page, tmp_path):
+    def where() -> np.ndarray:
+        return np.array(page.evaluate("window.ussim.image.pose"))
+
+    open_section(page, "Probe")
+    before = where()
+    numbers = [float(number) for number in page.locator("#pose-numbers").input_value().split()]
+    np.testing.assert_allclose(pose_of_angles(numbers[:3], numbers[3:]), before, atol=1e-2)
+    typed = page.locator("#pose-numbers")
+    with new_image(page):
+        typed.fill(f"{numbers[0] + 2} {' '.join(map(str, numbers[1:5]))} {numbers[5] + 4}")
+        typed.blur()
+    moved = where()
+    np.testing.assert_allclose(moved, pose_of_angles([numbers[0] + 2, *numbers[1:3]], [*numbers[3:5], numbers[5] + 4]),
+                               atol=1e-3)  # fmt: skip
+    page.select_option("#pose-format", ".tfm")
+    with page.expect_download() as waiting:
+        click(page, "#save-pose")
+    (tmp_path / "pose.tfm").write_bytes(waiting.value.path().read_bytes())
+    np.testing.assert_allclose(read_pose(tmp_path / "pose.tfm"), moved, atol=1e-3)
+    typed.fill("1 2 3")
+    typed.blur()
+    eventually(page, lambda: bool(errors(page)))
+    assert errors(page)[0].startswith("the pose is '1 2 3', expected 6 numbers") and np.array_equal(where(), moved)
+    page.evaluate("window.trame.trigger('dismiss', [0])")
+    with new_image(page):
+        page.evaluate("rows => window.trame.trigger('type_pose', [rows])", " ".join(map(str, before.ravel().tolist())))
+    page.set_input_files("#open-file", tmp_path / "pose.tfm")
+    page.get_by_text("Pose of the probe").click()
+    eventually(page, lambda: np.allclose(where(), moved, atol=1e-3))
+    assert not errors(page)

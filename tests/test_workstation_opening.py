@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import json
 import re
 import shutil
 from pathlib import Path
@@ -16,14 +15,11 @@ pytest.importorskip("playwright", reason="browser tests need playwright: pip ins
 
 from SlicerUSSim.Logic import Volume
 from SlicerUSSim.Logic.imaging.preset import Preset
-from SlicerUSSim.Logic.tracked.sequence import TrackedSequence
 from SlicerUSSim.Workstation.state import NAMES
 from tests.test_label_maps import head
 from tests.test_uploads import write_series
 from tests.test_workstation import (
     browser as browser,
-    click,
-    cost,
     dismiss_messages,
     errors,
     eventually,
@@ -113,21 +109,6 @@ def ball(mri: Volume, radius_mm: float = 12.0) -> Volume:
     return mri.with_array(inside.astype(np.uint8))
 
 
-@pytest.mark.long
-def test_points_of_slicer_are_an_opening_or_the_point_of_a_lesion(page, tmp_path):
-    points = [{"position": [x, y, 60.0]} for x, y in ((-10, -10), (10, -10), (10, 10))]
-    for kind, name, selector, deed in (
-        ("ClosedCurve", "hole.mrk.json", "openingSelector", "chosen as the opening of a craniotomy"),
-        ("Fiducial", "lesion.mrk.json", "seedSelector", "the last one is chosen as the point of a lesion"),
-    ):
-        markup = {"type": kind, "coordinateSystem": "LPS", "controlPoints": points}
-        (tmp_path / name).write_text(json.dumps({"@schema": "markups", "markups": [markup]}))
-        said = answered(page, tmp_path / name)
-        assert said.startswith(f"{name}: points of 3D Slicer: {deed}") and not errors(page)
-        titles = {item["value"]: item["title"] for item in state(page, NAMES.panel.nodes)[selector]}
-        assert titles[shown(page, selector)] == name
-
-
 @pytest.mark.slow
 def test_a_mask_is_a_tumour_or_a_brain_mask_as_the_user_says(page, files, tmp_path):
     mri = Volume.read(files / "head.nii.gz")
@@ -158,7 +139,8 @@ def test_a_mask_is_a_tumour_or_a_brain_mask_as_the_user_says(page, files, tmp_pa
 
 @pytest.mark.long
 def test_a_label_map_is_of_this_patient_or_of_a_new_one(page, files, tmp_path):
-    Volume.read(files / "labels.nii.gz").write(tmp_path / "own.nii.gz")  # without the names in its header
+    labels = Volume.read(files / "labels.nii.gz")
+    Volume(labels.array, labels.ijk_to_ras).write(tmp_path / "own.nii.gz")  # without the names in its header
     ball(Volume.read(files / "head.nii.gz")).write(tmp_path / "mask.nii.gz")
     answered(page, tmp_path / "mask.nii.gz", "Add as cyst")
     lesions = shown(page, "lesionsSelector")
@@ -186,25 +168,6 @@ def test_a_ct_is_recognised_and_segmented_as_one(page, tmp_path):
     assert "spine.nrrd: a CT by its numbers" in said and "segmented as ct (before: t1)" in said and not errors(page)
     assert shown(page, "contrastComboBox") == "ct"
     assert "bone" in {row["name"] for row in state(page, NAMES.panel.tissues)}
-
-
-@pytest.mark.long
-def test_ultrasound_that_is_opened_before_any_patient_stays_for_him(page, files, tmp_path):
-    sweep = TrackedSequence.read(files / "sweep.igs.mha")
-    bare = tuple({"ProbeToReference": entry["ProbeToReference"]} for entry in sweep.transforms)
-    TrackedSequence(sweep.images, bare, sweep.timestamps).write(tmp_path / "bare.mha")  # without a calibration
-    for file in (tmp_path / "bare.mha", files / "sweep.igs.mha"):
-        click(page, "#close-patient")
-        settled(page)
-        said = answered(page, file)
-        with new_image(page):
-            answered(page, files / "head.nii.gz")  # nothing is asked: no patient is open
-        assert state(page, NAMES.registration.recording).startswith(f"{file.name.split('.')[0]}: 6 images")
-        assert not errors(page)
-    assert said.endswith("compared with the patient who is opened next") and state(page, NAMES.sequence.length) == 6
-    page.evaluate("window.trame.trigger('show_number', [2])")
-    settled(page)
-    assert 0 < cost(page) < 1 and not errors(page)
 
 
 @pytest.mark.long
@@ -257,7 +220,6 @@ def test_the_series_of_a_dicom_folder_is_asked_by_its_description(page, dicom):
         answer(page, "New patient")
     settled(page)
     assert state(page, NAMES.title) == "T1 MPRAGE (series 3)" and not errors(page)
-    assert "1 file beside the DICOM images left out, as no image" in state(page, NAMES.opened)[0]
     body = page.locator("body").inner_text()
     assert "Miller" not in body and "4711" not in body and "/tmp" not in body
 
@@ -279,7 +241,7 @@ DROP = """async ([files, from]) => {
 def test_files_are_dropped_anywhere_on_the_page(page, files, dicom):
     paths = sorted((dicom / "IMAGES" / "A").iterdir())
     sent = [(path.name, base64.b64encode(path.read_bytes()).decode()) for path in paths]
-    assert page.evaluate(DROP, [sent, "#ultrasound"]) == [True, False]
+    assert page.evaluate(DROP, [sent, "#screens"]) == [True, False]
     assert question(page).startswith("T1 MPRAGE (series 3) is an MRI of a brain")  # the only series is not asked
     answer(page, "Second MRI of head.nii.gz")
     answer(page, "t2")

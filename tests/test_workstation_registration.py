@@ -94,14 +94,12 @@ def test_ultrasound_without_a_calibration_asks_for_it(page, recording):
         "tracked ultrasound: 6 images of 624x512, transforms ProbeToTracker, ReferenceToTracker, StylusToTracker: its "
         "calibration is asked for in Tracked ultrasound"
     )
-    assert state(page, NAMES.sequence.length) == 6 and not state(page, NAMES.sequence.is_placed)  # to be viewed only
-    assert "not calibrated" in page.locator("#advice").inner_text()
-    open_section(page, "Tracked ultrasound")
+    assert state(page, NAMES.sequence.length) == 6 and not state(page, NAMES.sequence.is_placed)
     assert "no path from Image to Reference" in page.locator("#calibration-from").inner_text()
     page.set_input_files("#calibration-file", recording["folder"] / "plus.xml")
     settled(page)
     assert page.locator("#calibration-from").inner_text() == "Calibration ImageToProbe of plus.xml"
-    assert state(page, NAMES.sequence.is_placed) and not errors(page)
+    assert state(page, NAMES.sequence.length) == 6 and not errors(page)
     assert "none: the frame of the ultrasound is taken" in page.locator("#registration-from").inner_text()
     page.set_input_files("#registration-file", recording["folder"] / "registration.txt")
     settled(page)
@@ -118,12 +116,12 @@ def test_wrong_calibrations_and_registrations_are_said_and_change_nothing(page, 
         page.set_input_files(f"#{name}-file", tmp_path / "matrix.txt")
         settled(page)
 
-    open_section(page, "Tracked ultrasound")
     sent("calibration", np.ones((1, 3)))
     assert "matrix.txt" in errors(page)[-1]
+    open_section(page, "Tracked ultrasound")
     page.fill("#calibration-name", "Image")
     sent("calibration", recording["calibration"])
-    assert errors(page)[-1] == "Its name is 'Image', expected two frames joined by To, such as ImageToProbe"
+    assert errors(page)[-1] == "transform is 'Image', expected two frames joined by To, such as ImageToReference"
     page.fill("#calibration-name", "ImageToProbe")
     skewed = recording["calibration"] @ np.array([[1, 0.2, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
     sent("calibration", skewed)

@@ -23,8 +23,6 @@ from SlicerUSSim.Logic.mri.samples import head_mri
 from SlicerUSSim.Logic.mrml.lesion_nodes import add_lesion
 from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic
 from SlicerUSSim.Logic.mrml.nodes import probe_pose, write_volume
-from SlicerUSSim.Logic.mrml.sequence_nodes import add_sequence
-from SlicerUSSim.Logic.tracked.sequence import TrackedSequence
 from SlicerUSSim.Widget.presenter import PanelPresenter
 from SlicerUSSim.Workstation.scene_files import read_scene
 from SlicerUSSim.Workstation.state import NAMES
@@ -158,7 +156,7 @@ def test_the_workstation_opens_the_scene_that_it_saved(page, files, tmp_path):
     assert np.array_equal(pixels(page), image)
     assert state(page, NAMES.sequence.length) == 6 and "saved.mrb: a scene" in shown(page, "notesLabel")
     assert shown(page, "depthSlider") == 45 and state(page, NAMES.image.status) == "LIVE"
-    assert state(page, NAMES.registration.registration) == "as it was kept"
+    assert state(page, NAMES.registration.registration) == "as it was given or saved"
     page.evaluate("window.trame.trigger('show_number', [1])")
     settled(page)
     now = state(page, NAMES.pose_matrix)
@@ -184,42 +182,6 @@ def test_the_workstation_opens_the_scene_of_the_slicer_module(page, module_scene
         click(page, "#live")
     settled(page)
     assert (np.asarray(Image.open(download(page, "png"))) != image).mean() < 0.001  # poses are saved as text
-
-
-@pytest.mark.long
-def test_a_frozen_image_comes_back_with_its_scene(page, files, tmp_path):
-    """A live image where the probe is was shown in its place, and said to be "as it was"; also with the probe there."""
-    open_new_patient(page, files / "labels.nii.gz")
-    click(page, "#live")
-    status(page, "FROZEN")
-    page.evaluate("window.trame.trigger('set', ['gainSlider', 9])")  # of which it is not
-    settled(page)
-    image, about = pixels(page), page.evaluate("window.ussim.image")
-
-    def is_frozen_as_it_was(page) -> bool:
-        again = page.evaluate("window.ussim.image")
-        assert not errors(page) and state(page, NAMES.image.status) == "FROZEN" and not shown(page, "liveCheckBox")
-        told = ("patient", "time")
-        assert np.array_equal(pixels(page), image) and all(again[name] == about[name] for name in told)
-        np.testing.assert_allclose(again["pose"], about["pose"], atol=1e-3)
-        return shown(page, "gainSlider") == 9
-
-    shutil.copy(download(page, "mrb"), tmp_path / "still.mrb")
-    for _ in range(3):
-        page.keyboard.press("d")
-    settled(page)
-    moved = state(page, NAMES.pose_matrix)
-    shutil.copy(download(page, "mrb"), tmp_path / "frozen.mrb")
-    open_new_patient(page, files / "head.nii.gz")
-    open_scene(page, tmp_path / "frozen.mrb")
-    assert is_frozen_as_it_was(page)
-    now = state(page, NAMES.pose_matrix)
-    np.testing.assert_allclose(*(np.array(text.split(), float) for text in (now, moved)), atol=1e-3)
-    open_scene(page, tmp_path / "still.mrb")
-    assert is_frozen_as_it_was(page)
-    click(page, "#live")
-    status(page, "LIVE")
-    settled(page)
 
 
 @pytest.mark.slow
@@ -284,27 +246,6 @@ def test_a_bundle_with_files_outside_or_headers_of_others_is_refused(module_scen
     bad = changed(module_scene[0], tmp_path / "header.mrb", "<MRML", "<MRML", **{"x/Data/other.nrrd": header})
     with pytest.raises(SimulationError, match="is a header whose voxels are in another file"):
         read_scene(bad)
-
-
-@pytest.mark.long
-def test_real_images_that_cannot_be_used_close_no_patient(page, files, tmp_path):
-    """The patient was closed before it was seen that they show nothing."""
-    app = app_of_slicer()
-    logic = UltrasoundSceneLogic(app.scene)
-    logic.parameters.mri = app.scene.AddNewNodeByClass("vtkMRMLScalarVolumeNode", "T1 of a study")
-    write_volume(logic.parameters.mri, head_mri(5.0))
-    images, times = np.zeros((2, 60, 80), np.uint8), np.arange(2.0)
-    tracked = TrackedSequence(images, ({"ImageToReference": np.diag([0.5, 0.5, 0.5, 1.0])},) * 2, times)
-    _, logic.parameters.real = add_sequence(app.scene, tracked, "black")
-    assert app.io_manager.write_scene(tmp_path / "black.mrb")
-    open_new_patient(page, files / "labels.nii.gz")
-    before = pixels(page)
-    page.set_input_files("#open-file", tmp_path / "black.mrb")
-    answer_new_patient(page, "The patient of the scene")
-    page.locator(".ussim-error").first.wait_for()
-    settled(page)
-    assert "image 0 of the sequence is black" in errors(page)[0]
-    assert state(page, NAMES.title) == "labels.nii.gz" and np.array_equal(pixels(page), before)
 
 
 @pytest.mark.long

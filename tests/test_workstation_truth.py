@@ -21,11 +21,9 @@ from vtkmodules.vtkIOXML import vtkXMLImageDataReader
 from SlicerUSSim.Logic import Volume
 from SlicerUSSim.Logic.base.volume import read_image_file
 from SlicerUSSim.Logic.tracked.sequence import TrackedSequence
-from SlicerUSSim.Workstation.scene_files import read_scene
 from SlicerUSSim.Workstation.state import NAMES
 from tests.conftest import name_labels
 from tests.test_workstation import (
-    answer_new_patient,
     browser as browser,
     click,
     cost,
@@ -37,7 +35,6 @@ from tests.test_workstation import (
     new_image,
     open_head,
     open_new_patient,
-    pixels,
     pose,
     pytestmark as pytestmark,
     serving,
@@ -136,27 +133,6 @@ def test_ruler_and_image_change_together(page):
     assert {round(entry[0] / 10) * 10 for entry in drawn_with} == {50, 70, 90}
     for of_image, of_ruler, ratio, of_pixels in drawn_with:
         assert of_image == of_ruler and ratio == pytest.approx(of_pixels, rel=0.02)
-
-
-@pytest.mark.long
-def test_a_frozen_image_stays_where_it_was_taken_in_every_export(head_page, tmp_path):
-    page = head_page
-    status(page, "LIVE")
-    click(page, "#live")
-    status(page, "FROZEN")
-    settled(page)
-    taken, seen = page.evaluate("window.ussim.image.pose"), pixels(page)
-    for _ in range(4):
-        page.keyboard.press("Shift+ArrowRight")
-    settled(page)
-    assert page.evaluate("window.ussim.image.pose") == taken and np.array_equal(pixels(page), seen)
-    shutil.copy(download(page, "nrrd"), tmp_path / "frozen.nrrd")
-    frozen = read_image_file(tmp_path / "frozen.nrrd")
-    node, in_scene = output_of_scene(download(page, "mrb"), tmp_path)
-    np.testing.assert_allclose(in_scene, frozen.ijk_to_ras, atol=1e-3)
-    assert node.GetAttribute("SlicerUSSim.frozen") and not errors(page)
-    click(page, "#live")
-    status(page, "LIVE")
 
 
 def output_of_scene(bundle: Path, folder: Path):
@@ -288,110 +264,7 @@ def test_an_upload_shows_how_far_it_is_can_be_cancelled_and_images_go_on(page, f
     assert state(page, NAMES.title) == before and not errors(page)
 
 
-# ---- images of a sequence --------------------------------------------------------------------------------------------
-
-
-@pytest.mark.long
-def test_simulated_sequences_are_shown_and_played_where_they_were_taken(head_page, files, tmp_path):
-    """The page made images that it could not show."""
-    page = head_page
-    assert state(page, NAMES.cine.sequence_length) == 0
-    page.evaluate("window.trame.trigger('press', ['simulateSequenceButton'])")
-    settled(page)
-    assert not errors(page) and state(page, NAMES.cine.sequence_length) == 6
-    page.evaluate("window.trame.trigger('cine_source', ['sequence'])")
-    settled(page)
-    assert (state(page, NAMES.cine.length), state(page, NAMES.cine.index)) == (6, 0)
-    recorded = TrackedSequence.read(files / "sweep.igs.mha")
-    seen = []
-    for number in (1, 4):
-        page.evaluate("number => window.trame.trigger('cine_show', [number])", number)
-        settled(page)
-        image = page.evaluate("window.ussim.image")
-        assert image["sequence"] == number
-        status(page, "FROZEN")
-        np.testing.assert_allclose(image["pose"], recorded.transforms[number]["ProbeToReference"], atol=0.05)
-        assert state(page, NAMES.sequence.number) == number and cost(page) > 0  # beside the real image of that pose
-        assert not shown(page, "liveCheckBox")
-        seen.append(pixels(page))
-    assert not np.array_equal(*seen)
-    # The probe is there, and what is exported is that image
-    np.testing.assert_allclose(probe_pose(page), recorded.transforms[4]["ProbeToReference"], atol=0.05)
-    again = np.asarray(Image.open(download(page, "png")))
-    shutil.copy(download(page, "mrb"), tmp_path / "sequence.mrb")
-    record = read_scene(str(tmp_path / "sequence.mrb")).simulated
-    assert record is not None and len(record.images) == 6 and np.array_equal(record.images[4], again)
-    assert '"patient": "head.nii.gz"' in record.about
-    click(page, "#cine-play")
-    page.wait_for_function(f"window.trame.state.get('{NAMES.cine.index}') === 2")
-    page.wait_for_function(f"window.trame.state.get('{NAMES.cine.index}') === 5")
-    click(page, "#live")  # ends it
-    eventually(page, lambda: not state(page, NAMES.cine.playing))
-    eventually(page, lambda: shown(page, "liveCheckBox"))
-    with new_image(page):
-        page.keyboard.press("a")
-    assert page.evaluate("window.ussim.image.sequence") is None
-    status(page, "LIVE")
-    # Those of a patient go with him
-    open_new_patient(page, files / "labels.nii.gz")
-    assert state(page, NAMES.cine.sequence_length) == 0 and not errors(page)
-
-
-def probe_pose(page) -> np.ndarray:
-    """(4, 4) of the probe, as the page shows it in numbers."""
-    return np.array(state(page, NAMES.pose_matrix).split(), float).reshape(4, 4)
-
-
 # ---- work that takes long --------------------------------------------------------------------------------------------
-
-
-_AT_WORK = f"title => window.trame.state.get('{NAMES.messages.progress_title}') === title"
-
-
-def cancel(page) -> None:
-    """Press Cancel and wait until the page shows that nothing is under way."""
-    page.evaluate("document.getElementById('cancel').click()")  # playwright waits until a button stands still
-    page.wait_for_function(_AT_WORK, arg="")
-
-
-def image_during(page, title: str) -> None:
-    """Assert that the image follows the probe while something is under way."""
-    count = page.evaluate("window.ussim.images")
-    page.keyboard.press("a")
-    page.wait_for_function("n => window.ussim.images > n", arg=count)
-    assert page.evaluate(_AT_WORK, title)
-
-
-@pytest.mark.long
-def test_a_surface_is_cancelled_or_late_and_images_go_on(page, files, tmp_path):
-    k, j, i = np.ogrid[-119.5:120, -119.5:120, -119.5:120]
-    away = k**2 + j**2 + i**2
-    ball = sum((away < radius**2).astype(np.uint8) for radius in (60.0, 90.0, 110.0))
-    Volume(ball, np.eye(4)).write(tmp_path / "ball.nii.gz")
-    shutil.copy(files / "labels.json", tmp_path / "ball.json")
-    ball = [tmp_path / "ball.nii.gz", tmp_path / "ball.json"]
-    page.set_input_files("#open-file", ball)
-    answer_new_patient(page)
-    page.wait_for_function(_AT_WORK, arg="Make the surface")
-    cancel(page)
-    settled(page)
-    assert state(page, NAMES.title) == "ball.nii.gz" and state(page, NAMES.pose) is None
-    assert state(page, NAMES.messages.status).startswith("no surface of the patient") and pixels(page).any()
-    click(page, "#look")
-    page.wait_for_function(_AT_WORK, arg="Make the surface")
-    image_during(page, "Make the surface")
-    settled(page)
-    assert abs(state(page, NAMES.pose)["lift_mm"]) < 5
-    page.set_input_files("#open-file", ball)
-    answer_new_patient(page)
-    page.wait_for_function(_AT_WORK, arg="Make the surface")
-    page.evaluate("window.trame.trigger('close_patient')")
-    page.wait_for_function("window.ussim.image === null")
-    settled(page)
-    assert state(page, NAMES.title) == "" and state(page, NAMES.pose) is None
-    page.keyboard.press("ArrowRight")  # along no surface
-    settled(page)
-    assert state(page, NAMES.pose) is None and page.evaluate("window.ussim.image") is None
 
 
 @pytest.mark.slow

@@ -192,7 +192,7 @@ def _opened_first(path: str, options: list[str]) -> tuple[tuple[SceneRecord | No
 
     Raises SimulationError for a file that cannot be opened, and for a scene with such patient.
     """
-    from SlicerUSSim.Workstation.content import Kind, content_of
+    from SlicerUSSim.Logic.imaging.content import Kind, content_of
     from SlicerUSSim.Workstation.scene_files import read_scene
 
     if not _is_zip(path) and content_of(Path(path)).kind is not Kind.SCENE:

@@ -150,7 +150,7 @@ class AnatomyViews:
         self.show_labels(None, False)
         self.hide_image()
         display_of(self._model(_BODY)).SetVisibility(False)
-        self.hide_surface()
+        self.show_surface(None)
 
     def hide_image(self) -> None:
         """Show no image in the views."""
@@ -159,22 +159,17 @@ class AnatomyViews:
         display_of(self._model(_FIELD)).SetVisibility(False)
         self.threed.schedule_render()
 
-    def hide_surface(self) -> None:
-        """Show no surface of a patient."""
-        display_of(self._model(_PATIENT)).SetVisibility(False)
-        self._model(_PATIENT).SetAndObservePolyData(None)
-        self.threed.schedule_render()
-
-    def show_surface(self, surface: PatientSurface) -> None:
-        """Show the patient in 3D."""
+    def show_surface(self, surface: PatientSurface | None) -> None:
+        """Show the patient in 3D, or none."""
         model = self._model(_PATIENT)
-        model.SetAndObservePolyData(surface.coarse_polydata)
+        model.SetAndObservePolyData(None if surface is None else surface.coarse_polydata)
         display = display_of(model)
         display.SetColor(*_SKIN_COLOR)
         display.SetOpacity(0.45)
-        display.SetVisibility(True)
+        display.SetVisibility(surface is not None)
         display.SetVisibility2D(False)
         display.SetBackfaceCulling(True)
+        self.threed.schedule_render()
 
     def show_probe(self, probe: Probe, transform_node) -> None:
         """Show the probe's body under its transform, and prepare its imaged field, which has the image as texture."""

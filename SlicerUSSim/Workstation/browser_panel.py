@@ -17,7 +17,7 @@ import numpy as np
 from greenlet import getcurrent, greenlet
 from trame_server.utils.asynchronous import get_event_loop
 
-from SlicerUSSim.Logic.base.errors import Cancelled, SimulationError, require, required, user_message
+from SlicerUSSim.Logic.base.errors import Cancelled, require, required, user_message
 from SlicerUSSim.Logic.mrml.fitting_nodes import offered
 from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic
 from SlicerUSSim.Logic.mrml.nodes import nodes_of_class
@@ -25,9 +25,9 @@ from SlicerUSSim.Widget.interface import Control, by_widget
 from SlicerUSSim.Widget.presenter import PanelPresenter
 from SlicerUSSim.Widget.sections import panel_sections
 from SlicerUSSim.Widget.tissue_presenter import TissueRow
-from SlicerUSSim.Widget.value_presenter import value_parameter
 from SlicerUSSim.Workstation.state import FreeParameter, NodeItem, SharedState, TissueLine
 from SlicerUSSim.Workstation.tasks import Tasks
+from SlicerUSSim.Workstation.uploads import as_known
 
 _log = logging.getLogger(__name__)
 
@@ -96,8 +96,6 @@ class BrowserPanel:
         self.shared, self.logic, self.tasks = shared, logic, tasks
         self._about_to_compute = about_to_compute
         self._thread = threading.get_ident()
-        #: Called after values were shown
-        self.refreshed: Callable[[], None] = lambda: None
         #: Calls a function with the point (3,), in the world, of the next click in a slice view, or None
         self.pick: Callable[[Callable[[np.ndarray | None], None]], None] = lambda clicked: None
         #: The work under way: its title, whether it is cancelled, and the task that does it. The last is shown
@@ -106,7 +104,7 @@ class BrowserPanel:
         self._table: Any = None  # vtkMRMLTableNode with the costs of a fit
         self._costs = Observed("ModifiedEvent", self._show_costs)
         #: Called after the controls were refreshed
-        self.refreshed: Callable[[], None] = lambda: None
+        self.refreshed: list[Callable[[], None]] = []
         self.presenter = PanelPresenter(
             logic, self, handles=False, label_maps=True
         )  # label maps: filled ten times as fast as segmentations, and usable as overlays of the slice views
@@ -121,6 +119,7 @@ class BrowserPanel:
     # ---- PanelView ---------------------------------------------------------------------------------------------
 
     def showError(self, message: str) -> None:
+        message = as_known(message)
         _log.warning("%s", message)
         with self.shared.changing() as now:
             now.messages.errors = [*now.messages.errors, message][-_MOST:]
@@ -179,7 +178,8 @@ class BrowserPanel:
                 panel.tissues = [_line(row) for row in self.presenter.tissues.rows()]
             if any(control.kind == "list" for control in stale.values()):
                 now.fit.free = [FreeParameter(*entry) for entry in self.presenter.fits.freeParameters()]
-        self.refreshed()
+        for told in self.refreshed:
+            told()
 
     @contextmanager
     def progress(self, title: str) -> Iterator[Callable[[float], None]]:
@@ -254,8 +254,8 @@ class BrowserPanel:
         if control.kind == "number" and none_at is not None:
             if value is None:  # an empty field
                 value = none_at
-            elif isinstance(value, int | float) and value <= none_at:  # a number that stands for none, but was typed
-                self._refuse(control, value)
+            elif isinstance(value, int | float) and value <= none_at:  # it stands for none, but was typed
+                self.showError(f"{control.label} is {value:g}, expected more than {none_at:g}, or nothing")
                 return
         if value == self._shown_value(control):
             return
@@ -267,16 +267,6 @@ class BrowserPanel:
         elif control.sets:
             control.sets(value)
         self.refresh(presenter.values.changes())
-
-    def _refuse(self, control: Control, value: float) -> None:
-        """Say that a number is out of the range of its parameter."""
-        declared = value_parameter(control.value)
-        whole = int(value) if float(value).is_integer() else value
-        with self.presenter.shown():
-            declared.checked(control.value.split(".")[0], whole)
-            raise SimulationError(
-                f"{declared.name} is {whole}, expected more than {control.range.none_at:g}, or nothing"
-            )
 
     def _assign_tissue(self) -> None:
         tissue = self.shared.now.panel.chosen_tissue

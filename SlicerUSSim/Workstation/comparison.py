@@ -13,7 +13,7 @@ from trame_server.utils.asynchronous import get_event_loop
 
 from SlicerUSSim.Logic.base.errors import SimulationError
 from SlicerUSSim.Logic.base.volume import Volume
-from SlicerUSSim.Logic.fitting.image_similarity import Similarity, similarity
+from SlicerUSSim.Logic.fitting.image_similarity import RealImages
 from SlicerUSSim.Logic.fitting.search import Progress
 from SlicerUSSim.Logic.probe.image_grid import ImageGrid
 from SlicerUSSim.Logic.probe.poses import slice_under_probe
@@ -27,45 +27,6 @@ _PLAY_EVERY_S = 0.1
 _BEST_EVERY_S = 0.5
 #: Difference of matrices up to which a pose is the same, mm: nodes and files keep some digits
 _SAME_POSE = 1e-3
-
-
-class RealImages:
-    """The images of a sequence, resampled to the grid of the simulated image."""
-
-    def __init__(self, tracked: TrackedImages) -> None:
-        self.tracked = tracked
-        self._on_grid: tuple[tuple, np.ndarray, np.ndarray] | None = None
-
-    def __len__(self) -> int:
-        return len(self.tracked.images)
-
-    def on_grid(self, place: int, grid: ImageGrid) -> tuple[np.ndarray, np.ndarray]:
-        """(image (rows, columns) uint8, mask (rows, columns) bool of the imaged field) of the image with this index."""
-        key = (place, grid)
-        if self._on_grid is None or self._on_grid[0] != key:
-            tracked = self.tracked
-            image, mask = (
-                slice_under_probe(Volume(array[None], tracked.grid.slice_to_probe), grid, np.eye(4), order)
-                for array, order in ((tracked.images[place].astype(np.float32), 1), (tracked.mask.astype(np.uint8), 0))
-            )
-            mask = mask > 0
-            self._on_grid = (key, np.where(mask, image.round(), 0).astype(np.uint8), mask)
-        return self._on_grid[1], self._on_grid[2]
-
-    def outline(self, grid: ImageGrid) -> str:
-        """What is compared, as a path of an SVG in mm of the probe frame."""
-        from skimage.measure import approximate_polygon, find_contours
-
-        _, mask = self.on_grid(0, grid)
-        lines = find_contours(np.pad(mask, 1).astype(float), 0.5)
-        scale, first = np.array(grid.pixel_spacing_mm), np.array([grid.left_mm, grid.top_mm])
-        shapes = [first + scale * (approximate_polygon(line, 0.7)[:, ::-1] - 0.5) for line in lines]
-        return " ".join("M " + " ".join(f"{x:.2f},{y:.2f}" for x, y in shape) + " Z" for shape in shapes)
-
-    def compared(self, place: int, simulated: np.ndarray, grid: ImageGrid) -> Similarity:
-        """The paper's cost between a simulated image and the real image with this index."""
-        real, mask = self.on_grid(place, grid)
-        return similarity(simulated, real, grid.pixel_spacing_mm, mask=mask)
 
 
 class Comparison:

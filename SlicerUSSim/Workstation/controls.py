@@ -69,23 +69,15 @@ def slider_html(control: Control) -> str:
     """A slider with its value, which can be typed, and its unit."""
     name, shown = control.widget, control.range
     return range_html(
-        value_of(name), name, control.label, control.tip, shown.low, shown.high, shown.step, control.unit,
-        control.decimals, f"trigger('set', ['{name}', Number($event.target.value)])",
+        value_of(name), name, f"trigger('set', ['{name}', Number($event.target.value)])", control.label, control.tip,
+        shown.low, shown.high, shown.step, control.unit, control.decimals,
     )  # fmt: skip
 
 
 def range_html(
-    key: str,
-    name: str,
-    label: str,
-    tip: str,
-    low: float,
-    high: float,
-    step: float,
-    unit: str,
-    decimals: int,
-    event: str,
-) -> str:
+    key: str, name: str, event: str, label: str, tip: str, low: float, high: float, step: float, unit: str,
+    decimals: int = 1,
+) -> str:  # fmt: skip
     """A slider with a field for its value; `key` and `event` are JavaScript. Values of presets can exceed its range."""
     value = f"{key} === null ? '' : Number({key}).toFixed({decimals})"
     limits = f""":min="Math.min({low}, {key} ?? {low})" :max="Math.max({high}, {key} ?? {high})" step="{step:g}" """

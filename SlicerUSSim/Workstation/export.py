@@ -5,69 +5,22 @@ from __future__ import annotations
 import io
 import json
 import zipfile
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
 
-import numpy as np
-from PIL import Image
-from PIL.PngImagePlugin import PngInfo
 from trame_slicer.core import SlicerApp
 from vtkmodules.vtkCommonCore import vtkOutputWindow
 
-from SlicerUSSim.Logic.base.errors import SimulationError, require, required
+from SlicerUSSim.Logic.base.errors import require, required
 from SlicerUSSim.Logic.mrml.nodes import nodes_of_class
-from SlicerUSSim.Logic.mrml.taken_image import TakenImage
-from SlicerUSSim.Logic.tracked.sequence import SIMULATED, TrackedSequence
+from SlicerUSSim.Logic.mrml.taken_files import FRAME_SUFFIXES, frame_file, png, sequence_file
 from SlicerUSSim.Workstation.browser_panel import BrowserPanel
 from SlicerUSSim.Workstation.cine import Cine
 from SlicerUSSim.Workstation.dicom_export import ultrasound_file
 
-#: File formats of an image with its geometry.
-FRAME_SUFFIXES = (".nrrd", ".mha", ".vti")
-#: Key of a file's header under which is what its image is of, see TakenImage.about
-ABOUT = "SlicerUSSim"
 #: The kind of export that a page composes
 DICOM = "dicom"
-
-
-def png(taken: TakenImage) -> bytes:
-    """An image as a PNG file, without scaling, with what it is of as a text."""
-    buffer, text = io.BytesIO(), PngInfo()
-    text.add_itxt(ABOUT, json.dumps(taken.about()))
-    Image.fromarray(taken.image).save(buffer, "PNG", pnginfo=text)
-    return buffer.getvalue()
-
-
-def frame_file(taken: TakenImage, suffix: str) -> bytes:
-    """An image with its position in the patient, and what it is of, as a file.
-
-    Raises SimulationError if `suffix` is not one of FRAME_SUFFIXES.
-    """
-    require(suffix in FRAME_SUFFIXES, f"the file type is {suffix!r}, expected {', '.join(FRAME_SUFFIXES)}")
-    with TemporaryDirectory() as folder:
-        path = Path(folder) / f"frame{suffix}"
-        taken.volume().write(path, about={ABOUT: json.dumps(taken.about())})
-        return path.read_bytes()
-
-
-def sequence_file(images: Sequence[tuple[float, TakenImage]]) -> bytes:
-    """Images with their times in s as a sequence metafile (.igs.mha), with their places in the MRI (RAS, mm).
-
-    The file says what the last one is of (TakenImage.about).
-    """
-    seconds, taken = zip(*images, strict=True)
-    transforms = tuple(
-        {"ImageToProbe": image.grid.image_to_probe, "ProbeToReference": image.probe_to_world} for image in taken
-    )
-    fields = {SIMULATED: "cine", ABOUT: json.dumps(taken[-1].about())}
-    with TemporaryDirectory() as folder:
-        path = Path(folder) / "cine.igs.mha"
-        TrackedSequence(np.stack([image.image for image in taken]), transforms, np.array(seconds), fields=fields).write(
-            path
-        )
-        return path.read_bytes()
 
 
 class Exports:
@@ -128,25 +81,19 @@ def write_bundle(app: SlicerApp, folder: Path) -> dict[str, Path]:
     """
     folder.mkdir()
     _remove_unused_stores(app.scene)
-    stores: dict[Any, Any] = {}
     for node in nodes_of_class(app.scene, "vtkMRMLStorableNode"):
         if node.GetSaveWithScene() and (node.GetStorageNode() is not None or node.AddDefaultStorageNode()):
             store = node.GetStorageNode()
             if store is not None:  # some are whole in the scene's own file
-                stores[store] = store.GetUseCompression()
+                store.SetUseCompression(False)
     window = vtkOutputWindow.GetInstance()
     window.SetDisplayModeToNever()  # VTK would report every file of the scene
     try:
-        for store in stores:
-            store.SetUseCompression(False)
         is_written = app.app_logic.SaveSceneToSlicerDataBundleDirectory(str(folder), None)
     finally:
-        for store, uses_compression in stores.items():
-            store.SetUseCompression(uses_compression)
         window.SetDisplayModeToAlwaysStdErr()
     scene = folder / f"{folder.name}.mrml"
-    if not is_written or not scene.exists():
-        raise SimulationError("the scene could not be written")
+    require(is_written and scene.exists(), "the scene could not be written")
     # What is saved from this scene again is compressed, as usual
     scene.write_text(scene.read_text("utf-8").replace('useCompression="0"', 'useCompression="1"'), "utf-8")
     return {path.relative_to(folder.parent).as_posix(): path for path in sorted(folder.rglob("*")) if path.is_file()}

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from SlicerUSSim.Logic.base.errors import Cancelled, SimulationError
 from SlicerUSSim.Logic.base.files import mask_beside
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.imaging.preset import Preset
@@ -37,7 +35,7 @@ from SlicerUSSim.Logic.tissue.table import TissueTable
 from SlicerUSSim.Logic.tracked.images import TrackedImages
 from SlicerUSSim.Logic.tracked.sequence import TrackedSequence
 from SlicerUSSim.Workstation.tasks import Tasks
-from SlicerUSSim.Workstation.uploads import DICOM
+from SlicerUSSim.Workstation.uploads import as_known
 
 #: Attribute of a node: the file from which it was read; "" for the demo brain, the name alone for one sent by a page.
 FILE = "SlicerUSSim.file"
@@ -103,66 +101,30 @@ class FileNodes:
         self._scene, self._logic, self._tasks, self._files = logic.scene, logic, tasks, files
         #: Volumes that were read to see what they are, by file, until they are used
         self.volumes = dict(files.volumes)
-        #: Folders with what pages have sent, while it is opened
-        self._sent: list[str] = []
         #: Names of the preset's tissues since the table of a label map was added to them
         self._names_of_table: list[str] | tuple[str, ...] = ()
-
-    # ---- names -------------------------------------------------------------------------------------------------
-
-    @contextmanager
-    def sent_in(self, folder: str) -> Iterator[None]:
-        """While files in a folder are opened that a page has sent: users know them by their names alone."""
-        self._sent.append(folder)
-        try:
-            yield
-        finally:
-            self._sent.remove(folder)
-            self.volumes = {path: volume for path, volume in self.volumes.items() if not path.startswith(folder)}
-
-    @contextmanager
-    def known_names(self) -> Iterator[None]:
-        """Errors within the block are about the names of files, as the user knows them."""
-        try:
-            yield
-        except Cancelled:
-            raise
-        except SimulationError as error:
-            raise SimulationError(self.as_known(str(error))) from None
-
-    def as_known(self, text: str) -> str:
-        """A message with the names of files as the user knows them, without the temporary folder."""
-        for folder in self._sent:
-            text = text.replace(os.path.join(folder, DICOM, ""), "").replace(os.path.join(folder, ""), "")
-        return text
-
-    def _place(self, path: str) -> str:
-        """The path of a file; the name alone of one that a page has sent."""
-        return Path(path).name if path.startswith(tuple(self._sent)) else os.path.abspath(path)
 
     # ---- images of the patient ---------------------------------------------------------------------------------
 
     def mri(self, path: str | None):
         """A volume node with the MRI of a file, or with the demo brain."""
         volume = self._tasks.doAside(lambda: demo_mri()[0]) if path is None else self._volume(path)
-        node = self._scene.AddNewNodeByClass(
-            "vtkMRMLScalarVolumeNode", "MNI152 brain" if path is None else Path(path).name
-        )
+        node = self._node("ScalarVolume", path or "MNI152 brain")
         write_volume(node, volume)
-        node.SetAttribute(FILE, "" if path is None else self._place(path))
+        node.SetAttribute(FILE, "" if path is None else as_known(os.path.abspath(path)))
         show_all_tissue(node, volume)
         return node
 
     def second_mri(self, path: str):
         """A volume node with a further MRI of the patient."""
-        node = self._scene.AddNewNodeByClass("vtkMRMLScalarVolumeNode", Path(path).name)
+        node = self._node("ScalarVolume", path)
         write_volume(node, self._volume(path))
         return node
 
     def mask_file(self, mri_node) -> Path | None:
         """Where the brain mask of an MRI is kept: beside the file with which the workstation was started."""
-        path = None if self._files.mri is None else os.path.abspath(self._files.mri)
-        return mask_beside(path) if path is not None and mri_node.GetAttribute(FILE) == path else None
+        path = os.path.abspath(self._files.mri or "")
+        return mask_beside(path) if self._files.mri and mri_node.GetAttribute(FILE) == path else None
 
     def sheets_file(self, mri_node) -> Path | None:
         """The same of the sheets that were found in it."""
@@ -195,11 +157,8 @@ class FileNodes:
             self._logic.preset = replace(self._logic.preset, tissues=mine)
             self._names_of_table = mine.names()
         named = f", named in {table.name}" if table is not None and mapping.names else ""
-        found = replace(
-            found,
-            message=self.as_known(found.message) + named,
-            warnings=tuple(map(self.as_known, (*found.warnings, *volume.doubts))),
-        )
+        warnings = tuple(map(as_known, (*found.warnings, *volume.doubts)))
+        found = replace(found, message=as_known(found.message) + named, warnings=warnings)
         node = self._label_map(found.labels, path, found.names)
         node.SetAttribute(PATIENT, node.GetName())
         return node, found
@@ -209,14 +168,10 @@ class FileNodes:
         volume, table = self._volume(path), TissueTable({})
         mapping = LabelMapping.of(maps, table)
         found = self._tasks.doAside(lambda: read_label_file(Path(path), volume, mapping, default=table, of_ct=True))
-        return self._label_map(found.labels, path, found.names), replace(found, message=self.as_known(found.message))
-
-    def mask(self, path: str):
-        """A label map node with the mask of a file."""
-        return self._label_map(self._volume(path), path, ["inside"])
+        return self._label_map(found.labels, path, found.names), replace(found, message=as_known(found.message))
 
     def brain_mask(self, path: str, mri_node):
-        """The same of a brain. Raises SimulationError unless it is one on the grid of the MRI."""
+        """A label map node with the mask of a file. Raises SimulationError unless it is one on the grid of the MRI."""
         volume, mri = self._volume(path), read_volume(mri_node)
         self._tasks.doAside(lambda: checked_mask(volume, mri))
         return self._label_map(volume, path, ["inside"])
@@ -224,14 +179,14 @@ class FileNodes:
     def lesions(self, path: str) -> Volume:
         """The mask of lesions of a file, with the names of its labels."""
         found = with_label_names(self._volume(path), path)
-        return replace(found, doubts=tuple(map(self.as_known, found.doubts)))
+        return replace(found, doubts=tuple(map(as_known, found.doubts)))
 
     # ---- surfaces and points -----------------------------------------------------------------------------------
 
     def sheets(self, path: str):
         """A model node with the sheets of a .vtp."""
         surfels = self._tasks.doAside(lambda: read_surfels(path))
-        node = self._scene.AddNewNodeByClass("vtkMRMLModelNode", Path(path).name)
+        node = self._node("Model", path)
         node.SetAndObservePolyData(as_polydata(surfels))
         display_of(node).SetVisibility(False)
         return node
@@ -240,11 +195,11 @@ class FileNodes:
         """A node with the opening of a file: a closed curve through the points of a markup, or a mask."""
         if not is_markup_name(path):
             return self._label_map(is_open(with_label_names(self._volume(path), path), path), path, ["opening"])
-        return self._markups("vtkMRMLMarkupsClosedCurveNode", path, polygon_of_file(path))
+        return self._markups("MarkupsClosedCurve", path, polygon_of_file(path))
 
     def points(self, path: str, points: np.ndarray):
         """A node with the list of points, (n, 3) RAS mm, of a file."""
-        return self._markups("vtkMRMLMarkupsFiducialNode", path, points)
+        return self._markups("MarkupsFiducial", path, points)
 
     # ---- tracked ultrasound ------------------------------------------------------------------------------------
 
@@ -277,8 +232,11 @@ class FileNodes:
 
     # ---- implementation ----------------------------------------------------------------------------------------
 
+    def _node(self, kind: str, path: str) -> Any:
+        return self._scene.AddNewNodeByClass(f"vtkMRML{kind}Node", Path(path).name)
+
     def _markups(self, kind: str, path: str, points: np.ndarray):
-        node = self._scene.AddNewNodeByClass(kind, Path(path).name)
+        node = self._node(kind, path)
         for point in points:
             node.AddControlPointWorld(*point)
         return node
@@ -289,8 +247,8 @@ class FileNodes:
 
     def _label_map(self, volume: Volume, path: str, names):
         volume = as_whole(volume, path)
-        node = self._scene.AddNewNodeByClass("vtkMRMLLabelMapVolumeNode", Path(path).name)
-        node.SetAttribute(FILE, self._place(path))
+        node = self._node("LabelMapVolume", path)
+        node.SetAttribute(FILE, as_known(os.path.abspath(path)))
         write_labels(node, volume.with_array(volume.array.astype(np.uint8)), names, node)
         return node
 

@@ -43,7 +43,7 @@ class ImageFlow:
         self._field: tuple[tuple[ImageGrid, Probe], np.ndarray] | None = None
         self._differs_since: float | None = None
         self._show_in_views = AtMost(_VIEWS_EVERY_S, self._views_changed)
-        panel.refreshed = self.tell
+        panel.refreshed.append(self.tell)
 
     @property
     def streams(self) -> tuple[ImageStream, ...]:

@@ -17,6 +17,7 @@ from SlicerUSSim.Logic.base.dicom import Series
 from SlicerUSSim.Logic.base.errors import Cancelled, SimulationError, require
 from SlicerUSSim.Logic.base.files import read_json
 from SlicerUSSim.Logic.base.reading import untrusted_folder
+from SlicerUSSim.Logic.imaging.content import Content, Kind, content_of
 from SlicerUSSim.Logic.imaging.preset import Preset
 from SlicerUSSim.Logic.mri.markups import markup_points
 from SlicerUSSim.Logic.mri.modality import has_brain_mask
@@ -27,7 +28,6 @@ from SlicerUSSim.Logic.tissue.label_mapping import LabelMapping
 from SlicerUSSim.Logic.tissue.table import TissueTable, tissues_beside
 from SlicerUSSim.Logic.tracked.pose_files import read_pose
 from SlicerUSSim.Workstation.browser_panel import BrowserPanel
-from SlicerUSSim.Workstation.content import Content, Kind, content_of
 from SlicerUSSim.Workstation.file_nodes import FileNodes, LabelTable
 from SlicerUSSim.Workstation.patient import OpenPatient
 from SlicerUSSim.Workstation.pose_entry import PoseEntry
@@ -35,7 +35,7 @@ from SlicerUSSim.Workstation.pose_registration import Registration
 from SlicerUSSim.Workstation.questions import Questions
 from SlicerUSSim.Workstation.scenes import Scenes
 from SlicerUSSim.Workstation.state import Choice
-from SlicerUSSim.Workstation.uploads import Sent, listed
+from SlicerUSSim.Workstation.uploads import Sent, as_known, listed
 
 _log = logging.getLogger(__name__)
 _T = TypeVar("_T")
@@ -97,15 +97,12 @@ class Opener:
         A transform that is `meant` to be a calibration or a registration is used as such without a question.
         """
         self._begin()
-        with self._presenter.shown(), untrusted_folder() as folder, self._nodes.sent_in(folder):
-            with self._presenter.view.progress(f"Open {listed(list(files))}"), self._nodes.known_names():
+        with self._presenter.shown(), untrusted_folder() as folder:
+            with self._presenter.view.progress(f"Open {listed(list(files))}"):
                 sent = Sent(folder, files)
                 series = self._tasks.doAside(sent.series) if sent.has_dicom else []
             if sent.has_dicom:
                 sent.take(self._chosen(series), series)
-            if sent.left_out:
-                files_left = f"{sent.left_out} file{'s' * (sent.left_out > 1)}"
-                self._say(f"{files_left} beside the DICOM images left out, as no image")
             self._open(sent.paths, meant)
 
     def open_paths(self, paths: Sequence[str]) -> None:
@@ -127,10 +124,18 @@ class Opener:
             now.opened = []
 
     def _open(self, paths: Sequence[Path], meant: str = "") -> None:
-        with self._presenter.view.progress(f"Open {listed([path.name for path in paths])}"):
-            files, wrong = self.recognised(paths)
+        try:
+            with self._presenter.view.progress(f"Open {listed([path.name for path in paths])}"):
+                files, wrong = self.recognised(paths)
+            self._take_all(files, meant)
+        finally:
+            self._nodes.volumes.clear()
+        for line in wrong:  # after a new patient, with whom the messages about the one before are gone
+            self._panel.showError(line)
+
+    def _take_all(self, files: list[_File], meant: str) -> None:
         for file in files:
-            with self._presenter.shown(), self._nodes.known_names():
+            with self._presenter.shown():
                 if meant:
                     is_one = file.kind in (Kind.TRANSFORM, Kind.POSE)
                     require(is_one, f"{file.name} is {file.content.what}, expected the {meant} of tracked ultrasound")
@@ -138,8 +143,6 @@ class Opener:
                 else:
                     deed = self._take[file.kind](file, files)
                 self._say(f"{file.name}: {file.content.what}: {deed}")
-        for line in wrong:  # after a new patient, with whom the messages about the one before are gone
-            self._panel.showError(line)
 
     def recognised(self, paths: Sequence[Path]) -> tuple[list[_File], list[str]]:
         """(what files are, in the order in which they can be opened; lines about those that cannot).
@@ -150,8 +153,7 @@ class Opener:
         wrong: list[str] = []
         for path in paths:
             try:
-                with self._nodes.known_names():
-                    found[path] = content = self._tasks.doAside(lambda path=path: content_of(path))
+                found[path] = content = self._tasks.doAside(lambda path=path: content_of(path))
             except Cancelled:
                 raise
             except SimulationError as error:
@@ -179,7 +181,7 @@ class Opener:
 
     def _say(self, line: str) -> None:
         with self._shared.changing() as now:
-            now.opened = [*now.opened, self._nodes.as_known(line)]
+            now.opened = [*now.opened, as_known(line)]
 
     def _read(self, file: _File, read: Callable[[str], _T]) -> _T:
         with self._presenter.view.progress(f"Open {file.name}"):
@@ -337,20 +339,11 @@ class Opener:
                 Choice(_CALIBRATION, "Calibration", f"Of tracked ultrasound: from pixels to its probe{later}"),
                 Choice(_REGISTRATION, "Registration", f"Of tracked ultrasound: from its frame to the patient{later}"),
             ]
-            if self._logic.parameters.labels is not None and self._is_pose(file):
+            if self._logic.parameters.labels is not None:
                 tip = f"The simulated probe is moved there, on {self._patient.name}"
                 choices.append(Choice(_POSE, "Pose of the probe", tip))
             key = self._ask_what(file, choices)
         return self._pose(file, together) if key == _POSE else self._transform_as(file, key)
-
-    def _is_pose(self, file: _File) -> bool:
-        try:
-            self._tasks.doAside(lambda: read_pose(file.path))
-        except Cancelled:
-            raise
-        except SimulationError:
-            return False
-        return True
 
     def _transform_as(self, file: _File, key: str) -> str:
         use = self._registration.calibrate if key == _CALIBRATION else self._registration.register
@@ -406,7 +399,7 @@ class Opener:
     def _ask(self, title: str, text: str, choices: list[Choice]) -> str:
         """The key of the answer. Raises SimulationError if the patient about whom was asked is not open any more."""
         patient = self._patient.name
-        key = self._questions.ask(title, self._nodes.as_known(text), choices)
+        key = self._questions.ask(title, as_known(text), choices)
         now = self._patient.name
         require(now == patient, f"{patient or 'no patient'} was open for this question, and now {now or 'none'} is")
         return key

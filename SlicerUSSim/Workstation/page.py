@@ -7,9 +7,9 @@ name (Workstation._answer_pages), and as changes of those fields; what concerns 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from html import escape
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from trame.ui.vuetify3 import VAppLayout
@@ -46,27 +46,14 @@ _TGC = tuple(f"depthGain{number}Slider" for number in range(1, 9))
 _BELOW_TGC = ("tgcSlider", "lookComboBox", "greyMapComboBox")
 
 
-@dataclass(frozen=True)
-class PoseSlider:
-    """The slider of one component of the probe's pose."""
-
-    #: Field of surface.SurfacePose
-    name: str
-    label: str
-    tip: str
-    minimum: float
-    maximum: float
-    step: float
-    unit: str
-
-
-POSE_SLIDERS = (
-    PoseSlider("right_deg", "Left - right", "Position on the head, from its vertex", -120, 120, 0.5, "°"),
-    PoseSlider("front_deg", "Back - front", "Position on the head, from its vertex", -120, 120, 0.5, "°"),
-    PoseSlider("rotate_deg", "Rotate", "About the probe's axis (keys Q, E; Ctrl and drag)", -180, 180, 1.0, "°"),
-    PoseSlider("rock_deg", "Rock", "In the image plane (keys A, D; Shift and drag)", -75, 75, 0.5, "°"),
-    PoseSlider("tilt_deg", "Tilt", "Out of the image plane (keys W, S; Shift and drag)", -75, 75, 0.5, "°"),
-    PoseSlider("lift_mm", "Lift", "Off the surface; negative: pressed in (keys +, -)", -10, 30, 0.5, "mm"),
+#: Sliders of the pose: field of surface.SurfacePose, label, tip, range, step, unit
+_POSE_SLIDERS = (
+    ("right_deg", "Left - right", "Position on the head, from its vertex", -120, 120, 0.5, "°"),
+    ("front_deg", "Back - front", "Position on the head, from its vertex", -120, 120, 0.5, "°"),
+    ("rotate_deg", "Rotate", "About the probe's axis (keys Q, E; Ctrl and drag)", -180, 180, 1.0, "°"),
+    ("rock_deg", "Rock", "In the image plane (keys A, D; Shift and drag)", -75, 75, 0.5, "°"),
+    ("tilt_deg", "Tilt", "Out of the image plane (keys W, S; Shift and drag)", -75, 75, 0.5, "°"),
+    ("lift_mm", "Lift", "Off the surface; negative: pressed in (keys +, -)", -10, 30, 0.5, "mm"),
 )
 #: What Save offers: pictures that the page composes, with banner, scale and measurements, and files of the server
 _COMPOSED = {
@@ -351,7 +338,7 @@ def _drawer(panel: BrowserPanel) -> None:
             shown = [one for one in section.controls if one.widget not in {*NOT_SHOWN, *_BESIDE, *_TGC, *_BELOW_TGC}]
             html.Div("".join(map(control_html, shown)))
             if section.title == "Probe":
-                html.Div("".join(map(_pose_slider, POSE_SLIDERS)) + _upright())
+                html.Div("".join(_pose_slider(*slider) for slider in _POSE_SLIDERS) + _upright())
                 pose_numbers()
             if section.title.startswith("Fit"):
                 html.Div(_cost_curve())
@@ -374,12 +361,9 @@ def _open_file() -> str:
       </button>"""
 
 
-def _pose_slider(slider: PoseSlider) -> str:
-    return range_html(
-        f"({NAMES.pose}?.{slider.name} ?? null)", f"pose-{slider.name}", slider.label, slider.tip, slider.minimum,
-        slider.maximum, slider.step, slider.unit, 1,
-        f"trigger('set_pose', ['{slider.name}', Number($event.target.value)])",
-    )  # fmt: skip
+def _pose_slider(name: str, *shown: Any) -> str:
+    moved = f"trigger('set_pose', ['{name}', Number($event.target.value)])"
+    return range_html(f"({NAMES.pose}?.{name} ?? null)", f"pose-{name}", moved, *shown)
 
 
 def _upright() -> str:

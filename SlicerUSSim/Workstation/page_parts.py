@@ -60,49 +60,33 @@ def question_dialog() -> None:
 def offer() -> None:
     """A bar with the question whether pose and settings of before are to be restored."""
     is_busy = f"{NAMES.messages.progress_title} !== ''"
-    with html.Div(
-        v_if=NAMES.offer, classes="ussim-bar ussim-offer", id="offer", raw_attrs=['role="status"']
-    ):  # fmt: skip
-        html.Span(f"{{{{ {NAMES.offer} }}}}", id="offer-text")
-        v3.VBtn(
-            "Restore", size="small", color="primary", click="trigger('restore')", id="restore",
-            disabled=(is_busy,), title="Pose and settings; the patient's files are opened if another patient is",
-        )  # fmt: skip
-        v3.VBtn(
-            "Discard", size="small", variant="outlined", click="trigger('discard')", id="discard",
-            disabled=(is_busy,), title="Go on with what is open",
-        )  # fmt: skip
+    html.Div(
+        f"""<span id="offer-text">{{{{ {NAMES.offer} }}}}</span>
+        <button class="ussim-button" id="restore" :disabled="{is_busy}" @click="trigger('restore')"
+        title="Pose and settings; the patient's files are opened if another patient is">Restore</button>
+        <button class="ussim-button" id="discard" :disabled="{is_busy}" @click="trigger('discard')"
+        title="Go on with what is open">Discard</button>""",
+        v_if=NAMES.offer, classes="ussim-bar ussim-offer", id="offer", raw_attrs=['role="status"'],
+    )  # fmt: skip
 
 
 def pose_numbers() -> None:
     """Fields for the pose, and a button to save it."""
     is_none = f"{NAMES.pose_numbers} === ''"
-    html.Div(
-        """<button class="ussim-button" id="stand-upright" @click="trigger('key', ['Home', false])">
-        Align with normal</button>"""
-    )
-    html.Div(
-        f"""<label for="pose-numbers">Pose</label>
-        <input type="text" id="pose-numbers" :value="{NAMES.pose_numbers}" :disabled="{is_none}"
-        {kept(NAMES.pose_numbers)}
-        @change="trigger('type_pose', [$event.target.value])">""",
-        classes="ussim-line", title=_NUMBERS_TIP,
-    )  # fmt: skip
-    html.Div(
-        f"""<label for="pose-matrix">Matrix</label>
-        <textarea id="pose-matrix" rows="4" :value="{NAMES.pose_matrix}" :disabled="{is_none}" spellcheck="false"
-        {kept(NAMES.pose_matrix)}
-        @change="trigger('type_pose', [$event.target.value])"></textarea>""",
-        classes="ussim-line", title=_MATRIX_TIP,
-    )  # fmt: skip
     options = "".join(f'<option value="{suffix}">{suffix} ({_FORMATS[suffix]})</option>' for suffix in POSE_SUFFIXES)
-    html.Div(
-        f"""<label for="pose-format">Save pose as</label><select id="pose-format">{options}</select>""",
-        classes="ussim-line", title="Format of the file",
-    )  # fmt: skip
     saved = "window.ussim.save('pose' + window.document.getElementById('pose-format').value)"
     html.Div(
-        f"""<button class="ussim-button" id="save-pose" :disabled="{is_none}" @click="{saved}"
+        f"""<button class="ussim-button" id="stand-upright" @click="trigger('key', ['Home', false])">
+        Align with normal</button>
+        <div class="ussim-line" title="{_NUMBERS_TIP}"><label for="pose-numbers">Pose</label>
+        <input type="text" id="pose-numbers" :value="{NAMES.pose_numbers}" :disabled="{is_none}"
+        {kept(NAMES.pose_numbers)} @change="trigger('type_pose', [$event.target.value])"></div>
+        <div class="ussim-line" title="{_MATRIX_TIP}"><label for="pose-matrix">Matrix</label>
+        <textarea id="pose-matrix" rows="4" :value="{NAMES.pose_matrix}" :disabled="{is_none}" spellcheck="false"
+        {kept(NAMES.pose_matrix)} @change="trigger('type_pose', [$event.target.value])"></textarea></div>
+        <div class="ussim-line" title="Format of the file"><label for="pose-format">Save pose as</label>
+        <select id="pose-format">{options}</select></div>
+        <button class="ussim-button" id="save-pose" :disabled="{is_none}" @click="{saved}"
         title="The present pose of the probe as a file">Save pose</button>"""
     )
 
@@ -110,57 +94,28 @@ def pose_numbers() -> None:
 def registration() -> None:
     """Calibration and registration of the tracked ultrasound."""
     state = NAMES.registration
+    names = "".join(f"<option>{name}</option>" for name in _CALIBRATIONS)
     html.Div(
-        f"{{{{ {state.recording} || 'none: open a file with tracked ultrasound' }}}}", id="recording",
-        classes="ussim-opened",
-    )  # fmt: skip
-    with html.Div(v_show=f"{state.recording} !== ''"):
-        _frame()
-        _calibration()
-        _registration()
-
-
-def _frame() -> None:
-    state = NAMES.registration
-    html.Div(
-        f"""<label for="frame">Patient's frame</label>
+        f"""<div id="recording" class="ussim-opened">{{{{ {state.recording} ||
+        'none: open a file with tracked ultrasound' }}}}</div><div v-show="{state.recording} !== ''">
+        <div class="ussim-line" title="The frame of the tracker that is fixed to the patient">
+        <label for="frame">Patient's frame</label>
         <select id="frame" :value="{state.frame}" @change="trigger('choose_frame', [$event.target.value])">
-        <option v-for="frame in {state.frames}">{{{{ frame }}}}</option></select>""",
-        classes="ussim-line", title="The frame of the tracker that is fixed to the patient",
+        <option v-for="frame in {state.frames}">{{{{ frame }}}}</option></select></div>
+        {_file("Calibration", state.calibration, "A Plus configuration (.xml), or 16 numbers by rows (text, .json)")}
+        <div class="ussim-line" title="From pixels to the tracked probe; more than one may lead there">
+        <label for="calibration-name">Its name</label><input type="text" id="calibration-name"
+        list="calibration-names" v-model="{state.name}"><datalist id="calibration-names">{names}</datalist></div>
+        {_file("Registration", state.registration, "From the frame above to the patient: .tfm, .xfm, .json, 16 "
+               "numbers, or .tag with landmarks in both")}</div>"""
     )  # fmt: skip
 
 
-def _calibration() -> None:
-    state = NAMES.registration
-    options = "".join(f"<option>{name}</option>" for name in _CALIBRATIONS)
-    _heading("Calibration", state.calibration, "calibration")
-    _file("calibration", "Calibration file", "A Plus configuration (.xml), or 16 numbers by rows (text, .json)")
-    html.Div(
-        f"""<label for="calibration-name">Its name</label><input type="text" id="calibration-name"
-        list="calibration-names" v-model="{state.name}"><datalist id="calibration-names">{options}</datalist>""",
-        classes="ussim-line", title="From pixels to the tracked probe; more than one may lead there",
-    )  # fmt: skip
-
-
-def _registration() -> None:
-    state = NAMES.registration
-    _heading("Registration", state.registration, "registration")
-    _file(
-        "registration", "Registration file", "From the frame above to the patient: .tfm, .xfm, .json, 16 numbers, or "
-        ".tag with landmarks in both",
-    )  # fmt: skip
-
-
-def _heading(title: str, value: str, name: str) -> None:
-    html.Div(
-        f"<b>{title}</b> <span>{{{{ {value} || 'none' }}}}</span>", id=f"{name}-from", classes="ussim-opened mt-2",
-        raw_attrs=['aria-live="polite"'],
-    )  # fmt: skip
-
-
-def _file(name: str, label: str, tip: str) -> None:
-    html.Div(
-        f"""<label for="{name}-file">{label}</label><input type="file" id="{name}-file"
-        @change="window.ussim.send($event.target, {{for: 'open', as: '{name}'}})">""",
-        classes="ussim-line", title=tip,
-    )  # fmt: skip
+def _file(title: str, value: str, tip: str) -> str:
+    """Where a transform is from, and an input for its file."""
+    name = title.lower()
+    return f"""<div id="{name}-from" class="ussim-opened mt-2" aria-live="polite"><b>{title}</b>
+        <span>{{{{ {value} || 'none' }}}}</span></div>
+        <div class="ussim-line" title="{tip}"><label for="{name}-file">{title} file</label>
+        <input type="file" id="{name}-file"
+        @change="window.ussim.send($event.target, {{for: 'open', as: '{name}'}})"></div>"""

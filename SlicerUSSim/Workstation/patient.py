@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Iterable
+from collections.abc import Callable, Hashable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any
 
@@ -13,7 +14,8 @@ from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.mri.given_mask import follows
 from SlicerUSSim.Logic.mrml.label_nodes import labels_version
 from SlicerUSSim.Logic.mrml.lesion_nodes import add_lesion
-from SlicerUSSim.Logic.mrml.nodes import nodes_of_class, read_volume
+from SlicerUSSim.Logic.mrml.nodes import read_volume, remove_patient_nodes
+from SlicerUSSim.Logic.mrml.scene_record import SequenceRecord
 from SlicerUSSim.Logic.mrml.taken_image import patient_of
 from SlicerUSSim.Logic.mrml.taken_sequence import FrozenRecord, version_taken
 from SlicerUSSim.Logic.tissue.label_maps import LabelledTissues
@@ -21,19 +23,13 @@ from SlicerUSSim.Workstation.anatomy import AnatomyViews
 from SlicerUSSim.Workstation.browser_panel import BrowserPanel
 from SlicerUSSim.Workstation.comparison import Comparison
 from SlicerUSSim.Workstation.file_nodes import FILE, FileNodes, Files
-from SlicerUSSim.Workstation.pose_registration import Recording, Registration
+from SlicerUSSim.Workstation.pose_registration import Registration
 from SlicerUSSim.Workstation.probe_control import ProbeControl
 
 #: Roles of nodes of a patient
 _OF_PATIENT = (
     "mri", "labels", "mask", "second_mri", "lesions", "organs", "sheets", "seed", "opening", "real",
     "transform_sequence", "image_sequence",
-)  # fmt: skip
-#: What is of a patient: images, labels, surfaces, points, recordings, the costs of a fit
-_PATIENT_CLASSES = (
-    "vtkMRMLSequenceBrowserNode", "vtkMRMLSequenceNode", "vtkMRMLVolumeNode", "vtkMRMLSegmentationNode",
-    "vtkMRMLModelNode", "vtkMRMLMarkupsNode", "vtkMRMLTransformNode", "vtkMRMLPlotChartNode", "vtkMRMLPlotSeriesNode",
-    "vtkMRMLTableNode",
 )  # fmt: skip
 
 
@@ -64,7 +60,7 @@ class OpenPatient:
             if files.mri is not None or files.labels is None:
                 self._choose_mri(self._nodes.mri(files.mri))
             if files.mask is not None:
-                parameters.mask = self._nodes.mask(files.mask)
+                parameters.mask = self._nodes.brain_mask(files.mask, parameters.mri)
             for contrast, path in list(files.also.items())[:1]:  # the panel has one
                 self.take_second(self._nodes.second_mri(path), contrast)
             if files.organs is not None:
@@ -73,7 +69,8 @@ class OpenPatient:
             if files.sheets is not None:
                 parameters.sheets = self._nodes.sheets(files.sheets)
             for tissue, path in files.additions:
-                self._add_lesions(self._nodes.lesions(path), tissue, path)
+                with self._added(self._nodes.lesions(path), tissue, path):
+                    pass
             if files.labels is not None:
                 self.take_labels(*self._nodes.labels(files.labels), are_of_patient=True)
                 if files.additions:
@@ -82,8 +79,8 @@ class OpenPatient:
                 self.segment()
             self._open_at_start(files)
             if files.sequence is not None:
-                recording = Recording(files.sequence, files.sequence_name, files.transform)
-                self._registration.take(recording, files.to_ras)
+                sequence = SequenceRecord(files.sequence, files.sequence_name, files.transform, files.to_ras)
+                self._registration.take(sequence)
             elif files.preset is not None and files.preset.probe_to_ras is not None:
                 self._presenter.values.takePreset(files.preset)
 
@@ -175,39 +172,25 @@ class OpenPatient:
 
     def lay(self, mask: Volume, tissue: str, name: str) -> None:
         """Add a mask of a file to the lesions, and lay them over the tissues; without tissues Segment does so."""
-        parameters: Any = self._logic.parameters
-        before = parameters.lesions
-        undo = self._add_lesions(mask, tissue, name)
-        try:
-            if parameters.labels is not None:
+        with self._added(mask, tissue, name):
+            if self._logic.parameters.labels is not None:
                 self.then_show(self._presenter.lesions.layLesions)
-        except SimulationError:
-            undo()
-            parameters.lesions = before
-            raise
 
-    def _add_lesions(self, mask: Volume, tissue: str, name: str) -> Callable[[], None]:
-        """Add a mask of a file to the lesions; returns a function that takes it out of them again."""
+    @contextmanager
+    def _added(self, mask: Volume, tissue: str, name: str) -> Iterator[None]:
+        """Add a mask of a file to the lesions; after an error in the block it is taken out of them again."""
         parameters: Any = self._logic.parameters
         before = parameters.lesions
-        node = before or self._scene.AddNewNodeByClass("vtkMRMLSegmentationNode", "Lesions")
-        is_saved = "lesions" not in self.unsaved
-
-        def undo(ids: Iterable[str] = ()) -> None:
-            for segment_id in ids:
-                node.GetSegmentation().RemoveSegment(segment_id)
-            if before is None:
-                self._scene.RemoveNode(node)
-
-        try:
+        with self._presenter.made(before, "Segmentation", "Lesions") as node:
             ids = add_lesion(node, mask, tissue, name)
-        except SimulationError:
-            undo()
-            raise
-        parameters.lesions = node
-        if is_saved:
-            self._saved["lesions"] = self._made().get("lesions")
-        return lambda: undo(ids)
+            try:
+                parameters.lesions = node
+                yield
+            except SimulationError:
+                parameters.lesions = before
+                for segment_id in ids:
+                    node.GetSegmentation().RemoveSegment(segment_id)
+                raise
 
     # ---- actions of the panel ----------------------------------------------------------------------------------
 
@@ -310,7 +293,7 @@ class OpenPatient:
             node: Any = getattr(parameters, role)
             if node not in kept:
                 setattr(parameters, role, None)
-        _remove_patient_nodes(self._scene, kept)
+        remove_patient_nodes(self._scene, kept)
         with self._shared.changing() as now:
             now.fit.curve, now.fit.costs = [], ""
         self._is_new = True
@@ -349,35 +332,3 @@ class OpenPatient:
             self._presenter.images.setLive(True)
         self._probe.update_surface()  # after the start of live images, which do not need it
         self._probe.look()
-
-
-def _remove_patient_nodes(scene, kept: Iterable[Any]) -> None:
-    """Remove all nodes of these classes, with what displays and stores them, except those that are kept.
-
-    Nodes that are not saved with the scene belong to the views and stay. The scene is the workstation's own: nobody
-    else puts nodes into it.
-    """
-    ids = {node.GetID() for node in kept if node is not None}
-    for name in _PATIENT_CLASSES:
-        for node in nodes_of_class(scene, name):
-            # One may be gone together with another one before
-            if node.GetSaveWithScene() and node.GetScene() is not None and node.GetID() not in ids and _is_data(node):
-                for helper in _helpers(node):
-                    scene.RemoveNode(helper)
-                scene.RemoveNode(node)
-
-
-def _is_data(node) -> bool:
-    """Not a model of a slice view, which Slicer makes and needs."""
-    is_shares = node.GetAttribute("SlicerUSSim.sharesOf") is not None
-    return (not (node.GetName() or "").endswith("Volume Slice") and not node.GetHideFromEditors()) or is_shares
-
-
-def _helpers(node) -> list[Any]:
-    """Display and storage nodes, and the colours of labels."""
-    displays = range(node.GetNumberOfDisplayNodes()) if node.IsA("vtkMRMLDisplayableNode") else ()
-    stores = range(node.GetNumberOfStorageNodes()) if node.IsA("vtkMRMLStorableNode") else ()
-    found = [node.GetNthDisplayNode(number) for number in displays]
-    found += [node.GetNthStorageNode(number) for number in stores]
-    found.append(node.GetNodeReference("tissueColors"))
-    return [helper for helper in found if helper is not None]

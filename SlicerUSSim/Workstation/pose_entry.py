@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from pathlib import Path
-from tempfile import TemporaryDirectory
 
 import numpy as np
 
 from SlicerUSSim.Logic.base.errors import require, required
 from SlicerUSSim.Logic.base.transforms import angles_of_pose
+from SlicerUSSim.Logic.mrml.taken_files import written
 from SlicerUSSim.Logic.tracked.pose_files import pose_of_text, write_pose
 from SlicerUSSim.Workstation.browser_panel import BrowserPanel
 
@@ -52,10 +51,7 @@ class PoseEntry:
         """(name, content) of a file with the pose. Raises SimulationError without a probe, or for another suffix."""
         pose = required(self._pose(), _NO_PROBE)
         require(suffix in POSE_SUFFIXES, f"the file type is {suffix!r}, expected {', '.join(POSE_SUFFIXES)}")
-        with TemporaryDirectory() as folder:
-            path = Path(folder) / f"pose{suffix}"
-            write_pose(path, pose)
-            return path.name, path.read_bytes()
+        return f"pose{suffix}", written(suffix, lambda path: write_pose(path, pose))
 
     def set(self, pose: np.ndarray) -> None:
         """Move the probe to a pose, (4, 4) probe_to_ras. Raises SimulationError without a probe."""

@@ -157,17 +157,15 @@ class ProbeControl:
             with self._progress("Make the surface") as progress:
                 made = self._tasks.doAside(lambda: PatientSurface(placed, progress))
         except Cancelled:
-            if self._surface_version == version:
-                self.surface = None  # that of the labels before is not of these
-                self._views.hide_surface()
-                with self._shared.changing() as now:
-                    now.pose = None
-                    now.messages.status = _NO_SURFACE
-            return
+            made = None  # that of the labels before is not of these
         if self._surface_version != version:  # of a patient who was closed meanwhile, or of labels of before
             return
         self.surface = made
         self._views.show_surface(made)
+        if made is None:
+            with self._shared.changing() as now:
+                now.pose, now.messages.status = None, _NO_SURFACE
+            return
         self.show_tissues(self._shared.now.views.show_tissues)
         self._tell()
 

@@ -13,12 +13,12 @@ from SlicerUSSim.Logic.imaging.preset import Preset
 from SlicerUSSim.Logic.mrml.nodes import display_of, set_node_to_world
 from SlicerUSSim.Logic.mrml.parameter_node import preset_texts
 from SlicerUSSim.Logic.mrml.scene_record import ROLES, SceneRecord, put_nodes, put_values
-from SlicerUSSim.Logic.mrml.taken_sequence import FrozenRecord, count_taken, put_taken, read_taken, taken_of
+from SlicerUSSim.Logic.mrml.taken_sequence import count_taken, put_taken, taken_of
 from SlicerUSSim.Workstation.browser_panel import BrowserPanel
 from SlicerUSSim.Workstation.cine import SEQUENCE
 from SlicerUSSim.Workstation.file_nodes import FileNodes, show_all_tissue
 from SlicerUSSim.Workstation.patient import OpenPatient
-from SlicerUSSim.Workstation.pose_registration import Recording, Registration
+from SlicerUSSim.Workstation.pose_registration import Registration
 from SlicerUSSim.Workstation.scene_files import read_scene
 
 
@@ -56,7 +56,7 @@ class Scenes:
         if record.frozen is not None:
             taken_of(record.frozen, None)
         found = record.sequence
-        if found is None or not Recording(found.sequence, found.name, found.path).is_calibrated:
+        if found is None or not found.is_calibrated:
             return record
         with self._presenter.view.progress("Find the probe's field"):
             tracked = self._nodes.prepared(found, preset.probe)
@@ -87,7 +87,7 @@ class Scenes:
         if pose is not None:
             self._put_probe(pose)
         if record.sequence is not None:
-            self._registration.restore(record.sequence)
+            self._registration.take(record.sequence)
             self._logic.preset = preset
         parameters.image_sequence = simulated
         if pose is not None:
@@ -95,8 +95,9 @@ class Scenes:
         self._presenter.notes.set()
         self._patient.show_restored(is_placed=pose is not None, frozen=record.frozen)
         if simulated is not None:
+            number = 0 if record.frozen is None else record.frozen.number or 0
             with self._shared.changing() as now:
-                now.cine.source, now.cine.index = SEQUENCE, _place_of(record.frozen, simulated)
+                now.cine.source, now.cine.index = SEQUENCE, number if number < count_taken(simulated) else 0
         return refused
 
     def _put_probe(self, pose: np.ndarray) -> None:
@@ -109,12 +110,3 @@ class Scenes:
             if display is not None:
                 display.SetEditorVisibility(False)
         set_node_to_world(transform, pose)
-
-
-def _place_of(frozen: FrozenRecord | None, images_node: Any) -> int:
-    """The number of a frozen image in a sequence; 0 if it is none of its images."""
-    number = None if frozen is None else frozen.number
-    if frozen is None or number is None or number >= count_taken(images_node):
-        return 0
-    is_same = read_taken(images_node, number).time == frozen.about.get("time")
-    return number if is_same else 0

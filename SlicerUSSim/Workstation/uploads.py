@@ -9,11 +9,13 @@ from __future__ import annotations
 import logging
 import os
 import re
+import tempfile
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 from SlicerUSSim.Logic.base.dicom import Series, list_series
 from SlicerUSSim.Logic.base.errors import SimulationError, require
+from SlicerUSSim.Logic.base.whole_files import other_file, plain
 
 _log = logging.getLogger(__name__)
 
@@ -25,14 +27,12 @@ MOST_BYTES = 2**31
 _MOST_LISTED = 4
 #: Files that are sent at once; a CT of the whole body has 2000 images
 MOST_FILES = 10_000
-#: Where headers end that name their voxels
-_HEADER_BYTES = 2**16
-#: First words of MetaImage headers, whose lines may come in any order
-_META = re.compile(rb"\s*(?:ObjectType|NDims|Comment|ObjectSubType|BinaryData)\s*=")
-_NRRD = re.compile(rb"^data ?file:\s*(.*)$", re.MULTILINE | re.IGNORECASE)
-_METAIMAGE = re.compile(rb"^ElementDataFile\s*=[ \t]*(.*)$", re.MULTILINE)
 #: Folder of the DICOM files, whose names may be those of others
 DICOM = "dicom"
+#: Folder of what a page has sent, as reading.untrusted_folder calls it, in messages
+_SENT = re.compile(
+    rf"{re.escape(str(Path(tempfile.gettempdir()).resolve()))}[/\\\\]ussim-untrusted-\w+[/\\\\](?:{DICOM}[/\\\\])?"
+)
 #: Endings of images of one file; beside DICOM files nothing else is opened, as from a CD with a viewer
 _IMAGES = (".nrrd", ".mha", ".nii", ".nii.gz", ".mgz", ".mgh", ".mnc", ".vti", ".vtp", ".mrb")
 
@@ -53,15 +53,11 @@ class Sent:
         self._folder = Path(folder)
         #: Those that are no DICOM images
         self.paths: list[Path] = []
-        #: How many files beside DICOM files are none of an image
-        self.left_out = 0
         dicom = {name for name, content in files.items() if _is_dicom(name, content)}
         for name, content in files.items():
             if name in dicom:
                 self._write(self._folder / DICOM / name, content)
-            elif dicom and not name.lower().endswith(_IMAGES):
-                self.left_out += 1
-            else:
+            elif not dicom or name.lower().endswith(_IMAGES):
                 self._write(self._folder / name, content)
                 self.paths.append(self._folder / name)
 
@@ -103,19 +99,16 @@ def require_whole_files(files: Mapping[str, bytes]) -> None:
 
     `files` are {name: content} as a page sent them. Nothing has been written yet.
     """
-    size = sum(map(len, files.values()))
-    require(size <= MOST_BYTES, f"{listed(list(files))}: {size} bytes, expected at most {MOST_BYTES}")
-    require(len(files) <= MOST_FILES, f"{len(files)} files are sent at once, expected at most {MOST_FILES}")
     for name, content in files.items():
         require(
             bool(name) and name not in (".", "..") and not re.search(r"[/\\\0-\x1f\x7f]", name),
-            f"{_shown(name)}: is no plain file name, expected one without slashes and control characters",
+            f"{plain(name)}: is no plain file name, expected one without slashes and control characters",
         )
         length = len(name.encode("utf-8", "replace"))
         require(
-            length <= _LONGEST_NAME, f"{_shown(name)}: its name has {length} bytes, expected at most {_LONGEST_NAME}"
+            length <= _LONGEST_NAME, f"{plain(name)}: its name has {length} bytes, expected at most {_LONGEST_NAME}"
         )
-        other = _other_file(name, content)
+        other = other_file(name, content)
         require(
             other is None,
             f"{name}: is a header whose voxels are in another file ({other}), which a page cannot send; save it as one "
@@ -123,15 +116,14 @@ def require_whole_files(files: Mapping[str, bytes]) -> None:
         )
 
 
-def require_whole_file(path: Path) -> None:
-    """Raise SimulationError for a file of a bundle that is a header whose voxels are in another file."""
-    other = _other_file(path.name, path.read_bytes())
-    require(other is None, f"{path.name}: is a header whose voxels are in another file ({other}), expected one file")
+def as_known(text: str) -> str:
+    """A message with the names of files as the user knows them, without the folder of what a page has sent."""
+    return _SENT.sub("", text)
 
 
 def listed(names: Sequence[str]) -> str:
     """Names of files for a message; many are counted."""
-    return ", ".join(map(_shown, names)) if len(names) <= _MOST_LISTED else f"{len(names)} files"
+    return ", ".join(map(plain, names)) if len(names) <= _MOST_LISTED else f"{len(names)} files"
 
 
 def plain_names(parts: Iterable[tuple[str, bytes]]) -> dict[str, bytes]:
@@ -150,25 +142,3 @@ def _is_dicom(name: str, content: bytes) -> bool:
     """Whether a file is a DICOM image: by its prefix, or by the ending of older ones that lack it."""
     has_prefix = content[128:132] == b"DICM" or name.lower().endswith((".dcm", ".ima"))
     return has_prefix and name.upper() != "DICOMDIR"
-
-
-def _other_file(name: str, content: bytes) -> str | None:
-    """The file that a header names as its voxels; None for a file that is whole."""
-    lower, start = name.lower(), content[:4]
-    if lower.endswith((".mhd", ".mha")) or _META.match(content[:256]):
-        # Of a sequence the line comes after the fields of all images
-        found = _METAIMAGE.search(content)
-        named = found[1].strip().decode("utf-8", "replace") if found else ""
-        return None if named in ("", "LOCAL", "Local", "local") else _shown(named)
-    if start == b"NRRD":
-        found = _NRRD.search(content.partition(b"\n\n")[0][:_HEADER_BYTES])
-        return _shown(found[1].strip().decode("utf-8", "replace")) if found else None
-    if lower.endswith((".nhdr", ".hdr", ".img")) and content[128:132] != b"DICM":  # as some DICOM files are called
-        return "beside it"
-    return None
-
-
-def _shown(text: str) -> str:
-    """A text for a message, short and without control characters."""
-    plain = "".join(letter if letter.isprintable() else "?" for letter in text)
-    return plain if len(plain) <= 60 else f"{plain[:57]}..."

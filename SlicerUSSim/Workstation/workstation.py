@@ -36,7 +36,7 @@ from SlicerUSSim.Workstation.scenes import Scenes
 from SlicerUSSim.Workstation.state import NAMES, SharedState
 from SlicerUSSim.Workstation.tasks import Tasks
 from SlicerUSSim.Workstation.tracker import Tracker
-from SlicerUSSim.Workstation.transfer import Receiver, Sender
+from SlicerUSSim.Workstation.transfer import Transfer
 from SlicerUSSim.Workstation.view_tools import view_tools
 
 #: Seconds between two checks whether all work is done.
@@ -88,7 +88,7 @@ class Workstation:
             panel, nodes, patient, self._scenes, registration, self._questions, self._poses
         )  # fmt: skip
         self._advice = advice = Advice(panel, registration)
-        panel.refreshed = advice.update
+        panel.refreshed.append(advice.update)
         self._kept = KeptState(state_file, panel, patient, opener, probe)
 
         self._following = False
@@ -108,9 +108,8 @@ class Workstation:
         self._answer_pages(stamps)
         self._follow_pages()
         opened = self._in_task(partial(self._then_refresh, opener.open_sent))
-        receiver, sender = Receiver(opened, self._export, panel.showError), Sender(self._export)
-        self.server.controller.on_server_bind.add(lambda wslink: receiver.serve(wslink.app))
-        self.server.controller.on_server_bind.add(lambda wslink: sender.serve(wslink.app))
+        transfer = Transfer(opened, self._export, panel.showError)
+        self.server.controller.on_server_bind.add(lambda wslink: transfer.serve(wslink.app))
         self.server.controller.on_server_ready.add(self._ready)
         self.server.controller.on_server_exited.add(self.close)
         build_page(self.server, panel, (*KEYS, "Escape"))

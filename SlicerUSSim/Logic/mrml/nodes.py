@@ -5,7 +5,9 @@ Uses only nodes, and nothing of the `slicer` namespace.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from vtkmodules.vtkCommonMath import vtkMatrix4x4
@@ -16,6 +18,13 @@ from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.base.vtk_data import matrix_array, vtk_matrix
 from SlicerUSSim.Logic.probe.arrays import Probe
 from SlicerUSSim.Logic.probe.shape import outline_polydata, probe_polydata
+
+#: What is of a patient: images, labels, surfaces, points, recordings, the costs of a fit
+_PATIENT_CLASSES = (
+    "vtkMRMLSequenceBrowserNode", "vtkMRMLSequenceNode", "vtkMRMLVolumeNode", "vtkMRMLSegmentationNode",
+    "vtkMRMLModelNode", "vtkMRMLMarkupsNode", "vtkMRMLTransformNode", "vtkMRMLPlotChartNode", "vtkMRMLPlotSeriesNode",
+    "vtkMRMLTableNode",
+)  # fmt: skip
 
 
 def named(node) -> str:
@@ -262,3 +271,38 @@ def composite_of(slice_node):
     """The vtkMRMLSliceCompositeNode of a slice view, or None."""
     composites = nodes_of_class(slice_node.GetScene(), "vtkMRMLSliceCompositeNode")
     return next((node for node in composites if node.GetLayoutName() == slice_node.GetLayoutName()), None)
+
+
+# ---- nodes of a patient ---------------------------------------------------------------------------------------------
+
+
+def remove_patient_nodes(scene, kept: Iterable[Any]) -> None:
+    """Remove all nodes of these classes, with what displays and stores them, except those that are kept.
+
+    Nodes that are not saved with the scene belong to the views and stay. The scene is the workstation's own: nobody
+    else puts nodes into it.
+    """
+    ids = {node.GetID() for node in kept if node is not None}
+    for name in _PATIENT_CLASSES:
+        for node in nodes_of_class(scene, name):
+            # One may be gone together with another one before
+            if node.GetSaveWithScene() and node.GetScene() is not None and node.GetID() not in ids and _is_data(node):
+                for helper in _helpers(node):
+                    scene.RemoveNode(helper)
+                scene.RemoveNode(node)
+
+
+def _is_data(node) -> bool:
+    """Not a model of a slice view, which Slicer makes and needs."""
+    is_shares = node.GetAttribute("SlicerUSSim.sharesOf") is not None
+    return (not (node.GetName() or "").endswith("Volume Slice") and not node.GetHideFromEditors()) or is_shares
+
+
+def _helpers(node) -> list[Any]:
+    """Display and storage nodes, and the colours of labels."""
+    displays = range(node.GetNumberOfDisplayNodes()) if node.IsA("vtkMRMLDisplayableNode") else ()
+    stores = range(node.GetNumberOfStorageNodes()) if node.IsA("vtkMRMLStorableNode") else ()
+    found = [node.GetNthDisplayNode(number) for number in displays]
+    found += [node.GetNthStorageNode(number) for number in stores]
+    found.append(node.GetNodeReference("tissueColors"))
+    return [helper for helper in found if helper is not None]

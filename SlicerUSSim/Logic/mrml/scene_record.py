@@ -109,6 +109,20 @@ class SequenceRecord:
     #: The probe and its place in the images; a user may have changed that of the scene since. None: unknown
     field: ImagedField | None = None
 
+    @property
+    def what(self) -> str:
+        """Its images and transforms, in words."""
+        rows, columns = self.sequence.images.shape[1:]
+        count = len(self.sequence)
+        names = sorted({name for entry in self.sequence.transforms for name in entry})
+        transforms = f"transforms {', '.join(names)}" if names else "no transforms"
+        return f"{count} image{'s' * (count > 1)} of {columns}x{rows}, {transforms}"
+
+    @property
+    def is_calibrated(self) -> bool:
+        """Whether the place of at least one image is known."""
+        return any(self.sequence.has_pose(number, self.path) for number in range(len(self.sequence)))
+
 
 @dataclass(frozen=True, eq=False)
 class SceneRecord:

@@ -138,7 +138,7 @@ def _of_json(path: Path) -> Content:
     if isinstance(values, dict):
         if "markups" in values:
             return Content(Kind.POINTS, "points of 3D Slicer")
-        if has_probe(values):
+        if values.keys() & {"probe", *SECTIONS}:
             return Content(Kind.PRESET, "a preset (probe, display, settings)")
         if "probe_to_ras" in values:
             return Content(Kind.POSE, "a pose of the probe")
@@ -149,11 +149,6 @@ def _of_json(path: Path) -> Content:
     if isinstance(values, list) and np.shape(values) == (4, 4):
         return Content(Kind.TRANSFORM, "a 4x4 matrix")
     return Content(Kind.PRESET, "a preset")
-
-
-def has_probe(values: object) -> bool:
-    """Whether the values of a .json file have sections that a preset has, and are no table of labels."""
-    return isinstance(values, dict) and bool(values.keys() & {"probe", *SECTIONS})
 
 
 def _has_16_numbers(path: Path) -> bool:
