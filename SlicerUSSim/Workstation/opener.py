@@ -371,7 +371,8 @@ class Opener:
         require(len(points) > 0, f"{file.name}: has no point that was placed, expected one or more")
         if kind == "Fiducial":
             parameters.seed = self._nodes.points(path, points)
-            return "the last one is chosen as the point of a lesion; Craniotomy has them, too, for an opening"
+            self._presenter.lesions.growAtPoint()
+            return "the lesion around the last one is grown, if the notes of Lesions say so"
         parameters.opening = self._read(file, self._nodes.opening)
         return "chosen as the opening of a craniotomy"
 
