@@ -159,12 +159,12 @@ def _banner() -> str:
 
 
 def _advice() -> str:
-    advice, image = NAMES.advice, NAMES.image
+    advice, remedy, image = NAMES.advice, NAMES.remedy, NAMES.image
     is_outdated = f"{image.status} === 'OUTDATED'"
-    return f"""<div class="ussim-advice" id="advice" role="status" v-if="{is_outdated} || {advice.text}">
-      <span>{{{{ {is_outdated} ? 'The image is outdated: ' + {image.differs} + ' changed' : {advice.text} }}}}</span>
-      <button v-if="{is_outdated} || {advice.remedy}" class="ussim-button" id="remedy"
-      @click="trigger('remedy', [{is_outdated}])">{{{{ {is_outdated} ? 'Simulate' : {advice.remedy} }}}}</button>
+    return f"""<div class="ussim-advice" id="advice" role="status" v-if="{is_outdated} || {advice}">
+      <span>{{{{ {is_outdated} ? 'The image is outdated: ' + {image.differs} + ' changed' : {advice} }}}}</span>
+      <button v-if="{is_outdated} || {remedy}" class="ussim-button" id="remedy"
+      @click="trigger('remedy', [{is_outdated}])">{{{{ {is_outdated} ? 'Simulate' : {remedy} }}}}</button>
       </div>"""
 
 

@@ -114,11 +114,6 @@ class Workstation:
         self.server.controller.on_server_exited.add(self.close)
         build_page(self.server, panel, (*KEYS, "Escape"))
 
-    @property
-    def is_computing(self) -> bool:
-        """Whether a thread computes something for the page."""
-        return self._tasks.are_computing
-
     def close(self, **_: object) -> None:
         """Close the connection to the tracker and cancel waiting tasks."""
         self._logic.stopLiveUpdate()
