@@ -53,7 +53,7 @@ class Bench:
         )
         comparison = SimpleNamespace(show_at=nothing, stop=nothing, compare=nothing, sees_nothing=nothing)
         self.cine = Cine(panel, comparison, lambda pose: set_node_to_world(self.probe, pose))
-        tracker = SimpleNamespace(is_on=False)
+        tracker = SimpleNamespace(send=nothing)
         self.flow = ImageFlow(panel, views, comparison, self.cine, tracker, LatencyStamps())
         self.node = Observed("ImageDataModifiedEvent", self.flow.image_changed)
         self.node.watch(output)

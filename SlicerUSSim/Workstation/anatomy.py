@@ -225,7 +225,8 @@ class AnatomyViews:
 
     def show_labels(self, labels_node: Any, on: bool) -> None:
         """Colour the tissues in the slice views, or not; only possible with a label map."""
-        shown = labels_node if on and _is_label_map(labels_node) else None
+        is_map = labels_node is not None and labels_node.IsA("vtkMRMLLabelMapVolumeNode")
+        shown = labels_node if on and is_map else None
         for view in self.slices:
             composite: Any = composite_of(_node(view))
             composite.SetLabelVolumeID(None if shown is None else shown.GetID())
@@ -384,7 +385,3 @@ def _silent(make):
 def _node(view: AbstractView) -> Any:
     """The MRML node of a view."""
     return view.get_view_node()
-
-
-def _is_label_map(node: Any) -> bool:
-    return node is not None and node.IsA("vtkMRMLLabelMapVolumeNode")

@@ -64,8 +64,7 @@ class ImageFlow:
         self._simulated.send(taken.image, stamp=self._stamps.computed, **_description(taken))
         self._cine.add(taken)
         self._show_in_views()
-        if self._tracker.is_on:
-            self._tracker.send(taken.volume())
+        self._tracker.send(taken)
         if taken.is_empty:
             self._comparison.sees_nothing(taken.grid)
         else:

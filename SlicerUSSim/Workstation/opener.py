@@ -136,12 +136,7 @@ class Opener:
     def _take_all(self, files: list[_File], meant: str) -> None:
         for file in files:
             with self._presenter.shown():
-                if meant:
-                    is_one = file.kind in (Kind.TRANSFORM, Kind.POSE)
-                    require(is_one, f"{file.name} is {file.content.what}, expected the {meant} of tracked ultrasound")
-                    deed = self._transform_as(file, meant)
-                else:
-                    deed = self._take[file.kind](file, files)
+                deed = self._transform_as(file, meant) if meant else self._take[file.kind](file, files)
                 self._say(f"{file.name}: {file.content.what}: {deed}")
 
     def recognised(self, paths: Sequence[Path]) -> tuple[list[_File], list[str]]:

@@ -133,7 +133,7 @@ class Registration:
         self._calibration, self._to_ras = calibration, to_ras
         if made is None:
             self._comparison.drop()
-            self._comparison.view(sequence.images, number)
+            self._comparison.take(sequence.images, number=number)
             self._logic.parameters.real = self._field = None
         else:
             tracked, browser, images, _ = made
