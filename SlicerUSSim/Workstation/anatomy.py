@@ -108,12 +108,8 @@ class AnatomyViews:
         self.threed.renderer().SetUseDepthPeelingForVolumes(False)
 
     def _fit_soon(self, view: SliceView, *_: object) -> None:
-        get_event_loop().call_later(_RESIZED_S, self._fit_anew, view)
-
-    def _fit_anew(self, view: SliceView) -> None:
-        self._fitted.discard(view.get_singleton_tag())
-        if self._followed is not None:
-            self.follow(*self._followed)
+        name = view.get_singleton_tag()
+        get_event_loop().call_later(_RESIZED_S, lambda: self.set_plane(name, self.planes[name]))
 
     # ---- content -----------------------------------------------------------------------------------------------
 

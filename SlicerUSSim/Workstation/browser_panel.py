@@ -129,7 +129,7 @@ class BrowserPanel:
         now = perf_counter()
         if message != self._status and (now > self._status_until or not message.endswith(_RATE)):
             self._status, self._status_until = message, now + _STATUS_EVERY_S
-            self._in_loop(lambda: self._send_status(message))
+            self._in_loop(lambda: self.shared.put("messages", {"status": message}))
 
     def schedule(self, function: Callable[[], None]) -> None:
         def run() -> None:
@@ -307,10 +307,6 @@ class BrowserPanel:
             curve = now.fit.curve = best[chosen].round(5).tolist()
             # Of the rounded numbers: rounding 0.23449998 at once gives 0.234, rounding it twice 0.235
             now.fit.costs = f"cost {curve[0]:.3f} → {curve[-1]:.3f} after {evaluations[-1]:.0f} evaluations"
-
-    def _send_status(self, message: str) -> None:
-        with self.shared.changing() as now:
-            now.messages.status = message
 
     def _show_work(self) -> None:
         work = self._under_way[-1] if self._under_way else None

@@ -236,9 +236,7 @@ def _screens(keys: tuple[str, ...]) -> str:
         f"{mode} === '{chosen.value}'"
         for chosen in (ComparisonMode.BESIDE, ComparisonMode.BLINK, ComparisonMode.DIFFERENCE)
     )
-    image = NAMES.image
-    values = {"Depth": image.depth, "Focus": image.focus, "Gain": image.gain, "DR": image.dynamic_range}
-    lines = "".join(f'<div v-if="{value}">{words} {{{{ {value} }}}}</div>' for words, value in values.items())
+    lines = f'<div v-for="(value, name) in {NAMES.image.values}">{{{{ name }}}} {{{{ value }}}}</div>'
     outline = f"""<svg v-if="{NAMES.sequence.mask} && {mode} !== '{ComparisonMode.SIMULATED.value}'" class="ussim-mask"
         :viewBox="{NAMES.sequence.box}" preserveAspectRatio="none"><path :d="{NAMES.sequence.mask}"/></svg>"""
     frame = f'<div class="ussim-frame">{outline}{cross_hair(IMAGE)}</div>'

@@ -167,10 +167,8 @@ class ImageState:
     time: str = ""
     probe: str = ""
     frequency: str = ""
-    depth: str = ""
-    focus: str = ""
-    gain: str = ""
-    dynamic_range: str = ""
+    #: Depth, Focus, Gain and DR in the image's corner
+    values: dict[str, str] = field(default_factory=dict)
 
 
 @dataclass

@@ -193,24 +193,21 @@ class AtMost:
 
     def __init__(self, seconds: float, function: Callable[[], None]) -> None:
         self._seconds, self._function = seconds, function
-        self._next, self._waiting = 0.0, False
-
-    @property
-    def is_waiting(self) -> bool:
-        """Whether the function is still to be called."""
-        return self._waiting
+        self._next = 0.0
+        #: Whether the function is still to be called
+        self.is_waiting = False
 
     def __call__(self) -> None:
         loop = get_event_loop()
-        if self._waiting:
+        if self.is_waiting:
             return
         if loop.time() >= self._next:
             self._run()
         else:
-            self._waiting = True
+            self.is_waiting = True
             loop.call_at(self._next, self._run)
 
     def _run(self) -> None:
-        self._waiting = False
+        self.is_waiting = False
         self._next = get_event_loop().time() + self._seconds
         self._function()

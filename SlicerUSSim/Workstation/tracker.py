@@ -55,7 +55,5 @@ class Tracker:
 
     async def _tell(self, link: TrackerLink) -> None:
         while self._link is link:
-            if self._shared.now.messages.tracker != link.status:
-                with self._shared.changing() as now:
-                    now.messages.tracker = link.status
+            self._shared.put("messages", {"tracker": link.status})
             await asyncio.sleep(_LOOK_EVERY_S)

@@ -81,7 +81,7 @@ class Workstation:
         panel.pick = probe.hand.pick
         self._registration = registration = Registration(panel, nodes, comparison)
         self._patient = patient = OpenPatient(panel, nodes, self._views, probe, comparison, registration)
-        self._exports = Exports(app, panel, cine, patient.saved)
+        self._exports = Exports(app, panel, cine, self._poses, patient.saved)
         self._questions = Questions(shared, tasks)
         self._scenes = Scenes(panel, nodes, patient, registration)
         self._opener = opener = Opener(
@@ -184,10 +184,7 @@ class Workstation:
             found = None
             try:
                 with self._presenter.shown():
-                    if kind.startswith("pose."):
-                        found = *self._poses.file(kind.removeprefix("pose")), "application/octet-stream"
-                    else:
-                        found = self._exports.export(kind, sent or {})
+                    found = self._exports.export(kind, sent or {})
             finally:
                 if not exported.done():  # the page may be gone
                     exported.set_result(found)
