@@ -24,10 +24,10 @@ pytest.importorskip("trame_slicer", reason="the workstation comes with: pip inst
 
 from trame_server.state import State  # noqa: E402
 
-from SlicerUSSim.Logic.mrml.nodes import node_to_world, set_node_to_world  # noqa: E402
+from SlicerUSSim.Logic.mrml.nodes import Observed, node_to_world, set_node_to_world  # noqa: E402
 from SlicerUSSim.Logic.mrml.taken_files import sequence_file  # noqa: E402
 from SlicerUSSim.Workstation import cine as cine_module, image_flow  # noqa: E402
-from SlicerUSSim.Workstation.browser_panel import BrowserPanel, Observed  # noqa: E402
+from SlicerUSSim.Workstation.browser_panel import BrowserPanel  # noqa: E402
 from SlicerUSSim.Workstation.cine import Cine  # noqa: E402
 from SlicerUSSim.Workstation.dicom_export import ultrasound_file  # noqa: E402
 from SlicerUSSim.Workstation.image_flow import ImageFlow, LatencyStamps  # noqa: E402

@@ -1,7 +1,4 @@
-"""BrowserPanel: connects the panel's controls on the page to a PanelPresenter.
-
-Besides: Observed, which observes the node that has a role.
-"""
+"""BrowserPanel: connects the panel's controls on the page to a PanelPresenter."""
 
 from __future__ import annotations
 
@@ -20,7 +17,7 @@ from trame_server.utils.asynchronous import get_event_loop
 from SlicerUSSim.Logic.base.errors import Cancelled, require, required, user_message
 from SlicerUSSim.Logic.mrml.fitting_nodes import offered
 from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic
-from SlicerUSSim.Logic.mrml.nodes import nodes_of_class
+from SlicerUSSim.Logic.mrml.nodes import Observed, nodes_of_class
 from SlicerUSSim.Widget.interface import Control, by_widget
 from SlicerUSSim.Widget.presenter import PanelPresenter
 from SlicerUSSim.Widget.sections import panel_sections
@@ -40,33 +37,6 @@ _MARKUPS = "vtkMRMLMarkupsNode"
 #: Maximum number of points of the cost curve on the page.
 _CURVE_POINTS = 150
 _CLICK = "click in the lesion, in a slice view (Escape: not)"
-
-
-class Observed:
-    """Observes the node that currently has a role.
-
-    Parameters
-    ----------
-    event : name of an event of that node, such as "TransformModifiedEvent".
-    method : called on this event.
-    """
-
-    def __init__(self, event: str, method: Callable[[], None]) -> None:
-        self._event, self._method = event, method
-        self._node: Any = None
-        self._tag = 0
-
-    def watch(self, node: Any) -> bool:
-        """Observe this node from now on, or none; whether it is another one than before."""
-        if node is self._node:
-            return False
-        if self._node is not None:
-            self._node.RemoveObserver(self._tag)
-        self._node = node
-        if node is not None:
-            event = getattr(node, self._event, self._event)  # VTK takes its own events by name, MRML's by number
-            self._tag = node.AddObserver(event, lambda *_: self._method())
-        return True
 
 
 @dataclass(eq=False)

@@ -192,9 +192,6 @@ class Opener:
             f"({listing or 'none'})",
         )
         if len(volumes) == 1:
-            if len(series) > 1:
-                title = volumes[0].title
-                self._say(f"the DICOM files have {len(series)} series, of which one is a volume: {title}")
             return volumes[0]
         patients = list(dict.fromkeys(one.patient for one in volumes))
         whose = [f", patient {patients.index(one.patient) + 1}" if len(patients) > 1 else "" for one in volumes]

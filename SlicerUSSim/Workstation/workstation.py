@@ -14,9 +14,10 @@ from trame_server import Server
 from trame_slicer.core import SlicerApp
 
 from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic
+from SlicerUSSim.Logic.mrml.nodes import Observed
 from SlicerUSSim.Workstation.advice import Advice
 from SlicerUSSim.Workstation.anatomy import AnatomyViews
-from SlicerUSSim.Workstation.browser_panel import BrowserPanel, Observed
+from SlicerUSSim.Workstation.browser_panel import BrowserPanel
 from SlicerUSSim.Workstation.cine import Cine
 from SlicerUSSim.Workstation.comparison import Comparison
 from SlicerUSSim.Workstation.export import Exports
