@@ -93,7 +93,7 @@ def test_pose_and_settings_are_offered_after_a_crash_and_restored(start, browser
     np.testing.assert_allclose(*(np.array(text.split(), float) for text in (state(page, NAMES.pose_matrix), pose)),
                                atol=1e-3)  # fmt: skip
     assert any(row["name"] == "white matter" and "0.41" in row["values"] for row in state(page, NAMES.panel.tissues))
-    click(page, "#close-patient")
+    page.evaluate("window.trame.trigger('close_patient')")
     eventually(page, lambda: not file.exists())
     page.close()
 
