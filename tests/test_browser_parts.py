@@ -384,7 +384,7 @@ def test_of_images_that_come_fast_the_last_is_compared(head):
     async def scenario():
         shared, moved = SharedState(State(ready=True)), []
         comparison = Comparison(shared, moved.append, lambda function: function())
-        comparison.view(sequence.images, 1)  # before its place is known
+        comparison.take(sequence.images, number=1)  # before its place is known
         for stream in comparison.streams:
             stream.set_streamer(SimpleNamespace(push_content=lambda name, about, content: sent.append(name)))
         assert shared.now.sequence.name == "image 1" and not (shared.now.sequence.is_placed or moved)

@@ -24,10 +24,10 @@ pytest.importorskip("trame_slicer", reason="the workstation comes with: pip inst
 
 from trame_server.state import State  # noqa: E402
 
-from SlicerUSSim.Logic.mrml.nodes import node_to_world, set_node_to_world  # noqa: E402
+from SlicerUSSim.Logic.mrml.nodes import Observed, node_to_world, set_node_to_world  # noqa: E402
 from SlicerUSSim.Logic.mrml.taken_files import sequence_file  # noqa: E402
 from SlicerUSSim.Workstation import cine as cine_module, image_flow  # noqa: E402
-from SlicerUSSim.Workstation.browser_panel import BrowserPanel, Observed  # noqa: E402
+from SlicerUSSim.Workstation.browser_panel import BrowserPanel  # noqa: E402
 from SlicerUSSim.Workstation.cine import Cine  # noqa: E402
 from SlicerUSSim.Workstation.dicom_export import ultrasound_file  # noqa: E402
 from SlicerUSSim.Workstation.image_flow import ImageFlow, LatencyStamps  # noqa: E402
@@ -53,7 +53,7 @@ class Bench:
         )
         comparison = SimpleNamespace(show_at=nothing, stop=nothing, compare=nothing, sees_nothing=nothing)
         self.cine = Cine(panel, comparison, lambda pose: set_node_to_world(self.probe, pose))
-        tracker = SimpleNamespace(is_on=False)
+        tracker = SimpleNamespace(send=nothing)
         self.flow = ImageFlow(panel, views, comparison, self.cine, tracker, LatencyStamps())
         self.node = Observed("ImageDataModifiedEvent", self.flow.image_changed)
         self.node.watch(output)
@@ -111,7 +111,10 @@ def test_an_image_is_live_only_while_its_record_is_that_of_now(head, clock):
     async def scenario(bench) -> None:
         assert bench.tell() == ("", "")
         await bench.run(bench.cine.freeze)
-        assert bench.image.status == "LIVE" and (bench.image.depth, bench.image.gain) == ("60 mm", "+0 dB")
+        assert bench.image.status == "LIVE" and (bench.image.values["Depth"], bench.image.values["Gain"]) == (
+            "60 mm",
+            "+0 dB",
+        )
         bench.logic.parameters.labels.GetImageData().Modified()  # as Segment writes them; no image has come yet
         assert bench.tell() == ("LIVE", "")
         clock.now = 0.45
@@ -163,19 +166,19 @@ def test_gain_acts_on_frozen_echoes_and_back_are_the_same_pixels(head):
         kept = bench.logic.taken
         await bench.display(gain_db=6.0, depth_gain_7_db=8.0, grey_map="soft", persistence=0.5)
         shown, display = bench.logic.taken, replace(bench.logic.preset.display, persistence=0.0)
-        assert (bench.image.gain, shown.time, bench.image.status) == ("+6 dB", kept.time, "FROZEN")
+        assert (bench.image.values["Gain"], shown.time, bench.image.status) == ("+6 dB", kept.time, "FROZEN")
         simulator = bench.logic.patients.simulator(bench.logic.patients.imaged(bench.logic.parameters.labels))
         pose = kept.frame.probe_to_ras
         now = simulator.simulate(kept.preset.probe, pose, display, noise_seed=seed_of_pose(pose)).image
         off, change = np.abs(shown.image.astype(int) - now), np.abs(now.astype(int) - kept.image)
         assert (off > 1).mean() < 1e-3 and (change > 10).mean() > 0.1  # smoothing reaches behind the end of lines
         await bench.run(bench.cine.step, -1)
-        assert bench.image.gain == "+6 dB" and bench.logic.taken.time < kept.time
+        assert bench.image.values["Gain"] == "+6 dB" and bench.logic.taken.time < kept.time
         await bench.run(bench.cine.step, 1)
         await bench.move()
         pose = node_to_world(bench.probe)
         await bench.display(gain_db=0.0, depth_gain_7_db=0.0, grey_map="linear")
-        assert np.array_equal(bench.logic.taken.image, kept.image) and bench.image.gain == "+0 dB"
+        assert np.array_equal(bench.logic.taken.image, kept.image) and bench.image.values["Gain"] == "+0 dB"
         assert np.array_equal(node_to_world(bench.probe), pose)  # the image stays, and so does the probe
 
     on_bench(head, scenario)

@@ -146,8 +146,7 @@ _run(
         server=types.SimpleNamespace(
             controller=types.SimpleNamespace(on_server_bind=handlers, on_server_ready=handlers),
             start=lambda **options: begun.wait() and print("served"),
-        ),
-        is_computing=begun.wait() and tasks.are_computing,
+        )
     ),
     "127.0.0.1", 0, None,
 )

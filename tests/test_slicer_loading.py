@@ -156,7 +156,7 @@ def test_a_wheel_holds_what_is_not_python_too(wheel):
     files = {path.relative_to(wheel / "SlicerUSSim").as_posix() for path in wheel.rglob("*") if path.is_file()}
     assert {
         "USSim.py", "Resources/Icons/USSim.png", "Resources/USSim/requirements.txt", "Logic/fitting/report.html",
-        "Logic/py.typed", "Logic/mri/mni152.npz", "Logic/mri/mni152.txt", "Workstation/static/workstation.css",
+        "Logic/py.typed", "Logic/mri/mni152.npz", "Logic/mri/mni152.txt", "Workstation/static/workstation.js",
         "kernels/common.clh", "kernels/bmode.cl",
     } <= files  # fmt: skip
     assert "__init__.py" not in files

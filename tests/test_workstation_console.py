@@ -293,7 +293,7 @@ def test_the_line_over_the_image_has_a_remedy(browser, tmp_path):
         eventually(page, lambda: "skull is closed" in page.locator("#advice").inner_text())
         assert page.locator("#remedy").inner_text() == "Open skull"
         click(page, "#remedy")
-        eventually(page, lambda: "skull is closed" not in json.dumps(state(page, NAMES.advice.text)))
+        eventually(page, lambda: "skull is closed" not in json.dumps(state(page, NAMES.advice)))
         settled(page)
         open_section(page, "Probe")
         assert "craniotomy: a disc of" in page.locator("#probeNotesLabel").inner_text() and not errors(page)

@@ -165,7 +165,7 @@ def test_a_ct_is_recognised_and_segmented_as_one(page, tmp_path):
     lumbar_spine((3.0, 3.0, 3.0)).ct.write(tmp_path / "spine.nrrd")
     with new_image(page):
         said = answered(page, tmp_path / "spine.nrrd", "New patient")
-    assert "spine.nrrd: a CT by its numbers" in said and "segmented as ct (before: t1)" in said and not errors(page)
+    assert "spine.nrrd: a CT (" in said and "segmented as ct (before: t1)" in said and not errors(page)
     assert shown(page, "contrastComboBox") == "ct"
     assert "bone" in {row["name"] for row in state(page, NAMES.panel.tissues)}
 

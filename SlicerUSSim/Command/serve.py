@@ -241,8 +241,7 @@ def _run(workstation: Workstation, host: str, port: int, tls: ssl.SSLContext | N
 
     server.controller.on_server_ready.add(tell)
     server.start(port=port, host=host, open_browser=False, show_connection_info=False, disable_logging=True, timeout=0)
-    if workstation.is_computing:
-        end_at_once()
+    end_at_once()
 
 
 def _usable_port(host: str, port: int | None) -> int:

@@ -7,7 +7,6 @@ from collections.abc import Callable
 from SlicerUSSim.Widget.notes import CHECK
 from SlicerUSSim.Workstation.browser_panel import BrowserPanel
 from SlicerUSSim.Workstation.pose_registration import Registration
-from SlicerUSSim.Workstation.state import AdviceState
 
 #: Words of warnings about the contrast (mri/plausibility.py), and the contrast that is meant
 _CONTRASTS = {"as in t1 or t1gd": "t1", "as in flair or t2": "t2", "choose t1gd": "t1gd"}
@@ -24,8 +23,7 @@ class Advice:
         """Find the line anew; called when the panel has been refreshed."""
         text, remedy, self._do = self._found()
         with self._panel.shared.changing() as now:
-            if (now.advice.text, now.advice.remedy) != (text, remedy):
-                now.advice = AdviceState(text, remedy)
+            now.advice, now.remedy = text, remedy
 
     def follow(self, is_outdated: bool) -> None:
         """Do what the button says; called in a task."""

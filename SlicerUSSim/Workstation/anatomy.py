@@ -108,12 +108,8 @@ class AnatomyViews:
         self.threed.renderer().SetUseDepthPeelingForVolumes(False)
 
     def _fit_soon(self, view: SliceView, *_: object) -> None:
-        get_event_loop().call_later(_RESIZED_S, self._fit_anew, view)
-
-    def _fit_anew(self, view: SliceView) -> None:
-        self._fitted.discard(view.get_singleton_tag())
-        if self._followed is not None:
-            self.follow(*self._followed)
+        name = view.get_singleton_tag()
+        get_event_loop().call_later(_RESIZED_S, lambda: self.set_plane(name, self.planes[name]))
 
     # ---- content -----------------------------------------------------------------------------------------------
 
@@ -225,7 +221,8 @@ class AnatomyViews:
 
     def show_labels(self, labels_node: Any, on: bool) -> None:
         """Colour the tissues in the slice views, or not; only possible with a label map."""
-        shown = labels_node if on and _is_label_map(labels_node) else None
+        is_map = labels_node is not None and labels_node.IsA("vtkMRMLLabelMapVolumeNode")
+        shown = labels_node if on and is_map else None
         for view in self.slices:
             composite: Any = composite_of(_node(view))
             composite.SetLabelVolumeID(None if shown is None else shown.GetID())
@@ -384,7 +381,3 @@ def _silent(make):
 def _node(view: AbstractView) -> Any:
     """The MRML node of a view."""
     return view.get_view_node()
-
-
-def _is_label_map(node: Any) -> bool:
-    return node is not None and node.IsA("vtkMRMLLabelMapVolumeNode")

@@ -1,7 +1,4 @@
-"""BrowserPanel: connects the panel's controls on the page to a PanelPresenter.
-
-Besides: Observed, which observes the node that has a role.
-"""
+"""BrowserPanel: connects the panel's controls on the page to a PanelPresenter."""
 
 from __future__ import annotations
 
@@ -20,7 +17,7 @@ from trame_server.utils.asynchronous import get_event_loop
 from SlicerUSSim.Logic.base.errors import Cancelled, require, required, user_message
 from SlicerUSSim.Logic.mrml.fitting_nodes import offered
 from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic
-from SlicerUSSim.Logic.mrml.nodes import nodes_of_class
+from SlicerUSSim.Logic.mrml.nodes import Observed, nodes_of_class
 from SlicerUSSim.Widget.interface import Control, by_widget
 from SlicerUSSim.Widget.presenter import PanelPresenter
 from SlicerUSSim.Widget.sections import panel_sections
@@ -40,33 +37,6 @@ _MARKUPS = "vtkMRMLMarkupsNode"
 #: Maximum number of points of the cost curve on the page.
 _CURVE_POINTS = 150
 _CLICK = "click in the lesion, in a slice view (Escape: not)"
-
-
-class Observed:
-    """Observes the node that currently has a role.
-
-    Parameters
-    ----------
-    event : name of an event of that node, such as "TransformModifiedEvent".
-    method : called on this event.
-    """
-
-    def __init__(self, event: str, method: Callable[[], None]) -> None:
-        self._event, self._method = event, method
-        self._node: Any = None
-        self._tag = 0
-
-    def watch(self, node: Any) -> bool:
-        """Observe this node from now on, or none; whether it is another one than before."""
-        if node is self._node:
-            return False
-        if self._node is not None:
-            self._node.RemoveObserver(self._tag)
-        self._node = node
-        if node is not None:
-            event = getattr(node, self._event, self._event)  # VTK takes its own events by name, MRML's by number
-            self._tag = node.AddObserver(event, lambda *_: self._method())
-        return True
 
 
 @dataclass(eq=False)
@@ -129,7 +99,7 @@ class BrowserPanel:
         now = perf_counter()
         if message != self._status and (now > self._status_until or not message.endswith(_RATE)):
             self._status, self._status_until = message, now + _STATUS_EVERY_S
-            self._in_loop(lambda: self._send_status(message))
+            self._in_loop(lambda: self.shared.put("messages", {"status": message}))
 
     def schedule(self, function: Callable[[], None]) -> None:
         def run() -> None:
@@ -307,10 +277,6 @@ class BrowserPanel:
             curve = now.fit.curve = best[chosen].round(5).tolist()
             # Of the rounded numbers: rounding 0.23449998 at once gives 0.234, rounding it twice 0.235
             now.fit.costs = f"cost {curve[0]:.3f} → {curve[-1]:.3f} after {evaluations[-1]:.0f} evaluations"
-
-    def _send_status(self, message: str) -> None:
-        with self.shared.changing() as now:
-            now.messages.status = message
 
     def _show_work(self) -> None:
         work = self._under_way[-1] if self._under_way else None

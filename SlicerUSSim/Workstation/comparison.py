@@ -59,16 +59,14 @@ class Comparison:
         """Whether the similarity of the latest images is still to be shown."""
         return self._comparing is not None
 
-    def take(self, tracked: TrackedImages, browser_node: Any, number: int = 0) -> None:
-        """Use these images for comparison from now on, and show that with the index `number`."""
-        self._use(RealImages(tracked), browser_node, number)
+    def take(self, images: TrackedImages | np.ndarray, browser_node: Any = None, number: int = 0) -> None:
+        """Compare these images from now on, and show that with the index `number`.
 
-    def view(self, images: np.ndarray, number: int = 0) -> None:
-        """Show images (n, rows, columns) whose place is not known beside the simulated ones, that of index `number`."""
-        self._use(images, None, number)
-
-    def _use(self, real: RealImages | np.ndarray, browser_node: Any, number: int) -> None:
-        self._real, self._browser, is_placed = real, browser_node, isinstance(real, RealImages)
+        Of images (n, rows, columns) the place is not known: they are shown beside the simulated ones.
+        """
+        is_placed = isinstance(images, TrackedImages)
+        self._real = real = RealImages(images) if isinstance(images, TrackedImages) else images
+        self._browser = browser_node
         self._numbers = real.tracked.numbers if isinstance(real, RealImages) else range(len(real))
         if not is_placed:
             self.sees_nothing(None)

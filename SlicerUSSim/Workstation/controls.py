@@ -102,15 +102,13 @@ def _field(control: Control) -> str:
     if control.kind == "text":
         value, entered, limits = key, "$event.target.value", ""
     else:
-        value, entered = (
-            f"{key} === null ? '' : +Number({key}).toFixed({control.decimals})",
-            "Number($event.target.value)",
-        )
+        none, entered = f"{key} === null", "Number($event.target.value)"
         limits = f'min="{shown.low:.10g}" max="{shown.high:.10g}" step="{shown.step:g}"'
         if shown.none_at is not None:  # an empty field, and not a number that means it
             limits += ' placeholder="none"'
-            value = f"{key} === null || {key} <= {shown.none_at:.10g} ? '' : +Number({key}).toFixed({control.decimals})"
-            entered = "$event.target.value === '' ? null : Number($event.target.value)"
+            none += f" || {key} <= {shown.none_at:.10g}"
+            entered = f"$event.target.value === '' ? null : {entered}"
+        value = f"{none} ? '' : +Number({key}).toFixed({control.decimals})"
     return f"""<input type="{control.kind}" id="{name}" {limits} :value="{value}" :disabled="{key} === null" {kept(key)}
         @change="trigger('set', ['{name}', {entered}])">"""
 

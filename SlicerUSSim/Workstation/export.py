@@ -18,18 +18,22 @@ from SlicerUSSim.Logic.mrml.taken_files import FRAME_SUFFIXES, frame_file, png, 
 from SlicerUSSim.Workstation.browser_panel import BrowserPanel
 from SlicerUSSim.Workstation.cine import Cine
 from SlicerUSSim.Workstation.dicom_export import ultrasound_file
+from SlicerUSSim.Workstation.pose_entry import PoseEntry
 
 #: The kind of export that a page composes
 DICOM = "dicom"
 
 
 class Exports:
-    """The files of the menu Save, by kind: png, .nrrd, .mha, .vti, cine, dicom, mrb, json.
+    """The contents of the menu Export, by kind: png, .nrrd, .mha, .vti, cine, dicom, mrb, json, pose.*.
 
     Each is (file name, content, MIME type). Raises SimulationError if there is nothing to export.
     """
 
-    def __init__(self, app: SlicerApp, panel: BrowserPanel, cine: Cine, saved: Callable[[], None]) -> None:
+    def __init__(
+        self, app: SlicerApp, panel: BrowserPanel, cine: Cine, poses: PoseEntry, saved: Callable[[], None]
+    ) -> None:
+        self._pose_file = poses.file
         self._app, self._logic, self._tasks, self._cine, self._saved = app, panel.logic, panel.tasks, cine, saved
         self._preset, self._progress = panel.presenter.values.presetToSave, panel.progress
 
@@ -42,6 +46,8 @@ class Exports:
             return "preset.json", json.dumps(self._preset().to_dict(), indent=2).encode(), "application/json"
         if kind == "mrb":
             return "ultrasound.mrb", self._scene(), "application/zip"
+        if kind.startswith("pose."):
+            return *self._pose_file(kind.removeprefix("pose")), "application/octet-stream"
         if kind == "cine":
             with self._progress("Export the cine") as progress:
                 images = list(self._cine.displayed(progress))

@@ -169,7 +169,8 @@ class ProbeHand:
         return drag is not None
 
     def _grab_in_slice(self, view: SliceView, pose: np.ndarray, pixel: np.ndarray) -> _Drag | None:
-        point, normal = _in_slice(view, pixel), _slice_normal(view)
+        node: Any = view.get_view_node()
+        point, normal = _in_slice(view, pixel), matrix_array(node.GetSliceToRAS())[:3, 2]
         x, y, _ = (np.linalg.inv(pose) @ [*point, 1.0])[:3]
         kind = _kind(view) or ("slide" if y < _AT_THE_PROBE_MM else "swing")
         beside = abs(x) > 60.0 and y < 0  # far from the body
@@ -246,11 +247,6 @@ def _in_slice(view: SliceView, pixel: np.ndarray) -> np.ndarray:
     """(3,) position of a pixel in the world frame."""
     node: Any = view.get_view_node()
     return (matrix_array(node.GetXYToRAS()) @ [*pixel, 0.0, 1.0])[:3]
-
-
-def _slice_normal(view: SliceView) -> np.ndarray:
-    node: Any = view.get_view_node()
-    return matrix_array(node.GetSliceToRAS())[:3, 2]
 
 
 def _ray(view: AbstractView, pixel: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -64,8 +64,7 @@ class ImageFlow:
         self._simulated.send(taken.image, stamp=self._stamps.computed, **_description(taken))
         self._cine.add(taken)
         self._show_in_views()
-        if self._tracker.is_on:
-            self._tracker.send(taken.volume())
+        self._tracker.send(taken)
         if taken.is_empty:
             self._comparison.sees_nothing(taken.grid)
         else:
@@ -142,10 +141,11 @@ def _texts(taken: TakenImage) -> ImageState:
     """What a banner says of an image."""
     probe, display = taken.preset.probe, taken.preset.display
     name = next((name.replace("_", " ") for name, known in PROBES.items() if known == probe), probe.kind)
+    focus = {"Focus": f"{probe.focus_mm:.4g} mm"} if probe.focus_mm else {}
+    values = {"Depth": f"{probe.depth_mm:.4g} mm", **focus, "Gain": f"{display.gain_db:+g} dB"}
     return ImageState(
         patient=taken.patient, time=f"{taken.time[11:19]} UTC", probe=name, frequency=f"{probe.received_mhz:.3g} MHz",
-        depth=f"{probe.depth_mm:.4g} mm", focus=f"{probe.focus_mm:.4g} mm" if probe.focus_mm else "",
-        gain=f"{display.gain_db:+g} dB", dynamic_range=f"{display.dynamic_range_db:g} dB",
+        values={**values, "DR": f"{display.dynamic_range_db:g} dB"},
     )  # fmt: skip
 
 

@@ -136,12 +136,7 @@ class Opener:
     def _take_all(self, files: list[_File], meant: str) -> None:
         for file in files:
             with self._presenter.shown():
-                if meant:
-                    is_one = file.kind in (Kind.TRANSFORM, Kind.POSE)
-                    require(is_one, f"{file.name} is {file.content.what}, expected the {meant} of tracked ultrasound")
-                    deed = self._transform_as(file, meant)
-                else:
-                    deed = self._take[file.kind](file, files)
+                deed = self._transform_as(file, meant) if meant else self._take[file.kind](file, files)
                 self._say(f"{file.name}: {file.content.what}: {deed}")
 
     def recognised(self, paths: Sequence[Path]) -> tuple[list[_File], list[str]]:
@@ -197,9 +192,6 @@ class Opener:
             f"({listing or 'none'})",
         )
         if len(volumes) == 1:
-            if len(series) > 1:
-                title = volumes[0].title
-                self._say(f"the DICOM files have {len(series)} series, of which one is a volume: {title}")
             return volumes[0]
         patients = list(dict.fromkeys(one.patient for one in volumes))
         whose = [f", patient {patients.index(one.patient) + 1}" if len(patients) > 1 else "" for one in volumes]

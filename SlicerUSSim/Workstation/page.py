@@ -159,12 +159,12 @@ def _banner() -> str:
 
 
 def _advice() -> str:
-    advice, image = NAMES.advice, NAMES.image
+    advice, remedy, image = NAMES.advice, NAMES.remedy, NAMES.image
     is_outdated = f"{image.status} === 'OUTDATED'"
-    return f"""<div class="ussim-advice" id="advice" role="status" v-if="{is_outdated} || {advice.text}">
-      <span>{{{{ {is_outdated} ? 'The image is outdated: ' + {image.differs} + ' changed' : {advice.text} }}}}</span>
-      <button v-if="{is_outdated} || {advice.remedy}" class="ussim-button" id="remedy"
-      @click="trigger('remedy', [{is_outdated}])">{{{{ {is_outdated} ? 'Simulate' : {advice.remedy} }}}}</button>
+    return f"""<div class="ussim-advice" id="advice" role="status" v-if="{is_outdated} || {advice}">
+      <span>{{{{ {is_outdated} ? 'The image is outdated: ' + {image.differs} + ' changed' : {advice} }}}}</span>
+      <button v-if="{is_outdated} || {remedy}" class="ussim-button" id="remedy"
+      @click="trigger('remedy', [{is_outdated}])">{{{{ {is_outdated} ? 'Simulate' : {remedy} }}}}</button>
       </div>"""
 
 
@@ -236,9 +236,7 @@ def _screens(keys: tuple[str, ...]) -> str:
         f"{mode} === '{chosen.value}'"
         for chosen in (ComparisonMode.BESIDE, ComparisonMode.BLINK, ComparisonMode.DIFFERENCE)
     )
-    image = NAMES.image
-    values = {"Depth": image.depth, "Focus": image.focus, "Gain": image.gain, "DR": image.dynamic_range}
-    lines = "".join(f'<div v-if="{value}">{words} {{{{ {value} }}}}</div>' for words, value in values.items())
+    lines = f'<div v-for="(value, name) in {NAMES.image.values}">{{{{ name }}}} {{{{ value }}}}</div>'
     outline = f"""<svg v-if="{NAMES.sequence.mask} && {mode} !== '{ComparisonMode.SIMULATED.value}'" class="ussim-mask"
         :viewBox="{NAMES.sequence.box}" preserveAspectRatio="none"><path :d="{NAMES.sequence.mask}"/></svg>"""
     frame = f'<div class="ussim-frame">{outline}{cross_hair(IMAGE)}</div>'

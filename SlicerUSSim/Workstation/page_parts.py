@@ -114,8 +114,8 @@ def registration() -> None:
 def _file(title: str, value: str, tip: str) -> str:
     """Where a transform is from, and an input for its file."""
     name = title.lower()
-    return f"""<div id="{name}-from" class="ussim-opened mt-2" aria-live="polite"><b>{title}</b>
-        <span>{{{{ {value} || 'none' }}}}</span></div>
+    return f"""<div id="{name}-from" class="ussim-opened mt-2" aria-live="polite">
+        <b>{title}</b> <span>{{{{ {value} || 'none' }}}}</span></div>
         <div class="ussim-line" title="{tip}"><label for="{name}-file">{title} file</label>
         <input type="file" id="{name}-file"
         @change="window.ussim.send($event.target, {{for: 'open', as: '{name}'}})"></div>"""

@@ -229,10 +229,8 @@ class OpenPatient:
 
     def show_title(self) -> None:
         """Show the name of the patient on the page."""
-        title = self.name
-        if self._shared.now.title != title:
-            with self._shared.changing() as now:
-                now.title = title
+        with self._shared.changing() as now:
+            now.title = self.name
 
     def _open_at_start(self, files: Files) -> None:
         """Open what --craniotomy asks for, and place the probe on the brain in it, as commands do."""
@@ -280,7 +278,7 @@ class OpenPatient:
         self._logic.clearImage(parameters.output)
         self._logic.clearOutline(parameters.outline)
         # Ultrasound that was opened before any patient of the user's is of this one
-        kept = [] if self.is_of_user else self._registration.nodes
+        kept = [] if self.is_of_user else list(self._registration.nodes)
         if self.is_of_user:
             self.forget_ultrasound()
         self._probe.forget_patient()

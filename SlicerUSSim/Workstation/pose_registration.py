@@ -37,7 +37,8 @@ class Registration:
         self._calibration: dict[str, np.ndarray] = {}
         self._to_ras = np.eye(4)
         self._from = {_CALIBRATION: "", _REGISTRATION: ""}
-        self._nodes: list[Any] = []
+        #: The nodes of the recording in the scene
+        self.nodes: list[Any] = []
         self._field: ImagedField | None = None  # of the images, once they are prepared
 
     # ---- recording ---------------------------------------------------------------------------------------------
@@ -53,11 +54,6 @@ class Registration:
     def is_waiting(self) -> bool:
         """Whether there is a recording whose place in the patient is not known yet."""
         return self.recording is not None and self._logic.parameters.real is None
-
-    @property
-    def nodes(self) -> list[Any]:
-        """The nodes of the recording in the scene."""
-        return list(self._nodes)
 
     def take(self, recording: SequenceRecord) -> None:
         """Use a recording from now on, in its place in the patient, if it is known.
@@ -76,7 +72,7 @@ class Registration:
     def forget(self) -> None:
         """Forget the recording, which is of another patient; its nodes are removed with him."""
         self.recording, self._calibration, self._to_ras = None, {}, np.eye(4)
-        self._nodes, self._field = [], None
+        self.nodes, self._field = [], None
         self._from = {_CALIBRATION: "", _REGISTRATION: ""}
         self._tell()
 
@@ -128,12 +124,12 @@ class Registration:
             with self._presenter.view.progress("Find the probe's field"):
                 made = self._file_nodes.sequence(record)
         number = self._shared.now.sequence.number if is_same else 0
-        old, self._nodes = self._nodes, [] if made is None else made[3]
+        old, self.nodes = self.nodes, [] if made is None else made[3]
         self.recording = replace(recording, tracked=None, field=None)  # which another calibration changes
         self._calibration, self._to_ras = calibration, to_ras
         if made is None:
             self._comparison.drop()
-            self._comparison.view(sequence.images, number)
+            self._comparison.take(sequence.images, number=number)
             self._logic.parameters.real = self._field = None
         else:
             tracked, browser, images, _ = made

@@ -167,18 +167,8 @@ class ImageState:
     time: str = ""
     probe: str = ""
     frequency: str = ""
-    depth: str = ""
-    focus: str = ""
-    gain: str = ""
-    dynamic_range: str = ""
-
-
-@dataclass
-class AdviceState:
-    """What a user should know or do first, and what its button does ("": no button)."""
-
-    text: str = ""
-    remedy: str = ""
+    #: Depth, Focus, Gain and DR in the image's corner
+    values: dict[str, str] = field(default_factory=dict)
 
 
 @dataclass
@@ -254,6 +244,9 @@ class PageState:
     pose_matrix: str = ""
     #: Whether the probe is aligned with the surface normal while it slides
     upright: bool = True
+    #: What a user should know or do first, and what its button does ("": no button)
+    advice: str = ""
+    remedy: str = ""
     #: Whether the latency from mouse to image is measured
     show_latency: bool = False
     panel: PanelState = field(default_factory=PanelState)
@@ -261,7 +254,6 @@ class PageState:
     views: ViewState = field(default_factory=ViewState)
     sequence: SequenceState = field(default_factory=SequenceState)
     image: ImageState = field(default_factory=ImageState)
-    advice: AdviceState = field(default_factory=AdviceState)
     cine: CineState = field(default_factory=CineState)
     fit: FitState = field(default_factory=FitState)
     registration: RegistrationState = field(default_factory=RegistrationState)

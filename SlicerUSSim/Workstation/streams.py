@@ -28,7 +28,8 @@ class ImageStream:
         self._streamer: Any = None
         self._waiting: tuple[np.ndarray, dict] | None = None
         self._last: tuple[bytes, dict] | None = None
-        self._encoding = False
+        #: Whether an image is being sent to the pages
+        self.is_sending = False
         self._era = 0  # changes when images of before must not be shown any more
         #: Number of the last image, starting at 1
         self.count = 0
@@ -36,8 +37,8 @@ class ImageStream:
     def send(self, image: np.ndarray, **about) -> None:
         """Send a (rows, columns) uint8 image with the metadata `about`; an image that is still waiting is replaced."""
         self._waiting = (image, about)
-        if not self._encoding:
-            self._encoding = True
+        if not self.is_sending:
+            self.is_sending = True
             get_event_loop().create_task(self._encode_all())
 
     def clear(self) -> None:
@@ -47,11 +48,6 @@ class ImageStream:
         self.count += 1
         self._last = (b"", {"number": self.count, "blank": True})
         self._push(*self._last)
-
-    @property
-    def is_sending(self) -> bool:
-        """Whether an image is being sent to the pages."""
-        return self._encoding
 
     def send_again(self) -> None:
         """Send the last image once more, to pages that have just opened."""
@@ -72,7 +68,7 @@ class ImageStream:
                 self._last = (content, about)
                 self._push(content, about)
         finally:
-            self._encoding = False
+            self.is_sending = False
 
     def _push(self, content: bytes, about: dict) -> None:
         if self._streamer is not None:

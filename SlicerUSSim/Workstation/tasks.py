@@ -28,8 +28,6 @@ class _Worker:
 
     def __init__(self, name: str) -> None:
         self._queue: SimpleQueue[tuple[Future, Callable[[], Any]] | None] = SimpleQueue()
-        #: Whether a function is being computed
-        self.is_busy = False
         threading.Thread(target=self._run, name=name, daemon=True).start()
 
     def submit(self, function: Callable[[], Any]) -> Future:
@@ -46,15 +44,10 @@ class _Worker:
             future, function = entry
             if not future.set_running_or_notify_cancel():
                 continue
-            self.is_busy = True
             try:
-                result = function()
+                future.set_result(function())
             except BaseException as error:
-                self.is_busy = False
                 future.set_exception(error)
-            else:
-                self.is_busy = False
-                future.set_result(result)
             del entry, future, function  # a patient's data, perhaps
 
 
@@ -81,8 +74,6 @@ class Tasks(AtOnce):
         # One thread: computations on a device must not be interleaved between tasks.
         self._worker = _Worker("ultrasound")
         self._aside = _Worker("files and surfaces")
-        #: Those whose work did not hear of its cancellation
-        self._abandoned: list[_Worker] = []
         self._waiting: list[_Waiting] = []
         self._unfinished = 0
 
@@ -90,11 +81,6 @@ class Tasks(AtOnce):
     def are_done(self) -> bool:
         """Whether no task is running or about to start."""
         return not self._unfinished
-
-    @property
-    def are_computing(self) -> bool:
-        """Whether a thread computes something, also what was cancelled."""
-        return any(worker.is_busy for worker in (self._worker, self._aside, *self._abandoned))
 
     def start(self, function: Callable[[], object]) -> None:
         """Call `function` soon, in the event loop, as a task that may wait for computations."""
@@ -170,8 +156,6 @@ class Tasks(AtOnce):
             if entry is None or entry.future.done() or not is_under_way():
                 return
             entry.is_abandoned = True
-            self._abandoned = [worker for worker in self._abandoned if worker.is_busy]
-            self._abandoned.append(self._aside if entry.is_aside else self._worker)
             if entry.is_aside:
                 self._aside.end()
                 self._aside = _Worker("files and surfaces")
@@ -209,24 +193,21 @@ class AtMost:
 
     def __init__(self, seconds: float, function: Callable[[], None]) -> None:
         self._seconds, self._function = seconds, function
-        self._next, self._waiting = 0.0, False
-
-    @property
-    def is_waiting(self) -> bool:
-        """Whether the function is still to be called."""
-        return self._waiting
+        self._next = 0.0
+        #: Whether the function is still to be called
+        self.is_waiting = False
 
     def __call__(self) -> None:
         loop = get_event_loop()
-        if self._waiting:
+        if self.is_waiting:
             return
         if loop.time() >= self._next:
             self._run()
         else:
-            self._waiting = True
+            self.is_waiting = True
             loop.call_at(self._next, self._run)
 
     def _run(self) -> None:
-        self._waiting = False
+        self.is_waiting = False
         self._next = get_event_loop().time() + self._seconds
         self._function()

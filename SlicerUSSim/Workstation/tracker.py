@@ -8,7 +8,7 @@ from collections.abc import Callable
 import numpy as np
 from trame_server.utils.asynchronous import get_event_loop
 
-from SlicerUSSim.Logic.base.volume import Volume
+from SlicerUSSim.Logic.mrml.taken_image import TakenImage
 from SlicerUSSim.Logic.tracked.openigtlink import TrackerLink, parse_address
 from SlicerUSSim.Workstation.state import SharedState
 from SlicerUSSim.Workstation.tasks import Tasks
@@ -39,15 +39,10 @@ class Tracker:
         self._link = TrackerLink(host, port, self._moved, device=device, listen=listen)
         self._telling = get_event_loop().create_task(self._tell(self._link))
 
-    @property
-    def is_on(self) -> bool:
-        """Whether a tracker has been started, so that images are sent."""
-        return self._link is not None
-
-    def send(self, image: Volume) -> None:
-        """Send an image with its position (RAS)."""
+    def send(self, taken: TakenImage) -> None:
+        """Send an image with its position (RAS), if there is a tracker."""
         if self._link is not None:
-            self._link.send(image)
+            self._link.send(taken.volume())
 
     def stop(self) -> None:
         """Close the connection."""
@@ -60,7 +55,5 @@ class Tracker:
 
     async def _tell(self, link: TrackerLink) -> None:
         while self._link is link:
-            if self._shared.now.messages.tracker != link.status:
-                with self._shared.changing() as now:
-                    now.messages.tracker = link.status
+            self._shared.put("messages", {"tracker": link.status})
             await asyncio.sleep(_LOOK_EVERY_S)

@@ -54,17 +54,14 @@ class Sent:
         #: Those that are no DICOM images
         self.paths: list[Path] = []
         dicom = {name for name, content in files.items() if _is_dicom(name, content)}
+        #: Whether there are DICOM files, which `series` and `take` make into a volume
+        self.has_dicom = bool(dicom)
         for name, content in files.items():
             if name in dicom:
                 self._write(self._folder / DICOM / name, content)
             elif not dicom or name.lower().endswith(_IMAGES):
                 self._write(self._folder / name, content)
                 self.paths.append(self._folder / name)
-
-    @property
-    def has_dicom(self) -> bool:
-        """Whether there are DICOM files, which `series` and `take` make into a volume."""
-        return (self._folder / DICOM).is_dir()
 
     def series(self) -> list[Series]:
         """The DICOM series; takes up to seconds."""

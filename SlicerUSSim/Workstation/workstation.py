@@ -14,9 +14,10 @@ from trame_server import Server
 from trame_slicer.core import SlicerApp
 
 from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic
+from SlicerUSSim.Logic.mrml.nodes import Observed
 from SlicerUSSim.Workstation.advice import Advice
 from SlicerUSSim.Workstation.anatomy import AnatomyViews
-from SlicerUSSim.Workstation.browser_panel import BrowserPanel, Observed
+from SlicerUSSim.Workstation.browser_panel import BrowserPanel
 from SlicerUSSim.Workstation.cine import Cine
 from SlicerUSSim.Workstation.comparison import Comparison
 from SlicerUSSim.Workstation.export import Exports
@@ -81,7 +82,7 @@ class Workstation:
         panel.pick = probe.hand.pick
         self._registration = registration = Registration(panel, nodes, comparison)
         self._patient = patient = OpenPatient(panel, nodes, self._views, probe, comparison, registration)
-        self._exports = Exports(app, panel, cine, patient.saved)
+        self._exports = Exports(app, panel, cine, self._poses, patient.saved)
         self._questions = Questions(shared, tasks)
         self._scenes = Scenes(panel, nodes, patient, registration)
         self._opener = opener = Opener(
@@ -113,11 +114,6 @@ class Workstation:
         self.server.controller.on_server_ready.add(self._ready)
         self.server.controller.on_server_exited.add(self.close)
         build_page(self.server, panel, (*KEYS, "Escape"))
-
-    @property
-    def is_computing(self) -> bool:
-        """Whether a thread computes something for the page."""
-        return self._tasks.are_computing
 
     def close(self, **_: object) -> None:
         """Close the connection to the tracker and cancel waiting tasks."""
@@ -189,10 +185,7 @@ class Workstation:
             found = None
             try:
                 with self._presenter.shown():
-                    if kind.startswith("pose."):
-                        found = *self._poses.file(kind.removeprefix("pose")), "application/octet-stream"
-                    else:
-                        found = self._exports.export(kind, sent or {})
+                    found = self._exports.export(kind, sent or {})
             finally:
                 if not exported.done():  # the page may be gone
                     exported.set_result(found)
