@@ -10,12 +10,13 @@ import pytest
 from SlicerUSSim.Logic import Volume
 from SlicerUSSim.Logic.mri.pathology import add_tissues
 from SlicerUSSim.Logic.placement.aiming import FARTHEST_DEG, opening_pose
-from SlicerUSSim.Logic.placement.bone_before_probe import CLOSED_DB, about_bone
+from SlicerUSSim.Logic.placement.bone_before_probe import CLOSED_DB, about_bone, about_missing_skull
 from SlicerUSSim.Logic.placement.craniotomy import default_pose, disc_opening, middle_of, opened, without_outside
 from SlicerUSSim.Logic.placement.views import view_pose
 from SlicerUSSim.Logic.probe import PROBES, ConvexProbe, LinearProbe, Probe
 from SlicerUSSim.Logic.probe.poses import pose_looking_at, turned
 from SlicerUSSim.Logic.tissue.presets import TISSUES
+from SlicerUSSim.Widget.interface import in_panel
 from tests.test_craniotomy import NAMES, TOP, head, places_of  # noqa: F401
 
 ILL = (*NAMES, "tumour", "oedema")
@@ -199,3 +200,16 @@ def test_a_probe_below_a_closed_skull_is_told_of(head):  # noqa: F811
     assert line.startswith("the probe is below the closed skull, with ") and "open the skull" in line
     opened_there = with_disc(head, 60.0)[0]
     assert notes_of(opened_there, PROBES["phased"], below, is_open=True) == ()
+
+
+def test_a_head_whose_skull_is_not_labelled_is_told_of(head):  # noqa: F811
+    """It was imaged straight through the skull without a word."""
+    mri = Volume(
+        np.array([5.0, *(90.0 if "skull" not in name else 10.0 for name in NAMES)])[head.array], head.ijk_to_ras
+    )
+    brain = without_outside(head, NAMES)
+    (line,) = about_missing_skull(brain, NAMES[:2], mri)
+    assert "tick Label what is outside the brain and press Segment" in in_panel(line)
+    assert about_missing_skull(head, NAMES, mri) == about_missing_skull(brain, ["liver"], mri) == ()
+    stripped = mri.with_array(np.where(brain.array > 0, mri.array, 0.0))
+    assert about_missing_skull(brain, NAMES[:2], stripped) == ()

@@ -1,10 +1,9 @@
-"""Parts of the workstation without a browser: tasks, cine loops, sequences as nodes, the probe's shape."""
+"""Parts of the workstation without a browser: tasks, sequences as nodes, the probe's shape."""
 
 from __future__ import annotations
 
 import asyncio
 import io
-import json
 import selectors
 import threading
 from concurrent.futures import ThreadPoolExecutor
@@ -21,7 +20,6 @@ from SlicerUSSim.Logic import (
     ConvexProbe,
     LinearProbe,
     PhasedProbe,
-    SimulationError,
     TissueTable,
     UltrasoundSimulator,
 )
@@ -50,7 +48,7 @@ from SlicerUSSim.Logic.mrml.sequence_nodes import TIME, SequenceIndex, add_seque
 from SlicerUSSim.Logic.tracked.images import TrackedImages  # noqa: E402
 from SlicerUSSim.Workstation.browser_panel import BrowserPanel  # noqa: E402
 from SlicerUSSim.Workstation.comparison import Comparison, RealImages  # noqa: E402
-from SlicerUSSim.Workstation.export import Cine, gif  # noqa: E402
+from SlicerUSSim.Workstation.image_flow import LatencyStamps  # noqa: E402
 from SlicerUSSim.Workstation.state import (  # noqa: E402
     NAMES,
     ComparisonMode,
@@ -59,6 +57,7 @@ from SlicerUSSim.Workstation.state import (  # noqa: E402
     TissueLine,
     value_of,
 )
+from SlicerUSSim.Workstation.streams import ImageStream, _jpeg  # noqa: E402
 from SlicerUSSim.Workstation.tasks import AtMost, Tasks  # noqa: E402
 
 
@@ -307,6 +306,41 @@ def test_a_probe_that_moves_during_the_first_live_image_is_followed(head):
     assert run_in_loop(scenario)
 
 
+def test_only_the_image_that_shows_a_movement_tells_its_latency():
+    """Images of minutes later had the time of the last event of the mouse: the read-out said 446,552 ms."""
+    stamps = LatencyStamps()
+    stamps.receive("page", 1.0)
+    stamps.image_begun()
+    assert stamps.computed is None  # of before the movement
+    stamps.probe_moved()
+    stamps.image_begun()
+    assert stamps.computed == ("page", 1.0)
+    stamps.image_begun()  # after a new value of the panel, say
+    stamps.probe_moved()  # by a key
+    stamps.image_begun()
+    assert stamps.computed is None
+
+    async def scenario() -> list[object]:
+        stream, sent = ImageStream("simulated"), []
+        stream.set_streamer(SimpleNamespace(push_content=lambda name, about, content: sent.append(about["stamp"])))
+        stream.send(np.zeros((8, 8), np.uint8), stamp=("page", 1.0))
+        while stream.is_sending:
+            await asyncio.sleep(0.01)
+        stream.send_again()  # another page has opened
+        return sent
+
+    assert run_in_loop(scenario) == [("page", 1.0), None]
+
+
+def test_an_image_takes_at_most_45_kb_and_looks_alike(head):
+    probe = PROBES["neonatal"]  # with the widest field
+    simulator = UltrasoundSimulator(head.labels, TissueTable.brain(head.tissue_names))
+    image = simulator.simulate(probe, craniotomy_pose(head.labels, probe)).image
+    content = _jpeg(image)
+    difference = np.abs(np.asarray(Image.open(io.BytesIO(content)), float) - image)
+    assert image.shape[0] == 512 and len(content) <= 45_000 and difference[image > 0].mean() < 6.0
+
+
 # ---- what page and control share -------------------------------------------------------------------------------------
 
 
@@ -337,9 +371,9 @@ def test_of_images_that_come_fast_the_last_is_compared(head):
     pose = craniotomy_pose(head.labels, probe)
     simulator = UltrasoundSimulator(head.labels, TissueTable.brain(head.tissue_names))
     image = simulator.simulate(probe, pose).image
-    sequence = TrackedSequence(
-        image[None], ({"ImageToProbe": grid.image_to_probe, "ProbeToReference": pose},), np.zeros(1)
-    )
+    known = {"ImageToProbe": grid.image_to_probe}
+    known, lost = {**known, "ProbeToReference": pose}, known
+    sequence = TrackedSequence(np.stack([image] * 3), (known, lost, known), np.arange(3.0))
     tracked = TrackedImages.of(sequence, path="ImageToReference", beam=probe, probe=probe)
 
     class Browser:
@@ -348,48 +382,36 @@ def test_of_images_that_come_fast_the_last_is_compared(head):
 
     async def scenario():
         shared, moved = SharedState(State(ready=True)), []
-        comparison = Comparison(shared, moved.append)
-        comparison.take(tracked, Browser())
+        comparison = Comparison(shared, moved.append, lambda function: function())
+        comparison.view(sequence.images, 1)  # before its place is known
+        for stream in comparison.streams:
+            stream.set_streamer(SimpleNamespace(push_content=lambda name, about, content: sent.append(name)))
+        assert shared.now.sequence.name == "image 1" and not (shared.now.sequence.is_placed or moved)
+        comparison.compare(image, grid)
+        while comparison.streams[0].is_sending:
+            await asyncio.sleep(0.01)
+        assert set(sent) == {"real"} and not shared.now.sequence.similarity
+        comparison.take(tracked, Browser(), 1)
+        shown = shared.now.sequence
+        assert (shown.name, shown.numbers, shown.length, shown.is_placed) == ("image 2", "0 to 2", 2, True)
         for simulated in (image // 2, np.zeros_like(image), image):  # one is compared while the others come
             comparison.compare(simulated, grid)
         while comparison.is_comparing or any(stream.is_sending for stream in comparison.streams):
             await asyncio.sleep(0.01)
         assert len(moved) == 1 and np.allclose(moved[0], pose)
+        corners = np.array([point.split(",") for point in shared.now.sequence.mask[2:-2].split()], float)
+        x, y = corners.T  # the outline of what is compared
+        area = 0.5 * abs(x @ np.roll(y, 1) - y @ np.roll(x, 1))
+        assert area == pytest.approx(tracked.mask.sum() * np.prod(tracked.grid.pixel_spacing_mm), rel=0.02)
         return shared.now.sequence.similarity
 
+    sent: list[str] = []
     cost = run_in_loop(scenario)
     same = RealImages(tracked).compared(0, image, grid).total
     assert cost.startswith(f"cost {same:.3f} ") and same < 0.5 * RealImages(tracked).compared(0, image // 2, grid).total
 
 
-# ---- export ----------------------------------------------------------------------------------------------------------
-
-
-def test_a_cine_keeps_time_and_begins_anew_with_another_size():
-    cine = Cine()
-    with pytest.raises(SimulationError, match="has 0 images"):
-        gif(cine.images)
-    cine.add(np.zeros((10, 10), np.uint8), 0.0)
-    for number in range(4):
-        about = json.dumps({"time": number, "preset": {"gain": number // 2}}) if number else ""
-        cine.add(np.full((12, 16), 50 * number, np.uint8), 10.0 + 0.25 * number, about)
-    told: list[float] = []
-    loop = Image.open(io.BytesIO(gif(cine.images, told.append)))
-    assert loop.size == (16, 12) and loop.n_frames == 4 and len(cine.images) == 4 and told == [0.25, 0.5, 0.75]
-    for number in range(3):
-        loop.seek(number)
-        assert loop.info["duration"] == 250 and np.asarray(loop.convert("L"))[0, 0] == 50 * number
-    loop.seek(0)
-    assert json.loads(loop.info["comment"]) == {
-        "images": [{}, {"time": 1, "preset": 0}, {"time": 2, "preset": 1}, {"time": 3, "preset": 1}],
-        "presets": [{"gain": 0}, {"gain": 1}],
-    }
-
-    def cancelled(share: float) -> None:
-        raise Cancelled
-
-    with pytest.raises(Cancelled):
-        gif(cine.images, progress=cancelled)
+# ---- work under way --------------------------------------------------------------------------------------------------
 
 
 def test_of_tasks_at_once_the_last_is_shown_and_each_can_be_cancelled():
@@ -658,7 +680,7 @@ def test_a_view_stands_in_the_plane_that_it_is_called():
             assert stand_as_called(views)
             # Those that follow the probe are empty until it is there, and show no other section under their name
             shown = {view.get_singleton_tag(): view.get_background_volume_id() for view in views.slices}
-            assert shown["Green"] == node.GetID() and not shown["Red"] and not shown["Yellow"]
+            assert shown["Green"] == node.GetID() and not shown["Red"]
         probe_to_ras = np.array([[1.0, 0, 0, 3], [0, 0, 1, 5], [0, -1, 0, 40], [0, 0, 0, 1]])
         views.follow(probe_to_ras, PhasedProbe(field_of_view_deg=75.0, depth_mm=70.0))
         assert stand_as_called(views)

@@ -50,3 +50,16 @@ def test_labels_of_one_tissue_or_none_tell_nothing(brain, labels):
     assert not follows(brain, labels.with_array((labels.array > 0).astype(np.uint8)))
     assert not follows(brain, labels.with_array(np.zeros_like(labels.array)))
     assert not follows(brain.with_array(np.zeros_like(brain.array)), labels)
+
+
+@pytest.mark.parametrize("shell_mm", [20.0, 60.0])
+def test_an_mri_follows_labels_that_are_the_same_beside_themselves(shell_mm):
+    """That of a symmetric phantom was taken for another patient's: labels of a cylinder are the same along its axis."""
+    k, j, i = np.ogrid[:40, :80, :80]
+    radius = 2.5 * np.hypot(j - 40, i - 40) + 0.0 * k
+    labels = np.where(radius < 95.0, 1 + radius // shell_mm, 0).astype(np.uint8)
+    noise = np.random.default_rng(1).normal(0.0, 20.0, labels.shape)
+    mri = np.array([0.0, 300.0, 100.0, 200.0, 50.0, 250.0])[labels] + noise
+    to_ras = np.diag([2.5, 2.5, 2.5, 1.0])
+    assert follows(Volume(mri.astype(np.float32), to_ras), Volume(labels, to_ras))
+    assert not follows(Volume(mri.astype(np.float32), to_ras), moved(Volume(labels, to_ras), 40.0, 0.0, 0.0))

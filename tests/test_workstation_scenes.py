@@ -48,6 +48,7 @@ from tests.test_workstation import (
     settled,
     shown,
     state,
+    status,
 )
 
 
@@ -156,7 +157,7 @@ def test_the_workstation_opens_the_scene_that_it_saved(page, files, tmp_path):
     np.testing.assert_allclose(page.evaluate("window.ussim.image.pose"), where, atol=1e-3)
     assert np.array_equal(pixels(page), image)
     assert state(page, NAMES.sequence.length) == 6 and "saved.mrb: a scene" in shown(page, "notesLabel")
-    assert shown(page, "depthSlider") == 45 and page.locator("#frozen").is_hidden()
+    assert shown(page, "depthSlider") == 45 and state(page, NAMES.image.status) == "LIVE"
     assert state(page, NAMES.registration.registration) == "as it was kept"
     page.evaluate("window.trame.trigger('show_number', [1])")
     settled(page)
@@ -178,7 +179,7 @@ def test_the_workstation_opens_the_scene_of_the_slicer_module(page, module_scene
     notes = shown(page, "notesLabel")
     assert "left out, since the simulator does not use them: FLAIR of somebody" in notes
     assert "cyst" in [row["name"] for row in state(page, NAMES.panel.tissues)]
-    assert page.locator("#frozen").is_visible()
+    status(page, "FROZEN")
     with new_image(page):
         click(page, "#live")
     settled(page)
@@ -190,14 +191,14 @@ def test_a_frozen_image_comes_back_with_its_scene(page, files, tmp_path):
     """A live image where the probe is was shown in its place, and said to be "as it was"; also with the probe there."""
     open_new_patient(page, files / "labels.nii.gz")
     click(page, "#live")
-    page.locator("#frozen").wait_for()
+    status(page, "FROZEN")
     page.evaluate("window.trame.trigger('set', ['gainSlider', 9])")  # of which it is not
     settled(page)
     image, about = pixels(page), page.evaluate("window.ussim.image")
 
     def is_frozen_as_it_was(page) -> bool:
         again = page.evaluate("window.ussim.image")
-        assert not errors(page) and page.locator("#frozen").is_visible() and not shown(page, "liveCheckBox")
+        assert not errors(page) and state(page, NAMES.image.status) == "FROZEN" and not shown(page, "liveCheckBox")
         told = ("patient", "time")
         assert np.array_equal(pixels(page), image) and all(again[name] == about[name] for name in told)
         np.testing.assert_allclose(again["pose"], about["pose"], atol=1e-3)
@@ -217,7 +218,7 @@ def test_a_frozen_image_comes_back_with_its_scene(page, files, tmp_path):
     open_scene(page, tmp_path / "still.mrb")
     assert is_frozen_as_it_was(page)
     click(page, "#live")
-    page.locator("#frozen").wait_for(state="hidden")
+    status(page, "LIVE")
     settled(page)
 
 
@@ -225,7 +226,7 @@ def test_a_frozen_image_comes_back_with_its_scene(page, files, tmp_path):
 def test_nothing_of_a_patient_stays_on_the_next_one(page, files, tmp_path):
     """The line "FROZEN: ..." and the outline of the imaged field of the patient before lay over the next one."""
     open_new_patient(page, files / "labels.nii.gz")
-    click(page, "#close-patient")
+    page.evaluate("window.trame.trigger('close_patient')")
     settled(page)
     assert state(page, NAMES.messages.status) == "" and state(page, NAMES.title) == ""
     shutil.copy(download(page, "mrb"), tmp_path / "closed.mrb")

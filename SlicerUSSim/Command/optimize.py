@@ -80,14 +80,14 @@ def optimize(
         found = fitted_to(
             simulator, tracked.images, free=names, display=tracked.examination.display,
             register=fit.register, speckle=fit.speckle,
-            max_evaluations=fit.evaluations, restarts=fit.restarts, progress=curve,
+            max_evaluations=fit.of_search, restarts=fit.restarts, progress=curve,
         )  # fmt: skip
         if tracked.others is not None:
             near = [neighbours_of(tracked.sequence, images) for images in (tracked.others, tracked.images)]
             prediction = predict(
                 found, simulator, tracked.others, free=names, display=tracked.examination.display,
                 speckle=fit.speckle, neighbours=near[0], fitted_neighbours=near[1],
-                max_evaluations=fit.evaluations, restarts=fit.restarts, progress=curve,
+                max_evaluations=fit.of_search, restarts=fit.restarts, progress=curve,
             )  # fmt: skip
             found = replace(found, prediction=prediction)
     write_json(out, found.to_dict())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 from SlicerUSSim.Logic.base.errors import SimulationError, require, required
@@ -32,6 +33,8 @@ class FitPresenter:
         self._before: Preset | None = None  # the preset that Apply replaced
         #: Result of the last fit, as text
         self.summary = ""
+        #: Called in the thread of a fit with its progress, and with None at its end
+        self.following: Callable[[Progress | None], None] = lambda step: None
 
     def forget(self) -> None:
         """Forget the last fit, which is of another patient."""
@@ -86,15 +89,19 @@ class FitPresenter:
 
             def report(step: Progress) -> None:
                 panel.view.showStatus(step.in_words())
+                self.following(step)
                 progress(step.share)
 
             labels, settings = parameters.labels, parameters.fit
-            found = panel.logic.optimize(
-                labels, parameters.real, probe_transform_node=parameters.probe_transform, frames=self._frames(),
-                validate=self._predicted(), free=free, register=settings.register,
-                speckle=settings.speckle, estimate_geometry=settings.estimate, max_evaluations=settings.evaluations,
-                restarts=settings.restarts, plot=plot, progress=report,
-            )  # fmt: skip
+            try:
+                found = panel.logic.optimize(
+                    labels, parameters.real, probe_transform_node=parameters.probe_transform, frames=self._frames(),
+                    validate=self._predicted(), free=free, register=settings.register,
+                    speckle=settings.speckle, estimate_geometry=settings.estimate,
+                    max_evaluations=settings.of_search, restarts=settings.restarts, plot=plot, progress=report,
+                )  # fmt: skip
+            finally:
+                self.following(None)
             self._fit, self._before = (found, labels), None
             self.summary = _in_words(found)
             panel.view.showStatus("")

@@ -1,4 +1,4 @@
-"""AnatomyViews: Slicer's 3D view and three slice views, which show the probe and the anatomy under it."""
+"""AnatomyViews: Slicer's 3D view and two slice views, which show the probe and the anatomy under it."""
 
 from __future__ import annotations
 
@@ -9,32 +9,30 @@ from typing import Any
 import numpy as np
 from trame_server import Server
 from trame_server.utils.asynchronous import get_event_loop
-from trame_slicer.core import LayoutManager, SlicerApp
+from trame_slicer.core import SlicerApp
 from trame_slicer.rca_view import RemoteViewFactory
 from trame_slicer.views import (
     AbstractView,
-    Layout,
-    LayoutDirection,
     NoScheduleRendering,
     SliceView,
     ThreeDView,
     ViewLayoutDefinition,
     ViewType,
 )
+from vtkmodules.util.numpy_support import vtk_to_numpy
 from vtkmodules.vtkCommonCore import vtkCommand
 from vtkmodules.vtkCommonExecutionModel import vtkTrivialProducer
 
 from SlicerUSSim.Logic.base.volume import Volume
-from SlicerUSSim.Logic.base.vtk_data import vtk_matrix
+from SlicerUSSim.Logic.base.vtk_data import matrix_array, vtk_matrix
 from SlicerUSSim.Logic.mrml.fitting_nodes import mark_as_drawn
 from SlicerUSSim.Logic.mrml.nodes import composite_of, display_of, node_called, show_in_slice, write_body, write_slice
 from SlicerUSSim.Logic.mrml.taken_image import TakenImage
 from SlicerUSSim.Logic.probe.arrays import Probe
-from SlicerUSSim.Logic.probe.shape import field_polydata
+from SlicerUSSim.Logic.probe.shape import field_polydata, probe_polydata
 from SlicerUSSim.Logic.probe.surface import PatientSurface
-from SlicerUSSim.Workstation.state import ACROSS, IN_PLANE, SLICE_VIEWS
+from SlicerUSSim.Workstation.state import ACROSS, IN_PLANE, SLICE_VIEWS, THREED
 
-THREED_VIEW = "ThreeD"
 #: Images per second of the view under the mouse, and of the others: on few cores the ultrasound image has priority.
 _CORES = os.cpu_count() or 2
 _FAST, _SLOW = min(2.0 * _CORES, 20.0), min(0.75 * _CORES, 8.0)
@@ -42,11 +40,14 @@ _FAST, _SLOW = min(2.0 * _CORES, 20.0), min(0.75 * _CORES, 8.0)
 _EVENTS_EVERY_S = 0.025
 #: Seconds after a resize event until a view has its new size.
 _RESIZED_S = 0.05
-_LAYOUT = "Anatomy"
+#: Radius of head and probe in the 3D view by that of the view, and its smaller angle, degrees
+_FILLED, _ANGLE_DEG = 0.95, 30.0
 #: Names of the nodes for display; they are not saved with the scene.
 _PATIENT, _BODY, _FIELD, _SEEN = "Patient surface", "Probe body", "Ultrasound field", "Ultrasound as shown"
 #: Name of the transform of what is shown of the image: the pose at which it was taken, which the probe may have left
 _POSE = "Pose of the image"
+#: Share of a direction from which its letters name a side
+_OBLIQUE = 0.35
 _SKIN_COLOR = (0.92, 0.8, 0.72)
 
 
@@ -69,6 +70,9 @@ class AnatomyViews:
         self._fitted: set[str] = set()
         self._volume_id: str | None = None
         self._blend = 1.0
+        self._field_of: Probe | None = None  # the probe of the image whose field is shown
+        #: Called after a slice view was turned, moved or zoomed
+        self.turned: Callable[[], None] = lambda: None
         self._image = vtkTrivialProducer()
         self._image.SetOutput(Volume(np.zeros((1, 2, 2), np.uint8), np.eye(4)).to_vtk())  # until the first image
         for kind, make in ((ViewType.SLICE_VIEW, SliceView), (ViewType.THREE_D_VIEW, ThreeDView)):
@@ -78,22 +82,24 @@ class AnatomyViews:
                     interactive_quality=75, rca_event_throttle_s=_EVENTS_EVERY_S,
                 )
             )  # fmt: skip
-        threed = ViewLayoutDefinition.threed_view(name=THREED_VIEW)
-        red, yellow, green = (
-            ViewLayoutDefinition.axial_view(), ViewLayoutDefinition.sagittal_view(), ViewLayoutDefinition.coronal_view()
-        )  # fmt: skip
-        above = Layout(LayoutDirection.Horizontal, [threed, red])
-        below = Layout(LayoutDirection.Horizontal, [yellow, green])
-        self.layout = LayoutManager(app.scene, app.view_manager, server)
-        self.layout.register_layout(_LAYOUT, Layout(LayoutDirection.Vertical, [above, below]))
-        self.layout.set_layout(_LAYOUT)
+        made = [ViewLayoutDefinition.threed_view(name=THREED), ViewLayoutDefinition.axial_view()]
+        made.append(ViewLayoutDefinition.coronal_view())  # Red and Green of Slicer
+        for view in made:
+            app.view_manager.create_view(view)
+        app.view_manager.set_current_view_ids([view.singleton_tag for view in made])
         # Without a GPU these cost more than all other rendering, and depth peeling hides translucent objects.
         for view in (self.threed, *self.slices):
             view.render_window().SetMultiSamples(0)
         for view in self.slices:
             self._stand_in_plane(view)
             view.interactor().AddObserver(vtkCommand.WindowResizeEvent, self._on_resize(view))
-        _node(self.threed).SetUseDepthPeeling(False)
+            _node(view).SetRulerType(_node(view).RulerTypeThin)
+            _node(view).AddObserver(vtkCommand.ModifiedEvent, lambda *_: self.turned())
+        threed = _node(self.threed)
+        threed.SetOrientationMarkerType(threed.OrientationMarkerTypeCube)
+        threed.SetOrientationMarkerSize(threed.OrientationMarkerSizeSmall)
+        self.threed.interactor().AddObserver(vtkCommand.WindowResizeEvent, lambda *_: self._keep_angle())
+        threed.SetUseDepthPeeling(False)
         self.threed.renderer().SetUseDepthPeeling(False)
         self.threed.renderer().SetUseDepthPeelingForVolumes(False)
 
@@ -173,7 +179,6 @@ class AnatomyViews:
         """Show the probe's body under its transform, and prepare its imaged field, which has the image as texture."""
         body, field = self._model(_BODY), self._model(_FIELD)
         write_body(body, probe)
-        field.SetAndObservePolyData(field_polydata(probe))
         body.SetAndObserveTransformNodeID(transform_node.GetID())
         field.SetAndObserveTransformNodeID(self._pose.GetID())
         display = display_of(body)
@@ -193,7 +198,10 @@ class AnatomyViews:
 
         `field` (rows, columns) bool is the imaged field; outside it the MRI is unchanged.
         """
-        image = taken.image
+        image, probe = taken.image, taken.preset.probe
+        if probe != self._field_of:
+            self._field_of = probe
+            self._model(_FIELD).SetAndObservePolyData(field_polydata(probe))
         # A copy without zeros inside the field, so that the threshold removes only the pixels outside.
         seen = np.where(field, np.maximum(image, 1), 0).astype(np.uint8)
         shown, pose = self._seen, self._pose
@@ -283,8 +291,15 @@ class AnatomyViews:
             node.EndModify(was_modifying)
             self._fitted.add(name)
 
-    def look_at_probe(self, probe_to_world: np.ndarray, surface: PatientSurface) -> None:
-        """Turn the 3D view so that the probe is on the visible side and its image is seen obliquely."""
+    def _keep_angle(self) -> None:
+        """Let the camera's angle be that of the narrower side of the 3D view, so that no size of it cuts anything."""
+        width, height = self.threed.render_window().GetSize()
+        camera = self.threed.renderer().GetActiveCamera()
+        camera.SetViewAngle(_ANGLE_DEG)
+        camera.SetUseHorizontalViewAngle(width < height)
+
+    def look_at_probe(self, probe_to_world: np.ndarray, surface: PatientSurface, probe: Probe) -> None:
+        """Turn the 3D view so that it shows head and probe, the probe on the visible side, its image obliquely."""
         camera = self.threed.get_camera_node()
         if camera is None:
             return
@@ -293,13 +308,47 @@ class AnatomyViews:
         if away @ [0, 1, 0] < 0:  # prefer a view from the patient's front
             away = away - 2.6 * probe_to_world[:3, 2]
         away = away / np.linalg.norm(away)
-        self.threed.reset_focal_point()
-        self.threed.reset_camera()
-        camera.SetFocalPoint(*surface.centre)
-        camera.SetPosition(*(surface.centre + 540.0 * away))
+        self._keep_angle()
+        head = vtk_to_numpy(surface.coarse_polydata.GetPoints().GetData())
+        body = vtk_to_numpy(probe_polydata(probe).GetPoints().GetData()) @ probe_to_world[:3, :3].T
+        points = np.vstack([head, body + probe_to_world[:3, 3]])
+        middle = 0.5 * (points.min(axis=0) + points.max(axis=0))
+        radius = np.linalg.norm(points - middle, axis=1).max()
+        away *= radius / (_FILLED * np.sin(np.radians(0.5 * _ANGLE_DEG)))
+        camera.SetFocalPoint(*middle)
+        camera.SetPosition(*(middle + away))
         camera.SetViewUp(0.0, 0.0, 1.0)
         camera.ResetClippingRange()
         self.threed.schedule_render()
+
+    # ---- points and sides --------------------------------------------------------------------------------------
+
+    @property
+    def background(self) -> Any:
+        """The node of the MRI that is shown, or None."""
+        return None if self._volume_id is None else self._app.scene.GetNodeByID(self._volume_id)
+
+    def letters(self) -> dict[str, list[str]]:
+        """Sides of the patient at the left, right, upper and lower edge of each slice view."""
+        axes = {view.get_singleton_tag(): matrix_array(_node(view).GetSliceToRAS())[:3, :2].T for view in self.slices}
+        return {name: [_side(-x), _side(x), _side(y), _side(-y)] for name, (x, y) in axes.items()}
+
+    def places(self, point_world: np.ndarray) -> dict[str, list[float]]:
+        """{view: shares of its width and height from the upper left corner, mm to its plane} of a point, (3,) mm."""
+        found, point = {}, [*point_world, 1.0]
+        for view in self.slices:
+            node = _node(view)
+            x, y = (np.linalg.inv(matrix_array(node.GetXYToRAS())) @ point)[:2]
+            width, height, _ = node.GetDimensions()
+            found[view.get_singleton_tag()] = [
+                x / width, 1.0 - y / height, abs((np.linalg.inv(matrix_array(node.GetSliceToRAS())) @ point)[2])
+            ]  # fmt: skip
+        renderer = self.threed.renderer()
+        renderer.SetWorldPoint(*point)
+        renderer.WorldToView()
+        x, y, _ = renderer.GetViewPoint()
+        found[THREED] = [0.5 + 0.5 * x, 0.5 - 0.5 * y, 0.0]
+        return found
 
     @property
     def _seen(self):
@@ -323,6 +372,12 @@ class AnatomyViews:
         display = display_of(model)
         display.SetSaveWithScene(False)
         return model
+
+
+def _side(direction: np.ndarray) -> str:
+    """The sides to which a direction, (3,) of length 1, leads, the first one first: "R", or "RA" for an oblique one."""
+    order = [axis for axis in np.argsort(-np.abs(direction)) if abs(direction[axis]) > _OBLIQUE]
+    return "".join("RAS"[axis] if direction[axis] > 0 else "LPI"[axis] for axis in order)
 
 
 def _silent(make):

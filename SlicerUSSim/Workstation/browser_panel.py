@@ -15,12 +15,12 @@ from typing import Any
 
 import numpy as np
 from greenlet import getcurrent, greenlet
+from trame_server.utils.asynchronous import get_event_loop
 
 from SlicerUSSim.Logic.base.errors import Cancelled, SimulationError, require, required, user_message
 from SlicerUSSim.Logic.mrml.fitting_nodes import offered
 from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic
 from SlicerUSSim.Logic.mrml.nodes import nodes_of_class
-from SlicerUSSim.Logic.mrml.taken_sequence import count_taken
 from SlicerUSSim.Widget.interface import Control, by_widget
 from SlicerUSSim.Widget.presenter import PanelPresenter
 from SlicerUSSim.Widget.sections import panel_sections
@@ -76,6 +76,7 @@ class _Work:
     title: str
     task: greenlet
     percent: int = 0
+    began: float = field(default_factory=perf_counter)
     #: Of this work alone: what is abandoned goes on to hear of it
     is_cancelled: threading.Event = field(default_factory=threading.Event)
 
@@ -95,6 +96,8 @@ class BrowserPanel:
         self.shared, self.logic, self.tasks = shared, logic, tasks
         self._about_to_compute = about_to_compute
         self._thread = threading.get_ident()
+        #: Called after values were shown
+        self.refreshed: Callable[[], None] = lambda: None
         #: Calls a function with the point (3,), in the world, of the next click in a slice view, or None
         self.pick: Callable[[Callable[[np.ndarray | None], None]], None] = lambda clicked: None
         #: The work under way: its title, whether it is cancelled, and the task that does it. The last is shown
@@ -102,6 +105,8 @@ class BrowserPanel:
         self._status, self._status_until = "", 0.0
         self._table: Any = None  # vtkMRMLTableNode with the costs of a fit
         self._costs = Observed("ModifiedEvent", self._show_costs)
+        #: Called after the controls were refreshed
+        self.refreshed: Callable[[], None] = lambda: None
         self.presenter = PanelPresenter(
             logic, self, handles=False, label_maps=True
         )  # label maps: filled ten times as fast as segmentations, and usable as overlays of the slice views
@@ -110,7 +115,6 @@ class BrowserPanel:
         #: Actions of the page in place of those of buttons
         self.own_actions: dict[Callable[[], object], Callable[[], object]] = {}
         with shared.changing() as now:
-            now.open_sections = [section.title for section in self.sections if section.is_open]
             now.panel.choices = {name: list(control.choices) for name, control in self._controls.items()}
         shared.show_values({name: next(iter(control.choices), None) for name, control in self._controls.items()})
 
@@ -175,21 +179,13 @@ class BrowserPanel:
                 panel.tissues = [_line(row) for row in self.presenter.tissues.rows()]
             if any(control.kind == "list" for control in stale.values()):
                 now.fit.free = [FreeParameter(*entry) for entry in self.presenter.fits.freeParameters()]
-            length = count_taken(self.logic.parameters.image_sequence)
-            if now.simulated.length != length:
-                now.simulated.length, now.simulated.number = length, 0
-        self.tellFrozen()
-
-    def tellFrozen(self) -> None:
-        """Mark an image that does not follow the probe, since live images ended or wait for other work."""
-        with self.shared.changing() as now:
-            now.is_frozen = self.logic.taken is not None and (not self.logic.isLive or self.presenter.isBusy)
+        self.refreshed()
 
     @contextmanager
     def progress(self, title: str) -> Iterator[Callable[[float], None]]:
         work = _Work(title, getcurrent())
         self._under_way.append(work)
-        self._show_work()
+        self._tick(work)
 
         def report(share: float) -> None:
             percent = int(100 * share)
@@ -245,8 +241,12 @@ class BrowserPanel:
         action = self._controls[name].action
         if name == "assignTissueButton":
             action = self._assign_tissue
-        action = required(action, f"{name} is no button of the page")
-        self.tasks.start(self.own_actions.get(action, action))
+        action = required(action, f"{name} is not a button of the page")
+        self.tasks.start(lambda: self.act(action))
+
+    def act(self, action: Callable[[], object]) -> None:
+        """Run the action of a button, or that of the page in place of it; called in a task."""
+        self.own_actions.get(action, action)()
 
     def _changed(self, control: Control, value: Any) -> None:
         presenter, parameters = self.presenter, self.logic.parameters
@@ -327,6 +327,13 @@ class BrowserPanel:
         with self.shared.changing() as now:
             now.messages.progress_title = "" if work is None else work.title
             now.messages.progress_percent = 0 if work is None else work.percent
+            now.messages.progress_s = 0 if work is None else int(perf_counter() - work.began)
+
+    def _tick(self, work: _Work) -> None:
+        """Show how long work has taken, every second: it may be long until it reports its next share."""
+        if work in self._under_way:
+            self._show_work()
+            get_event_loop().call_later(1.0, self._tick, work)
 
     def _in_loop(self, function: Callable[[], None]) -> None:
         if threading.get_ident() == self._thread:

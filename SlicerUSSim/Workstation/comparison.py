@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable
+from math import inf
+from time import perf_counter
 from typing import Any
 
 import numpy as np
@@ -12,6 +14,7 @@ from trame_server.utils.asynchronous import get_event_loop
 from SlicerUSSim.Logic.base.errors import SimulationError
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.fitting.image_similarity import Similarity, similarity
+from SlicerUSSim.Logic.fitting.search import Progress
 from SlicerUSSim.Logic.probe.image_grid import ImageGrid
 from SlicerUSSim.Logic.probe.poses import slice_under_probe
 from SlicerUSSim.Logic.tracked.images import TrackedImages
@@ -20,6 +23,8 @@ from SlicerUSSim.Workstation.streams import ImageStream
 
 #: Seconds between two images during playback of a sequence.
 _PLAY_EVERY_S = 0.1
+#: Seconds between two of the best images of a fit
+_BEST_EVERY_S = 0.5
 #: Difference of matrices up to which a pose is the same, mm: nodes and files keep some digits
 _SAME_POSE = 1e-3
 
@@ -47,10 +52,45 @@ class RealImages:
             self._on_grid = (key, np.where(mask, image.round(), 0).astype(np.uint8), mask)
         return self._on_grid[1], self._on_grid[2]
 
+    @property
+    def numbers(self) -> list[int]:
+        """Numbers of the images in their file."""
+        return self.tracked.numbers
+
+    def outline(self, grid: ImageGrid) -> str:
+        """What is compared, as a path of an SVG in mm of the probe frame."""
+        from skimage.measure import approximate_polygon, find_contours
+
+        _, mask = self.on_grid(0, grid)
+        lines = find_contours(np.pad(mask, 1).astype(float), 0.5)
+        (dx, dy), points = grid.pixel_spacing_mm, [approximate_polygon(line, 0.7) - 0.5 for line in lines]
+        paths = (" ".join(f"{grid.left_mm + dx * x:.2f},{grid.top_mm + dy * y:.2f}" for y, x in line) for line in points)
+        return " ".join(f"M {path} Z" for path in paths)
+
     def compared(self, place: int, simulated: np.ndarray, grid: ImageGrid) -> Similarity:
         """The paper's cost between a simulated image and the real image with this index."""
         real, mask = self.on_grid(place, grid)
         return similarity(simulated, real, grid.pixel_spacing_mm, mask=mask)
+
+
+class LooseImages:
+    """The images of a sequence whose place in the patient is not known; they can only be viewed.
+
+    Parameters
+    ----------
+    images : (n, rows, columns) numbers.
+    """
+
+    def __init__(self, images: np.ndarray) -> None:
+        self._images, self.numbers = images, list(range(len(images)))
+        self._low, self._high = (0, 255) if images.dtype == np.uint8 else (float(images.min()), float(images.max()))
+
+    def __len__(self) -> int:
+        return len(self._images)
+
+    def image(self, place: int) -> np.ndarray:
+        """(rows, columns) uint8 of the image with this index."""
+        return np.interp(self._images[place], (self._low, max(self._high, self._low + 1)), (0, 255)).astype(np.uint8)
 
 
 class Comparison:
@@ -59,19 +99,23 @@ class Comparison:
     Parameters
     ----------
     move : called with the pose (4, 4) of a real image.
+    tell : calls a function soon in the event loop, from another thread.
     """
 
-    def __init__(self, shared: SharedState, move: Callable[[np.ndarray], None]) -> None:
-        self._shared, self._move = shared, move
+    def __init__(
+        self, shared: SharedState, move: Callable[[np.ndarray], None], tell: Callable[[Callable[[], None]], None]
+    ) -> None:  # fmt: skip
+        self._shared, self._move, self._tell = shared, move, tell
         self._grid: ImageGrid | None = None  # of the simulated image
-        self._real: RealImages | None = None
+        self._real: RealImages | LooseImages | None = None
         self._browser: Any = None  # vtkMRMLSequenceBrowserNode
         self._playing: asyncio.Task | None = None
         self._waiting: tuple[RealImages, int, np.ndarray, ImageGrid] | None = None  # to be compared
         self._comparing: asyncio.Task | None = None
         self._era = 0  # changes when a similarity of before must not be shown any more
-        #: For display next to the simulated image, and over it
-        self.streams = (ImageStream("real"), ImageStream("real-over"))
+        #: For display next to the simulated image, and over it; and the best image of a fit that runs
+        self.streams = (ImageStream("real"), ImageStream("real-over"), ImageStream("best"))
+        self._best = (inf, 0.0)  # its cost, and when it was sent
 
     @property
     def is_comparing(self) -> bool:
@@ -80,26 +124,40 @@ class Comparison:
 
     def take(self, tracked: TrackedImages, browser_node: Any, number: int = 0) -> None:
         """Use these images for comparison from now on, and show that with the index `number`."""
-        self._real, self._browser = RealImages(tracked), browser_node
+        self._use(RealImages(tracked), browser_node, number)
+
+    def view(self, images: np.ndarray, number: int = 0) -> None:
+        """Show images (n, rows, columns) whose place is not known, beside the simulated ones, from index `number` on."""
+        self._use(LooseImages(images), None, number)
+
+    def _use(self, real: RealImages | LooseImages, browser_node: Any, number: int) -> None:
+        self._real, self._browser = real, browser_node
+        if isinstance(real, LooseImages):
+            self.sees_nothing(None)
         with self._shared.changing() as now:
-            now.sequence.length = len(self._real)
+            sequence, numbers = now.sequence, real.numbers
+            sequence.length, sequence.is_placed, sequence.mask = len(real), isinstance(real, RealImages), ""
+            sequence.numbers = f"{numbers[0]} to {numbers[-1]}"
+            if not sequence.is_placed:
+                sequence.comparison = ComparisonMode.BESIDE
         self.show(number)
 
     def show(self, number: int) -> None:
-        """Move the probe to the pose of the real image with this index, and show that image."""
-        if self._real is None:
+        """Show the real image with this index, and move the probe to its pose, if that is known."""
+        real = self._real
+        if real is None:
             return
-        number = int(np.clip(number, 0, len(self._real) - 1))
-        tracked = self._real.tracked
+        number = int(np.clip(number, 0, len(real) - 1))
         with self._shared.changing() as now:
-            now.sequence.number, now.sequence.name = number, f"image {tracked.numbers[number]}"
-        self._browser.SetSelectedItemNumber(number)
-        self._move(tracked.poses[number])
+            now.sequence.number, now.sequence.name = number, f"image {real.numbers[number]}"
+        if isinstance(real, RealImages):
+            self._browser.SetSelectedItemNumber(number)
+            self._move(real.tracked.poses[number])
         self.send()
 
     def show_at(self, pose: np.ndarray) -> bool:
         """As show, for the image with this pose (4, 4); whether there is one."""
-        poses = () if self._real is None else self._real.tracked.poses
+        poses = self._real.tracked.poses if isinstance(self._real, RealImages) else ()
         found = [number for number, known in enumerate(poses) if np.allclose(known, pose, atol=_SAME_POSE)]
         if found:
             self.show(found[0])
@@ -107,23 +165,56 @@ class Comparison:
 
     def send(self) -> None:
         """Send the real image to the pages if they show it."""
-        sequence = self._shared.now.sequence
-        if self._real is None or self._grid is None or sequence.comparison is ComparisonMode.SIMULATED:
+        sequence, real, grid = self._shared.now.sequence, self._real, self._grid
+        if sequence.comparison is ComparisonMode.SIMULATED:
             return
-        image, _ = self._real.on_grid(sequence.number, self._grid)
-        width, height = (
-            count * spacing
-            for count, spacing in zip((self._grid.columns, self._grid.rows), self._grid.pixel_spacing_mm, strict=True)
-        )
-        for stream in self.streams:
-            stream.send(image, ruler={"w": width, "h": height})
+        if isinstance(real, LooseImages):
+            image = real.image(sequence.number)
+            rows, columns = image.shape  # of a size that is not known: a ruler of its own, without marks
+            about = {"x": 0, "y": 0, "w": columns, "h": rows, "ticks": [], "size": rows / 36, "focus": 0, "range": ""}
+            self.streams[0].send(image, ruler=about)
+        elif real is not None and grid is not None:
+            image, _ = real.on_grid(sequence.number, grid)
+            width, height = (n * mm for n, mm in zip((grid.columns, grid.rows), grid.pixel_spacing_mm, strict=True))
+            for stream in self.streams[:2]:
+                stream.send(image, ruler={"w": width, "h": height})
+            box = f"{grid.left_mm:.3f} {grid.top_mm:.3f} {width:.3f} {height:.3f}"
+            if (sequence.box, bool(sequence.mask)) != (box, True):
+                with self._shared.changing() as now:
+                    now.sequence.box, now.sequence.mask = box, real.outline(grid)
+
+    def follow(self, step: Progress | None) -> None:
+        """Show the best image of a fit, at most twice a second; called in its thread, and with None at its end."""
+        if step is None:
+            self._tell(lambda: self._show_best(None, ""))
+        elif step.image is not None and step.best_cost != self._best[0] and perf_counter() > self._best[1] + _BEST_EVERY_S:
+            self._best, image = (step.best_cost, perf_counter()), step.image()
+            words = f"Best after {step.evaluations} evaluations: image {step.number}, cost {step.best_cost:.3f}"
+            self._tell(lambda: self._show_best(image, words))
+
+    def _show_best(self, image: np.ndarray | None, words: str) -> None:
+        real, grid = self._real, self._grid
+        if image is None:
+            self._best = (inf, 0.0)
+            self.streams[2].clear()
+        elif isinstance(real, RealImages) and grid is not None and image.shape == real.tracked.mask.shape:
+            placed = Volume(image[None].astype(np.float32), real.tracked.grid.slice_to_probe)
+            self.streams[2].send(slice_under_probe(placed, grid, np.eye(4)).round().astype(np.uint8))
+        with self._shared.changing() as now:
+            now.fit.best = words
+
+    def compare_next(self) -> None:
+        """Compare in the next way of ComparisonMode."""
+        modes = list(ComparisonMode)
+        with self._shared.changing() as now:
+            now.sequence.comparison = modes[(modes.index(now.sequence.comparison) + 1) % len(modes)]
 
     def compare(self, simulated: np.ndarray, grid: ImageGrid) -> None:
         """Show the similarity of a simulated image to the real one; if images arrive too fast, some are skipped."""
         if grid != self._grid:
             self._grid = grid
             self.send()
-        if self._real is None:
+        if not isinstance(self._real, RealImages):
             return
         self._waiting = (self._real, self._shared.now.sequence.number, simulated, grid)
         if self._comparing is None:
@@ -147,7 +238,7 @@ class Comparison:
         for stream in self.streams:
             stream.clear()
         with self._shared.changing() as now:
-            now.sequence.length, now.sequence.number, now.sequence.name = 0, 0, ""
+            now.sequence.length, now.sequence.number, now.sequence.name, now.sequence.mask = 0, 0, "", ""
 
     async def _compare_all(self) -> None:
         try:

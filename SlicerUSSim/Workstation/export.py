@@ -1,15 +1,14 @@
-"""Export of images, frames with their geometry, cine loops and the scene."""
+"""Export of images, alone and with their geometry, of the cine and of the scene."""
 
 from __future__ import annotations
 
 import io
 import json
 import zipfile
-from collections import deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from PIL import Image
@@ -20,15 +19,17 @@ from vtkmodules.vtkCommonCore import vtkOutputWindow
 from SlicerUSSim.Logic.base.errors import SimulationError, require, required
 from SlicerUSSim.Logic.mrml.nodes import nodes_of_class
 from SlicerUSSim.Logic.mrml.taken_image import TakenImage
+from SlicerUSSim.Logic.tracked.sequence import SIMULATED, TrackedSequence
 from SlicerUSSim.Workstation.browser_panel import BrowserPanel
+from SlicerUSSim.Workstation.cine import Cine
+from SlicerUSSim.Workstation.dicom_export import ultrasound_file
 
 #: File formats of an image with its geometry.
 FRAME_SUFFIXES = (".nrrd", ".mha", ".vti")
 #: Key of a file's header under which is what its image is of, see TakenImage.about
 ABOUT = "SlicerUSSim"
-#: Number of images in a cine loop; and limits of the display time of each, in milliseconds.
-MOST_IMAGES = 200
-_SHORTEST_MS, _LONGEST_MS = 40, 500
+#: The kind of export that a page composes
+DICOM = "dicom"
 
 
 def png(taken: TakenImage) -> bytes:
@@ -51,81 +52,26 @@ def frame_file(taken: TakenImage, suffix: str) -> bytes:
         return path.read_bytes()
 
 
-class CineImage(NamedTuple):
-    """One image of a cine loop."""
+def sequence_file(images: Sequence[tuple[float, TakenImage]]) -> bytes:
+    """Images with their times in s as a sequence metafile (.igs.mha), with their places in the MRI (RAS, mm).
 
-    #: When it was shown
-    seconds: float
-    #: (rows, columns) uint8
-    image: np.ndarray
-    #: What it is of, as JSON, see TakenImage.about; "" if that is not known
-    about: str = ""
-
-
-class Cine:
-    """A cine loop: the last images, as in a scanner."""
-
-    def __init__(self) -> None:
-        self._images: deque[CineImage] = deque(maxlen=MOST_IMAGES)
-
-    def add(self, image: np.ndarray, seconds: float, about: str = "") -> None:
-        """Append a (rows, columns) uint8 image with its time and what it is of; another size starts a new loop."""
-        if self._images and self._images[-1].image.shape != image.shape:
-            self.clear()
-        self._images.append(CineImage(seconds, image, about))
-
-    def clear(self) -> None:
-        """Forget all images."""
-        self._images.clear()
-
-    @property
-    def images(self) -> list[CineImage]:
-        """All, which are never changed."""
-        return list(self._images)
-
-
-def gif(images: Sequence[CineImage], progress: Callable[[float], None] = lambda share: None) -> bytes:
-    """An animated GIF with the original timing, and what each image is of as a comment (of_images).
-
-    `progress` is called with the fraction done before every image, and may raise errors.Cancelled.
-    Raises SimulationError for fewer than two images.
+    The file says what the last one is of (TakenImage.about).
     """
-    require(len(images) > 1, f"the cine loop has {len(images)} images, expected two or more")
-    times = np.array([one.seconds for one in images])
-    waits = np.clip(np.diff(times, append=times[-1] + 0.2) * 1e3, _SHORTEST_MS, _LONGEST_MS)
-
-    def others() -> Iterator[Image.Image]:
-        for number, one in enumerate(images[1:], 1):
-            progress(number / len(images))
-            yield Image.fromarray(one.image)
-
-    buffer = io.BytesIO()
-    Image.fromarray(images[0].image).save(
-        buffer, "GIF", save_all=True, append_images=others(), duration=waits.round(-1).astype(int).tolist(), loop=0,
-        comment=of_images(images).encode(),
-    )  # fmt: skip
-    return buffer.getvalue()
-
-
-def of_images(images: Sequence[CineImage]) -> str:
-    """What images are of, as JSON {"images": one for each, "presets": once each, by the images' "preset"}.
-
-    See TakenImage.about; {} for an image of which that is not known.
-    """
-    presets: list[Any] = []
-    about: list[dict[str, Any]] = []
-    for one in images:
-        known = json.loads(one.about) if one.about else {}
-        if "preset" in known:
-            if known["preset"] not in presets[-1:]:
-                presets.append(known["preset"])
-            known["preset"] = len(presets) - 1
-        about.append(known)
-    return json.dumps({"images": about, "presets": presets})
+    seconds, taken = zip(*images, strict=True)
+    transforms = tuple(
+        {"ImageToProbe": image.grid.image_to_probe, "ProbeToReference": image.probe_to_world} for image in taken
+    )
+    fields = {SIMULATED: "cine", ABOUT: json.dumps(taken[-1].about())}
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "cine.igs.mha"
+        TrackedSequence(np.stack([image.image for image in taken]), transforms, np.array(seconds), fields=fields).write(
+            path
+        )
+        return path.read_bytes()
 
 
 class Exports:
-    """The contents of the menu Export, by kind: png, .nrrd, .mha, .vti, gif, mrb, json.
+    """The contents of the menu Export, by kind: png, .nrrd, .mha, .vti, cine, dicom, mrb, json.
 
     Each is (file name, content, MIME type). Raises SimulationError if there is nothing to export.
     """
@@ -134,19 +80,23 @@ class Exports:
         self._app, self._logic, self._tasks, self._cine, self._saved = app, panel.logic, panel.tasks, cine, saved
         self._preset, self._progress = panel.presenter.values.presetToSave, panel.progress
 
-    def export(self, kind: str) -> tuple[str, bytes, str]:
-        """Export one kind, in a task: what takes time can be cancelled, and images go on meanwhile."""
+    def export(self, kind: str, sent: Mapping[str, bytes]) -> tuple[str, bytes, str]:
+        """Export one kind, in a task: what takes time can be cancelled, and images go on meanwhile.
+
+        `sent` are the files of which a page has composed it, see dicom_export.ultrasound_file.
+        """
         if kind == "json":
             return "preset.json", json.dumps(self._preset().to_dict(), indent=2).encode(), "application/json"
         if kind == "mrb":
             return "ultrasound.mrb", self._scene(), "application/zip"
-        if kind == "gif":
-            images = self._cine.images
-            with self._progress("Export the images") as progress:
-                content = self._tasks.doAside(lambda: gif(images, progress))
-            return "ultrasound.gif", content, "image/gif"
-        require(kind in ("png", *FRAME_SUFFIXES), f"the export is {kind[:20]!r}, expected one of the menu")
+        if kind == "cine":
+            with self._progress("Export the cine") as progress:
+                images = list(self._cine.displayed(progress))
+                return "cine.igs.mha", self._tasks.doAside(lambda: sequence_file(images)), "application/octet-stream"
+        require(kind in ("png", DICOM, *FRAME_SUFFIXES), f"the export is {kind[:20]!r}, expected one of the menu")
         taken = required(self._logic.taken, "there is no image, expected labels and a probe")
+        if kind == DICOM:
+            return "ultrasound.dcm", self._tasks.doAside(lambda: ultrasound_file(sent, taken)), "application/dicom"
         if kind == "png":
             return "ultrasound.png", png(taken), "image/png"
         return f"ultrasound{kind}", frame_file(taken, kind), "application/octet-stream"

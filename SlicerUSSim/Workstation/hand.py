@@ -57,6 +57,7 @@ class ProbeHand:
     surface : returns the surface that the probe slides over, or None.
     upright : whether sliding aligns the probe with the surface normal; otherwise it keeps its angles to the normal.
     hold : called with the slice view in which a drag starts, and with None at its end.
+    hover : called with the slice view under the mouse, while nothing is dragged, and the point (3,) there in the world.
     """
 
     def __init__(
@@ -66,8 +67,10 @@ class ProbeHand:
         surface: Callable[[], PatientSurface | None],
         upright: Callable[[], bool],
         hold: Callable[[SliceView | None], None],
+        hover: Callable[[SliceView, np.ndarray], None],
     ) -> None:
         self._pose, self._move, self._surface, self._upright, self._hold = pose, move, surface, upright, hold
+        self._hover = hover
         self._drag: _Drag | None = None
         self._last_press = (0.0, np.zeros(2))
         self._body = vtkStaticCellLocator()
@@ -198,9 +201,11 @@ class ProbeHand:
 
     def _moved(self, view: AbstractView) -> bool:
         drag = self._drag
-        if drag is None:
-            return False
         pixel = np.array(view.interactor().GetEventPosition(), float)
+        if drag is None:
+            if isinstance(view, SliceView):
+                self._hover(view, _in_slice(view, pixel))
+            return False
         if drag.kind == "rotate":
             self._move(turned(drag.pose, rotate_deg=_DEG_PER_PIXEL * (pixel - drag.pixel)[0]))
             return True

@@ -1,32 +1,37 @@
-"""ImageFlow: distribution of every simulated image: page, views, comparison, cine loop, tracker."""
+"""ImageFlow: distribution of every simulated image: page, views, comparison, cine, tracker; and what it is of."""
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from time import perf_counter
 
 import numpy as np
+from trame_server.utils.asynchronous import get_event_loop
 
 from SlicerUSSim.Logic.imaging.preset import Preset
-from SlicerUSSim.Logic.mrml.nodes import node_to_world
-from SlicerUSSim.Logic.mrml.taken_image import TakenImage, about_as_json
-from SlicerUSSim.Logic.probe.arrays import Probe
+from SlicerUSSim.Logic.mrml.taken_image import TakenImage
+from SlicerUSSim.Logic.probe.arrays import PROBES, Probe
 from SlicerUSSim.Logic.probe.image_grid import ImageGrid
+from SlicerUSSim.Widget.image_presenter import FROZEN
 from SlicerUSSim.Workstation.anatomy import AnatomyViews
 from SlicerUSSim.Workstation.browser_panel import BrowserPanel
+from SlicerUSSim.Workstation.cine import Cine
 from SlicerUSSim.Workstation.comparison import Comparison
-from SlicerUSSim.Workstation.export import Cine
+from SlicerUSSim.Workstation.state import ImageState
 from SlicerUSSim.Workstation.streams import ImageStream
 from SlicerUSSim.Workstation.tasks import AtMost
 from SlicerUSSim.Workstation.tracker import Tracker
 
 #: Seconds between two updates of Slicer's views, which delay the image.
 _VIEWS_EVERY_S = 0.12
+#: Seconds for which a live image may differ from the scene until it is outdated, and between two comparisons
+_OUTDATED_S, _COMPARE_EVERY_S = 0.5, 0.25
 #: Height of the image in heights of its letters
 _LETTERS = 36.0
 
 
 class ImageFlow:
-    """Distributes the images of the logic to page, views, comparison, cine loop and tracker."""
+    """Distributes the images of the logic to page, views, comparison, cine and tracker."""
 
     def __init__(
         self, panel: BrowserPanel, views: AnatomyViews, comparison: Comparison, cine: Cine, tracker: Tracker,
@@ -36,12 +41,14 @@ class ImageFlow:
         self._comparison, self._cine, self._tracker, self._stamps = comparison, cine, tracker, stamps
         self._simulated = ImageStream("simulated")
         self._field: tuple[tuple[ImageGrid, Probe], np.ndarray] | None = None
+        self._differs_since: float | None = None
         self._show_in_views = AtMost(_VIEWS_EVERY_S, self._views_changed)
+        panel.refreshed = self.tell
 
     @property
     def streams(self) -> tuple[ImageStream, ...]:
         """All image streams of the pages, simulated and real."""
-        return self._simulated, *self._comparison.streams
+        return self._simulated, self._cine.mmode, *self._comparison.streams
 
     @property
     def is_shown(self) -> bool:
@@ -55,7 +62,7 @@ class ImageFlow:
             self.clear()
             return
         self._simulated.send(taken.image, stamp=self._stamps.computed, **_description(taken))
-        self._cine.add(taken.image, perf_counter(), about_as_json(taken.node))
+        self._cine.add(taken)
         self._show_in_views()
         if self._tracker.is_on:
             self._tracker.send(taken.volume())
@@ -63,7 +70,8 @@ class ImageFlow:
             self._comparison.sees_nothing(taken.grid)
         else:
             self._comparison.compare(taken.image, taken.grid)
-        self._panel.tellFrozen()
+        self._differs_since = None
+        self.tell()
 
     def clear(self) -> None:
         """Show no image anywhere, since that of before is not of this patient or pose."""
@@ -71,7 +79,31 @@ class ImageFlow:
         self._cine.clear()
         self._views.hide_image()
         self._comparison.sees_nothing(None)
-        self._panel.tellFrozen()
+        self.tell()
+
+    def watch(self) -> None:
+        """Compare the image with the scene from now on; whatever has changed, pages are told if it is not as it is."""
+        self.tell()
+        get_event_loop().call_later(_COMPARE_EVERY_S, self.watch)
+
+    def tell(self) -> None:
+        """Bring ImageState and CineState up to date."""
+        self._cine.tell()
+        taken, shown = self._logic.taken, ImageState()
+        if taken is not None:
+            differs, seconds = self._logic.differences(taken), perf_counter()
+            if not differs:
+                self._differs_since = None
+            elif self._differs_since is None:
+                self._differs_since = seconds
+            is_late = self._differs_since is not None and seconds - self._differs_since > _OUTDATED_S
+            shown = _texts(taken)
+            shown.status = "OUTDATED" if is_late else "LIVE"
+            if not self._logic.isLive:
+                shown.status = FROZEN
+                self._logic.holdOutline()
+            shown.differs = "" if shown.status == "LIVE" else ", ".join(differs)
+        self._panel.shared.put("image", asdict(shown))
 
     def show_again(self) -> None:
         """Send the current images again, for a page that has just opened."""
@@ -85,13 +117,7 @@ class ImageFlow:
         taken = self._logic.taken
         if taken is not None:
             self._views.show_image(taken, self._field_of(taken.grid, taken.preset.probe))
-            if self._logic.isLive or self._is_at(taken):  # the first image comes before Live has begun
-                self._views.follow(taken.probe_to_world, taken.preset.probe)
-
-    def _is_at(self, taken: TakenImage) -> bool:
-        """Whether the probe is where an image was taken."""
-        transform = self._logic.parameters.probe_transform
-        return transform is not None and np.allclose(node_to_world(transform), taken.probe_to_world)
+            self._views.follow(taken.probe_to_world, taken.preset.probe)
 
     def _field_of(self, grid: ImageGrid, probe: Probe) -> np.ndarray:
         """(rows, columns) bool: the imaged field."""
@@ -108,8 +134,19 @@ def _description(taken: TakenImage) -> dict[str, object]:
         "patient": taken.patient,
         "time": taken.time,
         "pose": taken.probe_to_world.round(3).tolist(),
-        "sequence": None if taken.number is None else taken.number + 1,
+        "sequence": taken.number,
     }
+
+
+def _texts(taken: TakenImage) -> ImageState:
+    """What a banner says of an image."""
+    probe, display = taken.preset.probe, taken.preset.display
+    name = next((name.replace("_", " ") for name, known in PROBES.items() if known == probe), probe.kind)
+    return ImageState(
+        patient=taken.patient, time=f"{taken.time[11:19]} UTC", probe=name, frequency=f"{probe.received_mhz:.3g} MHz",
+        depth=f"{probe.depth_mm:.4g} mm", focus=f"{probe.focus_mm:.4g} mm" if probe.focus_mm else "",
+        gain=f"{display.gain_db:+g} dB", dynamic_range=f"{display.dynamic_range_db:g} dB",
+    )  # fmt: skip
 
 
 def _ruler(grid: ImageGrid, preset: Preset) -> dict[str, object]:
@@ -147,9 +184,9 @@ class LatencyStamps:
         self._received = (page, milliseconds)
 
     def probe_moved(self) -> None:
-        """Called before the user moves the probe."""
-        self._applied = self._received
+        """Called before the user moves the probe: by the event of which the page has just sent the time, or by none."""
+        self._applied, self._received = self._received, None
 
     def image_begun(self) -> None:
-        """Called before an image of the current pose is computed."""
-        self.computed = self._applied
+        """Called before an image of the current pose is computed; only the first one shows the effect of the event."""
+        self.computed, self._applied = self._applied, None

@@ -1,51 +1,49 @@
-"""Layout of the page: the panel's sections (left), the ultrasound image (middle), the anatomy and the probe (right).
+"""Layout of the page, as on a scanner: a banner, the probes, the image, its controls, the anatomy, and the cine.
 
-The page is built from trame's widgets, which are bound to fields of state.PageState through their NAMES. Actions of the
-user reach the workstation as calls of methods, as triggers by name (Workstation._answer_pages), and as changes of those
-fields.
+What is not needed while one looks at the image is in the drawer: the sections of the Slicer panel. The page is HTML for
+Vue, bound to fields of state.PageState through their NAMES. Actions of the user reach the workstation as triggers by
+name (Workstation._answer_pages), and as changes of those fields; what concerns one page alone is in static/.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from html import escape
 from pathlib import Path
 
+import numpy as np
 from trame.ui.vuetify3 import VAppLayout
 from trame.widgets import html, vuetify3 as v3
 from trame_server import Server
-from trame_slicer.core import LayoutManager
-from trame_slicer.views import AbstractView
 
-from SlicerUSSim.Widget.image_presenter import FROZEN
-from SlicerUSSim.Widget.interface import Control
-from SlicerUSSim.Widget.tissue_presenter import TISSUE_COLUMNS
+from SlicerUSSim.Logic.probe.arrays import PROBES, Probe
+from SlicerUSSim.Widget.interface import Control, by_widget
+from SlicerUSSim.Widget.value_presenter import SHOWN_PROBES
 from SlicerUSSim.Workstation.browser_panel import BrowserPanel
-from SlicerUSSim.Workstation.page_parts import offer, pose_numbers, question_dialog, registration
+from SlicerUSSim.Workstation.controls import control_html, range_html, slider_html, upright_html
+from SlicerUSSim.Workstation.page_parts import HELP, offer, pose_numbers, question_dialog, registration
 from SlicerUSSim.Workstation.pose_registration import SECTION
-from SlicerUSSim.Workstation.state import NAMES, PLANES, SLICE_VIEWS, ComparisonMode, value_of
+from SlicerUSSim.Workstation.state import IMAGE, NAMES, ComparisonMode, value_of
+from SlicerUSSim.Workstation.view_tools import anatomy_column, cross_hair
 
 _STATIC = Path(__file__).parent / "static"
 #: Files that the page loads in addition to those of trame.
 MODULE = {
     "serve": {"ussim": str(_STATIC)},
-    "scripts": ["ussim/overlay.js", "ussim/workstation.js"],
-    "styles": ["ussim/workstation.css"],
+    "module_scripts": ["ussim/workstation.js"],
+    "styles": ["ussim/workstation.css", "ussim/views.css"],
 }
 #: Controls of the panel that are not on the page: its views follow the probe and show it, it compares the fit in the
 #: ultrasound view, it has a button of its own to place the probe, and no editor of segments.
 NOT_SHOWN = {
     "sliceViewComboBox", "showInSliceCheckBox", "showIn3dCheckBox", "showProbeCheckBox", "layoutButton",
     "compareComboBox", "compareNumberComboBox", "blinkCheckBox", "statusLabel", "placeButton", "editTissuesButton",
+    "probePresetComboBox", "liveCheckBox",
 }  # fmt: skip
-#: JavaScript of buttons that act on the page, by widget name.
-_IN_PAGE = {
-    "savePresetButton": "window.ussim.save('json')",
-    "loadPresetButton": "window.document.getElementById('open-file').click()",
-}
-#: Colours of the marks beside the slice views' planes.
-_STRIPES = {"Red": "red", "Yellow": "yellow", "Green": "green"}
+#: Controls beside the image, and the gains at eight depths
+_BESIDE = ("gainSlider", "depthSlider", "frequencySlider", "focusSlider", "dynamicRangeSlider")
+_TGC = tuple(f"depthGain{number}Slider" for number in range(1, 9))
+_BELOW_TGC = ("tgcSlider", "lookComboBox", "greyMapComboBox")
 
 
 @dataclass(frozen=True)
@@ -70,18 +68,39 @@ POSE_SLIDERS = (
     PoseSlider("tilt_deg", "Tilt", "Out of the image plane (keys W, S; Shift and drag)", -75, 75, 0.5, "°"),
     PoseSlider("lift_mm", "Lift", "Off the surface; negative: pressed in (keys +, -)", -10, 30, 0.5, "mm"),
 )
-_EXPORTS = {
-    "png": "Image (PNG)", ".nrrd": "Image with geometry (NRRD)", ".mha": "Image with geometry (MHA)",
-    ".vti": "Image with geometry (VTI)", "gif": "Cine of the last images (GIF)", "mrb": "Scene for 3D Slicer (MRB)",
+#: What Save offers: pictures that the page composes, with banner, scale and measurements, and files of the server
+_COMPOSED = {
+    "picture": ("savePicture()", "Picture with scale and measurements (PNG)"),
+    "video": ("saveVideo()", "Cine with scale and measurements (WebM)"),
+    "dicom": ("saveDicom(false)", "DICOM ultrasound image"), "dicom-cine": ("saveDicom(true)", "DICOM ultrasound cine"),
+}  # fmt: skip
+_FILES = {
+    "png": "Image alone (PNG)", ".nrrd": "Image with geometry (NRRD)", ".mha": "Image with geometry (MHA)",
+    ".vti": "Image with geometry (VTI)", "cine": "Cine with poses (.igs.mha)", "mrb": "Scene for 3D Slicer (MRB)",
     "json": "Settings (JSON)",
 }  # fmt: skip
-
+_TOOLS = (
+    ("distance", "Distance", "Two clicks (M)"), ("ellipse", "Ellipse", "Two clicks on its long axis, one on its side"),
+    ("angle", "Angle", "Three clicks, the apex second"), ("depth", "Depth", "One click"),
+    ("text", "Text", "One click, then type (T)"), ("mmode", "M-mode", "Two clicks: grey levels of a line over time"),
+    ("bodymark", "Body mark", "Where the probe is on the head, on and off"), ("clear", "Clear", "Remove them all"),
+)  # fmt: skip
+#: Names of fields of the state that scripts read, as attributes of the screens
+_SHARED_WITH_SCRIPTS = [
+    f'data-{name}="{field}"'
+    for name, field in {
+        "pose": NAMES.pose, "cine-first": NAMES.cine.first, "cine-last": NAMES.cine.last,
+        "cine-index": NAMES.cine.index, "cine-seconds": NAMES.cine.seconds,
+    }.items()
+]  # fmt: skip
+_MMODE = """<canvas data-stream="mmode"></canvas><button class="ussim-icon" title="Close M-mode"
+    aria-label="Close M-mode" @click="window.ussim.tool('mmode-off')"><i class="mdi mdi-close"></i></button>"""
 #: In the browser's tab
 _PROGRAM = "SlicerUSSim"
 
 
-def build_page(server: Server, panel: BrowserPanel, layout: LayoutManager, keys: tuple[str, ...]) -> None:
-    """Build the page of a server. `layout` is that of the anatomy views, `keys` are the keys sent to the server."""
+def build_page(server: Server, panel: BrowserPanel, keys: tuple[str, ...]) -> None:
+    """Build the page of a server; `keys` are the keys that are sent to it."""
     server.enable_module(MODULE)
     server.state.trame__title = _PROGRAM
 
@@ -90,356 +109,288 @@ def build_page(server: Server, panel: BrowserPanel, layout: LayoutManager, keys:
         title = values.get(NAMES.title)
         server.state.trame__title = f"{title} - {_PROGRAM}" if title else _PROGRAM
 
+    controls = by_widget(panel.sections)
     with VAppLayout(server) as page:
         page.root.theme = "dark"
-        with v3.VNavigationDrawer(permanent=True, width=376, disable_resize_watcher=True, disable_route_watcher=True):
-            _drawer(panel)
-        with v3.VMain(style="height: 100vh"), html.Div(classes="ussim-main"):
-            with html.Div(classes="ussim-image"):
-                offer()
-                _tools()
-                _screens(keys)
-                _player()
-                _status(panel)
-            with html.Div(classes="ussim-anatomy"):
-                layout.initialize_layout_grid(page)
+        with html.Div(classes="ussim-page", id="page"):
+            html.Div(_banner(), classes="ussim-banner")
+            with html.Div(classes="ussim-main"):
+                html.Div(_probes(), classes="ussim-rail", raw_attrs=['aria-label="Probes"', 'role="group"'])
+                with html.Div(classes="ussim-stage"):
+                    offer()
+                    html.Div(_advice())
+                    html.Div(_screens(keys), classes="ussim-screens", id="screens", raw_attrs=_SHARED_WITH_SCRIPTS)
+                    html.Div(_MMODE, classes="ussim-mmode", id="mmode", raw_attrs=["hidden"])
+                    html.Div(_player(), classes="ussim-bars")
+                html.Div(_console(controls), classes="ussim-console")
+                with html.Div(classes="ussim-anatomy"):
+                    anatomy_column(server)
+            html.Div(_foot(), classes="ussim-foot")
+            with html.Div(classes="ussim-drawer", id="drawer", raw_attrs=['aria-label="Settings"', 'role="region"']):
+                _drawer(panel)
         _messages()
         question_dialog()
+        html.Div(HELP)
 
 
-def view_tools(_server: Server, _view_id: str, view: AbstractView) -> None:
-    """Tools over a view: a selector of its plane for slice views, a camera button for the 3D view."""
-    name = view.get_singleton_tag()
-    with html.Div(classes="ussim-view-tool"):
-        if name in SLICE_VIEWS:
-            html.Div(classes=f"ussim-stripe bg-{_STRIPES[name]}")
-            options = "".join(f"<option>{plane}</option>" for plane in PLANES)
-            html.Div(
-                f"""<select :value="{NAMES.views.planes}['{name}']" id="plane-{name}"
-                    aria-label="Plane of the {_STRIPES[name]} view"
-                    @change="trigger('plane', ['{name}', $event.target.value])">{options}</select>"""
-            )
-        else:
-            with v3.VBtn(
-                icon=True, size="x-small", variant="text", click="trigger('look')", id="look",
-                title="Turn the camera to the probe", raw_attrs=['aria-label="Turn the camera to the probe"'],
-            ):  # fmt: skip
-                v3.VIcon("mdi-camera-flip-outline")
+# ---- banner, and what matters most now -------------------------------------------------------------------------------
 
 
-# ---- left ------------------------------------------------------------------------------------------------------------
-
-
-def _drawer(panel: BrowserPanel) -> None:
-    html.Div("Ultrasound Simulator", classes="text-subtitle-1 px-4 pt-2")
-    html.Div(f"{{{{ {NAMES.title} }}}}", classes="text-caption px-4 pb-1 text-medium-emphasis", id="title")
-    with v3.VExpansionPanels(multiple=True, v_model=(NAMES.open_sections,), variant="accordion"):
-        # First what is used while one looks at the image
-        for section in sorted(panel.sections, key=lambda section: section.title != "Ultrasound"):
-            with v3.VExpansionPanel(value=section.title):
-                v3.VExpansionPanelTitle(section.title, style="min-height: 36px; font-size: 13px")
-                with v3.VExpansionPanelText(eager=True, id=f"section-{section.title.replace(' ', '-').lower()}"):
-                    if section.title == "Patient":
-                        _open_file()
-                    if section.title == SECTION:
-                        registration()
-                    for control in section.controls:
-                        if control.widget not in NOT_SHOWN:
-                            _control(control, panel)
-                    if section.title == "Probe":
-                        _pose_sliders(panel)
-                        pose_numbers()
-                    if section.title.startswith("Fit"):
-                        _cost_curve()
-
-
-def _open_file() -> None:
-    html.Div(
-        """<label for="open-file">Open files</label>
-        <input type="file" multiple id="open-file" @change="window.ussim.send($event.target, {for: 'open'})">""",
-        classes="ussim-line",
-        title="Also dropped on the page: MRI, CT, label map (with its table), mask, DICOM, tracked ultrasound, its "
-        "calibration or registration, sheets (.vtp), a scene (.mrb), preset, pose. What they are is recognised by "
-        "their content",
-    )  # fmt: skip
-    html.Div(
-        """<label for="open-folder">Open a folder</label>
-        <input type="file" webkitdirectory id="open-folder"
-        @change="window.ussim.send($event.target, {for: 'open'})">""",
-        classes="ussim-line", title="Of DICOM images; of several series the one is asked",
-    )  # fmt: skip
-    html.Div(
-        f"""<div v-for="line in {NAMES.opened}">{{{{ line }}}}</div>""", id="opened", classes="ussim-opened",
-        raw_attrs=['aria-live="polite"'],
-    )  # fmt: skip
-    v3.VBtn(
-        "Close patient", size="small", classes="mb-1", id="close-patient", click="trigger('close_patient')",
-        title="Nothing of the patient stays on the page, in the scene or in memory; settings stay",
-        disabled=(f"{NAMES.title} === ''",),
-    )  # fmt: skip
-
-
-def _control(control: Control, panel: BrowserPanel) -> None:
-    name, kind, low, high = control.widget, control.kind, control.range.low, control.range.high
-    key = value_of(name)
-    disabled = f"{NAMES.panel.can}.{name} === false"
-    if kind == "slider":
-        # Values of a loaded preset can exceed the slider's range.
-        _slider(
-            key, name, control.label, control.tip, f"Math.min({low}, {key} ?? 0)", f"Math.max({high}, {key} ?? 0)",
-            control.range.step, control.unit, control.decimals, (panel.set, f"['{name}', $event]"),
-        )  # fmt: skip
-    elif kind in ("number", "text"):
-        unit = f" [{control.unit}]" if control.unit else ""
-        value = "Number($event.target.value)" if kind == "number" else "$event.target.value"
-        shown = f"{key} === null ? '' : +Number({key}).toFixed({control.decimals})" if kind == "number" else key
-        limits = f'min="{low:.10g}" max="{high:.10g}" step="{control.range.step:g}"'
-        limits = limits if kind == "number" else ""
-        none_at = control.range.none_at
-        if kind == "number" and none_at is not None:  # an empty field, and not a number that means it
-            limits += ' placeholder="none"'
-            shown = f"{key} === null || {key} <= {none_at:.10g} ? '' : +Number({key}).toFixed({control.decimals})"
-            value = "$event.target.value === '' ? null : Number($event.target.value)"
-        html.Div(
-            f"""<label for="{name}">{escape(control.label)}{unit}</label>
-            <input type="{kind}" id="{name}" {limits}
-            :value="{shown}" :disabled="{key} === null" @change="trigger('set', ['{name}', {value}])">""",
-            classes="ussim-line", title=control.tip,
-        )  # fmt: skip
-    elif kind == "tick":
-        with html.Div(title=control.tip):  # a title of the check box would not apply to its label
-            v3.VCheckbox(
-                label=control.label, model_value=(key,), density="compact", hide_details=True, id=name,
-                update_modelValue=(panel.set, f"['{name}', $event]"), disabled=(disabled,),
-            )  # fmt: skip
-    elif kind in ("choice", "node"):
-        if kind == "node":  # an HTML option cannot be null: "" is no node
-            items = f"{NAMES.panel.nodes}.{name} ?? []"
-            options = f"""<option v-for="item in ({items})" :value="item.value ?? ''">{{{{ item.title }}}}
-            </option>"""
-        else:
-            options = f"""<option v-for="item in {NAMES.panel.choices}.{name}">{{{{ item }}}}</option>"""
-        html.Div(
-            f"""<label for="{name}">{escape(control.label)}</label>
-            <select id="{name}" :value="{key} ?? ''" aria-label="{escape(control.label or control.tip)}"
-            @change="trigger('set', ['{name}', $event.target.value])">{options}</select>""",
-            classes="ussim-line", title=control.tip,
-        )  # fmt: skip
-    elif kind == "button":
-        v3.VBtn(
-            control.label, size="small", classes="ma-1", id=name,
-            click=_IN_PAGE.get(name) or (panel.press, f"['{name}']"), disabled=(disabled,),
-            title=(f"{NAMES.panel.tips}.{name} ?? `{control.tip}`",),
-        )  # fmt: skip
-    elif kind == "words":
-        html.Div(f"{{{{ {key} }}}}", id=name, style="white-space: pre-line; font-size: 12px", title=control.tip)
-    elif kind == "table":
-        _tissue_table(control)
-    else:
-        html.Div(
-            f"""<div style="font-size: 12px">{control.label}</div><div class="ussim-free" id="{name}">
-            <label v-for="entry in {NAMES.fit.free}" style="display: block"><input type="checkbox" :checked="entry.on"
-            :aria-label="entry.label" @change="trigger('set_free', [entry.name, $event.target.checked])">
-            {{{{ entry.label }}}}</label></div>""",
-            title=control.tip,
-        )
-
-
-def _slider(
-    key: str, name: str, label: str, tip: str, minimum: str, maximum: str, step: float, unit: str, decimals: int,
-    event: str | tuple[Callable[..., object], str],
-) -> None:  # fmt: skip
-    """A slider with its value beside it; `key`, `minimum` and `maximum` are JavaScript expressions."""
-    with html.Div(classes="ussim-slider", title=tip):
-        html.Div(label)
-        v3.VSlider(
-            model_value=(f"{key} ?? {minimum}",), min=(minimum,), max=(maximum,), step=step, density="compact",
-            name=label, hide_details=True, thumb_size=12, track_size=2, disabled=(f"{key} === null",),
-            id=f"slider-{name}", update_modelValue=event,
-        )  # fmt: skip
-        html.Div(f"{{{{ {key} === null ? '' : Number({key}).toFixed({decimals}) }}}} {unit}", classes="value")
-
-
-def _tissue_table(control: Control) -> None:
-    heads = "".join(f'<th title="{tip}">{head}</th>' for _, head, tip in TISSUE_COLUMNS)
-    names = ", ".join(f"'{parameter}'" for parameter, _, _ in TISSUE_COLUMNS)
-    html.Div(
-        f"""<table class="ussim-table" id="{control.widget}"><tr><th>Tissue</th>{heads}</tr>
-        <tr v-for="row in {NAMES.panel.tissues}" :class="{{chosen: row.name === {NAMES.panel.chosen_tissue}}}"
-        @click="{NAMES.panel.chosen_tissue} = row.name">
-        <td>{{{{ row.name }}}}</td>
-        <td v-for="(value, n) in row.values"><input :value="value" :title="row.sources[n]"
-        :aria-label="row.name + ' ' + [{names}][n]"
-        @change="trigger('set_tissue', [row.name, [{names}][n], $event.target.value])"></td></tr></table>""",
-        title=control.tip,
+def _banner() -> str:
+    image = NAMES.image
+    saved = _COMPOSED | {kind.strip("."): (f"save('{kind}')", words) for kind, words in _FILES.items()}
+    saves = "".join(
+        f"""<button class="ussim-item" id="save-{name}" @click="window.ussim.{script}">{words}</button>"""
+        for name, (script, words) in saved.items()
     )
-
-
-def _pose_sliders(panel: BrowserPanel) -> None:
-    v3.VDivider(classes="my-1")
-    for slider in POSE_SLIDERS:
-        _slider(
-            f"({NAMES.pose}?.{slider.name} ?? null)", f"pose-{slider.name}", slider.label, slider.tip,
-            str(slider.minimum), str(slider.maximum), slider.step, slider.unit, 1,
-            f"trigger('set_pose', ['{slider.name}', $event])",
-        )  # fmt: skip
-    v3.VCheckbox(
-        label="Keep the probe along the surface normal", v_model=(NAMES.upright,), density="compact", hide_details=True,
-        title="While it slides; otherwise it keeps its angles to the normal", id="upright",
-    )  # fmt: skip
-    v3.VBtn(
-        "Place at craniotomy", size="small", classes="ma-1", id="place", click=(panel.press, "['placeButton']"),
-        disabled=(f"{NAMES.panel.can}.placeButton === false",),
-        title="Coronal view through a parasagittal craniotomy, or into the opening, aimed at a tumour below it",
-    )  # fmt: skip
-    v3.VBtn(
-        "Align with normal", size="small", classes="ma-1", click="trigger('key', ['Home', false])", id="stand-upright"
-    )
-
-
-def _cost_curve() -> None:
-    with html.Div(v_if=f"{NAMES.fit.curve}.length > 1", id="cost-curve"):
-        v3.VSparkline(
-            model_value=(NAMES.fit.curve,), color="orange", line_width=1.5, padding=4, height=70, smooth=False,
-            fill=False,
-        )  # fmt: skip
-        html.Div(f"{{{{ {NAMES.fit.costs} }}}}", classes="text-caption")
-
-
-# ---- middle ----------------------------------------------------------------------------------------------------------
-
-
-def _tools() -> None:
-    live = value_of("liveCheckBox")
-    with html.Div(classes="ussim-tool"):
-        with v3.VBtn(
-            icon=True, size="small", variant="text", id="live",
-            title="Live or frozen", raw_attrs=['aria-label="Live"', f':aria-pressed="{live}"'],
-            disabled=(f"{NAMES.panel.can}.liveCheckBox === false",),
-            click=f"trigger('set', ['liveCheckBox', !{live}])", color=(f"{live} ? 'success' : undefined",),
-        ):  # fmt: skip
-            v3.VIcon(icon=(f"{live} ? 'mdi-play-circle' : 'mdi-snowflake'",))
-        v3.VSpacer()
-        html.Div("Blend", classes="text-caption")
-        v3.VSlider(
-            v_model=(NAMES.views.blend,), min=0, max=1, step=0.05, density="compact", hide_details=True, thumb_size=12,
-            track_size=2, style="max-width: 90px; min-width: 60px", id="blend", name="Blend of image and MRI",
-        )  # fmt: skip
+    views = NAMES.views
+    toggles = "".join(
+        f"""<button class="ussim-icon" id="{name}" title="{tip}" aria-label="{tip}" :aria-pressed="!!{state}"
+        @click="{state} = !{state}"><i class="mdi mdi-{icon}"></i></button>"""
         for state, name, icon, tip in (
-            (NAMES.views.show_tissues, "show-tissues", "mdi-palette", "Colour the tissues in the slice views"),
-            (NAMES.views.follow, "follow", "mdi-crosshairs-gps", "Let the slice views follow the probe"),
-            (NAMES.show_latency, "show-latency", "mdi-timer-outline", "Measure images per second and latency"),
-        ):
-            with v3.VBtn(
-                icon=True, size="small", variant="text", click=f"{state} = !{state}", id=name,
-                title=tip, raw_attrs=[f'aria-label="{tip}"', f':aria-pressed="{state}"'],
-                color=(f"{state} ? 'primary' : undefined",),
-            ):  # fmt: skip
-                v3.VIcon(icon)
-        with v3.VMenu():
-            with v3.Template(v_slot_activator="{ props }"):
-                v3.VBtn("Export", size="small", v_bind="props", prepend_icon="mdi-download", id="export")
-            with v3.VList(density="compact"):
-                for kind, words in _EXPORTS.items():
-                    v3.VListItem(title=words, click=f"window.ussim.save('{kind}')", id=f"export-{kind.strip('.')}")
+            (views.show_tissues, "show-tissues", "palette", "Colour the tissues in the slice views"),
+            (views.follow, "follow", "crosshairs-gps", "Let the slice views follow the probe"),
+            (NAMES.show_latency, "show-latency", "timer-outline", "Measure images per second and latency"),
+        )
+    )
+    return f"""
+    <button class="ussim-icon" id="menu" title="Patient, lesions, tissues, fit and all settings (F2)"
+      aria-label="Settings" @click="window.ussim.toggle('drawer-open')"><i class="mdi mdi-menu"></i></button>
+    <b id="title">{{{{ {NAMES.title} || '{_PROGRAM}' }}}}</b>
+    <span id="image-caption">{{{{ {image.patient} && {image.patient} !== {NAMES.title} ? {image.patient} + ' · ' : ''
+      }}}}{{{{ {image.probe} }}}} {{{{ {image.frequency} }}}} {{{{ {image.time} ? '· ' + {image.time} : '' }}}}</span>
+    <span class="ussim-space"></span>{toggles}
+    <label class="ussim-blend">Blend <input type="range" id="blend" min="0" max="1" step="0.05" :value="{views.blend}"
+      aria-label="Blend of image and MRI in the slice views" @input="{views.blend} = Number($event.target.value)"></label>
+    <span v-if="{image.status}" class="ussim-status" :class="{image.status}.toLowerCase()" id="image-status"
+      role="status">{{{{ {image.status} }}}}</span>
+    <button class="ussim-icon" id="fold" title="Hide or show the views" aria-label="Fold the views"
+      @click="window.ussim.arrange('fold')"><i class="mdi mdi-dock-right"></i></button>
+    <details class="ussim-menu" id="save"><summary>Save</summary><div>{saves}</div></details>
+    <button class="ussim-button" id="help-button" title="Keys and gestures (F1)"
+      @click="window.ussim.help()">? F1</button>"""
 
 
-def _screens(keys: tuple[str, ...]) -> None:
+def _advice() -> str:
+    advice, image = NAMES.advice, NAMES.image
+    is_outdated = f"{image.status} === 'OUTDATED'"
+    return f"""<div class="ussim-advice" id="advice" role="status" v-if="{is_outdated} || {advice.text}">
+      <span>{{{{ {is_outdated} ? 'The image is outdated: ' + {image.differs} + ' changed' : {advice.text} }}}}</span>
+      <button v-if="{is_outdated} || {advice.remedy}" class="ussim-button" id="remedy"
+      @click="trigger('remedy', [{is_outdated}])">{{{{ {is_outdated} ? 'Simulate' : {advice.remedy} }}}}</button></div>"""
+
+
+# ---- beside the image ------------------------------------------------------------------------------------------------
+
+
+def _probes() -> str:
+    """A button with the imaged field of each probe."""
+    chosen = value_of("probePresetComboBox")
+    return "".join(
+        f"""<button class="ussim-probe" id="probe-{name}" :aria-pressed="{chosen} === '{shown}'"
+        title="{shown}, {PROBES[name].frequency_mhz:g} MHz" @click="trigger('set', ['probePresetComboBox', '{shown}'])">
+        {_field_picture(PROBES[name])}{shown}<small>{PROBES[name].frequency_mhz:g} MHz</small></button>"""
+        for shown, name in SHOWN_PROBES.items()
+    )
+
+
+def _field_picture(probe: Probe) -> str:
+    """An outline of the imaged field, of all probes in the same box."""
+    outline = probe.outline_mm(9)[:, :2]
+    low, size = outline.min(axis=0), np.ptp(outline, axis=0)
+    scaled = (outline - low - [0.5 * size[0], 0.0]) * min(38.0 / size[0], 26.0 / size[1]) + [20.0, 1.0]
+    points = " ".join(f"{x:.1f},{y:.1f}" for x, y in scaled)
+    return f'<svg viewBox="0 0 40 28" aria-hidden="true"><polygon points="{points}"/></svg>'
+
+
+def _console(controls: dict[str, Control]) -> str:
+    live, image = value_of("liveCheckBox"), NAMES.image
+    tools = "".join(
+        f"""<button class="ussim-item" id="tool-{name}" title="{tip}" @click="window.ussim.tool('{name}')">{label}
+        <small>{tip}</small></button>"""
+        for name, label, tip in _TOOLS
+    )
+    beside = "".join(slider_html(controls[name]) for name in _BESIDE)
+    tgc = "".join(upright_html(controls[name]) for name in _TGC)
+    names = ",".join(_TGC)
+    return f"""<div class="ussim-buttons">
+    <button class="ussim-button wide" id="live" :aria-pressed="!{live}" title="Freeze or live (space, F)"
+      :disabled="{NAMES.panel.can}.liveCheckBox === false" @click="trigger('freeze')">
+      {{{{ {live} ? 'Freeze' : 'Live' }}}}</button>
+    <details class="ussim-menu" id="measure"><summary>Measure</summary><div>{tools}</div></details>
+    <button class="ussim-button" id="compare" title="Real ultrasound beside, blinking or subtracted (C)"
+      :disabled="{NAMES.sequence.length} === 0" @click="trigger('compare_next')">Compare</button></div>
+    {beside}
+    <div class="ussim-tgc" role="group" aria-label="TGC at eight depths">{tgc}
+      <input type="range" class="ussim-upright master" id="tgc-master" min="-20" max="20" step="1" value="0"
+      aria-label="TGC master" title="All eight together" data-names="{names}"
+      @input="window.ussim.tgcMaster($event.target)" @change="$event.target.value = 0"></div>
+    {"".join(control_html(controls[name]) for name in _BELOW_TGC)}
+    <div class="ussim-buttons">
+    <button class="ussim-button" id="dual" title="Keep this image beside the next ones"
+      @click="window.ussim.dual()" :disabled="!{image.status}">Dual</button>
+    <button class="ussim-button" id="fit-view" title="Whole image: no zoom, not moved (0)"
+      @click="window.ussim.fitView()">Whole</button>
+    <button class="ussim-button" id="flip" title="Left and right exchanged" @click="window.ussim.flip('x')">Flip ⇄
+      </button>
+    <button class="ussim-button" id="flip-depth" title="Upside down" @click="window.ussim.flip('y')">Flip ⇅</button>
+    <button class="ussim-button wide" id="place" :title="{NAMES.panel.tips}.placeButton"
+      :disabled="{NAMES.panel.can}.placeButton === false" @click="trigger('press', ['placeButton'])">
+      Place at craniotomy</button></div>"""
+
+
+# ---- the image -------------------------------------------------------------------------------------------------------
+
+
+def _screens(keys: tuple[str, ...]) -> str:
     there, mode = f"{NAMES.sequence.length} > 0", NAMES.sequence.comparison
     beside, blink, over = (
         f"{mode} === '{chosen.value}'"
         for chosen in (ComparisonMode.BESIDE, ComparisonMode.BLINK, ComparisonMode.DIFFERENCE)
     )
-    simulated = f"{mode} === '{ComparisonMode.SIMULATED.value}'"
-    with html.Div(classes=(f"{{'ussim-screens': true, 'ussim-stacked': {there} && {beside}}}",)):
-        with html.Div(classes="ussim-screen"):
-            simulated_too = f"<span>{{{{ {there} && !({simulated}) ? 'Simulated, ' : '' }}}}</span>"
-            html.Div(f'{simulated_too}<span id="image-caption"></span>', classes="ussim-caption")
-            html.Div(
-                FROZEN, v_show=NAMES.is_frozen, classes="ussim-frozen", id="frozen",
-                title="The image does not follow the probe: it stays where it was taken",
-            )  # fmt: skip
-            with html.Div(classes="ussim-frame", id="ultrasound"):
-                html.Div(f'<canvas data-stream="simulated" data-keys="{escape(" ".join(keys))}"></canvas>')
-                html.Div(
-                    f"""<canvas data-stream="real-over" :class="{{blink: {blink}, difference: {over}}}"></canvas>""",
-                    v_show=f"{there} && ({blink} || {over})",
-                )
-                html.Div((_STATIC / "overlay.html").read_text())
-        with html.Div(classes="ussim-screen", v_show=f"{there} && {beside}"):
-            html.Div(f"Real, {{{{ {NAMES.sequence.name} }}}}", classes="ussim-caption")
-            with html.Div(classes="ussim-frame", id="real"):
-                html.Div('<canvas data-stream="real"></canvas>')
-
-
-def _player() -> None:
-    number, length = NAMES.sequence.number, NAMES.sequence.length
-    with html.Div(classes="ussim-bar", v_if=f"{length} > 0"):
-        with v3.VBtnToggle(
-            v_model=(NAMES.sequence.comparison,), density="compact", mandatory=True, id="comparison", divided=True
-        ):
-            for mode in ComparisonMode:
-                v3.VBtn(mode.value, value=mode.value, size="small", id=f"compare-{mode.value.lower()}")
-        html.Div(
-            f"{{{{ {NAMES.sequence.similarity} }}}}", classes="ussim-similarity", id="similarity",
-            title="Cost of the paper for the simulated and the real image; 0 if they are equal",
-        )  # fmt: skip
-    with html.Div(classes="ussim-bar", v_if=f"{length} > 0", id="player"):
-        with v3.VBtn(
-            icon=True, size="x-small", variant="text", click="trigger('play')", id="play",
-            raw_attrs=[f""":aria-label="{NAMES.sequence.playing} ? 'Stop the sequence' : 'Play the sequence'\""""],
-        ):  # fmt: skip
-            v3.VIcon(icon=(f"{NAMES.sequence.playing} ? 'mdi-pause' : 'mdi-play'",))
-        v3.VSlider(
-            model_value=(number,), min=0, max=(f"Math.max({length} - 1, 1)",), step=1, density="compact",
-            hide_details=True, thumb_size=12, track_size=2, id="sequence-slider", name="Image of the sequence",
-            update_modelValue="trigger('show_number', [$event])",
-        )  # fmt: skip
-        html.Div(f"{{{{ {number} + 1 }}}} of {{{{ {length} }}}}", style="white-space: nowrap", id="sequence-text")
-    simulated = NAMES.simulated
-    with html.Div(classes="ussim-bar", v_if=f"{simulated.length} > 0", id="simulated-player"):
-        with v3.VBtn(
-            icon=True, size="x-small", variant="text", click="trigger('play_simulated')", id="play-simulated",
-            title="Images of Simulate sequence; live images pause",
-            raw_attrs=[f""":aria-label="({simulated.playing} ? 'Stop' : 'Play') + ' the simulated sequence'\""""],
-        ):  # fmt: skip
-            v3.VIcon(icon=(f"{simulated.playing} ? 'mdi-pause' : 'mdi-play'",))
-        v3.VSlider(
-            model_value=(simulated.number,), min=0, max=(f"Math.max({simulated.length} - 1, 1)",), step=1,
-            density="compact", hide_details=True, thumb_size=12, track_size=2, id="simulated-slider",
-            name="Image of the simulated sequence", update_modelValue="trigger('show_simulated', [$event])",
-        )  # fmt: skip
-        html.Div(
-            f"Simulated {{{{ {simulated.number} + 1 }}}} of {{{{ {simulated.length} }}}}", style="white-space: nowrap",
-            id="simulated-text",
-        )  # fmt: skip
-
-
-def _status(panel: BrowserPanel) -> None:
-    messages = NAMES.messages
-    with html.Div(classes="ussim-bar"):
-        with html.Div(
-            v_if=messages.progress_title, style="display: flex; gap: 8px; align-items: center", id="progress"
-        ):
-            # Readers of files tell no share of what they have done
-            percent = messages.progress_percent
-            html.Span(f"{{{{ {messages.progress_title} }}}} {{{{ {percent} ? {percent} + ' %' : '…' }}}}")
-            v3.VProgressLinear(
-                model_value=(percent,), indeterminate=(f"{percent} === 0",), color="orange", style="width: 140px"
-            )
-            v3.VBtn("Cancel", size="x-small", click=(panel.cancel, "[]"), id="cancel")
-        html.Div(
-            """<span id="upload" hidden><span id="upload-text"></span>
-            <button id="upload-cancel" class="ussim-plain">Cancel</button></span>"""
+    image = NAMES.image
+    values = {"Depth": image.depth, "Focus": image.focus, "Gain": image.gain, "DR": image.dynamic_range}
+    lines = "".join(f'<div v-if="{value}">{words} {{{{ {value} }}}}</div>' for words, value in values.items())
+    outline = f"""<svg v-if="{NAMES.sequence.mask} && {mode} !== '{ComparisonMode.SIMULATED.value}'" class="ussim-mask"
+        :viewBox="{NAMES.sequence.box}" preserveAspectRatio="none"><path :d="{NAMES.sequence.mask}"/></svg>"""
+    frame = f'<div class="ussim-frame">{outline}{cross_hair(IMAGE)}</div>'
+    screen = """<div class="ussim-screen" data-screen="{name}" {more}>{canvas}<svg class="ussim-overlay"
+        role="img" aria-label="Ruler and measurements of the {name} image"></svg>{frame}{words}</div>"""
+    return (
+        screen.format(
+            name="simulated", more="", frame=frame,
+            canvas=f"""<canvas data-stream="simulated" data-keys="{escape(" ".join(keys))}"></canvas>
+            <canvas data-stream="real-over" v-show="{there} && ({blink} || {over})"
+            :class="{{blink: {blink}, difference: {over}}}"></canvas>""",
+            words=f'<div class="ussim-corner" id="image-values">{lines}</div>',
         )
-        html.Span(f"{{{{ {messages.status} }}}}", id="status")
-        v3.VSpacer()
-        html.Span(f"{{{{ {messages.tracker} }}}}", v_if=messages.tracker, id="tracker")
-        html.Span(v_if=NAMES.show_latency, id="ussim-latency")  # workstation.js measures while it exists
+        + screen.format(
+            name="real", frame=frame, more=f'v-show="{there} && {beside}"', canvas='<canvas data-stream="real"></canvas>',
+            words=f'<div class="ussim-corner">Real, {{{{ {NAMES.sequence.name} }}}}</div>',
+        )
+        + screen.format(
+            name="best", frame="", more=f'v-show="{NAMES.fit.best}"', canvas='<canvas data-stream="best"></canvas>',
+            words=f'<div class="ussim-corner" id="best-caption">{{{{ {NAMES.fit.best} }}}}</div>',
+        )
+        + screen.format(
+            name="kept", frame="", more="hidden", canvas='<canvas data-stream="kept"></canvas>',
+            words='<div class="ussim-corner" id="kept-caption"></div>',
+        )
+    )  # fmt: skip
+
+
+def _player() -> str:
+    """The bars of the real images and of the cine."""
+    sequence, cine = NAMES.sequence, NAMES.cine
+    modes = "".join(
+        f"""<button class="ussim-button" id="compare-{mode.value.lower()}" :aria-pressed="{sequence.comparison} ===
+        '{mode.value}'" @click="{sequence.comparison} = '{mode.value}'">{mode.value}</button>"""
+        for mode in ComparisonMode
+    )
+    return f"""<div class="ussim-bar" id="player" v-if="{sequence.length} > 0">
+      <button class="ussim-icon" id="play" @click="trigger('play')"
+      :aria-label="{sequence.playing} ? 'Stop the sequence' : 'Play the sequence'">
+      <i class="mdi" :class="{sequence.playing} ? 'mdi-pause' : 'mdi-play'"></i></button>
+      <input type="range" id="sequence-slider" min="0" :max="Math.max({sequence.length} - 1, 1)" step="1"
+      :value="{sequence.number}" aria-label="Image of the sequence"
+      @input="trigger('show_number', [Number($event.target.value)])">
+      <span id="sequence-text">Real {{{{ {sequence.name} }}}} ({{{{ {sequence.numbers} }}}})</span>
+      <span role="group" aria-label="Comparison" id="comparison">{modes}</span>
+      <span id="similarity" title="Cost of the paper for the simulated and the real image; 0 if they are equal">
+      {{{{ {sequence.similarity} }}}}</span></div>
+    <div class="ussim-bar" id="cine" v-if="{cine.length} > 1 && {NAMES.image.status} === 'FROZEN'">
+      <button class="ussim-icon" id="cine-play" :aria-label="{cine.playing} ? 'Stop the cine' : 'Play the cine'"
+      @click="trigger('cine_play')"><i class="mdi" :class="{cine.playing} ? 'mdi-pause' : 'mdi-play'"></i></button>
+      <input type="range" id="cine-slider" min="0" :max="{cine.length} - 1" step="1" :value="{cine.index}"
+      aria-label="Image of the cine" @input="trigger('cine_show', [Number($event.target.value)])">
+      <span id="cine-text">{{{{ {cine.source} === 'live' ? {cine.index} + 1 + ' of ' + {cine.length} : 'Simulated image ' +
+      {cine.index} + ' (0 to ' + ({cine.length} - 1) + ')' }}}}, {{{{ {cine.seconds}.toFixed(1) }}}} s
+      </span>
+      <button class="ussim-button" id="cine-from" title="The cine begins here"
+      @click="trigger('cine_trim', [{cine.index}, {cine.last}])">[ From</button>
+      <button class="ussim-button" id="cine-to" title="The cine ends here"
+      @click="trigger('cine_trim', [{cine.first}, {cine.index}])">To ]</button>
+      <button class="ussim-button" id="cine-source" v-if="{cine.sequence_length} > 0"
+      title="The last seconds, or the images of Simulate sequence"
+      @click="trigger('cine_source', [{cine.source} === 'live' ? 'sequence' : 'live'])">
+      {{{{ {cine.source} === 'live' ? 'Simulated sequence' : 'Last seconds' }}}}</button></div>"""
+
+
+def _foot() -> str:
+    messages, percent = NAMES.messages, NAMES.messages.progress_percent
+    return f"""<span v-if="{messages.progress_title}" id="progress">{{{{ {messages.progress_title} }}}}
+      {{{{ {percent} ? {percent} + ' %' : '…' }}}} {{{{ {messages.progress_s} }}}} s <progress :value="{percent} || undefined" max="100"
+      aria-label="Progress"></progress> <button class="ussim-button" id="cancel" @click="trigger('cancel')">Cancel
+      </button></span>
+      <span id="upload" hidden><span id="upload-text"></span>
+      <button id="upload-cancel" class="ussim-button">Cancel</button></span>
+      <span id="status">{{{{ {messages.status} }}}}</span>
+      <span class="ussim-space"></span>
+      <span v-if="{messages.tracker}" id="tracker">{{{{ {messages.tracker} }}}}</span>
+      <span v-if="{NAMES.show_latency}" id="ussim-latency"></span>
+      <span id="under-mouse">{{{{ {NAMES.views.under_mouse} }}}}</span>"""
+
+
+# ---- the drawer ------------------------------------------------------------------------------------------------------
+
+
+def _drawer(panel: BrowserPanel) -> None:
+    for section in panel.sections:
+        is_open = "open" if section.title == "Patient" else ""
+        name = section.title.replace(" ", "-").lower()
+        with html.Details(id=f"section-{name}", raw_attrs=[is_open] if is_open else []):
+            html.Summary(section.title)
+            if section.title == "Patient":
+                html.Div(_open_file())
+            if section.title == SECTION:
+                registration()
+            shown = [one for one in section.controls if one.widget not in {*NOT_SHOWN, *_BESIDE, *_TGC, *_BELOW_TGC}]
+            html.Div("".join(map(control_html, shown)))
+            if section.title == "Probe":
+                html.Div("".join(map(_pose_slider, POSE_SLIDERS)) + _upright())
+                pose_numbers()
+            if section.title.startswith("Fit"):
+                html.Div(_cost_curve())
+
+
+def _open_file() -> str:
+    tip = (
+        "Also dropped on the page: MRI, CT, label map (with its table), mask, DICOM, tracked ultrasound, its calibration "
+        "or registration, sheets (.vtp), a scene (.mrb), preset, pose. What they are is recognised by their content"
+    )
+    sent = "window.ussim.send($event.target, {for: 'open'})"
+    return f"""<div class="ussim-line" title="{tip}"><label for="open-file">Open files</label>
+      <input type="file" multiple id="open-file" @change="{sent}"></div>
+      <div class="ussim-line" title="Of DICOM images; of several series the one is asked"><label for="open-folder">
+      Open a folder</label><input type="file" webkitdirectory id="open-folder" @change="{sent}"></div>
+      <div id="opened" class="ussim-opened" aria-live="polite">
+      <div v-for="line in {NAMES.opened}">{{{{ line }}}}</div></div>
+      <button class="ussim-button" id="close-patient" @click="trigger('close_patient')" :disabled="{NAMES.title} === ''"
+      title="Nothing of the patient stays on the page, in the scene or in memory; settings stay">Close patient</button>"""
+
+
+def _pose_slider(slider: PoseSlider) -> str:
+    return range_html(
+        f"({NAMES.pose}?.{slider.name} ?? null)", f"pose-{slider.name}", slider.label, slider.tip, slider.minimum,
+        slider.maximum, slider.step, slider.unit, 1,
+        f"trigger('set_pose', ['{slider.name}', Number($event.target.value)])",
+    )  # fmt: skip
+
+
+def _upright() -> str:
+    return f"""<label class="ussim-tick" title="While it slides; otherwise it keeps its angles to the normal">
+      <input type="checkbox" id="upright" :checked="{NAMES.upright}" @change="{NAMES.upright} = $event.target.checked">
+      Keep the probe along the surface normal</label>"""
+
+
+def _cost_curve() -> str:
+    curve = NAMES.fit.curve
+    return f"""<div v-if="{curve}.length > 1" id="cost-curve"><v-sparkline :model-value="{curve}" color="orange"
+      :line-width="1.5" :padding="4" :height="70" :smooth="false"></v-sparkline>{{{{ {NAMES.fit.costs} }}}}</div>"""
 
 
 def _messages() -> None:
-    with html.Div(style="position: fixed; bottom: 44px; left: 400px; z-index: 3000; max-width: 60vw"):
+    with html.Div(classes="ussim-messages"):
         v3.VAlert(
             "{{ message }}", v_for=f"(message, n) in {NAMES.messages.errors}", key=("n",), type="error",
             density="compact", closable=True, classes="mb-1 ussim-error",

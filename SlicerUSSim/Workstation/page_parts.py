@@ -1,4 +1,4 @@
-"""Parts of the page: questions, what is offered, the pose of the probe, and registration of tracked ultrasound."""
+"""Parts of the page: questions, what is offered, keys, pose of the probe, registration of tracked ultrasound."""
 
 from __future__ import annotations
 
@@ -17,6 +17,21 @@ _MATRIX_TIP = "4x4 matrix from the probe to RAS by rows; columns: lateral, depth
 #: What the formats are for
 _FORMATS = {".json": "for ussim --pose", ".tfm": "ITK, 3D Slicer", ".h5": "ITK, 3D Slicer", ".mat": "ITK",
             ".txt": "16 numbers"}  # fmt: skip
+_KEYS = (
+    ("Space, F", "freeze, live"), ("wheel, ← →, when frozen", "image by image through the last seconds"),
+    ("arrows", "slide the probe; with Shift five times as far"), ("A D, W S, Q E", "rock, tilt, rotate the probe"),
+    ("+ -, Home", "lift or press, align with the surface"), ("double click", "aim at this point of image or slice"),
+    ("drag the probe", "slide it; Shift rocks and tilts, Ctrl rotates"), ("M, T", "measure a distance, write a text"),
+    ("Delete, Escape", "remove the last measurement, leave a tool"), ("C", "compare with real ultrasound"),
+    ("Ctrl + wheel, drag with the middle button, 0", "zoom and move the image, whole image"),
+    ("F1, F2", "this help, settings"),
+)  # fmt: skip
+#: The dialog of keys and gestures
+HELP = (
+    '<dialog id="help" class="ussim-help" aria-label="Keys and gestures"><h2>Keys and gestures</h2><dl>'
+    + "".join(f"<dt>{keys}</dt><dd>{does}</dd>" for keys, does in _KEYS)
+    + '</dl><form method="dialog"><button class="ussim-button">Close</button></form></dialog>'
+)
 
 
 def question_dialog() -> None:
@@ -62,6 +77,10 @@ def pose_numbers() -> None:
     """Fields for the pose, and a button to save it."""
     is_none = f"{NAMES.pose_numbers} === ''"
     html.Div(
+        """<button class="ussim-button" id="stand-upright" @click="trigger('key', ['Home', false])">
+        Align with normal</button>"""
+    )
+    html.Div(
         f"""<label for="pose-numbers">Pose</label>
         <input type="text" id="pose-numbers" :value="{NAMES.pose_numbers}" :disabled="{is_none}"
         @change="trigger('type_pose', [$event.target.value])">""",
@@ -78,11 +97,11 @@ def pose_numbers() -> None:
         f"""<label for="pose-format">Save pose as</label><select id="pose-format">{options}</select>""",
         classes="ussim-line", title="Format of the file",
     )  # fmt: skip
-    v3.VBtn(
-        "Save pose", size="small", classes="ma-1", id="save-pose", disabled=(is_none,),
-        click="window.ussim.save('pose' + window.document.getElementById('pose-format').value)",
-        title="The present pose of the probe as a file",
-    )  # fmt: skip
+    saved = "window.ussim.save('pose' + window.document.getElementById('pose-format').value)"
+    html.Div(
+        f"""<button class="ussim-button" id="save-pose" :disabled="{is_none}" @click="{saved}"
+        title="The present pose of the probe as a file">Save pose</button>"""
+    )
 
 
 def registration() -> None:

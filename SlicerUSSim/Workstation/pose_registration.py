@@ -77,6 +77,11 @@ class Registration:
         return Recording(sequence, Path(path).name.split(".")[0])
 
     @property
+    def is_waiting(self) -> bool:
+        """Whether there is a recording whose place in the patient is not known yet."""
+        return self.recording is not None and self._logic.parameters.real is None
+
+    @property
     def nodes(self) -> list[Any]:
         """The nodes of the recording in the scene."""
         return list(self._nodes)
@@ -94,8 +99,6 @@ class Registration:
         self._forget_next()
         self._from = {_CALIBRATION: calibrated_by, _REGISTRATION: source if to_ras is not None else ""}
         self._tell()
-        if not replace(recording, sequence=recording.sequence.with_transforms(calibration)).is_calibrated:
-            self._open_section()
 
     def restore(self, record: SequenceRecord) -> None:
         """Use what was kept of a recording, calibrated and in its place; its images are prepared if they can be."""
@@ -176,6 +179,7 @@ class Registration:
         self.recording, self._calibration, self._to_ras = recording, calibration, to_ras
         if made is None:
             self._comparison.drop()
+            self._comparison.view(sequence.images, number)
             self._logic.parameters.real = self._field = None
         else:
             tracked, browser, images, _ = made
@@ -227,11 +231,6 @@ class Registration:
         except SimulationError as error:
             return f"{source}; {error}" if source else str(error)
         return source
-
-    def _open_section(self) -> None:
-        with self._shared.changing() as now:
-            if SECTION not in now.open_sections:
-                now.open_sections = [*now.open_sections, SECTION]
 
 
 def _checked_name(name: str) -> str:

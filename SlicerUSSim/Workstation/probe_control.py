@@ -8,6 +8,7 @@ from dataclasses import fields
 from typing import Any
 
 import numpy as np
+from trame_slicer.views import SliceView
 
 from SlicerUSSim.Logic.base.errors import Cancelled, SimulationError
 from SlicerUSSim.Logic.base.volume import Volume
@@ -41,6 +42,10 @@ class ProbeControl:
         self._about_to_move, self._progress = about_to_move, panel.progress
         self.surface: PatientSurface | None = None
         self._surface_version: object = None
+        #: The labels in the world, and the names of tissue 1, 2, ... of which the surface is
+        self.labelled: tuple[Volume, tuple[str, ...]] | None = None
+        #: Called with the slice view under the mouse, and the point (3,) in the world
+        self.hovered: Callable[[SliceView, np.ndarray], None] = lambda view, point: None
         self._drawn: tuple | None = None
         self._refused = False  # whether the last pose was
         #: Called after the sliders were set to the pose
@@ -53,6 +58,7 @@ class ProbeControl:
             surface=lambda: self.surface,
             upright=lambda: panel.shared.now.upright,
             hold=self._hold,
+            hover=lambda view, point: self.hovered(view, point),
         )
         for view in (views.threed, *views.slices):
             self.hand.attach(view)
@@ -95,11 +101,11 @@ class ProbeControl:
 
     def aim_image(self, across: float, down: float) -> None:
         """Aim at a point of the image, given as fractions of its width and height."""
-        pose = self.pose()
-        left, right, top, bottom = self._logic.preset.probe.image_bounds_mm()
-        if pose is not None:
-            point = [left + across * (right - left), top + down * (bottom - top), 0.0, 1.0]
-            self.hand.aim((pose @ point)[:3])
+        taken = self._logic.taken
+        if taken is not None and self.pose() is not None:
+            rows, columns = taken.image.shape
+            point = [across * columns - 0.5, down * rows - 0.5, 0.0, 1.0]
+            self.hand.aim((taken.image_to_world @ point)[:3])
 
     def look_again(self) -> None:
         """As look, called in a task: a surface that was cancelled is made now."""
@@ -112,7 +118,7 @@ class ProbeControl:
         """Turn the 3D view to the probe."""
         pose = self.pose()
         if pose is not None and self.surface is not None:
-            self._views.look_at_probe(pose, self.surface)
+            self._views.look_at_probe(pose, self.surface, self._logic.preset.probe)
 
     def choose_plane(self, name: str, plane: str) -> None:
         """Choose the plane in which a slice view follows the probe."""
@@ -144,8 +150,9 @@ class ProbeControl:
         if version == self._surface_version:
             return
         self._surface_version = version
-        volume = read_labels(labels, self._logic.preset.tissues).labels
-        placed = Volume(volume.array, node_to_world(labels) @ volume.ijk_to_ras)
+        found = read_labels(labels, self._logic.preset.tissues)
+        placed = Volume(found.labels.array, node_to_world(labels) @ found.labels.ijk_to_ras)
+        self.labelled = placed, found.names
         try:
             with self._progress("Make the surface") as progress:
                 made = self._tasks.doAside(lambda: PatientSurface(placed, progress))
@@ -166,7 +173,7 @@ class ProbeControl:
 
     def forget_patient(self) -> None:
         """Forget the surface of a patient, and show neither patient nor probe nor pose until the next one is there."""
-        self.surface = self._surface_version = self._drawn = None
+        self.surface = self._surface_version = self._drawn = self.labelled = None
         self._views.hide_patient()
         with self._shared.changing() as now:
             now.pose, now.pose_numbers, now.pose_matrix = None, "", ""
@@ -194,9 +201,9 @@ class ProbeControl:
             self.moved()
 
     def _turn_slices(self) -> None:
-        """Turn the slices to the probe while there are no live images, to which ImageFlow turns them."""
+        """Turn the slices to the probe while there is no image, to which ImageFlow turns them."""
         pose = self.pose()
-        if pose is not None and self.surface is not None and not self._logic.isLive:
+        if pose is not None and self.surface is not None and self._logic.taken is None:
             self._views.follow(pose, self._logic.preset.probe)
 
     def _tell_pose(self) -> None:

@@ -15,6 +15,7 @@ from SlicerUSSim.Logic.mrml.parameter_node import preset_texts
 from SlicerUSSim.Logic.mrml.scene_record import ROLES, SceneRecord, put_nodes, put_values
 from SlicerUSSim.Logic.mrml.taken_sequence import FrozenRecord, count_taken, put_taken, read_taken, taken_of
 from SlicerUSSim.Workstation.browser_panel import BrowserPanel
+from SlicerUSSim.Workstation.cine import SEQUENCE
 from SlicerUSSim.Workstation.file_nodes import FileNodes, show_all_tissue
 from SlicerUSSim.Workstation.patient import OpenPatient
 from SlicerUSSim.Workstation.pose_registration import Recording, Registration
@@ -95,8 +96,7 @@ class Scenes:
         self._patient.show_restored(is_placed=pose is not None, frozen=record.frozen)
         if simulated is not None:
             with self._shared.changing() as now:
-                now.simulated.length = count_taken(simulated)
-                now.simulated.number = _place_of(record.frozen, simulated)
+                now.cine.source, now.cine.index = SEQUENCE, _place_of(record.frozen, simulated)
         return refused
 
     def _put_probe(self, pose: np.ndarray) -> None:

@@ -17,11 +17,13 @@ from trame_server.utils.typed_state import TypedState
 
 from SlicerUSSim.Logic.probe.surface import SurfacePose
 
+#: Name of the 3D view, and of the ultrasound image among the views that ViewState.cross marks
+THREED, IMAGE = "ThreeD", "image"
 #: Planes in which a slice view follows the probe: image plane, plane across it, and anatomical planes.
 IN_PLANE, ACROSS = "In plane", "Across"
 PLANES = (IN_PLANE, ACROSS, "Axial", "Coronal", "Sagittal")
 #: Initial planes of the slice views, by Slicer's names of the views.
-SLICE_VIEWS = {"Red": IN_PLANE, "Yellow": ACROSS, "Green": "Axial"}
+SLICE_VIEWS = {"Red": IN_PLANE, "Green": "Axial"}
 
 
 class ComparisonMode(Enum):
@@ -102,9 +104,10 @@ class MessageState:
     errors: list[str] = field(default_factory=list)
     #: One line in the bar below the image
     status: str = ""
-    #: Title of the work under way ("": none), and its progress in percent
+    #: Title of the work under way ("": none), its progress in percent, and how long it has taken, s
     progress_title: str = ""
     progress_percent: int = 0
+    progress_s: int = 0
     #: State of the tracker's connection; "" without a tracker
     tracker: str = ""
 
@@ -121,6 +124,13 @@ class ViewState:
     follow: bool = True
     #: Whether the tissues are coloured
     show_tissues: bool = False
+    #: Tissue, place, MRI and depth of the point under the mouse, one line; "": none
+    under_mouse: str = ""
+    #: That point in every view, by name (IMAGE, THREED, SLICE_VIEWS): shares of its width and height from the upper
+    #: left corner, and mm from the point to the plane of the view
+    cross: dict[str, list[float]] = field(default_factory=dict)
+    #: Sides of the patient at the left, right, upper and lower edge of a slice view: "R", or "RA" if it is oblique
+    letters: dict[str, list[str]] = field(default_factory=dict)
 
 
 @dataclass
@@ -129,9 +139,15 @@ class SequenceState:
 
     #: Number of images; 0 without a sequence
     length: int = 0
-    #: Index of the displayed image, from 0, and its name
+    #: Index of the displayed image among these, from 0; its name, which has its number in the file, and those of all
     number: int = 0
     name: str = ""
+    numbers: str = ""
+    #: Whether their place in the patient is known; else they can only be viewed
+    is_placed: bool = True
+    #: Outline of what is compared: viewBox and path (mm of the probe frame) of an SVG over an image; "" without
+    box: str = ""
+    mask: str = ""
     playing: bool = False
     comparison: ComparisonMode = ComparisonMode.BESIDE
     #: Cost between simulated and real image, as text
@@ -139,13 +155,47 @@ class SequenceState:
 
 
 @dataclass
-class SimulatedState:
-    """The sequence of simulated images."""
+class ImageState:
+    """The shown image, from its record (TakenImage) alone, and whether the record is that of now."""
 
-    #: Number of images; 0 without a sequence
+    #: "LIVE", "OUTDATED" or "FROZEN"; "" without an image
+    status: str = ""
+    #: What of the record is not as it is now, as "pose, tissues"; "" if nothing
+    differs: str = ""
+    #: Texts for a banner, with units
+    patient: str = ""
+    time: str = ""
+    probe: str = ""
+    frequency: str = ""
+    depth: str = ""
+    focus: str = ""
+    gain: str = ""
+    dynamic_range: str = ""
+
+
+@dataclass
+class AdviceState:
+    """What a user should know or do first, and what its button does ("": no button)."""
+
+    text: str = ""
+    remedy: str = ""
+
+
+@dataclass
+class CineState:
+    """The cine: the last seconds of live images, or the images of Simulate sequence."""
+
+    #: "live" or "sequence", and how many images Simulate sequence has made
+    source: str = "live"
+    sequence_length: int = 0
+    #: Number of images
     length: int = 0
-    #: Index of that which is shown, or was last
-    number: int = 0
+    #: Index of the shown image, from 0, and its time after the first image, s
+    index: int = 0
+    seconds: float = 0.0
+    #: Indices of the first and the last image that are played and exported
+    first: int = 0
+    last: int = 0
     playing: bool = False
 
 
@@ -157,6 +207,8 @@ class FitState:
     #: Best cost during the fit, and a summary as text
     curve: list[float] = field(default_factory=list)
     costs: str = ""
+    #: Caption of the best image so far (stream "best") while a fit runs; "" without
+    best: str = ""
 
 
 @dataclass
@@ -195,10 +247,6 @@ class PageState:
     title: str = ""
     #: The question whether pose and settings of before are to be restored; "": there is none
     offer: str = ""
-    #: Titles of the panel's sections that are open
-    open_sections: list[str] = field(default_factory=list)
-    #: Whether there is an image that does not follow the probe
-    is_frozen: bool = False
     #: Pose of the probe on the patient; None without a probe or a patient
     pose: SurfacePose | None = None
     #: The same as texts: position and angles, and matrix, as pose_files.pose_of_text reads them; "" without a probe
@@ -212,7 +260,9 @@ class PageState:
     messages: MessageState = field(default_factory=MessageState)
     views: ViewState = field(default_factory=ViewState)
     sequence: SequenceState = field(default_factory=SequenceState)
-    simulated: SimulatedState = field(default_factory=SimulatedState)
+    image: ImageState = field(default_factory=ImageState)
+    advice: AdviceState = field(default_factory=AdviceState)
+    cine: CineState = field(default_factory=CineState)
     fit: FitState = field(default_factory=FitState)
     registration: RegistrationState = field(default_factory=RegistrationState)
     question: QuestionState = field(default_factory=QuestionState)
@@ -254,6 +304,14 @@ class SharedState:
         """For writing; the changes are sent to the pages at the end of the context."""
         with self._state:
             yield self.now
+
+    def put(self, part: str, values: Mapping[str, object]) -> None:
+        """Send pages what of these values of a part, such as "cine", has changed."""
+        changed = {name: value for name, value in values.items() if getattr(getattr(self.now, part), name) != value}
+        if changed:
+            with self.changing() as now:
+                for name, value in changed.items():
+                    setattr(getattr(now, part), name, value)
 
     def show_values(self, values: Mapping[str, object]) -> None:
         """Show these values of controls, by Control.widget."""

@@ -6,12 +6,16 @@ On the web socket everything else would wait: it answers one request of a page a
 from __future__ import annotations
 
 from collections.abc import Awaitable, Callable
+from typing import TypeAlias
 from urllib.parse import quote
 
 from aiohttp import BodyPartReader, web
 
 from SlicerUSSim.Workstation import uploads
+from SlicerUSSim.Workstation.export import DICOM
 
+#: Called with what is wanted; (file name, content, MIME type)
+_Export: TypeAlias = Callable[..., Awaitable[tuple[str, bytes, str] | None]]
 #: Bytes of a piece
 _PIECE = 2**18
 
@@ -23,17 +27,20 @@ class Receiver:
     ----------
     opened : called in the event loop with {name: content} of files to open, and what they are meant to be ("": not
         said).
+    export : as of Sender, also called with the images from which a page has composed what is wanted.
     refused : called with a line about files that were not taken.
     """
 
-    def __init__(self, opened: Callable[[dict[str, bytes], str], None], refused: Callable[[str], None]) -> None:
-        self._opened, self._refused = opened, refused
+    def __init__(
+        self, opened: Callable[[dict[str, bytes], str], None], export: _Export, refused: Callable[[str], None]
+    ) -> None:
+        self._opened, self._export, self._refused = opened, export, refused
 
     def serve(self, app: web.Application) -> None:
         """Answer requests to an application, which is about to start."""
         app.router.add_post("/upload", self._receive)
 
-    async def _receive(self, request: web.Request) -> web.Response:
+    async def _receive(self, request: web.Request) -> web.StreamResponse:
         """A request that a page breaks off, since the user cancels it, opens nothing."""
         if not request.content_type.startswith("multipart/"):
             return web.Response(status=400, text="expected files")
@@ -55,6 +62,8 @@ class Receiver:
                 content += piece
             parts.append((part.filename or "", bytes(content)))
         files = uploads.plain_names(parts)
+        if request.query.get("for") == DICOM:
+            return await _answer(request, await self._export(DICOM, files))
         if files:
             self._opened(files, request.query.get("as", ""))
         return web.Response(status=204)
@@ -69,7 +78,7 @@ class Sender:
         nothing, which the page has been told.
     """
 
-    def __init__(self, export: Callable[[str], Awaitable[tuple[str, bytes, str] | None]]) -> None:
+    def __init__(self, export: _Export) -> None:
         self._export = export
 
     def serve(self, app: web.Application) -> None:
@@ -77,16 +86,19 @@ class Sender:
         app.router.add_get("/exported", self._send)
 
     async def _send(self, request: web.Request) -> web.StreamResponse:
-        found = await self._export(request.query.get("kind", ""))
-        if found is None:
-            return web.Response(status=204)
-        name, content, mime = found
-        response = web.StreamResponse()
-        response.content_type, response.content_length = mime, len(content)
-        response.headers["Content-Disposition"] = f"attachment; filename*=UTF-8''{quote(name)}"
-        response.headers["Cache-Control"] = "no-store"
-        await response.prepare(request)
-        for start in range(0, len(content), _PIECE):
-            await response.write(content[start : start + _PIECE])
-        await response.write_eof()
-        return response
+        return await _answer(request, await self._export(request.query.get("kind", "")))
+
+
+async def _answer(request: web.Request, found: tuple[str, bytes, str] | None) -> web.StreamResponse:
+    if found is None:
+        return web.Response(status=204)
+    name, content, mime = found
+    response = web.StreamResponse()
+    response.content_type, response.content_length = mime, len(content)
+    response.headers["Content-Disposition"] = f"attachment; filename*=UTF-8''{quote(name)}"
+    response.headers["Cache-Control"] = "no-store"
+    await response.prepare(request)
+    for start in range(0, len(content), _PIECE):
+        await response.write(content[start : start + _PIECE])
+    await response.write_eof()
+    return response

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any, cast
@@ -14,27 +14,30 @@ from trame_server import Server
 from trame_slicer.core import SlicerApp
 
 from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic
+from SlicerUSSim.Workstation.advice import Advice
 from SlicerUSSim.Workstation.anatomy import AnatomyViews
 from SlicerUSSim.Workstation.browser_panel import BrowserPanel, Observed
+from SlicerUSSim.Workstation.cine import Cine
 from SlicerUSSim.Workstation.comparison import Comparison
-from SlicerUSSim.Workstation.export import Cine, Exports
+from SlicerUSSim.Workstation.export import Exports
 from SlicerUSSim.Workstation.file_nodes import FileNodes, Files
 from SlicerUSSim.Workstation.hand import KEYS
 from SlicerUSSim.Workstation.image_flow import ImageFlow, LatencyStamps
 from SlicerUSSim.Workstation.kept_state import KeptState
 from SlicerUSSim.Workstation.opener import Opener
-from SlicerUSSim.Workstation.page import build_page, view_tools
+from SlicerUSSim.Workstation.page import build_page
 from SlicerUSSim.Workstation.patient import OpenPatient
+from SlicerUSSim.Workstation.pointer import Pointer
 from SlicerUSSim.Workstation.pose_entry import PoseEntry
 from SlicerUSSim.Workstation.pose_registration import Registration
 from SlicerUSSim.Workstation.probe_control import ProbeControl
 from SlicerUSSim.Workstation.questions import Questions
 from SlicerUSSim.Workstation.scenes import Scenes
-from SlicerUSSim.Workstation.simulated import SimulatedSequence
 from SlicerUSSim.Workstation.state import NAMES, SharedState
 from SlicerUSSim.Workstation.tasks import Tasks
 from SlicerUSSim.Workstation.tracker import Tracker
 from SlicerUSSim.Workstation.transfer import Receiver, Sender
+from SlicerUSSim.Workstation.view_tools import view_tools
 
 #: Seconds between two checks whether all work is done.
 _LOOK_EVERY_S = 0.02
@@ -57,7 +60,7 @@ class Workstation:
         app = SlicerApp()
         # Registers the classes of sequence nodes; pyright does not see names that slicer imports from its libraries.
         app.register_module_logic(cast(Any, slicer).vtkSlicerSequencesLogic())
-        stamps, cine = LatencyStamps(), Cine()
+        stamps = LatencyStamps()
 
         self._tasks = tasks = Tasks(lambda error: self._panel.failed(error))
         self._logic = logic = UltrasoundSceneLogic(app.scene, device, tasks)
@@ -65,12 +68,14 @@ class Workstation:
         self._presenter = presenter = panel.presenter
         self._views = AnatomyViews(app, self.server, view_tools)
         self._probe = probe = ProbeControl(panel, self._views, stamps.probe_moved)
+        self._pointer = Pointer(shared, logic, self._views, probe)
         self._poses = PoseEntry(panel, probe.pose, probe.move)
         probe.told = self._poses.show
-        self._comparison = comparison = Comparison(shared, probe.move)
+        self._comparison = comparison = Comparison(shared, probe.move, tasks.tell)
+        presenter.fits.following = comparison.follow
         self._tracker = Tracker(shared, tasks, probe.move)
+        self._cine = cine = Cine(panel, comparison, probe.move)
         self._images = ImageFlow(panel, self._views, comparison, cine, self._tracker, stamps)
-        self._simulated = SimulatedSequence(panel, comparison, probe.move)
         nodes = FileNodes(logic, tasks, files)
         presenter.segmenting.maskFile, presenter.segmenting.sheetsFile = nodes.mask_file, nodes.sheets_file
         panel.pick = probe.hand.pick
@@ -82,6 +87,8 @@ class Workstation:
         self._opener = opener = Opener(
             panel, nodes, patient, self._scenes, registration, self._questions, self._poses
         )  # fmt: skip
+        self._advice = advice = Advice(panel, registration)
+        panel.refreshed = advice.update
         self._kept = KeptState(state_file, panel, patient, opener, probe)
 
         self._following = False
@@ -100,12 +107,13 @@ class Workstation:
             panel.own_actions[action] = partial(patient.then_show, action)
         self._answer_pages(stamps)
         self._follow_pages()
-        receiver = Receiver(self._in_task(partial(self._then_refresh, opener.open_sent)), panel.showError)
+        opened = self._in_task(partial(self._then_refresh, opener.open_sent))
+        receiver, sender = Receiver(opened, self._export, panel.showError), Sender(self._export)
         self.server.controller.on_server_bind.add(lambda wslink: receiver.serve(wslink.app))
-        self.server.controller.on_server_bind.add(lambda wslink: Sender(self._export).serve(wslink.app))
+        self.server.controller.on_server_bind.add(lambda wslink: sender.serve(wslink.app))
         self.server.controller.on_server_ready.add(self._ready)
         self.server.controller.on_server_exited.add(self.close)
-        build_page(self.server, panel, self._views.layout, (*KEYS, "Escape"))
+        build_page(self.server, panel, (*KEYS, "Escape"))
 
     @property
     def is_computing(self) -> bool:
@@ -135,12 +143,20 @@ class Workstation:
             "plane": probe.choose_plane,
             "look": self._in_task(probe.look_again),
             "aim_image": probe.aim_image,
+            "point_at": self._pointer.at_image,
             "play": self._play,
-            "play_simulated": self._in_task(self._simulated.play),
-            "show_simulated": self._in_task(self._simulated.show),
+            "freeze": self._in_task(partial(self._then_refresh, self._cine.freeze)),
+            "cine_show": self._in_task(self._cine.show),
+            "cine_step": self._in_task(self._cine.step),
+            "cine_play": self._in_task(self._cine.play),
+            "cine_trim": self._cine.trim,
+            "cine_source": self._in_task(self._cine.choose),
+            "mmode": self._cine.draw_mmode,
             "show_number": comparison.show,
             "answer": self._questions.answer,
             "choose_frame": self._in_task(registration.choose_frame),
+            "remedy": self._in_task(self._advice.follow),
+            "compare_next": comparison.compare_next,
             "cancel": self._panel.cancel,
             "dismiss": self._panel.dismiss,
             "restore": self._in_task(partial(self._then_refresh, self._kept.restore)),
@@ -166,7 +182,7 @@ class Workstation:
         method(*arguments)
         self._panel.refresh()
 
-    async def _export(self, kind: str) -> tuple[str, bytes, str] | None:
+    async def _export(self, kind: str, sent: Mapping[str, bytes] | None = None) -> tuple[str, bytes, str] | None:
         """(file name, content, MIME type), or None after an error was shown on the page, or a cancellation."""
         exported: asyncio.Future[tuple[str, bytes, str] | None] = asyncio.get_running_loop().create_future()
 
@@ -177,7 +193,7 @@ class Workstation:
                     if kind.startswith("pose."):
                         found = *self._poses.file(kind.removeprefix("pose")), "application/octet-stream"
                     else:
-                        found = self._exports.export(kind)
+                        found = self._exports.export(kind, sent or {})
             finally:
                 if not exported.done():  # the page may be gone
                     exported.set_result(found)
@@ -186,7 +202,7 @@ class Workstation:
         return await exported
 
     def _play(self) -> None:
-        self._simulated.stop()
+        self._cine.stop()
         self._comparison.play()
 
     async def _at_rest(self) -> dict[str, int]:
@@ -209,6 +225,7 @@ class Workstation:
     def _ready(self, **_: object) -> None:
         for stream in self._images.streams:
             self.server.controller.rc_area_register(stream)
+        self._images.watch()
         self._tasks.start(self._begin)
 
     def _begin(self) -> None:
@@ -245,9 +262,10 @@ class Workstation:
         if self._image_node.watch(parameters.output) and taken is not None and taken.node is parameters.output:
             self._images.image_changed()  # it is in there already, as the frozen one of a scene at the start
         self._probe.draw()
-        self._panel.tellFrozen()
         if self._logic.isLive:
             with self._presenter.shown():
                 self._probe.update_surface()
         self._presenter.parametersChanged()
         self._kept.changed()
+        with self._presenter.shown():
+            self._cine.follow_display()  # at the end, since it waits for the device

@@ -6,6 +6,10 @@ from dataclasses import dataclass
 
 from SlicerUSSim.Logic.base.declaration import Declared, Shown, parameter
 
+#: The largest numbers of evaluations of a restart and of a search from the best of them, as fractions of those of the
+#: search; most restarts need half of it or less. Draws are of solutions that are expected to fit equally well.
+RESTART_SHARE, AGAIN_SHARE, DRAWS = 0.4, 0.3, 12
+
 
 @dataclass(frozen=True)
 class FitSettings(Declared):
@@ -30,7 +34,9 @@ class FitSettings(Declared):
         option="register/no-register",
     )  # fmt: skip
     evaluations: int = parameter(
-        500, "Evaluations", "Largest number of evaluations of the cost; each takes some milliseconds",
+        1000, "Evaluations",
+        "Largest number of evaluations of the cost, with restarts; each takes some milliseconds. Registration, speckle "
+        "and prediction take more",
         bounds=(1, 1_000_000), shown=Shown(10, 100_000, 100), option="evaluations",
     )  # fmt: skip
     restarts: int = parameter(
@@ -54,6 +60,12 @@ class FitSettings(Declared):
     def free_names(self) -> list[str]:
         """The free parameters one by one."""
         return [name.strip() for name in self.free.split(",") if name.strip()]
+
+    @property
+    def of_search(self) -> int:
+        """Evaluations of the search alone, such that with those of restarts there are at most `evaluations` (from 30 on)."""
+        share = 1.0 + (self.restarts * RESTART_SHARE + AGAIN_SHARE if self.restarts else 0.0)
+        return max(int((self.evaluations - DRAWS - 2 * self.restarts) / share), self.evaluations // 4, 1)
 
     def _owner(self) -> str:
         return "fit"

@@ -45,7 +45,7 @@ def predict(
     speckle: bool = False,
     neighbours: Sequence[Sequence[np.ndarray]] | None = None,
     fitted_neighbours: Sequence[Sequence[np.ndarray]] | None = None,
-    max_evaluations: int = FitSettings.evaluations,
+    max_evaluations: int = FitSettings().of_search,
     restarts: int = FitSettings.restarts,
     settings: SimilaritySettings | None = None,
     progress: Callable[[Progress], None] | None = None,

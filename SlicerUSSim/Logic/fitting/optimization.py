@@ -18,7 +18,7 @@ import numpy as np
 from SlicerUSSim.Logic.base.errors import require_between
 from SlicerUSSim.Logic.base.settings import DisplaySettings
 from SlicerUSSim.Logic.fitting.appearance import AppearanceModel
-from SlicerUSSim.Logic.fitting.fit_settings import FitSettings
+from SlicerUSSim.Logic.fitting.fit_settings import AGAIN_SHARE, DRAWS, RESTART_SHARE, FitSettings
 from SlicerUSSim.Logic.fitting.identifiability import (
     Identifiability,
     State,
@@ -48,16 +48,12 @@ STAGES = ("global", "local", "polish")
 AGAIN = "again"
 #: Fractions of the evaluations for the first two; the rest is for the search after the anchor has changed.
 _SHARES = (0.4, 0.3)
-#: The largest number of evaluations of a restart, as a fraction of the fit's. Most need half of it or less.
-_RESTART_SHARE = 0.4
 #: Standard deviation of the starting points of restarts around the best, with bounds scaled to 0 and 1.
 _RESTART_SPREAD = 0.15
 #: Costs that differ by less than this fraction are considered equal, even if other speckle changes them by less.
 _LEAST_TOLERANCE = 0.01
 #: Evaluations for the level of a tissue alone, and their steps, in parts of its bounds (2 of 24 dB)
 _FOR_A_LEVEL, _LEVEL_STEP = 4, 1.0 / 12.0
-#: Number of sampled solutions with equal variance of the scatterers, expected to fit equally well.
-_DRAWS = 12
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,6 +148,10 @@ class AppearanceCost:
         tissues, display = self.parameters.apply(units, self.tissues, self.display)
         return mean_total(self.of_each(tissues, display))
 
+    def image(self, units: np.ndarray) -> np.ndarray:
+        """(rows, columns) uint8 of the first pose at (parameters,) positions."""
+        return self.model.image(0, *self.parameters.apply(units, self.tissues, self.display))
+
     def anchor(self, units: np.ndarray) -> None:
         """Recompute what the model approximates, so that it is exact here."""
         self.model.anchor(self.parameters.apply(units, self.tissues, self.display)[0])
@@ -184,7 +184,7 @@ def optimize_appearance(
     begin: tuple[TissueTable, DisplaySettings] | None = None,
     grid: ImageGrid | None = None,
     masks: Sequence[np.ndarray] | None = None,
-    max_evaluations: int = FitSettings.evaluations,
+    max_evaluations: int = FitSettings().of_search,
     restarts: int = FitSettings.restarts,
     seed: int = 0,
     settings: SimilaritySettings | None = None,
@@ -239,8 +239,8 @@ def optimize_appearance(
     model = AppearanceModel(simulator, probe, poses, parameters.varied(), grid)
     cost = AppearanceCost(model, parameters, references, masks, tissues, display, settings)
     start = parameters.units(*(begin or (tissues, display)))
-    limit = max_evaluations + restarts * (int(_RESTART_SHARE * max_evaluations) + 1) + _DRAWS
-    limit += int(_SHARES[1] * max_evaluations) if restarts else 0
+    limit = max_evaluations + restarts * (int(RESTART_SHARE * max_evaluations) + 1) + DRAWS
+    limit += int(AGAIN_SHARE * max_evaluations) if restarts else 0
 
     def describe(units: np.ndarray) -> dict[str, float]:
         return dict(zip(parameters.names, parameters.values(units).tolist(), strict=True))
@@ -248,14 +248,14 @@ def optimize_appearance(
     _log.info(
         "fit of %d images, %d free parameters: %s", len(references), len(parameters.names), ", ".join(parameters.names)
     )
-    search = Search(cost, describe, limit, seed, progress)
+    search = Search(cost, describe, limit, seed, progress, cost.image)
 
     before = cost.of_each(tissues, display)
     if begin is not None:
         cost.anchor(start)
     best = _searched(search, cost, start, algorithms, max_evaluations)
-    again = _restarted(cost, search, simulator, best, restarts, int(_RESTART_SHARE * max_evaluations), algorithms[1])
-    best, best_cost = _better(search, cost, algorithms[1], best, again, int(_SHARES[1] * max_evaluations))
+    again = _restarted(cost, search, simulator, best, restarts, int(RESTART_SHARE * max_evaluations), algorithms[1])
+    best, best_cost = _better(search, cost, algorithms[1], best, again, int(AGAIN_SHARE * max_evaluations))
     fitted_tissues, fitted_display = parameters.apply(best, tissues, display)
     model.anchor(fitted_tissues)
     after = cost.of_each(fitted_tissues, fitted_display)
@@ -418,7 +418,7 @@ def _identifiability(
     met = [entry for entry in search.history if entry.stage in (*STAGES[1:], AGAIN)]
     # The change of the cost between realisations of the speckle: a smaller difference of two fits is not significant.
     tolerance = max(float(np.std(again.costs_of_best)), _LEAST_TOLERANCE * best_cost)
-    for units in equal_variance_draws(parameters, best, cost.tissues, cost.display, random, _DRAWS):
+    for units in equal_variance_draws(parameters, best, cost.tissues, cost.display, random, DRAWS):
         search.evaluate("draw", units)
     met += [entry for entry in search.history if entry.stage == "draw"]
     as_good = [entry.units for entry in met if entry.cost <= best_cost + tolerance]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import weakref
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from math import isnan, nan
 
 import numpy as np
@@ -44,6 +45,9 @@ class Progress:
     best_cost: float
     #: {parameter name: value} of the best so far
     best: dict[str, float]
+    #: Within a progress function: the first image with these, (rows, columns) uint8, and its number in the recording
+    image: Callable[[], np.ndarray] | None = None
+    number: int | None = None
 
     @property
     def share(self) -> float:
@@ -81,6 +85,7 @@ class Search:
     limit : largest number of evaluations, for progress.
     seed : of algorithms that draw random numbers.
     progress : called after every evaluation; may raise errors.Cancelled.
+    image : (rows, columns) uint8 image of a position, for progress.
     """
 
     def __init__(
@@ -90,9 +95,10 @@ class Search:
         limit: int,
         seed: int = 0,
         progress: Callable[[Progress], None] | None = None,
+        image: Callable[[np.ndarray], np.ndarray] | None = None,
     ) -> None:
         self.cost, self.describe, self.limit, self.seed = cost, describe, limit, seed
-        self.progress = progress
+        self.progress, self.image = progress, image
         self.history: list[Evaluation] = []
         self._best: Evaluation | None = None
 
@@ -169,8 +175,10 @@ class Search:
             self._best = entry
         if self.progress is not None:
             best = self._best
-            values = self.describe(np.array(best.units))
-            self.progress(Progress(stage, len(self.history), self.limit, cost, best.cost, values))
+            units = np.array(best.units)
+            image = None if self.image is None else partial(self.image, units)
+            values = self.describe(units)
+            self.progress(Progress(stage, len(self.history), self.limit, cost, best.cost, values, image))
         return cost
 
     def best(self, stage: str) -> Evaluation:

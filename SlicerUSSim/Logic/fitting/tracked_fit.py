@@ -85,7 +85,7 @@ def fit(
     display: DisplaySettings | None = None,
     register: bool = False,
     speckle: bool = False,
-    max_evaluations: int = FitSettings.evaluations,
+    max_evaluations: int = FitSettings().of_search,
     restarts: int = FitSettings.restarts,
     seed: int = 0,
     settings: SimilaritySettings | None = None,

@@ -24,7 +24,7 @@ from SlicerUSSim.Logic.imaging.bmode import downshift, log_band_above, pulse_tap
 from SlicerUSSim.Logic.imaging.compounding import Compounder, sweep_grid
 from SlicerUSSim.Logic.imaging.contact import line_contact
 from SlicerUSSim.Logic.imaging.diffraction import speckle_height_mm
-from SlicerUSSim.Logic.imaging.frame import Frame
+from SlicerUSSim.Logic.imaging.frame import Echoes, Frame
 from SlicerUSSim.Logic.imaging.medium import Medium, as_labels
 from SlicerUSSim.Logic.imaging.noise import stirred
 from SlicerUSSim.Logic.imaging.raytracing import RayTracer
@@ -201,6 +201,25 @@ class UltrasoundSimulator:
         """
         with self._lock:
             return self._rendered(probe, pose, display, grid, {} if timings is None else timings, noise_seed).image
+
+    def redisplay(
+        self, echoes: Echoes, probe: Probe, settings: SimulationSettings, display: DisplaySettings, noise_seed: int = 0
+    ) -> np.ndarray:
+        """(rows, columns) uint8 image of echoes that were kept, without those before (display.persistence).
+
+        `probe`, `settings` and `noise_seed` are those of the echoes; the patient of this simulator does not matter.
+        """
+        with self._lock:
+            own, self.settings = self.settings, replace(settings, contact_gap_mm=None)  # which the echoes have already
+            try:
+                frame = self.device_frame(
+                    probe, echoes.probe_to_ras, display, None, noise_seed, self._acquisition_buffer
+                )
+            finally:
+                self.settings = own
+            frame.iq = self.device.upload(echoes.iq(frame.line_shape[1]))
+            self._run(self.display_stages, frame, {})
+            return frame.download("image")
 
     def _persisted(
         self, image: np.ndarray, probe: Probe, display: DisplaySettings | None, grid: ImageGrid

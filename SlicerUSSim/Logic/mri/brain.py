@@ -80,7 +80,9 @@ def find_brain(
     if not isinstance(shown, Alignment):
         return _found(given, mri.with_array(shown).along(given).array, "stripped", "skull-stripped brain")
     distance = shown.brain_on(mri)
-    inside = refined(mri, distance, core_mm=8.0, reach_mm=12.0, keep_mm=3.0)
+    report(0.7)
+    border = lambda share: report(0.7 + 0.3 * share)  # noqa: E731
+    inside = refined(mri, distance, core_mm=8.0, reach_mm=12.0, keep_mm=3.0, progress=border)
     millilitres = float(inside.sum() * mri.voxel_ml)
     require(
         POSSIBLE_ML[0] <= millilitres <= POSSIBLE_ML[1],

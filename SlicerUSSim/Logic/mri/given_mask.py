@@ -78,8 +78,10 @@ def volume_doubts(millilitres: float) -> tuple[str, ...]:
 
 #: Labelled voxels that are looked at; the share of them that has to lie in the MRI
 _SAMPLES, _LEAST_INSIDE = 40_000, 0.5
-#: The labels are moved by so much along either direction of the three axes, for comparison
-_MOVED_MM = 6.0
+#: The labels are moved by so much along either direction of the three axes, for comparison; by the first of these with
+#: which they no longer explain more than this share of intensities that are exactly theirs. A direction in which they
+#: do so still, as that of a cylinder's axis, says nothing.
+_MOVED_MM, _MOST_ALIKE = (6.0, 12.0, 24.0), 0.35
 #: How many times as much of the variance of the intensities they explain in their place as in the best other place:
 #: 3.5 to 28 of a patient's own (also those of another contrast: 4.3 and 10.6), at most 1.4 of another head's that was
 #: registered to the same template
@@ -104,9 +106,26 @@ def follows(mri: Volume, labels: Volume) -> bool:
     places = places[np.random.default_rng(0).integers(len(places), size=_SAMPLES)]
     tissues = labels.array[tuple(places.T)]
     points = places[:, ::-1] @ labels.ijk_to_ras[:3, :3].T + labels.ijk_to_ras[:3, 3]
-    steps = [np.eye(3)[axis] * way * _MOVED_MM for axis, way in itertools.product(range(3), (-1, 1))]
-    beside = max(_explained(mri, points + step, tissues) for step in steps)
-    return _explained(mri, points, tissues) > _LEAST_GAIN * beside
+    exact = _exactly(mri, labels)
+    for moved_mm in _MOVED_MM:
+        steps = [np.eye(3)[axis] * way * moved_mm for axis, way in itertools.product(range(3), (-1, 1))]
+        telling = [step for step in steps if _explained(exact, points + step, tissues) < _MOST_ALIKE]
+        if telling:
+            beside = max(_explained(mri, points + step, tissues) for step in telling)
+            return _explained(mri, points, tissues) > _LEAST_GAIN * beside
+    return False
+
+
+def _exactly(mri: Volume, labels: Volume) -> Volume:
+    """An image on the grid of labels in which every tissue has its mean intensity in an MRI, and all else the least."""
+    to_mri = mri.ras_to_ijk @ labels.ijk_to_ras
+    found = ndimage.affine_transform(
+        mri.array, to_mri[2::-1, 2::-1], to_mri[2::-1, 3], labels.array.shape, np.float32, order=0, mode="nearest"
+    )
+    names, numbers = np.unique(labels.array, return_inverse=True)
+    means = np.bincount(numbers.ravel(), found.ravel()) / np.bincount(numbers.ravel())
+    means[names == 0] = mri.array.min()
+    return labels.with_array(means[numbers].reshape(labels.array.shape).astype(np.float32))
 
 
 def _explained(mri: Volume, points: np.ndarray, tissues: np.ndarray) -> float:

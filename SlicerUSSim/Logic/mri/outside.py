@@ -8,7 +8,7 @@ farther from the brain is air.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -92,24 +92,28 @@ def require_findable(contrast: str, skull_strip: str, has_mask: bool) -> None:
     )
 
 
-def find_outside(mri: Volume, brain: np.ndarray) -> Outside:
+def find_outside(
+    mri: Volume, brain: np.ndarray, progress: Callable[[float], None] = lambda share: None
+) -> Outside:  # fmt: skip
     """Label what lies outside the brain in the MRI of a whole head (T1, with or without contrast agent).
 
     Parameters
     ----------
     mri : whole head.
     brain : (k, j, i) bool, the brain.
+    progress : called with the completed fraction, 0 to 1.
 
     In a T1, CSF is as dark as bone: what lies between a shrunken brain and its skull counts as skull.
     Raises SimulationError if there is no brain, or nothing around it.
     """
     require(brain.any(), "the brain mask is empty, expected a brain")
     image = mri.array.astype(np.float32)
-    head = _head(image, mri.spacing_mm) | brain
+    head = _head(image, mri.spacing_mm, lambda share: progress(0.4 * share)) | brain
     margin = [slice(max(box.start - 2, 0), box.stop + 2) for box in ndimage.find_objects(head.astype(np.uint8))[0]]
     box = tuple(margin)
     image, head, brain, mm = image[box], head[box], brain[box], mri.spacing_mm
     inner = _within(_closed(brain, _SULCUS_MM, mm), _DURA_MM, mm)  # with sulci, dura and what is between
+    progress(0.46)
     from_brain = distance_to(inner, mm)
     beside = image[head & (from_brain > _BESIDE_MM[0]) & (from_brain < _BESIDE_MM[1])]
     require(
@@ -118,15 +122,20 @@ def find_outside(mri: Volume, brain: np.ndarray) -> Outside:
     )
     dark = _DARK * _otsu(beside)
     below_skin = _depth(head, mm)
+    progress(0.52)
     may_be = (below_skin > _SKIN_MM) & (from_brain < _LARGEST_SKULL_MM)
     thickness = thickness_of_skull(image, inner, below_skin, dark, mm, mri.ijk_to_ras)
+    progress(0.73)
     is_dark = head & (image < dark) & ~inner
     vault = may_be & (from_brain <= thickness)
     base = may_be & np.isnan(thickness) & (is_dark | inner)
     thick = _opened(is_dark & may_be, _CAVITY_MM, mm)  # also where it is thicker than usual
+    progress(0.8)
     skull = _closed(inner | vault | base | thick, _MARROW_MM, mm) & may_be
+    progress(0.86)
     skull = largest_component(_opened(skull | inner, _SMOOTH_MM, mm) | inner)
     skull |= head & (from_brain < _LEAST_SKULL_MM)
+    progress(0.92)
     below_table = _depth(skull, mm)
     labels = np.where(below_skin > _SKIN_MM, 2, 1).astype(np.uint8)
     is_void = is_dark & (image < _VOID * dark) & ~skull & (below_skin > _SKIN_MM)
@@ -161,14 +170,17 @@ def _at_faces(box: list[slice], mri: Volume) -> np.ndarray:
     return ~inside[tuple(box)]
 
 
-def _head(image: np.ndarray, mm: np.ndarray) -> np.ndarray:
+def _head(image: np.ndarray, mm: np.ndarray, progress: Callable[[float], None]) -> np.ndarray:
     """(k, j, i) bool: what is within the skin, with its cavities."""
     smooth = ndimage.gaussian_filter(image, 1.0 / mm[::-1])
     inside = largest_component(_opened(smooth > _AIR * _otsu(smooth[smooth > np.percentile(smooth, 1.0)]), 1.5, mm))
+    progress(0.3)
     inside = _closed(inside, _OUTLINE_MM, mm)
+    progress(0.55)
     for axis in range(3):
         inside = np.stack([ndimage.binary_fill_holes(part) for part in np.moveaxis(inside, axis, 0)])  # type: ignore
         inside = np.moveaxis(inside, 0, axis)
+    progress(0.7)
     return largest_component(_opened(inside, 4.0, mm))
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import cast
 
 import numpy as np
@@ -19,7 +20,10 @@ _TISSUE = 0.6
 _FLUID, _SOLID, _LEAST_TISSUE, _WINDOW_MM, _WIDE = 0.4, 0.5, 0.4, 5.0, 0.2
 
 
-def refined(mri: Volume, distance: np.ndarray, *, core_mm: float, reach_mm: float, keep_mm: float) -> np.ndarray:
+def refined(
+    mri: Volume, distance: np.ndarray, *, core_mm: float, reach_mm: float, keep_mm: float,
+    progress: Callable[[float], None] = lambda share: None,
+) -> np.ndarray:  # fmt: skip
     """(k, j, i) True in the brain.
 
     `distance` is the signed distance to a first mask in mm on the MRI's grid, negative inside. What is deeper than
@@ -27,7 +31,8 @@ def refined(mri: Volume, distance: np.ndarray, *, core_mm: float, reach_mm: floa
     division by that of the brain nearby (bias field), puts the border into the darkest valley (Hahn and Peitgen, MICCAI
     2000); darker tissue than grey matter is then taken off outside, and sulci are closed. Where much CSF is outside the
     cortex (the vertex of an older patient), gyri that a bias field makes dark are told from it by its own brightness.
-    What is deeper in the first mask than `keep_mm` stays if it is on this side of the valley.
+    What is deeper in the first mask than `keep_mm` stays if it is on this side of the valley. `progress` is called with
+    the completed fraction, 0 to 1.
     """
     from skimage.segmentation import watershed
 
@@ -38,20 +43,25 @@ def refined(mri: Volume, distance: np.ndarray, *, core_mm: float, reach_mm: floa
     far = on_grid(mri.with_array(distance), Volume(image, matrix), outside=reach_mm + 6.0)
     box = ndimage.find_objects((far <= reach_mm + 6.0).astype(np.uint8))[0]
     image, far = image[box], far[box]
+    progress(0.15)
     mm = _SPACING_MM
     core = far < -core_mm
     brightness = ndimage.gaussian_filter(brightness_near(image, core, mm), 0.5)
+    progress(0.3)
     markers = np.where(core, 1, np.where(far > reach_mm, 2, 0)).astype(np.int32)
     undecided = (far >= -core_mm - 3.0) & (far <= reach_mm + 3.0)  # and 3 mm of the markers on either side
     region = core | (watershed(-brightness, markers, mask=undecided) == 1)
+    progress(0.45)
     bright = region & (brightness > _tissue_from(brightness, region))
     ball = _ball(2.0 / mm)
     # Casts: the return types of scipy's functions depend on their arguments, without type annotations for that.
     opened = _connected(cast(np.ndarray, ndimage.binary_erosion(bright, ball)) | core, core)
     brain = cast(np.ndarray, ndimage.binary_dilation(opened, _ball(3.0 / mm))) & bright
     brain |= region & (far <= -keep_mm)
+    progress(0.7)
     brain = closed(brain | core, 5.0 / mm) & region
     brain = cast(np.ndarray, ndimage.binary_fill_holes(brain))
+    progress(0.9)
     smooth = ndimage.gaussian_filter(brain.astype(np.float32), 0.8)
     matrix[:3, 3] += mm * np.array([part.start for part in box][::-1])
     return on_grid(Volume(smooth, matrix), mri) > 0.5

@@ -294,7 +294,7 @@ def segment_mri(
         _log.info("thin sulci: %d voxels become leptomeninges", int(middles.sum()))
     whole, brain_labels = images[0].with_array(part.whole(labels)), len(tissue_names)
     if settings.outside:
-        around = find_outside(images[0], foreground)
+        around = find_outside(images[0], foreground, lambda share: told(end + (1.0 - end) * share))
         whole, tissue_names = around.over(whole, tissue_names)
         notes.append(around.text(mri.voxel_ml))
         warnings += around.warnings

@@ -34,7 +34,7 @@ class FitLogic:
         validate: Sequence[int] = (),
         free: Iterable[str] | Mapping[str, tuple[float, float] | None] = ("display", "tissues"),
         register: bool = False, speckle: bool = False, estimate_geometry: bool = False,
-        max_evaluations: int = FitSettings.evaluations, restarts: int = FitSettings.restarts,
+        max_evaluations: int = FitSettings().of_search, restarts: int = FitSettings.restarts,
         plot: CostPlot | None = None, progress: Callable[[Progress], None] | None = None,
     ) -> Fit:  # fmt: skip
         """Fit display and tissue parameters, with `register` the poses and with `speckle` the speckle, to
@@ -59,7 +59,7 @@ class FitLogic:
             if plot is not None:
                 work.tell(partial(plot.add, step))
             if progress is not None:
-                progress(step)
+                progress(replace(step, number=tracked.numbers[0]))
 
         def compute() -> Fit:
             simulator = self._patient.simulator(imaged)

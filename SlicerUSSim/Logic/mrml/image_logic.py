@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Hashable
+from dataclasses import replace
 from datetime import datetime, timezone
+from typing import Any
 
 import numpy as np
 
-from SlicerUSSim.Logic.base.errors import collected_warnings, require, required, warn_again
+from SlicerUSSim.Logic.base.errors import SimulationError, collected_warnings, require, required, warn_again
+from SlicerUSSim.Logic.base.settings import DisplaySettings
 from SlicerUSSim.Logic.base.volume import Volume
-from SlicerUSSim.Logic.base.vtk_data import matrix_array
+from SlicerUSSim.Logic.base.vtk_data import matrix_array, vtk_matrix
 from SlicerUSSim.Logic.imaging.contact import about_contact
-from SlicerUSSim.Logic.imaging.frame import Frame
+from SlicerUSSim.Logic.imaging.frame import Echoes, Frame
 from SlicerUSSim.Logic.imaging.noise import seed_of_pose
 from SlicerUSSim.Logic.imaging.simulator import EmptyViewWarning
 from SlicerUSSim.Logic.mrml.craniotomy_nodes import flap_centre, is_opened
@@ -20,8 +23,10 @@ from SlicerUSSim.Logic.mrml.label_nodes import labels_version
 from SlicerUSSim.Logic.mrml.nodes import (
     display_of,
     named,
+    node_to_world,
     pose_in_labels,
     probe_pose,
+    read_volume,
     require_node,
     set_node_to_world,
     show_in_slice,
@@ -30,12 +35,14 @@ from SlicerUSSim.Logic.mrml.nodes import (
 )
 from SlicerUSSim.Logic.mrml.own_results import OUTLINE, mark_as_result, may_replace_result, require_result
 from SlicerUSSim.Logic.mrml.patient_logic import PatientLogic
-from SlicerUSSim.Logic.mrml.taken_image import TakenImage, freeze, patient_of, remove_image, write_image
+from SlicerUSSim.Logic.mrml.taken_image import TakenImage, freeze, mri_of, patient_of, remove_image, write_image
 from SlicerUSSim.Logic.placement.aiming import opening_pose
-from SlicerUSSim.Logic.placement.bone_before_probe import about_bone
+from SlicerUSSim.Logic.placement.bone_before_probe import about_bone, about_missing_skull
 from SlicerUSSim.Logic.placement.craniotomy import default_pose
 from SlicerUSSim.Logic.placement.views import opened_view_pose, view_pose
+from SlicerUSSim.Logic.probe.image_grid import ImageGrid
 from SlicerUSSim.Logic.probe.poses import pose_in_slice
+from SlicerUSSim.Logic.probe.shape import outline_polydata
 
 #: Reference of an outline to the model of the probe's body
 _BODY = "SlicerUSSim.body"
@@ -48,6 +55,9 @@ class ImageLogic:
         self._patient, self._parameters = patient, patient.parameters
         #: The last image with all that it is of; None if there is none, or the last one failed
         self.taken: TakenImage | None = None
+        #: What about_missing_skull says, and of what
+        self._missing: tuple[Hashable, tuple[str, ...]] = None, ()
+        self._held = ""  # time of the image at which holdOutline left the outline
 
     def simulate(
         self, labels_node, probe_transform_node, output_node, *, warned: Callable[[Warning], None] = warn_again
@@ -100,6 +110,38 @@ class ImageLogic:
             frame.image, frame.grid, probe_to_world, preset, patient, anatomy, time, is_empty, output_node,
             frame=frame, number=number,
         )  # fmt: skip
+
+    def redisplay(self, taken: TakenImage, echoes: Echoes, display: DisplaySettings) -> TakenImage:
+        """An image of before with another display, from its echoes; nothing is written.
+
+        Raises SimulationError without labels.
+        """
+        imaged = self._patient.imaged(required(self._parameters.labels, "no label map is chosen"))
+        seed = seed_of_pose(echoes.probe_to_ras) if taken.number is None else taken.number
+        preset = replace(taken.preset, display=display)
+        image = self._patient.work.do(
+            lambda: self._patient.simulator(imaged).redisplay(
+                echoes, preset.probe, preset.settings, display, noise_seed=seed
+            )
+        )
+        return replace(taken, image=image, grid=ImageGrid.for_probe(preset.probe, display.image_size), preset=preset)
+
+    def differences(self, taken: TakenImage) -> tuple[str, ...]:
+        """What of an image is not as the scene is now, of patient, tissues, pose, probe, settings and display."""
+        labels, transform, preset = self._parameters.labels, self._parameters.probe_transform, self._parameters.preset
+        if labels is None or patient_of(labels) != taken.patient:
+            return ("patient",)
+        try:
+            are_same = {
+                "tissues": (self._patient.anatomyOf(labels), preset.tissues) == (taken.anatomy, taken.preset.tissues),
+                "pose": transform is not None and np.allclose(node_to_world(transform), taken.probe_to_world),
+                "probe": preset.probe == taken.preset.probe,
+                "settings": self._patient.settings(labels) == taken.preset.settings,
+                "display": preset.display == taken.preset.display,
+            }
+        except SimulationError:  # the nodes of now make no image
+            return ("tissues",)
+        return tuple(name for name, is_same in are_same.items() if not is_same)
 
     def _check_output(self, labels_node, output_node) -> None:
         require_node(output_node, "vtkMRMLScalarVolumeNode", use="output")
@@ -202,9 +244,17 @@ class ImageLogic:
     def aboutBone(self, labels_node, probe_transform_node) -> tuple[str, ...]:
         """Lines about bone before the probe at its pose: a closed skull, or an opening that its face does not fit.
 
-        See bone_before_probe.about_bone.
+        See bone_before_probe.about_bone, and about_missing_skull.
         """
         patient, preset = self._patient.patient(labels_node), self._parameters.preset
+        mri: Any = mri_of(labels_node) or self._parameters.mri
+        if "skull" not in patient.names and mri is not None and mri.GetImageData() is not None:
+            version = patient.version, mri.GetID(), mri.GetImageData().GetMTime()
+            if self._missing[0] != version:
+                image, to_patient = read_volume(mri), patient.world_to_patient @ node_to_world(mri)
+                placed = Volume(image.array, to_patient @ image.ijk_to_ras)
+                self._missing = version, about_missing_skull(patient.labels, patient.names, placed)
+            return self._missing[1]
         tissues = preset.tissues.for_names(patient.names).all_tissues()
         pose, is_open = patient.pose(probe_pose(probe_transform_node)), is_opened(labels_node)
         return about_bone(patient.labels, patient.names, tissues, preset.probe, pose, is_open=is_open)
@@ -230,6 +280,18 @@ class ImageLogic:
         write_outline(model_node, self._parameters.preset.probe, probe_transform_node)
         mark_as_result(model_node, OUTLINE)
         self._write_body(model_node)
+
+    def holdOutline(self) -> None:
+        """Leave the chosen outline where the last image was taken, as holdImage does with the image."""
+        taken, model = self.taken, self._parameters.outline
+        if taken is None or model is None or not may_replace_result(model):
+            return
+        if model.GetTransformNodeID() is not None or self._held != taken.time:
+            self._held = taken.time
+            model.SetAndObserveTransformNodeID(None)
+            model.SetAndObservePolyData(outline_polydata(taken.preset.probe))
+            model.ApplyTransformMatrix(vtk_matrix(taken.probe_to_world))
+            mark_as_result(model, OUTLINE)
 
     def showProbe(self, outline_node, is_shown: bool) -> None:
         """Show or hide a model of the probe's body, which belongs to the outline of its imaged field."""

@@ -154,19 +154,20 @@ class SequenceLogic:
         Ends live update, whose next image would take its place. Raises SimulationError for an output with data that
         this module did not make.
         """
-        return self._show_frozen(lambda: self.sequenceImage(images_node, number), output_node)
+        return self.showTaken(self.sequenceImage(images_node, number), output_node)
 
     def showFrozen(self, record: FrozenRecord, output_node) -> TakenImage:
         """Write an image of a scene that was saved into a scalar volume node, where it was taken; it stays there.
 
         Ends live update. Raises SimulationError for a damaged record, and for an output that this module did not make.
         """
-        return self._show_frozen(lambda: taken_of(record, output_node), output_node)
+        return self.showTaken(taken_of(record, output_node), output_node)
 
-    def _show_frozen(self, read: Callable[[], TakenImage], output_node) -> TakenImage:
+    def showTaken(self, taken: TakenImage, output_node) -> TakenImage:
+        """The same with any image that was taken."""
         require_node(output_node, "vtkMRMLScalarVolumeNode", use="output")
         require_result(output_node, "output")
-        taken = replace(read(), node=output_node)
+        taken = replace(taken, node=output_node)
         self._live.stopLiveUpdate()
         self._images.taken = taken
         was_modifying = output_node.StartModify()

@@ -9,7 +9,7 @@ import numpy as np
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.probe.arrays import Probe
 from SlicerUSSim.Logic.probe.poses import sample
-from SlicerUSSim.Logic.tissue.names import OUTSIDE
+from SlicerUSSim.Logic.tissue.names import BRAIN_TISSUES, OUTSIDE
 from SlicerUSSim.Logic.tissue.tissue import Tissue
 
 #: Tissues of the skull, which an opening removes
@@ -26,6 +26,8 @@ _BEHIND_MM, _COVERED_MM = 10.0, 1.0
 _BRAIN_MM = 60.0
 _STEP_MM, _COVER_STEP_MM = 0.5, 1.0
 _LINES = 33
+#: An MRI shows a head where so much, by what is labelled, is unlabelled and bright, by the brain; every so many voxels
+_HEAD, _BRIGHT, _SOME = 0.25, 0.35, 4
 _BONE, _BRAIN = 1, 2
 
 
@@ -70,6 +72,24 @@ def about_bone(
         return (f"{line}open the skull ({_OPEN_IT}), {through}",)
     line = _misfit(labels, names, probe, probe_to_ras) if is_open else ""
     return (line,) if line else ()
+
+
+def about_missing_skull(labels: Volume, names: Sequence[str], mri: Volume) -> tuple[str, ...]:
+    """A line about an MRI of a whole head, in the frame of labels that have its brain but not its skull; or none."""
+    if "skull" in names or not set(names) & set(BRAIN_TISSUES):
+        return ()
+    some = mri.array[(slice(None, None, _SOME),) * 3]
+    places = _SOME * np.moveaxis(np.indices(some.shape)[::-1], 0, -1)  # (k, j, i, 3) i, j, k
+    is_labelled = sample(labels, places @ mri.ijk_to_ras[:3, :3].T + mri.ijk_to_ras[:3, 3], order=0) > 0
+    if not is_labelled.any():
+        return ()
+    around = (some > _BRIGHT * np.median(some[is_labelled])) & ~is_labelled
+    if around.sum() < _HEAD * is_labelled.sum():
+        return ()
+    return (
+        "no skull is labelled, so that images are as if it were open everywhere: to see what bone does, label the "
+        "whole head (--outside)",
+    )
 
 
 def _bone_mm_and_db(

@@ -1,16 +1,21 @@
 // Client side of the page: draws the images from streams.py, forwards keys, and measures the latency from a mouse event
 // to the new image on the screen.
+import "./screen.js";
+import "./measure.js";
+
 (() => {
   const client = Math.random().toString(36).slice(2);
   const measured = []; // milliseconds from an event to the image that shows its effect
   const STAMP_EVERY_MS = 40; // events in between share the stamp of the previous one, which overestimates their latency
   let stamped = 0;
-  let drawnRuler = "null";
   const shown = []; // times at which simulated images were displayed
 
   const workstation = { measured, shown, measuring: false, images: 0, image: null, uploading: 0, exporting: 0, connected: false };
   window.ussim = workstation;
+  import("./views.js"); // which adds to it
 
+  const screens = window.ussimScreens;
+  const measure = window.ussimMeasure;
   const session = () => window.trame?.client?.getConnection?.()?.getSession?.();
   const canvasOf = (name) => document.querySelector(`canvas[data-stream="${name}"]`);
   const median = (values, share) => {
@@ -25,18 +30,12 @@
     const bitmap = meta.blank ? null : await createImageBitmap(new Blob([content], { type: meta.type }));
     if (Number(canvas.dataset.number ?? 0) > meta.number && meta.number > 1) return; // overtaken while it was decoded
     canvas.dataset.number = meta.number;
-    describe(canvas, meta);
-    if (!bitmap) {
-      canvas.getContext("2d", { alpha: false }).clearRect(0, 0, canvas.width, canvas.height);
-      return;
-    }
-    if (canvas.width !== bitmap.width || canvas.height !== bitmap.height) {
-      canvas.width = bitmap.width; // only on a change, since it makes the browser redo the layout
-      canvas.height = bitmap.height;
-    }
-    canvas.getContext("2d", { alpha: false }).drawImage(bitmap, 0, 0);
-    bitmap.close();
-    if (name !== "simulated") return;
+    if (name === "simulated") workstation.image = meta.blank ? null : meta;
+    // One ruler: real images are on the pixels of the simulated one, unless their size is not known
+    const ruler = meta.ruler?.x !== undefined ? meta.ruler : (workstation.image?.ruler ?? meta.ruler);
+    if (name === "simulated" && !isFrozen()) measure.unfrozen(); // they are of the image before
+    screens.put(name, bitmap, { ...meta, ruler });
+    if (name !== "simulated" || !bitmap) return;
     workstation.images += 1;
     requestAnimationFrame(() => {
       const now = performance.now();
@@ -47,25 +46,6 @@
         if (measured.length > 4000) measured.splice(0, 2000);
       }
     });
-  }
-
-  // Frame, ruler and caption of an image; they came with it, and change when it does.
-  function describe(canvas, meta) {
-    const frame = canvas.closest(".ussim-frame");
-    if (canvas.dataset.stream !== "real-over") frame.style.visibility = meta.blank ? "hidden" : "visible";
-    if (meta.ruler && canvas.dataset.stream !== "real-over") {
-      frame.style.setProperty("--w", meta.ruler.w);
-      frame.style.setProperty("--h", meta.ruler.h);
-    }
-    if (canvas.dataset.stream !== "simulated") return;
-    workstation.image = meta.blank ? null : meta;
-    const ruler = JSON.stringify(meta.ruler ?? null);
-    if (ruler !== drawnRuler) window.ussimOverlay(document.getElementById("overlay"), meta.ruler);
-    drawnRuler = ruler;
-    const caption = document.getElementById("image-caption");
-    const place = meta.sequence ? `Sequence no. ${meta.sequence}, ` : "";
-    caption.previousElementSibling.hidden = Boolean(meta.sequence); // "Simulated": there is no room for both
-    caption.textContent = meta.blank ? "" : `${place}${meta.patient}, ${meta.time.slice(11, 19)} UTC`;
   }
 
   workstation.summary = (count = 100) => {
@@ -106,6 +86,19 @@
     },
     { capture: true, passive: true },
   );
+  const isFrozen = () => document.getElementById("image-status")?.textContent.trim() === "FROZEN";
+  // Keys of the page itself, by what they do; the others move the probe.
+  const OWN_KEYS = {
+    " ": () => window.trame.trigger("freeze"),
+    f: () => window.trame.trigger("freeze"),
+    m: () => measure.tool("distance"),
+    t: () => measure.tool("text"),
+    c: () => window.trame.trigger("compare_next"),
+    0: () => screens.fit(),
+    Delete: () => measure.takeBack(),
+    F1: () => workstation.help(),
+    F2: () => workstation.toggle("drawer-open"),
+  };
   window.addEventListener("keydown", (event) => {
     const question = document.getElementById("question");
     if (question) {
@@ -113,12 +106,78 @@
       return; // keys that move the probe are not for a question
     }
     if (event.ctrlKey || event.altKey || event.metaKey || isTaken(event.key, event.target)) return;
-    const keys = canvasOf("simulated")?.dataset.keys.split(" ") ?? [];
+    if (document.getElementById("help").open) return;
     const key = event.key.length === 1 ? event.key.toLowerCase() : event.key;
+    if (key === "Escape" && measure.isDrawing()) {
+      measure.takeBack();
+      return;
+    }
+    if (OWN_KEYS[key]) {
+      event.preventDefault();
+      OWN_KEYS[key]();
+      return;
+    }
+    const keys = canvasOf("simulated")?.dataset.keys.split(" ") ?? [];
     if (!keys.includes(key)) return;
     event.preventDefault();
-    window.trame.trigger("key", [key, event.shiftKey]);
+    if (isFrozen() && ["ArrowLeft", "ArrowRight"].includes(key)) window.trame.trigger("cine_step", [key === "ArrowLeft" ? -1 : 1]);
+    else window.trame.trigger("key", [key, event.shiftKey]);
   });
+
+  // ---- mouse on the image ---------------------------------------------------------------------------------------
+
+  window.addEventListener(
+    "wheel",
+    (event) => {
+      if (!screens.at(event)) return;
+      event.preventDefault();
+      if (event.ctrlKey || !isFrozen()) screens.zoomAt(event, event.deltaY < 0 ? 1.15 : 1 / 1.15);
+      else window.trame.trigger("cine_step", [event.deltaY < 0 ? -1 : 1]);
+    },
+    { passive: false },
+  );
+  window.addEventListener("pointermove", (event) => {
+    if (event.buttons === 4 && screens.at(event)) screens.move(event.movementX, event.movementY);
+  });
+  window.addEventListener("dblclick", (event) => {
+    const where = screens.at(event);
+    const ruler = workstation.image?.ruler;
+    if (!where?.isInside || where.screen !== "simulated" || measure.isDrawing()) return;
+    window.trame.trigger("aim_image", [(where.mm[0] - ruler.x) / ruler.w, (where.mm[1] - ruler.y) / ruler.h]);
+  });
+
+  // ---- what buttons of the page do ------------------------------------------------------------------------------
+
+  workstation.toggle = (name) => document.getElementById("page").classList.toggle(name);
+  workstation.help = () => document.getElementById("help").showModal();
+  workstation.flip = (axis) => screens.flip(axis);
+  workstation.fitView = () => screens.fit();
+  workstation.until = async (condition) => {
+    while (!condition()) await new Promise((done) => setTimeout(done, 15));
+  };
+  for (const name of ["tool", "dual", "savePicture", "saveVideo", "saveDicom"]) {
+    workstation[name] = async (...options) => {
+      workstation.exporting += 1;
+      try {
+        for (const menu of document.querySelectorAll("details.ussim-menu[open]")) menu.open = false;
+        await measure[name](...options);
+      } finally {
+        workstation.exporting -= 1;
+      }
+    };
+  }
+  let before = null; // the eight gains when the master began to move
+  workstation.tgcMaster = (slider) => {
+    const names = slider.dataset.names.split(",");
+    if (!before) {
+      before = names.map((name) => Number(document.getElementById(`slider-${name}`).value));
+      slider.addEventListener("change", () => (before = null), { once: true });
+    }
+    names.forEach((name, n) => {
+      const { min, max } = document.getElementById(`slider-${name}`);
+      window.trame.trigger("set", [name, Math.min(Math.max(before[n] + Number(slider.value), Number(min)), Number(max))]);
+    });
+  };
 
   // Sends the files of an input; the bar below the image shows how far they are.
   workstation.send = (input, purpose) => {
@@ -185,19 +244,25 @@
   });
 
   // Over HTTP: on the web socket keys and Cancel would wait until the file is there.
-  workstation.save = async (kind) => {
+  workstation.save = (kind) => workstation.fetched(`exported?${new URLSearchParams({ kind })}`, { cache: "no-store" });
+  workstation.fetched = async (address, options) => {
+    for (const menu of document.querySelectorAll("details.ussim-menu[open]")) menu.open = false;
     workstation.exporting += 1;
     try {
-      const answer = await fetch(`exported?${new URLSearchParams({ kind })}`, { cache: "no-store" });
+      const answer = await fetch(address, options);
       if (answer.status !== 200) return; // the server shows the error, or it was cancelled
-      const link = document.createElement("a");
-      link.download = decodeURIComponent(answer.headers.get("Content-Disposition").split("''")[1]);
-      link.href = URL.createObjectURL(await answer.blob());
-      link.click();
-      setTimeout(() => URL.revokeObjectURL(link.href), 60_000); // the browser saves it in its own time
+      const name = decodeURIComponent(answer.headers.get("Content-Disposition").split("''")[1]);
+      workstation.download(await answer.blob(), name);
     } finally {
       workstation.exporting -= 1;
     }
+  };
+  workstation.download = (blob, name) => {
+    const link = document.createElement("a");
+    link.download = name;
+    link.href = URL.createObjectURL(blob);
+    link.click();
+    setTimeout(() => URL.revokeObjectURL(link.href), 60_000); // the browser saves it in its own time
   };
 
   // For screen readers, what trame's own parts lack: names of the rendered views, and leave to zoom.
@@ -226,6 +291,7 @@
     window.trame.client.onConnectionClose(lost);
     window.trame.client.onConnectionError(lost);
     connection.subscribe("trame.rca.topic.stream", draw);
+    screens.observe();
     workstation.connected = true;
     window.trame.trigger("page_opened");
     setInterval(showLatency, 300);

@@ -1,0 +1,67 @@
+"""Advice: the one line over the image that says what matters most now, and what its button does."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from SlicerUSSim.Widget.notes import CHECK
+from SlicerUSSim.Workstation.browser_panel import BrowserPanel
+from SlicerUSSim.Workstation.pose_registration import Registration
+from SlicerUSSim.Workstation.state import AdviceState
+
+#: Words of warnings about the contrast (mri/plausibility.py), and the contrast that is meant
+_CONTRASTS = {"as in t1 or t1gd": "t1", "as in flair or t2": "t2", "choose t1gd": "t1gd"}
+
+
+class Advice:
+    """Shows what the notes say first, with a remedy: bone before the probe, no contact, contrast, calibration."""
+
+    def __init__(self, panel: BrowserPanel, registration: Registration) -> None:
+        self._panel, self._presenter, self._registration = panel, panel.presenter, registration
+        self._do: Callable[[], object] = lambda: None
+
+    def update(self) -> None:
+        """Find the line anew; called when the panel has been refreshed."""
+        text, remedy, self._do = self._found()
+        with self._panel.shared.changing() as now:
+            if (now.advice.text, now.advice.remedy) != (text, remedy):
+                now.advice = AdviceState(text, remedy)
+
+    def follow(self, is_outdated: bool) -> None:
+        """Do what the button says; called in a task."""
+        if is_outdated:
+            self._presenter.images.simulate()
+        else:
+            self._panel.act(self._do)
+
+    def _found(self) -> tuple[str, str, Callable[[], object]]:
+        placing, values = self._presenter.placing, self._presenter.values
+        line = self._first("probeNotesLabel")
+        if line.startswith("no skull is labelled"):
+
+            def label() -> None:
+                values.setValue("scene.outside", True)
+                self._panel.act(self._presenter.segmenting.segment)
+
+            return line, "Label the whole head", label
+        if line and "skull" in line and placing.canOpenCraniotomy()[0]:
+            return line, "Open skull", placing.openCraniotomy
+        if line:
+            return line, "Place the probe", placing.placeAtView
+        line = self._first("notesLabel")
+        chosen = next((contrast for words, contrast in _CONTRASTS.items() if words in line), "")
+        if chosen:
+
+            def segment() -> None:
+                values.setValue("scene.contrast", chosen)
+                self._panel.act(self._presenter.segmenting.segment)
+
+            return line, f"Segment as {chosen}", segment
+        if self._registration.is_waiting:
+            return "The real ultrasound is not calibrated: its place in the patient is not known", "", lambda: None
+        return line, "", lambda: None
+
+    def _first(self, label: str) -> str:
+        """The first line of a label that a user should check."""
+        lines = str(self._panel.shared.value(label) or "").splitlines()
+        return next((line.partition(CHECK)[2] for line in lines if CHECK in line), "")
