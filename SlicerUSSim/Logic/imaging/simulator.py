@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import logging
 import warnings
-from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from threading import RLock
 from time import perf_counter
@@ -20,6 +20,7 @@ from SlicerUSSim.Logic.base.transforms import check_rigid
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.imaging import stages
 from SlicerUSSim.Logic.imaging.aperture import Aperture, aperture_fields
+from SlicerUSSim.Logic.imaging.batch import OUTPUTS, arrays_for, fetched, one_per_image, same_shapes
 from SlicerUSSim.Logic.imaging.bmode import downshift, log_band_above, pulse_taps
 from SlicerUSSim.Logic.imaging.compounding import Compounder, sweep_grid
 from SlicerUSSim.Logic.imaging.contact import line_contact
@@ -27,6 +28,7 @@ from SlicerUSSim.Logic.imaging.diffraction import speckle_height_mm
 from SlicerUSSim.Logic.imaging.frame import Echoes, Frame
 from SlicerUSSim.Logic.imaging.medium import Medium, as_labels
 from SlicerUSSim.Logic.imaging.noise import stirred
+from SlicerUSSim.Logic.imaging.quality import coarser_fans, sigmas_between, worked
 from SlicerUSSim.Logic.imaging.raytracing import RayTracer
 from SlicerUSSim.Logic.imaging.scattering import cells_in_view, sites_per_mm3
 from SlicerUSSim.Logic.imaging.signals import RayTree
@@ -168,7 +170,7 @@ class UltrasoundSimulator:
             frame = self._rendered(probe, pose, display, grid, timings, noise_seed)
             self._warn_if_empty(probe, pose)  # while the device computes
             with self._timed("download", timings):
-                samples = self._sample_count(probe)
+                samples = self._sample_count(frame.probe, frame.settings)
                 iq, envelope, bmode = (frame.download(name)[:, :samples] for name in ("iq", "envelope", "grey"))
                 image = self._persisted(frame.download("image"), probe, display, frame.grid)
                 self._warn_if_overflown()
@@ -178,12 +180,93 @@ class UltrasoundSimulator:
             envelope=envelope,
             bmode=bmode,
             image=image,
-            sample_interval_mm=self._sample_mm(probe),
+            sample_interval_mm=self._sample_mm(frame.probe, frame.settings),
             cycles_per_mm=self._cycles_per_mm(probe),
             grid=frame.grid,
             probe_to_ras=pose,
             timings_ms=timings,
+            probe=probe,
+            patient=self.medium.labels,
+            reference_speed_m_s=frame.settings.reference_speed_m_s,
         )
+
+    def simulate_batch(
+        self,
+        probes: Probe | Sequence[Probe],
+        poses: Iterable[np.ndarray],
+        *,
+        display: DisplaySettings | Sequence[DisplaySettings] | None = None,
+        tissues: TissueTable | Sequence[TissueTable] | None = None,
+        outputs: Sequence[str] = ("image",),
+        out: Mapping[str, np.ndarray] | None = None,
+        noise_seed: int = 0,
+    ) -> dict[str, np.ndarray]:
+        """{output: array} of images at `poses` (n, 4, 4); image i is that of simulate() with noise_seed + i.
+
+        One image is prepared while the device computes the one before, and nothing else than the outputs is downloaded.
+
+        Parameters
+        ----------
+        probes, display, tissues : one for all images, or one for each; tissues by default the simulator's. The images
+            do not follow each other: display.persistence has no effect.
+        outputs : some of "image" (n, rows, columns) uint8; "labels", the tissue labels at the places of the pixels, and
+            "labels_as_imaged", where travel time and refraction put them, both (n, rows, columns) uint8 and 0 outside
+            the imaged field; "depth" (n, rows, columns) float32, mm along the scan line, nan outside; "iq" complex64,
+            "envelope" float32 and "bmode" uint8 (n, scan_lines, samples).
+        out : {output: array} to write to, as np.memmap. Without it arrays for which memory is short are temporary files
+            (in TMPDIR), which go with them.
+
+        Warns as simulate(), and once for all images that are empty. Raises SimulationError, before anything is
+        computed, as simulate(), for images of different sizes and for an `out` of another shape or type.
+
+        >>> import numpy as np
+        >>> from SlicerUSSim.Logic import DisplaySettings, LinearProbe, TissueTable, UltrasoundSimulator, Volume
+        >>> from SlicerUSSim.Logic.probe import pose_looking_at, slide_sweep
+        >>> labels = Volume(np.ones((40, 40, 40), np.uint8), np.eye(4))
+        >>> simulator = UltrasoundSimulator(labels, TissueTable.named(["liver"]))
+        >>> poses = slide_sweep(pose_looking_at((20, 20, 39), (20, 20, 0)), length_mm=4, frames=3)
+        >>> display, probe = DisplaySettings(image_size=(128, 96)), LinearProbe(width_mm=20, depth_mm=30)
+        >>> pairs = simulator.simulate_batch(probe, poses, display=display, outputs=("image", "labels"))
+        >>> pairs["image"].shape, pairs["labels"].shape
+        ((3, 128, 96), (3, 128, 96))
+        """
+        poses = [check_rigid(f"pose {number}", pose) for number, pose in enumerate(poses)]
+        require(bool(poses), "the batch has no pose, expected at least one")
+        probes, displays, tables = (
+            one_per_image(name, given, kind, len(poses))
+            for name, given, kind in (
+                ("probes", probes, Probe), ("display", display, DisplaySettings), ("tissues", tissues, TissueTable),
+            )
+        )  # fmt: skip
+        grids = [
+            ImageGrid.for_probe(probe, shown and shown.image_size) for probe, shown in zip(probes, displays, strict=True)
+        ]
+        pixels = same_shapes([(grid.rows, grid.columns) for grid in grids])
+        lines = [self._signal_shape(*worked(probe, self.settings, pixels[1])) for probe in probes]
+        has_signals = not all(OUTPUTS[name][2] for name in outputs if name in OUTPUTS)
+        arrays = arrays_for(outputs, len(poses), pixels, same_shapes(lines) if has_signals else lines[0], out)
+        for probe in dict.fromkeys(probes):
+            self.warn_if_slow(probe)
+        table, before = None, None
+        with ExitStack() as stack:
+            if tissues is not None:  # of this batch alone
+                stack.enter_context(self._lock)
+                stack.enter_context(self.with_tissues(self.medium.tissues))
+            for number, (probe, pose, shown, own) in enumerate(zip(probes, poses, displays, tables, strict=True)):
+                if own is not table:
+                    self.set_tissues(own)
+                    table = own
+                with self._lock:  # for one image, so that others need not wait for the batch
+                    frame = self._rendered(probe, pose, shown, grids[number], {}, noise_seed + number)
+                    fetching = {name: fetched(name, frame, pose, lines[number][1]) for name in outputs}
+                    self.device.flush()
+                self._warn_if_empty(probe, pose)
+                # While the device computes this image, the host completes the one before, and prepares the next.
+                _complete(arrays, before)
+                before = number, fetching
+            _complete(arrays, before)
+        self._warn_if_overflown(len(poses))
+        return arrays
 
     def render(
         self,
@@ -212,8 +295,11 @@ class UltrasoundSimulator:
         with self._lock:
             own, self.settings = self.settings, replace(settings, contact_gap_mm=None)  # which the echoes have already
             try:
+                grid = ImageGrid.for_probe(probe, display.image_size)
+                probe, settings = worked(probe, self.settings, grid.columns)
+                probe = replace(probe, scan_lines=len(echoes.parts))
                 frame = self.device_frame(
-                    probe, echoes.probe_to_ras, display, None, noise_seed, self._acquisition_buffer
+                    probe, echoes.probe_to_ras, display, grid, noise_seed, self._acquisition_buffer, settings
                 )
             finally:
                 self.settings = own
@@ -252,9 +338,11 @@ class UltrasoundSimulator:
         noise_seed: int,
     ) -> DeviceFrame:
         with self._timed("upload", timings):
-            frame = self.device_frame(probe, pose, display, grid, noise_seed, self._acquisition_buffer)
+            grid = grid or ImageGrid.for_probe(probe, None if display is None else display.image_size)
+            probe, settings = worked(probe, self.settings, grid.columns)
+            frame = self.device_frame(probe, pose, display, grid, noise_seed, self._acquisition_buffer, settings)
         # The baseband signal does not depend on display, noise or pixels.
-        inputs = (frame.acquisition.tobytes(), self.settings, self.medium.version)
+        inputs = (frame.acquisition.tobytes(), settings, self.medium.version)
         if self.profiling or self._iq_made_for != inputs:
             _log.debug("frame: rays and echoes computed")
             self._iq_made_for = None
@@ -393,16 +481,20 @@ class UltrasoundSimulator:
         grid: ImageGrid | None = None,
         noise_seed: int = 0,
         buffer: Buffer | None = None,
+        settings: SimulationSettings | None = None,
     ) -> DeviceFrame:
-        """The inputs of the stages of one frame; its record is written to `buffer`, by default a new one."""
-        display = _DEFAULT_DISPLAY if display is None else display
+        """The inputs of the stages of one frame; its record is written to `buffer`, by default a new one.
+
+        Of full quality, unless probe and `settings` (default: the simulator's) are those of quality.worked.
+        """
+        display, settings = _DEFAULT_DISPLAY if display is None else display, settings or self.settings
         require(isinstance(display, DisplaySettings), f"display is {display!r:.80}, expected DisplaySettings")
-        gap_mm = self.settings.contact_gap_mm
+        gap_mm = settings.contact_gap_mm
         frame = DeviceFrame(
             probe=probe,
-            settings=self.settings,
+            settings=settings,
             contact=None if gap_mm is None else line_contact(self.medium.labels, probe, pose, gap_mm),
-            acquisition=self.acquisition(probe, pose),
+            acquisition=self.acquisition(probe, pose, settings),
             axial_sigma_mm=self.axial_sigma_mm(probe),
             display=display,
             grid=grid or ImageGrid.for_probe(probe, display.image_size),
@@ -413,18 +505,19 @@ class UltrasoundSimulator:
         self.device.write(frame.acquisition_buffer, frame.acquisition)
         return frame
 
-    def acquisition(self, probe: Probe, pose: np.ndarray) -> np.ndarray:
-        """The record (layout.ACQUISITION) of the constants of one frame."""
-        made_for = probe, self.settings, self.medium.version
+    def acquisition(self, probe: Probe, pose: np.ndarray, settings: SimulationSettings | None = None) -> np.ndarray:
+        """The record (layout.ACQUISITION) of the constants of one frame, by default with the simulator's settings."""
+        settings = settings or self.settings
+        made_for = probe, settings, self.medium.version
         if self._record is None or self._record_made_for != made_for:
-            self._record, self._record_made_for = self._record_of(probe), made_for
+            self._record, self._record_made_for = self._record_of(probe, settings), made_for
         acquisition = self._record.copy()
         acquisition["probe_to_ras"] = pose[:3].ravel()
         return acquisition
 
-    def _record_of(self, probe: Probe) -> np.ndarray:
+    def _record_of(self, probe: Probe, settings: SimulationSettings) -> np.ndarray:
         """The part of the record that does not depend on the pose."""
-        settings, medium = self.settings, self.medium
+        medium, sample_mm = self.medium, self._sample_mm(probe, settings)
         block = CONSTANTS["BLOCK"]
         axial_sigma = self.axial_sigma_mm(probe)
         acquisition = np.zeros((), ACQUISITION)
@@ -464,12 +557,12 @@ class UltrasoundSimulator:
         acquisition["frequency_mhz"] = probe.received_mhz
         acquisition["fractional_bandwidth"] = probe.received_bandwidth
         acquisition["cycles_per_mm"] = self._cycles_per_mm(probe)
-        acquisition["sample_mm"] = self._sample_mm(probe)
+        acquisition["sample_mm"] = sample_mm
         # The last samples of the image have echoes from half a pulse behind it. Borders are found by labels, up to a
         # voxel behind where they are.
-        behind = pulse_taps(axial_sigma / self._sample_mm(probe)).size // 2
-        acquisition["samples"] = -(-(self._sample_count(probe) + behind) // block) * block
-        acquisition["traced_mm"] = probe.displayed_mm + behind * self._sample_mm(probe) + medium.labels.spacing_mm.min()
+        behind = pulse_taps(axial_sigma / sample_mm).size // 2
+        acquisition["samples"] = -(-(self._sample_count(probe, settings) + behind) // block) * block
+        acquisition["traced_mm"] = probe.displayed_mm + behind * sample_mm + medium.labels.spacing_mm.min()
         acquisition["wavefront_curvature"] = CURVED if settings.wavefront_curvature else 0.0
         for name, value in transmit_fields(probe).items():
             acquisition[name] = value
@@ -482,7 +575,8 @@ class UltrasoundSimulator:
         acquisition["lateral_rays"], acquisition["guard_lines"] = lateral, guard
         traced = acquisition["traced_lines"] = (probe.scan_lines - 1) * lateral + 1 + 2 * guard
         voxel_mm = float(acquisition["voxel_mm"])
-        for name, value in aperture_fields(probe, settings, voxel_mm, traced, guard, lateral).items():
+        fans = aperture_fields(probe, settings, voxel_mm, traced, guard, lateral)
+        for name, value in (fans if settings.quality == "full" else fans | coarser_fans(fans)).items():
             acquisition[name] = value
         acquisition["interface_gain"] = 10.0 ** (settings.interface_gain_db / 20.0)
         acquisition["interface_is_energy"] = settings.interface_reflection == "energy"
@@ -502,11 +596,15 @@ class UltrasoundSimulator:
         """Standard deviation of the pulse in depth, millimetres, with the scanner's speed of sound."""
         return probe.axial_sigma_mm * self.settings.reference_speed_m_s / NOMINAL_SPEED_M_S
 
-    def _sample_mm(self, probe: Probe) -> float:
-        return 1.0 / (self.settings.samples_per_cycle * self._cycles_per_mm(probe))
+    def _signal_shape(self, probe: Probe, settings: SimulationSettings) -> tuple[int, int]:
+        """(scan_lines, samples) of the signals along the lines."""
+        return probe.scan_lines, self._sample_count(probe, settings)
 
-    def _sample_count(self, probe: Probe) -> int:
-        return int(np.ceil(probe.displayed_mm / self._sample_mm(probe)))
+    def _sample_mm(self, probe: Probe, settings: SimulationSettings) -> float:
+        return 1.0 / (settings.samples_per_cycle * self._cycles_per_mm(probe))
+
+    def _sample_count(self, probe: Probe, settings: SimulationSettings) -> int:
+        return int(np.ceil(probe.displayed_mm / self._sample_mm(probe, settings)))
 
     def warn_if_slow(self, probe: Probe) -> None:
         """Warn if an image has so many scatterers that it takes seconds.
@@ -518,7 +616,7 @@ class UltrasoundSimulator:
             return
         lateral, guard = _traced_lines_for(probe, self.settings)
         traced = (probe.scan_lines - 1) * lateral + 1 + 2 * guard
-        chunk_mm = CONSTANTS["BLOCK"] * self._sample_mm(probe)
+        chunk_mm = CONSTANTS["BLOCK"] * self._sample_mm(probe, self.settings)
         cells = cells_in_view(self.settings, probe, traced, lateral, chunk_mm)
         if cells <= _MANY_CELLS:
             self._fast_for = asked_for
@@ -576,6 +674,15 @@ class UltrasoundSimulator:
         timings[name] = (perf_counter() - start) * 1e3
 
 
+def _complete(
+    arrays: dict[str, np.ndarray], image: tuple[int, dict[str, Callable[[], np.ndarray]]] | None
+) -> None:
+    """Write the outputs of one image of a batch, its number and what gives them, to the arrays."""
+    if image is not None:
+        for name, output in image[1].items():
+            arrays[name][image[0]] = output()
+
+
 def _packed_texture(texture: Texture | None, labels: Volume, settings: SimulationSettings) -> np.ndarray | None:
     """The texture in the device's format, or None if the settings do not require it."""
     require(
@@ -631,8 +738,7 @@ def _traced_lines_for(probe: Probe, settings: SimulationSettings) -> tuple[int, 
     Those beyond the edge provide the other half of the beam for the outermost scan lines (if it is at most 16 lines
     wide, which is not the case only near the apex of a phased array).
     """
-    depth = np.linspace(0.0, probe.depth_mm, 65)
-    sigmas = probe.line_distance_mm(depth) / probe.beam_sigma_mm(depth)[0]
+    depth, sigmas = sigmas_between(probe)
     lateral = settings.lateral_rays or int(min(np.ceil(sigmas.max() / 1.5), 128))
     deep = sigmas[depth >= 0.1 * probe.depth_mm]
     return lateral, int(min(np.ceil(settings.beam_cutoff * lateral / deep.min()), 16 * lateral))
