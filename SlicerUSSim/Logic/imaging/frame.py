@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from SlicerUSSim.Logic.base.errors import require
+from SlicerUSSim.Logic.base.errors import required
 from SlicerUSSim.Logic.base.files import written_whole
 from SlicerUSSim.Logic.base.ultrasound_dicom import ultrasound_dicom
 from SlicerUSSim.Logic.base.volume import Volume, require_image_name
@@ -85,8 +85,8 @@ class Frame:
 
         Raises SimulationError for a frame without its probe and patient.
         """
-        require(self.probe is not None and self.patient is not None, "the frame has no patient, expected a simulated one")
-        return geometric_labels(self.patient, self.probe, self.grid, self.probe_to_ras)
+        why = "the frame has no patient, expected a simulated one"
+        return geometric_labels(required(self.patient, why), required(self.probe, why), self.grid, self.probe_to_ras)
 
     def save(self, path: str | os.PathLike) -> None:
         """Write the image as PNG, as a DICOM ultrasound image (.dcm) or as a volume of one slice (.nrrd, .nii.gz, ...).

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
@@ -115,6 +116,7 @@ class UltrasoundSimulator:
             f"settings are {self.settings!r:.80}, expected SimulationSettings",
         )
         self.device = Device.get(device)
+        self._device_choice = device if isinstance(device, str) else None
         #: As given, in the order of voxels of medium.labels; or None
         self.texture = texture = None if texture is None else texture.along(labels)
         labels = labels.along()  # kernels draw the tissues at borders along the axes of voxels
@@ -142,6 +144,29 @@ class UltrasoundSimulator:
         # Threads may share a simulator: its buffers hold one frame at a time
         self._lock = RLock()
 
+    @classmethod
+    def from_mri(
+        cls, mri: Volume | str | os.PathLike, settings: SimulationSettings | None = None, device: DeviceChoice = None,
+        **segmentation: Any,
+    ) -> UltrasoundSimulator:  # fmt: skip
+        """From an MRI or CT, or its file, to a simulator: segmented, with preset tissues and texture.
+
+        `segmentation` are values of SegmentationSettings, such as contrast="t2" or thin_sulci=True. medium.labels is
+        the label map, for example for craniotomy_pose. Raises SimulationError as Volume.read and segment_image do.
+        """
+        from SlicerUSSim.Logic.mri.modality import segment_image  # a simulator of labels does not wait for it
+
+        image = mri if isinstance(mri, Volume) else Volume.read(mri)
+        found = segment_image(image, device=device, **segmentation)
+        return cls(found.labels, TissueTable.brain(found.tissue_names), settings, device, found.texture())
+
+    def __reduce__(self) -> tuple:
+        """Pickled by its arguments: where it is unpickled, it is built anew, on the device chosen by name or there."""
+        medium = self.medium
+        return type(self), (
+            medium.labels, medium.tissues, self.settings, self._device_choice, self.texture, medium.sheets
+        )  # fmt: skip
+
     def simulate(
         self,
         probe: Probe,
@@ -151,7 +176,7 @@ class UltrasoundSimulator:
         *,
         noise_seed: int = 0,
     ) -> Frame:
-        """The image of `probe` at the pose `probe_to_ras` (4, 4).
+        """The image of `probe` at the pose `probe_to_ras` (4, 4), with the same noise each time (noise_seed 0).
 
         With display.persistence the image also shows what was in the last ones of this probe, grid and persistence.
         `grid` gives the pixels, for example those of a real image; by default they cover the bounding box of the imaged
@@ -388,9 +413,9 @@ class UltrasoundSimulator:
         display: DisplaySettings | None = None,
         progress: Callable[[int], None] | None = None,
     ) -> Iterator[Frame]:
-        """Yields one Frame per pose; `progress` is called with the number done.
+        """Yields one Frame per pose, whose noise differs: that of simulate() with noise_seed 0, 1, 2, ...
 
-        Their noise differs: the noise_seed is the frame's number, from 0.
+        `progress` is called with the number done.
         """
         require_kind("poses", poses, Iterable, "of (4, 4) probe_to_ras")
         for number, pose in enumerate(poses):

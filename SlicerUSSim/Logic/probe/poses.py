@@ -226,7 +226,6 @@ def sample(volume: Volume, points_ras: np.ndarray, order: int = 1) -> np.ndarray
 def slice_under_probe(volume: Volume, grid: ImageGrid, probe_to_ras: np.ndarray, order: int = 1) -> np.ndarray:
     """(rows, columns) values of `volume` at the pixels of a probe's image."""
     to_ijk = volume.ras_to_ijk @ probe_to_ras @ grid.image_to_probe
-    # (k, j, i) of output voxels (0, row, column), whose coordinates scipy does not keep
-    matrix, offset = to_ijk[[2, 1, 0]][:, [2, 1, 0]], to_ijk[[2, 1, 0], 3]
+    matrix = to_ijk[[2, 1, 0, 3]][:, [2, 1, 0, 3]]  # of (0, row, column), whose coordinates scipy does not store
     shape = (1, grid.rows, grid.columns)
-    return ndimage.affine_transform(volume.array, matrix, offset, output_shape=shape, order=order, cval=0)[0]
+    return ndimage.affine_transform(volume.array, matrix, output_shape=shape, order=order, cval=0)[0]
