@@ -6,7 +6,6 @@ import sys
 
 from vtkmodules.vtkCommonDataModel import vtkImageData
 from vtkmodules.vtkCommonTransforms import vtkTransform
-from vtkmodules.vtkImagingCore import vtkImageFlip
 from vtkmodules.vtkIOImage import vtkPNGWriter
 
 from SlicerUSSim.Logic import Volume
@@ -28,11 +27,8 @@ def write_picture(mri: vtkImageData, path: str) -> UltrasoundSimulationFilter:
     transform.SetMatrix(vtk_matrix(craniotomy_pose(labels, simulation.GetProbe())))
     simulation.SetProbeTransform(transform)
 
-    flip = vtkImageFlip()  # the first row of the image is next to the probe, that of a picture at the bottom
-    flip.SetFilteredAxis(1)
-    flip.SetInputConnection(simulation.GetOutputPort())
     writer = vtkPNGWriter()
-    writer.SetInputConnection(flip.GetOutputPort())
+    writer.SetInputData(simulation.GetPicture())
     writer.SetFileName(path)
     writer.Write()
     return simulation

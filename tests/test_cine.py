@@ -28,7 +28,7 @@ from SlicerUSSim.Logic.mrml.nodes import node_to_world, set_node_to_world  # noq
 from SlicerUSSim.Workstation import cine as cine_module, image_flow  # noqa: E402
 from SlicerUSSim.Workstation.browser_panel import BrowserPanel, Observed  # noqa: E402
 from SlicerUSSim.Workstation.cine import Cine  # noqa: E402
-from SlicerUSSim.Workstation.dicom_export import ultrasound_file  # noqa: E402
+from SlicerUSSim.Workstation.export import ultrasound_file  # noqa: E402
 from SlicerUSSim.Workstation.export import sequence_file  # noqa: E402
 from SlicerUSSim.Workstation.image_flow import ImageFlow, LatencyStamps  # noqa: E402
 from SlicerUSSim.Workstation.state import SharedState  # noqa: E402

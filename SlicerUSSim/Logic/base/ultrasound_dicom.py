@@ -55,7 +55,8 @@ def ultrasound_dicom(
         "DerivationDescription": "Simulated from images of the patient, not acquired by a scanner",
         "ImageType": ["DERIVED", "SECONDARY", "", "0001"],  # a two-dimensional image
         "Manufacturer": "SlicerUSSim", "ManufacturerModelName": "Simulator", "SoftwareVersions": __version__,
-        "BurnedInAnnotation": "YES" if has_texts else "NO", "LossyImageCompression": "00", "SequenceOfUltrasoundRegions": [_dataset(region)],
+        "BurnedInAnnotation": "YES" if has_texts else "NO", "LossyImageCompression": "00",
+        "SequenceOfUltrasoundRegions": [_dataset(region)],
         "SamplesPerPixel": 1 if is_grey else 3, "PhotometricInterpretation": "MONOCHROME2" if is_grey else "RGB",
         **({} if is_grey else {"PlanarConfiguration": 0}), "Rows": rows,
         "Columns": columns, "BitsAllocated": 8, "BitsStored": 8, "HighBit": 7, "PixelRepresentation": 0,

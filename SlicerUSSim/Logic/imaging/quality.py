@@ -2,8 +2,8 @@
 
 With SimulationSettings.quality "full" nothing depends on the size of the image. A "draft" has
 
-- 0.6 scan lines per column of the image, no more than the probe and no fewer than are three sigmas of the beam apart,
-  with one traced line each,
+- 0.6 scan lines per column of the image, no more than the probe and no fewer than are 1.75 sigmas of the beam apart,
+  with one traced line each, or as many as are that far apart where the probe has too few scan lines,
 - four samples per cycle of the carrier times the pulse's fractional bandwidth, two or more,
 - an eighth of the scatterers, about one in the smallest resolution cell, within two sigmas of the beam,
 - one ray instead of several across the slice, and
@@ -24,7 +24,7 @@ from SlicerUSSim.Logic.base.settings import SimulationSettings
 from SlicerUSSim.Logic.imaging.scattering import sites_per_mm3
 from SlicerUSSim.Logic.probe.arrays import Probe
 
-_LINES_PER_COLUMN, _APART_SIGMAS = 0.6, 3.0
+_LINES_PER_COLUMN, _APART_SIGMAS = 0.6, 1.75
 _SAMPLES_PER_BANDWIDTH, _LEAST_SAMPLES = 4.0, 2
 _FEWER_SITES, _LEAST_SITES, _CUTOFF = 8.0, 0.1, 2.0
 _FAN_STEP_MM = 2.0
@@ -35,11 +35,12 @@ def worked(probe: Probe, settings: SimulationSettings, columns: int) -> tuple[Pr
     """The probe and settings that an image of so many columns is computed with."""
     if settings.quality == "full":
         return probe, settings
-    lines = max(np.ceil(_LINES_PER_COLUMN * columns), lines_apart(probe, _APART_SIGMAS))
+    needed = lines_apart(probe, _APART_SIGMAS)
+    lines = int(min(probe.scan_lines, max(np.ceil(_LINES_PER_COLUMN * columns), needed)))
     samples = max(np.ceil(_SAMPLES_PER_BANDWIDTH * probe.received_bandwidth), _LEAST_SAMPLES)
-    return replace(probe, scan_lines=int(min(probe.scan_lines, lines))), replace(
+    return replace(probe, scan_lines=lines), replace(
         settings,
-        lateral_rays=settings.lateral_rays or 1,
+        lateral_rays=settings.lateral_rays or max(-(-(needed - 1) // (lines - 1)), 1),
         elevational_rays=1,
         scatterers_per_mm3=settings.scatterers_per_mm3
         or max(sites_per_mm3(settings, probe) / _FEWER_SITES, _LEAST_SITES),

@@ -264,7 +264,8 @@ class UltrasoundSimulator:
             )
         )  # fmt: skip
         grids = [
-            ImageGrid.for_probe(probe, shown and shown.image_size) for probe, shown in zip(probes, displays, strict=True)
+            ImageGrid.for_probe(probe, shown and shown.image_size)
+            for probe, shown in zip(probes, displays, strict=True)
         ]
         pixels = same_shapes([(grid.rows, grid.columns) for grid in grids])
         lines = [self._signal_shape(*worked(probe, self.settings, pixels[1])) for probe in probes]
@@ -699,9 +700,7 @@ class UltrasoundSimulator:
         timings[name] = (perf_counter() - start) * 1e3
 
 
-def _complete(
-    arrays: dict[str, np.ndarray], image: tuple[int, dict[str, Callable[[], np.ndarray]]] | None
-) -> None:
+def _complete(arrays: dict[str, np.ndarray], image: tuple[int, dict[str, Callable[[], np.ndarray]]] | None) -> None:
     """Write the outputs of one image of a batch, its number and what gives them, to the arrays."""
     if image is not None:
         for name, output in image[1].items():

@@ -65,7 +65,7 @@ class Beam(Declared):
     fractional_bandwidth: float = parameter(
         0.5, "Bandwidth", "-6 dB bandwidth of the two-way pulse, as a fraction of the frequency", bounds=(0.05, 1.5)
     )
-    focus_mm: MmOrNone = parameter(
+    focus_mm: MmOrNone = parameter(  # noqa: RUF009, which knows no descriptors
         _BY_DEPTH, "Focus", "Depth of the transmit focus; none (panels: 0): 60 % of the image depth", unit="mm",
         bounds=(0.1, 1000), shown=Shown(0, 300, is_slider=True, none_at=0.0), can_be_none=True,
         note="It then moves with the depth",
@@ -106,7 +106,7 @@ class Beam(Declared):
     elevation_aperture_mm: float = parameter(
         7.0, "Elevational aperture", "Height of the elements, in the elevation direction", unit="mm", bounds=(0.5, 100)
     )
-    elevation_focus_mm: MmOrNone = parameter(
+    elevation_focus_mm: MmOrNone = parameter(  # noqa: RUF009
         _BY_DEPTH, "Elevational focus", "Depth of the focus of the lens; none: 60 % of the image depth", unit="mm",
         bounds=(0.1, 1000), can_be_none=True, note="It then moves with the depth",
     )  # fmt: skip

@@ -8,14 +8,8 @@
     actor.GetMapper().SetInputConnection(simulation.GetOutputPort())
 
 All images are in patient space (RAS, mm), with origin, spacing and direction matrix. The first row of a B-mode image is
-next to the probe; writers of pictures, as vtkPNGWriter, put the first row at the bottom, so that a picture needs
-
-    flip = vtkImageFlip()  # of vtkImagingCore
-    flip.SetFilteredAxis(1)
-    flip.SetInputConnection(simulation.GetOutputPort())
-
-or simulation.GetFrame().save("image.png"). Errors caused by the caller are
-reported by an ErrorEvent with one line, and by GetErrorMessage; the output is then empty.
+next to the probe, and writers of pictures put the first row at the bottom: `GetPicture` is for them. Errors caused by
+the caller are reported by an ErrorEvent with one line, and by GetErrorMessage; the output is then empty.
 """
 
 from __future__ import annotations
@@ -388,6 +382,19 @@ class UltrasoundSimulationFilter(_ImageFilter):
     def GetFrame(self) -> Frame | None:
         """The frame of the last update: RF, envelope, image, pose."""
         return self._frame
+
+    def GetPicture(self) -> vtkImageData:
+        """The image, updated, for vtkPNGWriter and other writers of pictures: its last row first, without its place.
+
+        Empty after an error of the update.
+        """
+        self.Update()
+        picture, frame = vtkImageData(), self._frame
+        if frame is not None:
+            picture.SetDimensions(*frame.image.shape[::-1], 1)
+            picture.SetSpacing(*frame.pixel_spacing_mm, 1.0)
+            set_scalars(picture, frame.image[::-1])
+        return picture
 
     def FillInputPortInformation(self, port, info):
         info.Set(vtkAlgorithm.INPUT_REQUIRED_DATA_TYPE(), ("vtkImageData", "vtkPolyData")[port])
