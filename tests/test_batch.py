@@ -114,6 +114,7 @@ def test_labels_as_imaged_are_displaced_by_travel_time():
         ({"display": [SMALL, SMALL, DisplaySettings()]}, "image 2 of the batch is 512 x .* the first is 64 x 80"),
         ({"display": [SMALL]}, "display are 1 for 3 poses"),
         ({"probes": [PROBE, PROBE, "convex"]}, "expected one Probe or one for each"),
+        ({"probes": None}, "probes are 0 for 3 poses, expected one Probe"),
         ({"probes": [PROBE, PROBE, replace(PROBE, scan_lines=65)], "outputs": ["iq"]}, "image 2 of the batch is 65 x"),
         ({"outputs": ("picture",)}, "output 'picture' is unknown, expected some of image, labels"),
         ({"poses": []}, "the batch has no pose"),

@@ -138,7 +138,7 @@ class SimulationSettings(Declared):
         "full", "Quality",
         "full: as probe and settings say. draft: fewer scan lines, the fewer columns the image has, fewer scatterers, "
         "samples and rays; a quarter of the time for 160 columns",
-        choices=("full", "draft"), option="quality",
+        choices=("full", "draft"),
         note="The rule is in performance.md. Fits are of full quality",
     )  # fmt: skip
 

@@ -33,8 +33,11 @@ _MOST_OF_MEMORY = 0.5
 
 
 def one_per_image(name: str, given: Any, kind: type, count: int) -> list:
-    """`given`, one for all images or a sequence of one for each. Raises SimulationError for another number of them."""
-    if given is None or isinstance(given, kind):
+    """`given`, one for all images or a sequence of one for each. Raises SimulationError for another number of them.
+
+    All but probes may be None.
+    """
+    if isinstance(given, kind) or (given is None and kind is not Probe):
         return [given] * count
     values = list(given) if isinstance(given, Sequence) else []
     require(

@@ -255,6 +255,7 @@ class UltrasoundSimulator:
         >>> pairs["image"].shape, pairs["labels"].shape
         ((3, 128, 96), (3, 128, 96))
         """
+        require_kind("poses", poses, Iterable, "of (4, 4) probe_to_ras")
         poses = [check_rigid(f"pose {number}", pose) for number, pose in enumerate(poses)]
         require(bool(poses), "the batch has no pose, expected at least one")
         probes, displays, tables = (
@@ -273,24 +274,29 @@ class UltrasoundSimulator:
         arrays = arrays_for(outputs, len(poses), pixels, same_shapes(lines) if has_signals else lines[0], out)
         for probe in dict.fromkeys(probes):
             self.warn_if_slow(probe)
-        table, before = None, None
+
+        def jobs() -> Iterator[tuple]:
+            before = None
+            for number, table in enumerate(tables):
+                if table is not before:
+                    self.set_tissues(table)
+                    before = table
+                yield probes[number], poses[number], displays[number], grids[number], noise_seed + number
+
+        def start(number: int, frame: DeviceFrame) -> Callable[[], None]:
+            fetching = {name: fetched(name, frame, poses[number], lines[number][1]) for name in arrays}
+
+            def complete() -> None:
+                for name, output in fetching.items():
+                    arrays[name][number] = output()
+
+            return complete
+
         with ExitStack() as stack:
             if tissues is not None:  # of this batch alone
                 stack.enter_context(self._lock)
                 stack.enter_context(self.with_tissues(self.medium.tissues))
-            for number, (probe, pose, shown, own) in enumerate(zip(probes, poses, displays, tables, strict=True)):
-                if own is not table:
-                    self.set_tissues(own)
-                    table = own
-                with self._lock:  # for one image, so that others need not wait for the batch
-                    frame = self._rendered(probe, pose, shown, grids[number], {}, noise_seed + number)
-                    fetching = {name: fetched(name, frame, pose, lines[number][1]) for name in outputs}
-                    self.device.flush()
-                self._warn_if_empty(probe, pose)
-                # While the device computes this image, the host completes the one before, and prepares the next.
-                _complete(arrays, before)
-                before = number, fetching
-            _complete(arrays, before)
+            self._in_turn(jobs(), start)
         self._warn_if_overflown(len(poses))
         return arrays
 
@@ -455,7 +461,7 @@ class UltrasoundSimulator:
         """
         require_kind("probe", probe, Probe, "a ConvexProbe, LinearProbe or PhasedProbe")
         require_kind("poses", poses, Iterable, "of (4, 4) probe_to_ras")
-        poses = list(poses)
+        poses = [check_rigid("probe_to_ras", pose) for pose in poses]
         self.warn_if_slow(probe)
         grid = like if like is not None else sweep_grid(probe, poses, spacing_mm)
         _log.info(
@@ -465,22 +471,40 @@ class UltrasoundSimulator:
         compounder = Compounder(grid, probe, self.device)
         display = DisplaySettings() if display is None else display
         pixels = ImageGrid.for_probe(probe, display.image_size)
-        before = None
-        for number, pose in enumerate(poses):
-            pose = check_rigid("probe_to_ras", pose)
-            self._warn_if_empty(probe, pose)
-            with self._lock:  # for one image, so that others need not wait for the volume
-                image = self.render(probe, pose, display, pixels, noise_seed=number)
-                compounder.add_buffer(image, pixels, pose)
-            # One image is prepared while the device computes the previous one, and no more than one.
-            done = self.device.mark()
-            if before is not None:
-                before.wait()
-            before = done
-            if progress is not None:
-                progress(number + 1)
+
+        def start(number: int, frame: DeviceFrame) -> Callable[[], object]:
+            compounder.add_buffer(frame.image, pixels, poses[number])
+            return self.device.mark().wait
+
+        jobs = ((probe, pose, display, pixels, number) for number, pose in enumerate(poses))
+        self._in_turn(jobs, start, progress)
         self._warn_if_overflown(len(poses))
         return compounder.volume(hole_mm)
+
+    def _in_turn(
+        self,
+        jobs: Iterable[tuple],
+        start: Callable[[int, DeviceFrame], Callable[[], object]],
+        progress: Callable[[int], None] | None = None,
+    ) -> None:
+        """Enqueue images (probe, pose, display, grid, noise_seed), and call what `start` gives to complete each.
+
+        While the device computes an image, the host completes the one before and prepares the next, no more than one.
+        """
+        before: Callable[[], object] | None = None
+        for number, (probe, pose, display, grid, noise_seed) in enumerate(jobs):
+            with self._lock:  # for one image, so that others need not wait for all
+                frame = self._rendered(probe, pose, display, grid, {}, noise_seed)
+                complete = start(number, frame)
+                self.device.queue.flush()
+            self._warn_if_empty(probe, pose, stacklevel=4)
+            if before is not None:
+                before()
+            before = complete
+            if progress is not None:
+                progress(number + 1)
+        if before is not None:
+            before()
 
     def set_tissues(self, tissues: TissueTable) -> None:
         """Change tissue parameters without rebuilding the medium."""
@@ -664,11 +688,13 @@ class UltrasoundSimulator:
         require(cells <= _MOST_CELLS, f"{what}: {many}, expected at most {_MOST_CELLS:.0e} cells; {remedy}")
         warnings.warn(f"{what}: {many}; {remedy}", SlowScatterersWarning, stacklevel=3)
 
-    def _warn_if_empty(self, probe: Probe, pose: np.ndarray) -> None:
+    def _warn_if_empty(self, probe: Probe, pose: np.ndarray, stacklevel: int = 3) -> None:
         """Warn if the volume has no labels, or the bounding box of the imaged field, in voxels, does not meet it."""
         if list(self.medium.present) == [0] and not self.medium.tissues[0].scatterer_variance:
             warnings.warn(
-                "the label map has no labels, only 0: the image has no echoes of tissue", EmptyViewWarning, stacklevel=3
+                "the label map has no labels, only 0: the image has no echoes of tissue",
+                EmptyViewWarning,
+                stacklevel=stacklevel,
             )
         left, right, top, bottom = probe.image_bounds_mm()
         corners = np.array([[x, y, 0.0, 1.0] for x in (left, right) for y in (top, bottom)])
@@ -676,7 +702,9 @@ class UltrasoundSimulator:
         size = np.array(self.medium.labels.array.shape[::-1])
         if (voxels.max(axis=1) < -0.5).any() or (voxels.min(axis=1) > size - 0.5).any():
             warnings.warn(
-                "the probe looks past the volume: the image has no echoes of tissue", EmptyViewWarning, stacklevel=3
+                "the probe looks past the volume: the image has no echoes of tissue",
+                EmptyViewWarning,
+                stacklevel=stacklevel,
             )
 
     def _warn_if_overflown(self, frames: int = 1) -> None:
@@ -698,13 +726,6 @@ class UltrasoundSimulator:
         yield
         self.device.queue.finish()
         timings[name] = (perf_counter() - start) * 1e3
-
-
-def _complete(arrays: dict[str, np.ndarray], image: tuple[int, dict[str, Callable[[], np.ndarray]]] | None) -> None:
-    """Write the outputs of one image of a batch, its number and what gives them, to the arrays."""
-    if image is not None:
-        for name, output in image[1].items():
-            arrays[name][image[0]] = output()
 
 
 def _packed_texture(texture: Texture | None, labels: Volume, settings: SimulationSettings) -> np.ndarray | None:

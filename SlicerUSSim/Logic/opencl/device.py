@@ -257,10 +257,6 @@ class Device:
 
         return wait
 
-    def flush(self) -> None:
-        """Have the device begin with what is enqueued."""
-        self.queue.flush()
-
     def take_profile(self) -> dict[str, float]:
         """Milliseconds per kernel since the last call (requires profiling)."""
         self.queue.finish()
