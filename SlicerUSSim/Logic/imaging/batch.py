@@ -86,7 +86,7 @@ def arrays_for(
 
 
 def free_memory() -> float:
-    """Bytes of memory that are free or hold what can be read again; without Linux' or other numbers of it, infinite."""
+    """Bytes that new arrays may take, as Linux says; infinite elsewhere."""
     try:
         with open("/proc/meminfo") as lines:
             return 1024.0 * next(int(line.split()[1]) for line in lines if line.startswith("MemAvailable"))
@@ -101,7 +101,7 @@ def _filed(shape: tuple[int, ...], kind: type[np.generic]) -> np.ndarray:
         with tempfile.TemporaryFile() as file:
             if hasattr(os, "posix_fallocate"):  # a full disk would end the process later
                 os.posix_fallocate(file.fileno(), 0, size)
-            return np.memmap(file, kind, "r+" if hasattr(os, "posix_fallocate") else "w+", shape=shape)
+            return np.memmap(file, kind, "w+", shape=shape)
     except OSError as error:
         raise SimulationError(
             f"a batch of {size / 2**30:.1f} GB fits neither into memory nor into {tempfile.gettempdir()} "

@@ -119,10 +119,8 @@ class Frame:
         """The image with square pixels."""
         from PIL import Image
 
-        across, down = self.pixel_spacing_mm
-        rows, columns = self.image.shape
-        size = (max(round(columns * across / down), 1), rows)
-        return Image.fromarray(self.image) if size[0] == columns else Image.fromarray(self.image).resize(size)
+        (across, down), (rows, columns) = self.pixel_spacing_mm, self.image.shape
+        return Image.fromarray(self.image).resize((max(round(columns * across / down), 1), rows))
 
     def to_volume(self) -> Volume:
         """The image as a Volume of one slice in patient space; the slice thickness is the pixel height."""

@@ -35,7 +35,7 @@ def worked(probe: Probe, settings: SimulationSettings, columns: int) -> tuple[Pr
     """The probe and settings that an image of so many columns is computed with."""
     if settings.quality == "full":
         return probe, settings
-    needed = lines_apart(probe, _APART_SIGMAS)
+    needed = int(np.ceil((probe.scan_lines - 1) * sigmas_between(probe)[1].max() / _APART_SIGMAS)) + 1
     lines = int(min(probe.scan_lines, max(np.ceil(_LINES_PER_COLUMN * columns), needed)))
     samples = max(np.ceil(_SAMPLES_PER_BANDWIDTH * probe.received_bandwidth), _LEAST_SAMPLES)
     return replace(probe, scan_lines=lines), replace(
@@ -47,11 +47,6 @@ def worked(probe: Probe, settings: SimulationSettings, columns: int) -> tuple[Pr
         beam_cutoff=min(settings.beam_cutoff, _CUTOFF),
         samples_per_cycle=int(min(settings.samples_per_cycle, samples)),
     )
-
-
-def lines_apart(probe: Probe, sigmas: float) -> int:
-    """The fewest scan lines that are nowhere more than so many lateral sigmas of the beam apart."""
-    return int(np.ceil((probe.scan_lines - 1) * sigmas_between(probe)[1].max() / sigmas)) + 1
 
 
 @lru_cache(maxsize=64)
