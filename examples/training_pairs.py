@@ -31,7 +31,7 @@ def write_pairs(mri: Volume, out: Path, images: int, seed: int = 0) -> None:
     gains = random.uniform(-6, 6, images)
     displays = [DisplaySettings(gain_db=gain, image_size=(128, 160)) for gain in gains]
     pairs = simulator.simulate_batch(probes, poses, display=displays, outputs=("image", "labels"))
-    np.savez_compressed(out, poses=poses, **pairs)
+    np.savez_compressed(out, poses=poses, image=pairs["image"], labels=pairs["labels"])
 
 
 if __name__ == "__main__":

@@ -98,6 +98,8 @@ def test_labels_as_imaged_are_displaced_by_travel_time():
     found = slow.simulate_batch(PROBE, POSES[1:2], display=DisplaySettings(image_size=(250, 80)),
                                 outputs=("labels", "labels_as_imaged"))  # fmt: skip
     row_mm = 50.0 / 250
+    again = slow.simulate_batch(PROBE, POSES[1:2], display=SMALL, outputs=("labels_as_imaged", "iq"))  # echoes at hand
+    assert (again["labels_as_imaged"] == 3).any()
     true, seen = (int(np.argmax(labels[0][:, 40] == 3)) * row_mm for labels in found.values())
     assert true == pytest.approx(43.5, abs=0.3)
     assert seen - true == pytest.approx(12.0 * (1540.0 / 1400.0 - 1.0), abs=0.3)

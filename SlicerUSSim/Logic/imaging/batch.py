@@ -28,6 +28,8 @@ OUTPUTS: dict[str, tuple[type[np.generic], str, bool]] = {
     "envelope": (np.float32, "envelope", False),
     "bmode": (np.uint8, "grey", False),
 }
+#: Steps of the displacement of lines
+_SHIFT_STEP_MM = 0.25
 #: Part of the free memory that arrays may have; larger ones are files
 _MOST_OF_MEMORY = 0.5
 
@@ -154,38 +156,52 @@ def fetched(name: str, frame: DeviceFrame, pose: np.ndarray, samples: int) -> Ca
         start = frame.medium.device.start_download
         segments = start(tree.segments, (traced, CONSTANTS["MAX_SEGMENTS"]), SEGMENT)
         counts = start(tree.segment_counts, (traced,), np.int32)
-        return lambda: _imaged(frame, labels, segments(), counts())
+        return lambda: _imaged(frame, labels, pose, segments(), counts())
     signal = frame.start_download(OUTPUTS[name][1])
     return signal if name == "image" else lambda: signal()[:, :samples]
 
 
-def _imaged(frame: DeviceFrame, labels: Volume, segments: np.ndarray, counts: np.ndarray) -> np.ndarray:
+def _imaged(
+    frame: DeviceFrame, labels: Volume, pose: np.ndarray, segments: np.ndarray, counts: np.ndarray
+) -> np.ndarray:
     """(rows, columns) uint8 labels where travel time and refraction put them; 0 outside the imaged field.
 
-    A pixel has the label of the place that its traced line passes when the echo of the pixel's depth is made. A line
-    that ends, as at air, shows nothing behind that: 0. `segments` (traced lines, MAX_SEGMENTS) are layout.SEGMENT.
+    A pixel has the label of its own place, displaced as far as the nearest traced line is when the echo of the pixel's
+    depth is made. A line that ends, as at air, shows nothing behind that: 0. `segments` (traced lines, MAX_SEGMENTS)
+    are layout.SEGMENT, with `counts` in use.
     """
     probe, grid, record = frame.probe, frame.grid, frame.acquisition
-    step = 0.5 * grid.pixel_spacing_mm[1]
-    depth = np.arange(0.0, probe.displayed_mm + step, step)
-    to_voxel, shape = labels.ras_to_ijk, labels.array.shape
-    of_lines = np.zeros((len(counts), len(depth)), np.uint8)
-    for row, line, count in zip(of_lines, segments, counts, strict=True):
+    depth = np.arange(0.0, probe.displayed_mm + _SHIFT_STEP_MM, _SHIFT_STEP_MM)
+    places = np.full((len(counts), len(depth), 3), np.nan, np.float32)
+    for there, line, count in zip(places, segments, counts, strict=True):
         direct = line[:count][line["reflections"][:count] == 0]
-        if len(direct) == 0:
-            continue
-        piece = np.maximum(np.searchsorted(direct["depth_mm"], depth, side="right") - 1, 0)
-        at = direct[piece]
-        along = (depth - at["depth_mm"]) / at["depth_per_mm"]
-        place = at["start"] + along[:, None] * at["direction"]
-        k, j, i = np.rint(place @ to_voxel[:3, :3].T + to_voxel[:3, 3]).astype(int).T[::-1]
-        seen = along <= at["length_mm"] + step
-        for index, size in zip((k, j, i), shape, strict=True):
-            seen &= (index >= 0) & (index < size)
-        row[seen] = labels.array[k[seen], j[seen], i[seen]]
-    position, along = _places(probe, grid)
-    line = (position - probe.first_line) / probe.line_spacing * int(record["lateral_rays"])
-    line = np.clip(np.rint(line).astype(int) + int(record["guard_lines"]), 0, len(of_lines) - 1)
-    found = of_lines[line, np.clip(np.rint(along / step).astype(int), 0, len(depth) - 1)]
-    found[~_field(probe, grid)] = 0
+        if len(direct):
+            piece = np.maximum(np.searchsorted(direct["depth_mm"], depth, side="right") - 1, 0)
+            along = (depth - direct["depth_mm"][piece]) / direct["depth_per_mm"][piece]
+            there[:] = direct["start"][piece] + along[:, None] * direct["direction"][piece]
+            there[along > direct["length_mm"][piece] + _SHIFT_STEP_MM] = np.nan
+    lateral, guard = int(record["lateral_rays"]), int(record["guard_lines"])
+    origin, direction = probe.line_at(
+        probe.first_line + probe.line_spacing * (np.arange(len(counts)) - guard) / lateral
+    )
+    straight = (origin[:, None] + depth[:, None] * direction[:, None]) @ pose[:3, :3].T + pose[:3, 3]
+    shift = ((places - straight) @ labels.ras_to_ijk[:3, :3].T).astype(np.float32)
+    line, at = _nearest(probe, grid, lateral, guard, len(counts))
+    to_ijk = (labels.ras_to_ijk @ pose @ grid.image_to_probe).astype(np.float32)
+    columns, rows = np.arange(grid.columns, dtype=np.float32)[:, None], np.arange(grid.rows, dtype=np.float32)
+    ijk = shift[line, at] + (columns * to_ijk[:3, 0] + to_ijk[:3, 3]) + (rows[:, None] * to_ijk[:3, 1])[:, None]
+    seen = np.isfinite(ijk[..., 0]) & _field(probe, grid)
+    index = np.rint(ijk[seen]).astype(np.intp).T[::-1]
+    inside = np.all((index >= 0) & (index < np.array(labels.array.shape)[:, None]), axis=0)
+    found = np.zeros((grid.rows, grid.columns), np.uint8)
+    found[seen] = np.where(inside, labels.array[tuple(np.where(inside, index, 0))], 0)
     return found
+
+
+@lru_cache(maxsize=4)
+def _nearest(probe: Probe, grid: ImageGrid, lateral: int, guard: int, traced: int) -> tuple[np.ndarray, np.ndarray]:
+    """(rows, columns) numbers of the traced line and of the depth, in _SHIFT_STEP_MM, that are nearest to a pixel."""
+    position, along = _places(probe, grid)
+    line = np.rint((position - probe.first_line) / probe.line_spacing * lateral).astype(int) + guard
+    depth = np.rint(np.clip(along, 0.0, probe.displayed_mm) / _SHIFT_STEP_MM).astype(int)
+    return np.clip(line, 0, traced - 1), depth

@@ -281,6 +281,8 @@ class UltrasoundSimulator:
                 if table is not before:
                     self.set_tissues(table)
                     before = table
+                if "labels_as_imaged" in arrays:
+                    self.forget_echoes()  # they need the rays, too
                 yield probes[number], poses[number], displays[number], grids[number], noise_seed + number
 
         def start(number: int, frame: DeviceFrame) -> Callable[[], None]:

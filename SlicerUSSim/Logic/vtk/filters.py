@@ -391,7 +391,7 @@ class UltrasoundSimulationFilter(_ImageFilter):
         self.Update()
         picture, frame = vtkImageData(), self._frame
         if frame is not None:
-            picture.SetDimensions(*frame.image.shape[::-1], 1)
+            picture.SetDimensions(frame.grid.columns, frame.grid.rows, 1)
             picture.SetSpacing(*frame.pixel_spacing_mm, 1.0)
             set_scalars(picture, frame.image[::-1])
         return picture
