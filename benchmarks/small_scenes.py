@@ -128,6 +128,7 @@ def settings(rng: np.random.Generator) -> SimulationSettings:
         samples_per_cycle=int(rng.integers(3, 6)),
         beam=str(rng.choice(["aperture", "aperture", "ray"])),
         interface_reflection=str(rng.choice(["pressure", "energy"])),
+        quality="full",
         partial_volume=bool(rng.random() < 0.6),
         mri_modulation_db=float(rng.choice([0.0, 2.0])),
         contact_gap_mm=float(rng.uniform(0, 4)) if rng.random() < 0.4 else None,

@@ -29,7 +29,7 @@ from SlicerUSSim.Logic.mrml.taken_files import sequence_file  # noqa: E402
 from SlicerUSSim.Workstation import cine as cine_module, image_flow  # noqa: E402
 from SlicerUSSim.Workstation.browser_panel import BrowserPanel  # noqa: E402
 from SlicerUSSim.Workstation.cine import Cine  # noqa: E402
-from SlicerUSSim.Workstation.dicom_export import ultrasound_file  # noqa: E402
+from SlicerUSSim.Workstation.export import ultrasound_file  # noqa: E402
 from SlicerUSSim.Workstation.image_flow import ImageFlow, LatencyStamps  # noqa: E402
 from SlicerUSSim.Workstation.state import SharedState  # noqa: E402
 from SlicerUSSim.Workstation.tasks import Tasks  # noqa: E402

@@ -52,8 +52,8 @@ def test_a_wrong_value_in_the_record_of_a_frame_is_noticed(monkeypatch):
     unnoticed = []
     for field, factor in WRONG_RECORDS.items():
 
-        def wrong(probe, pose, field=field, factor=factor):
-            record = right(probe, pose)
+        def wrong(*inputs, field=field, factor=factor):
+            record = right(*inputs)
             record[field] *= factor
             return record
 

@@ -413,3 +413,25 @@ def test_labels_without_names_are_recognised_or_refused():
     known.SetTissues(TissueTable({0: FLUID, 1: SPECKLE}))
     known.Update()
     assert known.GetFrame() is not None
+
+
+def test_what_is_set_can_be_got():
+    """Each Set method of both filters has a Get method, which gives the same object."""
+    names = {"OtherData": "t2"}
+    for kind in (SegmentationFilter, UltrasoundSimulationFilter):
+        algorithm, own = kind(), {name for base in kind.__mro__[:2] for name in vars(base)}
+        values = {
+            "Settings": SegmentationSettings(classes=4) if kind is SegmentationFilter else SimulationSettings(seed=1),
+            "MaskData": cyst().to_vtk(), "OtherData": cyst().to_vtk(), "Device": "cpu", "InputData": cyst().to_vtk(),
+            "Probe": PROBE, "ProbeTransform": vtkTransform(), "Tissues": TISSUES, "Display": DISPLAY,
+            "FieldAlpha": True,
+            "Preset": Preset(PROBE, DISPLAY, SimulationSettings(seed=1), TISSUES), "SheetsData": vtkPolyData(),
+            "Texture": None,
+        }  # fmt: skip
+        for name in (name.removeprefix("Set") for name in own if name.startswith("Set")):
+            getattr(algorithm, f"Set{name}")(*([names[name]] if name in names else []), values[name])
+            got = algorithm.GetInputDataObject(0, 0) if name == "InputData" else getattr(algorithm, f"Get{name}")()
+            assert (got[names[name]] if name in names else got) == values[name], name
+    algorithm = SegmentationFilter()
+    algorithm.AddTissueData("tumour", values["MaskData"])
+    assert algorithm.GetAddedTissues() == (("tumour", values["MaskData"]),)

@@ -7,6 +7,7 @@ fitting, vtk, mrml. Names are imported when they are first used, so that importi
 from typing import TYPE_CHECKING
 
 from SlicerUSSim.Logic.base.lazy import lazy_exports
+from SlicerUSSim.Logic.base.version import __version__ as __version__
 
 if TYPE_CHECKING:
     from .base.errors import SimulationError as SimulationError

@@ -4,28 +4,36 @@ from __future__ import annotations
 
 import io
 import json
+import math
 import zipfile
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+import numpy as np
+from PIL import Image
 from trame_slicer.core import SlicerApp
 from vtkmodules.vtkCommonCore import vtkOutputWindow
 
-from SlicerUSSim.Logic.base.errors import require, required
+from SlicerUSSim.Logic.base.errors import SimulationError, require, required
+from SlicerUSSim.Logic.base.ultrasound_dicom import ultrasound_dicom
 from SlicerUSSim.Logic.mrml.nodes import nodes_of_class
 from SlicerUSSim.Logic.mrml.taken_files import FRAME_SUFFIXES, frame_file, png, sequence_file
+from SlicerUSSim.Logic.mrml.taken_image import TakenImage
 from SlicerUSSim.Workstation.browser_panel import BrowserPanel
 from SlicerUSSim.Workstation.cine import Cine
-from SlicerUSSim.Workstation.dicom_export import ultrasound_file
 from SlicerUSSim.Workstation.pose_entry import PoseEntry
 
 #: The kind of export that a page composes
 DICOM = "dicom"
+#: Bytes of all pixels
+_MOST_BYTES = 2**30
+#: Numbers that a page sends: edges of the image region in pixels (x1, y1 behind the last), mm per pixel, ms per frame
+_NAMES = ("x0", "y0", "x1", "y1", "mm_x", "mm_y", "frame_ms")
 
 
 class Exports:
-    """The contents of the menu Export, by kind: png, .nrrd, .mha, .vti, cine, dicom, mrb, json, pose.*.
+    """The files of the menu Save, by kind: png, .nrrd, .mha, .vti, cine, dicom, mrb, json, pose.*.
 
     Each is (file name, content, MIME type). Raises SimulationError if there is nothing to export.
     """
@@ -40,7 +48,7 @@ class Exports:
     def export(self, kind: str, sent: Mapping[str, bytes]) -> tuple[str, bytes, str]:
         """Export one kind, in a task: what takes time can be cancelled, and images go on meanwhile.
 
-        `sent` are the files of which a page has composed it, see dicom_export.ultrasound_file.
+        `sent` are the files of which a page has composed it, see ultrasound_file.
         """
         if kind == "json":
             return "preset.json", json.dumps(self._preset().to_dict(), indent=2).encode(), "application/json"
@@ -115,3 +123,30 @@ def _remove_unused_stores(scene) -> None:
     for store in nodes_of_class(scene, "vtkMRMLStorageNode"):
         if store not in used:
             scene.RemoveNode(store)
+
+
+def ultrasound_file(sent: Mapping[str, bytes], taken: TakenImage) -> bytes:
+    """One frame or several as a DICOM file of the patient and time of `taken`, with one calibrated region.
+
+    `sent` are the frames (PNG) by name, in their order, and "": JSON with the numbers of _NAMES.
+    Raises SimulationError for frames of several sizes, and for a region that is not in them.
+    """
+    try:
+        about = json.loads(sent.get("", b""))
+        x0, y0, x1, y1, mm_x, mm_y, frame_ms = (float(about[name]) for name in _NAMES)
+        images = [Image.open(io.BytesIO(content)) for name, content in sent.items() if name]
+        sizes = {image.size for image in images}
+        require(len(sizes) == 1, f"the frames have the sizes {sorted(sizes)}, expected one size")
+        width, height = sizes.pop()
+        require(3 * width * height * len(images) <= _MOST_BYTES, f"the frames are {len(images)}, expected fewer")
+        frames = np.stack([np.asarray(image.convert("RGB")) for image in images])
+    except (ValueError, LookupError, TypeError, OSError) as error:
+        raise SimulationError(f"the frames of the page cannot be read ({error})") from None
+    scale = mm_x, mm_y, frame_ms if len(images) > 1 else 1.0
+    is_scale = all(0 < value < math.inf for value in scale)
+    is_region = 0 <= x0 < x1 <= width and 0 <= y0 < y1 <= height
+    require(is_region and is_scale, f"the region of the image is {about}, expected one within {width}x{height} pixels")
+    edges = tuple(map(round, (x0, y0, x1 - 1, y1 - 1)))
+    return ultrasound_dicom(
+        frames, edges, (mm_x, mm_y), patient=taken.patient, time=taken.time, frame_ms=scale[2], has_texts=True
+    )

@@ -133,7 +133,14 @@ class SimulationSettings(Declared):
         "Exponent n of the echo's factor cosⁿ of the angle of incidence; higher is more specular",
         bounds=(0, 100),
     )
-    samples_per_cycle: int = parameter(4, "Samples per cycle", "RF samples per cycle of the carrier", bounds=(3, 16))
+    samples_per_cycle: int = parameter(4, "Samples per cycle", "RF samples per cycle of the carrier", bounds=(2, 16))
+    quality: str = parameter(
+        "full", "Quality",
+        "full: as probe and settings say. draft: fewer scan lines, the fewer columns the image has, fewer scatterers, "
+        "samples and rays; a quarter of the time for 160 columns",
+        choices=("full", "draft"),
+        note="The rule is in performance.md. Fits are of full quality",
+    )  # fmt: skip
 
     @property
     def needs_texture(self) -> bool:

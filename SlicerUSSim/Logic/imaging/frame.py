@@ -2,12 +2,22 @@
 
 from __future__ import annotations
 
+import io
+import os
 from dataclasses import dataclass, field
 from functools import cached_property
+from pathlib import Path
 
 import numpy as np
 
-from SlicerUSSim.Logic.base.volume import Volume
+from SlicerUSSim.Logic.base.errors import required
+from SlicerUSSim.Logic.base.files import written_whole
+from SlicerUSSim.Logic.base.ultrasound_dicom import ultrasound_dicom
+from SlicerUSSim.Logic.base.volume import Volume, require_image_name
+from SlicerUSSim.Logic.imaging.batch import geometric_labels
+from SlicerUSSim.Logic.imaging.figures import write_png
+from SlicerUSSim.Logic.probe.arrays import Probe
+from SlicerUSSim.Logic.probe.beam import NOMINAL_SPEED_M_S
 from SlicerUSSim.Logic.probe.image_grid import ImageGrid
 
 #: Largest of the numbers of Echoes, well within float16
@@ -16,31 +26,48 @@ _LARGEST = 2.0**15
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """One simulated image with its geometry and the signals from which it was computed."""
+    """One simulated image with its geometry and the signals from which it was computed.
 
-    #: (scan_lines, samples) complex64 baseband (I/Q) signal before ring-down, noise and TGC
+    Parameters
+    ----------
+    iq : (scan_lines, samples) complex64 baseband (I/Q) signal before ring-down, noise and TGC.
+    envelope : (scan_lines, samples) float32 after noise and TGC.
+    bmode : (scan_lines, samples) uint8 grey levels along the scan lines.
+    image : (rows, columns) uint8 scan-converted image, its first row next to the probe; outside the field 0.
+    sample_interval_mm : depth between samples.
+    cycles_per_mm : carrier cycles per millimetre of depth.
+    grid : the pixels in the probe frame.
+    probe_to_ras : (4, 4) pose of the probe.
+    timings_ms : {stage: milliseconds, the host waiting for each}, with "upload" and "download"; empty unless
+        `simulator.profiling` is on.
+    probe : that of the image; its field is where the image has pixels. A draft may have fewer scan lines.
+    patient : the Volume of tissue labels that was imaged.
+    reference_speed_m_s : the speed of sound that turns time into depth.
+    """
+
     iq: np.ndarray = field(repr=False)
-    #: (scan_lines, samples) float32 after noise and TGC
     envelope: np.ndarray = field(repr=False)
-    #: (scan_lines, samples) uint8 grey levels along the scan lines
     bmode: np.ndarray = field(repr=False)
-    #: (rows, columns) uint8 scan-converted image; outside the field 0
     image: np.ndarray = field(repr=False)
-    #: Depth between samples
     sample_interval_mm: float
-    #: Carrier cycles per millimetre of depth
     cycles_per_mm: float
     grid: ImageGrid
-    #: (4, 4)
     probe_to_ras: np.ndarray
-    #: Milliseconds per stage; empty unless the simulator profiles
     timings_ms: dict[str, float] = field(default_factory=dict, repr=False)
+    probe: Probe | None = field(default=None, repr=False)
+    patient: Volume | None = field(default=None, repr=False)
+    reference_speed_m_s: float = NOMINAL_SPEED_M_S
 
     @cached_property
     def rf(self) -> np.ndarray:
         """(scan_lines, samples) complex64 analytic RF signal; its real part is the sampled echo signal."""
         depth = np.arange(self.iq.shape[1]) * self.sample_interval_mm
         return self.iq * np.exp(2j * np.pi * self.cycles_per_mm * depth).astype(np.complex64)
+
+    @property
+    def sampling_rate_hz(self) -> float:
+        """Samples per second of the signals along the scan lines."""
+        return 500.0 * self.reference_speed_m_s / self.sample_interval_mm
 
     @property
     def pixel_spacing_mm(self) -> tuple[float, float]:
@@ -51,6 +78,49 @@ class Frame:
     def image_to_probe(self) -> np.ndarray:
         """(4, 4) from (column, row, 0, 1) to the probe frame in millimetres."""
         return self.grid.image_to_probe
+
+    def labels(self) -> np.ndarray:
+        """(rows, columns) tissue labels of the patient in the image plane, at the places of the pixels; 0 outside the
+        imaged field. Where refraction and travel time put them is labels_as_imaged of simulate_batch.
+
+        Raises SimulationError for a frame without its probe and patient.
+        """
+        why = "the frame has no patient, expected a simulated one"
+        return geometric_labels(required(self.patient, why), required(self.probe, why), self.grid, self.probe_to_ras)
+
+    def save(self, path: str | os.PathLike) -> None:
+        """Write the image as PNG, as a DICOM ultrasound image (.dcm) or as a volume of one slice (.nrrd, .nii.gz, ...).
+
+        DICOM has the millimetres per pixel and no patient; a volume its place. On failure an existing file is kept.
+        Raises SimulationError for another suffix, and if the file cannot be written.
+        """
+        require_image_name(Path(path), (".png", ".dcm"))
+        suffix = Path(path).suffix.lower()
+        if suffix == ".png":
+            write_png(path, self.image)
+        elif suffix == ".dcm":
+            rows, columns = self.image.shape
+            content = ultrasound_dicom(self.image[None], (0, 0, columns - 1, rows - 1), self.pixel_spacing_mm)
+            with written_whole(path) as partial:
+                Path(partial).write_bytes(content)
+        else:
+            self.to_volume().write(path)
+
+    def show(self) -> None:
+        """Open the image in the viewer of pictures of this computer; a notebook shows a frame by itself."""
+        self._picture().show("B-mode")
+
+    def _repr_png_(self) -> bytes:
+        buffer = io.BytesIO()
+        self._picture().save(buffer, "PNG")
+        return buffer.getvalue()
+
+    def _picture(self):
+        """The image with square pixels."""
+        from PIL import Image
+
+        (across, down), (rows, columns) = self.pixel_spacing_mm, self.image.shape
+        return Image.fromarray(self.image).resize((max(round(columns * across / down), 1), rows))
 
     def to_volume(self) -> Volume:
         """The image as a Volume of one slice in patient space; the slice thickness is the pixel height."""

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import logging
+import os
 import warnings
-from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from threading import RLock
 from time import perf_counter
@@ -20,6 +21,7 @@ from SlicerUSSim.Logic.base.transforms import check_rigid
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.imaging import stages
 from SlicerUSSim.Logic.imaging.aperture import Aperture, aperture_fields
+from SlicerUSSim.Logic.imaging.batch import OUTPUTS, arrays_for, fetched, one_per_image, same_shapes
 from SlicerUSSim.Logic.imaging.bmode import downshift, log_band_above, pulse_taps
 from SlicerUSSim.Logic.imaging.compounding import Compounder, sweep_grid
 from SlicerUSSim.Logic.imaging.contact import line_contact
@@ -27,6 +29,7 @@ from SlicerUSSim.Logic.imaging.diffraction import speckle_height_mm
 from SlicerUSSim.Logic.imaging.frame import Echoes, Frame
 from SlicerUSSim.Logic.imaging.medium import Medium, as_labels
 from SlicerUSSim.Logic.imaging.noise import stirred
+from SlicerUSSim.Logic.imaging.quality import coarser_fans, sigmas_between, worked
 from SlicerUSSim.Logic.imaging.raytracing import RayTracer
 from SlicerUSSim.Logic.imaging.scattering import cells_in_view, sites_per_mm3
 from SlicerUSSim.Logic.imaging.signals import RayTree
@@ -113,6 +116,7 @@ class UltrasoundSimulator:
             f"settings are {self.settings!r:.80}, expected SimulationSettings",
         )
         self.device = Device.get(device)
+        self._device_choice = device if isinstance(device, str) else None
         #: As given, in the order of voxels of medium.labels; or None
         self.texture = texture = None if texture is None else texture.along(labels)
         labels = labels.along()  # kernels draw the tissues at borders along the axes of voxels
@@ -140,6 +144,29 @@ class UltrasoundSimulator:
         # Threads may share a simulator: its buffers hold one frame at a time
         self._lock = RLock()
 
+    @classmethod
+    def from_mri(
+        cls, mri: Volume | str | os.PathLike, settings: SimulationSettings | None = None, device: DeviceChoice = None,
+        **segmentation: Any,
+    ) -> UltrasoundSimulator:  # fmt: skip
+        """From an MRI or CT, or its file, to a simulator: segmented, with preset tissues and texture.
+
+        `segmentation` are values of SegmentationSettings, such as contrast="t2" or thin_sulci=True. medium.labels is
+        the label map, for example for craniotomy_pose. Raises SimulationError as Volume.read and segment_image do.
+        """
+        from SlicerUSSim.Logic.mri.modality import segment_image  # a simulator of labels does not wait for it
+
+        image = mri if isinstance(mri, Volume) else Volume.read(mri)
+        found = segment_image(image, device=device, **segmentation)
+        return cls(found.labels, TissueTable.brain(found.tissue_names), settings, device, found.texture())
+
+    def __reduce__(self) -> tuple:
+        """Pickled by its arguments: where it is unpickled, it is built anew, on the device chosen by name or there."""
+        medium = self.medium
+        return type(self), (
+            medium.labels, medium.tissues, self.settings, self._device_choice, self.texture, medium.sheets
+        )  # fmt: skip
+
     def simulate(
         self,
         probe: Probe,
@@ -149,7 +176,7 @@ class UltrasoundSimulator:
         *,
         noise_seed: int = 0,
     ) -> Frame:
-        """The image of `probe` at the pose `probe_to_ras` (4, 4).
+        """The image of `probe` at the pose `probe_to_ras` (4, 4), with the same noise each time (noise_seed 0).
 
         With display.persistence the image also shows what was in the last ones of this probe, grid and persistence.
         `grid` gives the pixels, for example those of a real image; by default they cover the bounding box of the imaged
@@ -168,7 +195,7 @@ class UltrasoundSimulator:
             frame = self._rendered(probe, pose, display, grid, timings, noise_seed)
             self._warn_if_empty(probe, pose)  # while the device computes
             with self._timed("download", timings):
-                samples = self._sample_count(probe)
+                samples = self._sample_count(frame.probe, frame.settings)
                 iq, envelope, bmode = (frame.download(name)[:, :samples] for name in ("iq", "envelope", "grey"))
                 image = self._persisted(frame.download("image"), probe, display, frame.grid)
                 self._warn_if_overflown()
@@ -178,12 +205,102 @@ class UltrasoundSimulator:
             envelope=envelope,
             bmode=bmode,
             image=image,
-            sample_interval_mm=self._sample_mm(probe),
+            sample_interval_mm=self._sample_mm(frame.probe, frame.settings),
             cycles_per_mm=self._cycles_per_mm(probe),
             grid=frame.grid,
             probe_to_ras=pose,
             timings_ms=timings,
+            probe=probe,
+            patient=self.medium.labels,
+            reference_speed_m_s=frame.settings.reference_speed_m_s,
         )
+
+    def simulate_batch(
+        self,
+        probes: Probe | Sequence[Probe],
+        poses: Iterable[np.ndarray],
+        *,
+        display: DisplaySettings | Sequence[DisplaySettings] | None = None,
+        tissues: TissueTable | Sequence[TissueTable] | None = None,
+        outputs: Sequence[str] = ("image",),
+        out: Mapping[str, np.ndarray] | None = None,
+        noise_seed: int = 0,
+    ) -> dict[str, np.ndarray]:
+        """{output: array} of images at `poses` (n, 4, 4); image i is that of simulate() with noise_seed + i.
+
+        One image is prepared while the device computes the one before, and nothing else than the outputs is downloaded.
+
+        Parameters
+        ----------
+        probes, display, tissues : one for all images, or one for each; tissues by default the simulator's. The images
+            do not follow each other: display.persistence has no effect.
+        outputs : some of "image" (n, rows, columns) uint8; "labels", the tissue labels at the places of the pixels, and
+            "labels_as_imaged", where travel time and refraction put them, both (n, rows, columns) uint8 and 0 outside
+            the imaged field; "depth" (n, rows, columns) float32, mm along the scan line, nan outside; "iq" complex64,
+            "envelope" float32 and "bmode" uint8 (n, scan_lines, samples).
+        out : {output: array} to write to, as np.memmap. Without it arrays for which memory is short are temporary files
+            (in TMPDIR), which go with them.
+
+        Warns as simulate(), and once for all images that are empty. Raises SimulationError, before anything is
+        computed, as simulate(), for images of different sizes and for an `out` of another shape or type.
+
+        >>> import numpy as np
+        >>> from SlicerUSSim.Logic import DisplaySettings, LinearProbe, TissueTable, UltrasoundSimulator, Volume
+        >>> from SlicerUSSim.Logic.probe import pose_looking_at, slide_sweep
+        >>> labels = Volume(np.ones((40, 40, 40), np.uint8), np.eye(4))
+        >>> simulator = UltrasoundSimulator(labels, TissueTable.named(["liver"]))
+        >>> poses = slide_sweep(pose_looking_at((20, 20, 39), (20, 20, 0)), length_mm=4, frames=3)
+        >>> display, probe = DisplaySettings(image_size=(128, 96)), LinearProbe(width_mm=20, depth_mm=30)
+        >>> pairs = simulator.simulate_batch(probe, poses, display=display, outputs=("image", "labels"))
+        >>> pairs["image"].shape, pairs["labels"].shape
+        ((3, 128, 96), (3, 128, 96))
+        """
+        require_kind("poses", poses, Iterable, "of (4, 4) probe_to_ras")
+        poses = [check_rigid(f"pose {number}", pose) for number, pose in enumerate(poses)]
+        require(bool(poses), "the batch has no pose, expected at least one")
+        probes, displays, tables = (
+            one_per_image(name, given, kind, len(poses))
+            for name, given, kind in (
+                ("probes", probes, Probe), ("display", display, DisplaySettings), ("tissues", tissues, TissueTable),
+            )
+        )  # fmt: skip
+        grids = [
+            ImageGrid.for_probe(probe, shown and shown.image_size)
+            for probe, shown in zip(probes, displays, strict=True)
+        ]
+        pixels = same_shapes([(grid.rows, grid.columns) for grid in grids])
+        lines = [self._signal_shape(*worked(probe, self.settings, pixels[1])) for probe in probes]
+        has_signals = not all(OUTPUTS[name][2] for name in outputs if name in OUTPUTS)
+        arrays = arrays_for(outputs, len(poses), pixels, same_shapes(lines) if has_signals else lines[0], out)
+        for probe in dict.fromkeys(probes):
+            self.warn_if_slow(probe)
+
+        def jobs() -> Iterator[tuple]:
+            before = None
+            for number, table in enumerate(tables):
+                if table is not before:
+                    self.set_tissues(table)
+                    before = table
+                if "labels_as_imaged" in arrays:
+                    self.forget_echoes()  # they need the rays, too
+                yield probes[number], poses[number], displays[number], grids[number], noise_seed + number
+
+        def start(number: int, frame: DeviceFrame) -> Callable[[], None]:
+            fetching = {name: fetched(name, frame, poses[number], lines[number][1]) for name in arrays}
+
+            def complete() -> None:
+                for name, output in fetching.items():
+                    arrays[name][number] = output()
+
+            return complete
+
+        with ExitStack() as stack:
+            if tissues is not None:  # of this batch alone
+                stack.enter_context(self._lock)
+                stack.enter_context(self.with_tissues(self.medium.tissues))
+            self._in_turn(jobs(), start)
+        self._warn_if_overflown(len(poses))
+        return arrays
 
     def render(
         self,
@@ -212,8 +329,11 @@ class UltrasoundSimulator:
         with self._lock:
             own, self.settings = self.settings, replace(settings, contact_gap_mm=None)  # which the echoes have already
             try:
+                grid = ImageGrid.for_probe(probe, display.image_size)
+                probe, settings = worked(probe, self.settings, grid.columns)
+                probe = replace(probe, scan_lines=len(echoes.parts))
                 frame = self.device_frame(
-                    probe, echoes.probe_to_ras, display, None, noise_seed, self._acquisition_buffer
+                    probe, echoes.probe_to_ras, display, grid, noise_seed, self._acquisition_buffer, settings
                 )
             finally:
                 self.settings = own
@@ -252,9 +372,11 @@ class UltrasoundSimulator:
         noise_seed: int,
     ) -> DeviceFrame:
         with self._timed("upload", timings):
-            frame = self.device_frame(probe, pose, display, grid, noise_seed, self._acquisition_buffer)
+            grid = grid or ImageGrid.for_probe(probe, None if display is None else display.image_size)
+            probe, settings = worked(probe, self.settings, grid.columns)
+            frame = self.device_frame(probe, pose, display, grid, noise_seed, self._acquisition_buffer, settings)
         # The baseband signal does not depend on display, noise or pixels.
-        inputs = (frame.acquisition.tobytes(), self.settings, self.medium.version)
+        inputs = (frame.acquisition.tobytes(), settings, self.medium.version)
         if self.profiling or self._iq_made_for != inputs:
             _log.debug("frame: rays and echoes computed")
             self._iq_made_for = None
@@ -300,9 +422,9 @@ class UltrasoundSimulator:
         display: DisplaySettings | None = None,
         progress: Callable[[int], None] | None = None,
     ) -> Iterator[Frame]:
-        """Yields one Frame per pose; `progress` is called with the number done.
+        """Yields one Frame per pose, whose noise differs: that of simulate() with noise_seed 0, 1, 2, ...
 
-        Their noise differs: the noise_seed is the frame's number, from 0.
+        `progress` is called with the number done.
         """
         require_kind("poses", poses, Iterable, "of (4, 4) probe_to_ras")
         for number, pose in enumerate(poses):
@@ -341,7 +463,7 @@ class UltrasoundSimulator:
         """
         require_kind("probe", probe, Probe, "a ConvexProbe, LinearProbe or PhasedProbe")
         require_kind("poses", poses, Iterable, "of (4, 4) probe_to_ras")
-        poses = list(poses)
+        poses = [check_rigid("probe_to_ras", pose) for pose in poses]
         self.warn_if_slow(probe)
         grid = like if like is not None else sweep_grid(probe, poses, spacing_mm)
         _log.info(
@@ -351,22 +473,40 @@ class UltrasoundSimulator:
         compounder = Compounder(grid, probe, self.device)
         display = DisplaySettings() if display is None else display
         pixels = ImageGrid.for_probe(probe, display.image_size)
-        before = None
-        for number, pose in enumerate(poses):
-            pose = check_rigid("probe_to_ras", pose)
-            self._warn_if_empty(probe, pose)
-            with self._lock:  # for one image, so that others need not wait for the volume
-                image = self.render(probe, pose, display, pixels, noise_seed=number)
-                compounder.add_buffer(image, pixels, pose)
-            # One image is prepared while the device computes the previous one, and no more than one.
-            done = self.device.mark()
-            if before is not None:
-                before.wait()
-            before = done
-            if progress is not None:
-                progress(number + 1)
+
+        def start(number: int, frame: DeviceFrame) -> Callable[[], object]:
+            compounder.add_buffer(frame.image, pixels, poses[number])
+            return self.device.mark().wait
+
+        jobs = ((probe, pose, display, pixels, number) for number, pose in enumerate(poses))
+        self._in_turn(jobs, start, progress)
         self._warn_if_overflown(len(poses))
         return compounder.volume(hole_mm)
+
+    def _in_turn(
+        self,
+        jobs: Iterable[tuple],
+        start: Callable[[int, DeviceFrame], Callable[[], object]],
+        progress: Callable[[int], None] | None = None,
+    ) -> None:
+        """Enqueue images (probe, pose, display, grid, noise_seed), and call what `start` gives to complete each.
+
+        While the device computes an image, the host completes the one before and prepares the next, no more than one.
+        """
+        before: Callable[[], object] | None = None
+        for number, (probe, pose, display, grid, noise_seed) in enumerate(jobs):
+            with self._lock:  # for one image, so that others need not wait for all
+                frame = self._rendered(probe, pose, display, grid, {}, noise_seed)
+                complete = start(number, frame)
+                self.device.queue.flush()
+            self._warn_if_empty(probe, pose, stacklevel=4)
+            if before is not None:
+                before()
+            before = complete
+            if progress is not None:
+                progress(number + 1)
+        if before is not None:
+            before()
 
     def set_tissues(self, tissues: TissueTable) -> None:
         """Change tissue parameters without rebuilding the medium."""
@@ -393,16 +533,20 @@ class UltrasoundSimulator:
         grid: ImageGrid | None = None,
         noise_seed: int = 0,
         buffer: Buffer | None = None,
+        settings: SimulationSettings | None = None,
     ) -> DeviceFrame:
-        """The inputs of the stages of one frame; its record is written to `buffer`, by default a new one."""
-        display = _DEFAULT_DISPLAY if display is None else display
+        """The inputs of the stages of one frame; its record is written to `buffer`, by default a new one.
+
+        Of full quality, unless probe and `settings` (default: the simulator's) are those of quality.worked.
+        """
+        display, settings = _DEFAULT_DISPLAY if display is None else display, settings or self.settings
         require(isinstance(display, DisplaySettings), f"display is {display!r:.80}, expected DisplaySettings")
-        gap_mm = self.settings.contact_gap_mm
+        gap_mm = settings.contact_gap_mm
         frame = DeviceFrame(
             probe=probe,
-            settings=self.settings,
+            settings=settings,
             contact=None if gap_mm is None else line_contact(self.medium.labels, probe, pose, gap_mm),
-            acquisition=self.acquisition(probe, pose),
+            acquisition=self.acquisition(probe, pose, settings),
             axial_sigma_mm=self.axial_sigma_mm(probe),
             display=display,
             grid=grid or ImageGrid.for_probe(probe, display.image_size),
@@ -413,18 +557,19 @@ class UltrasoundSimulator:
         self.device.write(frame.acquisition_buffer, frame.acquisition)
         return frame
 
-    def acquisition(self, probe: Probe, pose: np.ndarray) -> np.ndarray:
-        """The record (layout.ACQUISITION) of the constants of one frame."""
-        made_for = probe, self.settings, self.medium.version
+    def acquisition(self, probe: Probe, pose: np.ndarray, settings: SimulationSettings | None = None) -> np.ndarray:
+        """The record (layout.ACQUISITION) of the constants of one frame, by default with the simulator's settings."""
+        settings = settings or self.settings
+        made_for = probe, settings, self.medium.version
         if self._record is None or self._record_made_for != made_for:
-            self._record, self._record_made_for = self._record_of(probe), made_for
+            self._record, self._record_made_for = self._record_of(probe, settings), made_for
         acquisition = self._record.copy()
         acquisition["probe_to_ras"] = pose[:3].ravel()
         return acquisition
 
-    def _record_of(self, probe: Probe) -> np.ndarray:
+    def _record_of(self, probe: Probe, settings: SimulationSettings) -> np.ndarray:
         """The part of the record that does not depend on the pose."""
-        settings, medium = self.settings, self.medium
+        medium, sample_mm = self.medium, self._sample_mm(probe, settings)
         block = CONSTANTS["BLOCK"]
         axial_sigma = self.axial_sigma_mm(probe)
         acquisition = np.zeros((), ACQUISITION)
@@ -464,12 +609,12 @@ class UltrasoundSimulator:
         acquisition["frequency_mhz"] = probe.received_mhz
         acquisition["fractional_bandwidth"] = probe.received_bandwidth
         acquisition["cycles_per_mm"] = self._cycles_per_mm(probe)
-        acquisition["sample_mm"] = self._sample_mm(probe)
+        acquisition["sample_mm"] = sample_mm
         # The last samples of the image have echoes from half a pulse behind it. Borders are found by labels, up to a
         # voxel behind where they are.
-        behind = pulse_taps(axial_sigma / self._sample_mm(probe)).size // 2
-        acquisition["samples"] = -(-(self._sample_count(probe) + behind) // block) * block
-        acquisition["traced_mm"] = probe.displayed_mm + behind * self._sample_mm(probe) + medium.labels.spacing_mm.min()
+        behind = pulse_taps(axial_sigma / sample_mm).size // 2
+        acquisition["samples"] = -(-(self._sample_count(probe, settings) + behind) // block) * block
+        acquisition["traced_mm"] = probe.displayed_mm + behind * sample_mm + medium.labels.spacing_mm.min()
         acquisition["wavefront_curvature"] = CURVED if settings.wavefront_curvature else 0.0
         for name, value in transmit_fields(probe).items():
             acquisition[name] = value
@@ -482,7 +627,8 @@ class UltrasoundSimulator:
         acquisition["lateral_rays"], acquisition["guard_lines"] = lateral, guard
         traced = acquisition["traced_lines"] = (probe.scan_lines - 1) * lateral + 1 + 2 * guard
         voxel_mm = float(acquisition["voxel_mm"])
-        for name, value in aperture_fields(probe, settings, voxel_mm, traced, guard, lateral).items():
+        fans = aperture_fields(probe, settings, voxel_mm, traced, guard, lateral)
+        for name, value in (fans if settings.quality == "full" else fans | coarser_fans(fans)).items():
             acquisition[name] = value
         acquisition["interface_gain"] = 10.0 ** (settings.interface_gain_db / 20.0)
         acquisition["interface_is_energy"] = settings.interface_reflection == "energy"
@@ -502,11 +648,15 @@ class UltrasoundSimulator:
         """Standard deviation of the pulse in depth, millimetres, with the scanner's speed of sound."""
         return probe.axial_sigma_mm * self.settings.reference_speed_m_s / NOMINAL_SPEED_M_S
 
-    def _sample_mm(self, probe: Probe) -> float:
-        return 1.0 / (self.settings.samples_per_cycle * self._cycles_per_mm(probe))
+    def _signal_shape(self, probe: Probe, settings: SimulationSettings) -> tuple[int, int]:
+        """(scan_lines, samples) of the signals along the lines."""
+        return probe.scan_lines, self._sample_count(probe, settings)
 
-    def _sample_count(self, probe: Probe) -> int:
-        return int(np.ceil(probe.displayed_mm / self._sample_mm(probe)))
+    def _sample_mm(self, probe: Probe, settings: SimulationSettings) -> float:
+        return 1.0 / (settings.samples_per_cycle * self._cycles_per_mm(probe))
+
+    def _sample_count(self, probe: Probe, settings: SimulationSettings) -> int:
+        return int(np.ceil(probe.displayed_mm / self._sample_mm(probe, settings)))
 
     def warn_if_slow(self, probe: Probe) -> None:
         """Warn if an image has so many scatterers that it takes seconds.
@@ -518,7 +668,7 @@ class UltrasoundSimulator:
             return
         lateral, guard = _traced_lines_for(probe, self.settings)
         traced = (probe.scan_lines - 1) * lateral + 1 + 2 * guard
-        chunk_mm = CONSTANTS["BLOCK"] * self._sample_mm(probe)
+        chunk_mm = CONSTANTS["BLOCK"] * self._sample_mm(probe, self.settings)
         cells = cells_in_view(self.settings, probe, traced, lateral, chunk_mm)
         if cells <= _MANY_CELLS:
             self._fast_for = asked_for
@@ -540,11 +690,13 @@ class UltrasoundSimulator:
         require(cells <= _MOST_CELLS, f"{what}: {many}, expected at most {_MOST_CELLS:.0e} cells; {remedy}")
         warnings.warn(f"{what}: {many}; {remedy}", SlowScatterersWarning, stacklevel=3)
 
-    def _warn_if_empty(self, probe: Probe, pose: np.ndarray) -> None:
+    def _warn_if_empty(self, probe: Probe, pose: np.ndarray, stacklevel: int = 3) -> None:
         """Warn if the volume has no labels, or the bounding box of the imaged field, in voxels, does not meet it."""
         if list(self.medium.present) == [0] and not self.medium.tissues[0].scatterer_variance:
             warnings.warn(
-                "the label map has no labels, only 0: the image has no echoes of tissue", EmptyViewWarning, stacklevel=3
+                "the label map has no labels, only 0: the image has no echoes of tissue",
+                EmptyViewWarning,
+                stacklevel=stacklevel,
             )
         left, right, top, bottom = probe.image_bounds_mm()
         corners = np.array([[x, y, 0.0, 1.0] for x in (left, right) for y in (top, bottom)])
@@ -552,7 +704,9 @@ class UltrasoundSimulator:
         size = np.array(self.medium.labels.array.shape[::-1])
         if (voxels.max(axis=1) < -0.5).any() or (voxels.min(axis=1) > size - 0.5).any():
             warnings.warn(
-                "the probe looks past the volume: the image has no echoes of tissue", EmptyViewWarning, stacklevel=3
+                "the probe looks past the volume: the image has no echoes of tissue",
+                EmptyViewWarning,
+                stacklevel=stacklevel,
             )
 
     def _warn_if_overflown(self, frames: int = 1) -> None:
@@ -631,8 +785,7 @@ def _traced_lines_for(probe: Probe, settings: SimulationSettings) -> tuple[int, 
     Those beyond the edge provide the other half of the beam for the outermost scan lines (if it is at most 16 lines
     wide, which is not the case only near the apex of a phased array).
     """
-    depth = np.linspace(0.0, probe.depth_mm, 65)
-    sigmas = probe.line_distance_mm(depth) / probe.beam_sigma_mm(depth)[0]
+    depth, sigmas = sigmas_between(probe)
     lateral = settings.lateral_rays or int(min(np.ceil(sigmas.max() / 1.5), 128))
     deep = sigmas[depth >= 0.1 * probe.depth_mm]
     return lateral, int(min(np.ceil(settings.beam_cutoff * lateral / deep.min()), 16 * lateral))

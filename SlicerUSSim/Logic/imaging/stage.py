@@ -8,6 +8,7 @@ user settings are fields of DisplaySettings, read from `frame.display`.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, ClassVar
 
@@ -93,8 +94,15 @@ class DeviceFrame:
 
     def download(self, signal: str) -> np.ndarray:
         """A copy on the host of "iq", "envelope", "grey" (scan lines, samples) or "image" (rows, columns)."""
+        return self.medium.device.download(*self._signal(signal))
+
+    def start_download(self, signal: str) -> Callable[[], np.ndarray]:
+        """The same without waiting, see Device.start_download."""
+        return self.medium.device.start_download(*self._signal(signal))
+
+    def _signal(self, signal: str) -> tuple[Buffer, tuple[int, int], type[np.generic]]:
         shape = (self.grid.rows, self.grid.columns) if signal == "image" else self.line_shape
-        return self.medium.device.download(getattr(self, signal), shape, _SIGNAL_TYPES[signal])
+        return getattr(self, signal), shape, _SIGNAL_TYPES[signal]
 
 
 _SIGNAL_TYPES = {"iq": np.complex64, "envelope": np.float32, "grey": np.uint8, "image": np.uint8}

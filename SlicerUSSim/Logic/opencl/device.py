@@ -7,6 +7,7 @@ import os
 import re
 import warnings
 from collections import deque
+from collections.abc import Callable
 from functools import lru_cache
 from pathlib import Path
 from threading import RLock
@@ -243,6 +244,18 @@ class Device:
             self.queue.finish()  # this thread takes part in Intel's runtime, unlike one that waits for a copy
             self.cl.enqueue_copy(self.queue, array, buffer)
         return array
+
+    def start_download(self, buffer: Buffer, shape: tuple[int, ...], dtype) -> Callable[[], np.ndarray]:
+        """Enqueue copying a buffer's content to a host array, which what is returned gives when it is there."""
+        _require_not_forked()
+        array = np.empty(shape, dtype)
+        done = self.cl.enqueue_copy(self.queue, array, buffer, is_blocking=False)
+
+        def wait() -> np.ndarray:
+            done.wait()
+            return array
+
+        return wait
 
     def take_profile(self) -> dict[str, float]:
         """Milliseconds per kernel since the last call (requires profiling)."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cache
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -28,6 +28,16 @@ LEAKED = 0.1
 _NO_FOCUS = 1e4
 #: {parameter of the transmit beam: the kind of transmission that it is for}
 TRANSMIT_OF = {"focal_zones": "zones", "transmit_angles": "angles", "largest_angle_deg": "angles"}
+if TYPE_CHECKING:
+
+    class MmOrNone:
+        """A number of millimetres that may be given as None, until the probe's depth is set."""
+
+        def __get__(self, instance: object, owner: Any) -> float: ...
+        def __set__(self, instance: object, value: float | None) -> None: ...
+
+else:
+    MmOrNone = float | None
 #: None until the probe's depth is set. Typed Any, since constructed probes never have None
 _BY_DEPTH: Any = None
 
@@ -55,7 +65,7 @@ class Beam(Declared):
     fractional_bandwidth: float = parameter(
         0.5, "Bandwidth", "-6 dB bandwidth of the two-way pulse, as a fraction of the frequency", bounds=(0.05, 1.5)
     )
-    focus_mm: float = parameter(
+    focus_mm: MmOrNone = parameter(  # noqa: RUF009, which knows no descriptors
         _BY_DEPTH, "Focus", "Depth of the transmit focus; none (panels: 0): 60 % of the image depth", unit="mm",
         bounds=(0.1, 1000), shown=Shown(0, 300, is_slider=True, none_at=0.0), can_be_none=True,
         note="It then moves with the depth",
@@ -96,7 +106,7 @@ class Beam(Declared):
     elevation_aperture_mm: float = parameter(
         7.0, "Elevational aperture", "Height of the elements, in the elevation direction", unit="mm", bounds=(0.5, 100)
     )
-    elevation_focus_mm: float = parameter(
+    elevation_focus_mm: MmOrNone = parameter(  # noqa: RUF009
         _BY_DEPTH, "Elevational focus", "Depth of the focus of the lens; none: 60 % of the image depth", unit="mm",
         bounds=(0.1, 1000), can_be_none=True, note="It then moves with the depth",
     )  # fmt: skip

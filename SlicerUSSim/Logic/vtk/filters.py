@@ -7,13 +7,16 @@
     simulation.SetProbeTransform(transform)
     actor.GetMapper().SetInputConnection(simulation.GetOutputPort())
 
-All images are in patient space (RAS, mm), with origin, spacing and direction matrix. Errors caused by the caller are
-reported by an ErrorEvent with one line, and by GetErrorMessage; the output is then empty.
+All images are in patient space (RAS, mm), with origin, spacing and direction matrix. The first row of a B-mode image is
+next to the probe, and writers of pictures put the first row at the bottom: `GetPicture` is for them. Errors caused by
+the caller are reported by an ErrorEvent with one line, and by GetErrorMessage; the output is then empty.
 """
 
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 from vtkmodules.util.vtkAlgorithm import VTKPythonAlgorithmBase
@@ -61,6 +64,16 @@ _METHODS = (
 )  # fmt: skip
 
 
+def _getter(attribute: str, what: str) -> Callable[[Any], Any]:
+    """The method that gives what a Set method has set."""
+
+    def get(self) -> Any:
+        return getattr(self, attribute)
+
+    get.__doc__ = what
+    return get
+
+
 class _ImageFilter(VTKPythonAlgorithmBase):
     """A filter that processes whole images and reports errors by VTK's means."""
 
@@ -72,6 +85,8 @@ class _ImageFilter(VTKPythonAlgorithmBase):
     def SetDevice(self, device: str | None) -> None:
         """OpenCL device (see opencl.devices.choose_device)."""
         self._change("_device", device)
+
+    GetDevice = _getter("_device", "The choice of an OpenCL device; None: the best.")
 
     def SetInputData(self, image: vtkImageData | None) -> None:
         """Set the input image directly, without a pipeline connection."""
@@ -148,6 +163,10 @@ class SegmentationFilter(_ImageFilter):
         """What is segmented and how; by default what SegmentationSettings has."""
         self._change("_settings", settings)
 
+    GetSettings = _getter("_settings", "The SegmentationSettings.")
+    GetOtherData = _getter("_others", "{contrast: vtkImageData} of the other MRIs.")
+    GetAddedTissues = _getter("_added", "(tissue, vtkImageData) of all that is laid over the labels, the last on top.")
+
     def SetOtherData(self, contrast: str, image: vtkImageData | None) -> None:
         """Another MRI of the same patient, on any grid, to classify together with the first; None removes it.
 
@@ -178,6 +197,10 @@ class SegmentationFilter(_ImageFilter):
     def SetMaskData(self, mask: vtkImageData | None) -> None:
         """A mask of the brain or patient on the MRI's grid, non-zero inside; or SetInputConnection(1, port)."""
         self.SetInputDataObject(1, mask)
+
+    def GetMaskData(self) -> vtkImageData | None:
+        """The mask, or None."""
+        return self.GetInputDataObject(1, 0)
 
     def GetSegmentation(self) -> Segmentation | CtSegmentation | None:
         """The mixture, posteriors and texture of the last update; of a CT its noise and texture."""
@@ -306,6 +329,15 @@ class UltrasoundSimulationFilter(_ImageFilter):
             transform.SetInput(matrix)
         self._placed_outline.SetTransform(transform)
 
+    GetProbe = _getter("_probe", "The probe.")
+    GetProbeTransform = _getter("_probe_transform", "The object that was given as the probe's pose.")
+    GetTissues = _getter("_tissues", "Acoustic parameters of the labels.")
+    GetSettings = _getter("_settings", "The SimulationSettings.")
+    GetDisplay = _getter("_display", "The DisplaySettings.")
+    GetTexture = _getter("_texture", "The texture, or None.")
+    GetSheetsData = _getter("_sheets_data", "The surface of thin sheets, or None.")
+    GetFieldAlpha = _getter("_field_alpha", "Whether the image has an alpha component.")
+
     def SetTissues(self, tissues: TissueTable) -> None:
         """Acoustic parameters of the labels; default: presets of the brain, for labels that have names or are known."""
         self._change("_tissues", tissues)
@@ -325,6 +357,10 @@ class UltrasoundSimulationFilter(_ImageFilter):
         self.SetDisplay(preset.display)
         self.SetSettings(preset.settings)
         self.SetTissues(preset.tissues)
+
+    def GetPreset(self) -> Preset:
+        """Probe, display, settings and tissues."""
+        return Preset(self._probe, self._display, self._settings, self._tissues)
 
     def SetTexture(self, texture: Texture | None) -> None:
         """Texture from the MRI (Segmentation.texture), for settings that use it."""
@@ -346,6 +382,19 @@ class UltrasoundSimulationFilter(_ImageFilter):
     def GetFrame(self) -> Frame | None:
         """The frame of the last update: RF, envelope, image, pose."""
         return self._frame
+
+    def GetPicture(self) -> vtkImageData:
+        """The image, updated, for vtkPNGWriter and other writers of pictures: its last row first, without its place.
+
+        Empty after an error of the update.
+        """
+        self.Update()
+        picture, frame = vtkImageData(), self._frame
+        if frame is not None:
+            picture.SetDimensions(frame.grid.columns, frame.grid.rows, 1)
+            picture.SetSpacing(*frame.pixel_spacing_mm, 1.0)
+            set_scalars(picture, frame.image[::-1])
+        return picture
 
     def FillInputPortInformation(self, port, info):
         info.Set(vtkAlgorithm.INPUT_REQUIRED_DATA_TYPE(), ("vtkImageData", "vtkPolyData")[port])

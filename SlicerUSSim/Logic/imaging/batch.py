@@ -1,0 +1,207 @@
+"""Many images as arrays: what UltrasoundSimulator.simulate_batch downloads or computes on the host."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from collections.abc import Callable, Mapping, Sequence
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+
+from SlicerUSSim.Logic.base.errors import SimulationError, require
+from SlicerUSSim.Logic.base.volume import Volume
+from SlicerUSSim.Logic.imaging.stage import DeviceFrame
+from SlicerUSSim.Logic.opencl.layout import CONSTANTS, SEGMENT
+from SlicerUSSim.Logic.probe.arrays import Probe
+from SlicerUSSim.Logic.probe.image_grid import ImageGrid
+from SlicerUSSim.Logic.probe.poses import slice_under_probe
+
+#: {output: (its type, the name of the signal on the device or "", whether it has the image's pixels)}
+OUTPUTS: dict[str, tuple[type[np.generic], str, bool]] = {
+    "image": (np.uint8, "image", True),
+    "labels": (np.uint8, "", True),
+    "labels_as_imaged": (np.uint8, "", True),
+    "depth": (np.float32, "", True),
+    "iq": (np.complex64, "iq", False),
+    "envelope": (np.float32, "envelope", False),
+    "bmode": (np.uint8, "grey", False),
+}
+#: Steps of the displacement of lines
+_SHIFT_STEP_MM = 0.25
+#: Part of the free memory that arrays may have; larger ones are files
+_MOST_OF_MEMORY = 0.5
+
+
+def one_per_image(name: str, given: Any, kind: type, count: int) -> list:
+    """`given`, one for all images or a sequence of one for each. Raises SimulationError for another number of them.
+
+    All but probes may be None.
+    """
+    if isinstance(given, kind) or (given is None and kind is not Probe):
+        return [given] * count
+    values = list(given) if isinstance(given, Sequence) else []
+    require(
+        len(values) == count and all(isinstance(value, kind) for value in values),
+        f"{name} are {len(values)} for {count} poses, expected one {kind.__name__} or one for each pose",
+    )
+    return values
+
+
+def same_shapes(shapes: Sequence[tuple]) -> tuple:
+    """The shape of all images. Raises SimulationError that names the first of another shape."""
+    other = next((number for number, shape in enumerate(shapes) if shape != shapes[0]), None)
+    require(
+        other is None,
+        f"image {other} of the batch is {_times(shapes[other or 0])}, the first is {_times(shapes[0])}, expected one "
+        "size; set display.image_size, or simulate them apart",
+    )
+    return shapes[0]
+
+
+def arrays_for(
+    outputs: Sequence[str], count: int, pixels: tuple[int, int], lines: tuple[int, int],
+    out: Mapping[str, np.ndarray] | None,
+) -> dict[str, np.ndarray]:  # fmt: skip
+    """{output: array of `count` images}: those of `out`, or new ones, which are temporary files if memory is short.
+
+    Raises SimulationError for unknown outputs, for an `out` of another shape or type, and if neither has room.
+    """
+    for name in outputs:
+        require(name in OUTPUTS, f"output {name!r} is unknown, expected some of {', '.join(OUTPUTS)}")
+    shapes = {name: (count, *(pixels if OUTPUTS[name][2] else lines)) for name in outputs}
+    if out is not None:
+        require(
+            isinstance(out, Mapping) and set(out) == set(outputs),
+            f"out has {', '.join(map(str, out))}, expected a dict with an array for each of {', '.join(outputs)}",
+        )
+        for name, array in out.items():
+            kind = np.dtype(OUTPUTS[name][0])
+            is_right = isinstance(array, np.ndarray) and (array.shape, array.dtype) == (shapes[name], kind)
+            found = f"{_times(array.shape)} {array.dtype}" if isinstance(array, np.ndarray) else type(array).__name__
+            require(is_right, f"out[{name!r}] is {found}, expected {_times(shapes[name])} {kind}")
+        return dict(out)
+    size = sum(int(np.prod(shapes[name])) * np.dtype(OUTPUTS[name][0]).itemsize for name in outputs)
+    make = _filed if size > _MOST_OF_MEMORY * free_memory() else np.empty
+    return {name: make(shapes[name], OUTPUTS[name][0]) for name in outputs}
+
+
+def free_memory() -> float:
+    """Bytes that new arrays may take, as Linux says; infinite elsewhere."""
+    try:
+        with open("/proc/meminfo") as lines:
+            return 1024.0 * next(int(line.split()[1]) for line in lines if line.startswith("MemAvailable"))
+    except (OSError, StopIteration):
+        return np.inf
+
+
+def _filed(shape: tuple[int, ...], kind: type[np.generic]) -> np.ndarray:
+    """An array in a temporary file, which goes with it."""
+    size = int(np.prod(shape)) * np.dtype(kind).itemsize
+    try:
+        with tempfile.TemporaryFile() as file:
+            if hasattr(os, "posix_fallocate"):  # a full disk would end the process later
+                os.posix_fallocate(file.fileno(), 0, size)
+            return np.memmap(file, kind, "w+", shape=shape)
+    except OSError as error:
+        raise SimulationError(
+            f"a batch of {size / 2**30:.1f} GB fits neither into memory nor into {tempfile.gettempdir()} "
+            f"({error.strerror}); simulate it in parts, or set TMPDIR"
+        ) from None
+
+
+def _times(shape: Sequence[int]) -> str:
+    return " x ".join(map(str, shape))
+
+
+# ---- labels and depths -----------------------------------------------------------------------------------------------
+
+
+def geometric_labels(labels: Volume, probe: Probe, grid: ImageGrid, pose: np.ndarray) -> np.ndarray:
+    """(rows, columns) uint8 labels at the places of the pixels; 0 outside the imaged field."""
+    found = slice_under_probe(labels, grid, pose, order=0).astype(np.uint8)
+    found[~_field(probe, grid)] = 0
+    return found
+
+
+@lru_cache(maxsize=4)
+def _field(probe: Probe, grid: ImageGrid) -> np.ndarray:
+    return grid.field(probe)
+
+
+@lru_cache(maxsize=4)
+def depth_of_pixels(probe: Probe, grid: ImageGrid) -> np.ndarray:
+    """(rows, columns) float32 millimetres along the scan line from the face; nan outside the imaged field."""
+    position, along = _places(probe, grid)
+    return np.where(_field(probe, grid), along - probe.line_starts_mm(position), np.nan).astype(np.float32)
+
+
+def _places(probe: Probe, grid: ImageGrid) -> tuple[np.ndarray, np.ndarray]:
+    """Probe.line_through of all pixels, (rows, columns) each."""
+    (x, y), (dx, dy) = (grid.left_mm, grid.top_mm), grid.pixel_spacing_mm
+    columns, rows = np.meshgrid(np.arange(grid.columns) + 0.5, np.arange(grid.rows) + 0.5)
+    return probe.line_through(x + dx * columns, y + dy * rows)
+
+
+def fetched(name: str, frame: DeviceFrame, pose: np.ndarray, samples: int) -> Callable[[], np.ndarray]:
+    """What gives one of OUTPUTS of a frame that is enqueued; downloads begin now, the rest is computed when called."""
+    labels, probe, grid = frame.medium.labels, frame.probe, frame.grid
+    if name == "labels":
+        return lambda: geometric_labels(labels, probe, grid, pose)
+    if name == "depth":
+        return lambda: depth_of_pixels(probe, grid)
+    if name == "labels_as_imaged":
+        traced, tree = int(frame.acquisition["traced_lines"]), frame.tree
+        start = frame.medium.device.start_download
+        segments = start(tree.segments, (traced, CONSTANTS["MAX_SEGMENTS"]), SEGMENT)
+        counts = start(tree.segment_counts, (traced,), np.int32)
+        return lambda: _imaged(frame, labels, pose, segments(), counts())
+    signal = frame.start_download(OUTPUTS[name][1])
+    return signal if name == "image" else lambda: signal()[:, :samples]
+
+
+def _imaged(
+    frame: DeviceFrame, labels: Volume, pose: np.ndarray, segments: np.ndarray, counts: np.ndarray
+) -> np.ndarray:
+    """(rows, columns) uint8 labels where travel time and refraction put them; 0 outside the imaged field.
+
+    A pixel has the label of its own place, displaced as far as the nearest traced line is when the echo of the pixel's
+    depth is made. A line that ends, as at air, shows nothing behind that: 0. `segments` (traced lines, MAX_SEGMENTS)
+    are layout.SEGMENT, with `counts` in use.
+    """
+    probe, grid, record = frame.probe, frame.grid, frame.acquisition
+    depth = np.arange(0.0, probe.displayed_mm + _SHIFT_STEP_MM, _SHIFT_STEP_MM)
+    places = np.full((len(counts), len(depth), 3), np.nan, np.float32)
+    for there, line, count in zip(places, segments, counts, strict=True):
+        direct = line[:count][line["reflections"][:count] == 0]
+        if len(direct):
+            piece = np.maximum(np.searchsorted(direct["depth_mm"], depth, side="right") - 1, 0)
+            along = (depth - direct["depth_mm"][piece]) / direct["depth_per_mm"][piece]
+            there[:] = direct["start"][piece] + along[:, None] * direct["direction"][piece]
+            there[along > direct["length_mm"][piece] + _SHIFT_STEP_MM] = np.nan
+    lateral, guard = int(record["lateral_rays"]), int(record["guard_lines"])
+    origin, direction = probe.line_at(
+        probe.first_line + probe.line_spacing * (np.arange(len(counts)) - guard) / lateral
+    )
+    straight = (origin[:, None] + depth[:, None] * direction[:, None]) @ pose[:3, :3].T + pose[:3, 3]
+    shift = ((places - straight) @ labels.ras_to_ijk[:3, :3].T).astype(np.float32)
+    line, at = _nearest(probe, grid, lateral, guard, len(counts))
+    to_ijk = (labels.ras_to_ijk @ pose @ grid.image_to_probe).astype(np.float32)
+    columns, rows = np.arange(grid.columns, dtype=np.float32)[:, None], np.arange(grid.rows, dtype=np.float32)
+    ijk = shift[line, at] + (columns * to_ijk[:3, 0] + to_ijk[:3, 3]) + (rows[:, None] * to_ijk[:3, 1])[:, None]
+    seen = np.isfinite(ijk[..., 0]) & _field(probe, grid)
+    index = np.rint(ijk[seen]).astype(np.intp).T[::-1]
+    inside = np.all((index >= 0) & (index < np.array(labels.array.shape)[:, None]), axis=0)
+    found = np.zeros((grid.rows, grid.columns), np.uint8)
+    found[seen] = np.where(inside, labels.array[tuple(np.where(inside, index, 0))], 0)
+    return found
+
+
+@lru_cache(maxsize=4)
+def _nearest(probe: Probe, grid: ImageGrid, lateral: int, guard: int, traced: int) -> tuple[np.ndarray, np.ndarray]:
+    """(rows, columns) numbers of the traced line and of the depth, in _SHIFT_STEP_MM, that are nearest to a pixel."""
+    position, along = _places(probe, grid)
+    line = np.rint((position - probe.first_line) / probe.line_spacing * lateral).astype(int) + guard
+    depth = np.rint(np.clip(along, 0.0, probe.displayed_mm) / _SHIFT_STEP_MM).astype(int)
+    return np.clip(line, 0, traced - 1), depth

@@ -1,0 +1,38 @@
+"""From an MRI to a picture with VTK's own filters: python examples/vtk_picture.py MRI OUT.png"""
+
+from __future__ import annotations
+
+import sys
+
+from vtkmodules.vtkCommonDataModel import vtkImageData
+from vtkmodules.vtkCommonTransforms import vtkTransform
+from vtkmodules.vtkIOImage import vtkPNGWriter
+
+from SlicerUSSim.Logic import Volume
+from SlicerUSSim.Logic.base.vtk_data import vtk_matrix
+from SlicerUSSim.Logic.probe import craniotomy_pose
+from SlicerUSSim.Logic.vtk import SegmentationFilter, UltrasoundSimulationFilter
+
+
+def write_picture(mri: vtkImageData, path: str) -> UltrasoundSimulationFilter:
+    """Write the image of the default probe at a craniotomy; returns the filter, whose transform may be moved."""
+    segmentation = SegmentationFilter()
+    segmentation.SetInputData(mri)
+    segmentation.Update()
+
+    simulation = UltrasoundSimulationFilter()
+    simulation.SetInputConnection(segmentation.GetOutputPort())
+    transform = vtkTransform()
+    labels = Volume.from_vtk(segmentation.GetOutput())
+    transform.SetMatrix(vtk_matrix(craniotomy_pose(labels, simulation.GetProbe())))
+    simulation.SetProbeTransform(transform)
+
+    writer = vtkPNGWriter()
+    writer.SetInputData(simulation.GetPicture())
+    writer.SetFileName(path)
+    writer.Write()
+    return simulation
+
+
+if __name__ == "__main__":
+    write_picture(Volume.read(sys.argv[1]).to_vtk(), sys.argv[2])
