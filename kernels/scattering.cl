@@ -75,7 +75,11 @@
 #define IS_ON_MEMBRANE(label) ((label) == MEMBRANE_LABEL)
 #endif
 
-#define GRAINS 1024.0f      // places of a scatterer along each axis of its cell, in the middle of as many parts
+#define GRAINS 1024.0f  // places of a scatterer along each axis of its cell, in the middle of as many parts
+// Where strips and segments meet, a scatterer passes from one to the other over twice this part of the strip's width,
+// or length: one that only one of them has would vanish, or count twice, with the least movement of the probe.
+#define SHARED 0.015625f
+#define SHARED_MM 0.01f
 #define BATCH (16 * LANES)  // cells waiting to be computed; rows are packed end to end so that every lane has work
 
 // What scatters, see above
@@ -103,11 +107,11 @@ typedef struct {
   float narrow0, narrow1;  // elevational exponent of two per mm^2 at the near end, and its change
   float curved0, curved1;  // elevational phase in cycles per mm^2, likewise
   float gain0, gain1;      // amplitude as an exponent of two, likewise
-  float line0, line1;      // 1 / distance of traced lines, likewise
-  float edge;              // of the strip that begins there: distance re its width
-  float bend;              // 1 / (2 radius) of the surfaces of equal range
+  float bend0, bend1;      // 1 / (2 radius) of the surfaces of equal range, likewise
+  float left0, left1;      // the strip's left border on the segment's lateral axis, and its change per mm of length
+  float wide0, wide1;      // its width, likewise
   float depth0, slope;
-  float from_mm, to_mm;    // path lengths whose scatterers belong to this piece
+  float from_mm, to_mm;    // ranges whose scatterers belong to this piece
   float path0;             // path length from the face at the near end
   float reach_l, reach_e;  // largest lateral and elevational distance
   int u, v, w, first;
@@ -366,11 +370,12 @@ inline floatn unevenness(uint seed, const floatn *words, int has_specks, floatn 
 
 // Where scatterers are re a piece, for LANES of them at places u, v, w from the segment's start.
 typedef struct {
-  floatn t, right, depth;  // part of the piece, of the strip's width, displayed depth
+  floatn t, aside, width;  // part of the piece, distance from the strip's middle, the strip's width
+  floatn range, depth;     // length along the segment at which it is seen, displayed depth
   floatn aside2;           // squared distance from the axis in elevation
-  intn counts;             // whether it belongs to this piece and strip
+  intn counts;             // whether a part of it belongs to this piece and strip
 #ifdef LOBES
-  floatn along, away;  // length along the segment, distance from the axis in elevation
+  floatn away;  // distance from the axis in elevation
 #endif
 } Beside;
 
@@ -380,16 +385,27 @@ inline Beside beside_piece(const Piece *piece, floatn pu, floatn pv, floatn pw) 
   const floatn aside_e = dot_lanes(pu, pv, pw, piece->elevational);
   Beside at;
   at.t = (along - piece->low) * piece->span;
-  at.right = fma(aside_l, line_lanes(at.t, piece->line0, piece->line1), (floatn)(piece->edge));
+  at.width = line_lanes(along, piece->wide0, piece->wide1);
+  at.aside = aside_l - line_lanes(along, piece->left0, piece->left1) - 0.5f * at.width;
   at.aside2 = aside_e * aside_e;
-  const floatn range = fma(aside_l, aside_l * piece->bend, along);
-  at.depth = line_lanes(range, piece->depth0, piece->slope);
-  at.counts = (at.right >= 0.0f) & (at.right < 1.0f) & (along >= piece->from_mm) & (along < piece->to_mm);
+  at.range = fma(aside_l * aside_l, line_lanes(at.t, piece->bend0, piece->bend1), along);
+  at.depth = line_lanes(at.range, piece->depth0, piece->slope);
+  at.counts = (fabs(at.aside) < (0.5f + SHARED) * at.width) & (at.range > piece->from_mm - SHARED_MM) &
+              (at.range < piece->to_mm + SHARED_MM);
 #ifdef LOBES
-  at.along = along;
   at.away = fabs(aside_e);
 #endif
   return at;
+}
+
+// 0 up to -1/2, 1 from 1/2 on
+inline floatn rise_lanes(floatn x) { return clamp(x + 0.5f, (floatn)(0.0f), (floatn)(1.0f)); }
+
+// The part of scatterers that belongs to a piece of the strip: with those of its neighbours the sum is one.
+inline floatn share_of(const Piece *piece, const Beside *at) {
+  const float per_mm = 0.5f / SHARED_MM, per_width = 0.5f / SHARED;
+  return (rise_lanes((at->range - piece->from_mm) * per_mm) - rise_lanes((at->range - piece->to_mm) * per_mm)) *
+         rise_lanes(per_width * (0.5f - fabs(at->aside) / at->width));
 }
 
 // Where the scatterers of cells are, and which contribute, often a quarter of them: those are put side by side.
@@ -453,7 +469,7 @@ inline void compute_echoes(Frame frame, const Piece *piece, Batch *batch) {
 #ifdef LOBES
     const floatn r2 = 0.0f, curved = 0.0f;  // lobes have random phases
     STORE_LANES(beside.away, batch->away + begin);
-    STORE_LANES(piece->path0 + (beside.along - piece->low), batch->path + begin);
+    STORE_LANES(piece->path0 + (beside.range - piece->low), batch->path + begin);
 #else
     const floatn r2 = beside.aside2 * line_lanes(beside.t, piece->narrow0, piece->narrow1);
     const floatn curved = beside.aside2 * line_lanes(beside.t, piece->curved0, piece->curved1);
@@ -462,7 +478,7 @@ inline void compute_echoes(Frame frame, const Piece *piece, Batch *batch) {
     const floatn bin = floor(place);
     const floatn amplitude =
         exp2_fast(clamp(line_lanes(beside.t, piece->gain0, piece->gain1) - r2, (floatn)(-100.0f), (floatn)(100.0f)));
-    const floatn echo = amplitude * (1.0f - TO_FLOATN((random >> 14) & 2u));
+    const floatn echo = share_of(piece, &beside) * amplitude * (1.0f - TO_FLOATN((random >> 14) & 2u));
     floatn cosine, sine;
     turn(fma(beside.depth, (floatn)(frame->cycles_per_mm), curved), &cosine, &sine);
     const float3 at = piece->at_start, ri = piece->row_i, rj = piece->row_j, rk = piece->row_k;
@@ -472,7 +488,7 @@ inline void compute_echoes(Frame frame, const Piece *piece, Batch *batch) {
     const intn ix = TO_INTN(vx), iy = TO_INTN(vy), iz = TO_INTN(vz);
     STORE_LANES(TO_INTN(bin) - piece->first, batch->bin + begin);
     STORE_LANES(place - bin, batch->part + begin);
-    STORE_LANES(beside.right, batch->right + begin);
+    STORE_LANES(beside.aside / beside.width + 0.5f, batch->right + begin);
     STORE_LANES(echo * cosine, batch->re + begin);
     STORE_LANES(echo * -sine, batch->im + begin);
     STORE_LANES(random, batch->random + begin);
@@ -753,10 +769,13 @@ inline void set_ends(const Patient *patient, __global const Segment *segment, co
   piece->low = low;
   piece->path0 = path_low;
   piece->span = 1.0f / fmax(high - low, 1e-6f);
-  piece->bend = frame->linear ? 0.0f : 0.5f / fmax(to_apex + low, 1.0f);
-  piece->edge = (strips->line - strips->left + 0.5f) / strips->lines;
-  piece->line0 = 1.0f / (strips->lines * apart_low);
-  piece->line1 = 1.0f / (strips->lines * apart_high) - piece->line0;
+  piece->bend0 = frame->linear ? 0.0f : 0.5f / fmax(to_apex + low, 1.0f);
+  piece->bend1 = frame->linear ? 0.0f : 0.5f / fmax(to_apex + high, 1.0f) - piece->bend0;
+  const float step = frame->line_spacing / frame->lateral_rays;
+  const float nominal0 = frame->linear ? step : step * to_apex, nominal1 = frame->linear ? 0.0f : step;
+  const float before = strips->line - strips->left + 0.5f;
+  piece->left0 = -before * nominal0, piece->left1 = -before * nominal1;
+  piece->wide0 = strips->lines * nominal0, piece->wide1 = strips->lines * nominal1;
 #ifdef LOBES
   // The table has the square root of the power per millimetre, where the main beam has 1 / (sqrt(pi) sigma_e).
   const float tall_low = 0.56418958f, tall_high = tall_low;
@@ -787,8 +806,10 @@ inline void set_ends(const Patient *patient, __global const Segment *segment, co
       0.5f * log2_scalar(piece->slope * wide_high /
                          (tall_high * tube_high.x * tube_high.z * apart_high * line_distance(frame, shown_high))) -
       piece->gain0;
-  const float lines_aside = max(strips->line - strips->left, strips->left + strips->lines - 1 - strips->line) + 0.5f;
-  piece->reach_l = lines_aside * fmax(apart_low, apart_high);
+  const float2 left = piece->left0 + piece->left1 * (float2)(low, high);
+  const float2 wide = piece->wide0 + piece->wide1 * (float2)(low, high);
+  const float2 reach = fmax(-left, left + wide) + SHARED * wide;
+  piece->reach_l = fmax(reach.x, reach.y);
 }
 
 ONE_BY_ONE
@@ -849,8 +870,8 @@ __kernel void scatter(Frame frame, __global const ushort *voxels, __global const
       piece.to_mm = n == pieces ? segment->length_mm : high;
       set_ends(&patient, segment, &strips, low, high, to_apex, &piece);
       // Off the axis of a curved array the same range is reached slightly earlier.
-      const float early = piece.bend * piece.reach_l * piece.reach_l;
-      float begin = fmax(low, chunk_low - early), end = fmin(high, chunk_high);
+      const float early = fmax(piece.bend0, piece.bend0 + piece.bend1) * piece.reach_l * piece.reach_l;
+      float begin = fmax(piece.from_mm - SHARED_MM, chunk_low) - early, end = fmin(piece.to_mm + SHARED_MM, chunk_high);
 #ifdef LOBES
       const float2 dark = dark_part(&patient, &piece, low, high);
       begin = fmax(begin, dark.x), end = fmin(end, dark.y);
