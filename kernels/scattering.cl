@@ -460,6 +460,7 @@ inline void compute_echoes(Frame frame, const Piece *piece, Batch *batch) {
   const int nx = frame->dims[0], ny = frame->dims[1];
   const float3 voxel_top = (float3)(nx - 1.001f, ny - 1.001f, frame->dims[2] - 1.001f);
   const float inverse_sample = 1.0f / frame->sample_mm;
+  const float cutoff2 = 0.5f * LOG2_E * frame->beam_cutoff * frame->beam_cutoff;
   for (int begin = 0; begin < batch->count; begin += LANES) {
     const floatn pu = LOAD_LANES(batch->u + begin), pv = LOAD_LANES(batch->v + begin),
                  pw = LOAD_LANES(batch->w + begin);
@@ -476,8 +477,12 @@ inline void compute_echoes(Frame frame, const Piece *piece, Batch *batch) {
 #endif
     const floatn place = beside.depth * inverse_sample;
     const floatn bin = floor(place);
-    const floatn amplitude =
+    floatn amplitude =
         exp2_fast(clamp(line_lanes(beside.t, piece->gain0, piece->gain1) - r2, (floatn)(-100.0f), (floatn)(100.0f)));
+#ifndef LOBES
+    // The profile's end is no step either
+    amplitude *= min(2.0f * (cutoff2 - r2), (floatn)(1.0f));
+#endif
     const floatn echo = share_of(piece, &beside) * amplitude * (1.0f - TO_FLOATN((random >> 14) & 2u));
     floatn cosine, sine;
     turn(fma(beside.depth, (floatn)(frame->cycles_per_mm), curved), &cosine, &sine);
