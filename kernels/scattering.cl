@@ -102,7 +102,7 @@ typedef struct {
 // Quantities common to all scatterers beside one piece of a segment. Vectors are in the order u, v, w of lattice axes.
 typedef struct {
   float3 start, direction, lateral, elevational;  // of the segment
-  float3 at_start, row_i, row_j, row_k;           // voxel index = at_start + rows * (offset from the segment's start)
+  float3 at_origin, row_i, row_j, row_k;          // voxel index = at_origin + rows * place
   float low, span;                                // first path length of this piece, 1 / its length
   float narrow0, narrow1;  // elevational exponent of two per mm^2 at the near end, and its change
   float curved0, curved1;  // elevational phase in cycles per mm^2, likewise
@@ -127,7 +127,7 @@ typedef struct {
 // The `count` scatterers of them which contribute, by stages of scatter_batch
 typedef struct {
   int count;
-  float u[BATCH], v[BATCH], w[BATCH];  // place_scatterers: from the segment's start
+  float u[BATCH], v[BATCH], w[BATCH];  // place_scatterers: their places, the same bits from every pose
   uint key[BATCH];
   float part[BATCH], right[BATCH], re[BATCH], im[BATCH];  // compute_echoes: between samples and strips' edges; the echo
   float fx[BATCH], fy[BATCH], fz[BATCH];                  // place in the cell of voxels at `voxel`
@@ -368,7 +368,7 @@ inline floatn unevenness(uint seed, const floatn *words, int has_specks, floatn 
   return exp2_fast(clamp(level, (floatn)(-30.0f), (floatn)(30.0f)));
 }
 
-// Where scatterers are re a piece, for LANES of them at places u, v, w from the segment's start.
+// Where scatterers are re a piece, for LANES of them at places u, v, w.
 typedef struct {
   floatn t, aside, width;  // part of the piece, distance from the strip's middle, the strip's width
   floatn range, depth;     // length along the segment at which it is seen, displayed depth
@@ -379,7 +379,8 @@ typedef struct {
 #endif
 } Beside;
 
-inline Beside beside_piece(const Piece *piece, floatn pu, floatn pv, floatn pw) {
+inline Beside beside_piece(const Piece *piece, floatn u, floatn v, floatn w) {
+  const floatn pu = u - piece->start.x, pv = v - piece->start.y, pw = w - piece->start.z;
   const floatn along = dot_lanes(pu, pv, pw, piece->direction);
   const floatn aside_l = dot_lanes(pu, pv, pw, piece->lateral);
   const floatn aside_e = dot_lanes(pu, pv, pw, piece->elevational);
@@ -410,7 +411,7 @@ inline floatn share_of(const Piece *piece, const Beside *at) {
 
 // Where the scatterers of cells are, and which contribute, often a quarter of them: those are put side by side.
 inline void place_scatterers(Frame frame, const Piece *piece, const Cells *cells, int count, Batch *batch) {
-  const float cell = frame->cell_mm, grain = cell / GRAINS, first_u = 0.5f * grain - piece->start.x;
+  const float cell = frame->cell_mm, grain = cell / GRAINS, first = 0.5f * grain;
   const float cutoff2 = 0.5f * LOG2_E * frame->beam_cutoff * frame->beam_cutoff;
   const float inverse_sample = 1.0f / frame->sample_mm;
   const int u = piece->u, v = piece->v, w = piece->w;
@@ -424,8 +425,7 @@ inline void place_scatterers(Frame frame, const Piece *piece, const Cells *cells
     // Jitter is defined by lattice axis: u, v, w use the bits of the axis they represent.
     const uintn bits_u = (key >> (10 * u)) & 0x3ffu, bits_v = (key >> (10 * v)) & 0x3ffu,
                 bits_w = (key >> (10 * w)) & 0x3ffu;
-    const floatn pu =
-        fma(TO_FLOATN(bits_u), (floatn)(grain), fma(TO_FLOATN(cell_u), (floatn)(cell), (floatn)(first_u)));
+    const floatn pu = fma(TO_FLOATN(bits_u), (floatn)(grain), fma(TO_FLOATN(cell_u), (floatn)(cell), (floatn)(first)));
     const floatn pv = fma(TO_FLOATN(bits_v), (floatn)(grain), LOAD_LANES(cells->v + begin));
     const floatn pw = fma(TO_FLOATN(bits_w), (floatn)(grain), LOAD_LANES(cells->w + begin));
     const Beside at = beside_piece(piece, pu, pv, pw);
@@ -486,7 +486,7 @@ inline void compute_echoes(Frame frame, const Piece *piece, Batch *batch) {
     const floatn echo = share_of(piece, &beside) * amplitude * (1.0f - TO_FLOATN((random >> 14) & 2u));
     floatn cosine, sine;
     turn(fma(beside.depth, (floatn)(frame->cycles_per_mm), curved), &cosine, &sine);
-    const float3 at = piece->at_start, ri = piece->row_i, rj = piece->row_j, rk = piece->row_k;
+    const float3 at = piece->at_origin, ri = piece->row_i, rj = piece->row_j, rk = piece->row_k;
     const floatn vx = clamp(at.x + dot_lanes(pu, pv, pw, ri), (floatn)(0.0f), (floatn)(voxel_top.x));
     const floatn vy = clamp(at.y + dot_lanes(pu, pv, pw, rj), (floatn)(0.0f), (floatn)(voxel_top.y));
     const floatn vz = clamp(at.z + dot_lanes(pu, pv, pw, rk), (floatn)(0.0f), (floatn)(voxel_top.z));
@@ -555,9 +555,8 @@ inline void vary_scatterers(const Patient *patient, const Piece *piece, Batch *b
     } else {
       for (int word = 0; word < 6; word++) words[word] = here[word];
     }
-    const floatn along_u = LOAD_LANES(batch->u + i) + piece->start.x,
-                 along_v = LOAD_LANES(batch->v + i) + piece->start.y,
-                 along_w = LOAD_LANES(batch->w + i) + piece->start.z;
+    const floatn along_u = LOAD_LANES(batch->u + i), along_v = LOAD_LANES(batch->v + i),
+                 along_w = LOAD_LANES(batch->w + i);
     const floatn x = u == 0 ? along_u : v == 0 ? along_v : along_w;  // along the axes of the patient
     const floatn y = u == 1 ? along_u : v == 1 ? along_v : along_w;
     const floatn z = u == 2 ? along_u : v == 2 ? along_v : along_w;
@@ -569,7 +568,7 @@ inline void vary_scatterers(const Patient *patient, const Piece *piece, Batch *b
 // The place of a scatterer in the patient, RAS mm.
 inline float3 place_of(const Piece *piece, const Batch *batch, int i) {
   const int u = piece->u, v = piece->v;
-  const float along[3] = {batch->u[i] + piece->start.x, batch->v[i] + piece->start.y, batch->w[i] + piece->start.z};
+  const float along[3] = {batch->u[i], batch->v[i], batch->w[i]};
   return (float3)(along[u == 0   ? 0
                         : v == 0 ? 1
                                  : 2],
@@ -637,9 +636,9 @@ inline float2 dark_part(const Patient *patient, const Piece *piece, float low, f
   for (int n = 0; n < steps; n++) {
     const float along = low + (n + 0.5f) * step;
     for (int side = -1; side <= 1; side++) {
-      const float3 p = along * piece->direction + (0.8f * side * piece->reach_l) * piece->lateral;
+      const float3 p = piece->start + along * piece->direction + (0.8f * side * piece->reach_l) * piece->lateral;
       const float3 voxel =
-          piece->at_start + (float3)(dot3(p, piece->row_i), dot3(p, piece->row_j), dot3(p, piece->row_k)) + 0.5f;
+          piece->at_origin + (float3)(dot3(p, piece->row_i), dot3(p, piece->row_j), dot3(p, piece->row_k)) + 0.5f;
       const int3 at = convert_int3(clamp(voxel, (float3)(0.0f), most));
       if (is_dark[patient->voxels[(at.z * ny + at.y) * nx + at.x] & LABEL_MASK] == 0.0f) continue;
       first = min(first, n);
@@ -687,8 +686,7 @@ inline void scatter_piece(const Patient *patient, const Piece *piece, float low,
                         : 0.5f * (high - low) * fabs(d.y - along_band * d.z) + radius_l * fabs(l.y - along_band * l.z);
 
   const float base_u = 0.5f * cell - start.x;
-  // Of rows, the first place of their cells
-  const float first_v = 0.5f * cell / GRAINS - start.y, first_w = 0.5f * cell / GRAINS - start.z;
+  const float first = 0.5f * cell / GRAINS;  // place in a cell
   int waiting = 0;
   for (int cw = w_low; cw <= w_high; cw++) {
     const float v_here = band_v + along_band * cw * cell, v_next = v_here + along_band * cell;
@@ -710,12 +708,12 @@ inline void scatter_piece(const Patient *patient, const Piece *piece, float low,
       SPREAD(int, fill_, TO_INTN(floor(to)) - u_low + 1);
       for (int j = 0; j < min(LANES, v_last - cv + 1); j++) {
         const uint key = (uint)(cv + j) * step_v + (uint)cw * step_w;
-        const float place_v = (cv + j) * cell + first_v;
+        const float place_v = fma((float)(cv + j), cell, first);
         for (int cu = 0; cu < fill_[j]; cu += LANES) {
           STORE_LANES(u_low_[j] + cu + LANE_INDEX, cells.u + waiting);
           STORE_LANES((uintn)(key), cells.key + waiting);
           STORE_LANES((floatn)(place_v), cells.v + waiting);
-          STORE_LANES((floatn)(cw * cell + first_w), cells.w + waiting);
+          STORE_LANES((floatn)(fma((float)cw, cell, first)), cells.w + waiting);
           waiting += min(LANES, fill_[j] - cu);
           if (waiting >= BATCH) {
             scatter_batch(patient, piece, &cells, BATCH, sum);
@@ -748,7 +746,7 @@ inline void set_axes(Frame frame, __global const Segment *segment, Piece *piece)
   piece->elevational = (float3)(segment->elevational[u], segment->elevational[v], segment->elevational[w]);
   __constant const float *m = frame->ras_to_voxel;
   piece->u = u, piece->v = v, piece->w = w;
-  piece->at_start = affine_point(m, (float3)(segment->start[0], segment->start[1], segment->start[2]));
+  piece->at_origin = (float3)(m[3], m[7], m[11]);
   piece->row_i = (float3)(m[u], m[v], m[w]);
   piece->row_j = (float3)(m[4 + u], m[4 + v], m[4 + w]);
   piece->row_k = (float3)(m[8 + u], m[8 + v], m[8 + w]);
