@@ -110,6 +110,7 @@ typedef struct {
   float bend0, bend1;      // 1 / (2 radius) of the surfaces of equal range, likewise
   float left0, left1;      // the strip's left border on the segment's lateral axis, and its change per mm of length
   float wide0, wide1;      // its width, likewise
+  float4 later;  // displayed depth per mm of lateral offset: to the left, its change; to the right, its change
   float depth0, slope;
   float from_mm, to_mm;    // ranges whose scatterers belong to this piece
   float path0;             // path length from the face at the near end
@@ -391,6 +392,10 @@ inline Beside beside_piece(const Piece *piece, floatn u, floatn v, floatn w) {
   at.aside2 = aside_e * aside_e;
   at.range = fma(aside_l * aside_l, line_lanes(at.t, piece->bend0, piece->bend1), along);
   at.depth = line_lanes(at.range, piece->depth0, piece->slope);
+#ifndef LOBES
+  at.depth = fma(min(aside_l, (floatn)(0.0f)), line_lanes(along, piece->later.x, piece->later.y), at.depth);
+  at.depth = fma(max(aside_l, (floatn)(0.0f)), line_lanes(along, piece->later.z, piece->later.w), at.depth);
+#endif
   at.counts = (fabs(at.aside) < (0.5f + SHARED) * at.width) & (at.range > piece->from_mm - SHARED_MM) &
               (at.range < piece->to_mm + SHARED_MM);
 #ifdef LOBES
@@ -752,6 +757,20 @@ inline void set_axes(Frame frame, __global const Segment *segment, Piece *piece)
   piece->row_k = (float3)(m[8 + u], m[8 + v], m[8 + w]);
 }
 
+// By how much displayed depths in the strip of a segment differ from those on its axis, at most.
+inline float depth_moved(__global const Segment *segment) {
+#ifdef LOBES
+  return 0.0f;
+#else
+  const float4 left = vload4(0, segment->left), right = vload4(0, segment->right);
+  const float2 length = (float2)(0.0f, segment->length_mm);
+  const float2 to_left = (left.x + left.y * length) * (left.z + left.w * length);
+  const float2 to_right = (right.x + right.y * length) * (right.z + right.w * length);
+  const float2 most = fmax(fabs(to_left), fabs(to_right));
+  return (1.0f + 2.0f * SHARED) * fmax(most.x, most.y);
+#endif
+}
+
 // The widths and gains of a piece of a segment between two lengths along it, linear between those at the ends.
 inline void set_ends(const Patient *patient, __global const Segment *segment, const Strips *strips, float low,
                      float high, float to_apex, Piece *piece) {
@@ -762,8 +781,6 @@ inline void set_ends(const Patient *patient, __global const Segment *segment, co
   float band_low, band_high;
   const float frequency_low = band_after(frame, loss_low, &band_low);
   const float frequency_high = band_after(frame, loss_high, &band_high);
-  const float apart_low = line_distance(frame, path_low + strips->begins);
-  const float apart_high = line_distance(frame, path_high + strips->begins);
   // beam.cl knows the displayed depth alone, which differs from the path where sound is slower or faster.
   const float shown_low = fmax(piece->depth0 + piece->slope * low, strips->begins);
   const float shown_high = fmax(piece->depth0 + piece->slope * high, strips->begins);
@@ -774,11 +791,22 @@ inline void set_ends(const Patient *patient, __global const Segment *segment, co
   piece->span = 1.0f / fmax(high - low, 1e-6f);
   piece->bend0 = frame->linear ? 0.0f : 0.5f / fmax(to_apex + low, 1.0f);
   piece->bend1 = frame->linear ? 0.0f : 0.5f / fmax(to_apex + high, 1.0f) - piece->bend0;
+#ifdef LOBES
   const float step = frame->line_spacing / frame->lateral_rays;
   const float nominal0 = frame->linear ? step : step * to_apex, nominal1 = frame->linear ? 0.0f : step;
   const float before = strips->line - strips->left + 0.5f;
   piece->left0 = -before * nominal0, piece->left1 = -before * nominal1;
   piece->wide0 = strips->lines * nominal0, piece->wide1 = strips->lines * nominal1;
+#else
+  const float4 to_left = vload4(0, segment->left), to_right = vload4(0, segment->right);
+  piece->left0 = to_left.x, piece->left1 = to_left.y;
+  piece->wide0 = to_right.x - to_left.x, piece->wide1 = to_right.y - to_left.y;
+  piece->later = (float4)(to_left.zw, to_right.zw);
+#endif
+  const float2 left = piece->left0 + piece->left1 * (float2)(low, high);
+  const float2 width = piece->wide0 + piece->wide1 * (float2)(low, high);
+  const float2 reach = fmax(-left, left + width) + SHARED * width, apart = fmax(width / strips->lines, 1e-4f);
+  piece->reach_l = fmax(reach.x, reach.y);
 #ifdef LOBES
   // The table has the square root of the power per millimetre, where the main beam has 1 / (sqrt(pi) sigma_e).
   const float tall_low = 0.56418958f, tall_high = tall_low;
@@ -803,16 +831,12 @@ inline void set_ends(const Patient *patient, __global const Segment *segment, co
   const float4 tube_high = tube_after(vload4(0, segment->tube), high);
   piece->gain0 = gain + LOG2_E * band_low - decay * low +
                  0.5f * log2_scalar(piece->slope * wide_low /
-                                    (tall_low * tube_low.x * tube_low.z * apart_low * line_distance(frame, shown_low)));
+                                    (tall_low * tube_low.x * tube_low.z * apart.x * line_distance(frame, shown_low)));
   piece->gain1 =
       gain + LOG2_E * band_high - decay * high +
       0.5f * log2_scalar(piece->slope * wide_high /
-                         (tall_high * tube_high.x * tube_high.z * apart_high * line_distance(frame, shown_high))) -
+                         (tall_high * tube_high.x * tube_high.z * apart.y * line_distance(frame, shown_high))) -
       piece->gain0;
-  const float2 left = piece->left0 + piece->left1 * (float2)(low, high);
-  const float2 wide = piece->wide0 + piece->wide1 * (float2)(low, high);
-  const float2 reach = fmax(-left, left + wide) + SHARED * wide;
-  piece->reach_l = fmax(reach.x, reach.y);
 }
 
 ONE_BY_ONE
@@ -848,10 +872,11 @@ __kernel void scatter(Frame frame, __global const ushort *voxels, __global const
     piece.first = first;
     piece.slope = segment->depth_per_mm;
     piece.depth0 = segment->depth_mm;
-    const float segment_low = fmax(0.0f, (block_low - piece.depth0) / piece.slope);
-    const float segment_high = fmin(segment->length_mm, (block_high - piece.depth0) / piece.slope);
-    const float chunk_low = (depth_low - piece.depth0) / piece.slope;
-    const float chunk_high = (depth_high - piece.depth0) / piece.slope;
+    const float moved = depth_moved(segment), before = piece.depth0 + moved, behind = piece.depth0 - moved;
+    const float segment_low = fmax(0.0f, (block_low - before) / piece.slope);
+    const float segment_high = fmin(segment->length_mm, (block_high - behind) / piece.slope);
+    const float chunk_low = (depth_low - before) / piece.slope;
+    const float chunk_high = (depth_high - behind) / piece.slope;
     if (fmax(segment_low, chunk_low) >= fmin(segment_high, chunk_high)) continue;
 
     set_axes(frame, segment, &piece);

@@ -25,6 +25,7 @@ class RayTracer(Stage):
     def __init__(self, device: Device) -> None:
         super().__init__(device)
         self.kernel = device.kernels("raytracing.cl")["trace"]
+        self._strips = device.kernels("strips.cl")["strips"]
         self._sheet_hits = device.kernels("sheet_hits.cl")["sheet_hits"]
         self._face_hits = device.kernels("face_hits.cl")["face_hits"]
         self._losses = device.kernels("downshift.cl", device.lanes)["losses"]
@@ -79,6 +80,9 @@ class RayTracer(Stage):
             tree.cut,
             self._overflown,
             heavy=True,
+        )
+        self.device.run(
+            self._strips, (traced,), frame.acquisition_buffer, tree.segments, tree.segment_counts, few=True
         )
         if medium.found is not None and medium.found.reflects:
             self.device.run(
