@@ -11,8 +11,8 @@
 
 #include "common.clh"
 
-#define LEAST_APART 0.25f  // distance of two axes, in that without tissue, at which they count: rays may cross, ...
-#define MOST_APART 3.0f    // ... and at a mirror or the edge of a bone they leave each other
+#define LEAST_APART 0.5f   // distance of two axes, in that without tissue, ...
+#define MOST_APART 1.5f    // ... at which they are as those of neighbours are
 #define MOST_CYCLES 0.25f  // by which a line's depths are changed at its border
 
 // The border towards a neighbouring line (`side` -1 or 1) at a length along a segment: its distance from the axis, and
@@ -23,12 +23,12 @@ inline float2 border_at(Frame frame, __global const Segment *segments, __global 
   const float apart = step * (frame->linear ? 1.0f : frame->apex_radius_mm + traced_start(frame, (float)line) + path);
   const int other = line + side;
   float2 border = (float2)(0.5f * apart, 0.0f);
-  if (other < 0 || other >= frame->traced_lines) return border;
+  if (!frame->aperture_beams || other < 0 || other >= frame->traced_lines) return border;
   const float3 direction = vload3(0, own->direction), lateral = vload3(0, own->lateral);
   const float3 place = vload3(0, own->start) + along * direction, expected = place + side * apart * lateral;
   // Of segments that meet where this one ends too, the one beside it
   const float inwards = (along > 0.0f ? -1.0f : 1.0f) * fmin(0.5f * own->length_mm, 0.05f);
-  float nearest = 3.0f + 2.0f * apart;
+  float nearest = 0.5f + apart;
   for (int n = 0; n < min(counts[other], MAX_SEGMENTS); n++) {
     __global const Segment *segment = segments + other * MAX_SEGMENTS + n;
     const float beyond = path - segment->path_mm, within = beyond + inwards;
