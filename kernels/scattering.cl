@@ -108,11 +108,12 @@ typedef struct {
   float curved0, curved1;  // elevational phase in cycles per mm^2, likewise
   float gain0, gain1;      // amplitude as an exponent of two, likewise
   float bend0, bend1;      // 1 / (2 radius) of the surfaces of equal range, likewise
-  float left0, left1;      // the strip's left border on the segment's lateral axis, and its change per mm of length
-  float wide0, wide1;      // its width, likewise
+  float middle0, middle1;  // of the strip on the segment's lateral axis, and its change per mm of length
+  float half0, half1;      // half the strip's width with what it shares, likewise
   float4 later;  // displayed depth per mm of lateral offset: to the left, its change; to the right, its change
   float depth0, slope;
   float from_mm, to_mm;    // ranges whose scatterers belong to this piece
+  int moved;               // samples by which these depths change at most
   float path0;             // path length from the face at the near end
   float reach_l, reach_e;  // largest lateral and elevational distance
   int u, v, w, first;
@@ -128,7 +129,7 @@ typedef struct {
 // The `count` scatterers of them which contribute, by stages of scatter_batch
 typedef struct {
   int count;
-  float u[BATCH], v[BATCH], w[BATCH];  // place_scatterers: their places, the same bits from every pose
+  float u[BATCH], v[BATCH], w[BATCH];  // place_scatterers: from the segment's start; compute_echoes: in the patient
   uint key[BATCH];
   float part[BATCH], right[BATCH], re[BATCH], im[BATCH];  // compute_echoes: between samples and strips' edges; the echo
   float fx[BATCH], fy[BATCH], fz[BATCH];                  // place in the cell of voxels at `voxel`
@@ -369,9 +370,10 @@ inline floatn unevenness(uint seed, const floatn *words, int has_specks, floatn 
   return exp2_fast(clamp(level, (floatn)(-30.0f), (floatn)(30.0f)));
 }
 
-// Where scatterers are re a piece, for LANES of them at places u, v, w.
+// Where scatterers are re a piece, for LANES of them at places u, v, w from the segment's start.
 typedef struct {
-  floatn t, aside, width;  // part of the piece, distance from the strip's middle, the strip's width
+  floatn t, along, aside;  // part of the piece, length along the segment, distance from its axis in the image plane
+  floatn right, ends;      // distance from the strip's middle, at which it ends
   floatn range, depth;     // length along the segment at which it is seen, displayed depth
   floatn aside2;           // squared distance from the axis in elevation
   intn counts;             // whether a part of it belongs to this piece and strip
@@ -380,24 +382,19 @@ typedef struct {
 #endif
 } Beside;
 
-inline Beside beside_piece(const Piece *piece, floatn u, floatn v, floatn w) {
-  const floatn pu = u - piece->start.x, pv = v - piece->start.y, pw = w - piece->start.z;
-  const floatn along = dot_lanes(pu, pv, pw, piece->direction);
-  const floatn aside_l = dot_lanes(pu, pv, pw, piece->lateral);
+inline Beside beside_piece(const Piece *piece, floatn pu, floatn pv, floatn pw) {
   const floatn aside_e = dot_lanes(pu, pv, pw, piece->elevational);
   Beside at;
-  at.t = (along - piece->low) * piece->span;
-  at.width = line_lanes(along, piece->wide0, piece->wide1);
-  at.aside = aside_l - line_lanes(along, piece->left0, piece->left1) - 0.5f * at.width;
+  at.along = dot_lanes(pu, pv, pw, piece->direction);
+  at.aside = dot_lanes(pu, pv, pw, piece->lateral);
+  at.t = (at.along - piece->low) * piece->span;
+  at.right = at.aside - line_lanes(at.along, piece->middle0, piece->middle1);
+  at.ends = line_lanes(at.along, piece->half0, piece->half1);
   at.aside2 = aside_e * aside_e;
-  at.range = fma(aside_l * aside_l, line_lanes(at.t, piece->bend0, piece->bend1), along);
+  at.range = fma(at.aside * at.aside, line_lanes(at.t, piece->bend0, piece->bend1), at.along);
   at.depth = line_lanes(at.range, piece->depth0, piece->slope);
-#ifndef LOBES
-  at.depth = fma(min(aside_l, (floatn)(0.0f)), line_lanes(along, piece->later.x, piece->later.y), at.depth);
-  at.depth = fma(max(aside_l, (floatn)(0.0f)), line_lanes(along, piece->later.z, piece->later.w), at.depth);
-#endif
-  at.counts = (fabs(at.aside) < (0.5f + SHARED) * at.width) & (at.range > piece->from_mm - SHARED_MM) &
-              (at.range < piece->to_mm + SHARED_MM);
+  at.counts =
+      (fabs(at.right) < at.ends) & (at.range > piece->from_mm - SHARED_MM) & (at.range < piece->to_mm + SHARED_MM);
 #ifdef LOBES
   at.away = fabs(aside_e);
 #endif
@@ -407,16 +404,17 @@ inline Beside beside_piece(const Piece *piece, floatn u, floatn v, floatn w) {
 // 0 up to -1/2, 1 from 1/2 on
 inline floatn rise_lanes(floatn x) { return clamp(x + 0.5f, (floatn)(0.0f), (floatn)(1.0f)); }
 
-// The part of scatterers that belongs to a piece of the strip: with those of its neighbours the sum is one.
-inline floatn share_of(const Piece *piece, const Beside *at) {
+// The part of scatterers that belongs to a piece of the strip, where they are `right` of its middle in widths: with
+// those of its neighbours the sum is one.
+inline floatn share_of(const Piece *piece, floatn range, floatn right) {
   const float per_mm = 0.5f / SHARED_MM, per_width = 0.5f / SHARED;
-  return (rise_lanes((at->range - piece->from_mm) * per_mm) - rise_lanes((at->range - piece->to_mm) * per_mm)) *
-         rise_lanes(per_width * (0.5f - fabs(at->aside) / at->width));
+  return (rise_lanes((range - piece->from_mm) * per_mm) - rise_lanes((range - piece->to_mm) * per_mm)) *
+         rise_lanes(per_width * (0.5f - fabs(right)));
 }
 
 // Where the scatterers of cells are, and which contribute, often a quarter of them: those are put side by side.
 inline void place_scatterers(Frame frame, const Piece *piece, const Cells *cells, int count, Batch *batch) {
-  const float cell = frame->cell_mm, grain = cell / GRAINS, first = 0.5f * grain;
+  const float cell = frame->cell_mm, grain = cell / GRAINS, first_u = 0.5f * grain - piece->start.x;
   const float cutoff2 = 0.5f * LOG2_E * frame->beam_cutoff * frame->beam_cutoff;
   const float inverse_sample = 1.0f / frame->sample_mm;
   const int u = piece->u, v = piece->v, w = piece->w;
@@ -430,7 +428,8 @@ inline void place_scatterers(Frame frame, const Piece *piece, const Cells *cells
     // Jitter is defined by lattice axis: u, v, w use the bits of the axis they represent.
     const uintn bits_u = (key >> (10 * u)) & 0x3ffu, bits_v = (key >> (10 * v)) & 0x3ffu,
                 bits_w = (key >> (10 * w)) & 0x3ffu;
-    const floatn pu = fma(TO_FLOATN(bits_u), (floatn)(grain), fma(TO_FLOATN(cell_u), (floatn)(cell), (floatn)(first)));
+    const floatn pu =
+        fma(TO_FLOATN(bits_u), (floatn)(grain), fma(TO_FLOATN(cell_u), (floatn)(cell), (floatn)(first_u)));
     const floatn pv = fma(TO_FLOATN(bits_v), (floatn)(grain), LOAD_LANES(cells->v + begin));
     const floatn pw = fma(TO_FLOATN(bits_w), (floatn)(grain), LOAD_LANES(cells->w + begin));
     const Beside at = beside_piece(piece, pu, pv, pw);
@@ -440,7 +439,8 @@ inline void place_scatterers(Frame frame, const Piece *piece, const Cells *cells
     const intn near = at.aside2 * line_lanes(at.t, piece->narrow0, piece->narrow1) <= cutoff2;
 #endif
     const intn bins = TO_INTN(floor(at.depth * inverse_sample)) - piece->first;
-    SPREAD(int, counts_, at.counts & near & (bins >= -1) & (bins < CHUNK) & (LANE_INDEX < count - begin));
+    const intn seen = (bins >= -1 - piece->moved) & (bins < CHUNK + piece->moved);
+    SPREAD(int, counts_, at.counts & near & seen & (LANE_INDEX < count - begin));
     for (int j = 0; j < LANES; j++) {
       chosen[n] = begin + j;
       n += counts_[j] & 1;
@@ -466,6 +466,7 @@ inline void compute_echoes(Frame frame, const Piece *piece, Batch *batch) {
   const float3 voxel_top = (float3)(nx - 1.001f, ny - 1.001f, frame->dims[2] - 1.001f);
   const float inverse_sample = 1.0f / frame->sample_mm;
   const float cutoff2 = 0.5f * LOG2_E * frame->beam_cutoff * frame->beam_cutoff;
+  const float grain = frame->cell_mm / GRAINS, inverse_grain = 1.0f / grain, first = 0.5f * grain;
   for (int begin = 0; begin < batch->count; begin += LANES) {
     const floatn pu = LOAD_LANES(batch->u + begin), pv = LOAD_LANES(batch->v + begin),
                  pw = LOAD_LANES(batch->w + begin);
@@ -476,29 +477,46 @@ inline void compute_echoes(Frame frame, const Piece *piece, Batch *batch) {
     const floatn r2 = 0.0f, curved = 0.0f;  // lobes have random phases
     STORE_LANES(beside.away, batch->away + begin);
     STORE_LANES(piece->path0 + (beside.range - piece->low), batch->path + begin);
+    const floatn depth = beside.depth;
 #else
+    floatn depth = beside.depth;
+    if (piece->moved > 0) {
+      const floatn along = beside.along, aside = beside.aside;
+      depth = fma(min(aside, (floatn)(0.0f)), line_lanes(along, piece->later.x, piece->later.y), depth);
+      depth = fma(max(aside, (floatn)(0.0f)), line_lanes(along, piece->later.z, piece->later.w), depth);
+    }
     const floatn r2 = beside.aside2 * line_lanes(beside.t, piece->narrow0, piece->narrow1);
     const floatn curved = beside.aside2 * line_lanes(beside.t, piece->curved0, piece->curved1);
 #endif
-    const floatn place = beside.depth * inverse_sample;
+    const floatn place = depth * inverse_sample, right = (0.5f + SHARED) * beside.right / beside.ends;
     const floatn bin = floor(place);
+    const intn bins = TO_INTN(bin) - piece->first;
     floatn amplitude =
         exp2_fast(clamp(line_lanes(beside.t, piece->gain0, piece->gain1) - r2, (floatn)(-100.0f), (floatn)(100.0f)));
 #ifndef LOBES
     // The profile's end is no step either
     amplitude *= min(2.0f * (cutoff2 - r2), (floatn)(1.0f));
 #endif
-    const floatn echo = share_of(piece, &beside) * amplitude * (1.0f - TO_FLOATN((random >> 14) & 2u));
+    if (piece->moved > 0) amplitude = ((bins >= -1) & (bins < CHUNK)) ? amplitude : (floatn)(0.0f);
+    const floatn share = share_of(piece, beside.range, right);
+    const floatn echo = share * amplitude * (1.0f - TO_FLOATN((random >> 14) & 2u));
     floatn cosine, sine;
-    turn(fma(beside.depth, (floatn)(frame->cycles_per_mm), curved), &cosine, &sine);
+    turn(fma(depth, (floatn)(frame->cycles_per_mm), curved), &cosine, &sine);
+    // Places in the patient are the same, to the bit, from every pose, and so are tissues.
+    const floatn u = fma(floor((pu + piece->start.x) * inverse_grain), (floatn)(grain), (floatn)(first));
+    const floatn v = fma(floor((pv + piece->start.y) * inverse_grain), (floatn)(grain), (floatn)(first));
+    const floatn w = fma(floor((pw + piece->start.z) * inverse_grain), (floatn)(grain), (floatn)(first));
     const float3 at = piece->at_origin, ri = piece->row_i, rj = piece->row_j, rk = piece->row_k;
-    const floatn vx = clamp(at.x + dot_lanes(pu, pv, pw, ri), (floatn)(0.0f), (floatn)(voxel_top.x));
-    const floatn vy = clamp(at.y + dot_lanes(pu, pv, pw, rj), (floatn)(0.0f), (floatn)(voxel_top.y));
-    const floatn vz = clamp(at.z + dot_lanes(pu, pv, pw, rk), (floatn)(0.0f), (floatn)(voxel_top.z));
+    const floatn vx = clamp(at.x + dot_lanes(u, v, w, ri), (floatn)(0.0f), (floatn)(voxel_top.x));
+    const floatn vy = clamp(at.y + dot_lanes(u, v, w, rj), (floatn)(0.0f), (floatn)(voxel_top.y));
+    const floatn vz = clamp(at.z + dot_lanes(u, v, w, rk), (floatn)(0.0f), (floatn)(voxel_top.z));
     const intn ix = TO_INTN(vx), iy = TO_INTN(vy), iz = TO_INTN(vz);
-    STORE_LANES(TO_INTN(bin) - piece->first, batch->bin + begin);
+    STORE_LANES(u, batch->u + begin);
+    STORE_LANES(v, batch->v + begin);
+    STORE_LANES(w, batch->w + begin);
+    STORE_LANES(clamp(bins, -1, CHUNK - 1), batch->bin + begin);
     STORE_LANES(place - bin, batch->part + begin);
-    STORE_LANES(beside.aside / beside.width + 0.5f, batch->right + begin);
+    STORE_LANES(right + 0.5f, batch->right + begin);
     STORE_LANES(echo * cosine, batch->re + begin);
     STORE_LANES(echo * -sine, batch->im + begin);
     STORE_LANES(random, batch->random + begin);
@@ -691,7 +709,8 @@ inline void scatter_piece(const Patient *patient, const Piece *piece, float low,
                         : 0.5f * (high - low) * fabs(d.y - along_band * d.z) + radius_l * fabs(l.y - along_band * l.z);
 
   const float base_u = 0.5f * cell - start.x;
-  const float first = 0.5f * cell / GRAINS;  // place in a cell
+  // Of rows, the first place of their cells
+  const float first_v = 0.5f * cell / GRAINS - start.y, first_w = 0.5f * cell / GRAINS - start.z;
   int waiting = 0;
   for (int cw = w_low; cw <= w_high; cw++) {
     const float v_here = band_v + along_band * cw * cell, v_next = v_here + along_band * cell;
@@ -713,12 +732,12 @@ inline void scatter_piece(const Patient *patient, const Piece *piece, float low,
       SPREAD(int, fill_, TO_INTN(floor(to)) - u_low + 1);
       for (int j = 0; j < min(LANES, v_last - cv + 1); j++) {
         const uint key = (uint)(cv + j) * step_v + (uint)cw * step_w;
-        const float place_v = fma((float)(cv + j), cell, first);
+        const float place_v = fma((float)(cv + j), cell, first_v);
         for (int cu = 0; cu < fill_[j]; cu += LANES) {
           STORE_LANES(u_low_[j] + cu + LANE_INDEX, cells.u + waiting);
           STORE_LANES((uintn)(key), cells.key + waiting);
           STORE_LANES((floatn)(place_v), cells.v + waiting);
-          STORE_LANES((floatn)(fma((float)cw, cell, first)), cells.w + waiting);
+          STORE_LANES((floatn)(fma((float)cw, cell, first_w)), cells.w + waiting);
           waiting += min(LANES, fill_[j] - cu);
           if (waiting >= BATCH) {
             scatter_batch(patient, piece, &cells, BATCH, sum);
@@ -795,17 +814,19 @@ inline void set_ends(const Patient *patient, __global const Segment *segment, co
   const float step = frame->line_spacing / frame->lateral_rays;
   const float nominal0 = frame->linear ? step : step * to_apex, nominal1 = frame->linear ? 0.0f : step;
   const float before = strips->line - strips->left + 0.5f;
-  piece->left0 = -before * nominal0, piece->left1 = -before * nominal1;
-  piece->wide0 = strips->lines * nominal0, piece->wide1 = strips->lines * nominal1;
+  const float2 left_border = -before * (float2)(nominal0, nominal1);
+  const float2 right_border = (strips->lines - before) * (float2)(nominal0, nominal1);
 #else
   const float4 to_left = vload4(0, segment->left), to_right = vload4(0, segment->right);
-  piece->left0 = to_left.x, piece->left1 = to_left.y;
-  piece->wide0 = to_right.x - to_left.x, piece->wide1 = to_right.y - to_left.y;
+  const float2 left_border = to_left.xy, right_border = to_right.xy;
   piece->later = (float4)(to_left.zw, to_right.zw);
 #endif
-  const float2 left = piece->left0 + piece->left1 * (float2)(low, high);
-  const float2 width = piece->wide0 + piece->wide1 * (float2)(low, high);
-  const float2 reach = fmax(-left, left + width) + SHARED * width, apart = fmax(width / strips->lines, 1e-4f);
+  const float2 middle = 0.5f * (left_border + right_border), across = right_border - left_border;
+  piece->middle0 = middle.x, piece->middle1 = middle.y;
+  piece->half0 = (0.5f + SHARED) * across.x, piece->half1 = (0.5f + SHARED) * across.y;
+  const float2 ends = (float2)(low, high), width = across.x + across.y * ends;
+  const float2 apart = fmax(width / strips->lines, 1e-4f);
+  const float2 reach = fabs(middle.x + middle.y * ends) + (0.5f + SHARED) * width;
   piece->reach_l = fmax(reach.x, reach.y);
 #ifdef LOBES
   // The table has the square root of the power per millimetre, where the main beam has 1 / (sqrt(pi) sigma_e).
@@ -872,7 +893,9 @@ __kernel void scatter(Frame frame, __global const ushort *voxels, __global const
     piece.first = first;
     piece.slope = segment->depth_per_mm;
     piece.depth0 = segment->depth_mm;
-    const float moved = depth_moved(segment), before = piece.depth0 + moved, behind = piece.depth0 - moved;
+    const float moved = depth_moved(segment);
+    piece.moved = moved > 1e-5f ? (int)ceil(moved / frame->sample_mm) : 0;
+    const float before = piece.depth0 + moved, behind = piece.depth0 - moved;
     const float segment_low = fmax(0.0f, (block_low - before) / piece.slope);
     const float segment_high = fmin(segment->length_mm, (block_high - behind) / piece.slope);
     const float chunk_low = (depth_low - before) / piece.slope;

@@ -60,8 +60,8 @@ inline Place place_at(Frame frame, __global const float *roots, int line, float 
 
 // A weight with a random sign: the parity of the bits that both have.
 inline float with_sign(float weight, const Place *place, uint offset) {
-  float sum = 0.0f;
-  for (int n = 0; n < place->count; n++)
+  float sum = as_float(as_uint(place->parts[0]) ^ (popcount(place->bits[0] & offset) << 31));
+  for (int n = 1; n < place->count; n++)
     sum += as_float(as_uint(place->parts[n]) ^ (popcount(place->bits[n] & offset) << 31));
   return weight * sum;
 }
