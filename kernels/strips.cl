@@ -16,9 +16,9 @@
 #define MOST_CYCLES 0.25f  // by which a line's depths are changed at its border
 
 // The border towards a neighbouring line (`side` -1 or 1) at a length along a segment: its distance from the axis, and
-// what is added to the displayed depth there.
+// what is added to the displayed depth there. `known` is the number of the neighbour's segment that was beside last.
 inline float2 border_at(Frame frame, __global const Segment *segments, __global const int *counts, int line, int side,
-                        __global const Segment *own, float along) {
+                        __global const Segment *own, float along, int *known) {
   const float path = own->path_mm + along, step = frame->line_spacing / frame->lateral_rays;
   const float apart = step * (frame->linear ? 1.0f : frame->apex_radius_mm + traced_start(frame, (float)line) + path);
   const int other = line + side;
@@ -28,15 +28,15 @@ inline float2 border_at(Frame frame, __global const Segment *segments, __global 
   const float3 place = vload3(0, own->start) + along * direction, expected = place + side * apart * lateral;
   // Of segments that meet where this one ends too, the one beside it
   const float inwards = (along > 0.0f ? -1.0f : 1.0f) * fmin(0.5f * own->length_mm, 0.05f);
-  float nearest = 0.5f + apart;
-  for (int n = 0; n < min(counts[other], MAX_SEGMENTS); n++) {
+  const int count = min(counts[other], MAX_SEGMENTS);
+  for (int steps = 0; steps < count; steps++) {
+    const int n = *known + steps < count ? *known + steps : *known + steps - count;
     __global const Segment *segment = segments + other * MAX_SEGMENTS + n;
     const float beyond = path - segment->path_mm, within = beyond + inwards;
     if (segment->reflections != own->reflections || within < 0.0f || within >= segment->length_mm) continue;
     const float3 its = vload3(0, segment->direction), there = vload3(0, segment->start) + beyond * its;
-    const float away = length3(there - expected);
-    if (away >= nearest) continue;
-    nearest = away;
+    if (length3(there - expected) > 0.3f + 0.5f * apart) continue;  // elsewhere, as behind a bone
+    *known = n;
     // Where both lines are at one point half-way between them
     const float depth = own->depth_mm + along * own->depth_per_mm;
     const float later = segment->depth_mm + beyond * segment->depth_per_mm - depth -
@@ -44,6 +44,7 @@ inline float2 border_at(Frame frame, __global const Segment *segments, __global 
     const float most = MOST_CYCLES / frame->cycles_per_mm;
     border.x = 0.5f * clamp(side * dot3(there - place, lateral), LEAST_APART * apart, MOST_APART * apart);
     border.y = 0.5f * clamp(later, -2.0f * most, 2.0f * most);
+    break;
   }
   return border;
 }
@@ -51,12 +52,13 @@ inline float2 border_at(Frame frame, __global const Segment *segments, __global 
 ONE_BY_ONE
 __kernel void strips(Frame frame, __global Segment *segments, __global const int *segment_counts) {
   const int line = get_global_id(0);
+  int known[2] = {0, 0};
   for (int n = 0; n < min(segment_counts[line], MAX_SEGMENTS); n++) {
     __global Segment *segment = segments + line * MAX_SEGMENTS + n;
     const float length = segment->length_mm, per_mm = 1.0f / fmax(length, 1e-3f);
     for (int side = -1; side <= 1; side += 2) {
-      const float2 from = border_at(frame, segments, segment_counts, line, side, segment, 0.0f);
-      const float2 to = border_at(frame, segments, segment_counts, line, side, segment, length);
+      const float2 from = border_at(frame, segments, segment_counts, line, side, segment, 0.0f, known + (side > 0));
+      const float2 to = border_at(frame, segments, segment_counts, line, side, segment, length, known + (side > 0));
       const float least = fmax(0.1f * fmax(from.x, to.x), 1e-4f);  // all lines of a sector begin at one point
       const float later = side * from.y / fmax(from.x, least), later_to = side * to.y / fmax(to.x, least);
       const float4 border =
