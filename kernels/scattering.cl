@@ -107,7 +107,7 @@ typedef struct {
   float narrow0, narrow1;  // elevational exponent of two per mm^2 at the near end, and its change
   float curved0, curved1;  // elevational phase in cycles per mm^2, likewise
   float gain0, gain1;      // amplitude as an exponent of two, likewise
-  float bend0, bend1;      // 1 / (2 radius) of the surfaces of equal range, likewise
+  float bend;              // 1 / (2 radius) of the surfaces of equal range
   float middle0, middle1;  // of the strip on the segment's lateral axis, and its change per mm of length
   float half0, half1;      // half the strip's width with what it shares, likewise
   float4 later;  // displayed depth per mm of lateral offset: to the left, its change; to the right, its change
@@ -391,7 +391,7 @@ inline Beside beside_piece(const Piece *piece, floatn pu, floatn pv, floatn pw) 
   at.right = at.aside - line_lanes(at.along, piece->middle0, piece->middle1);
   at.ends = line_lanes(at.along, piece->half0, piece->half1);
   at.aside2 = aside_e * aside_e;
-  at.range = fma(at.aside * at.aside, line_lanes(at.t, piece->bend0, piece->bend1), at.along);
+  at.range = fma(at.aside * at.aside, (floatn)(piece->bend), at.along);
   at.depth = line_lanes(at.range, piece->depth0, piece->slope);
   at.counts =
       (fabs(at.right) < at.ends) & (at.range > piece->from_mm - SHARED_MM) & (at.range < piece->to_mm + SHARED_MM);
@@ -808,8 +808,7 @@ inline void set_ends(const Patient *patient, __global const Segment *segment, co
   piece->low = low;
   piece->path0 = path_low;
   piece->span = 1.0f / fmax(high - low, 1e-6f);
-  piece->bend0 = frame->linear ? 0.0f : 0.5f / fmax(to_apex + low, 1.0f);
-  piece->bend1 = frame->linear ? 0.0f : 0.5f / fmax(to_apex + high, 1.0f) - piece->bend0;
+  piece->bend = frame->linear ? 0.0f : 0.5f / fmax(to_apex + low, 1.0f);
 #ifdef LOBES
   const float step = frame->line_spacing / frame->lateral_rays;
   const float nominal0 = frame->linear ? step : step * to_apex, nominal1 = frame->linear ? 0.0f : step;
@@ -921,7 +920,7 @@ __kernel void scatter(Frame frame, __global const ushort *voxels, __global const
       piece.to_mm = n == pieces ? segment->length_mm : high;
       set_ends(&patient, segment, &strips, low, high, to_apex, &piece);
       // Off the axis of a curved array the same range is reached slightly earlier.
-      const float early = fmax(piece.bend0, piece.bend0 + piece.bend1) * piece.reach_l * piece.reach_l;
+      const float early = piece.bend * piece.reach_l * piece.reach_l;
       float begin = fmax(piece.from_mm - SHARED_MM, chunk_low) - early, end = fmin(piece.to_mm + SHARED_MM, chunk_high);
 #ifdef LOBES
       const float2 dark = dark_part(&patient, &piece, low, high);

@@ -20,7 +20,7 @@
 // Signs are random from cell to cell of a lattice fixed in the patient, whose cells are so wide, in the same unit.
 #define SIGN_CELL 4.0f
 
-#define FADING 0.05f  // part of a cell to either side of its border over which those of its neighbour replace them
+#define FADING 0.03f  // part of a cell to either side of its border over which those of its neighbour replace them
 
 // Random bits of the cells of the patient that a place is in, with their amplitudes: one, or several near a border.
 typedef struct {
