@@ -80,6 +80,7 @@
 // or length: one that only one of them has would vanish, or count twice, with the least movement of the probe.
 #define SHARED 0.015625f
 #define SHARED_MM 0.01f
+#define MOST_DARK 40        // places along a piece at which tissue is looked at for lobes
 #define BATCH (16 * LANES)  // cells waiting to be computed; rows are packed end to end so that every lane has work
 
 // What scatters, see above
@@ -117,6 +118,9 @@ typedef struct {
   float path0;             // path length from the face at the near end
   float reach_l, reach_e;  // largest lateral and elevational distance
   int u, v, w, first;
+#ifdef LOBES
+  float dark[MOST_DARK + 1], dark_step;  // how dark tissue is from `low` on, at intervals in mm
+#endif
 } Piece;
 
 // Cells that wait to be computed: their u, and of the row the hash and v and w of the first place of its cells
@@ -609,6 +613,57 @@ inline float patch_gain(Frame frame, float3 place) {
   return exp2_scalar(octaves * (patch_at(frame, place) - 0.6931472f * octaves));
 }
 
+#ifdef LOBES
+// How dark tissue is at a place, from 0 to 1: trilinear.
+inline float darkness(const Patient *patient, const Piece *piece, float3 place) {
+  Frame frame = patient->frame;
+  __global const float *is_dark = patient->sites + 2 * MAX_TISSUES;
+  const int nx = frame->dims[0], ny = frame->dims[1];
+  const float3 voxel =
+      piece->at_origin + (float3)(dot3(place, piece->row_i), dot3(place, piece->row_j), dot3(place, piece->row_k));
+  const float3 inside = clamp(voxel, (float3)(0.0f), (float3)(nx - 1.001f, ny - 1.001f, frame->dims[2] - 1.001f));
+  const int3 base = convert_int3(inside);
+  const float3 part = inside - convert_float3(base);
+  float sum = 0.0f;
+  for (int corner = 0; corner < 8; corner++) {
+    const int dx = corner & 1, dy = (corner >> 1) & 1, dz = corner >> 2;
+    const float weight = (dx ? part.x : 1.0f - part.x) * (dy ? part.y : 1.0f - part.y) * (dz ? part.z : 1.0f - part.z);
+    const int label = patient->voxels[((base.z + dz) * ny + base.y + dy) * nx + base.x + dx] & LABEL_MASK;
+    sum += weight * is_dark[label];
+  }
+  return sum;
+}
+
+// Finds how dark tissue is along a piece, at most a step away: in the middle or near the edges of its strip. From where
+// to where it is; (high, low) if it is nowhere.
+inline float2 find_dark(const Patient *patient, Piece *piece, float low, float high) {
+  const int steps = min(max(1, (int)ceil(high - low)), MOST_DARK - 1);
+  float here[MOST_DARK];
+  int first = steps + 1, last = -1;
+  piece->dark_step = (high - low) / steps;
+  for (int n = 0; n <= steps; n++) {
+    here[n] = 0.0f;
+    for (int side = -1; side <= 1; side++) {
+      const float3 along = (low + n * piece->dark_step) * piece->direction;
+      const float3 place = piece->start + along + (0.8f * side * piece->reach_l) * piece->lateral;
+      here[n] = fmax(here[n], darkness(patient, piece, place));
+    }
+    if (here[n] > 0.0f) first = min(first, n), last = n;
+  }
+  for (int n = 0; n <= steps; n++) piece->dark[n] = fmax(here[n], fmax(here[max(n - 1, 0)], here[min(n + 1, steps)]));
+  piece->dark[steps + 1] = piece->dark[steps];
+  if (last < 0) return (float2)(high, low);
+  return (float2)(fmax(low, low + (first - 2) * piece->dark_step), fmin(high, low + (last + 2) * piece->dark_step));
+}
+
+// How dark tissue is at a length beyond the piece's start
+inline float dark_at(const Piece *piece, float length) {
+  const float place = clamp(length / piece->dark_step, 0.0f, MOST_DARK - 1.0f);
+  const int n = (int)place;
+  return blend(piece->dark[n], piece->dark[n + 1], place - n);
+}
+#endif
+
 inline void add_echoes(const Patient *patient, const Piece *piece, const Batch *batch, Echoes *sum) {
   for (int i = 0; i < batch->count; i++) {
     const int label = TISSUE_OF(batch->label[i]);
@@ -617,6 +672,7 @@ inline void add_echoes(const Patient *patient, const Piece *piece, const Batch *
 #ifdef LOBES
     if (strength == 0.0f) continue;
     strength *= lobe_at(patient->frame, patient->lobes, batch->path[i], batch->away[i]);
+    strength *= dark_at(piece, batch->path[i] - piece->path0);
 #endif
     if (IS_ON_MEMBRANE(batch->label[i])) {
       const float3 at = (float3)(batch->fx[i], batch->fy[i], batch->fz[i]);
@@ -645,31 +701,6 @@ inline void scatter_batch(const Patient *patient, const Piece *piece, const Cell
   vary_scatterers(patient, piece, &batch);
 #endif
   add_echoes(patient, piece, &batch, sum);
-}
-
-// From where to where along a piece there is dark tissue in the middle or near the edges of its strip, a step farther
-// to both sides; (high, low) if there is none.
-inline float2 dark_part(const Patient *patient, const Piece *piece, float low, float high) {
-  Frame frame = patient->frame;
-  __global const float *is_dark = patient->sites + 2 * MAX_TISSUES;
-  const int nx = frame->dims[0], ny = frame->dims[1], steps = max(1, (int)ceil(high - low));
-  const float3 most = (float3)(nx - 1, ny - 1, frame->dims[2] - 1);
-  const float step = (high - low) / steps;
-  int first = steps, last = -1;
-  for (int n = 0; n < steps; n++) {
-    const float along = low + (n + 0.5f) * step;
-    for (int side = -1; side <= 1; side++) {
-      const float3 p = piece->start + along * piece->direction + (0.8f * side * piece->reach_l) * piece->lateral;
-      const float3 voxel =
-          piece->at_origin + (float3)(dot3(p, piece->row_i), dot3(p, piece->row_j), dot3(p, piece->row_k)) + 0.5f;
-      const int3 at = convert_int3(clamp(voxel, (float3)(0.0f), most));
-      if (is_dark[patient->voxels[(at.z * ny + at.y) * nx + at.x] & LABEL_MASK] == 0.0f) continue;
-      first = min(first, n);
-      last = n;
-    }
-  }
-  if (last < 0) return (float2)(high, low);
-  return (float2)(fmax(low, low + (first - 1) * step), fmin(high, low + (last + 2) * step));
 }
 
 // The scatterers of one piece between two lengths along it: finds the lattice cells beside it and computes them in
@@ -923,10 +954,10 @@ __kernel void scatter(Frame frame, __global const ushort *voxels, __global const
       const float early = piece.bend * piece.reach_l * piece.reach_l;
       float begin = fmax(piece.from_mm - SHARED_MM, chunk_low) - early, end = fmin(piece.to_mm + SHARED_MM, chunk_high);
 #ifdef LOBES
-      const float2 dark = dark_part(&patient, &piece, low, high);
-      begin = fmax(begin, dark.x), end = fmin(end, dark.y);
-      if (dark.x > low) piece.from_mm = dark.x;
-      if (dark.y < high) piece.to_mm = dark.y;
+      const float2 dark = find_dark(&patient, &piece, low, high);
+      if (dark.x >= dark.y) continue;
+      if (dark.x > low) begin = fmax(begin, dark.x);
+      if (dark.y < high) end = fmin(end, dark.y);
 #endif
       if (begin >= end) continue;
       scatter_piece(&patient, &piece, begin, end, sum);
