@@ -106,7 +106,7 @@ class Medium:
         self._upload(padded, tissues)
         self.has_texture = texture is not None
         self.texture_buffer = device.upload(
-            np.zeros(1, np.uint32) if texture is None else np.pad(texture, _PAD, constant_values=128 << 16)
+            np.zeros(1, np.uint32) if texture is None else np.pad(texture, _PAD, mode="edge")
         )
         self.tissue_buffer = device.upload(self.rows)
         #: Counts the changes of tissues
@@ -187,7 +187,7 @@ class Medium:
     def _laid_over(self, tissues: TissueTable) -> np.ndarray:
         """(k, j, i) uint8 labels with a margin, whose narrow gaps are closed where a sheet that was found stands for
         them."""
-        padded = np.pad(as_labels(self.labels.array), _PAD)
+        padded = np.pad(as_labels(self.labels.array), _PAD, mode="edge")
         membrane, self.found = tissues.membrane, None
         if self.sheets is None or membrane is None or membrane.thickness_mm == 0:
             return padded
