@@ -34,6 +34,8 @@ DEFINE_ELEVATION(float8, elevation_sigma8)
 #define MOST_SPREAD 3.0f      // of a beam
 #define BENT_PER_MM 4.0f      // nepers, both ways, that a line loses in strong tissue that bends what goes through
 #define LEAST_PER_MM 1e-3f    // nepers by which strong tissue differs from soft, so that its ends are seen in the sums
+#define MOST_GATHERED 64      // lines whose strips have scatterers in common, ...
+#define LEAST_GATHERED 0.4f   // ... and the least part that is left of their power
 #define LEFT_FOR_MEANS 0.01f  // of the power of a line that strong tissue stops
 #define EDGE_OF_BONE 0.75f    // part of a cell from which lines are lost in it by their length
 #define LEAST_OPEN 0.05f      // amplitude that is left by the part that bone covers
@@ -665,6 +667,25 @@ __kernel void keep_levels(Frame frame, __global const float *screens_, __global 
       sqrt(mean_passed(frame, screens_, node, line, sigma) / mean_passed(frame, screens_, node, line, sigma * spread));
 }
 
+// The factor by which the power of speckle would change where the axes of neighbouring lines come together to the part
+// `ratio` of their distance: a scatterer is then in the strips of several lines, which add up with phases that differ
+// by `turns` from one to the next (docs/physics.md#beams-from-an-aperture).
+inline float gathered_power(Frame frame, float path, float apart_mm, float ratio, float turns) {
+  const float apart = 0.5f * apart_mm / lateral_sigma(frame, path);
+  // Their depths differ, too, by a part of the pulse. Its deviation is 2.3548 / (2 pi bandwidth) cycles.
+  const float later = 1.3341168f * frame->fractional_bandwidth * turns;
+  const float decay = apart * apart + later * later;
+  float sum = 1.0f;
+  for (int n = 1; n < MOST_GATHERED; n++) {
+    const float common = 1.0f - n * fabs(ratio), weight = exp_fast(-decay * n * n);
+    if (common <= 0.0f || weight < 1e-3f) break;
+    float cosine, sine;
+    turn(n * turns, &cosine, &sine);
+    sum += 2.0f * common * weight * cosine;
+  }
+  return fmax(sum, LEAST_GATHERED);
+}
+
 // The lines of an aperture seem to meet in a point on the axis, but out of its focus the transmitted beam is wide, and
 // a part of it passes beside strong tissue that is right in front of this point: the variance of its intensity, in
 // mm^2, by which it is wider than the received one. (Over the width of that, images average by the lateral beam.)
@@ -772,5 +793,9 @@ __kernel void beams(Frame frame, __global const float *screens_, __global const 
   const int is_inside = left_shade.w < 0.0f && right_shade.w < 0.0f;
   own.w = !is_inside ? 1.0f : left_shade.w == -NO_END && right_shade.w == -NO_END ? -2.0f : -1.0f;
   vstore4(own, to, shade);
+  const float4 per_strip = (right - left) * per_line;  // from line to line
+  const float tilt = beam.z / path;
+  const float turns = frame->cycles_per_mm * (per_strip.y - (apart + per_strip.z) * tilt);
+  beam.x += 0.375f * log_fast(gathered_power(frame, path, apart, 1.0f + per_strip.z / apart, turns));
   vstore4(beam, to, beams_);
 }
