@@ -5,7 +5,7 @@ What is compared is one simulation with another; the claim is of proportion alon
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -76,10 +76,12 @@ def gradients_agree(simulator: UltrasoundSimulator, probe: Probe, pose: np.ndarr
     return float(np.corrcoef(*found)[0, 1])
 
 
-def rows_of(simulator: UltrasoundSimulator, poses: Mapping[str, np.ndarray]) -> Iterator[Row]:
-    """For every array and motion: proportion of changes, in octaves, and gradients."""
+def rows_of(
+    simulator: UltrasoundSimulator, poses: Mapping[str, np.ndarray], motions: Sequence[str] = MOTIONS
+) -> Iterator[Row]:
+    """For the array of every pose and every motion: proportion of changes, in octaves, and gradients."""
     for name, pose in poses.items():
-        for kind in MOTIONS:
+        for kind in motions:
             *small, large = changes(simulator, ARRAYS[name], pose, kind)
             for step, change in zip(STEPS_MM, small, strict=False):
                 ratio = np.hypot(change, ROUNDING) / np.hypot(large * step / STEPS_MM[-1], ROUNDING)
