@@ -796,6 +796,6 @@ __kernel void beams(Frame frame, __global const float *screens_, __global const 
   const float4 per_strip = (right - left) * per_line;  // from line to line
   const float tilt = beam.z / path;
   const float turns = frame->cycles_per_mm * (per_strip.y - (apart + per_strip.z) * tilt);
-  beam.x += 0.375f * log_fast(gathered_power(frame, path, apart, 1.0f + per_strip.z / apart, turns));
+  beam.x += 0.5f * log_fast(gathered_power(frame, path, apart, 1.4f * (1.0f + per_strip.z / apart), turns));
   vstore4(beam, to, beams_);
 }
