@@ -9,7 +9,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
-from scipy.ndimage import uniform_filter
+from scipy.ndimage import uniform_filter1d
 from scipy.spatial.transform import Rotation
 
 from SlicerUSSim.Logic.imaging.found_sheets import with_their_tissue
@@ -30,6 +30,8 @@ ARRAYS["steered"] = replace(PROBES["linear"], scan_lines=96, steering_deg=12.0)
 ARRAYS["matrix"] = replace(SHIPPED["matrix"], scan_lines=96)
 #: mm, of which the first two are compared with the last, and twice that for gradients
 STEPS_MM = (1e-4, 1e-3, 1e-2)
+#: Along an axis of the probe, or about one
+MOTIONS = ("lateral", "axial", "elevational", "about lateral", "about axial", "about elevational")
 #: Part of the signal by which it changes where nothing moves: depths are float32, 7 nm or 3e-4 radians at 100 mm
 ROUNDING = 1.2e-4
 #: mm, from the surface of a brain into it. Where edge lines cross the coupling beside it, nothing is proportional.
@@ -42,15 +44,12 @@ _AT_FACE_MM = 2.0
 
 def motion(kind: str, distance_mm: float, depth_mm: float) -> np.ndarray:
     """(4, 4) motion of the probe along an axis, or about one, by which half of the image depth moves the distance."""
-    moved, axis = np.eye(4), "lateral axial elevational".split().index(kind.removeprefix("about "))
+    moved, axis = np.eye(4), MOTIONS.index(kind.removeprefix("about "))
     if kind.startswith("about "):
         moved[:3, :3] = Rotation.from_rotvec(np.eye(3)[axis] * distance_mm / (0.5 * depth_mm)).as_matrix()
     else:
         moved[axis, 3] = distance_mm
     return moved
-
-
-MOTIONS = ("lateral", "axial", "elevational", "about lateral", "about axial", "about elevational")
 
 
 def changes(simulator: UltrasoundSimulator, probe: Probe, pose: np.ndarray, kind: str) -> np.ndarray:
@@ -64,7 +63,8 @@ def gradients_agree(simulator: UltrasoundSimulator, probe: Probe, pose: np.ndarr
     """Correlation of the central differences of the envelope's logarithm over the last step and twice that."""
     frame = simulator.simulate(probe, pose, EVEN)
     power = np.abs(frame.iq) ** 2
-    counts = power > _NEAR_ZERO**2 * uniform_filter(power, (9, 65))
+    surroundings = uniform_filter1d(uniform_filter1d(power, 9, 0), 65, 1)
+    counts = power > _NEAR_ZERO**2 * surroundings
     counts[:, : int(_AT_FACE_MM / frame.sample_interval_mm)] = False
     found = []
     for step in (STEPS_MM[-1], 2.0 * STEPS_MM[-1]):

@@ -46,7 +46,9 @@ def scatterer_lines(record, labels: np.ndarray, tissues: np.ndarray, segments, l
         near = tree.query_ball_point(segment["start"] + half * segment["direction"], half + reach)
         axes = np.stack([segment[name] for name in ("direction", "lateral", "elevational")])
         along, aside, height = axes @ (places[near] - segment["start"]).T
-        bend = 0.0 if of["linear"] else 0.5 / np.maximum(of["apex_radius_mm"] + begins + segment["path_mm"] + along, 1.0)
+        bend = (
+            0.0 if of["linear"] else 0.5 / np.maximum(of["apex_radius_mm"] + begins + segment["path_mm"] + along, 1.0)
+        )
         at = along + bend * aside**2  # off the axis of a sector the same range is reached earlier
         left, apart = (segment["left"], segment["right"] - segment["left"])
         left, apart = left[0] + left[1] * along, apart[0] + apart[1] * along

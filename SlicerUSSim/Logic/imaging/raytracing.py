@@ -81,9 +81,7 @@ class RayTracer(Stage):
             self._overflown,
             heavy=True,
         )
-        self.device.run(
-            self._strips, (traced,), frame.acquisition_buffer, tree.segments, tree.segment_counts, few=True
-        )
+        self.device.run(self._strips, (traced,), frame.acquisition_buffer, tree.segments, tree.segment_counts, few=True)
         if medium.found is not None and medium.found.reflects:
             self.device.run(
                 self._sheet_hits, (traced, rays), frame.acquisition_buffer, medium.sheet_buffer, self._quantiles,
