@@ -380,7 +380,6 @@ typedef struct {
   floatn right, ends;      // distance from the strip's middle, at which it ends
   floatn range, depth;     // length along the segment at which it is seen, displayed depth
   floatn aside2;           // squared distance from the axis in elevation
-  intn counts;             // whether a part of it belongs to this piece and strip
 #ifdef LOBES
   floatn away;  // distance from the axis in elevation
 #endif
@@ -397,8 +396,6 @@ inline Beside beside_piece(const Piece *piece, floatn pu, floatn pv, floatn pw) 
   at.aside2 = aside_e * aside_e;
   at.range = fma(at.aside * at.aside, (floatn)(piece->bend), at.along);
   at.depth = line_lanes(at.range, piece->depth0, piece->slope);
-  at.counts =
-      (fabs(at.right) < at.ends) & (at.range > piece->from_mm - SHARED_MM) & (at.range < piece->to_mm + SHARED_MM);
 #ifdef LOBES
   at.away = fabs(aside_e);
 #endif
@@ -420,7 +417,11 @@ inline floatn share_of(const Piece *piece, floatn range, floatn right) {
 inline void place_scatterers(Frame frame, const Piece *piece, const Cells *cells, int count, Batch *batch) {
   const float cell = frame->cell_mm, grain = cell / GRAINS, first_u = 0.5f * grain - piece->start.x;
   const float cutoff2 = 0.5f * LOG2_E * frame->beam_cutoff * frame->beam_cutoff;
-  const float inverse_sample = 1.0f / frame->sample_mm;
+  // The ranges of which something is seen in these samples, and of which a part belongs to this piece
+  const float before = (piece->first - 1 - piece->moved) * frame->sample_mm - piece->depth0;
+  const float behind = (piece->first + CHUNK + piece->moved) * frame->sample_mm - piece->depth0;
+  const float nearest = fmax(piece->from_mm - SHARED_MM, before / piece->slope);
+  const float farthest = fmin(piece->to_mm + SHARED_MM, behind / piece->slope);
   const int u = piece->u, v = piece->v, w = piece->w;
   const uint step_u = axis_step(u);
   ushort chosen[BATCH + 1];
@@ -442,9 +443,8 @@ inline void place_scatterers(Frame frame, const Piece *piece, const Cells *cells
 #else
     const intn near = at.aside2 * line_lanes(at.t, piece->narrow0, piece->narrow1) <= cutoff2;
 #endif
-    const intn bins = TO_INTN(floor(at.depth * inverse_sample)) - piece->first;
-    const intn seen = (bins >= -1 - piece->moved) & (bins < CHUNK + piece->moved);
-    SPREAD(int, counts_, at.counts & near & seen & (LANE_INDEX < count - begin));
+    const intn counts = (fabs(at.right) < at.ends) & (at.range > nearest) & (at.range < farthest) & near;
+    SPREAD(int, counts_, counts &(LANE_INDEX < count - begin));
     for (int j = 0; j < LANES; j++) {
       chosen[n] = begin + j;
       n += counts_[j] & 1;
@@ -501,7 +501,7 @@ inline void compute_echoes(Frame frame, const Piece *piece, Batch *batch) {
     // The profile's end is no step either
     amplitude *= min(2.0f * (cutoff2 - r2), (floatn)(1.0f));
 #endif
-    if (piece->moved > 0) amplitude = ((bins >= -1) & (bins < CHUNK)) ? amplitude : (floatn)(0.0f);
+    amplitude = ((bins >= -1) & (bins < CHUNK)) ? amplitude : (floatn)(0.0f);
     const floatn share = share_of(piece, beside.range, right);
     const floatn echo = share * amplitude * (1.0f - TO_FLOATN((random >> 14) & 2u));
     floatn cosine, sine;
