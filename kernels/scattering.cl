@@ -624,6 +624,8 @@ inline float darkness(const Patient *patient, const Piece *piece, float3 place) 
   const float3 inside = clamp(voxel, (float3)(0.0f), (float3)(nx - 1.001f, ny - 1.001f, frame->dims[2] - 1.001f));
   const int3 base = convert_int3(inside);
   const float3 part = inside - convert_float3(base);
+  const int here = patient->voxels[(base.z * ny + base.y) * nx + base.x];
+  if (here & SAME_LABEL) return is_dark[here & LABEL_MASK];
   float sum = 0.0f;
   for (int corner = 0; corner < 8; corner++) {
     const int dx = corner & 1, dy = (corner >> 1) & 1, dz = corner >> 2;
