@@ -66,25 +66,25 @@ inline Place place_at(Frame frame, __global const float *roots, int line, float 
 }
 
 // A weight with a random sign: the parity of the bits that both have.
-inline float with_sign(float weight, const Place *place, uint offset) {
-  float sum = as_float(as_uint(place->parts[0]) ^ (popcount(place->bits[0] & offset) << 31));
-  for (int n = 1; n < place->count; n++)
-    sum += as_float(as_uint(place->parts[n]) ^ (popcount(place->bits[n] & offset) << 31));
-  return weight * sum;
+inline float with_sign(float weight, uint place, uint offset) {
+  return as_float(as_uint(weight) ^ (popcount(place & offset) << 31));
 }
 
 // What the lobes of a node receive, with the weights of nodes 0, 1, 2... to either side and the random bits of these
-// distances. Beyond the image nothing is known.
-inline void at_node(const floatn *re, const floatn *im, const Place *places, const uint *offsets, const float *weights,
-                    int node, int nodes, int reach, floatn *lobe_re, floatn *lobe_im) {
+// distances. `places` are those from places_of[node] on. Beyond the image nothing is known.
+inline void at_node(const floatn *re, const floatn *im, const int *nodes_of, const uint *bits, const float *parts,
+                    const int *places_of, const uint *offsets, const float *weights, int node, int nodes, int reach,
+                    floatn *lobe_re, floatn *lobe_im) {
   floatn x = weights[0] * re[node], y = weights[0] * im[node];
-  for (int other = max(node - reach, 0); other < node; other++) {
-    const float weight = with_sign(weights[node - other], places + other, offsets[node - other]);
+  for (int n = places_of[max(node - reach, 0)]; n < places_of[node]; n++) {
+    const int other = nodes_of[n], away = node - other;
+    const float weight = with_sign(weights[away] * parts[n], bits[n], offsets[away]);
     x += weight * re[other];
     y += weight * im[other];
   }
-  for (int other = node + 1; other <= min(node + reach, nodes - 1); other++) {
-    const float weight = with_sign(weights[other - node], places + other, rotate(offsets[other - node], 16u));
+  for (int n = places_of[node + 1]; n < places_of[min(node + reach, nodes - 1) + 1]; n++) {
+    const int other = nodes_of[n], away = other - node;
+    const float weight = with_sign(weights[away] * parts[n], bits[n], rotate(offsets[away], 16u));
     x += weight * re[other];
     y += weight * im[other];
   }
@@ -135,7 +135,9 @@ __kernel void side_lobes(Frame frame, __global const float *lobes, __global cons
   }
 
   floatn node_re[LOBE_NODES], node_im[LOBE_NODES];
-  Place places[LOBE_NODES];  // of every node
+  int places_of[LOBE_NODES + 1], nodes_of[8 * LOBE_NODES], found = 0;  // first place of every node, node of every place
+  uint bits[8 * LOBE_NODES];
+  float parts[8 * LOBE_NODES];
   const float inverse_cell = 1.0f / (SIGN_CELL * unit_least);
   for (int node = 0; node < nodes; node++) {
     floatn sum_re = 0.0f, sum_im = 0.0f;
@@ -145,8 +147,11 @@ __kernel void side_lobes(Frame frame, __global const float *lobes, __global cons
     }
     node_re[node] = sum_re / (float)step;
     node_im[node] = sum_im / (float)step;
-    places[node] = place_at(frame, roots, min(node * step + step / 2, lines - 1), depth_mm, inverse_cell);
+    const Place at = place_at(frame, roots, min(node * step + step / 2, lines - 1), depth_mm, inverse_cell);
+    places_of[node] = found;
+    for (int n = 0; n < at.count; n++) nodes_of[found] = node, bits[found] = at.bits[n], parts[found++] = at.parts[n];
   }
+  places_of[nodes] = found;
 
   floatn before_re, before_im;
   float before_kept = 1.0f;
@@ -154,7 +159,8 @@ __kernel void side_lobes(Frame frame, __global const float *lobes, __global cons
   for (int node = 0; node <= nodes; node++) {
     const int last = min(node, nodes - 1);
     floatn lobe_re, lobe_im;
-    at_node(node_re, node_im, places, offsets, weights, last, nodes, reach, &lobe_re, &lobe_im);
+    at_node(node_re, node_im, nodes_of, bits, parts, places_of, offsets, weights, last, nodes, reach, &lobe_re,
+            &lobe_im);
     // Of those that there are
     const int left = min(last, reach), right = min(nodes - 1 - last, reach);
     const float kept =
