@@ -34,7 +34,8 @@ DEFINE_ELEVATION(float8, elevation_sigma8)
 #define MOST_SPREAD 3.0f      // of a beam
 #define BENT_PER_MM 4.0f      // nepers, both ways, that a line loses in strong tissue that bends what goes through
 #define LEAST_PER_MM 1e-3f    // nepers by which strong tissue differs from soft, so that its ends are seen in the sums
-#define MOST_GATHERED 64      // lines whose strips have scatterers in common, ...
+#define NOT_TOGETHER 1.7f     // axes from 1 / this of their distance without tissue on do not come together; ...
+#define MOST_GATHERED 64      // ... lines whose strips have scatterers in common, ...
 #define LEAST_GATHERED 0.4f   // ... and the least part that is left of their power
 #define LEFT_FOR_MEANS 0.01f  // of the power of a line that strong tissue stops
 #define EDGE_OF_BONE 0.75f    // part of a cell from which lines are lost in it by their length
@@ -668,8 +669,8 @@ __kernel void keep_levels(Frame frame, __global const float *screens_, __global 
 }
 
 // The factor by which the power of speckle would change where the axes of neighbouring lines come together to the part
-// `ratio` of their distance: a scatterer is then in the strips of several lines, which add up with phases that differ
-// by `turns` from one to the next (docs/physics.md#beams-from-an-aperture).
+// `ratio` of their distance: several lines then look at the same tissue, and add up with phases that differ by `turns`
+// from one to the next (docs/physics.md#beams-from-an-aperture).
 inline float gathered_power(Frame frame, float path, float apart_mm, float ratio, float turns) {
   const float apart = 0.5f * apart_mm / lateral_sigma(frame, path);
   // Their depths differ, too, by a part of the pulse. Its deviation is 2.3548 / (2 pi bandwidth) cycles.
@@ -760,8 +761,8 @@ inline float2 mean_shades(Frame frame, __global const float *shades, int node, f
                   -log_fast(mean_lit(frame, shades, 1, node, place, end_sigma)));
 }
 
-// The beams of traced lines, interpolated between screens; 0 at the face. Axes that come together must not create
-// energy. One work-item computes one depth of one traced line. Global size (1 + depths, traced lines).
+// The beams of traced lines, interpolated between screens; 0 at the face. One work-item computes one depth of one
+// traced line. Global size (1 + depths, traced lines).
 __kernel void beams(Frame frame, __global const float *screens_, __global const float *shades, int all_soft,
                     __global float *beams_) {
   const int number = get_global_id(0), line = get_global_id(1), depths = frame->screen_depths;
@@ -796,6 +797,6 @@ __kernel void beams(Frame frame, __global const float *screens_, __global const 
   const float4 per_strip = (right - left) * per_line;  // from line to line
   const float tilt = beam.z / path;
   const float turns = frame->cycles_per_mm * (per_strip.y - (apart + per_strip.z) * tilt);
-  beam.x += 0.5f * log_fast(gathered_power(frame, path, apart, 1.0f + per_strip.z / apart, turns));
+  beam.x += 0.5f * log_fast(gathered_power(frame, path, apart, NOT_TOGETHER * (1.0f + per_strip.z / apart), turns));
   vstore4(beam, to, beams_);
 }

@@ -82,7 +82,7 @@ def test_stages_do_what_their_references_do_with_the_same_inputs(kind, turn):
         stage.run(frame)
     tree, traced = made.tracer.download(), impulses(frame.traced, 2 * int(record["traced_lines"]))
     at = np.rint(tree.segment_line * int(record["lateral_rays"]) + int(record["guard_lines"])).astype(int)
-    labels = np.pad(made.medium.labels.array, 1)
+    labels = np.pad(made.medium.labels.array, 1, mode="edge")
     # Where the kernel's gains are linear along pieces of paths, and single scatterers lie between two strips
     most = 0.04 if kind == "angles" else 0.015
     assert off(traced, scatterer_lines(record, labels, made.medium.rows, tree.segments, at)) < most
@@ -155,9 +155,8 @@ def test_the_medium_has_groups_smoothed_shares_and_the_fluid_distance(has_shares
     labels = Volume(labels.array, labels.ijk_to_ras @ np.diag([1.0, 1.0, 1.3, 1.0]))
     tissues = TissueTable(tissues, membrane=Membrane(BRAIN, 0.8, ("fluid",)))
     group_of, texture = np.array([0, 1, 0, 2, 1]), None  # of labels, the most frequent first
-    padded = np.pad(labels.array, 1)
-    continued = np.pad(labels.array, 1, mode="edge")
-    second, part = continued, np.zeros(padded.shape)
+    padded = np.pad(labels.array, 1, mode="edge")
+    second, part = padded, np.zeros(padded.shape)
     if has_shares:
         rng, shape = np.random.default_rng(0), labels.array.shape
         nothing, share = np.zeros(shape, np.float32), rng.uniform(0.0, 0.5, shape).astype(np.float32)
@@ -172,7 +171,7 @@ def test_the_medium_has_groups_smoothed_shares_and_the_fluid_distance(has_shares
     assert np.array_equal(groups, group_of[padded])
     smooth = download(found.smooth_buffer, (found.smooth_groups, *padded.shape), np.uint16)
     for number in range(3):
-        member = (1.0 - part) * (group_of[continued] == number) + part * (group_of[second] == number)
+        member = (1.0 - part) * (group_of[padded] == number) + part * (group_of[second] == number)
         expected = 65535.0 * ndimage.gaussian_filter(member, 3.0, mode="nearest", truncate=2.5)
         assert np.abs(smooth[number] - expected).max() < 2.5
     sigma_mm = 0.75 * np.prod(labels.spacing_mm) ** (1.0 / 3.0)

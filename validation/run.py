@@ -88,6 +88,7 @@ def all_checks() -> tuple[Check, ...]:
         artefacts,
         band,
         beams,
+        continuity,
         curved_walls,
         flat_walls,
         floor,
@@ -103,6 +104,7 @@ def all_checks() -> tuple[Check, ...]:
     groups = (
         rays,
         speckle,
+        continuity,
         band,
         floor,
         artefacts,

@@ -46,13 +46,22 @@ def scatterer_lines(record, labels: np.ndarray, tissues: np.ndarray, segments, l
         near = tree.query_ball_point(segment["start"] + half * segment["direction"], half + reach)
         axes = np.stack([segment[name] for name in ("direction", "lateral", "elevational")])
         along, aside, height = axes @ (places[near] - segment["start"]).T
-        widest = beam.line_distance(segment["path_mm"] + 2.0 * half + begins)
-        inside = (along >= 0.0) & (along < segment["length_mm"]) & (abs(aside) <= widest)
-        along, aside, height = along[inside], aside[inside], height[inside]
-        amplitude = amplitudes[near][inside]
+        bend = (
+            0.0 if of["linear"] else 0.5 / np.maximum(of["apex_radius_mm"] + begins + segment["path_mm"] + along, 1.0)
+        )
+        at = along + bend * aside**2  # off the axis of a sector the same range is reached earlier
+        left, apart = (segment["left"], segment["right"] - segment["left"])
+        left, apart = left[0] + left[1] * along, apart[0] + apart[1] * along
+        # Where strips and segments meet, a scatterer passes from one to the other.
+        share = np.clip(at / 0.02 + 0.5, 0.0, 1.0) - np.clip((at - segment["length_mm"]) / 0.02 + 0.5, 0.0, 1.0)
+        right = (aside - left) / apart
+        share *= np.clip(32.0 * (0.5 - abs(right - 0.5)) + 0.5, 0.0, 1.0)
+        inside = (share > 0.0) & (apart > 0.0)
+        along, aside, height, at, apart, right = (x[inside] for x in (along, aside, height, at, apart, right))
+        amplitude = amplitudes[near][inside] * share[inside]
         path, loss = segment["path_mm"] + along, segment["loss"] + segment["loss_per_mm"] * along
-        frequency, apart = beam.frequency_after(loss), beam.line_distance(path + begins)
-        tall, right = beam.elevation_sigma(path, frequency), 0.5 + aside / apart
+        frequency = beam.frequency_after(loss)
+        tall = beam.elevation_sigma(path, frequency)
         # The image is as wide as the beam at the displayed depth.
         shown = np.maximum(segment["depth_mm"] + segment["depth_per_mm"] * along, begins)
         wide = beam.lateral_sigma(shown - begins, frequency) / beam.line_distance(shown)
@@ -61,14 +70,16 @@ def scatterer_lines(record, labels: np.ndarray, tissues: np.ndarray, segments, l
         amplitude = amplitude * segment["weight"] * segment["attenuation"] * of["speckle_scale"] * np.sqrt(2.0 * np.pi)
         amplitude *= np.exp(beam.gain_of_band(loss) - segment["decay_per_mm"] * along - 0.5 * (height / tall) ** 2)
         amplitude *= np.sqrt(segment["depth_per_mm"] * wide / spread)
-        # Off the axis of a sector the same range is reached earlier.
-        bend = 0.0 if of["linear"] else 0.5 / np.maximum(of["apex_radius_mm"] + begins + path, 1.0)
-        depth = segment["depth_mm"] + segment["depth_per_mm"] * (along + bend * aside**2)
+        depth = segment["depth_mm"] + segment["depth_per_mm"] * at
+        for side, (_, _, later, change) in ((aside < 0.0, segment["left"]), (aside > 0.0, segment["right"])):
+            depth += np.where(side, aside * (later + change * along), 0.0)
         cycles = depth * of["cycles_per_mm"] + height**2 * beam.elevational_cycles(path, frequency)
         echo = amplitude * np.exp(-2j * np.pi * cycles)
         place = depth / of["sample_mm"]
         bins, part = np.floor(place).astype(int), place % 1.0
-        counts = (right >= 0.0) & (right < 1.0) & (abs(height) <= of["beam_cutoff"] * tall)
+        end = 0.5 / np.log(2.0) * (of["beam_cutoff"] ** 2 - (height / tall) ** 2)  # of the profile, where it has none
+        echo *= np.clip(2.0 * end, 0.0, 1.0)
+        counts = end > 0.0
         for edge, of_edge in enumerate((1.0 - right, right)):
             for ahead, of_sample in enumerate((1.0 - part, part)):
                 within = counts & (bins + ahead >= 0) & (bins + ahead < sums.shape[1])

@@ -199,6 +199,10 @@ SEGMENT = np.dtype(
         ("decay_per_mm", _FLOAT),  # -d ln(attenuation) / ds
         ("loss", _FLOAT),  # nepers at `start` by the attenuation of tissues alone, without what a beam loses otherwise
         ("loss_per_mm", _FLOAT),
+        # The borders of its strip (strips.cl): lateral offset at `start`, its change per mm along the segment, what the
+        # displayed depth changes per mm of offset from the axis towards that border, its change
+        ("left", _FLOAT, 4),
+        ("right", _FLOAT, 4),
         ("reflections", _INT),
         ("label", _INT),
     ]
