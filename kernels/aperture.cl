@@ -662,7 +662,8 @@ __kernel void keep_levels(Frame frame, __global const float *screens_, __global 
   const float path = (node + 1) * frame->screen_step, spread = spreads[2 * at];
   const float traced_lines = (float)(frame->traced_lines - 1) / (frame->screen_lines - 1);
   const float apart = line_distance(frame, path + traced_start(frame, line * traced_lines));
-  const float sigma = lateral_sigma(frame, path) / (apart * traced_lines);
+  const float cosine = traced_cosine(frame, line * traced_lines);
+  const float sigma = lateral_sigma(frame, path, 1.0f, cosine) / (apart * traced_lines);
   spreads[2 * at + 1] =
       sqrt(mean_passed(frame, screens_, node, line, sigma) / mean_passed(frame, screens_, node, line, sigma * spread));
 }
@@ -670,8 +671,8 @@ __kernel void keep_levels(Frame frame, __global const float *screens_, __global 
 // The factor by which the power of speckle would change where the axes of neighbouring lines come together to the part
 // `ratio` of their distance: a scatterer is then in the strips of several lines, which add up with phases that differ
 // by `turns` from one to the next (docs/physics.md#beams-from-an-aperture).
-inline float gathered_power(Frame frame, float path, float apart_mm, float ratio, float turns) {
-  const float apart = 0.5f * apart_mm / lateral_sigma(frame, path);
+inline float gathered_power(Frame frame, float path, float apart_mm, float ratio, float turns, float cosine) {
+  const float apart = 0.5f * apart_mm / lateral_sigma(frame, path, 1.0f, cosine);
   // Their depths differ, too, by a part of the pulse. Its deviation is 2.3548 / (2 pi bandwidth) cycles.
   const float later = 1.3341168f * frame->fractional_bandwidth * turns;
   const float decay = apart * apart + later * later;
@@ -691,7 +692,7 @@ inline float gathered_power(Frame frame, float path, float apart_mm, float ratio
 // mm^2, by which it is wider than the received one. (Over the width of that, images average by the lateral beam.)
 inline float extra_variance(Frame frame, float path) {
   const float receive = fmax(path * frame->receive_sigma_slope, frame->receive_sigma_min);
-  return 0.5f * fmax(transmit_variance(frame, path, 1.0f) - receive * receive, 0.0f);
+  return 0.5f * fmax(transmit_variance(frame, path, 1.0f, 1.0f) - receive * receive, 0.0f);
 }
 
 // A place between two screen lines
@@ -796,6 +797,7 @@ __kernel void beams(Frame frame, __global const float *screens_, __global const 
   const float4 per_strip = (right - left) * per_line;  // from line to line
   const float tilt = beam.z / path;
   const float turns = frame->cycles_per_mm * (per_strip.y - (apart + per_strip.z) * tilt);
-  beam.x += 0.5f * log_fast(gathered_power(frame, path, apart, 1.0f + per_strip.z / apart, turns));
+  beam.x += 0.5f * log_fast(gathered_power(frame, path, apart, 1.0f + per_strip.z / apart, turns,
+                                           traced_cosine(frame, (float)line)));
   vstore4(beam, to, beams_);
 }

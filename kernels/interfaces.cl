@@ -66,7 +66,7 @@ __kernel void find_walls(Frame frame, __global const Hit *hits, __global const i
   const int line = get_global_id(0), rays = frame->elevational_rays;
   const float pulse = frame->fractional_bandwidth * 0.42466090f;  // 1 / (2 sqrt(2 ln 2))
   const float per_mm = TWO_PI * frame->cycles_per_mm;
-  const float start = traced_start(frame, (float)line);
+  const float start = traced_start(frame, (float)line), cosine = traced_cosine(frame, (float)line);
   __global Wall *my_walls = walls + line * rays * MAX_HITS;
   int walls_found = 0;
   float farthest = 0.0f;
@@ -74,7 +74,8 @@ __kernel void find_walls(Frame frame, __global const Hit *hits, __global const i
     const int slot = line * rays + ray, count = min(hit_counts[slot], MAX_HITS);
     for (int h = 0; h < count; h++) {
       __global const Hit *hit = hits + slot * MAX_HITS + h;
-      const float2 sigma = beam_sigma(frame, hit->path_mm);
+      const float2 sigma =
+          (float2)(lateral_sigma(frame, hit->path_mm, 1.0f, cosine), elevation_sigma(frame, hit->path_mm));
       // Near the apex of a phased array all lines are within the beam, and every second, fourth ... is enough.
       float step = line_distance(frame, hit->path_mm + start);
       int every = 1;

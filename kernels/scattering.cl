@@ -89,10 +89,10 @@ typedef struct {
 } Patient;
 
 // The strips that a work-item computes: `lines` of them from `left` on, along the path of one in the middle, whose
-// displayed depths begin with `begins`.
+// displayed depths begin with `begins`, and for which the face is foreshortened by `cosine`.
 typedef struct {
   int line, left, lines;
-  float begins;
+  float begins, cosine;
 } Strips;
 
 // Quantities common to all scatterers beside one piece of a segment. Vectors are in the order u, v, w of lattice axes.
@@ -748,8 +748,8 @@ inline void set_ends(const Patient *patient, __global const Segment *segment, co
   // beam.cl knows the displayed depth alone, which differs from the path where sound is slower or faster.
   const float shown_low = fmax(piece->depth0 + piece->slope * low, strips->begins);
   const float shown_high = fmax(piece->depth0 + piece->slope * high, strips->begins);
-  const float wide_low = lateral_sigma_at(frame, shown_low - strips->begins, 1.0f / frequency_low);
-  const float wide_high = lateral_sigma_at(frame, shown_high - strips->begins, 1.0f / frequency_high);
+  const float wide_low = lateral_sigma(frame, shown_low - strips->begins, 1.0f / frequency_low, strips->cosine);
+  const float wide_high = lateral_sigma(frame, shown_high - strips->begins, 1.0f / frequency_high, strips->cosine);
   piece->low = low;
   piece->path0 = path_low;
   piece->span = 1.0f / fmax(high - low, 1e-6f);
@@ -814,7 +814,7 @@ __kernel void scatter(Frame frame, __global const ushort *voxels, __global const
   const int block = first / PIECE_BLOCK * PIECE_BLOCK;
   const float block_low = (block - 1) * frame->sample_mm;
   const float block_high = (block + PIECE_BLOCK) * frame->sample_mm;
-  const Strips strips = {line, left, lines, traced_start(frame, (float)line)};
+  const Strips strips = {line, left, lines, traced_start(frame, (float)line), traced_cosine(frame, (float)line)};
   const Patient patient = {frame, voxels, planes, texture, sites, PART_OF, LOBE_TABLE};
 
   int count = min(segment_counts[line], MAX_SEGMENTS);

@@ -41,7 +41,8 @@ def scatterer_lines(record, labels: np.ndarray, tissues: np.ndarray, segments, l
     places, amplitudes = places[exists], amplitudes[exists]
     tree = spatial.cKDTree(places)
     for segment, line in zip(segments, lines, strict=True):
-        begins = beam.line_start((line - of["guard_lines"]) / of["lateral_rays"])
+        scan_line = (line - of["guard_lines"]) / of["lateral_rays"]
+        begins, cosine = beam.line_start(scan_line), beam.line_cosine(scan_line)
         half = 0.5 * segment["length_mm"]
         near = tree.query_ball_point(segment["start"] + half * segment["direction"], half + reach)
         axes = np.stack([segment[name] for name in ("direction", "lateral", "elevational")])
@@ -55,7 +56,7 @@ def scatterer_lines(record, labels: np.ndarray, tissues: np.ndarray, segments, l
         tall, right = beam.elevation_sigma(path, frequency), 0.5 + aside / apart
         # The image is as wide as the beam at the displayed depth.
         shown = np.maximum(segment["depth_mm"] + segment["depth_per_mm"] * along, begins)
-        wide = beam.lateral_sigma(shown - begins, frequency) / beam.line_distance(shown)
+        wide = beam.lateral_sigma(shown - begins, frequency, cosine) / beam.line_distance(shown)
         tube = segment["tube"]
         spread = tall * (tube[0] + tube[1] * along) * (tube[2] + tube[3] * along) * apart
         amplitude = amplitude * segment["weight"] * segment["attenuation"] * of["speckle_scale"] * np.sqrt(2.0 * np.pi)

@@ -162,6 +162,11 @@ class Probe(Beam):
         """Angle of parallel scan lines to the normal of the face."""
         return 0.0
 
+    def line_levels(self) -> np.ndarray | None:
+        """(scan_lines,) float32 factor of every line's echoes by steered_level; None where no line is steered."""
+        sines = self.directions()[:, 0] if self.has_flat_face else np.zeros(1)
+        return self.steered_level(np.arcsin(sines)).astype(np.float32) if sines.any() else None
+
     def line_starts_mm(self, position) -> np.ndarray:
         """Distance from line_at's origin to where lines at these positions leave the face.
 

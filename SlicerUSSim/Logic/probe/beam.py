@@ -93,6 +93,14 @@ class Beam(Declared):
         "none: only side lobes", unit="dB", bounds=(-100, 0),
         note="They and the side lobes fill cysts; they fall off smoothly over 48 wavelengths x f-number to either side",
     )  # fmt: skip
+    element_mm: float | None = parameter(
+        None, "Element", "Lateral size of the elements: the larger, the less they send and receive along steered lines; "
+        "none: half a wavelength", unit="mm", bounds=(0.01, 10),
+    )  # fmt: skip
+    baffle: str = parameter(
+        "soft", "Baffle", "What surrounds the elements. soft: it yields, and steered lines lose the cosine of their "
+        "angle both ways, as measured on arrays; rigid: they do not", choices=("soft", "rigid"),
+    )  # fmt: skip
     elevation_aperture_mm: float = parameter(
         7.0, "Elevational aperture", "Height of the elements, in the elevation direction", unit="mm", bounds=(0.5, 100)
     )
@@ -136,22 +144,41 @@ class Beam(Declared):
         sigma_mhz = self.received_bandwidth * self.received_mhz / FWHM_PER_SIGMA
         return NOMINAL_SPEED_M_S * 1e-3 / (4.0 * np.pi * sigma_mhz)
 
-    def beam_sigma_mm(self, depth_mm) -> tuple[np.ndarray, np.ndarray]:
-        """(lateral, elevational) standard deviation of the two-way beam amplitude at `depth_mm` along a scan line."""
+    def beam_sigma_mm(self, depth_mm, cosine: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
+        """(lateral, elevational) standard deviation of the two-way beam amplitude at `depth_mm` along a scan line.
+
+        The aperture of a steered line is foreshortened by the `cosine` of its angle to the normal of the face.
+        """
         depth = np.asarray(depth_mm, dtype=float)
-        transmit, receive = self.lateral_sigmas_mm(depth)
+        transmit, receive = self.lateral_sigmas_mm(depth, cosine)
         lateral = transmit * receive / np.hypot(transmit, receive)
         return lateral, self._gaussian_beam(depth, *self.elevation_beam())
 
-    def lateral_sigmas_mm(self, depth_mm) -> tuple[np.ndarray, np.ndarray]:
-        """(transmit, receive) standard deviations of the lateral one-way beams at `depth_mm` along a scan line."""
+    def lateral_sigmas_mm(self, depth_mm, cosine: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
+        """(transmit, receive) standard deviations of the lateral one-way beams, as for beam_sigma_mm."""
         depth = np.asarray(depth_mm, dtype=float)
-        zones = self.transmit_zones()
+        zones = [(sigma / cosine, focus, length / cosine**2) for sigma, focus, length in self.transmit_zones()]
         if zones:
             transmit = np.min([self._gaussian_beam(depth, *zone) for zone in zones], axis=0)
         else:
-            transmit = self._focused_everywhere(depth, *self.compounded_beam())
-        return transmit, self._focused_everywhere(depth, *self.receive_beam())
+            transmit = self._focused_everywhere(depth, *self.compounded_beam()) / cosine
+        return transmit, self._focused_everywhere(depth, *self.receive_beam()) / cosine
+
+    def steered_level(self, angle_rad) -> np.ndarray:
+        """Amplitude of echoes along lines at these angles to the normal of the face, re a line along it.
+
+        Elements w wide send and receive sinc(w sin a / wavelength), in a soft baffle cos a of that (A. R. Selfridge, G.
+        S. Kino, B. T. Khuri-Yakub, Appl. Phys. Lett. 37(1), 1980). The beam, wider by 1 / cos a, keeps its power of
+        speckle, so that the echo of a point is lowered by the elements alone.
+        """
+        sine, cosine = np.sin(angle_rad), np.cos(angle_rad)
+        width = 0.5 * self.wavelength_mm if self.element_mm is None else self.element_mm
+
+        def pattern(mhz: float) -> np.ndarray:
+            return np.sinc(width * mhz * 1e3 / NOMINAL_SPEED_M_S * sine) * (cosine if self.baffle == "soft" else 1.0)
+
+        sent = pattern(self.frequency_mhz)
+        return (sent**2 if self.harmonic else sent) * pattern(self.received_mhz) / np.sqrt(cosine)
 
     def speckle_sigma_mm(self, depth_mm) -> np.ndarray:
         """Lateral sigma of the uncurved beam whose speckle correlates over the same distance.
