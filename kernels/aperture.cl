@@ -23,8 +23,6 @@
 
 #include "common.clh"
 
-DEFINE_ELEVATION(float8, elevation_sigma8)
-
 #define ROWS 3
 // Nodes and weights of the three-point Gauss-Hermite rule for the power of the elevational beam.
 #define ROW_SIGMA 1.2247449f

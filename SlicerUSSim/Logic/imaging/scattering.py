@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from SlicerUSSim.Logic.imaging.diffraction import lobes_of
 from SlicerUSSim.Logic.imaging.raytracing import ray_centres
 from SlicerUSSim.Logic.imaging.side_lobes import DARK, Tables, elevational_lobe_record, lines_together
 from SlicerUSSim.Logic.imaging.signals import EchoLines
@@ -43,7 +42,7 @@ class Scatterers(Stage):
         size = 4 * (3 + CONSTANTS["UNEVEN_WORDS"]) * CONSTANTS["MAX_TISSUES"]
         self._sites = [device.empty(size) for _ in range(2)]
         self._lobes = device.empty(ACQUISITION.itemsize)
-        self._tables = Tables(device)
+        self._beams = [Tables(device) for _ in range(2)]  # the main beam's and that of its lobes
 
     def run(self, frame: DeviceFrame) -> None:
         """Enqueue the speckle of one frame: its `traced` impulses, zero if scattering is off."""
@@ -64,6 +63,8 @@ class Scatterers(Stage):
         end = [] if part_of is None else [part_of]
         variant = (["TEXTURE"] if frame.medium.has_texture else []) + (["VARIED"] if part_of is not None else [])
         variant += ["FOUND"] if frame.medium.found is not None else []
+        lens = frame.probe.lens()
+        beam = self._beams[0].get(frame.probe, packed_beam(lens.main, lens.main_mm))
         table = unevenness_table(tissues)
         variant += ["UNEVEN"] if is_uneven(table) else []
         uneven, none_dark = table.ravel(), np.zeros(CONSTANTS["MAX_TISSUES"], np.float32)
@@ -72,19 +73,19 @@ class Scatterers(Stage):
         )
         self._enqueue(
             frame, lines, frame.acquisition_buffer, self._sites[0],
-            [*variant, f"CHUNK={self.device.chunk}"], (samples // self.device.chunk, traced), end,
+            [*variant, f"CHUNK={self.device.chunk}"], (samples // self.device.chunk, traced), [beam, *end],
         )  # fmt: skip
         if frame.settings.side_lobes:
-            record, lobes = elevational_lobe_record(frame.acquisition), lobes_of(frame.probe)
+            record = elevational_lobe_record(frame.acquisition)
             self.device.write(self._lobes, record)
             chunk, together = _LOBE_CHUNKS * self.device.chunk, lines_together(record, frame.probe)
-            patterns = self._tables.get(frame.probe, np.append(lobes.elevational, lobes.reach_mm))
+            lobes = self._beams[1].get(frame.probe, packed_beam(lens.lobes, lens.lobes_mm))
             dark = frame.medium.quieter(DARK).astype(np.float32)
             sites = np.concatenate([lattice_sites(tissues, record).ravel(), dark, uneven])
             self.device.write(self._sites[1], sites)
             self._enqueue(
                 frame, lines, self._lobes, self._sites[1], [*variant, "LOBES", f"CHUNK={chunk}"],
-                (-(-samples // chunk), -(-traced // together)), [*end, patterns, np.int32(together)],
+                (-(-samples // chunk), -(-traced // together)), [lobes, *end, np.int32(together)],
             )  # fmt: skip
 
     def _enqueue(
@@ -187,6 +188,11 @@ class LateralBeam(Stage):
         )
 
 
+def packed_beam(table: np.ndarray, reach_mm: np.ndarray) -> np.ndarray:
+    """A table of lens.LensBeam and where its rows end, as kernels/scattering.cl takes them."""
+    return np.concatenate([table.ravel(), reach_mm, [reach_mm.max()]])
+
+
 def sites_per_mm3(settings: SimulationSettings, probe: Probe) -> float:
     """Density of the lattice of scatterers: the one set, or by the probe's smallest resolution cell."""
     if settings.scatterers_per_mm3 is not None:
@@ -209,8 +215,9 @@ def cells_in_view(
     """
     density = sites_per_mm3(settings, probe)
     slack = _OBLIQUE * density ** (-1.0 / 3.0)
-    depth = np.linspace(0.0, probe.depth_mm, 65)
-    height = 2.0 * settings.beam_cutoff * probe.beam_sigma_mm(depth)[1] + slack
+    reach = probe.lens().main_mm
+    depth = np.linspace(0.0, probe.displayed_mm, len(reach))
+    height = 2.0 * reach + slack
     width = probe.line_distance_mm(depth) / lateral_rays + slack
     return density * traced_lines * (1.0 + slack / chunk_mm) * float(_integral(height * width, depth))
 

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from SlicerUSSim.Logic.base.declaration import Declared, Shown, parameter
+from SlicerUSSim.Logic.probe.lens import LensBeam, lens_beam
 
 NOMINAL_SPEED_M_S = 1540.0
 #: -6 dB width of the main lobe of a uniform aperture, in wavelengths x f-number
@@ -152,7 +153,8 @@ class Beam(Declared):
         depth = np.asarray(depth_mm, dtype=float)
         transmit, receive = self.lateral_sigmas_mm(depth, cosine)
         lateral = transmit * receive / np.hypot(transmit, receive)
-        return lateral, self._gaussian_beam(depth, *self.elevation_beam())
+        sigma = self.lens().sigma_mm.astype(float)
+        return lateral, np.interp(depth, np.linspace(0.0, self.displayed_mm, len(sigma)), sigma)
 
     def lateral_sigmas_mm(self, depth_mm, cosine: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
         """(transmit, receive) standard deviations of the lateral one-way beams, as for beam_sigma_mm."""
@@ -195,14 +197,11 @@ class Beam(Declared):
         per_f_number = MAIN_LOBE * widening(self.receive_apodization) * self.wavelength_mm / FWHM_PER_SIGMA
         return per_f_number * self.receive_f_number, per_f_number / self.aperture_mm
 
-    def elevation_beam(self) -> tuple[float, float, float]:
-        """(sigma at the focus, focus, Rayleigh length) of the two-way elevational beam, millimetres."""
-        sigma, focus, rayleigh = self.elevation_waist()
-        if not self.harmonic:
-            return sigma / np.sqrt(2.0), focus, rayleigh
-        # 1 / s^2 of the product is 2 / s^2 (1 + b^2) for the square of the transmitted and 1 / s^2 (1/4 + b^2) for the
-        # received beam, b in Rayleigh lengths: about 6 / (s^2 (1 + 2 b^2)), exactly so at the focus and far from it.
-        return sigma / np.sqrt(6.0), focus, rayleigh / np.sqrt(2.0)
+    def lens(self) -> LensBeam:
+        """The two-way elevational beam, by the diffraction integral of the lens."""
+        height = min(self.elevation_aperture_mm, self.elevation_focus_mm / LEAST_F_NUMBER)
+        spread = float(self.received_bandwidth / FWHM_PER_SIGMA)
+        return lens_beam(self.wavelength_mm, spread, height, self.elevation_focus_mm, self.displayed_mm, self.harmonic)
 
     def harmonic_level(self, depth_mm) -> np.ndarray:
         """Amplitude of the second harmonic at `depth_mm` re the fundamental, 1 at the transmit focus.
@@ -270,6 +269,11 @@ class Beam(Declared):
     @property
     def face_mm(self) -> float:
         """Lateral size of all elements that can transmit, defined by each kind."""
+        raise NotImplementedError
+
+    @property
+    def displayed_mm(self) -> float:
+        """Largest distance from line_at's origin within the imaged field, defined by each kind."""
         raise NotImplementedError
 
     def transmit_waist(self) -> tuple[float, float, float]:
