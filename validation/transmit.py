@@ -158,7 +158,7 @@ def _levels_of_lines(tissue: Phantom, device) -> list[Row]:
 
 def _level_of_elements_db(probe: Probe, sines: np.ndarray) -> float:
     """Of speckle along lines at angles of these sines: elements of half a wavelength in a soft baffle, wider beams."""
-    assert probe.element_mm is None and probe.baffle == "soft"
+    assert probe.element_mm is None and probe.directivity == "soft"
     cosines = np.sqrt(1.0 - sines**2)
     power = (np.sinc(0.5 * sines) * cosines) ** 4 / cosines
     return float(10 * np.log10(SPECKLE.scatterer_variance * power.mean()))

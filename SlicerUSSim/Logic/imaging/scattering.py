@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from functools import cache
+from functools import cache, lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 #: Of the paper's lattice of scatterers
 PAPER_SITES_PER_MM3 = 0.02**-3
 # In the probe's smallest resolution cell, for developed speckle; thin structures need some too, whatever the probe
-_SITES_PER_CELL, _LEAST_PER_MM3 = 8.0, 4.0
+_SITES_PER_CELL, _LEAST_PER_MM3 = 5.0, 4.0
 _LOBE_CHUNKS = 4  # samples of a work-item for elevational side lobes re those for the main beam
 _SLICES = 16  # of a scan line for the interfaces on GPUs, which have more work-items than scan lines
 
@@ -63,8 +63,9 @@ class Scatterers(Stage):
         end = [] if part_of is None else [part_of]
         variant = (["TEXTURE"] if frame.medium.has_texture else []) + (["VARIED"] if part_of is not None else [])
         variant += ["FOUND"] if frame.medium.found is not None else []
-        lens = frame.probe.lens()
-        beam = self._beams[0].get(frame.probe, packed_beam(lens.main, lens.main_mm))
+        main, lobes = (
+            buffer.get(frame.probe, table) for buffer, table in zip(self._beams, beam_tables(frame.probe), strict=True)
+        )
         table = unevenness_table(tissues)
         variant += ["UNEVEN"] if is_uneven(table) else []
         uneven, none_dark = table.ravel(), np.zeros(CONSTANTS["MAX_TISSUES"], np.float32)
@@ -73,13 +74,12 @@ class Scatterers(Stage):
         )
         self._enqueue(
             frame, lines, frame.acquisition_buffer, self._sites[0],
-            [*variant, f"CHUNK={self.device.chunk}"], (samples // self.device.chunk, traced), [beam, *end],
+            [*variant, f"CHUNK={self.device.chunk}"], (samples // self.device.chunk, traced), [main, *end],
         )  # fmt: skip
         if frame.settings.side_lobes:
             record = elevational_lobe_record(frame.acquisition)
             self.device.write(self._lobes, record)
             chunk, together = _LOBE_CHUNKS * self.device.chunk, lines_together(record, frame.probe)
-            lobes = self._beams[1].get(frame.probe, packed_beam(lens.lobes, lens.lobes_mm))
             dark = frame.medium.quieter(DARK).astype(np.float32)
             sites = np.concatenate([lattice_sites(tissues, record).ravel(), dark, uneven])
             self.device.write(self._sites[1], sites)
@@ -188,9 +188,15 @@ class LateralBeam(Stage):
         )
 
 
-def packed_beam(table: np.ndarray, reach_mm: np.ndarray) -> np.ndarray:
-    """A table of lens.LensBeam and where its rows end, as kernels/scattering.cl takes them."""
-    return np.concatenate([table.ravel(), reach_mm, [reach_mm.max()]])
+@lru_cache(maxsize=16)
+def beam_tables(probe: Probe) -> tuple[np.ndarray, np.ndarray]:
+    """The tables of the main beam and of its lobes (lens.LensBeam), and where they end, as kernels take them."""
+    lens = probe.lens()
+    main, lobes = (
+        np.concatenate([table.ravel(), reach_mm, [reach_mm.max()]])
+        for table, reach_mm in ((lens.main, lens.main_mm), (lens.lobes, lens.lobes_mm))
+    )
+    return main, lobes
 
 
 def sites_per_mm3(settings: SimulationSettings, probe: Probe) -> float:

@@ -455,7 +455,7 @@ class UltrasoundSimulator:
             acquisition[name] = value
         acquisition["receive_sigma_min"], acquisition["receive_sigma_slope"] = probe.receive_beam()
         acquisition["elevation_sigma"] = probe.lens().sigma_mm
-        acquisition["elevation_rayleigh"] = probe.elevation_waist()[2]
+        _, acquisition["elevation_focus"], acquisition["elevation_rayleigh"] = probe.elevation_waist()
         acquisition["max_ray_depth"] = settings.max_ray_depth if settings.reflections else 0
         lateral, guard = _traced_lines_for(probe, settings)
         acquisition["lateral_rays"], acquisition["guard_lines"] = lateral, guard

@@ -164,8 +164,7 @@ class Probe(Beam):
 
     def line_levels(self) -> np.ndarray | None:
         """(scan_lines,) float32 factor of every line's echoes by steered_level; None where no line is steered."""
-        sines = self.directions()[:, 0] if self.has_flat_face else np.zeros(1)
-        return self.steered_level(np.arcsin(sines)).astype(np.float32) if sines.any() else None
+        return _levels_of(self)
 
     def line_starts_mm(self, position) -> np.ndarray:
         """Distance from line_at's origin to where lines at these positions leave the face.
@@ -283,6 +282,15 @@ def _bounds_of(probe: Probe) -> tuple[float, float, float, float]:
         points = np.concatenate([points, [[0.0, probe.depth_mm, 0.0]]])  # the middle of the arc, if there is no line
     x, y = points[:, 0], points[:, 1]
     return float(x.min()), float(x.max()), float(min(y.min(), 0.0)), float(y.max())
+
+
+@lru_cache(maxsize=16)
+def _levels_of(probe: Probe) -> np.ndarray | None:
+    """Probe.line_levels, which every frame asks for."""
+    sines = probe.directions()[:, 0] if probe.has_flat_face else np.zeros(1)
+    if probe.directivity == "none" or not sines.any():
+        return None
+    return probe.steered_level(np.arcsin(sines)).astype(np.float32)
 
 
 def _own(label: str, tip: str, unit: str, bounds: tuple[float, float], shown: Shown) -> Any:

@@ -98,9 +98,10 @@ class Beam(Declared):
         None, "Element", "Lateral size of the elements: the larger, the less they send and receive along steered lines; "
         "none: half a wavelength", unit="mm", bounds=(0.01, 10),
     )  # fmt: skip
-    baffle: str = parameter(
-        "soft", "Baffle", "What surrounds the elements. soft: it yields, and steered lines lose the cosine of their "
-        "angle both ways, as measured on arrays; rigid: they do not", choices=("soft", "rigid"),
+    directivity: str = parameter(
+        "soft", "Directivity", "What steered lines lose. soft: their elements are in a soft baffle, which takes the "
+        "cosine of the angle both ways besides, as measured on arrays; rigid: what elements of their size lose; "
+        "none: nothing, as if a gain made up for it", choices=("soft", "rigid", "none"),
     )  # fmt: skip
     elevation_aperture_mm: float = parameter(
         7.0, "Elevational aperture", "Height of the elements, in the elevation direction", unit="mm", bounds=(0.5, 100)
@@ -174,10 +175,12 @@ class Beam(Declared):
         speckle, so that the echo of a point is lowered by the elements alone.
         """
         sine, cosine = np.sin(angle_rad), np.cos(angle_rad)
+        if self.directivity == "none":
+            return np.ones_like(cosine)
         width = 0.5 * self.wavelength_mm if self.element_mm is None else self.element_mm
 
         def pattern(mhz: float) -> np.ndarray:
-            return np.sinc(width * mhz * 1e3 / NOMINAL_SPEED_M_S * sine) * (cosine if self.baffle == "soft" else 1.0)
+            return np.sinc(width * mhz * 1e3 / NOMINAL_SPEED_M_S * sine) * (cosine if self.directivity == "soft" else 1.0)
 
         sent = pattern(self.frequency_mhz)
         return (sent**2 if self.harmonic else sent) * pattern(self.received_mhz) / np.sqrt(cosine)
