@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 
 _DEPTHS, _DISTANCES, _STEP = (CONSTANTS[f"LOBE_{name}"] for name in ("DEPTHS", "DISTANCES", "STEP"))
 _POINTS, _PADDED = 512, 4096  # of an aperture, and of its Fourier transform
+_PLANE_POINTS, _PLANE_FREQUENCIES = 256, 9  # of both apertures, and of the pulse, for the echoes of planes
+_LEAST_PLANE = 1e-4  # of these, re a square plane
 _BEYOND_SIGMAS = 2.0  # what is closer to the axis belongs to the main beam
 #: Variance by which side_lobes.cl widens lobes: of a node's lines and of the interpolation between nodes, in squared
 #: distances of nodes (1/12 + 0.105), and of the table's mean over one lobe and its interpolation (1/12 + 0.75^2 / 12),
@@ -156,3 +158,69 @@ def _tails(x: np.ndarray, pattern: np.ndarray, sigma: np.ndarray) -> list[Callab
 def _density(tail: Callable[[np.ndarray], np.ndarray], at: np.ndarray, window: float) -> np.ndarray:
     """The power per millimetre on either side at distances `at`, averaged over a window."""
     return 0.5 * (tail(np.maximum(at - 0.5 * window, 0.0)) - tail(at + 0.5 * window)) / window
+
+
+@lru_cache(maxsize=16)
+def plane_echoes(probe: Probe) -> np.ndarray:
+    """(PLANE_DEPTHS, PLANE_TILTS, 2) float32, echoes of tilted planes re square ones as kernels/interfaces.cl takes them.
+
+    Exponents of two of the peak of the pulse, by lateral and by elevational tilt: at depths evenly from the face to the
+    image depth, and tangents of the tilt whose square roots are evenly from 0 to 1. What leaves the transmit aperture at
+    a is reflected to c - a, c = 2 s tan(tilt), but for diffraction:
+
+        integral T(a) R(b) exp(-i k (a + b - c)^2 / 4 s) da db,    T(a) = exp(i k a^2 (1 / s - 1 / F) / 2)
+
+    over the apertures, at every frequency of the pulse (docs/physics.md#3-rays). Those of the second harmonic are not
+    known: nan, for which the kernel takes those of a Gaussian beam.
+    """
+    rows, tilts = CONSTANTS["PLANE_DEPTHS"], CONSTANTS["PLANE_TILTS"]
+    if probe.harmonic:
+        return np.full((rows, tilts, 2), np.nan, np.float32)
+    depth = probe.displayed_mm * np.maximum(np.arange(rows), 0.5) / (rows - 1)
+    received = np.minimum(probe.aperture_mm, depth / probe.receive_f_number)
+    zones = np.array(probe.transmit_apertures())
+    if len(zones):
+        focus, sent = zones[probe.zone_at(depth)].T
+    else:
+        least, slope = probe.compounded_beam()
+        wide = np.maximum(least, slope * depth) * FWHM_PER_SIGMA / MAIN_LOBE
+        focus, sent = depth, depth * probe.wavelength_mm / wide
+    lens = np.full(rows, probe.lens_height_mm), 1.0 / depth - 1.0 / probe.elevation_focus_mm
+    lateral = (sent, 1.0 / depth - 1.0 / focus), (received, 0.0 * depth)
+    found = [
+        _plane_echo(probe, depth, *apertures, apodization)
+        for apertures, apodization in ((lateral, probe.receive_apodization), ((lens, lens), 0.0))
+    ]
+    return np.log2(np.maximum(np.stack(found, axis=-1), _LEAST_PLANE)).astype(np.float32)
+
+
+def _plane_echo(
+    probe: Probe, depth: np.ndarray, sent: tuple[np.ndarray, np.ndarray], received: tuple[np.ndarray, np.ndarray],
+    apodization: float,
+) -> np.ndarray:  # fmt: skip
+    """(depths, tilts) peaks of the integral of plane_echoes; apertures are (sizes in mm, bends 1 / s - 1 / F)."""
+    step = (sent[0] + received[0]) / _PLANE_POINTS
+    place = step[:, None] * np.fft.fftfreq(2 * _PLANE_POINTS, 0.5 / _PLANE_POINTS)
+    across = np.fft.fftfreq(2 * _PLANE_POINTS) / step[:, None]
+    one, other = (
+        np.clip(0.5 + (0.5 * size[:, None] - np.abs(place)) / step[:, None], 0.0, 1.0) for size, _ in (sent, received)
+    )
+    other *= 1.0 - apodization * np.sin(np.pi * place / received[0][:, None]) ** 2
+    spread = float(probe.received_bandwidth / FWHM_PER_SIGMA)
+    frequency = np.maximum(1.0 + spread * np.linspace(-2.5, 2.5, _PLANE_FREQUENCIES), 0.1)
+    time = np.linspace(-0.5, 0.5, 32) * (_PLANE_FREQUENCIES - 1) / (frequency[-1] - frequency[0])
+    echo: np.ndarray = np.zeros((1, 1, 1))
+    for f in frequency:
+        length = probe.wavelength_mm / f
+        pairs = 1.0
+        for weight, (_, bend) in ((one, sent), (other, received)):
+            pairs = pairs * fft.fft(weight * np.exp(1j * np.pi / length * bend[:, None] * place**2), axis=1)
+        blurred = fft.ifft(pairs * np.exp(2j * np.pi * length * depth[:, None] * across**2), axis=1)
+        blurred = blurred[:, :_PLANE_POINTS] * np.exp(-0.5 * ((f - 1.0) / spread) ** 2) / np.sqrt(f)
+        echo = echo + blurred[..., None] * np.exp(-2j * np.pi * f * time)
+    peak = np.abs(echo).max(axis=-1)
+    tilt = np.linspace(0.0, 1.0, CONSTANTS["PLANE_TILTS"]) ** 2
+    return np.array([
+        np.interp(2.0 * s * tilt, at[:_PLANE_POINTS], of / of[0], right=0.0)
+        for s, at, of in zip(depth, place, peak, strict=True)
+    ])  # fmt: skip

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from SlicerUSSim.Logic.imaging.diffraction import plane_echoes
 from SlicerUSSim.Logic.imaging.raytracing import ray_centres
 from SlicerUSSim.Logic.imaging.side_lobes import DARK, Tables, elevational_lobe_record, lines_together
 from SlicerUSSim.Logic.imaging.signals import EchoLines
@@ -121,6 +122,7 @@ class InterfaceEchoes(Stage):
         kernels = device.kernels("interfaces.cl")
         self._find, self._add = kernels["find_walls"], kernels["interface_echoes"]
         self.workspace = Workspace(device)
+        self._planes = Tables(device)
         self._centres_of = 0  # rays
         self._centres: Buffer
 
@@ -136,8 +138,8 @@ class InterfaceEchoes(Stage):
         if self._centres_of != rays:
             self._centres, self._centres_of = self.device.upload(ray_centres(rays)), rays
         self.device.run(
-            self._find, (traced,), frame.acquisition_buffer, tree.hits, tree.hit_counts, self._centres, *walls, reach,
-            few=True,
+            self._find, (traced,), frame.acquisition_buffer, tree.hits, tree.hit_counts, self._centres,
+            self._planes.get(frame.probe, plane_echoes(frame.probe)), *walls, reach, few=True,
         )  # fmt: skip
         self.device.run(
             self._add,

@@ -56,6 +56,8 @@ CONSTANTS = {
     "MAX_ZONES": 8,  # of a transmit beam: probe.beam.MOST_ZONES
     "LOBE_DEPTHS": 33,  # of the tables of side lobes (diffraction.py), from the face to the image depth, ...
     "LOBE_DISTANCES": 65,  # ... and lateral distances from the axis
+    "PLANE_DEPTHS": 17,  # of the table of planes' echoes (diffraction.py), from the face to the image depth, ...
+    "PLANE_TILTS": 65,  # ... and roots of tangents of tilts, from 0 to 1
     "LENS_DISTANCES": 129,  # distances from the axis of the elevational tables (probe/lens.py)
     "LOBE_STEP": 0.75,  # ... which are so far apart laterally, in wavelengths x receive f-number
     "LOBE_NODES": 128,  # places across the image for which lateral side lobes are computed, at most

@@ -200,10 +200,15 @@ class Beam(Declared):
         per_f_number = MAIN_LOBE * widening(self.receive_apodization) * self.wavelength_mm / FWHM_PER_SIGMA
         return per_f_number * self.receive_f_number, per_f_number / self.aperture_mm
 
+    @property
+    def lens_height_mm(self) -> float:
+        """Size of the elevational aperture; elements farther aside than the focus is deep hardly contribute."""
+        return min(self.elevation_aperture_mm, self.elevation_focus_mm / LEAST_F_NUMBER)
+
     def lens(self) -> LensBeam:
         """The two-way elevational beam, by the diffraction integral of the lens."""
-        height = min(self.elevation_aperture_mm, self.elevation_focus_mm / LEAST_F_NUMBER)
         spread = float(self.received_bandwidth / FWHM_PER_SIGMA)
+        height = self.lens_height_mm
         return lens_beam(self.wavelength_mm, spread, height, self.elevation_focus_mm, self.displayed_mm, self.harmonic)
 
     def harmonic_level(self, depth_mm) -> np.ndarray:
