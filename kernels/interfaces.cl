@@ -25,9 +25,9 @@ inline float plane_echo(float phase2, float width) {
 
 // Factor of the echo of a patch. Of the squared phase over the beam (`phase2`) the sum over the patches has what is not
 // `inside` them. Both parts are Gaussian, but for a pulse the product of their peaks is not the peak of their product,
-// which matters as long as the echo of a plane can be seen: up to three radians, -30 dB.
+// which matters as long as the echo of a plane can be seen: up to 4.5 radians, -40 dB.
 inline float patch_echo(float phase2, float inside2, float width) {
-  const float seen = fmin(1.0f, 9.0f / fmax(phase2, 1e-6f)), seen2 = seen * phase2, seen_inside2 = seen * inside2;
+  const float seen = fmin(1.0f, 20.0f / fmax(phase2, 1e-6f)), seen2 = seen * phase2, seen_inside2 = seen * inside2;
   return plane_echo(inside2, width) * plane_echo(seen2, width) /
          (plane_echo(seen_inside2, width) * plane_echo(seen2 - seen_inside2, width));
 }
