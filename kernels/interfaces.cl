@@ -60,17 +60,15 @@ inline float part_carried(float least, float phase, float most, float flat) {
   return part + flat * (1.0f - part) * (1.0f - 1.0f / sqrt(1.0f + share * share));
 }
 
-// The exponent of two by which a plane of this tilt echoes more than with a Gaussian beam, over whose deviation it has
-// the squared phase `phase2`: along one `axis` of the aperture's table (diffraction.py), nan where there is none.
-inline float above_gauss(Frame frame, __global const float *planes, float path, float tilt, int axis, float phase2,
-                         float pulse) {
+// The echo of a plane of this tilt re a square one, as an exponent of two, along one `axis` of the aperture's table
+// (diffraction.py); nan where there is none.
+inline float plane_of_aperture(Frame frame, __global const float *planes, float path, float tilt, int axis) {
   const float deep = clamp(path * ((PLANE_DEPTHS - 1) / frame->depth_mm), 0.0f, PLANE_DEPTHS - 1.001f);
   const float place = clamp(sqrt(fabs(tilt)) * (PLANE_TILTS - 1), 0.0f, PLANE_TILTS - 1.001f);
   const int row = (int)deep, column = (int)place;
   __global const float *near = planes + 2 * (row * PLANE_TILTS + column) + axis, *far = near + 2 * PLANE_TILTS;
   const float part = place - column;
-  const float found = blend(blend(near[0], near[2], part), blend(far[0], far[2], part), deep - row);
-  return found == found ? found - log2_scalar(plane_echo(phase2, pulse)) : 0.0f;
+  return blend(blend(near[0], near[2], part), blend(far[0], far[2], part), deep - row);
 }
 
 // One work-item computes the walls of one traced line.
@@ -126,10 +124,12 @@ __kernel void find_walls(Frame frame, __global const Hit *hits, __global const i
       const float zones = per_mm * bend * inside * sigma2;
       wall.echo /= sqrt(sqrt(1.0f + zones * zones));
       // What planes echo is a matter of the edges of the apertures, which the beam's Gaussian does not have.
-      const float tilted =
-          flat * above_gauss(frame, planes, hit->path_mm, hit->lateral_slope / cosine, 0, phase_l, pulse) +
-          flat_aside * above_gauss(frame, planes, hit->path_mm, hit->elevational_slope, 1, phase_e, pulse);
-      const float share = patch_echo(phase2, inside2, pulse) * exp2_scalar(clamp(tilted, -60.0f, 60.0f));
+      const float gauss = plane_echo(flat * phase_l + flat_aside * phase_e, pulse);
+      const float of_aperture = flat * plane_of_aperture(frame, planes, hit->path_mm, hit->lateral_slope / cosine, 0) +
+                                flat_aside * plane_of_aperture(frame, planes, hit->path_mm, hit->elevational_slope, 1) -
+                                log2_scalar(gauss);
+      const float more = of_aperture == of_aperture ? clamp(of_aperture, -60.0f, 60.0f) : 0.0f;
+      const float share = patch_echo(phase2, inside2, pulse) * exp2_scalar(more);
       if (share < 1e-4f) continue;
       const float lines = step / sqrt(width2), per_line = lines / every;
       wall.depth_per_line = carried * hit->lateral_slope * step / every;

@@ -85,6 +85,7 @@ def all_checks() -> tuple[Check, ...]:
     """Every check, in the order of the physics: rays, speckle, artefacts, space."""
     from validation import (
         aberration,
+        apertures,
         artefacts,
         band,
         beams,
@@ -107,6 +108,7 @@ def all_checks() -> tuple[Check, ...]:
         floor,
         artefacts,
         beams,
+        apertures,
         curved_walls,
         transmit,
         walls,

@@ -37,9 +37,9 @@ _SHARPENED, _FINER, _LEAST_POWER = 3, 8, 1e-9
 def lobes_of(probe: Probe) -> np.ndarray:
     """(depths, distances) float32, the lateral lobes of a probe's two-way beam at its centre frequency.
 
-    At LOBE_DEPTHS depths evenly from the face to the image depth, and distances LOBE_STEP wavelengths x receive f-number
-    at that depth apart: square roots of the power per such distance, averaged over one lobe, since it is sampled at
-    intervals, on either side, re that of the main beam.
+    At LOBE_DEPTHS depths evenly from the face to the image depth, and distances that are LOBE_STEP wavelengths x receive
+    f-number at that depth apart: square roots of the power per such distance, averaged over one lobe, since it is
+    sampled at intervals, on either side, re that of the main beam.
 
     The transmit aperture is uniform and focused once (with zones: once for each), the receive
     aperture has the weights 1 - a + a cos(pi x)^2 and is focused at every depth. The second harmonic is fed by the
@@ -162,11 +162,11 @@ def _density(tail: Callable[[np.ndarray], np.ndarray], at: np.ndarray, window: f
 
 @lru_cache(maxsize=16)
 def plane_echoes(probe: Probe) -> np.ndarray:
-    """(PLANE_DEPTHS, PLANE_TILTS, 2) float32, echoes of tilted planes re square ones as kernels/interfaces.cl takes them.
+    """(PLANE_DEPTHS, PLANE_TILTS, 2) float32, echoes of tilted planes re square ones, for kernels/interfaces.cl.
 
     Exponents of two of the peak of the pulse, by lateral and by elevational tilt: at depths evenly from the face to the
-    image depth, and tangents of the tilt whose square roots are evenly from 0 to 1. What leaves the transmit aperture at
-    a is reflected to c - a, c = 2 s tan(tilt), but for diffraction:
+    image depth, and tangents of the tilt whose square roots are evenly from 0 to 1. What leaves the transmit aperture
+    at a is reflected to c - a, c = 2 s tan(tilt), but for diffraction:
 
         integral T(a) R(b) exp(-i k (a + b - c)^2 / 4 s) da db,    T(a) = exp(i k a^2 (1 / s - 1 / F) / 2)
 

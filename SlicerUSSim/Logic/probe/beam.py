@@ -95,8 +95,8 @@ class Beam(Declared):
         note="They and the side lobes fill cysts; they fall off smoothly over 48 wavelengths x f-number to either side",
     )  # fmt: skip
     element_mm: float | None = parameter(
-        None, "Element", "Lateral size of the elements: the larger, the less they send and receive along steered lines; "
-        "none: half a wavelength", unit="mm", bounds=(0.01, 10),
+        None, "Element", "Lateral size of the elements: larger ones send and receive less along steered lines; none: half "
+        "a wavelength", unit="mm", bounds=(0.01, 10),
     )  # fmt: skip
     directivity: str = parameter(
         "soft", "Directivity", "What steered lines lose. soft: their elements are in a soft baffle, which takes the "
@@ -180,7 +180,8 @@ class Beam(Declared):
         width = 0.5 * self.wavelength_mm if self.element_mm is None else self.element_mm
 
         def pattern(mhz: float) -> np.ndarray:
-            return np.sinc(width * mhz * 1e3 / NOMINAL_SPEED_M_S * sine) * (cosine if self.directivity == "soft" else 1.0)
+            of_baffle = cosine if self.directivity == "soft" else 1.0
+            return np.sinc(width * mhz * 1e3 / NOMINAL_SPEED_M_S * sine) * of_baffle
 
         sent = pattern(self.frequency_mhz)
         return (sent**2 if self.harmonic else sent) * pattern(self.received_mhz) / np.sqrt(cosine)

@@ -16,7 +16,7 @@ _DEPTHS, _DISTANCES = CONSTANTS["LOBE_DEPTHS"], CONSTANTS["LENS_DISTANCES"]
 #: Points of the open aperture, and the fewest and most of the plane that waves run over
 _OPEN, _LEAST_PLANE, _MOST_PLANE = 256, 2048, 16384
 #: Frequencies of the band, by a Gauss-Hermite rule; the lowest re the centre
-_FREQUENCIES, _LEAST_FREQUENCY = 5, 0.2
+_FREQUENCIES, _LEAST_FREQUENCY = 7, 0.2
 #: The main beam begins to fade where it has this part of the deviation of all of the power, and ends at so many times
 #: that distance
 _KEPT, _ENDS = 0.88, 1.12
