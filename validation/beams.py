@@ -13,6 +13,7 @@ from scipy.special import ndtr
 from SlicerUSSim.Logic.base.settings import DisplaySettings, SimulationSettings
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.imaging.simulator import UltrasoundSimulator
+from SlicerUSSim.Logic.probe.arrays import Probe
 from SlicerUSSim.Logic.probe.beam import FWHM_PER_SIGMA
 from SlicerUSSim.Logic.probe.poses import elevational_motion, sample, slide_sweep, tilt_sweep
 from validation.apertures import lens_profile, mirror_echo_db
@@ -303,7 +304,7 @@ CHECKS = (
     Check("specular echoes", "The echo of a hit is w A |r| cos^n of the angle of incidence.", specular_echoes),
     Check(
         "elevational tilt",
-        "A plane tilted out of the image has the echo of its mirror images: sums over the ways between points of the lens.",
+        "The echo of a plane tilted out of the image is that of its mirror images: sums over the ways of the lens.",
         tilted_in_elevation,
     ),
     Check("interface width", "The echo of a small sheet is widened by the beam in both directions.", interface_width),

@@ -24,8 +24,8 @@ _DEPTH_MM = 25.0
 _FLOOR_DB, _CEILING_DB = -30.0, -28.0
 _SETTINGS = SimulationSettings(scattering=False, specular_exponent=0.0)
 #: Echo of a smooth plane re perpendicular in dB, by its tilt in degrees: two-dimensional finite-difference simulation
-#: of pulse and echo at f/2, both ways (fourth order, perfectly matched layer, delay and sum). At 15 degrees it has -20.5,
-#: where sums over the ways of the apertures have -28.6.
+#: of pulse and echo at f/2, both ways (fourth order, perfectly matched layer, delay and sum). At 15 degrees it has
+#: -20.5, where sums over the ways of the apertures have -28.6.
 _FULL_WAVE = {0.0: 0.0, 4.0: -0.9, 8.0: -6.3, 12.0: -14.3, 20.0: -30.8, 30.0: -43.5}
 _IMAGED_MM = 40.0  # deeper samples are not looked at
 #: The shipped probes; their lens is focused at the wall, since the phantom is only 12 mm thick.

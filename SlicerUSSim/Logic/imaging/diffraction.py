@@ -37,7 +37,7 @@ _SHARPENED, _FINER, _LEAST_POWER = 3, 8, 1e-9
 def lobes_of(probe: Probe) -> np.ndarray:
     """(depths, distances) float32, the lateral lobes of a probe's two-way beam at its centre frequency.
 
-    At LOBE_DEPTHS depths evenly from the face to the image depth, and distances that are LOBE_STEP wavelengths x receive
+    At LOBE_DEPTHS depths evenly from the face to the image depth, and distances LOBE_STEP wavelengths times receive
     f-number at that depth apart: square roots of the power per such distance, averaged over one lobe, since it is
     sampled at intervals, on either side, re that of the main beam.
 

@@ -95,8 +95,8 @@ class Beam(Declared):
         note="They and the side lobes fill cysts; they fall off smoothly over 48 wavelengths x f-number to either side",
     )  # fmt: skip
     element_mm: float | None = parameter(
-        None, "Element", "Lateral size of the elements: larger ones send and receive less along steered lines; none: half "
-        "a wavelength", unit="mm", bounds=(0.01, 10),
+        None, "Element", "Lateral size of the elements: larger ones send and receive less along steered lines; none: "
+        "half a wavelength", unit="mm", bounds=(0.01, 10),
     )  # fmt: skip
     directivity: str = parameter(
         "soft", "Directivity", "What steered lines lose. soft: their elements are in a soft baffle, which takes the "
