@@ -41,7 +41,7 @@ class Beam:
     def elevation(
         self, lens: LensBeam, s: np.ndarray, height: np.ndarray, frequency: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """(root of the power per mm, cycles behind the axis) of the two-way beam at distances `height` from the axis."""
+        """(root of the power per mm, cycles behind the axis) of the two-way beam at `height` from the axis."""
         away = (s - self.of["elevation_focus"]) / self.of["elevation_rayleigh"]
         wider = np.hypot(1.0 / frequency, away) / np.hypot(1.0, away)
         rows, columns, _ = lens.main.shape
