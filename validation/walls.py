@@ -118,7 +118,7 @@ def walls_and_lines(rotation: np.ndarray, device) -> Outcome:
                 square = levels[1]
             change = float(np.ptp(np.maximum(levels - square, _CEILING_DB)))
             where = f"{tilt:.0f} degrees{f' in a plane turned by {turn:.0f}' if turn else ''}, {name}"
-            rows.append(Row(f"change at {where}", "dB", 1.5, change, 0.0, "at most"))
+            rows.append(Row(f"change at {where}", "dB", 2.5, change, 0.0, "at most"))
     return Outcome(tuple(rows))
 
 

@@ -199,12 +199,10 @@ def _plane_echo(
     apodization: float,
 ) -> np.ndarray:  # fmt: skip
     """(depths, tilts) peaks of the integral of plane_echoes; apertures are (sizes in mm, bends 1 / s - 1 / F)."""
-    step = (sent[0] + received[0]) / _PLANE_POINTS
-    place = step[:, None] * np.fft.fftfreq(2 * _PLANE_POINTS, 0.5 / _PLANE_POINTS)
-    across = np.fft.fftfreq(2 * _PLANE_POINTS) / step[:, None]
-    one, other = (
-        np.clip(0.5 + (0.5 * size[:, None] - np.abs(place)) / step[:, None], 0.0, 1.0) for size, _ in (sent, received)
-    )
+    step = (sent[0] + received[0])[:, None] / _PLANE_POINTS
+    place, across = (np.fft.fftfreq(2 * _PLANE_POINTS, per) for per in (0.5 / _PLANE_POINTS, 1.0))
+    place, across = step * place, across / step
+    one, other = (np.clip(0.5 + (0.5 * size[:, None] - np.abs(place)) / step, 0.0, 1.0) for size, _ in (sent, received))
     other *= 1.0 - apodization * np.sin(np.pi * place / received[0][:, None]) ** 2
     spread = float(probe.received_bandwidth / FWHM_PER_SIGMA)
     frequency = np.maximum(1.0 + spread * np.linspace(-2.5, 2.5, _PLANE_FREQUENCIES), 0.1)
@@ -212,15 +210,10 @@ def _plane_echo(
     echo: np.ndarray = np.zeros((1, 1, 1))
     for f in frequency:
         length = probe.wavelength_mm / f
-        pairs = 1.0
+        pairs = np.exp(2j * np.pi * length * depth[:, None] * across**2 - 0.5 * ((f - 1.0) / spread) ** 2) / np.sqrt(f)
         for weight, (_, bend) in ((one, sent), (other, received)):
-            pairs = pairs * fft.fft(weight * np.exp(1j * np.pi / length * bend[:, None] * place**2), axis=1)
-        blurred = fft.ifft(pairs * np.exp(2j * np.pi * length * depth[:, None] * across**2), axis=1)
-        blurred = blurred[:, :_PLANE_POINTS] * np.exp(-0.5 * ((f - 1.0) / spread) ** 2) / np.sqrt(f)
-        echo = echo + blurred[..., None] * np.exp(-2j * np.pi * f * time)
-    peak = np.abs(echo).max(axis=-1)
-    tilt = np.linspace(0.0, 1.0, CONSTANTS["PLANE_TILTS"]) ** 2
-    return np.array([
-        np.interp(2.0 * s * tilt, at[:_PLANE_POINTS], of / of[0], right=0.0)
-        for s, at, of in zip(depth, place, peak, strict=True)
-    ])  # fmt: skip
+            pairs = pairs * np.fft.fft(weight * np.exp(1j * np.pi / length * bend[:, None] * place**2), axis=1)
+        echo = echo + np.fft.ifft(pairs, axis=1)[:, :_PLANE_POINTS, None] * np.exp(-2j * np.pi * f * time)
+    peak, tilt = np.abs(echo).max(axis=-1), np.linspace(0.0, 1.0, CONSTANTS["PLANE_TILTS"]) ** 2
+    ways = zip(depth, place[:, :_PLANE_POINTS], peak, strict=True)
+    return np.array([np.interp(2.0 * s * tilt, at, of / of[0], right=0.0) for s, at, of in ways])

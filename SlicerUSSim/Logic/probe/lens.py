@@ -68,9 +68,9 @@ def lens_beam(
     def field(length: float) -> np.ndarray:
         face = np.fft.fft(np.exp(-1j * np.pi / (length * focus_mm) * place**2), plane)
         beam = np.fft.ifft(face * np.exp(-1j * np.pi * length * near[:, None] * across**2), axis=1)
-        return beam[:, _OPEN // 2 :][:, : plane // 2 - _OPEN]  # to one side of the axis
+        return beam[:, _OPEN // 2 : plane // 2 - _OPEN // 2]  # to one side of the axis
 
-    power = np.zeros(1)
+    power, cycles = np.zeros(1), np.zeros((1, 1))
     nodes, weights = np.polynomial.hermite.hermgauss(_FREQUENCIES)
     for node, weight in zip(nodes, weights, strict=True):
         length = wavelength_mm / max(1.0 + spread * node, _LEAST_FREQUENCY)
@@ -80,7 +80,7 @@ def lens_beam(
         power = power + weight * np.abs(beam) ** 2 * length ** (3.0 if harmonic else 2.0)
         if abs(node) < 1e-6:
             cycles = np.unwrap(np.angle(beam * beam[:, :1].conj()), axis=1) / (2.0 * np.pi)
-    x = wider[:, None] * point * (np.arange(power.shape[1]) + 0.5)
+    x = wider[:, None] * point * (np.arange(cycles.shape[1]) + 0.5)
     power /= 2.0 * point * wider[:, None] * power.sum(axis=1, keepdims=True)
     within, moments = np.cumsum(power, axis=1), np.cumsum(power * x**2, axis=1)
     sigma = np.sqrt(2.0 * moments[:, -1] / within[:, -1])
