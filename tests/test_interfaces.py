@@ -182,7 +182,7 @@ def test_lines_on_a_walls_flank_do_not_depend_on_their_number(name):
     seen = levels.min(axis=0) > -30.0
     assert seen.sum() > 10
     assert levels[:, seen].min() < -18.0
-    assert np.ptp(levels[:, seen], axis=0).max() < 1.5, np.round(levels[:, seen], 1)
+    assert np.ptp(levels[:, seen], axis=0).max() < 2.5, np.round(levels[:, seen], 1)
 
 
 def test_a_plane_nearly_across_a_diagonal_of_the_voxels_keeps_its_level():

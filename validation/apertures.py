@@ -190,12 +190,13 @@ def slices(rotation: np.ndarray, device) -> Outcome:
 def _slab_powers(probe: Probe, rotation: np.ndarray, offsets: np.ndarray, depths: list[float], device) -> np.ndarray:
     """(depths, offsets) mean power of the middle lines within 3 mm of a depth, from both sides, as one smooth curve."""
     step = np.array([2.0, 2.0, _SLAB_MM])
-    counts = np.array([40, int(probe.depth_mm / 2.0) + 4, 3])
+    layers = 2 * int(offsets[-1] / _SLAB_MM) + 5
+    counts = np.array([40, int(probe.depth_mm / 2.0) + 4, layers])
     labels = np.zeros(counts[::-1], np.uint8)
-    labels[1] = 1
+    labels[layers // 2] = 1
     to_ras = np.eye(4)
     to_ras[:3, :3] = rotation * step
-    to_ras[:3, 3] = rotation @ (step * [-19.5, -2.0, -1.0])
+    to_ras[:3, 3] = rotation @ (step * [-19.5, -2.0, -(layers // 2)])
     pose = np.eye(4)
     pose[:3, :3] = rotation
     tissues = TissueTable({0: FLUID, 1: replace(SPECKLE, impedance_mrayl=FLUID.impedance_mrayl)})
