@@ -4,10 +4,10 @@
 // One work-item computes CHUNK samples of one traced line. It processes the segments of the line's ray tree that
 // overlap these samples in time and, for each, the cells of the patient-fixed scatterer lattice beside it: laterally
 // half-way to the next traced line, and as far as the beam reaches in the elevation direction. A scatterer is weighted
-// by the elevational profile and distributed linearly between the two edges of its strip (buffer line 2 line: left,
-// 2 line + 1: right); beam.cl then distributes it over all scan lines whose beam covers it. So each scatterer is
-// computed once per image, not once per beam. Work-items write disjoint samples in a fixed order: a pose always gives
-// the same bits. Global size (chunks, traced lines).
+// by the elevational profile (a table, lens_at) and distributed linearly between the two edges of its strip (buffer
+// line 2 line: left, 2 line + 1: right); beam.cl then distributes it over all scan lines whose beam covers it. So each
+// scatterer is computed once per image, not once per beam. Work-items write disjoint samples in a fixed order: a pose
+// always gives the same bits. Global size (chunks, traced lines).
 //
 // Position, sign and existence of a cell's scatterer come from a hash of the cell's index and the seed. It stands for
 // all scatterers that tissue has in the cell: it exists if there is any, and its amplitude is the tissue's in every
@@ -21,9 +21,8 @@
 //
 // With LOBES defined, the echoes are those that elevational side lobes receive, and are added to those that are there.
 // Lobes have a record and a coarser lattice of their own (side_lobes.py), whose cells are wider than the strip of a
-// line: one work-item computes `together` lines, along the path of the one in their middle. A scatterer is weighted by
-// the diffraction pattern (diffraction.py) instead of the main beam's profile. Only pieces of the path in dark tissue
-// count.
+// line: one work-item computes `together` lines, along the path of the one in their middle. The table is that of what
+// the main beam leaves out. Only pieces of the path in dark tissue count.
 //
 // With FOUND defined, planes have two words: some are of sheets that were found in the MRI (sheets.clh). Beside these
 // nothing else is membrane.
@@ -34,8 +33,8 @@
 // texture uint [k][j][i] (one element without TEXTURE); sites float2 [label], the share of cells with a scatterer, in
 // 1/65536, and its amplitude, behind them whether it is dark (with LOBES), behind that UNEVEN_WORDS of
 // imaging/scattering.py; re, im float [2 traced line + side][stride]; with VARIED also [part] before these, and part_of
-// int [label], -1 for a tissue in none; with LOBES lobes float [LOBE_DEPTHS][LOBE_DISTANCES], and behind them the
-// distance of the last column [LOBE_DEPTHS].
+// int [label], -1 for a tissue in none; beam float2 [LOBE_DEPTHS][LENS_DISTANCES] of probe/lens.py, behind it float
+// [LOBE_DEPTHS] where it ends, and the largest of these, that of the last column.
 
 #include "common.clh"
 #include "sheets.clh"
@@ -55,12 +54,10 @@
 #define PART (CHUNK + 2)  // one extra sample at either end: echoes lie between samples
 #ifdef LOBES
 #define PIECE_BLOCK (4 * BLOCK)  // samples over which gains are assumed linear
-#define LOBE_PARAMETERS , __global const float *lobes, int together
-#define LOBE_TABLE lobes
+#define LOBE_PARAMETERS , int together
 #else
 #define PIECE_BLOCK BLOCK
 #define LOBE_PARAMETERS
-#define LOBE_TABLE 0
 #endif
 
 #ifdef FOUND
@@ -89,15 +86,15 @@ typedef struct {
   __global const ushort *voxels;
   __global const uint *planes, *texture;
   __global const float *sites;
+  __global const float *beam;
   __global const int *part_of;  // with VARIED
-  __global const float *lobes;  // with LOBES
 } Patient;
 
 // The strips that a work-item computes: `lines` of them from `left` on, along the path of one in the middle, whose
-// displayed depths begin with `begins`.
+// displayed depths begin with `begins`, and for which the face is foreshortened by `cosine`.
 typedef struct {
   int line, left, lines;
-  float begins;
+  float begins, cosine;
 } Strips;
 
 // Quantities common to all scatterers beside one piece of a segment. Vectors are in the order u, v, w of lattice axes.
@@ -105,8 +102,8 @@ typedef struct {
   float3 start, direction, lateral, elevational;  // of the segment
   float3 at_origin, row_i, row_j, row_k;          // voxel index = at_origin + rows * place
   float low, span;                                // first path length of this piece, 1 / its length
-  float narrow0, narrow1;  // elevational exponent of two per mm^2 at the near end, and its change
-  float curved0, curved1;  // elevational phase in cycles per mm^2, likewise
+  float tall0, tall1;      // distances of the beam's table per elevational mm at the near end, and their change
+  float turned0, turned1;  // factor of its phase, likewise
   float gain0, gain1;      // amplitude as an exponent of two, likewise
   float bend;              // 1 / (2 radius) of the surfaces of equal range
   float middle0, middle1;  // of the strip on the segment's lateral axis, and its change per mm of length
@@ -140,7 +137,7 @@ typedef struct {
   int bin[BATCH], voxel[BATCH];
   uint random[BATCH];
 #ifdef LOBES
-  float away[BATCH], path[BATCH];
+  float beyond[BATCH];  // range from the start of the piece on
 #endif
   uchar label[BATCH];  // label_scatterers
 #ifdef UNEVEN
@@ -168,41 +165,32 @@ inline floatn line_lanes(floatn t, float a, float slope) { return fma(t, (floatn
 // The hash uses cell indices by lattice axis (0, 1, 2), not by u, v, w: the same scatterer from every direction.
 inline uint axis_step(int axis) { return axis == 0 ? 0x9E3779B1u : axis == 1 ? 0x85EBCA77u : 0xC2B2AE3Du; }
 
-// The depth of tables for a path length: its row, and the part by which it is deeper.
-inline float row_of_depth(Frame frame, float path, int *row) {
-  const float place = clamp(path / frame->depth_mm * (LOBE_DEPTHS - 1), 0.0f, LOBE_DEPTHS - 1.001f);
-  *row = (int)place;
-  return place - *row;
+// The table of the beam (probe/lens.py) at LANES path lengths, and places among its distances from the axis: square
+// root of the power per millimetre, and by how many cycles the phase is behind that on the axis.
+inline void lens_at(Frame frame, __global const float *beam, floatn path, floatn place, floatn *root, floatn *cycles) {
+  const floatn row =
+      clamp(path * ((LOBE_DEPTHS - 1) / frame->depth_mm), (floatn)(0.0f), (floatn)(LOBE_DEPTHS - 1.001f));
+  const floatn column = fmin(place, (floatn)(LENS_DISTANCES - 1.001f));
+  const intn rows = TO_INTN(row), columns = TO_INTN(column);
+  SPREAD(int, at_, rows *LENS_DISTANCES + columns);
+  SPREAD(float, deeper_, row - TO_FLOATN(rows));
+  float near_root[LANES], far_root[LANES], near_cycles[LANES], far_cycles[LANES];
+  for (int lane = 0; lane < LANES; lane++) {
+    const float4 above = vload4(0, beam + 2 * at_[lane]), below = vload4(0, beam + 2 * (at_[lane] + LENS_DISTANCES));
+    const float4 here = above + deeper_[lane] * (below - above);
+    near_root[lane] = here.x, near_cycles[lane] = here.y, far_root[lane] = here.z, far_cycles[lane] = here.w;
+  }
+  const floatn farther = column - TO_FLOATN(columns), root0 = LOAD_LANES(near_root), cycles0 = LOAD_LANES(near_cycles);
+  *root = fma(farther, LOAD_LANES(far_root) - root0, root0);
+  *cycles = fma(farther, LOAD_LANES(far_cycles) - cycles0, cycles0);
 }
 
-// By how many cycles the phase of the elevational beam, of this sigma, is behind that on its axis, per squared
-// millimetre from there. With it, speckle has the height that it has at the aperture's beam (diffraction.py).
-inline float elevational_cycles(Frame frame, float path, float frequency, float sigma) {
+// The distance from the axis at which the table ends, at no depth around this one nearer.
+inline float reach_of_lens(Frame frame, __global const float *beam, float path) {
   int row;
-  const float deeper = row_of_depth(frame, path, &row);
-  __constant const float *heights = frame->speckle_height_mm + row;
-  const float height = blend(heights[0], heights[1], deeper) / frequency;
-  if (height <= 0.0f || height >= sigma) return 0.0f;
-  return sqrt(1.0f / (height * height) - 1.0f / (sigma * sigma)) / (sigma * 2.0f * TWO_PI);
-}
-
-// The distance from the axis at which lobes are cut off.
-inline float reach_of_lobes(Frame frame, __global const float *lobes, float path) {
-  int row;
-  const float deeper = row_of_depth(frame, path, &row);
-  __global const float *ends = lobes + LOBE_DEPTHS * LOBE_DISTANCES + row;
-  return blend(ends[0], ends[1], deeper);
-}
-
-// The square root of their power per millimetre at a distance from the axis.
-inline float lobe_at(Frame frame, __global const float *lobes, float path, float distance) {
-  const float at = distance / reach_of_lobes(frame, lobes, path) * (LOBE_DISTANCES - 1);
-  if (at >= LOBE_DISTANCES - 1) return 0.0f;
-  int row;
-  const float deeper = row_of_depth(frame, path, &row);
-  const int column = (int)at;
-  __global const float *near = lobes + row * LOBE_DISTANCES + column, *far = near + LOBE_DISTANCES;
-  return blend(blend(near[0], near[1], at - column), blend(far[0], far[1], at - column), deeper);
+  row_of_depth(frame, path, &row);
+  __global const float *ends = beam + 2 * LOBE_DEPTHS * LENS_DISTANCES + row;
+  return fmax(ends[0], ends[1]);
 }
 
 #ifdef LOBES
@@ -379,10 +367,7 @@ typedef struct {
   floatn t, along, aside;  // part of the piece, length along the segment, distance from its axis in the image plane
   floatn right, ends;      // distance from the strip's middle, at which it ends
   floatn range, depth;     // length along the segment at which it is seen, displayed depth
-  floatn aside2;           // squared distance from the axis in elevation
-#ifdef LOBES
-  floatn away;  // distance from the axis in elevation
-#endif
+  floatn away;             // distance from the axis in elevation
 } Beside;
 
 inline Beside beside_piece(const Piece *piece, floatn pu, floatn pv, floatn pw) {
@@ -393,12 +378,9 @@ inline Beside beside_piece(const Piece *piece, floatn pu, floatn pv, floatn pw) 
   at.t = (at.along - piece->low) * piece->span;
   at.right = at.aside - line_lanes(at.along, piece->middle0, piece->middle1);
   at.ends = line_lanes(at.along, piece->half0, piece->half1);
-  at.aside2 = aside_e * aside_e;
   at.range = fma(at.aside * at.aside, (floatn)(piece->bend), at.along);
   at.depth = line_lanes(at.range, piece->depth0, piece->slope);
-#ifdef LOBES
   at.away = fabs(aside_e);
-#endif
   return at;
 }
 
@@ -416,7 +398,6 @@ inline floatn share_of(const Piece *piece, floatn range, floatn right) {
 // Where the scatterers of cells are, and which contribute, often a quarter of them: those are put side by side.
 inline void place_scatterers(Frame frame, const Piece *piece, const Cells *cells, int count, Batch *batch) {
   const float cell = frame->cell_mm, grain = cell / GRAINS, first_u = 0.5f * grain - piece->start.x;
-  const float cutoff2 = 0.5f * LOG2_E * frame->beam_cutoff * frame->beam_cutoff;
   // The ranges of which something is seen in these samples, and of which a part belongs to this piece
   const float before = (piece->first - 1 - piece->moved) * frame->sample_mm - piece->depth0;
   const float behind = (piece->first + CHUNK + piece->moved) * frame->sample_mm - piece->depth0;
@@ -438,11 +419,7 @@ inline void place_scatterers(Frame frame, const Piece *piece, const Cells *cells
     const floatn pv = fma(TO_FLOATN(bits_v), (floatn)(grain), LOAD_LANES(cells->v + begin));
     const floatn pw = fma(TO_FLOATN(bits_w), (floatn)(grain), LOAD_LANES(cells->w + begin));
     const Beside at = beside_piece(piece, pu, pv, pw);
-#ifdef LOBES
     const intn near = at.away <= piece->reach_e;
-#else
-    const intn near = at.aside2 * line_lanes(at.t, piece->narrow0, piece->narrow1) <= cutoff2;
-#endif
     const intn counts = (fabs(at.right) < at.ends) & (at.range > nearest) & (at.range < farthest) & near;
     SPREAD(int, counts_, counts &(LANE_INDEX < count - begin));
     for (int j = 0; j < LANES; j++) {
@@ -465,11 +442,11 @@ inline void place_scatterers(Frame frame, const Piece *piece, const Cells *cells
 }
 
 // The echoes of scatterers of unit amplitude, where they are among samples and strips, and among voxels.
-inline void compute_echoes(Frame frame, const Piece *piece, Batch *batch) {
+inline void compute_echoes(const Patient *patient, const Piece *piece, Batch *batch) {
+  Frame frame = patient->frame;
   const int nx = frame->dims[0], ny = frame->dims[1];
   const float3 voxel_top = (float3)(nx - 1.001f, ny - 1.001f, frame->dims[2] - 1.001f);
   const float inverse_sample = 1.0f / frame->sample_mm;
-  const float cutoff2 = 0.5f * LOG2_E * frame->beam_cutoff * frame->beam_cutoff;
   const float grain = frame->cell_mm / GRAINS, inverse_grain = 1.0f / grain, first = 0.5f * grain;
   for (int begin = 0; begin < batch->count; begin += LANES) {
     const floatn pu = LOAD_LANES(batch->u + begin), pv = LOAD_LANES(batch->v + begin),
@@ -477,35 +454,28 @@ inline void compute_echoes(Frame frame, const Piece *piece, Batch *batch) {
     // 16 bits for its existence, one for its sign, 15 for its label
     const uintn random = hash_mixn(LOAD_LANES(batch->key + begin) + 0x3C6EF372u);
     const Beside beside = beside_piece(piece, pu, pv, pw);
+    floatn root, curved, depth = beside.depth;
+    lens_at(frame, patient->beam, piece->path0 + (beside.along - piece->low),
+            beside.away * line_lanes(beside.t, piece->tall0, piece->tall1), &root, &curved);
 #ifdef LOBES
-    const floatn r2 = 0.0f, curved = 0.0f;  // lobes have random phases
-    STORE_LANES(beside.away, batch->away + begin);
-    STORE_LANES(piece->path0 + (beside.range - piece->low), batch->path + begin);
-    const floatn depth = beside.depth;
+    STORE_LANES(beside.range - piece->low, batch->beyond + begin);
 #else
-    floatn depth = beside.depth;
     if (piece->moved > 0) {
       const floatn along = beside.along, aside = beside.aside;
       depth = fma(min(aside, (floatn)(0.0f)), line_lanes(along, piece->later.x, piece->later.y), depth);
       depth = fma(max(aside, (floatn)(0.0f)), line_lanes(along, piece->later.z, piece->later.w), depth);
     }
-    const floatn r2 = beside.aside2 * line_lanes(beside.t, piece->narrow0, piece->narrow1);
-    const floatn curved = beside.aside2 * line_lanes(beside.t, piece->curved0, piece->curved1);
 #endif
     const floatn place = depth * inverse_sample, right = (0.5f + SHARED) * beside.right / beside.ends;
     const floatn bin = floor(place);
     const intn bins = TO_INTN(bin) - piece->first;
-    floatn amplitude =
-        exp2_fast(clamp(line_lanes(beside.t, piece->gain0, piece->gain1) - r2, (floatn)(-100.0f), (floatn)(100.0f)));
-#ifndef LOBES
-    // The profile's end is no step either
-    amplitude *= min(2.0f * (cutoff2 - r2), (floatn)(1.0f));
-#endif
-    amplitude = ((bins >= -1) & (bins < CHUNK)) ? amplitude : (floatn)(0.0f);
+    const floatn gain = clamp(line_lanes(beside.t, piece->gain0, piece->gain1), (floatn)(-100.0f), (floatn)(100.0f));
+    const floatn amplitude = ((bins >= -1) & (bins < CHUNK)) ? root * exp2_fast(gain) : (floatn)(0.0f);
     const floatn share = share_of(piece, beside.range, right);
     const floatn echo = share * amplitude * (1.0f - TO_FLOATN((random >> 14) & 2u));
     floatn cosine, sine;
-    turn(fma(depth, (floatn)(frame->cycles_per_mm), curved), &cosine, &sine);
+    turn(fma(depth, (floatn)(frame->cycles_per_mm), curved * line_lanes(beside.t, piece->turned0, piece->turned1)),
+         &cosine, &sine);
     // Places in the patient are the same, to the bit, from every pose, and so are tissues.
     const floatn u = fma(floor((pu + piece->start.x) * inverse_grain), (floatn)(grain), (floatn)(first));
     const floatn v = fma(floor((pv + piece->start.y) * inverse_grain), (floatn)(grain), (floatn)(first));
@@ -673,8 +643,7 @@ inline void add_echoes(const Patient *patient, const Piece *piece, const Batch *
     float strength = (batch->random[i] >> 16) + 0.5f < site.x ? site.y : 0.0f;
 #ifdef LOBES
     if (strength == 0.0f) continue;
-    strength *= lobe_at(patient->frame, patient->lobes, batch->path[i], batch->away[i]);
-    strength *= dark_at(piece, batch->path[i] - piece->path0);
+    strength *= dark_at(piece, batch->beyond[i]);
 #endif
     if (IS_ON_MEMBRANE(batch->label[i])) {
       const float3 at = (float3)(batch->fx[i], batch->fy[i], batch->fz[i]);
@@ -697,7 +666,7 @@ inline void add_echoes(const Patient *patient, const Piece *piece, const Batch *
 inline void scatter_batch(const Patient *patient, const Piece *piece, const Cells *cells, int count, Echoes *sum) {
   Batch batch;
   place_scatterers(patient->frame, piece, cells, count, &batch);
-  compute_echoes(patient->frame, piece, &batch);
+  compute_echoes(patient, piece, &batch);
   label_scatterers(patient, piece, &batch);
 #ifdef UNEVEN
   vary_scatterers(patient, piece, &batch);
@@ -836,8 +805,8 @@ inline void set_ends(const Patient *patient, __global const Segment *segment, co
   // beam.cl knows the displayed depth alone, which differs from the path where sound is slower or faster.
   const float shown_low = fmax(piece->depth0 + piece->slope * low, strips->begins);
   const float shown_high = fmax(piece->depth0 + piece->slope * high, strips->begins);
-  const float wide_low = lateral_sigma_at(frame, shown_low - strips->begins, 1.0f / frequency_low);
-  const float wide_high = lateral_sigma_at(frame, shown_high - strips->begins, 1.0f / frequency_high);
+  const float wide_low = lateral_sigma(frame, shown_low - strips->begins, 1.0f / frequency_low, strips->cosine);
+  const float wide_high = lateral_sigma(frame, shown_high - strips->begins, 1.0f / frequency_high, strips->cosine);
   piece->low = low;
   piece->path0 = path_low;
   piece->span = 1.0f / fmax(high - low, 1e-6f);
@@ -860,20 +829,17 @@ inline void set_ends(const Patient *patient, __global const Segment *segment, co
   const float2 apart = fmax(width / strips->lines, 1e-4f);
   const float2 reach = fabs(middle.x + middle.y * ends) + (0.5f + SHARED) * width;
   piece->reach_l = fmax(reach.x, reach.y);
-#ifdef LOBES
-  // The table has the square root of the power per millimetre, where the main beam has 1 / (sqrt(pi) sigma_e).
-  const float tall_low = 0.56418958f, tall_high = tall_low;
-  piece->reach_e =
-      fmax(reach_of_lobes(frame, patient->lobes, path_low), reach_of_lobes(frame, patient->lobes, path_high));
-#else
-  const float tall_low = elevation_sigma_at(frame, path_low, 1.0f / frequency_low);
-  const float tall_high = elevation_sigma_at(frame, path_high, 1.0f / frequency_high);
-  piece->reach_e = frame->beam_cutoff * fmax(tall_low, tall_high);
-  piece->narrow0 = 0.5f * LOG2_E / (tall_low * tall_low);
-  piece->narrow1 = 0.5f * LOG2_E / (tall_high * tall_high) - piece->narrow0;
-  piece->curved0 = elevational_cycles(frame, path_low, frequency_low, tall_low);
-  piece->curved1 = elevational_cycles(frame, path_high, frequency_high, tall_high) - piece->curved0;
-#endif
+  // The table has the square root of the power per millimetre, where a Gaussian beam has 1 / (sqrt(pi) sigma_e).
+  const float stretch_low = elevation_stretch(frame, path_low, 1.0f / frequency_low);
+  const float stretch_high = elevation_stretch(frame, path_high, 1.0f / frequency_high);
+  const float tall_low = 0.56418958f * stretch_low, tall_high = 0.56418958f * stretch_high;
+  const float widest = patient->beam[2 * LOBE_DEPTHS * LENS_DISTANCES + LOBE_DEPTHS];  // distance of the last column
+  piece->tall0 = (LENS_DISTANCES - 1) / (widest * stretch_low);
+  piece->tall1 = (LENS_DISTANCES - 1) / (widest * stretch_high) - piece->tall0;
+  piece->reach_e = fmax(stretch_low * reach_of_lens(frame, patient->beam, path_low),
+                        stretch_high * reach_of_lens(frame, patient->beam, path_high));
+  piece->turned0 = frame->wavefront_curvature == 0.0f ? 0.0f : frequency_low;
+  piece->turned1 = frame->wavefront_curvature == 0.0f ? 0.0f : frequency_high - frequency_low;
   // Unit energy of the point spread function for all widths: sqrt(1 / (sigma_l sigma_e)) times the scale. The
   // weights of beam.cl have unit sum, that is apart / (sqrt(2 pi) sigma_l) at the peak, so that a strip of width
   // `apart` has the power apart / sigma_l of both at the displayed depth. A pulse covers 1 / slope of its length.
@@ -895,8 +861,8 @@ inline void set_ends(const Patient *patient, __global const Segment *segment, co
 ONE_BY_ONE
 __kernel void scatter(Frame frame, __global const ushort *voxels, __global const uint *planes,
                       __global const uint *texture, __global const float *sites, __global const Segment *segments,
-                      __global const int *segment_counts, __global float *re, __global float *im,
-                      int stride VARIED_PARAMETERS LOBE_PARAMETERS) {
+                      __global const int *segment_counts, __global float *re, __global float *im, int stride,
+                      __global const float *beam VARIED_PARAMETERS LOBE_PARAMETERS) {
   const int chunk = get_global_id(0), first = chunk * CHUNK;
 #ifdef LOBES
   const int left = get_global_id(1) * together, lines = min(together, frame->traced_lines - left);
@@ -915,8 +881,8 @@ __kernel void scatter(Frame frame, __global const ushort *voxels, __global const
   const int block = first / PIECE_BLOCK * PIECE_BLOCK;
   const float block_low = (block - 1) * frame->sample_mm;
   const float block_high = (block + PIECE_BLOCK) * frame->sample_mm;
-  const Strips strips = {line, left, lines, traced_start(frame, (float)line)};
-  const Patient patient = {frame, voxels, planes, texture, sites, PART_OF, LOBE_TABLE};
+  const Strips strips = {line, left, lines, traced_start(frame, (float)line), traced_cosine(frame, (float)line)};
+  const Patient patient = {frame, voxels, planes, texture, sites, beam, PART_OF};
 
   int count = min(segment_counts[line], MAX_SEGMENTS);
   for (int index = 0; index < count; index++) {

@@ -101,14 +101,15 @@ __kernel void side_lobes(Frame frame, __global const float *lobes, __global cons
   const float depth_mm = (sample / LOSS_STEP * LOSS_STEP + 0.5f * LOSS_STEP) * frame->sample_mm;
   const float s = fmax(depth_mm - line_start(frame, 0.5f * (lines - 1)), 0.0f);
   const float apart = line_distance(frame, depth_mm) * frame->lateral_rays;
-  const float unit = fmax(unit_least, unit_slope * s), main_beam = lateral_sigma(frame, s);
+  const float unit = fmax(unit_least, unit_slope * s), cosine = line_cosine(frame, 0.5f * (lines - 1)),
+              main_beam = lateral_sigma(frame, s, 1.0f, cosine);
   const int dense = (lines + LOBE_NODES - 1) / LOBE_NODES;
   const int step = clamp((int)(NODE_DISTANCE * unit / apart), dense, lines), nodes = (lines + step - 1) / step;
 
   // The mean of lines whose speckle has the correlation exp(-distance^2 / 4 sigma^2) has this part of their power; with
   // a curved phase k y^2 / 2 the exponent is 1 + k^2 sigma^4 times as large. (Signs are random, so that the correlation
   // of different nodes does not matter.)
-  const float bent = lateral_curvature(frame, s, 1.0f) * main_beam * main_beam;
+  const float bent = lateral_curvature(frame, s, 1.0f, cosine) * main_beam * main_beam;
   const float fall = 0.25f * LOG2_E * (apart / main_beam) * (apart / main_beam) * (1.0f + bent * bent);
   float mean_power = 1.0f;
   for (int n = 1; n < step; n++)

@@ -108,7 +108,8 @@ def test_tgc_undoes_the_attenuation_it_is_set_to():
     dz = frame.sample_interval_mm
     raw = [level_db(frame.iq[:, int(d / dz) : int((d + 8) / dz)]) for d in (5, 37)]
     seen = [level_db(frame.envelope[:, int(d / dz) : int((d + 8) / dz)]) for d in (5, 37)]
-    assert raw[1] - raw[0] == pytest.approx(-2 * 0.5 * 5 * 3.2, abs=0.7)
+    # The band of the pulse loses 0.7 dB less than its centre.
+    assert raw[1] - raw[0] == pytest.approx(-2 * 0.5 * 5 * 3.2 + 0.7, abs=0.4)
     assert seen[1] - seen[0] == pytest.approx(0, abs=0.7)
 
 
@@ -523,7 +524,7 @@ def test_so_many_scatterers_that_an_image_takes_long_are_a_warning():
     with warnings.catch_warnings():  # as an error, before the image is computed
         warnings.simplefilter("error")
         dense = simulator(labels, SPECKLE, scatterers_per_mm3=200_000.0)
-        with pytest.raises(SlowScatterersWarning, match=r"200000: 2\.9e\+09 cells .* about 98 s on .* none, 33 for"):
+        with pytest.raises(SlowScatterersWarning, match=r"200000: 3\.1e\+09 cells .* about 104 s on .* none, 18 for"):
             dense.simulate(PROBES["convex"], pose)
         with pytest.raises(SlowScatterersWarning):
             dense.volume(PROBES["convex"], [pose])

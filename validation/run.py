@@ -85,6 +85,7 @@ def all_checks() -> tuple[Check, ...]:
     """Every check, in the order of the physics: rays, speckle, artefacts, space."""
     from validation import (
         aberration,
+        apertures,
         artefacts,
         band,
         beams,
@@ -109,6 +110,7 @@ def all_checks() -> tuple[Check, ...]:
         floor,
         artefacts,
         beams,
+        apertures,
         curved_walls,
         transmit,
         walls,

@@ -23,7 +23,6 @@ from SlicerUSSim.Logic.imaging.aperture import Aperture, aperture_fields
 from SlicerUSSim.Logic.imaging.bmode import downshift, log_band_above, pulse_taps
 from SlicerUSSim.Logic.imaging.compounding import Compounder, sweep_grid
 from SlicerUSSim.Logic.imaging.contact import line_contact
-from SlicerUSSim.Logic.imaging.diffraction import speckle_height_mm
 from SlicerUSSim.Logic.imaging.frame import Echoes, Frame
 from SlicerUSSim.Logic.imaging.medium import Medium, as_labels
 from SlicerUSSim.Logic.imaging.noise import stirred
@@ -477,9 +476,8 @@ class UltrasoundSimulator:
         for name, value in transmit_fields(probe).items():
             acquisition[name] = value
         acquisition["receive_sigma_min"], acquisition["receive_sigma_slope"] = probe.receive_beam()
-        for name, value in zip(("sigma", "focus", "rayleigh"), probe.elevation_beam(), strict=True):
-            acquisition[f"elevation_{name}"] = value
-        acquisition["speckle_height_mm"] = speckle_height_mm(probe) if settings.wavefront_curvature else 0.0
+        acquisition["elevation_sigma"] = probe.lens().sigma_mm
+        _, acquisition["elevation_focus"], acquisition["elevation_rayleigh"] = probe.elevation_waist()
         acquisition["max_ray_depth"] = settings.max_ray_depth if settings.reflections else 0
         lateral, guard = _traced_lines_for(probe, settings)
         acquisition["lateral_rays"], acquisition["guard_lines"] = lateral, guard
