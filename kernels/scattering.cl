@@ -117,6 +117,7 @@ typedef struct {
   int u, v, w, first;
 #ifdef LOBES
   float dark[MOST_DARK + 1], dark_step;  // how dark tissue is from `low` on, at intervals in mm
+  int dark_steps;                        // of these in the piece
 #endif
 } Piece;
 
@@ -612,7 +613,8 @@ inline float2 find_dark(const Patient *patient, Piece *piece, float low, float h
   const int steps = min(max(1, (int)ceil(high - low)), MOST_DARK - 1);
   float here[MOST_DARK];
   int first = steps + 1, last = -1;
-  piece->dark_step = (high - low) / steps;
+  piece->dark_steps = steps;
+  piece->dark_step = fmax((high - low) / steps, 1e-6f);
   for (int n = 0; n <= steps; n++) {
     here[n] = 0.0f;
     for (int side = -1; side <= 1; side++) {
@@ -630,7 +632,7 @@ inline float2 find_dark(const Patient *patient, Piece *piece, float low, float h
 
 // How dark tissue is at a length beyond the piece's start
 inline float dark_at(const Piece *piece, float length) {
-  const float place = clamp(length / piece->dark_step, 0.0f, MOST_DARK - 1.0f);
+  const float place = clamp(length / piece->dark_step, 0.0f, (float)piece->dark_steps);
   const int n = (int)place;
   return blend(piece->dark[n], piece->dark[n + 1], place - n);
 }

@@ -524,7 +524,7 @@ def test_so_many_scatterers_that_an_image_takes_long_are_a_warning():
     with warnings.catch_warnings():  # as an error, before the image is computed
         warnings.simplefilter("error")
         dense = simulator(labels, SPECKLE, scatterers_per_mm3=200_000.0)
-        with pytest.raises(SlowScatterersWarning, match=r"200000: 3\.1e\+09 cells .* about 104 s on .* none, 18 for"):
+        with pytest.raises(SlowScatterersWarning, match=r"200000: 3\.2e\+09 cells .* about 108 s on .* none, 18 for"):
             dense.simulate(PROBES["convex"], pose)
         with pytest.raises(SlowScatterersWarning):
             dense.volume(PROBES["convex"], [pose])

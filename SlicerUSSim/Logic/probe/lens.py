@@ -86,8 +86,10 @@ def lens_beam(
     sigma = np.sqrt(2.0 * moments[:, -1] / within[:, -1])
     row = np.arange(_DEPTHS)
     fades_mm = x[row, np.argmax(2.0 * moments >= (_KEPT * sigma[:, None]) ** 2 * within, axis=1)]
-    main_mm = _ENDS * fades_mm
-    lobes_mm = np.maximum(_REACH_LOBES * wavelength_mm * depth / aperture_mm, _REACH_WAVELENGTHS * wavelength_mm)
+    main_mm = _to_columns(_ENDS * fades_mm)
+    lobes_mm = _to_columns(
+        np.maximum(_REACH_LOBES * wavelength_mm * depth / aperture_mm, _REACH_WAVELENGTHS * wavelength_mm)
+    )
     fading = np.cos(0.5 * np.pi * np.clip((x / fades_mm[:, None] - 1.0) / (_ENDS - 1.0), 0.0, 1.0)) ** 2
     main, lobes = _columns(x, power * fading, main_mm), _columns(x, power * (1.0 - fading), lobes_mm)
     main /= 2.0 * (main.sum(axis=1, keepdims=True) - 0.5 * main[:, :1]) * main_mm.max() / (_DISTANCES - 1)
@@ -97,8 +99,14 @@ def lens_beam(
     return LensBeam(*(part.astype(np.float32) for part in (sigma, tables[0], main_mm, tables[1], lobes_mm)))
 
 
+def _to_columns(reach_mm: np.ndarray) -> np.ndarray:
+    """The next column of a table to the largest reach: interpolated to zero there, a profile has no step."""
+    step = reach_mm.max() / (_DISTANCES - 1)
+    return step * np.ceil(reach_mm / step - 1e-6)
+
+
 def _columns(x: np.ndarray, power: np.ndarray, reach_mm: np.ndarray) -> np.ndarray:
-    """(depths, LENS_DISTANCES) mean power around distances evenly from 0 to the largest reach, 0 beyond each row's."""
+    """(depths, LENS_DISTANCES) mean power around distances evenly from 0 to the largest reach, 0 from each row's on."""
     at, step = np.linspace(0.0, reach_mm.max(), _DISTANCES, retstep=True)
     rows = []
     for places, values, reach in zip(x, power, reach_mm, strict=True):
@@ -106,5 +114,5 @@ def _columns(x: np.ndarray, power: np.ndarray, reach_mm: np.ndarray) -> np.ndarr
         edges, sums = np.append(0.0, places + half), np.append(0.0, np.cumsum(values) * 2.0 * half)
         low, high = (np.interp(np.abs(at + side * step), edges, sums) for side in (-0.5, 0.5))
         low[0] *= -1.0
-        rows.append((high - low) / step * (at <= reach))
+        rows.append((high - low) / step * (at < reach - 0.5 * step))
     return np.array(rows)
