@@ -43,12 +43,12 @@ HEAVY = {
 #: Lines of Python that a room, or a folder beside the product, may have. Raising one is a decision: the commit says
 #: what users get for it.
 BUDGETS = {
-    "base": 3225, "opencl": 1290, "probe": 1505, "tissue": 2070, "tracked": 1935, "mri": 7440, "placement": 825,
-    "imaging": 4605, "fitting": 3635, "vtk": 465, "mrml": 4480, "Widget": 3025, "Workstation": 5785, "Command": 2835,
-    "module": 430, "validation": 6055, "benchmarks": 3695, "tests": 28290, "tests/reference": 460,
+    "base": 3350, "opencl": 1305, "probe": 1690, "tissue": 2065, "tracked": 1930, "mri": 7470, "placement": 845,
+    "imaging": 5350, "fitting": 3695, "vtk": 505, "mrml": 4780, "Widget": 3045, "Workstation": 5775, "Command": 2830,
+    "module": 430, "validation": 6420, "benchmarks": 3805, "tests": 28795, "tests/reference": 480,
 }  # fmt: skip
 #: Lines of all of SlicerUSSim/, and of kernels/
-LARGEST_PRODUCT, LARGEST_KERNELS = 43_460, 5_600
+LARGEST_PRODUCT, LARGEST_KERNELS = 45_040, 5_815
 #: Packages of the checkout that use the product and are not installed with it
 CHECKOUT = {"validation", "benchmarks", "tests", "examples"}
 
