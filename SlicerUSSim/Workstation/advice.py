@@ -18,12 +18,21 @@ class Advice:
     def __init__(self, panel: BrowserPanel, registration: Registration) -> None:
         self._panel, self._presenter, self._registration = panel, panel.presenter, registration
         self._do: Callable[[], object] = lambda: None
+        self._dismissed = ""
 
     def update(self) -> None:
         """Find the line anew; called when the panel has been refreshed."""
-        text, remedy, self._do = self._found()
+        # While something is under way the notes are about what was before
+        text, remedy, self._do = ("", "", lambda: None) if self._presenter.isBusy else self._found()
+        if text == self._dismissed:
+            text = remedy = ""
         with self._panel.shared.changing() as now:
             now.advice, now.remedy = text, remedy
+
+    def dismiss(self) -> None:
+        """Do not show this line again."""
+        self._dismissed = self._panel.shared.now.advice
+        self.update()
 
     def follow(self, is_outdated: bool) -> None:
         """Do what the button says; called in a task."""
@@ -47,6 +56,9 @@ class Advice:
         if line:
             return line, "Place the probe", placing.placeAtView
         line = self._first("notesLabel")
+        labels = self._panel.logic.parameters.labels
+        if labels is not None and self._panel.logic.closedLabels(labels) is not labels:
+            return "", "", lambda: None  # another Segment would close the opening
         chosen = next((contrast for words, contrast in _CONTRASTS.items() if words in line), "")
         if chosen:
 

@@ -18,6 +18,7 @@ from SlicerUSSim.Logic.base.errors import Cancelled, require, required, user_mes
 from SlicerUSSim.Logic.mrml.fitting_nodes import offered
 from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic
 from SlicerUSSim.Logic.mrml.nodes import Observed, nodes_of_class
+from SlicerUSSim.Widget.image_presenter import FROZEN
 from SlicerUSSim.Widget.interface import Control, by_widget
 from SlicerUSSim.Widget.presenter import PanelPresenter
 from SlicerUSSim.Widget.sections import panel_sections
@@ -97,6 +98,7 @@ class BrowserPanel:
     def showStatus(self, message: str) -> None:
         # The frame rate is reported with every image, which is too often for updates of the page.
         now = perf_counter()
+        message = "" if message.startswith(FROZEN) else message  # the badge says so, of the shown image
         if message != self._status and (now > self._status_until or not message.endswith(_RATE)):
             self._status, self._status_until = message, now + _STATUS_EVERY_S
             self._in_loop(lambda: self.shared.put("messages", {"status": message}))

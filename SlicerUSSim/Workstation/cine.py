@@ -183,6 +183,7 @@ class Cine:
         return CineImage(self._logic.sequenceImage(self._logic.parameters.image_sequence, index), index * _EVERY_S)
 
     def _show(self, index: int) -> None:
+        self.tell()  # images may be gone since
         length = self._shared.now.cine.length
         require(length > 0, _NONE)
         index = min(max(int(index), 0), length - 1)

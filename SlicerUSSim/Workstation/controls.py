@@ -91,7 +91,7 @@ def range_html(
 def upright_html(control: Control) -> str:
     """A slider that stands upright, one of several side by side."""
     name, key, shown = control.widget, value_of(control.widget), control.range
-    return f"""<input type="range" class="ussim-upright" id="slider-{name}" min="{shown.low:g}" max="{shown.high:g}"
+    return f"""<input type="range" class="ussim-upright" id="tgc-{name}" min="{shown.low:g}" max="{shown.high:g}"
         step="{shown.step:g}" :value="{key} ?? 0" aria-label="{escape(control.label)}"
         :title="`{escape(control.label)}: ${{{key}}} {control.unit}`" {kept(key)}
         @input="trigger('set', ['{name}', Number($event.target.value)])">"""

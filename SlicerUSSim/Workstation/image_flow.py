@@ -98,7 +98,7 @@ class ImageFlow:
             is_late = self._differs_since is not None and seconds - self._differs_since > _OUTDATED_S
             shown = _texts(taken)
             shown.status = "OUTDATED" if is_late else "LIVE"
-            if not self._logic.isLive:
+            if not self._logic.isLive and not (differs and self._panel.presenter.isBusy):  # not until Segment is done
                 shown.status = FROZEN
                 self._logic.holdOutline()
             shown.differs = "" if shown.status == "LIVE" else ", ".join(differs)
@@ -142,10 +142,10 @@ def _texts(taken: TakenImage) -> ImageState:
     probe, display = taken.preset.probe, taken.preset.display
     name = next((name.replace("_", " ") for name, known in PROBES.items() if known == probe), probe.kind)
     focus = {"Focus": f"{probe.focus_mm:.4g} mm"} if probe.focus_mm else {}
-    values = {"Depth": f"{probe.depth_mm:.4g} mm", **focus, "Gain": f"{display.gain_db:+g} dB"}
+    values = {"Depth": f"{probe.depth_mm:.4g} mm", **focus, "Gain": f"{display.gain_db:+.3g} dB"}
     return ImageState(
         patient=taken.patient, time=f"{taken.time[11:19]} UTC", probe=name, frequency=f"{probe.received_mhz:.3g} MHz",
-        values={**values, "DR": f"{display.dynamic_range_db:g} dB"},
+        values={**values, "DR": f"{display.dynamic_range_db:.3g} dB"},
     )  # fmt: skip
 
 

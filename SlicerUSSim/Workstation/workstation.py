@@ -151,6 +151,7 @@ class Workstation:
             "answer": self._questions.answer,
             "choose_frame": self._in_task(registration.choose_frame),
             "remedy": self._in_task(self._advice.follow),
+            "dismiss_advice": self._advice.dismiss,
             "compare_next": comparison.compare_next,
             "cancel": self._panel.cancel,
             "dismiss": self._panel.dismiss,

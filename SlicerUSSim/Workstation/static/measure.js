@@ -97,7 +97,7 @@
   function showLine(points) {
     line = points;
     document.getElementById("mmode").hidden = !points;
-    trame().trigger("mmode", points ? points.flat() : [null]);
+    trame().trigger("mmode", [points ? points.flat() : null]);
   }
 
   function clicked(event) {

@@ -37,6 +37,7 @@ import "./measure.js";
     screens.put(name, bitmap, { ...meta, ruler });
     if (name !== "simulated" || !bitmap) return;
     workstation.images += 1;
+    workstation.pointAgain?.(); // what is under a mouse that rests has changed
     requestAnimationFrame(() => {
       const now = performance.now();
       shown.push(now);
@@ -86,6 +87,10 @@ import "./measure.js";
     },
     { capture: true, passive: true },
   );
+  const closeMenus = (except) => {
+    for (const menu of document.querySelectorAll("details.ussim-menu[open]")) if (menu !== except) menu.open = false;
+  };
+  window.addEventListener("pointerdown", (event) => closeMenus(event.target.closest?.("details.ussim-menu")));
   const isFrozen = () => document.getElementById("image-status")?.textContent.trim() === "FROZEN";
   // Keys of the page itself, by what they do; the others move the probe.
   const OWN_KEYS = {
@@ -108,6 +113,7 @@ import "./measure.js";
     if (event.ctrlKey || event.altKey || event.metaKey || isTaken(event.key, event.target)) return;
     if (document.getElementById("help").open) return;
     const key = event.key.length === 1 ? event.key.toLowerCase() : event.key;
+    if (key === "Escape") closeMenus();
     if (key === "Escape" && measure.isDrawing()) {
       measure.takeBack();
       return;
@@ -159,7 +165,7 @@ import "./measure.js";
     workstation[name] = async (...options) => {
       workstation.exporting += 1;
       try {
-        for (const menu of document.querySelectorAll("details.ussim-menu[open]")) menu.open = false;
+        closeMenus();
         await measure[name](...options);
       } finally {
         workstation.exporting -= 1;
@@ -170,11 +176,11 @@ import "./measure.js";
   workstation.tgcMaster = (slider) => {
     const names = slider.dataset.names.split(",");
     if (!before) {
-      before = names.map((name) => Number(document.getElementById(`slider-${name}`).value));
+      before = names.map((name) => Number(document.getElementById(`tgc-${name}`).value));
       slider.addEventListener("change", () => (before = null), { once: true });
     }
     names.forEach((name, n) => {
-      const { min, max } = document.getElementById(`slider-${name}`);
+      const { min, max } = document.getElementById(`tgc-${name}`);
       window.trame.trigger("set", [name, Math.min(Math.max(before[n] + Number(slider.value), Number(min)), Number(max))]);
     });
   };
@@ -246,7 +252,7 @@ import "./measure.js";
   // Over HTTP: on the web socket keys and Cancel would wait until the file is there.
   workstation.save = (kind) => workstation.fetched(`exported?${new URLSearchParams({ kind })}`, { cache: "no-store" });
   workstation.fetched = async (address, options) => {
-    for (const menu of document.querySelectorAll("details.ussim-menu[open]")) menu.open = false;
+    closeMenus();
     workstation.exporting += 1;
     try {
       const answer = await fetch(address, options);
@@ -259,7 +265,9 @@ import "./measure.js";
   };
   workstation.download = (blob, name) => {
     const link = document.createElement("a");
-    link.download = name;
+    const { patient = "", time = "" } = workstation.image ?? {};
+    const whose = `${patient.split(".")[0]}-${time.slice(0, 19).replaceAll(/[-:]/g, "")}`.replaceAll(/[^\w-]+/g, "-");
+    link.download = name.replace(/^ultrasound/, whose);
     link.href = URL.createObjectURL(blob);
     link.click();
     setTimeout(() => URL.revokeObjectURL(link.href), 60_000); // the browser saves it in its own time
