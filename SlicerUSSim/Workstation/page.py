@@ -162,10 +162,11 @@ def _advice() -> str:
     advice, remedy, image = NAMES.advice, NAMES.remedy, NAMES.image
     is_outdated = f"{image.status} === 'OUTDATED'"
     return f"""<div class="ussim-advice" id="advice" role="status" v-if="{is_outdated} || {advice}">
-      <span>{{{{ {is_outdated} ? 'The image is outdated: ' + {image.differs} + ' changed' : {advice} }}}}</span>
+      <span :title="{advice}">{{{{ {is_outdated} ? 'The image is outdated: ' + {image.differs} + ' changed' : {advice} }}}}</span>
       <button v-if="{is_outdated} || {remedy}" class="ussim-button" id="remedy"
       @click="trigger('remedy', [{is_outdated}])">{{{{ {is_outdated} ? 'Simulate' : {remedy} }}}}</button>
-      </div>"""
+      <button v-if="!({is_outdated})" class="ussim-icon" id="dismiss-advice" title="Do not show this again"
+      aria-label="Dismiss" @click="trigger('dismiss_advice')"><i class="mdi mdi-close"></i></button></div>"""
 
 
 # ---- beside the image ------------------------------------------------------------------------------------------------
@@ -333,7 +334,7 @@ def _drawer(panel: BrowserPanel) -> None:
                 html.Div(_open_file())
             if section.title == SECTION:
                 registration()
-            shown = [one for one in section.controls if one.widget not in {*NOT_SHOWN, *_BESIDE, *_TGC, *_BELOW_TGC}]
+            shown = [one for one in section.controls if one.widget not in {*NOT_SHOWN, *_BESIDE, *_BELOW_TGC}]
             html.Div("".join(map(control_html, shown)))
             if section.title == "Probe":
                 html.Div("".join(_pose_slider(*slider) for slider in _POSE_SLIDERS) + _upright())

@@ -29,12 +29,19 @@
   }
 
   let inside = false;
+  let last = null;
+  let again = 0;
+  window.ussim.pointAgain = () => {
+    clearTimeout(again);
+    again = setTimeout(() => last && point(last), 150);
+  };
   window.addEventListener(
     "pointermove",
     (event) => {
       const [was, where] = [inside, window.ussimScreens.at(event)];
       inside = Boolean(where?.isInside || event.target.closest?.(".ussim-view")); // views send their points themselves
-      if (where?.isInside && where.isInMm) point(where.mm);
+      last = where?.isInside && where.isInMm ? where.mm : null;
+      if (last) point(last);
       else if (was && !inside) point(null);
     },
     { passive: true },
