@@ -162,7 +162,8 @@ def _advice() -> str:
     advice, remedy, image = NAMES.advice, NAMES.remedy, NAMES.image
     is_outdated = f"{image.status} === 'OUTDATED'"
     return f"""<div class="ussim-advice" id="advice" role="status" v-if="{is_outdated} || {advice}">
-      <span :title="{advice}">{{{{ {is_outdated} ? 'The image is outdated: ' + {image.differs} + ' changed' : {advice} }}}}</span>
+      <span :title="{advice}">
+      {{{{ {is_outdated} ? 'The image is outdated: ' + {image.differs} + ' changed' : {advice} }}}}</span>
       <button v-if="{is_outdated} || {remedy}" class="ussim-button" id="remedy"
       @click="trigger('remedy', [{is_outdated}])">{{{{ {is_outdated} ? 'Simulate' : {remedy} }}}}</button>
       <button v-if="!({is_outdated})" class="ussim-icon" id="dismiss-advice" title="Do not show this again"
