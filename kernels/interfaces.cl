@@ -47,7 +47,7 @@ inline float bent_patch(float per_mm, float slope, float bend, float variance, f
 #define MOST_PER_STEP 3.0f
 #define MOST_ASIDE 0.7f
 
-#define MOST_MORE 4.0f  // octaves by which the echo of a plane is larger than that of a Gaussian beam
+#define MOST_MORE 4.3f  // octaves by which the echo of a plane is larger than that of a Gaussian beam
 
 // How far a wall is a plane that bends by `turning` radians within the beam. Others are seen where they are square to
 // it, and a plane there is not what is found beside that.
