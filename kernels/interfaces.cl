@@ -47,6 +47,8 @@ inline float bent_patch(float per_mm, float slope, float bend, float variance, f
 #define MOST_PER_STEP 3.0f
 #define MOST_ASIDE 0.7f
 
+#define MOST_MORE 4.3f  // octaves by which the echo of a plane is larger than that of a Gaussian beam
+
 // How far a wall is a plane that bends by `turning` radians within the beam. Others are seen where they are square to
 // it, and a plane there is not what is found beside that.
 inline float flatness(float turning) { return 1.0f / (1.0f + 16.0f * turning * turning); }
@@ -128,7 +130,8 @@ __kernel void find_walls(Frame frame, __global const Hit *hits, __global const i
       const float of_aperture = flat * plane_of_aperture(frame, planes, hit->path_mm, hit->lateral_slope / cosine, 0) +
                                 flat_aside * plane_of_aperture(frame, planes, hit->path_mm, hit->elevational_slope, 1) -
                                 log2_scalar(gauss);
-      const float more = of_aperture == of_aperture ? clamp(of_aperture, -60.0f, 60.0f) : 0.0f;
+      // More than this would raise what the sum over the patches of a steep wall leaves, which no wall echoes.
+      const float more = of_aperture == of_aperture ? clamp(of_aperture, -60.0f, MOST_MORE) : 0.0f;
       const float share = patch_echo(phase2, inside2, pulse) * exp2_scalar(more);
       if (share < 1e-4f) continue;
       const float lines = step / sqrt(width2), per_line = lines / every;
