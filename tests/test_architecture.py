@@ -44,11 +44,11 @@ HEAVY = {
 #: what users get for it.
 BUDGETS = {
     "base": 3350, "opencl": 1305, "probe": 1690, "tissue": 2065, "tracked": 1930, "mri": 7470, "placement": 845,
-    "imaging": 5350, "fitting": 3695, "vtk": 505, "mrml": 4780, "Widget": 3045, "Workstation": 5775, "Command": 2830,
-    "module": 430, "validation": 6420, "benchmarks": 3805, "tests": 28795, "tests/reference": 480,
+    "imaging": 5350, "fitting": 3695, "vtk": 505, "mrml": 4780, "Widget": 3045, "Workstation": 5795, "Command": 2830,
+    "module": 430, "validation": 6420, "benchmarks": 3805, "tests": 28800, "tests/reference": 480,
 }  # fmt: skip
 #: Lines of all of SlicerUSSim/, and of kernels/
-LARGEST_PRODUCT, LARGEST_KERNELS = 45_040, 5_815
+LARGEST_PRODUCT, LARGEST_KERNELS = 45_060, 5_815
 #: Packages of the checkout that use the product and are not installed with it
 CHECKOUT = {"validation", "benchmarks", "tests", "examples"}
 
