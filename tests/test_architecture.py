@@ -45,7 +45,7 @@ HEAVY = {
 BUDGETS = {
     "base": 3350, "opencl": 1295, "probe": 1520, "tissue": 2070, "tracked": 1935, "mri": 7470, "placement": 845,
     "imaging": 5320, "fitting": 3695, "vtk": 505, "mrml": 4780, "Widget": 3045, "Workstation": 5795, "Command": 2835,
-    "module": 430, "validation": 6055, "benchmarks": 3805, "tests": 28680, "tests/reference": 460,
+    "module": 430, "validation": 6055, "benchmarks": 3805, "tests": 28685, "tests/reference": 460,
 }  # fmt: skip
 #: Lines of all of SlicerUSSim/, and of kernels/
 LARGEST_PRODUCT, LARGEST_KERNELS = 44_850, 5_600

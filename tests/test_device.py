@@ -249,9 +249,14 @@ def test_pocl_builds_for_a_processor_with_its_librarys_vectors(monkeypatch, tmp_
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="PoCL's wheel is for Linux")
-def test_the_self_test_of_pocl_passes_here(monkeypatch, tmp_path):
+def test_what_the_self_test_of_pocl_found_is_kept(monkeypatch, tmp_path):
+    """On some processors it fails, or never ends: then PoCL is patched."""
     monkeypatch.setenv("POCL_CACHE_DIR", str(tmp_path))
-    assert _passes_self_test("3.0 of this processor") and (tmp_path / "ussim-self-test").read_text().endswith("passed")
+    passes = _passes_self_test("3.0 of this processor")
+    kept = (tmp_path / "ussim-self-test").read_text()
+    assert kept == f"3.0 of this processor\n{'passed' if passes else 'failed'}"
+    monkeypatch.setattr("subprocess.run", lambda *_, **__: pytest.fail("it was tried again"))
+    assert _passes_self_test("3.0 of this processor") == passes
 
 
 def test_threads_share_a_simulator_and_a_device():
