@@ -16,7 +16,7 @@ from dataclasses import replace
 import numpy as np
 
 from benchmarks.frames import FRAMES
-from benchmarks.measuring import timed
+from benchmarks.measuring import resident_mb, timed
 from SlicerUSSim.Logic import DisplaySettings, SimulationError, UltrasoundSimulator
 from SlicerUSSim.Logic.mri import demo_mri
 from SlicerUSSim.Logic.opencl.devices import devices_to_measure
@@ -68,12 +68,6 @@ def with_device(simulator: UltrasoundSimulator, function: Callable[[], object]) 
         return took, sum(simulator.device.take_profile().values())
     finally:
         simulator.device.profiling = False
-
-
-def resident_mb() -> float:
-    """Memory of this process (Linux)."""
-    with open("/proc/self/statm") as file:
-        return int(file.read().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 2**20
 
 
 def memory(simulator: UltrasoundSimulator, images: int) -> list[float]:

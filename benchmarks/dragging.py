@@ -10,19 +10,17 @@ from __future__ import annotations
 
 import argparse
 import math
-import os
 import shutil
 import subprocess
 import sys
 from contextlib import contextmanager, suppress
-from pathlib import Path
 from time import perf_counter
 from typing import Any
 
 import numpy as np
 from playwright.sync_api import Page, sync_playwright
 
-from benchmarks.measuring import output_file
+from benchmarks.measuring import output_file, resident_mb
 from SlicerUSSim.Logic.base import write_json
 from SlicerUSSim.Logic.opencl import list_devices
 from SlicerUSSim.Workstation.state import NAMES
@@ -140,10 +138,6 @@ def watched(page: Page, process: subprocess.Popen, frames: int) -> dict:
         session.send("HeapProfiler.collectGarbage")
         return page.evaluate("performance.memory.usedJSHeapSize") / 2**20
 
-    def server_mb() -> float:
-        pages = int(Path(f"/proc/{process.pid}/statm").read_text().split()[1])
-        return pages * os.sysconf("SC_PAGE_SIZE") / 2**20
-
     def run(count: int) -> None:
         end, step = page.evaluate("window.ussim.images") + count, 0
         while page.evaluate("window.ussim.images") < end:
@@ -152,9 +146,9 @@ def watched(page: Page, process: subprocess.Popen, frames: int) -> dict:
                 page.evaluate("([n, v]) => window.trame.trigger('set_pose', [n, v])", [name, angle])
 
     run(WARM_UP_FRAMES)
-    before = server_mb(), page_mb()
+    before = resident_mb(process.pid), page_mb()
     run(frames)
-    after = server_mb(), page_mb()
+    after = resident_mb(process.pid), page_mb()
     return {"frames": frames, "server_mb": [before[0], after[0]], "page_mb": [before[1], after[1]]}
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from time import perf_counter
@@ -52,3 +53,9 @@ def measured(function: Callable[[], object], repeat: int) -> dict[str, float]:
     """Best and median milliseconds of `repeat` calls, after a warm-up call."""
     function()
     return summary(timed(function) for _ in range(repeat))
+
+
+def resident_mb(process: int | str = "self") -> float:
+    """Memory of a process, by its number (Linux)."""
+    pages = int(Path(f"/proc/{process}/statm").read_text().split()[1])
+    return pages * os.sysconf("SC_PAGE_SIZE") / 2**20

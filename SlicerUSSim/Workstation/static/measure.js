@@ -83,7 +83,6 @@
   // ---- tools -----------------------------------------------------------------------------------------------------
 
   function tool(kind) {
-    for (const menu of document.querySelectorAll("details.ussim-menu[open]")) menu.open = false;
     document.querySelector(".ussim-typed")?.remove();
     drawing = null;
     if (kind === "clear") marks.length = 0;

@@ -96,8 +96,8 @@ import "./measure.js";
   const OWN_KEYS = {
     " ": () => window.trame.trigger("freeze"),
     f: () => window.trame.trigger("freeze"),
-    m: () => measure.tool("distance"),
-    t: () => measure.tool("text"),
+    m: () => workstation.tool("distance"),
+    t: () => workstation.tool("text"),
     c: () => window.trame.trigger("compare_next"),
     0: () => screens.fit(),
     Delete: () => measure.takeBack(),
