@@ -30,7 +30,7 @@ FLAGS = [
     "--disable-component-update", "--disable-sync",
 ]  # fmt: skip
 #: Position of the probe's body in a view, as fractions of its width and height, at the craniotomy of the demo brain.
-GRIPS = {"slice view": (1, 0.5, 0.2), "3D view": (0, 0.12, 0.08)}
+GRIPS = {"slice view": (1, 0.5, 0.12), "3D view": (0, 0.3, 0.3)}
 #: Frames before the first measurement of memory, after which one-time allocations are complete.
 WARM_UP_FRAMES = 300
 
