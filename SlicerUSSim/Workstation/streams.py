@@ -1,15 +1,13 @@
-"""ImageStream: sends the newest of a series of images, at the rate at which it can encode them."""
+"""ImageStream: sends a series of images to the pages."""
 
 from __future__ import annotations
 
-import asyncio
 import io
 import time
 from typing import Any
 
 import numpy as np
 from PIL import Image
-from trame_server.utils.asynchronous import get_event_loop
 
 #: Qualities of which the first that is small enough is taken, in half a millisecond each. With the first one, speckle
 #: differs by 2 of 255 grey levels in the mean (38 dB); the last one is for the widest fields (32 dB). WebP is a quarter
@@ -26,25 +24,21 @@ class ImageStream:
     def __init__(self, name: str) -> None:
         self.area_name = name
         self._streamer: Any = None
-        self._waiting: tuple[np.ndarray, dict] | None = None
         self._last: tuple[bytes, dict] | None = None
-        #: Whether an image is being sent to the pages
-        self.is_sending = False
-        self._era = 0  # changes when images of before must not be shown any more
         #: Number of the last image, starting at 1
         self.count = 0
 
     def send(self, image: np.ndarray, **about) -> None:
-        """Send a (rows, columns) uint8 image with the metadata `about`; an image that is still waiting is replaced."""
-        self._waiting = (image, about)
-        if not self.is_sending:
-            self.is_sending = True
-            get_event_loop().create_task(self._encode_all())
+        """Send a (rows, columns) uint8 image with the metadata `about`.
+
+        It is encoded here, in 1 to 5 ms: another thread's result would wait for the views to be drawn.
+        """
+        self.count += 1
+        self._last = _jpeg(image), {"type": "image/jpeg", "number": self.count, **about}
+        self._push(*self._last)
 
     def clear(self) -> None:
-        """Let the pages show no image; one that is still waiting or encoded is dropped."""
-        self._waiting = None
-        self._era += 1
+        """Let the pages show no image."""
         self.count += 1
         self._last = (b"", {"number": self.count, "blank": True})
         self._push(*self._last)
@@ -54,21 +48,6 @@ class ImageStream:
         if self._last is not None:
             content, about = self._last
             self._push(content, {**about, "stamp": None})  # which is not shown to an event of before
-
-    async def _encode_all(self) -> None:
-        try:
-            while self._waiting is not None:
-                (image, about), self._waiting = self._waiting, None
-                era = self._era
-                content = await asyncio.get_running_loop().run_in_executor(None, _jpeg, image)
-                if era != self._era:
-                    continue
-                self.count += 1
-                about = {"type": "image/jpeg", "number": self.count, **about}
-                self._last = (content, about)
-                self._push(content, about)
-        finally:
-            self.is_sending = False
 
     def _push(self, content: bytes, about: dict) -> None:
         if self._streamer is not None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import Any, cast
@@ -13,6 +14,9 @@ from trame.app import get_server
 from trame_server import Server
 from trame_slicer.core import SlicerApp
 
+from SlicerUSSim.Logic.base.errors import SimulationError
+from SlicerUSSim.Logic.imaging.self_check import golden_scene, golden_view
+from SlicerUSSim.Logic.imaging.simulator import UltrasoundSimulator
 from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic
 from SlicerUSSim.Logic.mrml.nodes import Observed
 from SlicerUSSim.Workstation.advice import Advice
@@ -209,9 +213,8 @@ class Workstation:
 
     @property
     def _is_at_rest(self) -> bool:
-        sending = any(stream.is_sending for stream in self._images.streams)
         is_told = self._probe.is_told and self._images.is_shown
-        return self._tasks.are_done and is_told and not sending and not self._comparison.is_comparing
+        return self._tasks.are_done and is_told and not self._comparison.is_comparing
 
     # ---- scene -------------------------------------------------------------------------------------------------
 
@@ -220,6 +223,12 @@ class Workstation:
             self.server.controller.rc_area_register(stream)
         self._images.watch()
         self._tasks.start(self._begin)
+        self._tasks.start(lambda: self._tasks.doAside(self._build_kernels))
+
+    def _build_kernels(self) -> None:
+        """While the patient's files are read and segmented: the first image would wait for them."""
+        with suppress(SimulationError):  # which the first image reports
+            golden_view(UltrasoundSimulator(*golden_scene(), device=self._logic.device), self._logic.preset.probe)
 
     def _begin(self) -> None:
         files = self._files

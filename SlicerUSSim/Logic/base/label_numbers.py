@@ -60,7 +60,7 @@ def whole_numbers(array: np.ndarray) -> np.ndarray | None:
     if not np.issubdtype(array.dtype, np.floating):
         return array
     rounded = np.rint(array)
-    if not np.allclose(array, rounded, rtol=0.0, atol=_ROUNDING):
+    if not (np.abs(array - rounded) <= _ROUNDING).all():
         return rounded if _is_scaled(array, rounded) else None
     return rounded if rounded.any() or not array.any() else None
 
@@ -96,8 +96,15 @@ def _is_scaled(array: np.ndarray, rounded: np.ndarray) -> bool:
 def _has_regions(array: np.ndarray) -> bool:
     """Whether neighbours have mostly equal values, as in a label map; those of the most frequent one do not count."""
     part = array[middle(array)]
-    _, ranks, counts = np.unique(part, return_inverse=True, return_counts=True)
-    ranks = ranks.reshape(part.shape)
+    low = int(part.min())
+    if int(part.max()) - low > _COUNTED:
+        _, ranks, counts = np.unique(part, return_inverse=True, return_counts=True)
+        ranks = ranks.reshape(part.shape)
+    else:
+        whole = part.astype(np.int64) - low
+        counts = np.bincount(whole.ravel())
+        rank_of = np.cumsum(counts > 0) - 1
+        ranks, counts = rank_of[whole], counts[counts > 0]
     inside = ranks != counts.argmax()
     pairs = np.concatenate([_pairs(ranks, inside, axis) for axis in range(3)], axis=1)
     is_equal = pairs[0] == pairs[1]

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from typing import cast
 
 import numpy as np
-from scipy import ndimage, signal
+from scipy import ndimage
 
 from SlicerUSSim.Logic.base.errors import SimulationError, require
 from SlicerUSSim.Logic.base.files import written_whole
@@ -117,6 +117,8 @@ def place_field(images: np.ndarray, pixel_spacing_mm: tuple[float, float], probe
     Parameters as those of estimate_field. What is bright lies in the field, and begins at the probe's face.
     Raises SimulationError for black images, and if the field covers less than 0.85 of what is bright.
     """
+    from scipy import signal  # takes half a second to import, which every start of the program would have to wait for
+
     images = np.asarray(images)
     stack = images if images.ndim == 3 else images[None]
     bright = bright_region(stack)
