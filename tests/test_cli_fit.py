@@ -225,7 +225,7 @@ def test_a_volume_with_landmarks_is_cut_where_the_probe_looked(folder, tmp_path)
             "images 1 are fitted and predicted, expected others to predict",
         ),
         (["--set", "fit.validate=9"], "image 9 does not exist, expected 0 to 2"),
-        (["--frames", "one"], "frames are 'one', expected numbers such as 0,5,10 or 0:20:5"),
+        (["--frames", "one"], "frames are 'one', expected numbers such as 0,5,10, 3-5 or 0:20:5"),
         (["--free", "gain_db=5:1"], "bounds of gain_db are 5.0 to 1.0, expected two numbers, the smaller one first"),
         (["--free", "liver.mu0"], "no free parameter 'liver.mu0'"),
         (["--set", "results.save_transform=there.json"], "results.save_transform needs --register"),

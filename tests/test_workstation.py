@@ -24,10 +24,13 @@ pyigtl = pytest.importorskip("pyigtl", reason="OpenIGTLink comes with pyigtl: pi
 from playwright.sync_api import Page, sync_playwright  # noqa: E402
 
 from SlicerUSSim.Logic import TissueTable, Volume  # noqa: E402
+from SlicerUSSim.Logic.base.errors import required  # noqa: E402
 from SlicerUSSim.Logic.base.volume import read_image_file  # noqa: E402
 from SlicerUSSim.Logic.probe.poses import pose_looking_at  # noqa: E402
 from SlicerUSSim.Workstation.state import NAMES, value_of  # noqa: E402
 from tests.served import Served, refused  # noqa: E402
+from tests.test_grown_lesions import CENTRE  # noqa: E402
+from validation.brain_phantoms import phantom, tissue_maps, with_low_grade_tumour  # noqa: E402
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="Chromium is missing: apt-get install chromium")
@@ -460,6 +463,14 @@ def test_keys_and_sliders_move_the_probe(page):
         after = pose(page)
         assert after[name] - before[name] == pytest.approx(change, abs=0.6), key
         before = after
+    page.locator("#slider-gainSlider").focus()
+    with new_image(page):
+        page.keyboard.press("ArrowRight")  # of the slider
+    assert shown(page, "gainSlider") > 0 and pose(page) == before
+    with new_image(page):
+        page.keyboard.press("d")  # which no slider takes
+    assert pose(page)["rock_deg"] < before["rock_deg"]
+    page.evaluate("window.trame.trigger('set', ['gainSlider', 0])")
     open_section(page, "Probe")
     with new_image(page):
         page.locator("#slider-pose-lift_mm").fill("10")
@@ -476,7 +487,7 @@ def test_keys_and_sliders_move_the_probe(page):
 # ---- tissues, settings -----------------------------------------------------------------------------------------------
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_changed_tissue_changes_the_image_and_nonsense_is_refused(page):
     open_section(page, "Tissues")
     cell, before = page.get_by_label("white matter mu0"), pixels(page)
@@ -722,6 +733,42 @@ def test_two_tabs_show_and_drive_the_same_workstation(page, browser, url):
     page.keyboard.press("a")  # and one can go
     settled(page)
     assert pose(page)["rock_deg"] - before["rock_deg"] == pytest.approx(12, abs=0.9)
+
+
+def test_a_reloaded_page_shows_the_same_image(page):
+    image, where = pixels(page), pose(page)
+    page.reload()
+    loaded(page)
+    settled(page)
+    assert np.array_equal(pixels(page), image) and pose(page) == where
+
+
+@pytest.mark.slow
+def test_a_click_grows_a_lesion_that_is_added_to_the_tissues(browser, tmp_path):
+    maps = with_low_grade_tumour(required(tissue_maps("mni152"), "no atlas"), CENTRE, 14.0).coarser(2)
+    image = phantom(maps, "flair", noise=0.03, bias=0.0)
+    image.mri.write(tmp_path / "flair.nii.gz")
+    image.mask.write(tmp_path / "mask.nii.gz")
+    arguments = [str(tmp_path / "flair.nii.gz"), "--contrast", "flair", "--mask", str(tmp_path / "mask.nii.gz")]
+    with serving(*arguments) as address:
+        page = opened(browser, address)
+        settled(page)
+        axial = views(page)[2]
+        for across, down in ((0.05, 0.1), (0.352, 0.507)):  # beside the head; in the lesion
+            page.evaluate("window.trame.trigger('press', ['pickSeedButton'])")
+            settled(page)
+            with heard(page):
+                page.mouse.click(*in_view(axial, across, down))
+            if down == 0.1:
+                eventually(page, lambda: bool(errors(page)))
+                assert re.search(r"mm outside the (brain|image)", errors(page)[0]), errors(page)
+                dismiss_messages(page)
+        eventually(page, lambda: "grown: tumour" in shown(page, "lesionNotesLabel"))
+        page.evaluate("window.trame.trigger('press', ['addTissuesButton'])")
+        eventually(page, lambda: "tumour" in [row["name"] for row in state(page, NAMES.panel.tissues)])
+        settled(page)
+        assert not errors(page)
+        page.close()
 
 
 def test_a_file_that_cannot_be_read_is_said_and_changes_nothing(page):

@@ -124,7 +124,7 @@ def _tissue_table(control: Control) -> str:
     return f"""<table class="ussim-table" id="{control.widget}" title="{escape(control.tip)}" {memo}>
         <tr><th>Tissue</th>{heads}
         </tr><tr v-for="row in {NAMES.panel.tissues}" :class="{{chosen: row.name === {NAMES.panel.chosen_tissue}}}"
-        @click="{NAMES.panel.chosen_tissue} = row.name">
+        @click="trigger('choose_tissue', [row.name])">
         <td>{{{{ row.name }}}}</td>
         <td v-for="(value, n) in row.values"><input :value="value" :title="row.sources[n]"
         :aria-label="row.name + ' ' + [{names}][n]"

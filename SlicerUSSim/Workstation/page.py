@@ -238,6 +238,8 @@ def _screens(keys: tuple[str, ...]) -> str:
         f"{mode} === '{chosen.value}'"
         for chosen in (ComparisonMode.BESIDE, ComparisonMode.BLINK, ComparisonMode.DIFFERENCE)
     )
+    title = NAMES.messages.progress_title
+    wait = f'<div v-if="{title} && !{NAMES.image.status}" class="ussim-wait" id="wait">{{{{ {title} }}}} …</div>'
     lines = f'<div v-for="(value, name) in {NAMES.image.values}">{{{{ name }}}} {{{{ value }}}}</div>'
     outline = f"""<svg v-if="{NAMES.sequence.mask} && {mode} !== '{ComparisonMode.SIMULATED.value}'" class="ussim-mask"
         :viewBox="{NAMES.sequence.box}" preserveAspectRatio="none"><path :d="{NAMES.sequence.mask}"/></svg>"""
@@ -250,7 +252,7 @@ def _screens(keys: tuple[str, ...]) -> str:
             canvas=f"""<canvas data-stream="simulated" data-keys="{escape(" ".join(keys))}"></canvas>
             <canvas data-stream="real-over" v-show="{there} && ({blink} || {over})"
             :class="{{blink: {blink}, difference: {over}}}"></canvas>""",
-            words=f'<div class="ussim-corner" id="image-values">{lines}</div>',
+            words=f'<div class="ussim-corner" id="image-values">{lines}</div>{wait}',
         )
         + screen.format(
             name="real", frame=frame.replace(">", f' v-show="{NAMES.sequence.is_placed}">', 1),

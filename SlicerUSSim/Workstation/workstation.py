@@ -152,6 +152,7 @@ class Workstation:
             "cine_source": self._in_task(self._cine.choose),
             "mmode": self._cine.draw_mmode,
             "show_number": comparison.show,
+            "choose_tissue": lambda name: self._shared.put("panel", {"chosen_tissue": name}),
             "answer": self._questions.answer,
             "choose_frame": self._in_task(registration.choose_frame),
             "remedy": self._in_task(self._advice.follow),

@@ -326,7 +326,7 @@ def require_sequence_name(path: Path) -> None:
 
 
 def frame_numbers(text: str, count: int) -> list[int]:
-    """Numbers of images from a text: 0,5,10, or start:stop:step as in Python, or both.
+    """Numbers of images from a text: 0,5,10 or 3-5 (with both ends), or start:stop:step as in Python, or several.
 
     Raises SimulationError for other text, and if it selects none of the `count` images.
     """
@@ -335,10 +335,12 @@ def frame_numbers(text: str, count: int) -> list[int]:
         try:
             if ":" in part:
                 numbers += range(count)[slice(*(int(end) if end.strip() else None for end in part.split(":")))]
+            elif (ends := re.fullmatch(r"\s*(\d+)\s*-\s*(\d+)\s*", part)) is not None:
+                numbers += range(int(ends[1]), int(ends[2]) + 1)
             else:
                 numbers.append(int(part))
         except (TypeError, ValueError):  # not numbers; more than three; a step of 0
-            raise SimulationError(f"frames are {text!r}, expected numbers such as 0,5,10 or 0:20:5") from None
+            raise SimulationError(f"frames are {text!r}, expected numbers such as 0,5,10, 3-5 or 0:20:5") from None
     require(bool(numbers), f"frames are {text!r}, expected at least one of the {count} images")
     return numbers
 
