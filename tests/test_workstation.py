@@ -590,7 +590,7 @@ def fit(page: Page, evaluations: int) -> None:
     click(page, "#fitButton")
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_fit_outlives_its_page_and_is_applied_and_reverted(page, browser, url):
     page.evaluate("window.trame.trigger('show_number', [2])")
     settled(page)
