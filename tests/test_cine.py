@@ -51,7 +51,8 @@ class Bench:
         views = SimpleNamespace(
             show_image=nothing, hide_image=nothing, follow=lambda pose, _: self.followed.append(pose)
         )
-        comparison = SimpleNamespace(show_at=nothing, stop=nothing, compare=nothing, sees_nothing=nothing)
+        methods = ("show_at", "stop", "compare", "sees_nothing", "tell_whether_at")
+        comparison = SimpleNamespace(**dict.fromkeys(methods, nothing))
         self.cine = Cine(panel, comparison, lambda pose: set_node_to_world(self.probe, pose))
         tracker = SimpleNamespace(send=nothing)
         self.flow = ImageFlow(panel, views, comparison, self.cine, tracker, LatencyStamps())

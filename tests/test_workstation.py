@@ -606,15 +606,8 @@ def test_a_fit_outlives_its_page_and_is_applied_and_reverted(page, browser, url)
     settled(page)
     curve = state(page, NAMES.fit.curve)
     assert len(curve) > 2 and min(curve) < curve[0] and curve == sorted(curve, reverse=True)
-    # The last value may come after the label
-    said = re.compile(r"→ ([0-9.]+) after")
-    eventually(
-        page,
-        lambda: (
-            float(said.search(page.locator("#cost-curve").inner_text())[1])
-            == pytest.approx(min(state(page, NAMES.fit.curve)), abs=6e-4)
-        ),  # both are rounded
-    )
+    evaluations = int(re.search(r", (\d+) evaluations", shown(page, "fitLabel"))[1])
+    assert 10 <= evaluations <= 32
     with new_image(page):
         click(page, "#applyFitButton")
     assert cost(page) <= before  # three decimals

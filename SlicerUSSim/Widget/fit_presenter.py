@@ -199,7 +199,8 @@ def label_of(name: str) -> str:
 
 def _in_words(found: Fit) -> str:
     result = found.appearance
-    lines = [f"cost {result.cost_before:.3f} → {result.cost_after:.3f}, {len(found.tracked.images)} images"]
+    cost = f"cost {result.cost_before:.3f} → {result.cost_after:.3f}"
+    lines = [f"{cost}, {len(found.tracked.images)} images, {result.evaluations} evaluations"]
     if result.cost_after >= result.cost_before:
         lines.insert(0, f"{CHECK}the fit is no better than before: give more evaluations, or free fewer parameters")
     if found.registration is not None:

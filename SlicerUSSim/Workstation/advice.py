@@ -69,6 +69,8 @@ class Advice:
             return line, f"Segment as {chosen}", segment
         if self._registration.is_waiting:
             return "The real ultrasound is not calibrated: its place in the patient is not known", "", lambda: None
+        if self._registration.is_assumed and not line:
+            return "The real ultrasound is not registered: its frame is taken for the patient's", "", lambda: None
         return line, "", lambda: None
 
     def _first(self, label: str) -> str:

@@ -132,7 +132,7 @@ class BrowserPanel:
         self._table = chart_node.GetNthPlotSeriesNode(0).GetTableNode()
         self._costs.watch(self._table)
         with self.shared.changing() as now:
-            now.fit.curve, now.fit.costs, now.fit.best = [], "", ""
+            now.fit.curve, now.fit.best = [], ""
 
     def refresh(self, changed: Collection[str] | None = None) -> None:
         stale = {name: control for name, control in self._controls.items() if control.depends_on(changed)}
@@ -174,7 +174,7 @@ class BrowserPanel:
             self._show_work()
 
     def clearErrors(self) -> None:
-        """Remove all errors, which are about another patient than the one that is opened now."""
+        """Remove all errors, which are about what was before."""
         with self.shared.changing() as now:
             now.messages.errors = []
 
@@ -214,6 +214,7 @@ class BrowserPanel:
         if name == "assignTissueButton":
             action = self._assign_tissue
         action = required(action, f"{name} is not a button of the page")
+        self.clearErrors()
         self.tasks.start(lambda: self.act(action))
 
     def act(self, action: Callable[[], object]) -> None:
@@ -272,13 +273,10 @@ class BrowserPanel:
         columns = [rows.GetColumn(number) for number in range(rows.GetNumberOfColumns())]
         if len(columns) < 3 or not columns[0].GetNumberOfTuples():
             return
-        evaluations, best = (np.asarray(memoryview(columns[n])) for n in (0, 2))
-        best = np.minimum.accumulate(best)  # restarts, which measure identifiability, begin with high costs
+        best = np.minimum.accumulate(np.asarray(memoryview(columns[2])))  # a new stage begins with its own
         chosen = np.unique(np.linspace(0, len(best) - 1, _CURVE_POINTS).round().astype(int))
         with self.shared.changing() as now:
-            curve = now.fit.curve = best[chosen].round(5).tolist()
-            # Of the rounded numbers: rounding 0.23449998 at once gives 0.234, rounding it twice 0.235
-            now.fit.costs = f"cost {curve[0]:.3f} → {curve[-1]:.3f} after {evaluations[-1]:.0f} evaluations"
+            now.fit.curve = best[chosen].round(5).tolist()
 
     def _show_work(self) -> None:
         work = self._under_way[-1] if self._under_way else None

@@ -124,10 +124,12 @@ class Comparison:
         if step.image is not None and is_new and seconds > self._best[1] + _BEST_EVERY_S:
             self._best, image = (step.best_cost, seconds), step.image()
             words = f"Best after {step.evaluations} evaluations: image {step.number}, cost {step.best_cost:.3f}"
-            self._tell(lambda: self._show_best(image, words))
+            self._tell(lambda: self._show_best(image, words, step.number))
 
-    def _show_best(self, image: np.ndarray, words: str) -> None:
+    def _show_best(self, image: np.ndarray, words: str, number: int | None) -> None:
         real, grid = self._real, self._grid
+        if number in self._numbers and number != self._numbers[self._shared.now.sequence.number]:
+            self.show(self._numbers.index(number))  # the same image everywhere
         if isinstance(real, RealImages) and grid is not None and image.shape == real.tracked.mask.shape:
             placed = Volume(image[None].astype(np.float32), real.tracked.grid.slice_to_probe)
             self.streams[2].send(slice_under_probe(placed, grid, np.eye(4)).round().astype(np.uint8))
@@ -150,6 +152,12 @@ class Comparison:
         self._waiting = (self._real, self._shared.now.sequence.number, simulated, grid)
         if self._comparing is None:
             self._comparing = get_event_loop().create_task(self._compare_all())
+
+    def tell_whether_at(self, pose: np.ndarray) -> None:
+        """Bring is_elsewhere up to date, for a simulated image with this pose (4, 4)."""
+        real, number = self._real, self._shared.now.sequence.number
+        is_there = not isinstance(real, RealImages) or np.allclose(real.tracked.poses[number], pose, atol=_SAME_POSE)
+        self._shared.put("sequence", {"is_elsewhere": not is_there})
 
     def sees_nothing(self, grid: ImageGrid | None) -> None:
         """Show no similarity: there is no image, or one without tissue, of which a number would mean nothing."""

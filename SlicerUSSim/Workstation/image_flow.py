@@ -90,6 +90,7 @@ class ImageFlow:
         self._cine.tell()
         taken, shown = self._logic.taken, ImageState()
         if taken is not None:
+            self._comparison.tell_whether_at(taken.probe_to_world)
             differs, seconds = self._logic.differences(taken), perf_counter()
             if not differs:
                 self._differs_since = None

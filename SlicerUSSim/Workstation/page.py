@@ -224,7 +224,8 @@ def _console(controls: dict[str, Control]) -> str:
     <button class="ussim-button" id="flip" title="Left and right exchanged" @click="window.ussim.flip('x')">Flip ⇄
       </button>
     <button class="ussim-button" id="flip-depth" title="Upside down" @click="window.ussim.flip('y')">Flip ⇅</button>
-    <button class="ussim-button wide" id="place" :title="{NAMES.panel.tips}.placeButton"
+    <button class="ussim-button wide" id="place"
+      title="Move the probe to the opening of the skull, or to the default place on the brain"
       :disabled="{NAMES.panel.can}.placeButton === false" @click="trigger('press', ['placeButton'])">
       Place at craniotomy</button></div>"""
 
@@ -252,7 +253,8 @@ def _screens(keys: tuple[str, ...]) -> str:
             canvas=f"""<canvas data-stream="simulated" data-keys="{escape(" ".join(keys))}"></canvas>
             <canvas data-stream="real-over" v-show="{there} && ({blink} || {over})"
             :class="{{blink: {blink}, difference: {over}}}"></canvas>""",
-            words=f'<div class="ussim-corner" id="image-values">{lines}</div>{wait}',
+            words=f"""<div class="ussim-corner" id="image-values">{lines}
+            <div v-if="{there} && {over}">minus real {{{{ {NAMES.sequence.name} }}}}</div></div>{wait}""",
         )
         + screen.format(
             name="real", frame=frame.replace(">", f' v-show="{NAMES.sequence.is_placed}">', 1),
@@ -289,7 +291,9 @@ def _player() -> str:
       <span id="sequence-text">Real {{{{ {sequence.name} }}}} ({{{{ {sequence.numbers} }}}})</span>
       <span role="group" aria-label="Comparison" id="comparison">{modes}</span>
       <span id="similarity" title="Cost of the paper for the simulated and the real image; 0 if they are equal">
-      {{{{ {sequence.similarity} }}}}</span></div>
+      {{{{ {sequence.is_elsewhere} ? 'the probe is not at this image' : {sequence.similarity} }}}}</span></div>
+    <div class="ussim-bar" id="cine-none" v-if="{cine.length} === 1 && {NAMES.image.status} === 'FROZEN'">
+      No cine: in the last 10 s nothing moved, or depth or probe changed</div>
     <div class="ussim-bar" id="cine" v-if="{cine.length} > 1 && {NAMES.image.status} === 'FROZEN'">
       <button class="ussim-icon" id="cine-play" :aria-label="{cine.playing} ? 'Stop the cine' : 'Play the cine'"
       @click="trigger('cine_play')"><i class="mdi" :class="{cine.playing} ? 'mdi-pause' : 'mdi-play'"></i></button>
@@ -377,13 +381,13 @@ def _upright() -> str:
 def _cost_curve() -> str:
     curve = NAMES.fit.curve
     return f"""<div v-if="{curve}.length > 1" id="cost-curve"><v-sparkline :model-value="{curve}" color="orange"
-      :line-width="1.5" :padding="4" :height="70" :smooth="false"></v-sparkline>{{{{ {NAMES.fit.costs} }}}}</div>"""
+      :line-width="1.5" :padding="4" :height="70" :smooth="false"></v-sparkline></div>"""
 
 
 def _messages() -> None:
     with html.Div(classes="ussim-messages"):
         v3.VAlert(
-            "{{ message }}", v_for=f"(message, n) in {NAMES.messages.errors}", key=("n",), type="error",
+            "{{ message }}", v_for=f"(message, n) in {NAMES.messages.errors}", key=("message + n",), type="error",
             density="compact", closable=True, classes="mb-1 ussim-error",
             update_modelValue="trigger('dismiss', [n])",
         )  # fmt: skip

@@ -293,7 +293,7 @@ class OpenPatient:
                 setattr(parameters, role, None)
         remove_patient_nodes(self._scene, kept)
         with self._shared.changing() as now:
-            now.fit.curve, now.fit.costs = [], ""
+            now.fit.curve = []
         self._is_new = True
 
     def forget_ultrasound(self) -> None:

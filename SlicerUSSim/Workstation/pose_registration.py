@@ -55,6 +55,11 @@ class Registration:
         """Whether there is a recording whose place in the patient is not known yet."""
         return self.recording is not None and self._logic.parameters.real is None
 
+    @property
+    def is_assumed(self) -> bool:
+        """Whether the frame of the recording is taken for the patient's."""
+        return self.recording is not None and not self._from[_REGISTRATION]
+
     def take(self, recording: SequenceRecord) -> None:
         """Use a recording from now on, in its place in the patient, if it is known.
 

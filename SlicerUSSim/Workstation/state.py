@@ -150,8 +150,9 @@ class SequenceState:
     mask: str = ""
     playing: bool = False
     comparison: ComparisonMode = ComparisonMode.BESIDE
-    #: Cost between simulated and real image, as text
+    #: Cost between simulated and real image, as text, and whether they are of different poses
     similarity: str = ""
+    is_elsewhere: bool = False
 
 
 @dataclass
@@ -194,9 +195,8 @@ class FitState:
     """The fit to real ultrasound."""
 
     free: list[FreeParameter] = field(default_factory=list)
-    #: Best cost during the fit, and a summary as text
+    #: Best cost during the fit
     curve: list[float] = field(default_factory=list)
-    costs: str = ""
     #: Caption of the best image so far (stream "best") of a fit, which is shown while it runs
     best: str = ""
 

@@ -374,6 +374,7 @@ def _restarted(
     settings = simulator.settings
     costs_of_best, found = [best_cost], []
     axes = cost.axes(best) if restarts else None
+    search.is_aside = True
     try:
         for number in range(1, restarts + 1):
             simulator.settings = replace(settings, seed=(settings.seed + 7919 * number) % 2**32)
@@ -385,7 +386,7 @@ def _restarted(
             units = _descended_again(search, cost, algorithm, stage, start, axes, budget, enough)
             found.append((units, search.best_cost(stage) - costs_of_best[-1]))
     finally:
-        simulator.settings = settings
+        simulator.settings, search.is_aside = settings, False
     return _Again(costs_of_best, found)
 
 

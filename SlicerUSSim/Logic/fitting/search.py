@@ -101,6 +101,8 @@ class Search:
         self.progress, self.image = progress, image
         self.history: list[Evaluation] = []
         self._best: Evaluation | None = None
+        #: Whether evaluations are with another cost, so that none of them is the best
+        self.is_aside = False
 
     def minimise(
         self,
@@ -171,7 +173,8 @@ class Search:
         entry = Evaluation(stage, key, cost)
         self.history.append(entry)
         # A new stage may have another cost function, so earlier values are not comparable.
-        if self._best is None or self._best.stage != stage or cost < self._best.cost:
+        is_new = self._best is None or self._best.stage != stage
+        if self._best is None or (not self.is_aside and (is_new or cost < self._best.cost)):
             self._best = entry
         if self.progress is not None:
             best = self._best

@@ -167,7 +167,9 @@
     canvas.getContext("2d").drawImage(image.bitmap, 0, 0);
     kept.hidden = false;
     const { patient, time } = image.meta;
-    document.getElementById("kept-caption").textContent = `Kept: ${patient}, ${time.slice(11, 19)} UTC`;
+    const values = [...document.querySelectorAll("#image-values div")].map((one) => one.textContent.trim()).join(", ");
+    document.getElementById("kept-caption").textContent = `Kept: ${patient}, ${time.slice(11, 19)} UTC, ${values}`;
+    marks.push(...marks.filter((mark) => mark.screen === "simulated").map((mark) => ({ ...mark, screen: "kept" })));
     screens.put("kept", canvas.transferToImageBitmap(), image.meta);
   }
 

@@ -66,7 +66,8 @@ import "./measure.js";
       : "Move the probe with the mouse to measure latency";
   }
 
-  // Whether a key belongs to the focused element: all of a field for text, those that change a slider or a choice.
+  // Whether a key belongs to the focused element: all of a field for text until Enter, those that change a slider (Space
+  // does not: it freezes) or a choice.
   const NOT_TEXT = ["checkbox", "radio", "button", "submit", "file", "range"];
   const CHANGES = ["ArrowLeft", "ArrowRight", "ArrowUp", "ArrowDown", "Home", "End", "PageUp", "PageDown", " ", "Enter"];
   function isTaken(key, element) {
@@ -74,8 +75,15 @@ import "./measure.js";
     const isText = element.tagName === "INPUT" && !NOT_TEXT.includes(element.type);
     if (isText || element.isContentEditable || element.tagName === "TEXTAREA") return true;
     const hasValue = element.closest("select, input[type=range], [role=slider], [role=menu], [role=listbox], [role=dialog]");
-    return Boolean(hasValue) && CHANGES.includes(key);
+    return Boolean(hasValue) && CHANGES.includes(key) && !(key === " " && element.type === "range");
   }
+  // After Enter, and a slider that was dragged, the next key is for the image.
+  window.addEventListener("keydown", ({ key, target }) => {
+    if (key === "Enter" && target.matches?.("input[type=number]")) target.blur();
+  });
+  window.addEventListener("pointerup", ({ target }) => {
+    if (target.matches?.("input[type=range]")) target.blur();
+  });
 
   // The time of a mouse event is sent to the server just before the event itself.
   window.addEventListener(
