@@ -67,11 +67,7 @@ class Advice:
                 self._panel.act(self._presenter.segmenting.segment)
 
             return line, f"Segment as {chosen}", segment
-        if self._registration.is_waiting:
-            return "The real ultrasound is not calibrated: its place in the patient is not known", "", lambda: None
-        if self._registration.is_assumed and not line:
-            return "The real ultrasound is not registered: its frame is taken for the patient's", "", lambda: None
-        return line, "", lambda: None
+        return line or self._registration.doubt, "", lambda: None
 
     def _first(self, label: str) -> str:
         """The first line of a label that a user should check."""

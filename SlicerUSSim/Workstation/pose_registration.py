@@ -56,9 +56,12 @@ class Registration:
         return self.recording is not None and self._logic.parameters.real is None
 
     @property
-    def is_assumed(self) -> bool:
-        """Whether the frame of the recording is taken for the patient's."""
-        return self.recording is not None and not self._from[_REGISTRATION]
+    def doubt(self) -> str:
+        """What is assumed or not known of the recording's place, or ""."""
+        if self.is_waiting:
+            return "The real ultrasound is not calibrated: its place in the patient is not known"
+        is_assumed = self.recording is not None and not self._from[_REGISTRATION]
+        return "The real ultrasound is not registered: its frame is taken for the patient's" if is_assumed else ""
 
     def take(self, recording: SequenceRecord) -> None:
         """Use a recording from now on, in its place in the patient, if it is known.
