@@ -175,8 +175,7 @@ class BrowserPanel:
 
     def clearErrors(self) -> None:
         """Remove all errors, which are about what was before."""
-        with self.shared.changing() as now:
-            now.messages.errors = []
+        self.shared.put("messages", {"errors": []})
 
     def failed(self, error: Exception) -> None:
         """Show an exception that a task did not catch; an internal error is also logged with its traceback."""
@@ -275,8 +274,7 @@ class BrowserPanel:
             return
         best = np.minimum.accumulate(np.asarray(memoryview(columns[2])))  # a new stage begins with its own
         chosen = np.unique(np.linspace(0, len(best) - 1, _CURVE_POINTS).round().astype(int))
-        with self.shared.changing() as now:
-            now.fit.curve = best[chosen].round(5).tolist()
+        self.shared.put("fit", {"curve": best[chosen].round(5).tolist()})
 
     def _show_work(self) -> None:
         work = self._under_way[-1] if self._under_way else None
