@@ -476,7 +476,7 @@ def test_keys_and_sliders_move_the_probe(page):
 # ---- tissues, settings -----------------------------------------------------------------------------------------------
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_changed_tissue_changes_the_image_and_nonsense_is_refused(page):
     open_section(page, "Tissues")
     cell, before = page.get_by_label("white matter mu0"), pixels(page)
@@ -579,7 +579,7 @@ def fit(page: Page, evaluations: int) -> None:
     click(page, "#fitButton")
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_fit_outlives_its_page_and_is_applied_and_reverted(page, browser, url):
     page.evaluate("window.trame.trigger('show_number', [2])")
     settled(page)
