@@ -77,6 +77,7 @@
 // or length: one that only one of them has would vanish, or count twice, with the least movement of the probe.
 #define SHARED 0.015625f
 #define SHARED_MM 0.01f
+#define MOST_MOVED 1.3f     // cycles: depth_moved, with LEAST_PART and MOST_CYCLES of strips.cl
 #define MOST_DARK 40        // places along a piece at which tissue is looked at for lobes
 #define BATCH (16 * LANES)  // cells waiting to be computed; rows are packed end to end so that every lane has work
 
@@ -111,7 +112,7 @@ typedef struct {
   float4 later;  // displayed depth per mm of lateral offset: to the left, its change; to the right, its change
   float depth0, slope;
   float from_mm, to_mm;    // ranges whose scatterers belong to this piece
-  int moved;               // samples by which these depths change at most
+  float moved;             // by how many mm these depths change at most
   float path0;             // path length from the face at the near end
   float reach_l, reach_e;  // largest lateral and elevational distance
   int u, v, w, first;
@@ -400,8 +401,8 @@ inline floatn share_of(const Piece *piece, floatn range, floatn right) {
 inline void place_scatterers(Frame frame, const Piece *piece, const Cells *cells, int count, Batch *batch) {
   const float cell = frame->cell_mm, grain = cell / GRAINS, first_u = 0.5f * grain - piece->start.x;
   // The ranges of which something is seen in these samples, and of which a part belongs to this piece
-  const float before = (piece->first - 1 - piece->moved) * frame->sample_mm - piece->depth0;
-  const float behind = (piece->first + CHUNK + piece->moved) * frame->sample_mm - piece->depth0;
+  const float before = (piece->first - 1) * frame->sample_mm - piece->moved - piece->depth0;
+  const float behind = (piece->first + CHUNK) * frame->sample_mm + piece->moved - piece->depth0;
   const float nearest = fmax(piece->from_mm - SHARED_MM, before / piece->slope);
   const float farthest = fmin(piece->to_mm + SHARED_MM, behind / piece->slope);
   const int u = piece->u, v = piece->v, w = piece->w;
@@ -461,7 +462,7 @@ inline void compute_echoes(const Patient *patient, const Piece *piece, Batch *ba
 #ifdef LOBES
     STORE_LANES(beside.range - piece->low, batch->beyond + begin);
 #else
-    if (piece->moved > 0) {
+    if (piece->moved > 0.0f) {
       const floatn along = beside.along, aside = beside.aside;
       depth = fma(min(aside, (floatn)(0.0f)), line_lanes(along, piece->later.x, piece->later.y), depth);
       depth = fma(max(aside, (floatn)(0.0f)), line_lanes(along, piece->later.z, piece->later.w), depth);
@@ -786,10 +787,11 @@ inline float depth_moved(__global const Segment *segment) {
   return 0.0f;
 #else
   const float4 left = vload4(0, segment->left), right = vload4(0, segment->right);
-  const float2 length = (float2)(0.0f, segment->length_mm);
-  const float2 to_left = (left.x + left.y * length) * (left.z + left.w * length);
-  const float2 to_right = (right.x + right.y * length) * (right.z + right.w * length);
-  const float2 most = fmax(fabs(to_left), fabs(to_right));
+  const float length = segment->length_mm;
+  const float2 from = (float2)(left.x, right.x), later = (float2)(left.z, right.z);
+  const float2 to = from + length * (float2)(left.y, right.y), later_to = later + length * (float2)(left.w, right.w);
+  // A product of two linear functions is among its ends and the point that its tangents there have in common.
+  const float2 most = fmax(fmax(fabs(from * later), fabs(to * later_to)), 0.5f * fabs(from * later_to + to * later));
   return (1.0f + 2.0f * SHARED) * fmax(most.x, most.y);
 #endif
 }
@@ -893,8 +895,13 @@ __kernel void scatter(Frame frame, __global const ushort *voxels, __global const
     piece.first = first;
     piece.slope = segment->depth_per_mm;
     piece.depth0 = segment->depth_mm;
+    // Most segments are elsewhere.
+    const float farthest = MOST_MOVED / frame->cycles_per_mm;
+    if (piece.depth0 > depth_high + farthest ||
+        piece.depth0 + piece.slope * segment->length_mm < depth_low - farthest)
+      continue;
     const float moved = depth_moved(segment);
-    piece.moved = moved > 1e-5f ? (int)ceil(moved / frame->sample_mm) : 0;
+    piece.moved = moved > 1e-5f ? moved : 0.0f;
     const float before = piece.depth0 + moved, behind = piece.depth0 - moved;
     const float segment_low = fmax(0.0f, (block_low - before) / piece.slope);
     const float segment_high = fmin(segment->length_mm, (block_high - behind) / piece.slope);

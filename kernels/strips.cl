@@ -14,6 +14,7 @@
 #define LEAST_APART 0.5f   // distance of two axes, in that without tissue, ...
 #define MOST_APART 1.5f    // ... at which they are as those of neighbours are
 #define MOST_CYCLES 0.25f  // by which a line's depths are changed at its border
+#define LEAST_PART 0.1f    // of its half width at the other end, by which these depths change at most so much per mm
 
 // The border towards a neighbouring line (`side` -1 or 1) at a length along a segment: its distance from the axis, and
 // what is added to the displayed depth there. `known` is the number of the neighbour's segment that was beside last.
@@ -59,7 +60,7 @@ __kernel void strips(Frame frame, __global Segment *segments, __global const int
     for (int side = -1; side <= 1; side += 2) {
       const float2 from = border_at(frame, segments, segment_counts, line, side, segment, 0.0f, known + (side > 0));
       const float2 to = border_at(frame, segments, segment_counts, line, side, segment, length, known + (side > 0));
-      const float least = fmax(0.1f * fmax(from.x, to.x), 1e-4f);  // all lines of a sector begin at one point
+      const float least = fmax(LEAST_PART * fmax(from.x, to.x), 1e-4f);  // all lines of a sector begin at one point
       const float later = side * from.y / fmax(from.x, least), later_to = side * to.y / fmax(to.x, least);
       const float4 border =
           (float4)(side * from.x, side * (to.x - from.x) * per_mm, later, (later_to - later) * per_mm);
