@@ -796,6 +796,27 @@ inline float depth_moved(__global const Segment *segment) {
 #endif
 }
 
+// The factor by which curved mirrors lower the power of speckle at a path length: the integral of what is transmitted
+// times what is received, re the same behind plane ones.
+inline float mirrored_power(Frame frame, float path, float4 tube, float cosine) {
+  if (tube.x == 1.0f && tube.z == 1.0f) return 1.0f;
+  const float receive = fmax(path * frame->receive_sigma_slope, frame->receive_sigma_min) / cosine;
+  const float receive2 = receive * receive, length = 0.5f * TWO_PI * frame->cycles_per_mm * receive2;
+  // (Compounded waves are in focus everywhere.)
+  const float transmit2 = transmit_variance(frame, path, 1.0f, cosine);
+  float mirrored2 = transmit2 * mirrored_beam(0.0f, 0.5f * TWO_PI * frame->cycles_per_mm * transmit2, tube.x, tube.y);
+  float least = 1e30f;
+  for (int zone = 0; zone < frame->transmit_zones; zone++) {
+    const float away = path - frame->transmit_focus[zone], sigma = frame->transmit_sigma[zone] / cosine;
+    const float rayleigh = frame->transmit_rayleigh[zone] / (cosine * cosine), a = away / rayleigh;
+    const float here = sigma * sigma * (1.0f + a * a);
+    if (here < least) mirrored2 = sigma * sigma * mirrored_beam(away, rayleigh, tube.x, tube.y), least = here;
+  }
+  const float lateral = (transmit2 + receive2) / (mirrored2 + receive2 * mirrored_beam(0.0f, length, tube.x, tube.y));
+  const float away = path - frame->elevation_focus, rayleigh = frame->elevation_rayleigh, b = away / rayleigh;
+  return sqrt(lateral * (1.0f + b * b) / mirrored_beam(away, rayleigh, tube.z, tube.w));
+}
+
 // The widths and gains of a piece of a segment between two lengths along it, linear between those at the ends.
 inline void set_ends(const Patient *patient, __global const Segment *segment, const Strips *strips, float low,
                      float high, float to_apex, Piece *piece) {
@@ -849,17 +870,16 @@ inline void set_ends(const Patient *patient, __global const Segment *segment, co
   // `apart` has the power apart / sigma_l of both at the displayed depth. A pulse covers 1 / slope of its length.
   const float gain = log2_scalar(segment->weight * segment->attenuation * frame->speckle_scale * 2.50662827f);
   const float decay = LOG2_E * segment->decay_per_mm;
-  // Behind a curved mirror the same power is spread over a wider tube.
-  const float4 tube_low = tube_after(vload4(0, segment->tube), low);
-  const float4 tube_high = tube_after(vload4(0, segment->tube), high);
-  piece->gain0 = gain + LOG2_E * band_low - decay * low +
-                 0.5f * log2_scalar(piece->slope * wide_low /
-                                    (tall_low * tube_low.x * tube_low.z * apart.x * line_distance(frame, shown_low)));
-  piece->gain1 =
-      gain + LOG2_E * band_high - decay * high +
-      0.5f * log2_scalar(piece->slope * wide_high /
-                         (tall_high * tube_high.x * tube_high.z * apart.y * line_distance(frame, shown_high))) -
-      piece->gain0;
+  const float4 tube = vload4(0, segment->tube);
+  const float left_low = mirrored_power(frame, path_low, tube_after(tube, low), strips->cosine);
+  const float left_high = mirrored_power(frame, path_high, tube_after(tube, high), strips->cosine);
+  piece->gain0 =
+      gain + LOG2_E * band_low - decay * low +
+      0.5f * log2_scalar(piece->slope * wide_low * left_low / (tall_low * apart.x * line_distance(frame, shown_low)));
+  piece->gain1 = gain + LOG2_E * band_high - decay * high +
+                 0.5f * log2_scalar(piece->slope * wide_high * left_high /
+                                    (tall_high * apart.y * line_distance(frame, shown_high))) -
+                 piece->gain0;
 }
 
 ONE_BY_ONE
@@ -897,8 +917,7 @@ __kernel void scatter(Frame frame, __global const ushort *voxels, __global const
     piece.depth0 = segment->depth_mm;
     // Most segments are elsewhere.
     const float farthest = MOST_MOVED / frame->cycles_per_mm;
-    if (piece.depth0 > depth_high + farthest ||
-        piece.depth0 + piece.slope * segment->length_mm < depth_low - farthest)
+    if (piece.depth0 > depth_high + farthest || piece.depth0 + piece.slope * segment->length_mm < depth_low - farthest)
       continue;
     const float moved = depth_moved(segment);
     piece.moved = moved > 1e-5f ? moved : 0.0f;

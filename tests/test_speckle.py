@@ -146,7 +146,7 @@ def test_speckle_near_the_face_of_a_phased_array_has_its_level():
 
 @pytest.mark.slow
 def test_rare_scatterers_of_a_15_mhz_array_are_sparse_as_predicted():
-    """There are 2.4 in the smallest resolution cell: the slice is thinnest in front of the focus of the lens, at 9 mm."""
+    """There are 2.4 in the smallest resolution cell: the slice is thinnest in front of the lens's focus, at 9 mm."""
     tissue, probe = replace(SPECKLE, mu1=3.0), PROBES["linear_15"]
     depth, cell, expected = smallest_cell(probe, tissue, 1.0)
     assert 125_000 * tissue.scatterer_share * cell == pytest.approx(2.4, abs=0.1) and 8.0 < depth < 11.0

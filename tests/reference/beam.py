@@ -77,6 +77,29 @@ class Beam:
         transmit2, receive2 = self._one_way(s, frequency, cosine)
         return np.sqrt(np.maximum(self.of["wavefront_curvature"] * (receive2**-2.0 - transmit2**-2.0), 0.0))
 
+    def mirrored_power(self, s: np.ndarray, tube: np.ndarray, along: np.ndarray, cosine: float) -> np.ndarray:
+        """What curved mirrors leave of the power of speckle; `tube` as in SEGMENT, `along` from where it is."""
+        wide, growth = np.maximum(tube[::2, None] + tube[1::2, None] * along - 1.0, 0.0), tube[1::2]
+        behind = [w / max(g, 1e-9) for w, g in zip(wide, growth, strict=True)]  # the mirror
+
+        def squared(axis: int, away: np.ndarray | float, length: np.ndarray | float) -> np.ndarray:
+            turned = away + wide[axis] * (away - behind[axis])
+            return (1.0 + wide[axis]) ** 2 + (turned / length) ** 2
+
+        of, zones, per_mm2 = self.of, int(self.of["transmit_zones"]), np.pi * self.of["cycles_per_mm"]
+        transmit2, receive2 = self._one_way(s, 1.0, cosine)
+        if zones == 0:
+            mirrored2 = transmit2 * squared(0, 0.0, per_mm2 * transmit2)
+        else:
+            sigma, focus, length = (of[f"transmit_{name}"][:zones, None] for name in ("sigma", "focus", "rayleigh"))
+            sigma, length = sigma / cosine, length / cosine**2
+            at = np.argmin(sigma * np.hypot(1.0, (s - focus) / length), axis=0)
+            sigma, focus, length = (values[at, 0] for values in (sigma, focus, length))
+            mirrored2 = sigma**2 * squared(0, s - focus, length)
+        lateral = (transmit2 + receive2) / (mirrored2 + receive2 * squared(0, 0.0, per_mm2 * receive2))
+        away, length = s - of["elevation_focus"], of["elevation_rayleigh"]
+        return np.sqrt(lateral * (1.0 + (away / length) ** 2) / squared(1, away, length))
+
     def line_cosine(self, line: float) -> float:
         """Of the angle of a line to the normal of a flat face; `line` in scan lines from the first."""
         if not self.of["flat_face"]:

@@ -68,13 +68,12 @@ def scatterer_lines(record, lens: LensBeam, labels: np.ndarray, tissues: np.ndar
         # The image is as wide as the beam at the displayed depth.
         shown = np.maximum(segment["depth_mm"] + segment["depth_per_mm"] * along, begins)
         wide = beam.lateral_sigma(shown - begins, frequency, cosine) / beam.line_distance(shown)
-        tube = segment["tube"]
-        spread = (tube[0] + tube[1] * along) * (tube[2] + tube[3] * along) * apart
+        left = beam.mirrored_power(path, segment["tube"], along, cosine)
         amplitude = (
             amplitude * segment["weight"] * segment["attenuation"] * of["speckle_scale"] * np.sqrt(2.0 * np.pi**1.5)
         )
         amplitude *= np.exp(beam.gain_of_band(loss) - segment["decay_per_mm"] * along) * root
-        amplitude *= np.sqrt(segment["depth_per_mm"] * wide / spread)
+        amplitude *= np.sqrt(segment["depth_per_mm"] * wide * left / apart)
         depth = segment["depth_mm"] + segment["depth_per_mm"] * at
         for side, (_, _, later, change) in ((aside < 0.0, segment["left"]), (aside > 0.0, segment["right"])):
             depth += np.where(side, aside * (later + change * along), 0.0)
