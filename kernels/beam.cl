@@ -80,8 +80,8 @@ __kernel void lateral_beam(Frame frame, __global const float *edge_re, __global 
   __global const float *stored = of_line + LOSS_WORDS * node + 2;
   const float frequency = 0.5f * (stored[0] + stored[LOSS_WORDS]);
   SPREAD(float, spread_, spread);
-  const float across = line_distance(frame, middle + start) / spread_[0];
-  const float curved = lateral_curvature(frame, middle, 1.0f / frequency, cosine) * across * across;
+  const float across = line_distance(frame, middle + start);
+  const float curved = spread_curvature(frame, middle, 1.0f / frequency, cosine, spread_[0]) * across * across;
   const float turns = curved / (2.0f * TWO_PI);
   // Edge `edge` is half a step before traced line `edge`. Edges come in pairs, n + 1/2 lines to either side. Their
   // weights w are a Gaussian by recurrence: w(n + 1) = w(n) ratio(n).

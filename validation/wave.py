@@ -26,13 +26,26 @@ def speckle_power(
 ) -> np.ndarray:
     """(depths,) mean power of speckle on a scan line: the integral of the transmitted times the received intensity.
 
-    Parameters as in beam_intensities.
+    Parameters as in beam_fields.
     """
     _, transmitted, received = beam_intensities(speed, depths_mm, nepers_per_mm=nepers_per_mm, **beam)
     return (transmitted * received).sum(axis=1)
 
 
 def beam_intensities(
+    speed: Map | None,
+    depths_mm: np.ndarray,
+    **beam,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Intensities across a scan line: (lateral,) place in mm, (depths, lateral) transmitted and received.
+
+    Parameters as in beam_fields.
+    """
+    x, transmitted, received = beam_fields(speed, depths_mm, **beam)
+    return x, np.abs(transmitted) ** 2, np.abs(received) ** 2
+
+
+def beam_fields(
     speed: Map | None,
     depths_mm: np.ndarray,
     *,
@@ -44,7 +57,7 @@ def beam_intensities(
     steering_rad: float = 0.0,
     nepers_per_mm: Map | None = None,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Intensities across a scan line: (lateral,) place in mm, (depths, lateral) transmitted and received.
+    """Complex amplitudes across a scan line: (lateral,) place in mm, (depths, lateral) transmitted and received.
 
     `speed` gives metres per second at lateral positions and depths in the line's frame (mm, any one shape); None is a
     medium of the reference speed. `nepers_per_mm` is what amplitudes lose there, one way. The aperture transmits to
@@ -68,7 +81,7 @@ def beam_intensities(
     waves = np.clip((0.5 * open_mm - np.abs(face)) / _DX_MM + 0.5, 0.0, 1.0)
     waves = waves * np.exp(-1j * k * (np.hypot(x, away) - away))
     ends = np.rint((np.asarray(depths_mm) - start) / _DZ_MM).astype(int)
-    transmitted, received = np.zeros((2, len(ends), _WIDTH))
+    transmitted, received = np.zeros((2, len(ends), _WIDTH), complex)
     for n in range(ends.max()):
         waves = np.fft.ifft(np.fft.fft(waves, axis=1) * step, axis=1) * sides
         if speed is not None:
@@ -78,7 +91,7 @@ def beam_intensities(
         if nepers_per_mm is not None:
             waves = waves * np.exp(-nepers_per_mm(x, np.full_like(x, start + (n + 0.5) * _DZ_MM)) * _DZ_MM)
         for at in np.flatnonzero(ends == n + 1):
-            transmitted[at], received[at] = np.abs(waves[[0, at + 1]]) ** 2
+            transmitted[at], received[at] = waves[[0, at + 1]]
     return x, transmitted, received
 
 

@@ -38,8 +38,11 @@ def lateral_beam(record: np.ndarray, traced: np.ndarray, spreads: np.ndarray, fr
         blocks = np.arange(len(s)) // 16
         middle = np.maximum((16 * blocks + 8) * of["sample_mm"] - start, 0.0)
         of_blocks = frequencies[n].reshape(-1, 16).mean(axis=1)[blocks]
-        curved = beam.lateral_curvature(middle, of_blocks, cosine)
-        curved = curved * (beam.line_distance(middle + start) / spread) ** 2
+        # A beam that tissue has made wider keeps its spatial frequencies.
+        undisturbed2 = beam.lateral_sigma(middle, of_blocks, cosine) ** 2
+        frequencies2 = 1.0 + (beam.lateral_curvature(middle, of_blocks, cosine) * undisturbed2) ** 2
+        curved = np.sqrt(np.maximum(frequencies2 - spread**-2.0, 0.0)) / (spread * undisturbed2)
+        curved = curved * beam.line_distance(middle + start) ** 2 * bool(of["wavefront_curvature"])
         weights = near * np.exp(-0.5 * (apart2 + 1j * curved) * away**2)
         # Interpolation between edges loses some power of what turns from one to the next.
         kept = (2.0 + np.exp(-0.25 * (apart2 + curved**2 / apart2))) / (2.0 + np.exp(-0.25 * apart2))
