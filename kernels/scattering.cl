@@ -566,17 +566,9 @@ inline void vary_scatterers(const Patient *patient, const Piece *piece, Batch *b
 
 // The place of a scatterer in the patient, RAS mm.
 inline float3 place_of(const Piece *piece, const Batch *batch, int i) {
-  const int u = piece->u, v = piece->v;
-  const float along[3] = {batch->u[i], batch->v[i], batch->w[i]};
-  return (float3)(along[u == 0   ? 0
-                        : v == 0 ? 1
-                                 : 2],
-                  along[u == 1   ? 0
-                        : v == 1 ? 1
-                                 : 2],
-                  along[u == 2   ? 0
-                        : v == 2 ? 1
-                                 : 2]);
+  float place[3];
+  place[piece->u] = batch->u[i], place[piece->v] = batch->v[i], place[piece->w] = batch->w[i];
+  return vload3(0, place);
 }
 
 // The factor of the amplitude of a membrane's scatterers there: a log-normal one, whose mean power is 1.
@@ -783,9 +775,6 @@ inline void set_axes(Frame frame, __global const Segment *segment, Piece *piece)
 
 // By how much displayed depths in the strip of a segment differ from those on its axis, at most.
 inline float depth_moved(__global const Segment *segment) {
-#ifdef LOBES
-  return 0.0f;
-#else
   const float4 left = vload4(0, segment->left), right = vload4(0, segment->right);
   const float length = segment->length_mm;
   const float2 from = (float2)(left.x, right.x), later = (float2)(left.z, right.z);
@@ -793,28 +782,26 @@ inline float depth_moved(__global const Segment *segment) {
   // A product of two linear functions is among its ends and the point that its tangents there have in common.
   const float2 most = fmax(fmax(fabs(from * later), fabs(to * later_to)), 0.5f * fabs(from * later_to + to * later));
   return (1.0f + 2.0f * SHARED) * fmax(most.x, most.y);
-#endif
 }
 
 // The factor by which curved mirrors lower the power of speckle at a path length: the integral of what is transmitted
 // times what is received, re the same behind plane ones.
 inline float mirrored_power(Frame frame, float path, float4 tube, float cosine) {
   if (tube.x == 1.0f && tube.z == 1.0f) return 1.0f;
+  const float per_mm2 = 0.5f * TWO_PI * frame->cycles_per_mm;
   const float receive = fmax(path * frame->receive_sigma_slope, frame->receive_sigma_min) / cosine;
-  const float receive2 = receive * receive, length = 0.5f * TWO_PI * frame->cycles_per_mm * receive2;
-  // (Compounded waves are in focus everywhere.)
-  const float transmit2 = transmit_variance(frame, path, 1.0f, cosine);
-  float mirrored2 = transmit2 * mirrored_beam(0.0f, 0.5f * TWO_PI * frame->cycles_per_mm * transmit2, tube.x, tube.y);
-  float least = 1e30f;
+  const float receive2 = receive * receive, transmit2 = transmit_variance(frame, path, 1.0f, cosine);
+  float waist2 = transmit2, away = 0.0f, length = per_mm2 * transmit2, least = 1e30f;  // of compounded waves
   for (int zone = 0; zone < frame->transmit_zones; zone++) {
-    const float away = path - frame->transmit_focus[zone], sigma = frame->transmit_sigma[zone] / cosine;
-    const float rayleigh = frame->transmit_rayleigh[zone] / (cosine * cosine), a = away / rayleigh;
-    const float here = sigma * sigma * (1.0f + a * a);
-    if (here < least) mirrored2 = sigma * sigma * mirrored_beam(away, rayleigh, tube.x, tube.y), least = here;
+    const float a = path - frame->transmit_focus[zone], rayleigh = frame->transmit_rayleigh[zone] / (cosine * cosine);
+    const float sigma = frame->transmit_sigma[zone] / cosine, b = sigma * sqrt(1.0f + a * a / (rayleigh * rayleigh));
+    if (b < least) least = b, waist2 = sigma * sigma, away = a, length = rayleigh;
   }
-  const float lateral = (transmit2 + receive2) / (mirrored2 + receive2 * mirrored_beam(0.0f, length, tube.x, tube.y));
-  const float away = path - frame->elevation_focus, rayleigh = frame->elevation_rayleigh, b = away / rayleigh;
-  return sqrt(lateral * (1.0f + b * b) / mirrored_beam(away, rayleigh, tube.z, tube.w));
+  const float mirrored2 = waist2 * mirrored_beam(away, length, tube.x, tube.y) +
+                          receive2 * mirrored_beam(0.0f, per_mm2 * receive2, tube.x, tube.y);
+  const float from_lens = path - frame->elevation_focus, b = from_lens / frame->elevation_rayleigh;
+  return sqrt((transmit2 + receive2) / mirrored2 * (1.0f + b * b) /
+              mirrored_beam(from_lens, frame->elevation_rayleigh, tube.z, tube.w));
 }
 
 // The widths and gains of a piece of a segment between two lengths along it, linear between those at the ends.
@@ -919,7 +906,11 @@ __kernel void scatter(Frame frame, __global const ushort *voxels, __global const
     const float farthest = MOST_MOVED / frame->cycles_per_mm;
     if (piece.depth0 > depth_high + farthest || piece.depth0 + piece.slope * segment->length_mm < depth_low - farthest)
       continue;
+#ifdef LOBES
+    const float moved = 0.0f;
+#else
     const float moved = depth_moved(segment);
+#endif
     piece.moved = moved > 1e-5f ? moved : 0.0f;
     const float before = piece.depth0 + moved, behind = piece.depth0 - moved;
     const float segment_low = fmax(0.0f, (block_low - before) / piece.slope);

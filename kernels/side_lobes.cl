@@ -45,13 +45,6 @@ inline Place place_at(Frame frame, __global const float *roots, int line, float 
   const float scale = 1.0f / sqrt(power.x * power.y * power.z);
   Place found;
   found.count = 0;
-  if (beside.x + beside.y + beside.z == 0.0f) {
-    const uint key =
-        (uint)(int)cell.x * 0x9E3779B1u + (uint)(int)cell.y * 0x85EBCA77u + (uint)(int)cell.z * 0xC2B2AE3Du;
-    found.bits[found.count] = hash_mix(key ^ frame->seed);
-    found.parts[found.count++] = 1.0f;
-    return found;
-  }
   for (int corner = 0; corner < 8; corner++) {
     const int dx = corner & 1, dy = (corner >> 1) & 1, dz = corner >> 2;
     const float part =
