@@ -23,8 +23,6 @@
 
 #include "common.clh"
 
-DEFINE_ELEVATION(float8, elevation_sigma8)
-
 #define ROWS 3
 // Nodes and weights of the three-point Gauss-Hermite rule for the power of the elevational beam.
 #define ROW_SIGMA 1.2247449f
@@ -34,7 +32,8 @@ DEFINE_ELEVATION(float8, elevation_sigma8)
 #define MOST_SPREAD 3.0f      // of a beam
 #define BENT_PER_MM 4.0f      // nepers, both ways, that a line loses in strong tissue that bends what goes through
 #define LEAST_PER_MM 1e-3f    // nepers by which strong tissue differs from soft, so that its ends are seen in the sums
-#define MOST_GATHERED 64      // lines whose strips have scatterers in common, ...
+#define NOT_TOGETHER 1.7f     // axes from 1 / this of their distance without tissue on do not come together; ...
+#define MOST_GATHERED 64      // ... lines whose strips have scatterers in common, ...
 #define LEAST_GATHERED 0.4f   // ... and the least part that is left of their power
 #define LEFT_FOR_MEANS 0.01f  // of the power of a line that strong tissue stops
 #define EDGE_OF_BONE 0.75f    // part of a cell from which lines are lost in it by their length
@@ -119,7 +118,9 @@ __kernel void fans(Frame frame, __global const ushort *voxels, __global const fl
   for (int depth = 1; depth < depths; depth += 8) {
     // Eight look-ups at once, which are nearly always in one tissue.
     const float8 path = (depth - 0.5f + (float8)(0, 1, 2, 3, 4, 5, 6, 7)) * length;
-    const float8 sigma = elevation_sigma8(frame, path);
+    // Over eight of them it is nearly linear.
+    const float sigma0 = elevation_sigma(frame, path.s0), sigma7 = elevation_sigma(frame, path.s7);
+    const float8 sigma = fma((float8)(0, 1, 2, 3, 4, 5, 6, 7), (float8)((sigma7 - sigma0) / 7.0f), (float8)(sigma0));
     const float8 x = clamp(start.x + path * step.x + sigma * aside.x, (float8)(0.0f), (float8)(top.x));
     const float8 y = clamp(start.y + path * step.y + sigma * aside.y, (float8)(0.0f), (float8)(top.y));
     const float8 z = clamp(start.z + path * step.z + sigma * aside.z, (float8)(0.0f), (float8)(top.z));
@@ -662,16 +663,17 @@ __kernel void keep_levels(Frame frame, __global const float *screens_, __global 
   const float path = (node + 1) * frame->screen_step, spread = spreads[2 * at];
   const float traced_lines = (float)(frame->traced_lines - 1) / (frame->screen_lines - 1);
   const float apart = line_distance(frame, path + traced_start(frame, line * traced_lines));
-  const float sigma = lateral_sigma(frame, path) / (apart * traced_lines);
+  const float cosine = traced_cosine(frame, line * traced_lines);
+  const float sigma = lateral_sigma(frame, path, 1.0f, cosine) / (apart * traced_lines);
   spreads[2 * at + 1] =
       sqrt(mean_passed(frame, screens_, node, line, sigma) / mean_passed(frame, screens_, node, line, sigma * spread));
 }
 
 // The factor by which the power of speckle would change where the axes of neighbouring lines come together to the part
-// `ratio` of their distance: a scatterer is then in the strips of several lines, which add up with phases that differ
-// by `turns` from one to the next (docs/physics.md#beams-from-an-aperture).
-inline float gathered_power(Frame frame, float path, float apart_mm, float ratio, float turns) {
-  const float apart = 0.5f * apart_mm / lateral_sigma(frame, path);
+// `ratio` of their distance: several lines then look at the same tissue, and add up with phases that differ by `turns`
+// from one to the next (docs/physics.md#beams-from-an-aperture).
+inline float gathered_power(Frame frame, float path, float apart_mm, float ratio, float turns, float cosine) {
+  const float apart = 0.5f * apart_mm / lateral_sigma(frame, path, 1.0f, cosine);
   // Their depths differ, too, by a part of the pulse. Its deviation is 2.3548 / (2 pi bandwidth) cycles.
   const float later = 1.3341168f * frame->fractional_bandwidth * turns;
   const float decay = apart * apart + later * later;
@@ -691,7 +693,7 @@ inline float gathered_power(Frame frame, float path, float apart_mm, float ratio
 // mm^2, by which it is wider than the received one. (Over the width of that, images average by the lateral beam.)
 inline float extra_variance(Frame frame, float path) {
   const float receive = fmax(path * frame->receive_sigma_slope, frame->receive_sigma_min);
-  return 0.5f * fmax(transmit_variance(frame, path, 1.0f) - receive * receive, 0.0f);
+  return 0.5f * fmax(transmit_variance(frame, path, 1.0f, 1.0f) - receive * receive, 0.0f);
 }
 
 // A place between two screen lines
@@ -760,8 +762,8 @@ inline float2 mean_shades(Frame frame, __global const float *shades, int node, f
                   -log_fast(mean_lit(frame, shades, 1, node, place, end_sigma)));
 }
 
-// The beams of traced lines, interpolated between screens; 0 at the face. Axes that come together must not create
-// energy. One work-item computes one depth of one traced line. Global size (1 + depths, traced lines).
+// The beams of traced lines, interpolated between screens; 0 at the face. One work-item computes one depth of one
+// traced line. Global size (1 + depths, traced lines).
 __kernel void beams(Frame frame, __global const float *screens_, __global const float *shades, int all_soft,
                     __global float *beams_) {
   const int number = get_global_id(0), line = get_global_id(1), depths = frame->screen_depths;
@@ -796,6 +798,7 @@ __kernel void beams(Frame frame, __global const float *screens_, __global const 
   const float4 per_strip = (right - left) * per_line;  // from line to line
   const float tilt = beam.z / path;
   const float turns = frame->cycles_per_mm * (per_strip.y - (apart + per_strip.z) * tilt);
-  beam.x += 0.5f * log_fast(gathered_power(frame, path, apart, 1.0f + per_strip.z / apart, turns));
+  beam.x += 0.5f * log_fast(gathered_power(frame, path, apart, NOT_TOGETHER * (1.0f + per_strip.z / apart), turns,
+                                           traced_cosine(frame, (float)line)));
   vstore4(beam, to, beams_);
 }

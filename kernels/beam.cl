@@ -58,14 +58,14 @@ __kernel void lateral_beam(Frame frame, __global const float *edge_re, __global 
   int sample = get_global_id(0) * LANES, line = get_global_id(1);
   int centre = frame->guard_lines + line * frame->lateral_rays;
   // One width per lane: near a tight focus the width changes from sample to sample.
-  const float start = line_start(frame, (float)line);
+  const float start = line_start(frame, (float)line), cosine = line_cosine(frame, (float)line);
   const floatn s = fmax((TO_FLOATN(LANE_INDEX) + sample) * frame->sample_mm - start, (floatn)(0.0f));
   floatn spread, factor;
   find_spread(frame, spreads, centre, s, &spread, &factor);
   __global const float *of_line = losses + LOSS_WORDS * line * (frame->samples / LOSS_STEP + 1);
   const floatn stretch = 1.0f / frequency_at(of_line, sample);
   const floatn apart = line_distance_lanes(frame, s + start);
-  const floatn sigma = spread * lateral_sigma_lanes_at(frame, s, stretch);
+  const floatn sigma = spread * lateral_sigma_lanes(frame, s, stretch, cosine);
   floatn step = apart / sigma;  // between traced lines, in sigmas
   floatn step2 = step * step;
   floatn narrow2 = fmax(1.0f - step2 / 6.0f, 0.25f);  // (sigma of these weights / sigma of the beam)^2
@@ -80,8 +80,8 @@ __kernel void lateral_beam(Frame frame, __global const float *edge_re, __global 
   __global const float *stored = of_line + LOSS_WORDS * node + 2;
   const float frequency = 0.5f * (stored[0] + stored[LOSS_WORDS]);
   SPREAD(float, spread_, spread);
-  const float across = line_distance(frame, middle + start) / spread_[0];
-  const float curved = lateral_curvature(frame, middle, 1.0f / frequency) * across * across;
+  const float across = line_distance(frame, middle + start);
+  const float curved = spread_curvature(frame, middle, 1.0f / frequency, cosine, spread_[0]) * across * across;
   const float turns = curved / (2.0f * TWO_PI);
   // Edge `edge` is half a step before traced line `edge`. Edges come in pairs, n + 1/2 lines to either side. Their
   // weights w are a Gaussian by recurrence: w(n + 1) = w(n) ratio(n).

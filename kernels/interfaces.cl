@@ -8,7 +8,8 @@
 // by the part `carried`, and the phase over the patch lowers it. For a plane the sum over the patches is that over the
 // whole beam, whatever their number; small targets keep the width of the beam.
 //
-// Buffers: hits, hit_counts (raytracing.cl); centres float [elevational ray] (raytracing.py, ray_centres); walls Wall
+// Buffers: hits, hit_counts (raytracing.cl); centres float [elevational ray] (raytracing.py, ray_centres); planes
+// float2 [PLANE_DEPTHS][PLANE_TILTS] of diffraction.py: (lateral, elevational); walls Wall
 // [traced line][elevational ray * MAX_HITS] with wall_counts, and wall_reach int [traced line], the largest `reach` of
 // a line's walls; re, im float [scan line][stride]: complex baseband impulses (beam.cl).
 
@@ -24,9 +25,9 @@ inline float plane_echo(float phase2, float width) {
 
 // Factor of the echo of a patch. Of the squared phase over the beam (`phase2`) the sum over the patches has what is not
 // `inside` them. Both parts are Gaussian, but for a pulse the product of their peaks is not the peak of their product,
-// which matters as long as the echo of a plane can be seen: up to three radians, -30 dB.
+// which matters as long as the echo of a plane can be seen: up to 4.5 radians, -40 dB.
 inline float patch_echo(float phase2, float inside2, float width) {
-  const float seen = fmin(1.0f, 9.0f / fmax(phase2, 1e-6f)), seen2 = seen * phase2, seen_inside2 = seen * inside2;
+  const float seen = fmin(1.0f, 20.0f / fmax(phase2, 1e-6f)), seen2 = seen * phase2, seen_inside2 = seen * inside2;
   return plane_echo(inside2, width) * plane_echo(seen2, width) /
          (plane_echo(seen_inside2, width) * plane_echo(seen2 - seen_inside2, width));
 }
@@ -46,6 +47,8 @@ inline float bent_patch(float per_mm, float slope, float bend, float variance, f
 #define MOST_PER_STEP 3.0f
 #define MOST_ASIDE 0.7f
 
+#define MOST_MORE 4.3f  // octaves by which the echo of a plane is larger than that of a Gaussian beam
+
 // How far a wall is a plane that bends by `turning` radians within the beam. Others are seen where they are square to
 // it, and a plane there is not what is found beside that.
 inline float flatness(float turning) { return 1.0f / (1.0f + 16.0f * turning * turning); }
@@ -59,14 +62,25 @@ inline float part_carried(float least, float phase, float most, float flat) {
   return part + flat * (1.0f - part) * (1.0f - 1.0f / sqrt(1.0f + share * share));
 }
 
+// The echo of a plane of this tilt re a square one, as an exponent of two, along one `axis` of the aperture's table
+// (diffraction.py); nan where there is none.
+inline float plane_of_aperture(Frame frame, __global const float *planes, float path, float tilt, int axis) {
+  const float deep = clamp(path * ((PLANE_DEPTHS - 1) / frame->depth_mm), 0.0f, PLANE_DEPTHS - 1.001f);
+  const float place = clamp(sqrt(fabs(tilt)) * (PLANE_TILTS - 1), 0.0f, PLANE_TILTS - 1.001f);
+  const int row = (int)deep, column = (int)place;
+  __global const float *near = planes + 2 * (row * PLANE_TILTS + column) + axis, *far = near + 2 * PLANE_TILTS;
+  const float part = place - column;
+  return blend(blend(near[0], near[2], part), blend(far[0], far[2], part), deep - row);
+}
+
 // One work-item computes the walls of one traced line.
 __kernel void find_walls(Frame frame, __global const Hit *hits, __global const int *hit_counts,
-                         __global const float *centres, __global Wall *walls, __global int *wall_counts,
-                         __global int *wall_reach) {
+                         __global const float *centres, __global const float *planes, __global Wall *walls,
+                         __global int *wall_counts, __global int *wall_reach) {
   const int line = get_global_id(0), rays = frame->elevational_rays;
   const float pulse = frame->fractional_bandwidth * 0.42466090f;  // 1 / (2 sqrt(2 ln 2))
   const float per_mm = TWO_PI * frame->cycles_per_mm;
-  const float start = traced_start(frame, (float)line);
+  const float start = traced_start(frame, (float)line), cosine = traced_cosine(frame, (float)line);
   __global Wall *my_walls = walls + line * rays * MAX_HITS;
   int walls_found = 0;
   float farthest = 0.0f;
@@ -74,7 +88,8 @@ __kernel void find_walls(Frame frame, __global const Hit *hits, __global const i
     const int slot = line * rays + ray, count = min(hit_counts[slot], MAX_HITS);
     for (int h = 0; h < count; h++) {
       __global const Hit *hit = hits + slot * MAX_HITS + h;
-      const float2 sigma = beam_sigma(frame, hit->path_mm);
+      const float2 sigma =
+          (float2)(lateral_sigma(frame, hit->path_mm, 1.0f, cosine), elevation_sigma(frame, hit->path_mm));
       // Near the apex of a phased array all lines are within the beam, and every second, fourth ... is enough.
       float step = line_distance(frame, hit->path_mm + start);
       int every = 1;
@@ -83,7 +98,8 @@ __kernel void find_walls(Frame frame, __global const Hit *hits, __global const i
       const float stretch = fmin(1.0f + hit->lateral_slope * hit->lateral_slope, 10.0f);
       const float bend = hit->curvature * stretch * sqrt(stretch), sigma2 = sigma.x * sigma.x;
       const float across = per_mm * hit->lateral_slope, aside = per_mm * hit->elevational_slope;
-      const float phase2 = across * across * sigma2 + aside * aside * sigma.y * sigma.y;
+      const float phase_l = across * across * sigma2, phase_e = aside * aside * sigma.y * sigma.y;
+      const float phase2 = phase_l + phase_e;
       // A patch has a deviation of 0.45 steps: aliases of planes are then below -35 dB at one frequency. The beam times
       // the patch would be wider than the beam; this width gives a row of hits, each a strip one step wide, the beam's.
       const float width2 = sigma2 + step * step / 12.0f;
@@ -109,7 +125,14 @@ __kernel void find_walls(Frame frame, __global const Hit *hits, __global const i
       // where patches are wide, this is within 2 dB of theory for spheres and for cylinders along and across the plane.
       const float zones = per_mm * bend * inside * sigma2;
       wall.echo /= sqrt(sqrt(1.0f + zones * zones));
-      const float share = patch_echo(phase2, inside2, pulse);
+      // What planes echo is a matter of the edges of the apertures, which the beam's Gaussian does not have.
+      const float gauss = plane_echo(flat * phase_l + flat_aside * phase_e, pulse);
+      const float of_aperture = flat * plane_of_aperture(frame, planes, hit->path_mm, hit->lateral_slope / cosine, 0) +
+                                flat_aside * plane_of_aperture(frame, planes, hit->path_mm, hit->elevational_slope, 1) -
+                                log2_scalar(gauss);
+      // More than this would raise what the sum over the patches of a steep wall leaves, which no wall echoes.
+      const float more = of_aperture == of_aperture ? clamp(of_aperture, -60.0f, MOST_MORE) : 0.0f;
+      const float share = patch_echo(phase2, inside2, pulse) * exp2_scalar(more);
       if (share < 1e-4f) continue;
       const float lines = step / sqrt(width2), per_line = lines / every;
       wall.depth_per_line = carried * hit->lateral_slope * step / every;

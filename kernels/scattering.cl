@@ -4,10 +4,10 @@
 // One work-item computes CHUNK samples of one traced line. It processes the segments of the line's ray tree that
 // overlap these samples in time and, for each, the cells of the patient-fixed scatterer lattice beside it: laterally
 // half-way to the next traced line, and as far as the beam reaches in the elevation direction. A scatterer is weighted
-// by the elevational profile and distributed linearly between the two edges of its strip (buffer line 2 line: left,
-// 2 line + 1: right); beam.cl then distributes it over all scan lines whose beam covers it. So each scatterer is
-// computed once per image, not once per beam. Work-items write disjoint samples in a fixed order: a pose always gives
-// the same bits. Global size (chunks, traced lines).
+// by the elevational profile (a table, lens_at) and distributed linearly between the two edges of its strip (buffer
+// line 2 line: left, 2 line + 1: right); beam.cl then distributes it over all scan lines whose beam covers it. So each
+// scatterer is computed once per image, not once per beam. Work-items write disjoint samples in a fixed order: a pose
+// always gives the same bits. Global size (chunks, traced lines).
 //
 // Position, sign and existence of a cell's scatterer come from a hash of the cell's index and the seed. It stands for
 // all scatterers that tissue has in the cell: it exists if there is any, and its amplitude is the tissue's in every
@@ -21,9 +21,8 @@
 //
 // With LOBES defined, the echoes are those that elevational side lobes receive, and are added to those that are there.
 // Lobes have a record and a coarser lattice of their own (side_lobes.py), whose cells are wider than the strip of a
-// line: one work-item computes `together` lines, along the path of the one in their middle. A scatterer is weighted by
-// the diffraction pattern (diffraction.py) instead of the main beam's profile. Only pieces of the path in dark tissue
-// count.
+// line: one work-item computes `together` lines, along the path of the one in their middle. The table is that of what
+// the main beam leaves out. Only pieces of the path in dark tissue count.
 //
 // With FOUND defined, planes have two words: some are of sheets that were found in the MRI (sheets.clh). Beside these
 // nothing else is membrane.
@@ -34,8 +33,8 @@
 // texture uint [k][j][i] (one element without TEXTURE); sites float2 [label], the share of cells with a scatterer, in
 // 1/65536, and its amplitude, behind them whether it is dark (with LOBES), behind that UNEVEN_WORDS of
 // imaging/scattering.py; re, im float [2 traced line + side][stride]; with VARIED also [part] before these, and part_of
-// int [label], -1 for a tissue in none; with LOBES lobes float [LOBE_DEPTHS][LOBE_DISTANCES], and behind them the
-// distance of the last column [LOBE_DEPTHS].
+// int [label], -1 for a tissue in none; beam float2 [LOBE_DEPTHS][LENS_DISTANCES] of probe/lens.py, behind it float
+// [LOBE_DEPTHS] where it ends, and the largest of these, that of the last column.
 
 #include "common.clh"
 #include "sheets.clh"
@@ -55,12 +54,10 @@
 #define PART (CHUNK + 2)  // one extra sample at either end: echoes lie between samples
 #ifdef LOBES
 #define PIECE_BLOCK (4 * BLOCK)  // samples over which gains are assumed linear
-#define LOBE_PARAMETERS , __global const float *lobes, int together
-#define LOBE_TABLE lobes
+#define LOBE_PARAMETERS , int together
 #else
 #define PIECE_BLOCK BLOCK
 #define LOBE_PARAMETERS
-#define LOBE_TABLE 0
 #endif
 
 #ifdef FOUND
@@ -75,7 +72,13 @@
 #define IS_ON_MEMBRANE(label) ((label) == MEMBRANE_LABEL)
 #endif
 
-#define GRAINS 1024.0f      // places of a scatterer along each axis of its cell, in the middle of as many parts
+#define GRAINS 1024.0f  // places of a scatterer along each axis of its cell, in the middle of as many parts
+// Where strips and segments meet, a scatterer passes from one to the other over twice this part of the strip's width,
+// or length: one that only one of them has would vanish, or count twice, with the least movement of the probe.
+#define SHARED 0.015625f
+#define SHARED_MM 0.01f
+#define MOST_MOVED 1.3f     // cycles: depth_moved, with LEAST_PART and MOST_CYCLES of strips.cl
+#define MOST_DARK 40        // places along a piece at which tissue is looked at for lobes
 #define BATCH (16 * LANES)  // cells waiting to be computed; rows are packed end to end so that every lane has work
 
 // What scatters, see above
@@ -84,33 +87,39 @@ typedef struct {
   __global const ushort *voxels;
   __global const uint *planes, *texture;
   __global const float *sites;
+  __global const float *beam;
   __global const int *part_of;  // with VARIED
-  __global const float *lobes;  // with LOBES
 } Patient;
 
 // The strips that a work-item computes: `lines` of them from `left` on, along the path of one in the middle, whose
-// displayed depths begin with `begins`.
+// displayed depths begin with `begins`, and for which the face is foreshortened by `cosine`.
 typedef struct {
   int line, left, lines;
-  float begins;
+  float begins, cosine;
 } Strips;
 
 // Quantities common to all scatterers beside one piece of a segment. Vectors are in the order u, v, w of lattice axes.
 typedef struct {
   float3 start, direction, lateral, elevational;  // of the segment
-  float3 at_start, row_i, row_j, row_k;           // voxel index = at_start + rows * (offset from the segment's start)
+  float3 at_origin, row_i, row_j, row_k;          // voxel index = at_origin + rows * place
   float low, span;                                // first path length of this piece, 1 / its length
-  float narrow0, narrow1;  // elevational exponent of two per mm^2 at the near end, and its change
-  float curved0, curved1;  // elevational phase in cycles per mm^2, likewise
+  float tall0, tall1;      // distances of the beam's table per elevational mm at the near end, and their change
+  float turned0, turned1;  // factor of its phase, likewise
   float gain0, gain1;      // amplitude as an exponent of two, likewise
-  float line0, line1;      // 1 / distance of traced lines, likewise
-  float edge;              // of the strip that begins there: distance re its width
   float bend;              // 1 / (2 radius) of the surfaces of equal range
+  float middle0, middle1;  // of the strip on the segment's lateral axis, and its change per mm of length
+  float half0, half1;      // half the strip's width with what it shares, likewise
+  float4 later;  // displayed depth per mm of lateral offset: to the left, its change; to the right, its change
   float depth0, slope;
-  float from_mm, to_mm;    // path lengths whose scatterers belong to this piece
+  float from_mm, to_mm;    // ranges whose scatterers belong to this piece
+  float moved;             // by how many mm these depths change at most
   float path0;             // path length from the face at the near end
   float reach_l, reach_e;  // largest lateral and elevational distance
   int u, v, w, first;
+#ifdef LOBES
+  float dark[MOST_DARK + 1], dark_step;  // how dark tissue is from `low` on, at intervals in mm
+  int dark_steps;                        // of these in the piece
+#endif
 } Piece;
 
 // Cells that wait to be computed: their u, and of the row the hash and v and w of the first place of its cells
@@ -123,14 +132,14 @@ typedef struct {
 // The `count` scatterers of them which contribute, by stages of scatter_batch
 typedef struct {
   int count;
-  float u[BATCH], v[BATCH], w[BATCH];  // place_scatterers: from the segment's start
+  float u[BATCH], v[BATCH], w[BATCH];  // place_scatterers: from the segment's start; compute_echoes: in the patient
   uint key[BATCH];
   float part[BATCH], right[BATCH], re[BATCH], im[BATCH];  // compute_echoes: between samples and strips' edges; the echo
   float fx[BATCH], fy[BATCH], fz[BATCH];                  // place in the cell of voxels at `voxel`
   int bin[BATCH], voxel[BATCH];
   uint random[BATCH];
 #ifdef LOBES
-  float away[BATCH], path[BATCH];
+  float beyond[BATCH];  // range from the start of the piece on
 #endif
   uchar label[BATCH];  // label_scatterers
 #ifdef UNEVEN
@@ -158,41 +167,32 @@ inline floatn line_lanes(floatn t, float a, float slope) { return fma(t, (floatn
 // The hash uses cell indices by lattice axis (0, 1, 2), not by u, v, w: the same scatterer from every direction.
 inline uint axis_step(int axis) { return axis == 0 ? 0x9E3779B1u : axis == 1 ? 0x85EBCA77u : 0xC2B2AE3Du; }
 
-// The depth of tables for a path length: its row, and the part by which it is deeper.
-inline float row_of_depth(Frame frame, float path, int *row) {
-  const float place = clamp(path / frame->depth_mm * (LOBE_DEPTHS - 1), 0.0f, LOBE_DEPTHS - 1.001f);
-  *row = (int)place;
-  return place - *row;
+// The table of the beam (probe/lens.py) at LANES path lengths, and places among its distances from the axis: square
+// root of the power per millimetre, and by how many cycles the phase is behind that on the axis.
+inline void lens_at(Frame frame, __global const float *beam, floatn path, floatn place, floatn *root, floatn *cycles) {
+  const floatn row =
+      clamp(path * ((LOBE_DEPTHS - 1) / frame->depth_mm), (floatn)(0.0f), (floatn)(LOBE_DEPTHS - 1.001f));
+  const floatn column = fmin(place, (floatn)(LENS_DISTANCES - 1.001f));
+  const intn rows = TO_INTN(row), columns = TO_INTN(column);
+  SPREAD(int, at_, rows *LENS_DISTANCES + columns);
+  SPREAD(float, deeper_, row - TO_FLOATN(rows));
+  float near_root[LANES], far_root[LANES], near_cycles[LANES], far_cycles[LANES];
+  for (int lane = 0; lane < LANES; lane++) {
+    const float4 above = vload4(0, beam + 2 * at_[lane]), below = vload4(0, beam + 2 * (at_[lane] + LENS_DISTANCES));
+    const float4 here = above + deeper_[lane] * (below - above);
+    near_root[lane] = here.x, near_cycles[lane] = here.y, far_root[lane] = here.z, far_cycles[lane] = here.w;
+  }
+  const floatn farther = column - TO_FLOATN(columns), root0 = LOAD_LANES(near_root), cycles0 = LOAD_LANES(near_cycles);
+  *root = fma(farther, LOAD_LANES(far_root) - root0, root0);
+  *cycles = fma(farther, LOAD_LANES(far_cycles) - cycles0, cycles0);
 }
 
-// By how many cycles the phase of the elevational beam, of this sigma, is behind that on its axis, per squared
-// millimetre from there. With it, speckle has the height that it has at the aperture's beam (diffraction.py).
-inline float elevational_cycles(Frame frame, float path, float frequency, float sigma) {
+// The distance from the axis at which the table ends, at no depth around this one nearer.
+inline float reach_of_lens(Frame frame, __global const float *beam, float path) {
   int row;
-  const float deeper = row_of_depth(frame, path, &row);
-  __constant const float *heights = frame->speckle_height_mm + row;
-  const float height = blend(heights[0], heights[1], deeper) / frequency;
-  if (height <= 0.0f || height >= sigma) return 0.0f;
-  return sqrt(1.0f / (height * height) - 1.0f / (sigma * sigma)) / (sigma * 2.0f * TWO_PI);
-}
-
-// The distance from the axis at which lobes are cut off.
-inline float reach_of_lobes(Frame frame, __global const float *lobes, float path) {
-  int row;
-  const float deeper = row_of_depth(frame, path, &row);
-  __global const float *ends = lobes + LOBE_DEPTHS * LOBE_DISTANCES + row;
-  return blend(ends[0], ends[1], deeper);
-}
-
-// The square root of their power per millimetre at a distance from the axis.
-inline float lobe_at(Frame frame, __global const float *lobes, float path, float distance) {
-  const float at = distance / reach_of_lobes(frame, lobes, path) * (LOBE_DISTANCES - 1);
-  if (at >= LOBE_DISTANCES - 1) return 0.0f;
-  int row;
-  const float deeper = row_of_depth(frame, path, &row);
-  const int column = (int)at;
-  __global const float *near = lobes + row * LOBE_DISTANCES + column, *far = near + LOBE_DISTANCES;
-  return blend(blend(near[0], near[1], at - column), blend(far[0], far[1], at - column), deeper);
+  row_of_depth(frame, path, &row);
+  __global const float *ends = beam + 2 * LOBE_DEPTHS * LENS_DISTANCES + row;
+  return fmax(ends[0], ends[1]);
 }
 
 #ifdef LOBES
@@ -366,37 +366,45 @@ inline floatn unevenness(uint seed, const floatn *words, int has_specks, floatn 
 
 // Where scatterers are re a piece, for LANES of them at places u, v, w from the segment's start.
 typedef struct {
-  floatn t, right, depth;  // part of the piece, of the strip's width, displayed depth
-  floatn aside2;           // squared distance from the axis in elevation
-  intn counts;             // whether it belongs to this piece and strip
-#ifdef LOBES
-  floatn along, away;  // length along the segment, distance from the axis in elevation
-#endif
+  floatn t, along, aside;  // part of the piece, length along the segment, distance from its axis in the image plane
+  floatn right, ends;      // distance from the strip's middle, at which it ends
+  floatn range, depth;     // length along the segment at which it is seen, displayed depth
+  floatn away;             // distance from the axis in elevation
 } Beside;
 
 inline Beside beside_piece(const Piece *piece, floatn pu, floatn pv, floatn pw) {
-  const floatn along = dot_lanes(pu, pv, pw, piece->direction);
-  const floatn aside_l = dot_lanes(pu, pv, pw, piece->lateral);
   const floatn aside_e = dot_lanes(pu, pv, pw, piece->elevational);
   Beside at;
-  at.t = (along - piece->low) * piece->span;
-  at.right = fma(aside_l, line_lanes(at.t, piece->line0, piece->line1), (floatn)(piece->edge));
-  at.aside2 = aside_e * aside_e;
-  const floatn range = fma(aside_l, aside_l * piece->bend, along);
-  at.depth = line_lanes(range, piece->depth0, piece->slope);
-  at.counts = (at.right >= 0.0f) & (at.right < 1.0f) & (along >= piece->from_mm) & (along < piece->to_mm);
-#ifdef LOBES
-  at.along = along;
+  at.along = dot_lanes(pu, pv, pw, piece->direction);
+  at.aside = dot_lanes(pu, pv, pw, piece->lateral);
+  at.t = (at.along - piece->low) * piece->span;
+  at.right = at.aside - line_lanes(at.along, piece->middle0, piece->middle1);
+  at.ends = line_lanes(at.along, piece->half0, piece->half1);
+  at.range = fma(at.aside * at.aside, (floatn)(piece->bend), at.along);
+  at.depth = line_lanes(at.range, piece->depth0, piece->slope);
   at.away = fabs(aside_e);
-#endif
   return at;
+}
+
+// 0 up to -1/2, 1 from 1/2 on
+inline floatn rise_lanes(floatn x) { return clamp(x + 0.5f, (floatn)(0.0f), (floatn)(1.0f)); }
+
+// The part of scatterers that belongs to a piece of the strip, where they are `right` of its middle in widths: with
+// those of its neighbours the sum is one.
+inline floatn share_of(const Piece *piece, floatn range, floatn right) {
+  const float per_mm = 0.5f / SHARED_MM, per_width = 0.5f / SHARED;
+  return (rise_lanes((range - piece->from_mm) * per_mm) - rise_lanes((range - piece->to_mm) * per_mm)) *
+         rise_lanes(per_width * (0.5f - fabs(right)));
 }
 
 // Where the scatterers of cells are, and which contribute, often a quarter of them: those are put side by side.
 inline void place_scatterers(Frame frame, const Piece *piece, const Cells *cells, int count, Batch *batch) {
   const float cell = frame->cell_mm, grain = cell / GRAINS, first_u = 0.5f * grain - piece->start.x;
-  const float cutoff2 = 0.5f * LOG2_E * frame->beam_cutoff * frame->beam_cutoff;
-  const float inverse_sample = 1.0f / frame->sample_mm;
+  // The ranges of which something is seen in these samples, and of which a part belongs to this piece
+  const float before = (piece->first - 1) * frame->sample_mm - piece->moved - piece->depth0;
+  const float behind = (piece->first + CHUNK) * frame->sample_mm + piece->moved - piece->depth0;
+  const float nearest = fmax(piece->from_mm - SHARED_MM, before / piece->slope);
+  const float farthest = fmin(piece->to_mm + SHARED_MM, behind / piece->slope);
   const int u = piece->u, v = piece->v, w = piece->w;
   const uint step_u = axis_step(u);
   ushort chosen[BATCH + 1];
@@ -413,13 +421,9 @@ inline void place_scatterers(Frame frame, const Piece *piece, const Cells *cells
     const floatn pv = fma(TO_FLOATN(bits_v), (floatn)(grain), LOAD_LANES(cells->v + begin));
     const floatn pw = fma(TO_FLOATN(bits_w), (floatn)(grain), LOAD_LANES(cells->w + begin));
     const Beside at = beside_piece(piece, pu, pv, pw);
-#ifdef LOBES
     const intn near = at.away <= piece->reach_e;
-#else
-    const intn near = at.aside2 * line_lanes(at.t, piece->narrow0, piece->narrow1) <= cutoff2;
-#endif
-    const intn bins = TO_INTN(floor(at.depth * inverse_sample)) - piece->first;
-    SPREAD(int, counts_, at.counts & near & (bins >= -1) & (bins < CHUNK) & (LANE_INDEX < count - begin));
+    const intn counts = (fabs(at.right) < at.ends) & (at.range > nearest) & (at.range < farthest) & near;
+    SPREAD(int, counts_, counts &(LANE_INDEX < count - begin));
     for (int j = 0; j < LANES; j++) {
       chosen[n] = begin + j;
       n += counts_[j] & 1;
@@ -440,39 +444,55 @@ inline void place_scatterers(Frame frame, const Piece *piece, const Cells *cells
 }
 
 // The echoes of scatterers of unit amplitude, where they are among samples and strips, and among voxels.
-inline void compute_echoes(Frame frame, const Piece *piece, Batch *batch) {
+inline void compute_echoes(const Patient *patient, const Piece *piece, Batch *batch) {
+  Frame frame = patient->frame;
   const int nx = frame->dims[0], ny = frame->dims[1];
   const float3 voxel_top = (float3)(nx - 1.001f, ny - 1.001f, frame->dims[2] - 1.001f);
   const float inverse_sample = 1.0f / frame->sample_mm;
+  const float grain = frame->cell_mm / GRAINS, inverse_grain = 1.0f / grain, first = 0.5f * grain;
   for (int begin = 0; begin < batch->count; begin += LANES) {
     const floatn pu = LOAD_LANES(batch->u + begin), pv = LOAD_LANES(batch->v + begin),
                  pw = LOAD_LANES(batch->w + begin);
     // 16 bits for its existence, one for its sign, 15 for its label
     const uintn random = hash_mixn(LOAD_LANES(batch->key + begin) + 0x3C6EF372u);
     const Beside beside = beside_piece(piece, pu, pv, pw);
+    floatn root, curved, depth = beside.depth;
+    lens_at(frame, patient->beam, piece->path0 + (beside.along - piece->low),
+            beside.away * line_lanes(beside.t, piece->tall0, piece->tall1), &root, &curved);
 #ifdef LOBES
-    const floatn r2 = 0.0f, curved = 0.0f;  // lobes have random phases
-    STORE_LANES(beside.away, batch->away + begin);
-    STORE_LANES(piece->path0 + (beside.along - piece->low), batch->path + begin);
+    STORE_LANES(beside.range - piece->low, batch->beyond + begin);
 #else
-    const floatn r2 = beside.aside2 * line_lanes(beside.t, piece->narrow0, piece->narrow1);
-    const floatn curved = beside.aside2 * line_lanes(beside.t, piece->curved0, piece->curved1);
+    if (piece->moved > 0.0f) {
+      const floatn along = beside.along, aside = beside.aside;
+      depth = fma(min(aside, (floatn)(0.0f)), line_lanes(along, piece->later.x, piece->later.y), depth);
+      depth = fma(max(aside, (floatn)(0.0f)), line_lanes(along, piece->later.z, piece->later.w), depth);
+    }
 #endif
-    const floatn place = beside.depth * inverse_sample;
+    const floatn place = depth * inverse_sample, right = (0.5f + SHARED) * beside.right / beside.ends;
     const floatn bin = floor(place);
-    const floatn amplitude =
-        exp2_fast(clamp(line_lanes(beside.t, piece->gain0, piece->gain1) - r2, (floatn)(-100.0f), (floatn)(100.0f)));
-    const floatn echo = amplitude * (1.0f - TO_FLOATN((random >> 14) & 2u));
+    const intn bins = TO_INTN(bin) - piece->first;
+    const floatn gain = clamp(line_lanes(beside.t, piece->gain0, piece->gain1), (floatn)(-100.0f), (floatn)(100.0f));
+    const floatn amplitude = ((bins >= -1) & (bins < CHUNK)) ? root * exp2_fast(gain) : (floatn)(0.0f);
+    const floatn share = share_of(piece, beside.range, right);
+    const floatn echo = share * amplitude * (1.0f - TO_FLOATN((random >> 14) & 2u));
     floatn cosine, sine;
-    turn(fma(beside.depth, (floatn)(frame->cycles_per_mm), curved), &cosine, &sine);
-    const float3 at = piece->at_start, ri = piece->row_i, rj = piece->row_j, rk = piece->row_k;
-    const floatn vx = clamp(at.x + dot_lanes(pu, pv, pw, ri), (floatn)(0.0f), (floatn)(voxel_top.x));
-    const floatn vy = clamp(at.y + dot_lanes(pu, pv, pw, rj), (floatn)(0.0f), (floatn)(voxel_top.y));
-    const floatn vz = clamp(at.z + dot_lanes(pu, pv, pw, rk), (floatn)(0.0f), (floatn)(voxel_top.z));
+    turn(fma(depth, (floatn)(frame->cycles_per_mm), curved * line_lanes(beside.t, piece->turned0, piece->turned1)),
+         &cosine, &sine);
+    // Places in the patient are the same, to the bit, from every pose, and so are tissues.
+    const floatn u = fma(floor((pu + piece->start.x) * inverse_grain), (floatn)(grain), (floatn)(first));
+    const floatn v = fma(floor((pv + piece->start.y) * inverse_grain), (floatn)(grain), (floatn)(first));
+    const floatn w = fma(floor((pw + piece->start.z) * inverse_grain), (floatn)(grain), (floatn)(first));
+    const float3 at = piece->at_origin, ri = piece->row_i, rj = piece->row_j, rk = piece->row_k;
+    const floatn vx = clamp(at.x + dot_lanes(u, v, w, ri), (floatn)(0.0f), (floatn)(voxel_top.x));
+    const floatn vy = clamp(at.y + dot_lanes(u, v, w, rj), (floatn)(0.0f), (floatn)(voxel_top.y));
+    const floatn vz = clamp(at.z + dot_lanes(u, v, w, rk), (floatn)(0.0f), (floatn)(voxel_top.z));
     const intn ix = TO_INTN(vx), iy = TO_INTN(vy), iz = TO_INTN(vz);
-    STORE_LANES(TO_INTN(bin) - piece->first, batch->bin + begin);
+    STORE_LANES(u, batch->u + begin);
+    STORE_LANES(v, batch->v + begin);
+    STORE_LANES(w, batch->w + begin);
+    STORE_LANES(clamp(bins, -1, CHUNK - 1), batch->bin + begin);
     STORE_LANES(place - bin, batch->part + begin);
-    STORE_LANES(beside.right, batch->right + begin);
+    STORE_LANES(right + 0.5f, batch->right + begin);
     STORE_LANES(echo * cosine, batch->re + begin);
     STORE_LANES(echo * -sine, batch->im + begin);
     STORE_LANES(random, batch->random + begin);
@@ -534,9 +554,8 @@ inline void vary_scatterers(const Patient *patient, const Piece *piece, Batch *b
     } else {
       for (int word = 0; word < 6; word++) words[word] = here[word];
     }
-    const floatn along_u = LOAD_LANES(batch->u + i) + piece->start.x,
-                 along_v = LOAD_LANES(batch->v + i) + piece->start.y,
-                 along_w = LOAD_LANES(batch->w + i) + piece->start.z;
+    const floatn along_u = LOAD_LANES(batch->u + i), along_v = LOAD_LANES(batch->v + i),
+                 along_w = LOAD_LANES(batch->w + i);
     const floatn x = u == 0 ? along_u : v == 0 ? along_v : along_w;  // along the axes of the patient
     const floatn y = u == 1 ? along_u : v == 1 ? along_v : along_w;
     const floatn z = u == 2 ? along_u : v == 2 ? along_v : along_w;
@@ -547,17 +566,9 @@ inline void vary_scatterers(const Patient *patient, const Piece *piece, Batch *b
 
 // The place of a scatterer in the patient, RAS mm.
 inline float3 place_of(const Piece *piece, const Batch *batch, int i) {
-  const int u = piece->u, v = piece->v;
-  const float along[3] = {batch->u[i] + piece->start.x, batch->v[i] + piece->start.y, batch->w[i] + piece->start.z};
-  return (float3)(along[u == 0   ? 0
-                        : v == 0 ? 1
-                                 : 2],
-                  along[u == 1   ? 0
-                        : v == 1 ? 1
-                                 : 2],
-                  along[u == 2   ? 0
-                        : v == 2 ? 1
-                                 : 2]);
+  float place[3];
+  place[piece->u] = batch->u[i], place[piece->v] = batch->v[i], place[piece->w] = batch->w[i];
+  return vload3(0, place);
 }
 
 // The factor of the amplitude of a membrane's scatterers there: a log-normal one, whose mean power is 1.
@@ -566,6 +577,60 @@ inline float patch_gain(Frame frame, float3 place) {
   return exp2_scalar(octaves * (patch_at(frame, place) - 0.6931472f * octaves));
 }
 
+#ifdef LOBES
+// How dark tissue is at a place, from 0 to 1: trilinear.
+inline float darkness(const Patient *patient, const Piece *piece, float3 place) {
+  Frame frame = patient->frame;
+  __global const float *is_dark = patient->sites + 2 * MAX_TISSUES;
+  const int nx = frame->dims[0], ny = frame->dims[1];
+  const float3 voxel =
+      piece->at_origin + (float3)(dot3(place, piece->row_i), dot3(place, piece->row_j), dot3(place, piece->row_k));
+  const float3 inside = clamp(voxel, (float3)(0.0f), (float3)(nx - 1.001f, ny - 1.001f, frame->dims[2] - 1.001f));
+  const int3 base = convert_int3(inside);
+  const float3 part = inside - convert_float3(base);
+  const int here = patient->voxels[(base.z * ny + base.y) * nx + base.x];
+  if (here & SAME_LABEL) return is_dark[here & LABEL_MASK];
+  float sum = 0.0f;
+  for (int corner = 0; corner < 8; corner++) {
+    const int dx = corner & 1, dy = (corner >> 1) & 1, dz = corner >> 2;
+    const float weight = (dx ? part.x : 1.0f - part.x) * (dy ? part.y : 1.0f - part.y) * (dz ? part.z : 1.0f - part.z);
+    const int label = patient->voxels[((base.z + dz) * ny + base.y + dy) * nx + base.x + dx] & LABEL_MASK;
+    sum += weight * is_dark[label];
+  }
+  return sum;
+}
+
+// Finds how dark tissue is along a piece, at most a step away: in the middle or near the edges of its strip. From where
+// to where it is; (high, low) if it is nowhere.
+inline float2 find_dark(const Patient *patient, Piece *piece, float low, float high) {
+  const int steps = min(max(1, (int)ceil(high - low)), MOST_DARK - 1);
+  float here[MOST_DARK];
+  int first = steps + 1, last = -1;
+  piece->dark_steps = steps;
+  piece->dark_step = fmax((high - low) / steps, 1e-6f);
+  for (int n = 0; n <= steps; n++) {
+    here[n] = 0.0f;
+    for (int side = -1; side <= 1; side++) {
+      const float3 along = (low + n * piece->dark_step) * piece->direction;
+      const float3 place = piece->start + along + (0.8f * side * piece->reach_l) * piece->lateral;
+      here[n] = fmax(here[n], darkness(patient, piece, place));
+    }
+    if (here[n] > 0.0f) first = min(first, n), last = n;
+  }
+  for (int n = 0; n <= steps; n++) piece->dark[n] = fmax(here[n], fmax(here[max(n - 1, 0)], here[min(n + 1, steps)]));
+  piece->dark[steps + 1] = piece->dark[steps];
+  if (last < 0) return (float2)(high, low);
+  return (float2)(fmax(low, low + (first - 2) * piece->dark_step), fmin(high, low + (last + 2) * piece->dark_step));
+}
+
+// How dark tissue is at a length beyond the piece's start
+inline float dark_at(const Piece *piece, float length) {
+  const float place = clamp(length / piece->dark_step, 0.0f, (float)piece->dark_steps);
+  const int n = (int)place;
+  return blend(piece->dark[n], piece->dark[n + 1], place - n);
+}
+#endif
+
 inline void add_echoes(const Patient *patient, const Piece *piece, const Batch *batch, Echoes *sum) {
   for (int i = 0; i < batch->count; i++) {
     const int label = TISSUE_OF(batch->label[i]);
@@ -573,7 +638,7 @@ inline void add_echoes(const Patient *patient, const Piece *piece, const Batch *
     float strength = (batch->random[i] >> 16) + 0.5f < site.x ? site.y : 0.0f;
 #ifdef LOBES
     if (strength == 0.0f) continue;
-    strength *= lobe_at(patient->frame, patient->lobes, batch->path[i], batch->away[i]);
+    strength *= dark_at(piece, batch->beyond[i]);
 #endif
     if (IS_ON_MEMBRANE(batch->label[i])) {
       const float3 at = (float3)(batch->fx[i], batch->fy[i], batch->fz[i]);
@@ -596,37 +661,12 @@ inline void add_echoes(const Patient *patient, const Piece *piece, const Batch *
 inline void scatter_batch(const Patient *patient, const Piece *piece, const Cells *cells, int count, Echoes *sum) {
   Batch batch;
   place_scatterers(patient->frame, piece, cells, count, &batch);
-  compute_echoes(patient->frame, piece, &batch);
+  compute_echoes(patient, piece, &batch);
   label_scatterers(patient, piece, &batch);
 #ifdef UNEVEN
   vary_scatterers(patient, piece, &batch);
 #endif
   add_echoes(patient, piece, &batch, sum);
-}
-
-// From where to where along a piece there is dark tissue in the middle or near the edges of its strip, a step farther
-// to both sides; (high, low) if there is none.
-inline float2 dark_part(const Patient *patient, const Piece *piece, float low, float high) {
-  Frame frame = patient->frame;
-  __global const float *is_dark = patient->sites + 2 * MAX_TISSUES;
-  const int nx = frame->dims[0], ny = frame->dims[1], steps = max(1, (int)ceil(high - low));
-  const float3 most = (float3)(nx - 1, ny - 1, frame->dims[2] - 1);
-  const float step = (high - low) / steps;
-  int first = steps, last = -1;
-  for (int n = 0; n < steps; n++) {
-    const float along = low + (n + 0.5f) * step;
-    for (int side = -1; side <= 1; side++) {
-      const float3 p = along * piece->direction + (0.8f * side * piece->reach_l) * piece->lateral;
-      const float3 voxel =
-          piece->at_start + (float3)(dot3(p, piece->row_i), dot3(p, piece->row_j), dot3(p, piece->row_k)) + 0.5f;
-      const int3 at = convert_int3(clamp(voxel, (float3)(0.0f), most));
-      if (is_dark[patient->voxels[(at.z * ny + at.y) * nx + at.x] & LABEL_MASK] == 0.0f) continue;
-      first = min(first, n);
-      last = n;
-    }
-  }
-  if (last < 0) return (float2)(high, low);
-  return (float2)(fmax(low, low + (first - 1) * step), fmin(high, low + (last + 2) * step));
 }
 
 // The scatterers of one piece between two lengths along it: finds the lattice cells beside it and computes them in
@@ -689,12 +729,12 @@ inline void scatter_piece(const Patient *patient, const Piece *piece, float low,
       SPREAD(int, fill_, TO_INTN(floor(to)) - u_low + 1);
       for (int j = 0; j < min(LANES, v_last - cv + 1); j++) {
         const uint key = (uint)(cv + j) * step_v + (uint)cw * step_w;
-        const float place_v = (cv + j) * cell + first_v;
+        const float place_v = fma((float)(cv + j), cell, first_v);
         for (int cu = 0; cu < fill_[j]; cu += LANES) {
           STORE_LANES(u_low_[j] + cu + LANE_INDEX, cells.u + waiting);
           STORE_LANES((uintn)(key), cells.key + waiting);
           STORE_LANES((floatn)(place_v), cells.v + waiting);
-          STORE_LANES((floatn)(cw * cell + first_w), cells.w + waiting);
+          STORE_LANES((floatn)(fma((float)cw, cell, first_w)), cells.w + waiting);
           waiting += min(LANES, fill_[j] - cu);
           if (waiting >= BATCH) {
             scatter_batch(patient, piece, &cells, BATCH, sum);
@@ -727,10 +767,41 @@ inline void set_axes(Frame frame, __global const Segment *segment, Piece *piece)
   piece->elevational = (float3)(segment->elevational[u], segment->elevational[v], segment->elevational[w]);
   __constant const float *m = frame->ras_to_voxel;
   piece->u = u, piece->v = v, piece->w = w;
-  piece->at_start = affine_point(m, (float3)(segment->start[0], segment->start[1], segment->start[2]));
+  piece->at_origin = (float3)(m[3], m[7], m[11]);
   piece->row_i = (float3)(m[u], m[v], m[w]);
   piece->row_j = (float3)(m[4 + u], m[4 + v], m[4 + w]);
   piece->row_k = (float3)(m[8 + u], m[8 + v], m[8 + w]);
+}
+
+// By how much displayed depths in the strip of a segment differ from those on its axis, at most.
+inline float depth_moved(__global const Segment *segment) {
+  const float4 left = vload4(0, segment->left), right = vload4(0, segment->right);
+  const float length = segment->length_mm;
+  const float2 from = (float2)(left.x, right.x), later = (float2)(left.z, right.z);
+  const float2 to = from + length * (float2)(left.y, right.y), later_to = later + length * (float2)(left.w, right.w);
+  // A product of two linear functions is among its ends and the point that its tangents there have in common.
+  const float2 most = fmax(fmax(fabs(from * later), fabs(to * later_to)), 0.5f * fabs(from * later_to + to * later));
+  return (1.0f + 2.0f * SHARED) * fmax(most.x, most.y);
+}
+
+// The factor by which curved mirrors lower the power of speckle at a path length: the integral of what is transmitted
+// times what is received, re the same behind plane ones.
+inline float mirrored_power(Frame frame, float path, float4 tube, float cosine) {
+  if (tube.x == 1.0f && tube.z == 1.0f) return 1.0f;
+  const float per_mm2 = 0.5f * TWO_PI * frame->cycles_per_mm;
+  const float receive = fmax(path * frame->receive_sigma_slope, frame->receive_sigma_min) / cosine;
+  const float receive2 = receive * receive, transmit2 = transmit_variance(frame, path, 1.0f, cosine);
+  float waist2 = transmit2, away = 0.0f, length = per_mm2 * transmit2, least = 1e30f;  // of compounded waves
+  for (int zone = 0; zone < frame->transmit_zones; zone++) {
+    const float a = path - frame->transmit_focus[zone], rayleigh = frame->transmit_rayleigh[zone] / (cosine * cosine);
+    const float sigma = frame->transmit_sigma[zone] / cosine, b = sigma * sqrt(1.0f + a * a / (rayleigh * rayleigh));
+    if (b < least) least = b, waist2 = sigma * sigma, away = a, length = rayleigh;
+  }
+  const float mirrored2 = waist2 * mirrored_beam(away, length, tube.x, tube.y) +
+                          receive2 * mirrored_beam(0.0f, per_mm2 * receive2, tube.x, tube.y);
+  const float from_lens = path - frame->elevation_focus, b = from_lens / frame->elevation_rayleigh;
+  return sqrt((transmit2 + receive2) / mirrored2 * (1.0f + b * b) /
+              mirrored_beam(from_lens, frame->elevation_rayleigh, tube.z, tube.w));
 }
 
 // The widths and gains of a piece of a segment between two lengths along it, linear between those at the ends.
@@ -743,59 +814,66 @@ inline void set_ends(const Patient *patient, __global const Segment *segment, co
   float band_low, band_high;
   const float frequency_low = band_after(frame, loss_low, &band_low);
   const float frequency_high = band_after(frame, loss_high, &band_high);
-  const float apart_low = line_distance(frame, path_low + strips->begins);
-  const float apart_high = line_distance(frame, path_high + strips->begins);
   // beam.cl knows the displayed depth alone, which differs from the path where sound is slower or faster.
   const float shown_low = fmax(piece->depth0 + piece->slope * low, strips->begins);
   const float shown_high = fmax(piece->depth0 + piece->slope * high, strips->begins);
-  const float wide_low = lateral_sigma_at(frame, shown_low - strips->begins, 1.0f / frequency_low);
-  const float wide_high = lateral_sigma_at(frame, shown_high - strips->begins, 1.0f / frequency_high);
+  const float wide_low = lateral_sigma(frame, shown_low - strips->begins, 1.0f / frequency_low, strips->cosine);
+  const float wide_high = lateral_sigma(frame, shown_high - strips->begins, 1.0f / frequency_high, strips->cosine);
   piece->low = low;
   piece->path0 = path_low;
   piece->span = 1.0f / fmax(high - low, 1e-6f);
   piece->bend = frame->linear ? 0.0f : 0.5f / fmax(to_apex + low, 1.0f);
-  piece->edge = (strips->line - strips->left + 0.5f) / strips->lines;
-  piece->line0 = 1.0f / (strips->lines * apart_low);
-  piece->line1 = 1.0f / (strips->lines * apart_high) - piece->line0;
 #ifdef LOBES
-  // The table has the square root of the power per millimetre, where the main beam has 1 / (sqrt(pi) sigma_e).
-  const float tall_low = 0.56418958f, tall_high = tall_low;
-  piece->reach_e =
-      fmax(reach_of_lobes(frame, patient->lobes, path_low), reach_of_lobes(frame, patient->lobes, path_high));
+  const float step = frame->line_spacing / frame->lateral_rays;
+  const float nominal0 = frame->linear ? step : step * to_apex, nominal1 = frame->linear ? 0.0f : step;
+  const float before = strips->line - strips->left + 0.5f;
+  const float2 left_border = -before * (float2)(nominal0, nominal1);
+  const float2 right_border = (strips->lines - before) * (float2)(nominal0, nominal1);
 #else
-  const float tall_low = elevation_sigma_at(frame, path_low, 1.0f / frequency_low);
-  const float tall_high = elevation_sigma_at(frame, path_high, 1.0f / frequency_high);
-  piece->reach_e = frame->beam_cutoff * fmax(tall_low, tall_high);
-  piece->narrow0 = 0.5f * LOG2_E / (tall_low * tall_low);
-  piece->narrow1 = 0.5f * LOG2_E / (tall_high * tall_high) - piece->narrow0;
-  piece->curved0 = elevational_cycles(frame, path_low, frequency_low, tall_low);
-  piece->curved1 = elevational_cycles(frame, path_high, frequency_high, tall_high) - piece->curved0;
+  const float4 to_left = vload4(0, segment->left), to_right = vload4(0, segment->right);
+  const float2 left_border = to_left.xy, right_border = to_right.xy;
+  piece->later = (float4)(to_left.zw, to_right.zw);
 #endif
+  const float2 middle = 0.5f * (left_border + right_border), across = right_border - left_border;
+  piece->middle0 = middle.x, piece->middle1 = middle.y;
+  piece->half0 = (0.5f + SHARED) * across.x, piece->half1 = (0.5f + SHARED) * across.y;
+  const float2 ends = (float2)(low, high), width = across.x + across.y * ends;
+  const float2 apart = fmax(width / strips->lines, 1e-4f);
+  const float2 reach = fabs(middle.x + middle.y * ends) + (0.5f + SHARED) * width;
+  piece->reach_l = fmax(reach.x, reach.y);
+  // The table has the square root of the power per millimetre, where a Gaussian beam has 1 / (sqrt(pi) sigma_e).
+  const float stretch_low = elevation_stretch(frame, path_low, 1.0f / frequency_low);
+  const float stretch_high = elevation_stretch(frame, path_high, 1.0f / frequency_high);
+  const float tall_low = 0.56418958f * stretch_low, tall_high = 0.56418958f * stretch_high;
+  const float widest = patient->beam[2 * LOBE_DEPTHS * LENS_DISTANCES + LOBE_DEPTHS];  // distance of the last column
+  piece->tall0 = (LENS_DISTANCES - 1) / (widest * stretch_low);
+  piece->tall1 = (LENS_DISTANCES - 1) / (widest * stretch_high) - piece->tall0;
+  piece->reach_e = fmax(stretch_low * reach_of_lens(frame, patient->beam, path_low),
+                        stretch_high * reach_of_lens(frame, patient->beam, path_high));
+  piece->turned0 = frame->wavefront_curvature == 0.0f ? 0.0f : frequency_low;
+  piece->turned1 = frame->wavefront_curvature == 0.0f ? 0.0f : frequency_high - frequency_low;
   // Unit energy of the point spread function for all widths: sqrt(1 / (sigma_l sigma_e)) times the scale. The
   // weights of beam.cl have unit sum, that is apart / (sqrt(2 pi) sigma_l) at the peak, so that a strip of width
   // `apart` has the power apart / sigma_l of both at the displayed depth. A pulse covers 1 / slope of its length.
   const float gain = log2_scalar(segment->weight * segment->attenuation * frame->speckle_scale * 2.50662827f);
   const float decay = LOG2_E * segment->decay_per_mm;
-  // Behind a curved mirror the same power is spread over a wider tube.
-  const float4 tube_low = tube_after(vload4(0, segment->tube), low);
-  const float4 tube_high = tube_after(vload4(0, segment->tube), high);
-  piece->gain0 = gain + LOG2_E * band_low - decay * low +
-                 0.5f * log2_scalar(piece->slope * wide_low /
-                                    (tall_low * tube_low.x * tube_low.z * apart_low * line_distance(frame, shown_low)));
-  piece->gain1 =
-      gain + LOG2_E * band_high - decay * high +
-      0.5f * log2_scalar(piece->slope * wide_high /
-                         (tall_high * tube_high.x * tube_high.z * apart_high * line_distance(frame, shown_high))) -
-      piece->gain0;
-  const float lines_aside = max(strips->line - strips->left, strips->left + strips->lines - 1 - strips->line) + 0.5f;
-  piece->reach_l = lines_aside * fmax(apart_low, apart_high);
+  const float4 tube = vload4(0, segment->tube);
+  const float left_low = mirrored_power(frame, path_low, tube_after(tube, low), strips->cosine);
+  const float left_high = mirrored_power(frame, path_high, tube_after(tube, high), strips->cosine);
+  piece->gain0 =
+      gain + LOG2_E * band_low - decay * low +
+      0.5f * log2_scalar(piece->slope * wide_low * left_low / (tall_low * apart.x * line_distance(frame, shown_low)));
+  piece->gain1 = gain + LOG2_E * band_high - decay * high +
+                 0.5f * log2_scalar(piece->slope * wide_high * left_high /
+                                    (tall_high * apart.y * line_distance(frame, shown_high))) -
+                 piece->gain0;
 }
 
 ONE_BY_ONE
 __kernel void scatter(Frame frame, __global const ushort *voxels, __global const uint *planes,
                       __global const uint *texture, __global const float *sites, __global const Segment *segments,
-                      __global const int *segment_counts, __global float *re, __global float *im,
-                      int stride VARIED_PARAMETERS LOBE_PARAMETERS) {
+                      __global const int *segment_counts, __global float *re, __global float *im, int stride,
+                      __global const float *beam VARIED_PARAMETERS LOBE_PARAMETERS) {
   const int chunk = get_global_id(0), first = chunk * CHUNK;
 #ifdef LOBES
   const int left = get_global_id(1) * together, lines = min(together, frame->traced_lines - left);
@@ -814,8 +892,8 @@ __kernel void scatter(Frame frame, __global const ushort *voxels, __global const
   const int block = first / PIECE_BLOCK * PIECE_BLOCK;
   const float block_low = (block - 1) * frame->sample_mm;
   const float block_high = (block + PIECE_BLOCK) * frame->sample_mm;
-  const Strips strips = {line, left, lines, traced_start(frame, (float)line)};
-  const Patient patient = {frame, voxels, planes, texture, sites, PART_OF, LOBE_TABLE};
+  const Strips strips = {line, left, lines, traced_start(frame, (float)line), traced_cosine(frame, (float)line)};
+  const Patient patient = {frame, voxels, planes, texture, sites, beam, PART_OF};
 
   int count = min(segment_counts[line], MAX_SEGMENTS);
   for (int index = 0; index < count; index++) {
@@ -824,10 +902,21 @@ __kernel void scatter(Frame frame, __global const ushort *voxels, __global const
     piece.first = first;
     piece.slope = segment->depth_per_mm;
     piece.depth0 = segment->depth_mm;
-    const float segment_low = fmax(0.0f, (block_low - piece.depth0) / piece.slope);
-    const float segment_high = fmin(segment->length_mm, (block_high - piece.depth0) / piece.slope);
-    const float chunk_low = (depth_low - piece.depth0) / piece.slope;
-    const float chunk_high = (depth_high - piece.depth0) / piece.slope;
+    // Most segments are elsewhere.
+    const float farthest = MOST_MOVED / frame->cycles_per_mm;
+    if (piece.depth0 > depth_high + farthest || piece.depth0 + piece.slope * segment->length_mm < depth_low - farthest)
+      continue;
+#ifdef LOBES
+    const float moved = 0.0f;
+#else
+    const float moved = depth_moved(segment);
+#endif
+    piece.moved = moved > 1e-5f ? moved : 0.0f;
+    const float before = piece.depth0 + moved, behind = piece.depth0 - moved;
+    const float segment_low = fmax(0.0f, (block_low - before) / piece.slope);
+    const float segment_high = fmin(segment->length_mm, (block_high - behind) / piece.slope);
+    const float chunk_low = (depth_low - before) / piece.slope;
+    const float chunk_high = (depth_high - behind) / piece.slope;
     if (fmax(segment_low, chunk_low) >= fmin(segment_high, chunk_high)) continue;
 
     set_axes(frame, segment, &piece);
@@ -850,12 +939,12 @@ __kernel void scatter(Frame frame, __global const ushort *voxels, __global const
       set_ends(&patient, segment, &strips, low, high, to_apex, &piece);
       // Off the axis of a curved array the same range is reached slightly earlier.
       const float early = piece.bend * piece.reach_l * piece.reach_l;
-      float begin = fmax(low, chunk_low - early), end = fmin(high, chunk_high);
+      float begin = fmax(piece.from_mm - SHARED_MM, chunk_low) - early, end = fmin(piece.to_mm + SHARED_MM, chunk_high);
 #ifdef LOBES
-      const float2 dark = dark_part(&patient, &piece, low, high);
-      begin = fmax(begin, dark.x), end = fmin(end, dark.y);
-      if (dark.x > low) piece.from_mm = dark.x;
-      if (dark.y < high) piece.to_mm = dark.y;
+      const float2 dark = find_dark(&patient, &piece, low, high);
+      if (dark.x >= dark.y) continue;
+      if (dark.x > low) begin = fmax(begin, dark.x);
+      if (dark.y < high) end = fmin(end, dark.y);
 #endif
       if (begin >= end) continue;
       scatter_piece(&patient, &piece, begin, end, sum);

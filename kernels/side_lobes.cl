@@ -20,19 +20,42 @@
 // Signs are random from cell to cell of a lattice fixed in the patient, whose cells are so wide, in the same unit.
 #define SIGN_CELL 4.0f
 
-// The lattice is oblique to the patient's axes: an image along them would lie in the border of its cells, and a
-// movement less than rounding turn all signs. Rows of (2 -1 2; 2 2 -1; -1 2 2) / 3 are its axes.
+#define FADING 0.03f  // part of a cell to either side of its border over which those of its neighbour replace them
+
+// Random bits of the cells of the patient that a place is in, with their amplitudes: one, or several near a border.
+typedef struct {
+  int count;
+  uint bits[8];
+  float parts[8];
+} Place;
+
+// The lattice is oblique to the patient's axes: an image along them would lie in the border of its cells. Rows of
+// (2 -1 2; 2 2 -1; -1 2 2) / 3 are its axes.
 //
-// Random bits of the cell of the patient in which a scan line is at a displayed depth.
-inline uint bits_at(Frame frame, __global const float *roots, int line, float depth_mm, float inverse_cell) {
+// Where in the patient a scan line is at a displayed depth.
+inline Place place_at(Frame frame, __global const float *roots, int line, float depth_mm, float inverse_cell) {
   const float4 root = vload4(frame->guard_lines + line * frame->lateral_rays, roots);
   const float along = fmax(depth_mm - line_start(frame, (float)line), 0.0f);
   const float3 place = (float3)(root.x + along * root.z, root.y + along * root.w, 0.0f);
   const float3 p = affine_point(frame->probe_to_ras, place) * (inverse_cell / 3.0f);
-  const float3 turned = 2.0f * (p.xxy + p.zyz) - p.yzx;
-  const float3 cell = floor(turned + 0.37f);
-  const uint key = (uint)(int)cell.x * 0x9E3779B1u + (uint)(int)cell.y * 0x85EBCA77u + (uint)(int)cell.z * 0xC2B2AE3Du;
-  return hash_mix(key ^ frame->seed);
+  const float3 at = 2.0f * (p.xxy + p.zyz) - p.yzx + 0.37f, cell = floor(at), inside = at - cell;
+  const float3 beside = fmax(0.5f - 0.5f / FADING * fmin(inside, 1.0f - inside), 0.0f);  // of the nearest neighbours
+  const float3 power = beside * beside + (1.0f - beside) * (1.0f - beside);
+  const int3 step = select((int3)(-1), (int3)(1), inside > 0.5f);
+  const float scale = 1.0f / sqrt(power.x * power.y * power.z);
+  Place found;
+  found.count = 0;
+  for (int corner = 0; corner < 8; corner++) {
+    const int dx = corner & 1, dy = (corner >> 1) & 1, dz = corner >> 2;
+    const float part =
+        (dx ? beside.x : 1.0f - beside.x) * (dy ? beside.y : 1.0f - beside.y) * (dz ? beside.z : 1.0f - beside.z);
+    if (part == 0.0f) continue;
+    const uint key = (uint)((int)cell.x + dx * step.x) * 0x9E3779B1u + (uint)((int)cell.y + dy * step.y) * 0x85EBCA77u +
+                     (uint)((int)cell.z + dz * step.z) * 0xC2B2AE3Du;
+    found.bits[found.count] = hash_mix(key ^ frame->seed);
+    found.parts[found.count++] = scale * part;
+  }
+  return found;
 }
 
 // A weight with a random sign: the parity of the bits that both have.
@@ -41,17 +64,20 @@ inline float with_sign(float weight, uint place, uint offset) {
 }
 
 // What the lobes of a node receive, with the weights of nodes 0, 1, 2... to either side and the random bits of these
-// distances. Beyond the image nothing is known.
-inline void at_node(const floatn *re, const floatn *im, const uint *places, const uint *offsets, const float *weights,
-                    int node, int nodes, int reach, floatn *lobe_re, floatn *lobe_im) {
+// distances. `places` are those from places_of[node] on. Beyond the image nothing is known.
+inline void at_node(const floatn *re, const floatn *im, const int *nodes_of, const uint *bits, const float *parts,
+                    const int *places_of, const uint *offsets, const float *weights, int node, int nodes, int reach,
+                    floatn *lobe_re, floatn *lobe_im) {
   floatn x = weights[0] * re[node], y = weights[0] * im[node];
-  for (int other = max(node - reach, 0); other < node; other++) {
-    const float weight = with_sign(weights[node - other], places[other], offsets[node - other]);
+  for (int n = places_of[max(node - reach, 0)]; n < places_of[node]; n++) {
+    const int other = nodes_of[n], away = node - other;
+    const float weight = with_sign(weights[away] * parts[n], bits[n], offsets[away]);
     x += weight * re[other];
     y += weight * im[other];
   }
-  for (int other = node + 1; other <= min(node + reach, nodes - 1); other++) {
-    const float weight = with_sign(weights[other - node], places[other], rotate(offsets[other - node], 16u));
+  for (int n = places_of[node + 1]; n < places_of[min(node + reach, nodes - 1) + 1]; n++) {
+    const int other = nodes_of[n], away = other - node;
+    const float weight = with_sign(weights[away] * parts[n], bits[n], rotate(offsets[away], 16u));
     x += weight * re[other];
     y += weight * im[other];
   }
@@ -68,14 +94,15 @@ __kernel void side_lobes(Frame frame, __global const float *lobes, __global cons
   const float depth_mm = (sample / LOSS_STEP * LOSS_STEP + 0.5f * LOSS_STEP) * frame->sample_mm;
   const float s = fmax(depth_mm - line_start(frame, 0.5f * (lines - 1)), 0.0f);
   const float apart = line_distance(frame, depth_mm) * frame->lateral_rays;
-  const float unit = fmax(unit_least, unit_slope * s), main_beam = lateral_sigma(frame, s);
+  const float unit = fmax(unit_least, unit_slope * s), cosine = line_cosine(frame, 0.5f * (lines - 1)),
+              main_beam = lateral_sigma(frame, s, 1.0f, cosine);
   const int dense = (lines + LOBE_NODES - 1) / LOBE_NODES;
   const int step = clamp((int)(NODE_DISTANCE * unit / apart), dense, lines), nodes = (lines + step - 1) / step;
 
   // The mean of lines whose speckle has the correlation exp(-distance^2 / 4 sigma^2) has this part of their power; with
   // a curved phase k y^2 / 2 the exponent is 1 + k^2 sigma^4 times as large. (Signs are random, so that the correlation
   // of different nodes does not matter.)
-  const float bent = lateral_curvature(frame, s, 1.0f) * main_beam * main_beam;
+  const float bent = lateral_curvature(frame, s, 1.0f, cosine) * main_beam * main_beam;
   const float fall = 0.25f * LOG2_E * (apart / main_beam) * (apart / main_beam) * (1.0f + bent * bent);
   float mean_power = 1.0f;
   for (int n = 1; n < step; n++)
@@ -102,7 +129,9 @@ __kernel void side_lobes(Frame frame, __global const float *lobes, __global cons
   }
 
   floatn node_re[LOBE_NODES], node_im[LOBE_NODES];
-  uint places[LOBE_NODES];  // random bits of every node
+  int places_of[LOBE_NODES + 1], nodes_of[8 * LOBE_NODES], found = 0;  // first place of every node, node of every place
+  uint bits[8 * LOBE_NODES];
+  float parts[8 * LOBE_NODES];
   const float inverse_cell = 1.0f / (SIGN_CELL * unit_least);
   for (int node = 0; node < nodes; node++) {
     floatn sum_re = 0.0f, sum_im = 0.0f;
@@ -112,8 +141,11 @@ __kernel void side_lobes(Frame frame, __global const float *lobes, __global cons
     }
     node_re[node] = sum_re / (float)step;
     node_im[node] = sum_im / (float)step;
-    places[node] = bits_at(frame, roots, min(node * step + step / 2, lines - 1), depth_mm, inverse_cell);
+    const Place at = place_at(frame, roots, min(node * step + step / 2, lines - 1), depth_mm, inverse_cell);
+    places_of[node] = found;
+    for (int n = 0; n < at.count; n++) nodes_of[found] = node, bits[found] = at.bits[n], parts[found++] = at.parts[n];
   }
+  places_of[nodes] = found;
 
   floatn before_re, before_im;
   float before_kept = 1.0f;
@@ -121,7 +153,8 @@ __kernel void side_lobes(Frame frame, __global const float *lobes, __global cons
   for (int node = 0; node <= nodes; node++) {
     const int last = min(node, nodes - 1);
     floatn lobe_re, lobe_im;
-    at_node(node_re, node_im, places, offsets, weights, last, nodes, reach, &lobe_re, &lobe_im);
+    at_node(node_re, node_im, nodes_of, bits, parts, places_of, offsets, weights, last, nodes, reach, &lobe_re,
+            &lobe_im);
     // Of those that there are
     const int left = min(last, reach), right = min(nodes - 1 - last, reach);
     const float kept =

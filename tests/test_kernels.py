@@ -82,10 +82,10 @@ def test_stages_do_what_their_references_do_with_the_same_inputs(kind, turn):
         stage.run(frame)
     tree, traced = made.tracer.download(), impulses(frame.traced, 2 * int(record["traced_lines"]))
     at = np.rint(tree.segment_line * int(record["lateral_rays"]) + int(record["guard_lines"])).astype(int)
-    labels = np.pad(made.medium.labels.array, 1)
+    labels = np.pad(made.medium.labels.array, 1, mode="edge")
     # Where the kernel's gains are linear along pieces of paths, and single scatterers lie between two strips
     most = 0.04 if kind == "angles" else 0.015
-    assert off(traced, scatterer_lines(record, labels, made.medium.rows, tree.segments, at)) < most
+    assert off(traced, scatterer_lines(record, probe.lens(), labels, made.medium.rows, tree.segments, at)) < most
 
     losses = download(frame.losses, (lines, samples // CONSTANTS["LOSS_STEP"] + 1, 3), np.float32)
     nodes = np.arange(losses.shape[1]) * CONSTANTS["LOSS_STEP"]
@@ -104,7 +104,7 @@ def test_stages_do_what_their_references_do_with_the_same_inputs(kind, turn):
         stage.run(frame)
     np.testing.assert_allclose(frame.download("envelope"), envelope_of(frame, iq), rtol=1e-4)
     image = frame.download("image")
-    assert (np.abs(image.astype(int) - image_of(frame, iq)) <= 1).mean() > 0.999 and image.max() > 100
+    assert (np.abs(image.astype(int) - image_of(frame, iq)) <= 1).mean() > 0.999 and image.max() > 80
 
 
 @pytest.mark.parametrize("sigma", [0.3, 0.7, 2.0, 11.5])
@@ -136,7 +136,7 @@ def test_the_record_of_a_frame_follows_from_the_equations():
         "transmit_sigma": [transmit, *[0.0] * 7], "transmit_focus": [31.0, *[0.0] * 7],
         "transmit_rayleigh": [2.0 * np.pi * transmit**2 / wavelength, *[0.0] * 7],
         "receive_sigma_min": 1.5 * per_f_number, "receive_sigma_slope": per_f_number / 15.5,
-        "elevation_sigma": elevation / np.sqrt(2.0), "elevation_focus": 60.0,
+        "elevation_focus": 60.0,
         "elevation_rayleigh": 2.0 * np.pi * elevation**2 / wavelength,
         "cell_mm": 99.0 ** (-1.0 / 3.0), "speckle_scale": (99.0 * np.pi**1.5 * axial) ** -0.5,
         "seed": hash_mix(np.array([77], np.uint32))[0] ^ np.uint32(0x2545F491),
@@ -155,9 +155,8 @@ def test_the_medium_has_groups_smoothed_shares_and_the_fluid_distance(has_shares
     labels = Volume(labels.array, labels.ijk_to_ras @ np.diag([1.0, 1.0, 1.3, 1.0]))
     tissues = TissueTable(tissues, membrane=Membrane(BRAIN, 0.8, ("fluid",)))
     group_of, texture = np.array([0, 1, 0, 2, 1]), None  # of labels, the most frequent first
-    padded = np.pad(labels.array, 1)
-    continued = np.pad(labels.array, 1, mode="edge")
-    second, part = continued, np.zeros(padded.shape)
+    padded = np.pad(labels.array, 1, mode="edge")
+    second, part = padded, np.zeros(padded.shape)
     if has_shares:
         rng, shape = np.random.default_rng(0), labels.array.shape
         nothing, share = np.zeros(shape, np.float32), rng.uniform(0.0, 0.5, shape).astype(np.float32)
@@ -172,7 +171,7 @@ def test_the_medium_has_groups_smoothed_shares_and_the_fluid_distance(has_shares
     assert np.array_equal(groups, group_of[padded])
     smooth = download(found.smooth_buffer, (found.smooth_groups, *padded.shape), np.uint16)
     for number in range(3):
-        member = (1.0 - part) * (group_of[continued] == number) + part * (group_of[second] == number)
+        member = (1.0 - part) * (group_of[padded] == number) + part * (group_of[second] == number)
         expected = 65535.0 * ndimage.gaussian_filter(member, 3.0, mode="nearest", truncate=2.5)
         assert np.abs(smooth[number] - expected).max() < 2.5
     sigma_mm = 0.75 * np.prod(labels.spacing_mm) ** (1.0 / 3.0)

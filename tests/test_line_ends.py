@@ -42,7 +42,7 @@ def test_an_image_ends_as_a_deeper_one_goes_on(probe):
     sim = simulator(medium, SPECKLE, replace(TISSUES["fat"], attenuation_db_cm_mhz=0.0), **PLAIN)
     short, long = (sim.simulate(replace(probe, depth_mm=depth), POSE).iq for depth in (40.0, 46.0))
     cut = long[:, : short.shape[1]]
-    np.testing.assert_allclose(short[:, -40:], cut[:, -40:], atol=0.02 * np.abs(cut[:, -40:]).max())
+    np.testing.assert_allclose(short[:, -40:], cut[:, -40:], atol=0.03 * np.abs(cut[:, -40:]).max())
 
 
 def test_a_coarse_image_has_no_dark_last_row():

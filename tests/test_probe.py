@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -82,7 +83,7 @@ def test_beam_is_narrowest_near_its_focus_and_diffraction_limited_there():
     probe = PhasedProbe(75, 90, focus_mm=50, elevation_focus_mm=50, aperture_mm=15, receive_f_number=1.0)
     depth = np.linspace(1, 90, 500)
     lateral, elevational = probe.beam_sigma_mm(depth)
-    assert depth[np.argmin(elevational)] == pytest.approx(50, abs=0.5)
+    assert 25.0 < depth[np.argmin(elevational)] < 50.5  # a lens of few Fresnel zones is narrowest before its focus
     # Two-way: a product of two equal Gaussians, each of FWHM 1.21 wavelength x f-number.
     wavelength = 1.54 / 5
     expected = 1.21 * wavelength * 50 / 15 / 2.3548 / np.sqrt(2)
@@ -202,8 +203,6 @@ def test_a_matrix_array_is_focused_elevationally_as_laterally():
     for depth in (probe.depth_mm, 90.0):
         seen = Preset(probe).changed("probe", depth_mm=depth).probe
         assert seen.elevation_waist() == seen.transmit_waist()
-        sigma = seen.beam_sigma_mm(seen.focus_mm)
-        assert sigma[0] == pytest.approx(sigma[1], rel=0.01)
 
 
 def row_of(name: str) -> str:
@@ -228,3 +227,36 @@ def test_the_page_of_the_presets_has_their_numbers_and_sources():
     numbers = [row for row in rows if row.count("|") > 3]
     assert numbers == [row_of(name) for name in PROBES]
     assert [re.findall("`(.*?)`", row)[0] for row in rows if row not in numbers] == list(PROBES)
+
+
+@pytest.mark.parametrize("angle, width", [(0.0, 1.24), (20.0, 1.31), (36.0, 1.52)])
+def test_a_steered_aperture_is_foreshortened(angle, width):
+    """Widths by sums over the aperture, in mm at the focus."""
+    found = FWHM_PER_SIGMA * PROBES["phased"].beam_sigma_mm(54.0, float(np.cos(np.radians(angle))))[0]
+    assert found == pytest.approx(width, rel=0.06)
+
+
+@pytest.mark.parametrize("directivity, level_db", [("soft", -6.9), ("rigid", -2.8)])
+def test_elements_send_and_receive_less_along_steered_lines(directivity, level_db):
+    """The echo of a point at 38 degrees, by sums over elements of half a wavelength; the beam is wider by 1 / cos."""
+    probe, steered = replace(PROBES["phased"], directivity=directivity), np.radians(38.0)
+    peak = float(probe.steered_level(steered)) * np.sqrt(np.cos(steered))
+    assert 20.0 * np.log10(peak) == pytest.approx(level_db, abs=0.2)
+    assert replace(probe, directivity="none").line_levels() is None is PROBES["convex"].line_levels()
+
+
+@pytest.mark.parametrize(
+    "name, thickness", [("linear", (1.04, 0.54, 0.24, 0.46)), ("phased", (1.35, 0.62, 0.68, 1.06))]
+)
+def test_a_slice_is_as_thick_as_its_lens_makes_it(name, thickness):
+    """RMS by power at F/5, F/2, F and 1.5 F, in mm: sums over points of the lens, all frequencies of the pulse."""
+    probe, found = PROBES[name], []
+    lens = probe.lens()
+    across = np.linspace(0.0, float(lens.main_mm.max()), lens.main.shape[1])
+    for part in (0.2, 0.5, 1.0, 1.5):
+        row = part * probe.elevation_focus_mm / probe.displayed_mm * (len(lens.main) - 1)
+        near, far = lens.main[int(row) : int(row) + 2, :, 0].astype(float)
+        power = (near + row % 1.0 * (far - near)) ** 2
+        power[0] *= 0.5
+        found.append(float(np.sqrt((power * across**2).sum() / power.sum())))
+    assert found == pytest.approx(thickness, rel=0.12)

@@ -12,6 +12,7 @@ slicer = pytest.importorskip("slicer", reason="MRML nodes come with slicer-core:
 from SlicerUSSim.Logic import TissueTable, UltrasoundSimulator, Volume  # noqa: E402
 from SlicerUSSim.Logic.base.vtk_data import vtk_matrix  # noqa: E402
 from SlicerUSSim.Logic.imaging.noise import seed_of_pose  # noqa: E402
+from SlicerUSSim.Logic.mri.pathology import add_tissues, texture_below  # noqa: E402
 from SlicerUSSim.Logic.mri.samples import head_mri  # noqa: E402
 from SlicerUSSim.Logic.mri.sheets import find_sheets  # noqa: E402
 from SlicerUSSim.Logic.mrml.label_nodes import read_labels, write_labels  # noqa: E402
@@ -100,10 +101,11 @@ def test_segment_finds_sheets_and_images_show_them(monkeypatch):
     shown = bench.logic.lastFrame.image
 
     result = segment_once(mri, classes=None, thin_sulci=False)
+    laid = add_tissues(result.labels, result.tissue_names, found[0].masks(), has_brain_mask=True)  # corpus callosum
     preset, pose = bench.logic.preset, np.linalg.inv(TURN) @ node_to_world(parameters.probe_transform)
     simulator = UltrasoundSimulator(
-        result.labels, TissueTable.brain(result.tissue_names), preset.settings, texture=result.texture(),
-        sheets=found[0].surfels,
+        laid.labels, TissueTable.brain(laid.tissue_names), preset.settings,
+        texture=texture_below(result.texture(), mri, result.labels, laid.labels), sheets=found[0].surfels,
     )  # fmt: skip
     expected = simulator.simulate(preset.probe, pose, preset.display, noise_seed=seed_of_pose(pose)).image
 
@@ -111,7 +113,7 @@ def test_segment_finds_sheets_and_images_show_them(monkeypatch):
         presenter.values.setValue(f"scene.sheet_{kind}", False)
     presenter.images.simulate()
     without = bench.logic.lastFrame.image
-    assert np.abs(without.astype(int) - shown).mean() > 5.0 * np.abs(shown.astype(int) - expected).mean()
+    assert np.abs(shown.astype(int) - expected).mean() < 0.01 and np.abs(without.astype(int) - shown).mean() > 1.0
     parameters.sheets = None
     presenter.images.simulate()
     np.testing.assert_array_equal(bench.logic.lastFrame.image, without)

@@ -108,7 +108,8 @@ def test_tgc_undoes_the_attenuation_it_is_set_to():
     dz = frame.sample_interval_mm
     raw = [level_db(frame.iq[:, int(d / dz) : int((d + 8) / dz)]) for d in (5, 37)]
     seen = [level_db(frame.envelope[:, int(d / dz) : int((d + 8) / dz)]) for d in (5, 37)]
-    assert raw[1] - raw[0] == pytest.approx(-2 * 0.5 * 5 * 3.2, abs=0.7)
+    # The band of the pulse loses 0.7 dB less than its centre.
+    assert raw[1] - raw[0] == pytest.approx(-2 * 0.5 * 5 * 3.2 + 0.7, abs=0.4)
     assert seen[1] - seen[0] == pytest.approx(0, abs=0.7)
 
 
@@ -222,9 +223,8 @@ def test_changed_tissues_give_what_a_new_simulator_would(solid):
     )
 
 
-@pytest.mark.parametrize("spacing_mm", [0.3])
-def test_there_is_no_membrane_beside_a_label_map_of_small_voxels(spacing_mm):
-    """Look-ups outside the volume find its margin, half a voxel from the border to the coupling medium."""
+@pytest.mark.parametrize("spacing_mm", [0.3, 1.0])
+def test_a_membrane_goes_on_beyond_the_end_of_a_label_map(spacing_mm):
     half = block(lambda x, y, z: np.where(y > 0, 1, 0), (8, 12, 6), spacing_mm)
     bright = Tissue("bright", 1540.0, 1.54, 0.0, mu0=1.0, sigma0=0.5)
     silent = Tissue("silent", 1540.0, 1.54, 0.0)
@@ -232,9 +232,19 @@ def test_there_is_no_membrane_beside_a_label_map_of_small_voxels(spacing_mm):
     probe = LinearProbe(40, 22, scan_lines=81, focus_mm=12, elevation_focus_mm=12)
     settings = SimulationSettings(interfaces=False, side_lobes=False)
     iq = UltrasoundSimulator(half, table, settings).simulate(probe, rigid(np.eye(3), [0, -10, 0])).iq
-    power, outside = np.mean(np.abs(iq) ** 2, axis=1), np.abs(probe.line_positions()) > 12.0
-    assert power[np.abs(probe.line_positions()) < 6.0].min() > 1e-4
-    assert power[outside].max() < 1e-9
+    power, outside = np.mean(np.abs(iq) ** 2, axis=1), np.abs(probe.line_positions()) > 10.0
+    assert power.min() > 1e-4
+    assert 0.5 < power[outside].mean() / power[~outside].mean() < 2.0
+
+
+def test_the_end_of_a_label_map_is_no_border_and_is_told_of_once(caplog):
+    """Tissue goes on with its level and without a wall, whether the map ends in the depth or beside the lines."""
+    whole, short = (simulator(block(lambda x, y, z: 1 + 0 * x, half), SPECKLE) for half in ((40,) * 3, (12, 12, 20)))
+    probe = LinearProbe(30, 40, scan_lines=61, focus_mm=20, elevation_focus_mm=20)
+    images = [made.simulate(probe, rigid(np.eye(3), [0, -10, 0])).iq for made in (whole, short, short)]
+    np.testing.assert_allclose(images[1], images[0], atol=1e-3 * np.abs(images[0]).max())
+    told = [record.getMessage() for record in caplog.records if "beyond the volume" in record.getMessage()]
+    assert told == ["57 % of the image is beyond the volume, whose tissue goes on from its end"]
 
 
 @pytest.mark.parametrize("thickness", [0.6, 1.6])
@@ -358,10 +368,9 @@ def test_a_label_map_without_labels_is_a_warning_and_a_black_image():
         assert not sim.simulate(PROBES["linear"], rigid(np.eye(3), [10, 0, 10])).image.any()
 
 
-def test_a_probe_that_looks_past_the_volume_sees_nothing_and_warns(solid):
+def test_a_probe_that_looks_past_the_volume_warns(solid):
     with pytest.warns(EmptyViewWarning, match="looks past the volume"):
-        frame = solid.simulate(PROBES["linear"], rigid(np.eye(3), [300, 0, 0]), QUIET)
-    assert (frame.image == 0).all()
+        solid.simulate(PROBES["linear"], rigid(np.eye(3), [300, 0, 0]), QUIET)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         solid.simulate(PROBES["linear"], rigid(np.eye(3), [0, -60, 0]), QUIET)
@@ -515,7 +524,7 @@ def test_so_many_scatterers_that_an_image_takes_long_are_a_warning():
     with warnings.catch_warnings():  # as an error, before the image is computed
         warnings.simplefilter("error")
         dense = simulator(labels, SPECKLE, scatterers_per_mm3=200_000.0)
-        with pytest.raises(SlowScatterersWarning, match=r"200000: 2\.9e\+09 cells .* about 98 s on .* none, 33 for"):
+        with pytest.raises(SlowScatterersWarning, match=r"200000: 3\.2e\+09 cells .* about 108 s on .* none, 18 for"):
             dense.simulate(PROBES["convex"], pose)
         with pytest.raises(SlowScatterersWarning):
             dense.volume(PROBES["convex"], [pose])

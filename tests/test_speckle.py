@@ -135,8 +135,8 @@ def test_a_pulse_loses_less_than_its_centre_frequency():
 
 @pytest.mark.slow
 def test_speckle_near_the_face_of_a_phased_array_has_its_level():
-    """Near the point where all lines begin."""
-    probe = replace(PROBES["phased"], scan_lines=64)
+    """Near the point where all lines begin. (Elements make steered lines darker.)"""
+    probe = replace(PROBES["phased"], scan_lines=64, directivity="none")
     pose = rigid(np.eye(3), [0, -10, 0])
     signals = [simulator(SOLID, SPECKLE, coupling=SPECKLE, seed=s).simulate(probe, pose) for s in range(30)]
     for depth in (1.5, 2.5, 3.5, 4.5):
@@ -146,10 +146,10 @@ def test_speckle_near_the_face_of_a_phased_array_has_its_level():
 
 @pytest.mark.slow
 def test_rare_scatterers_of_a_15_mhz_array_are_sparse_as_predicted():
-    """There are two in the smallest resolution cell."""
+    """There are 2.4 in the smallest resolution cell: the slice is thinnest in front of the lens's focus, at 9 mm."""
     tissue, probe = replace(SPECKLE, mu1=3.0), PROBES["linear_15"]
     depth, cell, expected = smallest_cell(probe, tissue, 1.0)
-    assert 125_000 * tissue.scatterer_share * cell == pytest.approx(2.1, abs=0.1)
+    assert 125_000 * tissue.scatterer_share * cell == pytest.approx(2.4, abs=0.1) and 8.0 < depth < 11.0
     frames = [
         simulator(SOLID, tissue, seed=seed).simulate(probe, rigid(np.eye(3), [0, -depth, 0])) for seed in range(12)
     ]

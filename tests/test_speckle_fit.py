@@ -52,8 +52,8 @@ def tracked():
     return sequence, TrackedImages.of(sequence, probe=PROBE)
 
 
-def simulator(tissues=TISSUES) -> UltrasoundSimulator:
-    return UltrasoundSimulator(LABELS, tissues, SimulationSettings(seed=2, ring_down=False))
+def simulator(tissues=TISSUES, seed: int = 2) -> UltrasoundSimulator:
+    return UltrasoundSimulator(LABELS, tissues, SimulationSettings(seed=seed, ring_down=False))
 
 
 @pytest.mark.slow
@@ -65,11 +65,12 @@ def test_smoothing_and_texture_are_found_by_the_costs_of_texture(tracked):
     assert found.display.smoothing_axial_mm == pytest.approx(0.12, abs=0.05)
     assert found.display.smoothing_lateral_deg == pytest.approx(0.5, abs=0.25)
     assert found.texture_factor in (0.5, 1.0, 1.4)  # not 0: the true tissue is uneven
-    made, depths = simulator(found.tissues), (15.0, 23.0, 32.0, 41.0)
-    display = replace(found.display, image_size=TRUE.image_size)
-    images = [made.simulate(PROBE, pose, display).image for pose in tracked[1].poses]
-    real, simulated = (speckle_widths(i, PROBE, tracked[1].grid, depths) for i in (tracked[1].images, images))
-    assert width_misfit(simulated, real) < 0.07
+    depths, display = (15.0, 23.0, 32.0, 41.0), replace(found.display, image_size=TRUE.image_size)
+    real, misfits = speckle_widths(tracked[1].images, PROBE, tracked[1].grid, depths), []
+    for seed in range(2, 6):  # the true parameters have 0.06, by chance from 0.02 to 0.09
+        images = [simulator(found.tissues, seed).simulate(PROBE, pose, display).image for pose in tracked[1].poses]
+        misfits.append(width_misfit(speckle_widths(images, PROBE, tracked[1].grid, depths), real))
+    assert np.mean(misfits) < 0.07
     unlike = [replace(width, lateral_mm=1.2 * width.lateral_mm) for width in real]
     assert width_misfit(unlike, real) == pytest.approx(0.5 * np.log(1.2))
     unknown = [replace(width, axial_mm=np.nan, lateral_mm=np.nan) for width in real]

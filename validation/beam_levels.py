@@ -46,14 +46,17 @@ def levels_db(
 def levels_and_widths(
     labels: Volume, tissues: TissueTable, baseline: TissueTable, probe: Probe, pose: np.ndarray, device,
     *, beam: str, edges_mm: np.ndarray, lines: slice, seeds: int, reflections: bool = True,
+    wavefront_curvature: bool = True,
 ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
     """Speckle between the edges of blocks of depth re the same with the tissues of `baseline`: levels and widths.
 
     (lines,) power in dB, the mean over blocks of their changes, whatever the gain of depths is; and (lines, blocks) the
     width of the beam, from the correlation between a line and the next one, exp(-d^2 / 4 sigma^2) for Gaussian beams a
-    distance d apart. Over `seeds` speckle averages.
+    distance d apart. With `wavefront_curvature` that is the length of its speckle. Over `seeds` speckle averages.
     """
-    settings = SimulationSettings(beam=beam, interfaces=False, reflections=reflections)
+    settings = SimulationSettings(
+        beam=beam, interfaces=False, reflections=reflections, wavefront_curvature=wavefront_curvature
+    )
     simulator = UltrasoundSimulator(labels, tissues, settings, device)
     following = slice(lines.start + 1, lines.stop + 1, lines.step)
     powers, decays = [], []

@@ -13,8 +13,10 @@ from scipy.special import ndtr
 from SlicerUSSim.Logic.base.settings import DisplaySettings, SimulationSettings
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.imaging.simulator import UltrasoundSimulator
+from SlicerUSSim.Logic.probe.arrays import Probe
 from SlicerUSSim.Logic.probe.beam import FWHM_PER_SIGMA
 from SlicerUSSim.Logic.probe.poses import elevational_motion, sample, slide_sweep, tilt_sweep
+from validation.apertures import lens_profile, mirror_echo_db
 from validation.checks import PROBES, Check, Outcome, Row
 from validation.measurement import EVEN, depth_window, echo_near, full_width
 from validation.phantoms import (
@@ -77,7 +79,7 @@ def specular_echoes(rotation: np.ndarray, device) -> Outcome:
 
 
 def tilted_in_elevation(rotation: np.ndarray, device) -> Outcome:
-    """A plane tilted out of the image plane: for a Gaussian beam its echo is the Fourier transform of a Gaussian.
+    """A plane tilted out of the image plane: its echo is that of its mirror images over the lens.
 
     Where the beam is wide, rays meet a steep plane at ranges that differ by a pulse length or more. The integral over
     the stratum of each ray still vanishes, as does the integral over the whole beam. Without it, the image would show
@@ -89,7 +91,6 @@ def tilted_in_elevation(rotation: np.ndarray, device) -> Outcome:
     rows = []
     for name, probe in PROBES.items():
         low = replace(probe, frequency_mhz=2.0)
-        sigma = float(low.beam_sigma_mm(25.0)[1])
 
         def peak(probe, tilt: float, depth: float) -> float:
             motion = elevational_motion(angle_deg=tilt)
@@ -99,9 +100,7 @@ def tilted_in_elevation(rotation: np.ndarray, device) -> Outcome:
             return echo_near(frame, probe, (0.0, depth), 2.0)[2]
 
         peaks = {tilt: peak(low, tilt, 25.0) for tilt in (0.0, 2.0, 3.0, 8.0)}
-        for tilt in (2.0, 3.0):
-            turns = low.cycles_per_mm * np.tan(np.radians(tilt)) * sigma
-            theory = -20 * np.log10(np.e) * 0.5 * (2 * np.pi * turns) ** 2
+        for tilt, theory in zip((2.0, 3.0), mirror_echo_db(low, (2.0, 3.0), 25.0, 90.0).tolist(), strict=True):
             rows.append(Row(f"{tilt:.0f} degrees, {name}", "dB", theory, 20 * np.log10(peaks[tilt] / peaks[0.0]), 1.0))
         rows.append(Row(f"8 degrees, {name}", "dB", -15.0, 20 * np.log10(peaks[8.0] / peaks[0.0]), 0.0, "at most"))
         wide = replace(probe, elevation_focus_mm=55.0)
@@ -200,7 +199,7 @@ def slice_thickness(rotation: np.ndarray, device) -> Outcome:
         powers = [_band_power(frame, wide, depth) for frame in simulator.sweep(wide, poses, EVEN)]
         powers = np.reshape(powers, (2, -1)).mean(0)
         measured = 10 * np.log10(np.maximum(powers, 1e-30) / powers[0])
-        expected = _bar_fall_db(offsets, sigma, width)
+        expected = _bar_fall_db(wide, depth, offsets, width)
         rows += [
             Row(f"fall at {offset / sigma:.1f} sigma out of plane, {name}", "dB", e, m, 0.5 + 0.08 * abs(e))
             for offset, e, m in zip(offsets[1:], expected[1:], measured[1:], strict=True)
@@ -210,10 +209,11 @@ def slice_thickness(rotation: np.ndarray, device) -> Outcome:
     return Outcome(tuple(rows), partial(draw_plots, plots=[plot]))
 
 
-def _bar_fall_db(offsets_mm: np.ndarray, sigma_mm: float, width_mm: float) -> np.ndarray:
+def _bar_fall_db(probe: Probe, depth_mm: float, offsets_mm: np.ndarray, width_mm: float) -> np.ndarray:
     """Theoretical power in dB of a bar of this width at distances from the image plane, relative to the first."""
     across = np.linspace(-0.5 * width_mm, 0.5 * width_mm, 25)
-    power = np.exp(-((across - offsets_mm[:, None]) ** 2) / sigma_mm**2).mean(axis=1)
+    beside = np.abs(across - offsets_mm[:, None])
+    power = (lens_profile(probe, depth_mm, beside.ravel()) ** 2).reshape(beside.shape).mean(axis=1)
     return 10 * np.log10(power / power[0])
 
 
@@ -243,7 +243,7 @@ def compounding(rotation: np.ndarray, device) -> Outcome:
         "freehand": freehand_sweep(phantom.probe_to_ras, 10.0, 60),
     }
     offsets = sigma * np.array([0.0, 0.5, 1.0, 1.5])
-    theory = _bar_fall_db(offsets, sigma, width)
+    theory = _bar_fall_db(probe, depth, offsets, width)
     rows, volumes = [], {}
     for name, poses in sweeps.items():
         volume = volumes[name] = simulator.volume(probe, poses, display, spacing_mm=0.35)
@@ -304,14 +304,14 @@ CHECKS = (
     Check("specular echoes", "The echo of a hit is w A |r| cos^n of the angle of incidence.", specular_echoes),
     Check(
         "elevational tilt",
-        "A plane tilted out of the image by t lowers its echo by exp(-(2 pi f tan t sigma)^2 / 2), f in cycles per mm.",
+        "The echo of a plane tilted out of the image is that of its mirror images: sums over the ways of the lens.",
         tilted_in_elevation,
     ),
     Check("interface width", "The echo of a small sheet is widened by the beam in both directions.", interface_width),
     Check("resolution", "The echo of a wire has the width of the beam at its depth.", resolution),
     Check(
         "slice thickness",
-        "The power of a thin bar out of plane falls as exp(-z^2 / sigma^2), averaged over its width.",
+        "The power of a thin bar out of plane falls as the lens says: sums over its points, averaged over the bar.",
         slice_thickness,
     ),
     Check(

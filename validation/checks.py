@@ -22,7 +22,7 @@ _FOCUS = {"scan_lines": 161, "focus_mm": 30.0, "elevation_focus_mm": 30.0}
 PROBES: dict[str, Probe] = {
     "linear": LinearProbe(36.0, 52.0, **_FOCUS),
     "convex": ConvexProbe(60.0, 36.0, 52.0, **_FOCUS),
-    "phased": PhasedProbe(70.0, 52.0, **_FOCUS),
+    "phased": PhasedProbe(70.0, 52.0, directivity="none", **_FOCUS),
 }
 
 

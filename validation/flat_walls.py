@@ -47,7 +47,7 @@ _DIAGONALS, _FROM_DIAGONAL = ((0, 1, 1), (1, 1, 1), (0, 1, 2), (1, 1, 2)), (0.8,
 
 #: Planes tilted to the axis, in degrees, about azimuths from the image plane, in voxels turned as numbered; and
 #: the dB re a square wall down to which single lines are compared, which change by less than the second
-_FLANKS, _FLANK_FLOOR_DB, _CHANGE_DB = ((5.0, 347.0, 11), (5.0, 200.0, 12), (12.0, 50.0, 13)), -30.0, 1.5
+_FLANKS, _FLANK_FLOOR_DB, _CHANGE_DB = ((5.0, 347.0, 11), (5.0, 200.0, 12), (12.0, 50.0, 13)), -30.0, 3.0
 _LINES = (96, 191, 381)
 
 #: The same of layers, by their thickness in voxels. Single lines lose up to 7 dB where it is two voxels (physics.md).

@@ -39,6 +39,7 @@ def beams_in_heads(rotation: np.ndarray, device) -> Outcome:
                 level, width = levels_and_widths(
                     brain.labels, brain.tissues, brain.baseline, probe, pose, device,
                     beam=beam, edges_mm=_EDGES * probe.depth_mm, lines=_LINES, seeds=_SEEDS[beam],
+                    wavefront_curvature=False,
                 )  # fmt: skip
                 found[beam].append(level)
                 widths[beam].append(width)

@@ -22,6 +22,7 @@ from SlicerUSSim.Logic.probe.arrays import Probe
 from SlicerUSSim.Logic.probe.beam import FWHM_PER_SIGMA
 from SlicerUSSim.Logic.tissue.table import TissueTable
 from SlicerUSSim.Logic.tissue.tissue import Tissue
+from validation.wave import mirrored_by_rod
 
 REFERENCE_SPEED_M_S = 1540.0
 #: Speckle in a medium with the reference speed of sound
@@ -263,13 +264,23 @@ def parallel_plates(
     )
 
 
+def mirrored_power_behind(probe: Probe, radius_mm: float, top_mm: float, away_mm: float, *, is_sphere: bool) -> float:
+    """Power of speckle that a ball, or a rod across the image, mirrors at a distance behind its surface, re none."""
+    if radius_mm > 1e3:
+        return 1.0
+    depth = top_mm + away_mm
+    lateral = (probe.aperture_mm, probe.focus_mm), (min(probe.aperture_mm, depth / probe.receive_f_number), depth)
+    lens = (probe.elevation_aperture_mm, probe.elevation_focus_mm)
+    around = [lateral, (lens, lens)][: 1 + is_sphere]
+    return float(np.prod([mirrored_by_rod(radius_mm, top_mm, away_mm, of, probe.frequency_mhz) for of in around]))
+
+
 def curved_mirror(
     rotation: np.ndarray | None = None, *, radius_mm: float = 12.0, is_sphere: bool = True
 ) -> Phantom[Level]:
     """A steel ball, or a rod across the image, that mirrors the surrounding speckle; the level falls with distance.
 
-    A convex mirror of radius r has the focal length r/2, so at a distance l a narrow beam is 1 + 2 l / r times as wide,
-    in both directions behind a ball and laterally behind a rod. The power of mirrored speckle falls by these factors.
+    The level is that of the exact waves at a rod, laterally and, for a ball, also elevationally.
     """
     top = 22.0
     plain = replace(BACKGROUND, attenuation_db_cm_mhz=0.0)
@@ -282,9 +293,9 @@ def curved_mirror(
         direct = 10 * np.log10(plain.scatterer_variance)
         levels = []
         for away in (3.0, 6.0, 10.0):
-            wider = (1.0 + 2.0 * away / radius_mm) ** (2 if is_sphere else 1)
+            left = mirrored_power_behind(probe, radius_mm, top, away, is_sphere=is_sphere)
             region = (-1.5, 1.5, top + away - 1.0, top + away + 1.0)
-            level = float(direct + 20 * np.log10(reflectance) - 10 * np.log10(wider))
+            level = float(direct + 20 * np.log10(reflectance) + 10 * np.log10(left))
             levels.append(Level(f"{away:.0f} mm", region, level))
         return tuple(levels)
 
@@ -335,7 +346,7 @@ def speed_cyst(
 def behind_object(
     shape: str, tissue: Tissue, rotation: np.ndarray | None = None, *, background: Tissue = BACKGROUND
 ) -> Phantom[LevelChange]:
-    """A "plate" (x > 0) or "strip" (3 mm) from 15 to 18 mm, or a "ball" of 3 mm radius at 16 mm, without attenuation.
+    """A "plate" (x > 0) or "strip" (3 mm) from 15 to 18 mm, a "ball" of 3 mm radius or a "rod" of 2 mm at 16 mm.
 
     The speckle has no attenuation around the object.
     """
@@ -345,6 +356,7 @@ def behind_object(
         "plate": lambda x, y, z: (y > 15.0) & (y < 18.0) & (x > 0.0),
         "strip": lambda x, y, z: (y > 15.0) & (y < 18.0) & (np.abs(x) < 1.5),
         "ball": lambda x, y, z: x**2 + (y - 16.0) ** 2 + z**2 < 9.0,
+        "rod": lambda x, y, z: x**2 + (y - 16.0) ** 2 + 0.0 * z < 4.0,
     }
     require(shape in shapes, f"shape is {shape!r}, expected one of {', '.join(shapes)}")
     baseline = TissueTable(dict.fromkeys(tissues, plain))
@@ -352,7 +364,8 @@ def behind_object(
     def label(x, y, z):
         return np.where(shapes[shape](x, y, z), 2, 1)
 
-    return _phantom(f"behind a {shape}", label, tissues, rotation, 0.5, lambda probe: (), baseline)
+    spacing = 0.25 if shape == "rod" else 0.5
+    return _phantom(f"behind a {shape}", label, tissues, rotation, spacing, lambda probe: (), baseline)
 
 
 # ---- resolution and speckle -----------------------------------------------------------------------------------------

@@ -124,10 +124,12 @@ def sub_voxel_interfaces(rotation: np.ndarray, device) -> Outcome:
     simulator = UltrasoundSimulator(phantom.labels, phantom.tissues, settings, device)
     probe = LinearProbe(30, 30, scan_lines=121, elevation_aperture_mm=30, elevation_focus_mm=60)
     hits = simulator.trace(probe, phantom.probe_to_ras).hits
-    front = hits[hits["label_before"] == 0]
+    from_centre = hits["position"] - np.array(phantom.centre_ras)
+    # Behind the equator, a ray along it enters a voxel of the sphere while it leaves the smooth one.
+    is_front = (hits["label_before"] == 0) & (from_centre @ phantom.probe_to_ras[:3, 1] < 0.0)
+    front, from_centre = hits[is_front], from_centre[is_front]
     seen = replace(PROBES["convex"], depth_mm=60.0)
     image = simulator.simulate(seen, phantom.probe_to_ras, EVEN)
-    from_centre = front["position"] - np.array(phantom.centre_ras)
     radius = np.linalg.norm(from_centre, axis=1)
     angle = np.degrees(np.arccos(np.clip((front["normal"] * from_centre / radius[:, None]).sum(axis=1), -1, 1)))
     return Outcome(

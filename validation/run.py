@@ -85,9 +85,11 @@ def all_checks() -> tuple[Check, ...]:
     """Every check, in the order of the physics: rays, speckle, artefacts, space."""
     from validation import (
         aberration,
+        apertures,
         artefacts,
         band,
         beams,
+        continuity,
         curved_walls,
         flat_walls,
         floor,
@@ -103,10 +105,12 @@ def all_checks() -> tuple[Check, ...]:
     groups = (
         rays,
         speckle,
+        continuity,
         band,
         floor,
         artefacts,
         beams,
+        apertures,
         curved_walls,
         transmit,
         walls,

@@ -104,7 +104,8 @@ def everywhere(rotation: np.ndarray, device) -> Outcome:
     """First-order statistics of the probes of the presets at their own frequencies, and of all tissues."""
     rows = []
     phantom, simulators = _simulators(rotation, device)
-    for name, probe in SHIPPED.items():
+    for name, shipped in SHIPPED.items():
+        probe = replace(shipped, directivity="none")
         frames = [s.simulate(probe, phantom.probe_to_ras, EVEN) for s in simulators]
         for place, depth in {"near the face": 0.1, "at the focus": 0.6, "far": 0.9}.items():
             found = _window_statistics(frames, depth * probe.depth_mm, 0.06 * probe.depth_mm)
@@ -177,8 +178,10 @@ def correlations(rotation: np.ndarray, device) -> Outcome:
             lag = max(1, round(sigma_l / apart))
             beside = phantom.probe_to_ras @ elevational_motion(half_e)
             others = [s.simulate(probe, beside, EVEN) for s in simulators]
-            near = [depth_window(f, depth, 1.0) for f in frames]
-            wide = [depth_window(f, depth, 3.0) for f in frames]
+            # Steered lines have wider beams.
+            part = slice(len(frames[0].iq) // 3, -(len(frames[0].iq) // 3)) if name == "phased" else slice(None)
+            near = [depth_window(f, depth, 1.0)[part] for f in frames]
+            wide = [depth_window(f, depth, 3.0)[part] for f in frames]
             dz, sigma_a = frames[0].sample_interval_mm, probe.axial_sigma_mm
             axial = max(1, round(sigma_a / dz))
             found = {
@@ -186,7 +189,7 @@ def correlations(rotation: np.ndarray, device) -> Outcome:
                 "elevational": (
                     half_e,
                     half_e / np.sqrt(4.0 * np.log(2.0)),
-                    [correlation(s, depth_window(o, depth, 1.0)) for s, o in zip(near, others, strict=True)],
+                    [correlation(s, depth_window(o, depth, 1.0)[part]) for s, o in zip(near, others, strict=True)],
                 ),
                 "axial": (axial * dz, sigma_a, [correlation(s[:, :-axial], s[:, axial:]) for s in wide]),
             }

@@ -126,7 +126,7 @@ def steered_lines(rotation: np.ndarray, device) -> Outcome:
         wrong = float(((frame.image > 0) != field).mean())
         rows.append(Row(f"pixels on the wrong side of the field's edge, {name}", "", 0.0, wrong, 0.01, "at most"))
         inside = depth_window(frame, 30.0 + float(probe.line_starts_mm(0.0)), 5.0)
-        level = 10 * np.log10(SPECKLE.scatterer_variance)
+        level = _level_of_elements_db(probe, probe.directions()[:, 0])
         rows.append(Row(f"level of speckle, {name}", "dB", level, level_db(inside), 1.0))
         views.append(View(name, phantom, probe, simulator.simulate(probe, phantom.probe_to_ras, EVEN)))
     rows += _levels_of_lines(tissue, device)
@@ -143,16 +143,25 @@ def _levels_of_lines(tissue: Phantom, device) -> list[Row]:
     ]
     count, dz = _WIDE.scan_lines, frames[0].sample_interval_mm
     starts = _WIDE.line_starts_mm(_WIDE.line_positions())
-    level, rows = 10 * np.log10(SPECKLE.scatterer_variance), []
+    rows = []
     for depths in ((3.0, 9.0), (20.0, 30.0)):
         spans = [slice(*(round((start + depth) / dz) for depth in depths)) for start in starts]
         power = [np.mean([np.mean(np.abs(frame.iq[n, span]) ** 2) for frame in frames]) for n, span in enumerate(spans)]
         inner = np.abs(np.arange(count) - 0.5 * (count - 1)) < count / 6
         for name, lines in (("inner", inner), ("outer", ~inner)):
             found = 10 * np.log10(np.mean(np.array(power)[lines]))
+            level = _level_of_elements_db(_WIDE, _WIDE.directions()[lines, 0])
             text = f"level at {depths[0]:.0f} to {depths[1]:.0f} mm, {name} lines of a trapezoid of 45 degrees"
             rows.append(Row(text, "dB", level, float(found), 0.3))
     return rows
+
+
+def _level_of_elements_db(probe: Probe, sines: np.ndarray) -> float:
+    """Of speckle along lines at angles of these sines: elements of half a wavelength in a soft baffle, wider beams."""
+    assert probe.element_mm is None and probe.directivity == "soft"
+    cosines = np.sqrt(1.0 - sines**2)
+    power = (np.sinc(0.5 * sines) * cosines) ** 4 / cosines
+    return float(10 * np.log10(SPECKLE.scatterer_variance * power.mean()))
 
 
 def harmonic(rotation: np.ndarray, device) -> Outcome:

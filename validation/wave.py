@@ -2,7 +2,8 @@
 
 Split steps: the angular spectrum over a short distance at the reference speed, then the phase that the medium adds
 (Hardin and Tappert, SIAM Review 15, 1973). The field of a lens is Huygens' sum over its aperture, with the distances as
-they are and for several frequencies of the band. Independent of the simulator; there are no reflections.
+they are and for several frequencies of the band. Waves at a rod are the exact series of cylindrical waves (Morse and
+Ingard, Theoretical Acoustics, section 8.1). Independent of the simulator; only rods reflect.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
+from scipy.special import h1vp, hankel1, jvp
 
 _DX_MM, _DZ_MM, _WIDTH = 0.1, 0.25, 512
 _EDGE_MM = 3.0  # over which waves fade at the sides
@@ -24,13 +26,26 @@ def speckle_power(
 ) -> np.ndarray:
     """(depths,) mean power of speckle on a scan line: the integral of the transmitted times the received intensity.
 
-    Parameters as in beam_intensities.
+    Parameters as in beam_fields.
     """
     _, transmitted, received = beam_intensities(speed, depths_mm, nepers_per_mm=nepers_per_mm, **beam)
     return (transmitted * received).sum(axis=1)
 
 
 def beam_intensities(
+    speed: Map | None,
+    depths_mm: np.ndarray,
+    **beam,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Intensities across a scan line: (lateral,) place in mm, (depths, lateral) transmitted and received.
+
+    Parameters as in beam_fields.
+    """
+    x, transmitted, received = beam_fields(speed, depths_mm, **beam)
+    return x, np.abs(transmitted) ** 2, np.abs(received) ** 2
+
+
+def beam_fields(
     speed: Map | None,
     depths_mm: np.ndarray,
     *,
@@ -42,7 +57,7 @@ def beam_intensities(
     steering_rad: float = 0.0,
     nepers_per_mm: Map | None = None,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Intensities across a scan line: (lateral,) place in mm, (depths, lateral) transmitted and received.
+    """Complex amplitudes across a scan line: (lateral,) place in mm, (depths, lateral) transmitted and received.
 
     `speed` gives metres per second at lateral positions and depths in the line's frame (mm, any one shape); None is a
     medium of the reference speed. `nepers_per_mm` is what amplitudes lose there, one way. The aperture transmits to
@@ -66,7 +81,7 @@ def beam_intensities(
     waves = np.clip((0.5 * open_mm - np.abs(face)) / _DX_MM + 0.5, 0.0, 1.0)
     waves = waves * np.exp(-1j * k * (np.hypot(x, away) - away))
     ends = np.rint((np.asarray(depths_mm) - start) / _DZ_MM).astype(int)
-    transmitted, received = np.zeros((2, len(ends), _WIDTH))
+    transmitted, received = np.zeros((2, len(ends), _WIDTH), complex)
     for n in range(ends.max()):
         waves = np.fft.ifft(np.fft.fft(waves, axis=1) * step, axis=1) * sides
         if speed is not None:
@@ -76,7 +91,7 @@ def beam_intensities(
         if nepers_per_mm is not None:
             waves = waves * np.exp(-nepers_per_mm(x, np.full_like(x, start + (n + 0.5) * _DZ_MM)) * _DZ_MM)
         for at in np.flatnonzero(ends == n + 1):
-            transmitted[at], received[at] = np.abs(waves[[0, at + 1]]) ** 2
+            transmitted[at], received[at] = waves[[0, at + 1]]
     return x, transmitted, received
 
 
@@ -110,3 +125,60 @@ def speckle_half_length(
     beyond = int(np.argmax(correlation < 0.5 * correlation[0]))
     near = slice(beyond - 1, beyond + 1)
     return float(np.interp(-0.5 * correlation[0], -correlation[near], place[near] - place[0]))
+
+
+#: (size, focus) of the transmit and the receive aperture, mm
+Apertures = tuple[tuple[float, float], tuple[float, float]]
+
+
+def past_rod(
+    radius_mm: float, centre_mm: tuple[float, float], depth_mm: float, apertures: Apertures, frequency_mhz: float
+) -> float:
+    """Power of speckle at a depth on a scan line past a rigid rod, re none; `centre_mm` is (lateral, depth).
+
+    The integral of the transmitted times the received intensity across the line, continuous waves.
+    """
+    place = np.arange(-10.0, 10.0, 0.05)
+    plain, scattered = _at_rod(place, np.full_like(place, depth_mm), radius_mm, centre_mm, apertures, frequency_mhz)
+    return float(np.sum(_both(plain + scattered)) / np.sum(_both(plain)))
+
+
+def mirrored_by_rod(
+    radius_mm: float, top_mm: float, away_mm: float, apertures: Apertures, frequency_mhz: float
+) -> float:
+    """Power of the speckle that a rigid rod on the axis mirrors, shown `away_mm` behind its surface, re no rod."""
+    centre, reach = (0.0, top_mm + radius_mm), radius_mm + away_mm
+    angle = np.linspace(-0.75, 0.75, 1201) * np.pi
+    x, y = reach * np.sin(angle), centre[1] - reach * np.cos(angle)
+    seen = y > 0.0
+    _, mirrored = _at_rod(x[seen], y[seen], radius_mm, centre, apertures, frequency_mhz)
+    place = np.arange(-10.0, 10.0, 0.05)
+    depth = np.full_like(place, top_mm + away_mm)
+    plain, _ = _at_rod(place, depth, 1e-3, (50.0, 0.0), apertures, frequency_mhz)
+    return float(np.sum(_both(mirrored)) * reach * (angle[1] - angle[0]) / (np.sum(_both(plain)) * 0.05))
+
+
+def _both(fields: np.ndarray) -> np.ndarray:
+    return np.abs(fields[0] * fields[1]) ** 2
+
+
+def _at_rod(
+    x: np.ndarray, y: np.ndarray, radius_mm: float, centre_mm: tuple[float, float], apertures: Apertures,
+    frequency_mhz: float, speed_m_s: float = 1540.0,
+) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+    """((2, places) transmitted and received fields without the rod; what the rod adds), of points 0.45 waves apart."""
+    k = 2e3 * np.pi * frequency_mhz / speed_m_s
+    half = 0.5 * max(size for size, _ in apertures)
+    point = np.arange(-half, half, 0.9 * np.pi / k)
+    weights = np.stack(
+        [(abs(point) <= 0.5 * size) * np.exp(-1j * k * np.hypot(point, focus)) for size, focus in apertures], axis=1
+    )
+    plain = hankel1(0, k * np.hypot(x[:, None] - point, y[:, None])) @ weights
+    order = np.arange(-int(k * radius_mm + 25), int(k * radius_mm + 26))
+    waves = []  # about the rod: of every order at every point of the aperture and every place
+    for aside, below in ((point - centre_mm[0], 0.0 * point - centre_mm[1]), (x - centre_mm[0], y - centre_mm[1])):
+        waves.append((hankel1(order, k * np.hypot(aside, below)[:, None]), np.arctan2(below, aside)[:, None]))
+    sent = (waves[0][0] * np.exp(-1j * order * waves[0][1])).T @ weights
+    strength = jvp(order, k * radius_mm) / h1vp(order, k * radius_mm)
+    added = -(waves[1][0] * np.exp(1j * order * waves[1][1]) * strength) @ sent
+    return plain.T, added.T

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy import special
+from scipy import ndimage, special
+
+from SlicerUSSim.Logic.probe.lens import LensBeam
 
 
 class Beam:
@@ -36,43 +38,74 @@ class Beam:
         parts = special.log_ndtr(np.sqrt(2.0) * z) - special.log_ndtr(np.sqrt(2.0 / shift))
         return 0.5 * (shift * lost**2 + parts)
 
-    def elevation_sigma(self, s: np.ndarray, frequency: np.ndarray | float = 1.0) -> np.ndarray:
+    def elevation(
+        self, lens: LensBeam, s: np.ndarray, height: np.ndarray, frequency: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """(root of the power per mm, cycles behind the axis) of the two-way beam at `height` from the axis."""
         away = (s - self.of["elevation_focus"]) / self.of["elevation_rayleigh"]
-        return self.of["elevation_sigma"] * np.hypot(1.0 / frequency, away)
+        wider = np.hypot(1.0 / frequency, away) / np.hypot(1.0, away)
+        rows, columns, _ = lens.main.shape
+        place = np.clip(s / self.of["depth_mm"], 0.0, 1.0) * (rows - 1.0)
+        aside = np.minimum(np.abs(height) / wider / lens.main_mm.max() * (columns - 1.0), columns - 1.0)
+        root, cycles = (
+            ndimage.map_coordinates(lens.main[..., n].astype(float), [place, aside], order=1, mode="nearest")
+            for n in range(2)
+        )
+        return root / np.sqrt(wider), cycles * frequency * bool(self.of["wavefront_curvature"])
 
-    def elevational_cycles(self, s: np.ndarray, frequency: np.ndarray) -> np.ndarray:
-        """Cycles per squared millimetre by which the phase of the two-way elevational beam is behind off its axis."""
-        heights = self.of["speckle_height_mm"]
-        if not heights.any():
-            return np.zeros_like(s)
-        place = np.clip(s / self.of["depth_mm"], 0.0, 1.0)
-        height = np.interp(place, np.linspace(0.0, 1.0, len(heights)), heights) / frequency
-        sigma = self.elevation_sigma(s, frequency)
-        return np.sqrt(np.maximum(height**-2.0 - sigma**-2.0, 0.0)) / sigma / (4.0 * np.pi)
-
-    def _one_way(self, s: np.ndarray, frequency: np.ndarray | float) -> tuple[np.ndarray, np.ndarray]:
-        """Variances of the lateral transmit and receive beams."""
+    def _one_way(self, s: np.ndarray, frequency: np.ndarray | float, cosine: float) -> tuple[np.ndarray, np.ndarray]:
+        """Variances of the lateral transmit and receive beams of a line with this cosine."""
         of, zones = self.of, int(self.of["transmit_zones"])
         if zones == 0:
             transmit = np.maximum(s * of["transmit_sigma_slope"], of["transmit_sigma"][0]) / frequency
         else:
             transmit = np.min([
-                sigma * np.hypot(1.0 / frequency, (s - focus) / length)
+                sigma * np.hypot(1.0 / frequency, (s - focus) / length * cosine**2)
                 for sigma, focus, length in zip(
                     *(of[f"transmit_{name}"][:zones] for name in ("sigma", "focus", "rayleigh")), strict=True
                 )
             ], axis=0)  # fmt: skip
         receive = np.maximum(s * of["receive_sigma_slope"], of["receive_sigma_min"]) / frequency
-        return transmit**2, receive**2
+        return (transmit / cosine) ** 2, (receive / cosine) ** 2
 
-    def lateral_sigma(self, s: np.ndarray, frequency: np.ndarray | float = 1.0) -> np.ndarray:
-        transmit2, receive2 = self._one_way(s, frequency)
+    def lateral_sigma(self, s: np.ndarray, frequency: np.ndarray | float, cosine: float) -> np.ndarray:
+        transmit2, receive2 = self._one_way(s, frequency, cosine)
         return np.sqrt(transmit2 * receive2 / (transmit2 + receive2))
 
-    def lateral_curvature(self, s: np.ndarray, frequency: np.ndarray | float) -> np.ndarray:
+    def lateral_curvature(self, s: np.ndarray, frequency: np.ndarray | float, cosine: float) -> np.ndarray:
         """Radians per squared millimetre by which the phase of the two-way beam is bent."""
-        transmit2, receive2 = self._one_way(s, frequency)
+        transmit2, receive2 = self._one_way(s, frequency, cosine)
         return np.sqrt(np.maximum(self.of["wavefront_curvature"] * (receive2**-2.0 - transmit2**-2.0), 0.0))
+
+    def mirrored_power(self, s: np.ndarray, tube: np.ndarray, along: np.ndarray, cosine: float) -> np.ndarray:
+        """What curved mirrors leave of the power of speckle; `tube` as in SEGMENT, `along` from where it is."""
+        wide, growth = np.maximum(tube[::2, None] + tube[1::2, None] * along - 1.0, 0.0), tube[1::2]
+        behind = [w / max(g, 1e-9) for w, g in zip(wide, growth, strict=True)]  # the mirror
+
+        def squared(axis: int, away: np.ndarray | float, length: np.ndarray | float) -> np.ndarray:
+            turned = away + wide[axis] * (away - behind[axis])
+            return (1.0 + wide[axis]) ** 2 + (turned / length) ** 2
+
+        of, zones, per_mm2 = self.of, int(self.of["transmit_zones"]), np.pi * self.of["cycles_per_mm"]
+        transmit2, receive2 = self._one_way(s, 1.0, cosine)
+        if zones == 0:
+            mirrored2 = transmit2 * squared(0, 0.0, per_mm2 * transmit2)
+        else:
+            sigma, focus, length = (of[f"transmit_{name}"][:zones, None] for name in ("sigma", "focus", "rayleigh"))
+            sigma, length = sigma / cosine, length / cosine**2
+            at = np.argmin(sigma * np.hypot(1.0, (s - focus) / length), axis=0)
+            sigma, focus, length = (values[at, 0] for values in (sigma, focus, length))
+            mirrored2 = sigma**2 * squared(0, s - focus, length)
+        lateral = (transmit2 + receive2) / (mirrored2 + receive2 * squared(0, 0.0, per_mm2 * receive2))
+        away, length = s - of["elevation_focus"], of["elevation_rayleigh"]
+        return np.sqrt(lateral * (1.0 + (away / length) ** 2) / squared(1, away, length))
+
+    def line_cosine(self, line: float) -> float:
+        """Of the angle of a line to the normal of a flat face; `line` in scan lines from the first."""
+        if not self.of["flat_face"]:
+            return 1.0
+        angle = self.of["first_line"] + self.of["line_spacing"] * line
+        return float(self.of["steering_cos"] if self.of["linear"] else np.cos(angle))
 
     def line_distance(self, s: np.ndarray) -> np.ndarray:
         """Between neighbouring traced lines at path length s plus where they begin (line_start)."""

@@ -21,13 +21,14 @@ def lateral_beam(record: np.ndarray, traced: np.ndarray, spreads: np.ndarray, fr
     nodes = of["screen_step"] * np.arange(1, depths + 1)
     result = np.empty((int(of["scan_lines"]), len(depth)), complex)
     for n in range(len(result)):
+        cosine = beam.line_cosine(n)
         start, centre = beam.line_start(n), of["guard_lines"] + n * of["lateral_rays"]
         s = np.maximum(depth - start, 0.0)
         line = centre * (screens - 1) / (of["traced_lines"] - 1)
         left = min(int(line), screens - 2)
         of_line = spreads[left] + (line - left) * (spreads[left + 1] - spreads[left])
         spread, factor = (np.interp(s, nodes, of_line[:, k]) for k in range(2))
-        sigma, apart = spread * beam.lateral_sigma(s, frequencies[n]), beam.line_distance(s + start)
+        sigma, apart = spread * beam.lateral_sigma(s, frequencies[n], cosine), beam.line_distance(s + start)
         # Between traced lines in sigmas of these weights, less the variance that the distribution to edges has added
         narrow2 = np.maximum(1.0 - (apart / sigma) ** 2 / 6.0, 0.25)
         apart2 = (apart / sigma) ** 2 / narrow2
@@ -36,8 +37,12 @@ def lateral_beam(record: np.ndarray, traced: np.ndarray, spreads: np.ndarray, fr
         # The phase is that of the middle of sixteen samples.
         blocks = np.arange(len(s)) // 16
         middle = np.maximum((16 * blocks + 8) * of["sample_mm"] - start, 0.0)
-        curved = beam.lateral_curvature(middle, frequencies[n].reshape(-1, 16).mean(axis=1)[blocks])
-        curved = curved * (beam.line_distance(middle + start) / spread) ** 2
+        of_blocks = frequencies[n].reshape(-1, 16).mean(axis=1)[blocks]
+        # A beam that tissue has made wider keeps its spatial frequencies.
+        undisturbed2 = beam.lateral_sigma(middle, of_blocks, cosine) ** 2
+        frequencies2 = 1.0 + (beam.lateral_curvature(middle, of_blocks, cosine) * undisturbed2) ** 2
+        curved = np.sqrt(np.maximum(frequencies2 - spread**-2.0, 0.0)) / (spread * undisturbed2)
+        curved = curved * beam.line_distance(middle + start) ** 2 * bool(of["wavefront_curvature"])
         weights = near * np.exp(-0.5 * (apart2 + 1j * curved) * away**2)
         # Interpolation between edges loses some power of what turns from one to the next.
         kept = (2.0 + np.exp(-0.25 * (apart2 + curved**2 / apart2))) / (2.0 + np.exp(-0.25 * apart2))
@@ -64,8 +69,8 @@ def baseband(frame: DeviceFrame, scanned: np.ndarray, frequencies: np.ndarray) -
     if frame.probe.harmonic:
         level = frame.probe.harmonic_level(np.arange(samples) * beam.of["sample_mm"])
         lines = lines * level[np.maximum(samples_from_face(beam, *scanned.shape), 0)]
-    if frame.contact is not None:
-        lines = lines * frame.contact[:, None]
+    for factor in (frame.contact, frame.probe.line_levels()):
+        lines = lines * (1.0 if factor is None else factor[:, None])
     taps = pulse_taps(frame.axial_sigma_mm / beam.of["sample_mm"])
     return np.array([np.convolve(line, taps, "same") for line in lines]) * np.exp(-2j * np.pi * turns)
 

@@ -10,16 +10,18 @@ import itertools
 import numpy as np
 from scipy import spatial
 
+from SlicerUSSim.Logic.probe.lens import LensBeam
 from tests.reference.beam import Beam
 from tests.reference.elementary import gaussian, hash_mix, hash_of_cells
 
 
-def scatterer_lines(record, labels: np.ndarray, tissues: np.ndarray, segments, lines) -> np.ndarray:
+def scatterer_lines(record, lens: LensBeam, labels: np.ndarray, tissues: np.ndarray, segments, lines) -> np.ndarray:
     """(2 traced lines, samples) complex impulses on the left and right edges of the strips of all traced lines.
 
     Parameters
     ----------
     record : of layout.ACQUISITION.
+    lens : of the probe.
     labels : (k, j, i) with a margin of one voxel, without sheets and membranes.
     tissues : (labels,) layout.TISSUE.
     segments, lines : layout.SEGMENT and the traced line of each.
@@ -29,7 +31,7 @@ def scatterer_lines(record, labels: np.ndarray, tissues: np.ndarray, segments, l
     sums = np.zeros((2 * int(of["traced_lines"]), int(of["samples"])), complex)
     far = segments["start"] + segments["length_mm"][:, None] * segments["direction"]
     ends = np.concatenate([segments["start"], far])
-    reach = of["beam_cutoff"] * beam.elevation_sigma(np.array([0.0, of["traced_mm"]])).max() + 1.0
+    reach = 2.0 * float(lens.main_mm.max()) + 1.0
     low, high = np.floor([(ends.min(axis=0) - reach) / cell, (ends.max(axis=0) + reach) / cell]).astype(int)
     cells = np.stack(np.meshgrid(*map(np.arange, low, high + 1), indexing="ij"), axis=-1).reshape(-1, 3)
     key = hash_of_cells(cells, seed)
@@ -41,37 +43,46 @@ def scatterer_lines(record, labels: np.ndarray, tissues: np.ndarray, segments, l
     places, amplitudes = places[exists], amplitudes[exists]
     tree = spatial.cKDTree(places)
     for segment, line in zip(segments, lines, strict=True):
-        begins = beam.line_start((line - of["guard_lines"]) / of["lateral_rays"])
+        scan_line = (line - of["guard_lines"]) / of["lateral_rays"]
+        begins, cosine = beam.line_start(scan_line), beam.line_cosine(scan_line)
         half = 0.5 * segment["length_mm"]
         near = tree.query_ball_point(segment["start"] + half * segment["direction"], half + reach)
         axes = np.stack([segment[name] for name in ("direction", "lateral", "elevational")])
         along, aside, height = axes @ (places[near] - segment["start"]).T
-        widest = beam.line_distance(segment["path_mm"] + 2.0 * half + begins)
-        inside = (along >= 0.0) & (along < segment["length_mm"]) & (abs(aside) <= widest)
-        along, aside, height = along[inside], aside[inside], height[inside]
-        amplitude = amplitudes[near][inside]
+        bend = (
+            0.0 if of["linear"] else 0.5 / np.maximum(of["apex_radius_mm"] + begins + segment["path_mm"] + along, 1.0)
+        )
+        at = along + bend * aside**2  # off the axis of a sector the same range is reached earlier
+        left, apart = (segment["left"], segment["right"] - segment["left"])
+        left, apart = left[0] + left[1] * along, apart[0] + apart[1] * along
+        # Where strips and segments meet, a scatterer passes from one to the other.
+        share = np.clip(at / 0.02 + 0.5, 0.0, 1.0) - np.clip((at - segment["length_mm"]) / 0.02 + 0.5, 0.0, 1.0)
+        right = (aside - left) / apart
+        share *= np.clip(32.0 * (0.5 - abs(right - 0.5)) + 0.5, 0.0, 1.0)
+        inside = (share > 0.0) & (apart > 0.0)
+        along, aside, height, at, apart, right = (x[inside] for x in (along, aside, height, at, apart, right))
+        amplitude = amplitudes[near][inside] * share[inside]
         path, loss = segment["path_mm"] + along, segment["loss"] + segment["loss_per_mm"] * along
-        frequency, apart = beam.frequency_after(loss), beam.line_distance(path + begins)
-        tall, right = beam.elevation_sigma(path, frequency), 0.5 + aside / apart
+        frequency = beam.frequency_after(loss)
+        root, cycles = beam.elevation(lens, path, height, frequency)
         # The image is as wide as the beam at the displayed depth.
         shown = np.maximum(segment["depth_mm"] + segment["depth_per_mm"] * along, begins)
-        wide = beam.lateral_sigma(shown - begins, frequency) / beam.line_distance(shown)
-        tube = segment["tube"]
-        spread = tall * (tube[0] + tube[1] * along) * (tube[2] + tube[3] * along) * apart
-        amplitude = amplitude * segment["weight"] * segment["attenuation"] * of["speckle_scale"] * np.sqrt(2.0 * np.pi)
-        amplitude *= np.exp(beam.gain_of_band(loss) - segment["decay_per_mm"] * along - 0.5 * (height / tall) ** 2)
-        amplitude *= np.sqrt(segment["depth_per_mm"] * wide / spread)
-        # Off the axis of a sector the same range is reached earlier.
-        bend = 0.0 if of["linear"] else 0.5 / np.maximum(of["apex_radius_mm"] + begins + path, 1.0)
-        depth = segment["depth_mm"] + segment["depth_per_mm"] * (along + bend * aside**2)
-        cycles = depth * of["cycles_per_mm"] + height**2 * beam.elevational_cycles(path, frequency)
-        echo = amplitude * np.exp(-2j * np.pi * cycles)
+        wide = beam.lateral_sigma(shown - begins, frequency, cosine) / beam.line_distance(shown)
+        left = beam.mirrored_power(path, segment["tube"], along, cosine)
+        amplitude = (
+            amplitude * segment["weight"] * segment["attenuation"] * of["speckle_scale"] * np.sqrt(2.0 * np.pi**1.5)
+        )
+        amplitude *= np.exp(beam.gain_of_band(loss) - segment["decay_per_mm"] * along) * root
+        amplitude *= np.sqrt(segment["depth_per_mm"] * wide * left / apart)
+        depth = segment["depth_mm"] + segment["depth_per_mm"] * at
+        for side, (_, _, later, change) in ((aside < 0.0, segment["left"]), (aside > 0.0, segment["right"])):
+            depth += np.where(side, aside * (later + change * along), 0.0)
+        echo = amplitude * np.exp(-2j * np.pi * (depth * of["cycles_per_mm"] + cycles))
         place = depth / of["sample_mm"]
         bins, part = np.floor(place).astype(int), place % 1.0
-        counts = (right >= 0.0) & (right < 1.0) & (abs(height) <= of["beam_cutoff"] * tall)
         for edge, of_edge in enumerate((1.0 - right, right)):
             for ahead, of_sample in enumerate((1.0 - part, part)):
-                within = counts & (bins + ahead >= 0) & (bins + ahead < sums.shape[1])
+                within = (bins + ahead >= 0) & (bins + ahead < sums.shape[1])
                 np.add.at(sums[2 * line + edge], (bins + ahead)[within], (echo * of_edge * of_sample)[within])
     return sums
 

@@ -60,7 +60,7 @@ class PulseFilter(Stage):
                 frame.scanned.im,
                 np.int32(frame.scanned.stride),
             )
-        if frame.probe.harmonic or frame.contact is not None:
+        if frame.probe.harmonic or frame.contact is not None or frame.probe.line_levels() is not None:
             self._apply_level(frame)
         self.device.run(
             self.kernel,
@@ -84,9 +84,11 @@ class PulseFilter(Stage):
             if frame.probe.harmonic:
                 levels = frame.probe.harmonic_level(np.arange(samples) * key[2]).astype(np.float32)
             self._levels = key, self.device.upload(levels)
-        contact = np.ones(lines, np.float32) if frame.contact is None else frame.contact
-        buffer = self.workspace.get("contact", contact.nbytes)
-        self.device.write(buffer, contact)
+        of_lines = np.ones(lines, np.float32)
+        for factor in (frame.contact, frame.probe.line_levels()):
+            of_lines *= 1.0 if factor is None else factor
+        buffer = self.workspace.get("of_lines", of_lines.nbytes)
+        self.device.write(buffer, of_lines)
         self.device.run(
             self._level,
             (samples // self.device.lanes, lines),

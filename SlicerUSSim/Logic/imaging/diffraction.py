@@ -6,7 +6,6 @@ J. W. Goodman, Introduction to Fourier Optics, sections 4.2 and 4.4 (docs/physic
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import lru_cache
 from typing import TYPE_CHECKING
 
@@ -16,13 +15,15 @@ from scipy.ndimage import gaussian_filter1d
 from scipy.special import erfc
 
 from SlicerUSSim.Logic.opencl.layout import CONSTANTS
-from SlicerUSSim.Logic.probe.beam import FWHM_PER_SIGMA, LEAST_F_NUMBER, MAIN_LOBE, apodized_pattern
+from SlicerUSSim.Logic.probe.beam import FWHM_PER_SIGMA, MAIN_LOBE, apodized_pattern
 
 if TYPE_CHECKING:
     from SlicerUSSim.Logic.probe.arrays import Probe
 
 _DEPTHS, _DISTANCES, _STEP = (CONSTANTS[f"LOBE_{name}"] for name in ("DEPTHS", "DISTANCES", "STEP"))
 _POINTS, _PADDED = 512, 4096  # of an aperture, and of its Fourier transform
+_PLANE_POINTS, _PLANE_FREQUENCIES = 256, 9  # of both apertures, and of the pulse, for the echoes of planes
+_LEAST_PLANE = 1e-4  # of these, re a square plane
 _BEYOND_SIGMAS = 2.0  # what is closer to the axis belongs to the main beam
 #: Variance by which side_lobes.cl widens lobes: of a node's lines and of the interpolation between nodes, in squared
 #: distances of nodes (1/12 + 0.105), and of the table's mean over one lobe and its interpolation (1/12 + 0.75^2 / 12),
@@ -30,46 +31,29 @@ _BEYOND_SIGMAS = 2.0  # what is closer to the axis belongs to the main beam
 _NODE_VARIANCE, _TABLE_VARIANCE = 0.188, 0.130
 #: Steps of the deconvolution, its samples per distance of the table, and what it takes for no power
 _SHARPENED, _FINER, _LEAST_POWER = 3, 8, 1e-9
-#: Elevational lobes are computed up to the larger of these: in wavelengths x f-number, and in wavelengths
-_REACH_LOBES, _REACH_WAVELENGTHS = 5.0, 26.0
-#: Points of the elevational aperture for speckle_height_mm, and the fewest and most of the plane that waves run over
-_OPEN, _LEAST_PLANE, _MOST_PLANE = 256, 2048, 16384
-
-
-@dataclass(frozen=True)
-class Lobes:
-    """The lobes of a two-way beam, at LOBE_DEPTHS depths evenly from the face to the image depth.
-
-    Amplitudes are square roots of the power per distance, on either side, re that of the main beam; the lateral power
-    is averaged over one lobe, since it is sampled at intervals.
-    """
-
-    #: (depths, distances) float32, per wavelength x receive f-number at that depth; distances are LOBE_STEP of
-    #: these apart
-    lateral: np.ndarray
-    #: (depths, distances) float32, per millimetre, at distances evenly from 0 to ...
-    elevational: np.ndarray
-    #: ... (depths,) float32 millimetres, where they are cut off
-    reach_mm: np.ndarray
 
 
 @lru_cache(maxsize=16)
-def lobes_of(probe: Probe) -> Lobes:
-    """The lobes of a probe's two-way beam at its centre frequency.
+def lobes_of(probe: Probe) -> np.ndarray:
+    """(depths, distances) float32, the lateral lobes of a probe's two-way beam at its centre frequency.
 
-    The transmit aperture and the elements are uniform and focused once (with zones: once for each), the receive
+    At LOBE_DEPTHS depths evenly from the face to the image depth, and distances LOBE_STEP wavelengths times receive
+    f-number at that depth apart: square roots of the power per such distance, averaged over one lobe, since it is
+    sampled at intervals, on either side, re that of the main beam.
+
+    The transmit aperture is uniform and focused once (with zones: once for each), the receive
     aperture has the weights 1 - a + a cos(pi x)^2 and is focused at every depth. The second harmonic is fed by the
     square of the field of the pulse, of twice the received wavelength. Compounded waves are in focus at every depth.
     The probe's clutter falls as 1 + cos(pi u / U) with the distance u up to the end U of the lateral table.
     """
     depth = probe.displayed_mm * np.maximum(np.arange(_DEPTHS), 0.5) / (_DEPTHS - 1)
-    sigma = probe.beam_sigma_mm(depth)
+    sigma = probe.beam_sigma_mm(depth)[0]
     column = np.arange(_DISTANCES)
 
     unit = probe.wavelength_mm * np.maximum(probe.receive_f_number, depth / probe.aperture_mm)
     x, amplitude = _transmitted(probe, depth, unit)
     pattern = (amplitude * apodized_pattern(x / unit[:, None], probe.receive_apodization)) ** 2
-    tails = _tails(x, pattern, sigma[0])
+    tails = _tails(x, pattern, sigma)
     place = column / (_DISTANCES - 1)
     clutter = 0.5 * probe.clutter_power / (_STEP * (_DISTANCES - 1)) * (1.0 + np.cos(np.pi * place))
     fading = 0.5 + 0.5 * np.cos(np.pi * np.clip(4.0 * place - 3.0, 0.0, 1.0))  # the table ends smoothly
@@ -78,16 +62,7 @@ def lobes_of(probe: Probe) -> Lobes:
         for tail, scale in zip(tails, unit, strict=True)
     ]
 
-    lobe = probe.wavelength_mm * depth / probe.elevation_aperture_mm
-    reach = np.maximum(_REACH_LOBES * lobe, _REACH_WAVELENGTHS * probe.wavelength_mm)
-    lens = np.full(_DEPTHS, probe.elevation_aperture_mm), np.full(_DEPTHS, probe.elevation_focus_mm)
-    x, received = _focused_once(probe.wavelength_mm, *lens, depth)
-    sent = _focused_once(probe.wavelength_mm, *lens, depth, octaves=1)[1] ** 2 if probe.harmonic else received
-    elevational = [
-        _density(tail, step * column, step)
-        for tail, step in zip(_tails(x, (sent * received) ** 2, sigma[1]), reach / (_DISTANCES - 1), strict=True)
-    ]
-    return Lobes(*(np.array(values, np.float32) for values in (np.sqrt(lateral), np.sqrt(elevational), reach)))
+    return np.sqrt(lateral).astype(np.float32)
 
 
 @lru_cache(maxsize=16)
@@ -107,7 +82,7 @@ def lateral_weights(probe: Probe) -> np.ndarray:
     column = np.arange(_DISTANCES)
     place = column / (_DISTANCES - 1)
     clutter = 0.5 * probe.clutter_power / (_STEP * (_DISTANCES - 1)) * (1.0 + np.cos(np.pi * place))
-    power = np.maximum(lobes_of(probe).lateral.astype(float) ** 2 - clutter, 0.0)
+    power = np.maximum(lobes_of(probe).astype(float) ** 2 - clutter, 0.0)
     fine = np.arange(_FINER * (_DISTANCES - 1) + 1) / _FINER
     rows = []
     for row, width in zip(power, np.sqrt(variance), strict=True):
@@ -118,42 +93,6 @@ def lateral_weights(probe: Probe) -> np.ndarray:
             made = made * wanted / gaussian_filter1d(made, width * _FINER / _STEP, mode="mirror")
         rows.append(np.where(column > peak, np.maximum(made[::_FINER] - _LEAST_POWER, 0.0), row))
     return np.sqrt(np.array(rows) + clutter).astype(np.float32)
-
-
-@lru_cache(maxsize=16)
-def speckle_height_mm(probe: Probe) -> np.ndarray:
-    """(LOBE_DEPTHS,) float32 elevational sigma, in millimetres, of the beam without curved phase of the same speckle.
-
-    At LOBE_DEPTHS depths evenly from the face to the image depth. Speckle d apart has the correlation
-    exp(-d^2 / 4 sigma^2), here one half where that of the two-way field of the lens has one half. That field is found
-    by its angular spectrum at the centre frequency (Goodman, section 3.10), so that its phase is right too
-    (docs/physics.md#wavefront-curvature).
-    """
-    wavelength, focus = probe.wavelength_mm, probe.elevation_focus_mm
-    aperture = min(probe.elevation_aperture_mm, focus / LEAST_F_NUMBER)
-    point = aperture / _OPEN
-    # What leaves the plane at one side returns at the other one: beams, with six lobes, must not be as wide. Far away
-    # speckle has the same length at all depths, so that depths end there.
-    aside = 0.5 * aperture / focus + 6.0 * (2.0 if probe.harmonic else 1.0) * wavelength / aperture
-    needed = 2.0 * (aperture + aside * probe.displayed_mm) / point
-    plane = int(np.clip(2 ** np.ceil(np.log2(needed)), _LEAST_PLANE, _MOST_PLANE))
-    farthest = max(0.5 * plane * point - aperture, 0.0) / aside
-    depth = np.minimum(np.linspace(0.0, probe.displayed_mm, _DEPTHS), farthest)
-    place, frequency = ((np.arange(_OPEN) + 0.5) / _OPEN - 0.5) * aperture, np.fft.fftfreq(plane, point)
-
-    def field(length: float) -> np.ndarray:
-        face = fft.fft(np.exp(-1j * np.pi / (length * focus) * place**2), plane)
-        return np.asarray(fft.ifft(face * np.exp(-1j * np.pi * length * depth[:, None] * frequency**2), axis=1))
-
-    received = field(wavelength)
-    sent = field(2.0 * wavelength) ** 2 if probe.harmonic else received
-    power = np.abs(np.asarray(fft.fft(sent * received, axis=1))) ** 2
-    correlation = np.abs(np.asarray(fft.ifft(power, axis=1)))[:, : plane // 2]
-    correlation /= correlation[:, :1]
-    beyond, row = np.argmax(correlation < 0.5, axis=1), np.arange(_DEPTHS)
-    at, before = correlation[row, beyond], correlation[row, beyond - 1]
-    half = point * (beyond - (0.5 - at) / (before - at))
-    return (half / np.sqrt(4.0 * np.log(2.0))).astype(np.float32)
 
 
 def _transmitted(probe: Probe, depth: np.ndarray, unit: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -219,3 +158,62 @@ def _tails(x: np.ndarray, pattern: np.ndarray, sigma: np.ndarray) -> list[Callab
 def _density(tail: Callable[[np.ndarray], np.ndarray], at: np.ndarray, window: float) -> np.ndarray:
     """The power per millimetre on either side at distances `at`, averaged over a window."""
     return 0.5 * (tail(np.maximum(at - 0.5 * window, 0.0)) - tail(at + 0.5 * window)) / window
+
+
+@lru_cache(maxsize=16)
+def plane_echoes(probe: Probe) -> np.ndarray:
+    """(PLANE_DEPTHS, PLANE_TILTS, 2) float32, echoes of tilted planes re square ones, for kernels/interfaces.cl.
+
+    Exponents of two of the peak of the pulse, by lateral and by elevational tilt: at depths evenly from the face to the
+    image depth, and tangents of the tilt whose square roots are evenly from 0 to 1. What leaves the transmit aperture
+    at a is reflected to c - a, c = 2 s tan(tilt), but for diffraction:
+
+        integral T(a) R(b) exp(-i k (a + b - c)^2 / 4 s) da db,    T(a) = exp(i k a^2 (1 / s - 1 / F) / 2)
+
+    over the apertures, at every frequency of the pulse (docs/physics.md#3-rays). Those of the second harmonic are not
+    known: nan, for which the kernel takes those of a Gaussian beam.
+    """
+    rows, tilts = CONSTANTS["PLANE_DEPTHS"], CONSTANTS["PLANE_TILTS"]
+    if probe.harmonic:
+        return np.full((rows, tilts, 2), np.nan, np.float32)
+    depth = probe.displayed_mm * np.maximum(np.arange(rows), 0.5) / (rows - 1)
+    received = np.minimum(probe.aperture_mm, depth / probe.receive_f_number)
+    zones = np.array(probe.transmit_apertures())
+    if len(zones):
+        focus, sent = zones[probe.zone_at(depth)].T
+    else:
+        least, slope = probe.compounded_beam()
+        wide = np.maximum(least, slope * depth) * FWHM_PER_SIGMA / MAIN_LOBE
+        focus, sent = depth, depth * probe.wavelength_mm / wide
+    lens = np.full(rows, probe.lens_height_mm), 1.0 / depth - 1.0 / probe.elevation_focus_mm
+    lateral = (sent, 1.0 / depth - 1.0 / focus), (received, 0.0 * depth)
+    found = [
+        _plane_echo(probe, depth, *apertures, apodization)
+        for apertures, apodization in ((lateral, probe.receive_apodization), ((lens, lens), 0.0))
+    ]
+    return np.log2(np.maximum(np.stack(found, axis=-1), _LEAST_PLANE)).astype(np.float32)
+
+
+def _plane_echo(
+    probe: Probe, depth: np.ndarray, sent: tuple[np.ndarray, np.ndarray], received: tuple[np.ndarray, np.ndarray],
+    apodization: float,
+) -> np.ndarray:  # fmt: skip
+    """(depths, tilts) peaks of the integral of plane_echoes; apertures are (sizes in mm, bends 1 / s - 1 / F)."""
+    step = (sent[0] + received[0])[:, None] / _PLANE_POINTS
+    place, across = (np.fft.fftfreq(2 * _PLANE_POINTS, per) for per in (0.5 / _PLANE_POINTS, 1.0))
+    place, across = step * place, across / step
+    one, other = (np.clip(0.5 + (0.5 * size[:, None] - np.abs(place)) / step, 0.0, 1.0) for size, _ in (sent, received))
+    other *= 1.0 - apodization * np.sin(np.pi * place / received[0][:, None]) ** 2
+    spread = float(probe.received_bandwidth / FWHM_PER_SIGMA)
+    frequency = np.maximum(1.0 + spread * np.linspace(-2.5, 2.5, _PLANE_FREQUENCIES), 0.1)
+    time = np.linspace(-0.5, 0.5, 32) * (_PLANE_FREQUENCIES - 1) / (frequency[-1] - frequency[0])
+    echo: np.ndarray = np.zeros((1, 1, 1))
+    for f in frequency:
+        length = probe.wavelength_mm / f
+        pairs = np.exp(2j * np.pi * length * depth[:, None] * across**2 - 0.5 * ((f - 1.0) / spread) ** 2) / np.sqrt(f)
+        for weight, (_, bend) in ((one, sent), (other, received)):
+            pairs = pairs * np.fft.fft(weight * np.exp(1j * np.pi / length * bend[:, None] * place**2), axis=1)
+        echo = echo + np.fft.ifft(pairs, axis=1)[:, :_PLANE_POINTS, None] * np.exp(-2j * np.pi * f * time)
+    peak, tilt = np.abs(echo).max(axis=-1), np.linspace(0.0, 1.0, CONSTANTS["PLANE_TILTS"]) ** 2
+    ways = zip(depth, place[:, :_PLANE_POINTS], peak, strict=True)
+    return np.array([np.interp(2.0 * s * tilt, at, of / of[0], right=0.0) for s, at, of in ways])

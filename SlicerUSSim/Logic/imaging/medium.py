@@ -106,7 +106,7 @@ class Medium:
         self._upload(padded, tissues)
         self.has_texture = texture is not None
         self.texture_buffer = device.upload(
-            np.zeros(1, np.uint32) if texture is None else np.pad(texture, _PAD, constant_values=128 << 16)
+            np.zeros(1, np.uint32) if texture is None else np.pad(texture, _PAD, mode="edge")
         )
         self.tissue_buffer = device.upload(self.rows)
         #: Counts the changes of tissues
@@ -185,9 +185,9 @@ class Medium:
         return rows
 
     def _laid_over(self, tissues: TissueTable) -> np.ndarray:
-        """(k, j, i) uint8 labels with a margin, whose narrow gaps are closed where a sheet that was found stands for
-        them."""
-        padded = np.pad(as_labels(self.labels.array), _PAD)
+        """(k, j, i) uint8 labels, which go on in a margin: the volume's ends are no borders. Narrow gaps are closed
+        where a sheet that was found stands for them."""
+        padded = np.pad(as_labels(self.labels.array), _PAD, mode="edge")
         membrane, self.found = tissues.membrane, None
         if self.sheets is None or membrane is None or membrane.thickness_mm == 0:
             return padded
@@ -243,12 +243,12 @@ class Medium:
 
     def _upload_groups(self, padded: np.ndarray) -> None:
         """The acoustic group of every voxel, and smoothed indicators of the first groups, which give the most accurate
-        normals on flat interfaces. For them tissues go on beyond the volume, whose ends are no borders."""
+        normals on flat interfaces."""
         group_of = self.rows["group"].astype(np.uint8)
         group = np.zeros(padded.shape, np.uint8)
         for label in {0, *self.present}:  # faster than indices of eight bytes for every voxel
             group |= (padded == label).view(np.uint8) * group_of[label]
-        # The coupling medium surrounds the volume even if its label does not occur.
+        # The coupling medium is at the probe's face even if its label does not occur.
         groups = {int(group_of[label]) for label in (0, *self.present)}
         room = max(_SMOOTHED_VOXELS // padded.size, 2)
         self.smooth_groups = min(max(groups) + 1, _MOST_SMOOTHED_GROUPS, room)
@@ -259,11 +259,8 @@ class Medium:
                 share = np.where(self.found.closed, 0, share).astype(share.dtype)
             membership = group_of[second], share
             groups |= {int(group) for group in np.unique(membership[0][share > 0])}
-        inside = tuple(slice(_PAD, -_PAD) for _ in range(3))
-        continued = self.device.upload(np.pad(np.pad(group[inside], _PAD, mode="edge").ravel(), (0, 16)))
-        self.smooth_buffer = smoothed_indicators(
-            self.device, continued, self.dims, groups, self.smooth_groups, membership
-        )
+        buffer = self.device.upload(np.pad(group.ravel(), (0, 16)))
+        self.smooth_buffer = smoothed_indicators(self.device, buffer, self.dims, groups, self.smooth_groups, membership)
         self.device.mark()  # the device begins, and the host goes on
         words = group | np.uint8(CONSTANTS["SAME_GROUP"]) * _are_same(group)
         # Rows are read eight voxels at a time, including the last one.

@@ -5,7 +5,7 @@ With SimulationSettings.quality "full" nothing depends on the size of the image.
 - 0.6 scan lines per column of the image, no more than the probe and no fewer than are 1.75 sigmas of the beam apart,
   with one traced line each, or as many as are that far apart where the probe has too few scan lines,
 - four samples per cycle of the carrier times the pulse's fractional bandwidth, two or more,
-- an eighth of the scatterers, about one in the smallest resolution cell, within two sigmas of the beam,
+- a fifth of the scatterers, about one in the smallest resolution cell, within two sigmas of the beam,
 - one ray instead of several across the slice, and
 - half the points and angles of the aperture's fans, whose look-ups are two millimetres apart.
 
@@ -26,7 +26,7 @@ from SlicerUSSim.Logic.probe.arrays import Probe
 
 _LINES_PER_COLUMN, _APART_SIGMAS = 0.6, 1.75
 _SAMPLES_PER_BANDWIDTH, _LEAST_SAMPLES = 4.0, 2
-_FEWER_SITES, _LEAST_SITES, _CUTOFF = 8.0, 0.1, 2.0
+_FEWER_SITES, _LEAST_SITES, _CUTOFF = 5.0, 0.1, 2.0
 _FAN_STEP_MM = 2.0
 
 

@@ -25,6 +25,7 @@ class RayTracer(Stage):
     def __init__(self, device: Device) -> None:
         super().__init__(device)
         self.kernel = device.kernels("raytracing.cl")["trace"]
+        self._strips = device.kernels("strips.cl")["strips"]
         self._sheet_hits = device.kernels("sheet_hits.cl")["sheet_hits"]
         self._face_hits = device.kernels("face_hits.cl")["face_hits"]
         self._losses = device.kernels("downshift.cl", device.lanes)["losses"]
@@ -80,6 +81,7 @@ class RayTracer(Stage):
             self._overflown,
             heavy=True,
         )
+        self.device.run(self._strips, (traced,), frame.acquisition_buffer, tree.segments, tree.segment_counts, few=True)
         if medium.found is not None and medium.found.reflects:
             self.device.run(
                 self._sheet_hits, (traced, rays), frame.acquisition_buffer, medium.sheet_buffer, self._quantiles,

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from functools import cache
+from functools import cache, lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from SlicerUSSim.Logic.imaging.diffraction import lobes_of
+from SlicerUSSim.Logic.imaging.diffraction import plane_echoes
 from SlicerUSSim.Logic.imaging.raytracing import ray_centres
 from SlicerUSSim.Logic.imaging.side_lobes import DARK, Tables, elevational_lobe_record, lines_together
 from SlicerUSSim.Logic.imaging.signals import EchoLines
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 #: Of the paper's lattice of scatterers
 PAPER_SITES_PER_MM3 = 0.02**-3
 # In the probe's smallest resolution cell, for developed speckle; thin structures need some too, whatever the probe
-_SITES_PER_CELL, _LEAST_PER_MM3 = 8.0, 4.0
+_SITES_PER_CELL, _LEAST_PER_MM3 = 5.0, 4.0
 _LOBE_CHUNKS = 4  # samples of a work-item for elevational side lobes re those for the main beam
 _SLICES = 16  # of a scan line for the interfaces on GPUs, which have more work-items than scan lines
 
@@ -43,7 +43,7 @@ class Scatterers(Stage):
         size = 4 * (3 + CONSTANTS["UNEVEN_WORDS"]) * CONSTANTS["MAX_TISSUES"]
         self._sites = [device.empty(size) for _ in range(2)]
         self._lobes = device.empty(ACQUISITION.itemsize)
-        self._tables = Tables(device)
+        self._beams = [Tables(device) for _ in range(2)]  # the main beam's and that of its lobes
 
     def run(self, frame: DeviceFrame) -> None:
         """Enqueue the speckle of one frame: its `traced` impulses, zero if scattering is off."""
@@ -64,6 +64,9 @@ class Scatterers(Stage):
         end = [] if part_of is None else [part_of]
         variant = (["TEXTURE"] if frame.medium.has_texture else []) + (["VARIED"] if part_of is not None else [])
         variant += ["FOUND"] if frame.medium.found is not None else []
+        main, lobes = (
+            buffer.get(frame.probe, table) for buffer, table in zip(self._beams, beam_tables(frame.probe), strict=True)
+        )
         table = unevenness_table(tissues)
         variant += ["UNEVEN"] if is_uneven(table) else []
         uneven, none_dark = table.ravel(), np.zeros(CONSTANTS["MAX_TISSUES"], np.float32)
@@ -72,19 +75,18 @@ class Scatterers(Stage):
         )
         self._enqueue(
             frame, lines, frame.acquisition_buffer, self._sites[0],
-            [*variant, f"CHUNK={self.device.chunk}"], (samples // self.device.chunk, traced), end,
+            [*variant, f"CHUNK={self.device.chunk}"], (samples // self.device.chunk, traced), [main, *end],
         )  # fmt: skip
         if frame.settings.side_lobes:
-            record, lobes = elevational_lobe_record(frame.acquisition), lobes_of(frame.probe)
+            record = elevational_lobe_record(frame.acquisition)
             self.device.write(self._lobes, record)
             chunk, together = _LOBE_CHUNKS * self.device.chunk, lines_together(record, frame.probe)
-            patterns = self._tables.get(frame.probe, np.append(lobes.elevational, lobes.reach_mm))
             dark = frame.medium.quieter(DARK).astype(np.float32)
             sites = np.concatenate([lattice_sites(tissues, record).ravel(), dark, uneven])
             self.device.write(self._sites[1], sites)
             self._enqueue(
                 frame, lines, self._lobes, self._sites[1], [*variant, "LOBES", f"CHUNK={chunk}"],
-                (-(-samples // chunk), -(-traced // together)), [*end, patterns, np.int32(together)],
+                (-(-samples // chunk), -(-traced // together)), [lobes, *end, np.int32(together)],
             )  # fmt: skip
 
     def _enqueue(
@@ -120,6 +122,7 @@ class InterfaceEchoes(Stage):
         kernels = device.kernels("interfaces.cl")
         self._find, self._add = kernels["find_walls"], kernels["interface_echoes"]
         self.workspace = Workspace(device)
+        self._planes = Tables(device)
         self._centres_of = 0  # rays
         self._centres: Buffer
 
@@ -135,8 +138,8 @@ class InterfaceEchoes(Stage):
         if self._centres_of != rays:
             self._centres, self._centres_of = self.device.upload(ray_centres(rays)), rays
         self.device.run(
-            self._find, (traced,), frame.acquisition_buffer, tree.hits, tree.hit_counts, self._centres, *walls, reach,
-            few=True,
+            self._find, (traced,), frame.acquisition_buffer, tree.hits, tree.hit_counts, self._centres,
+            self._planes.get(frame.probe, plane_echoes(frame.probe)), *walls, reach, few=True,
         )  # fmt: skip
         self.device.run(
             self._add,
@@ -187,6 +190,17 @@ class LateralBeam(Stage):
         )
 
 
+@lru_cache(maxsize=16)
+def beam_tables(probe: Probe) -> tuple[np.ndarray, np.ndarray]:
+    """The tables of the main beam and of its lobes (lens.LensBeam), and where they end, as kernels take them."""
+    lens = probe.lens()
+    main, lobes = (
+        np.concatenate([table.ravel(), reach_mm, [reach_mm.max()]])
+        for table, reach_mm in ((lens.main, lens.main_mm), (lens.lobes, lens.lobes_mm))
+    )
+    return main, lobes
+
+
 def sites_per_mm3(settings: SimulationSettings, probe: Probe) -> float:
     """Density of the lattice of scatterers: the one set, or by the probe's smallest resolution cell."""
     if settings.scatterers_per_mm3 is not None:
@@ -209,8 +223,9 @@ def cells_in_view(
     """
     density = sites_per_mm3(settings, probe)
     slack = _OBLIQUE * density ** (-1.0 / 3.0)
-    depth = np.linspace(0.0, probe.depth_mm, 65)
-    height = 2.0 * settings.beam_cutoff * probe.beam_sigma_mm(depth)[1] + slack
+    reach = probe.lens().main_mm
+    depth = np.linspace(0.0, probe.displayed_mm, len(reach))
+    height = 2.0 * reach + slack
     width = probe.line_distance_mm(depth) / lateral_rays + slack
     return density * traced_lines * (1.0 + slack / chunk_mm) * float(_integral(height * width, depth))
 

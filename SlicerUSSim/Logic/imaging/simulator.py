@@ -25,7 +25,6 @@ from SlicerUSSim.Logic.imaging.batch import OUTPUTS, arrays_for, fetched, one_pe
 from SlicerUSSim.Logic.imaging.bmode import downshift, log_band_above, pulse_taps
 from SlicerUSSim.Logic.imaging.compounding import Compounder, sweep_grid
 from SlicerUSSim.Logic.imaging.contact import line_contact
-from SlicerUSSim.Logic.imaging.diffraction import speckle_height_mm
 from SlicerUSSim.Logic.imaging.frame import Echoes, Frame
 from SlicerUSSim.Logic.imaging.medium import Medium, as_labels
 from SlicerUSSim.Logic.imaging.noise import stirred
@@ -49,6 +48,8 @@ if TYPE_CHECKING:
 
 #: Beyond all fields
 _FAR_MM = 1e6
+#: Part of an image beyond the volume, in tissue, of which the user is told
+_TOLD_SHARE = 0.01
 #: Cells of the scatterer lattice per image: about 5 s on two cores, what is not begun, and per second there (measured
 #: with tall beams; two to three times as many with low ones)
 _MANY_CELLS, _MOST_CELLS, _CELLS_PER_S = 1.5e8, 1e10, 3e7
@@ -59,7 +60,7 @@ StageKind = TypeVar("StageKind", bound=Stage)
 
 
 class EmptyViewWarning(UserWarning):
-    """The imaged field is completely outside the volume; the image has no echoes of tissue."""
+    """The imaged field is completely outside the volume, or that has no labels: the image shows nothing of it."""
 
 
 class SlowScatterersWarning(UserWarning):
@@ -141,6 +142,7 @@ class UltrasoundSimulator:
         self._shown: tuple[tuple, np.ndarray] | None = None
         #: Measure every stage (Frame.timings_ms); the host then waits for each stage.
         self.profiling = False
+        self._has_told_of_end = False
         # Threads may share a simulator: its buffers hold one frame at a time
         self._lock = RLock()
 
@@ -182,7 +184,7 @@ class UltrasoundSimulator:
         `grid` gives the pixels, for example those of a real image; by default they cover the bounding box of the imaged
         field, with display.image_size pixels. `noise_seed` selects the amplifier noise (noise.py): 0 depends only on
         the settings' seed, seed_of_pose(probe_to_ras) also on the pose.
-        Warns with EmptyViewWarning and returns a black image if the field is outside the volume, and with
+        Warns with EmptyViewWarning if the field is outside the volume, whose last tissue goes on there, and with
         SlowScatterersWarning if there are so many scatterers that it takes more than seconds on a CPU.
         Raises SimulationError if it would take minutes, for a pose that is not rigid and a noise_seed that is not a
         whole number of 32 bits.
@@ -619,9 +621,8 @@ class UltrasoundSimulator:
         for name, value in transmit_fields(probe).items():
             acquisition[name] = value
         acquisition["receive_sigma_min"], acquisition["receive_sigma_slope"] = probe.receive_beam()
-        for name, value in zip(("sigma", "focus", "rayleigh"), probe.elevation_beam(), strict=True):
-            acquisition[f"elevation_{name}"] = value
-        acquisition["speckle_height_mm"] = speckle_height_mm(probe) if settings.wavefront_curvature else 0.0
+        acquisition["elevation_sigma"] = probe.lens().sigma_mm
+        _, acquisition["elevation_focus"], acquisition["elevation_rayleigh"] = probe.elevation_waist()
         acquisition["max_ray_depth"] = settings.max_ray_depth if settings.reflections else 0
         lateral, guard = _traced_lines_for(probe, settings)
         acquisition["lateral_rays"], acquisition["guard_lines"] = lateral, guard
@@ -704,10 +705,24 @@ class UltrasoundSimulator:
         size = np.array(self.medium.labels.array.shape[::-1])
         if (voxels.max(axis=1) < -0.5).any() or (voxels.min(axis=1) > size - 0.5).any():
             warnings.warn(
-                "the probe looks past the volume: the image has no echoes of tissue",
-                EmptyViewWarning,
+                "the probe looks past the volume: the image has only what goes on beyond its end", EmptyViewWarning,
                 stacklevel=stacklevel,
-            )
+            )  # fmt: skip
+        elif not self._has_told_of_end and ((voxels.min(axis=1) < -0.5) | (voxels.max(axis=1) > size - 0.5)).any():
+            self._tell_of_end(probe, pose)
+
+    def _tell_of_end(self, probe: Probe, pose: np.ndarray) -> None:
+        """Log, once, how much of the imaged field is beyond the volume where tissue goes on from its end."""
+        labels, depth = self.medium.labels, np.linspace(0.0, probe.depth_mm, 33)
+        origins, directions = probe.origins_mm()[::4, :, None], probe.directions()[::4, :, None]
+        place, to_voxel = np.moveaxis(origins + depth * directions, 1, -1).reshape(-1, 3), labels.ras_to_ijk @ pose
+        voxel = place @ to_voxel[:3, :3].T + to_voxel[:3, 3]
+        inside = np.clip(np.rint(voxel).astype(int), 0, np.array(labels.array.shape[::-1]) - 1)
+        is_beyond = (np.abs(voxel - inside) > 0.5).any(axis=1) & (labels.array[tuple(inside.T[::-1])] != 0)
+        share = float(is_beyond.mean())
+        if share > _TOLD_SHARE:
+            self._has_told_of_end = True
+            _log.warning("%.0f %% of the image is beyond the volume, whose tissue goes on from its end", 100.0 * share)
 
     def _warn_if_overflown(self, frames: int = 1) -> None:
         lines, traced = self.tracer.overflown_lines(), frames * self.tracer.shape[0]

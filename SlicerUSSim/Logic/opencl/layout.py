@@ -55,7 +55,10 @@ CONSTANTS = {
     "LOSS_STEP": 16,  # samples between those at which losses are stored (downshift.cl); a multiple of all LANES
     "MAX_ZONES": 8,  # of a transmit beam: probe.beam.MOST_ZONES
     "LOBE_DEPTHS": 33,  # of the tables of side lobes (diffraction.py), from the face to the image depth, ...
-    "LOBE_DISTANCES": 65,  # ... and distances from the axis
+    "LOBE_DISTANCES": 65,  # ... and lateral distances from the axis
+    "PLANE_DEPTHS": 17,  # of the table of planes' echoes (diffraction.py), from the face to the image depth, ...
+    "PLANE_TILTS": 65,  # ... and roots of tangents of tilts, from 0 to 1
+    "LENS_DISTANCES": 129,  # distances from the axis of the elevational tables (probe/lens.py)
     "LOBE_STEP": 0.75,  # ... which are so far apart laterally, in wavelengths x receive f-number
     "LOBE_NODES": 128,  # places across the image for which lateral side lobes are computed, at most
     "MAX_BINS": 256,  # of the histograms in similarity.cl
@@ -123,10 +126,9 @@ ACQUISITION = np.dtype(
         ("wavefront_curvature", _FLOAT),  # laterally, probe.beam.CURVED; 0: none
         ("receive_sigma_min", _FLOAT),
         ("receive_sigma_slope", _FLOAT),
-        ("elevation_sigma", _FLOAT),
+        ("elevation_sigma", _FLOAT, CONSTANTS["LOBE_DEPTHS"]),  # LensBeam.sigma_mm
         ("elevation_focus", _FLOAT),
         ("elevation_rayleigh", _FLOAT),
-        ("speckle_height_mm", _FLOAT, CONSTANTS["LOBE_DEPTHS"]),  # diffraction.speckle_height_mm; 0: no curved phase
         # beams from an aperture (aperture.cl)
         ("aperture_beams", _INT),
         ("aperture_mm", _FLOAT),
@@ -199,6 +201,10 @@ SEGMENT = np.dtype(
         ("decay_per_mm", _FLOAT),  # -d ln(attenuation) / ds
         ("loss", _FLOAT),  # nepers at `start` by the attenuation of tissues alone, without what a beam loses otherwise
         ("loss_per_mm", _FLOAT),
+        # The borders of its strip (strips.cl): lateral offset at `start`, its change per mm along the segment, what the
+        # displayed depth changes per mm of offset from the axis towards that border, its change
+        ("left", _FLOAT, 4),
+        ("right", _FLOAT, 4),
         ("reflections", _INT),
         ("label", _INT),
     ]

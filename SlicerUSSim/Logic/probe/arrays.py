@@ -162,6 +162,10 @@ class Probe(Beam):
         """Angle of parallel scan lines to the normal of the face."""
         return 0.0
 
+    def line_levels(self) -> np.ndarray | None:
+        """(scan_lines,) float32 factor of every line's echoes by steered_level; None where no line is steered."""
+        return _levels_of(self)
+
     def line_starts_mm(self, position) -> np.ndarray:
         """Distance from line_at's origin to where lines at these positions leave the face.
 
@@ -278,6 +282,15 @@ def _bounds_of(probe: Probe) -> tuple[float, float, float, float]:
         points = np.concatenate([points, [[0.0, probe.depth_mm, 0.0]]])  # the middle of the arc, if there is no line
     x, y = points[:, 0], points[:, 1]
     return float(x.min()), float(x.max()), float(min(y.min(), 0.0)), float(y.max())
+
+
+@lru_cache(maxsize=16)
+def _levels_of(probe: Probe) -> np.ndarray | None:
+    """Probe.line_levels, which every frame asks for."""
+    sines = probe.directions()[:, 0] if probe.has_flat_face else np.zeros(1)
+    if probe.directivity == "none" or not sines.any():
+        return None
+    return probe.steered_level(np.arcsin(sines)).astype(np.float32)
 
 
 def _own(label: str, tip: str, unit: str, bounds: tuple[float, float], shown: Shown) -> Any:
@@ -447,7 +460,7 @@ PROBES: dict[str, Probe] = {
         band_mhz=(3.75, 6.25),
     ),
     "linear": LinearProbe(
-        width_mm=38.0, depth_mm=40.0, scan_lines=192, frequency_mhz=9.0, elevation_aperture_mm=5.0,
+        width_mm=38.0, depth_mm=40.0, scan_lines=192, frequency_mhz=9.0, element_mm=0.2, elevation_aperture_mm=5.0,
         band_mhz=(6.75, 11.25),
     ),
     "microconvex": ConvexProbe(
@@ -462,7 +475,7 @@ PROBES: dict[str, Probe] = {
     "cardiac": PhasedProbe(  # 64 elements of 0.3 mm
         field_of_view_deg=90.0, depth_mm=160.0, frequency_mhz=2.7, fractional_bandwidth=0.74,
         band_mhz=(1.7, 3.7), aperture_mm=19.2,
-        elevation_aperture_mm=14.0, elevation_focus_mm=60.0, ring_down_mm=3.0,
+        element_mm=0.3, elevation_aperture_mm=14.0, elevation_focus_mm=60.0, ring_down_mm=3.0,
     ),
     "transcranial": PhasedProbe(  # for the temporal bone
         field_of_view_deg=90.0, depth_mm=140.0, frequency_mhz=2.0, fractional_bandwidth=0.6,
@@ -477,17 +490,17 @@ PROBES: dict[str, Probe] = {
     "linear_15": LinearProbe(
         width_mm=25.6, depth_mm=30.0, scan_lines=256, frequency_mhz=15.0,
         band_mhz=(11.25, 18.75), aperture_mm=6.4, focus_mm=15.0,
-        elevation_aperture_mm=2.5, elevation_focus_mm=12.0,
+        element_mm=0.1, elevation_aperture_mm=2.5, elevation_focus_mm=12.0,
     ),
     "burr_hole": PhasedProbe(  # its face fits into a hole of 14 mm
         field_of_view_deg=90.0, depth_mm=80.0, frequency_mhz=5.2, fractional_bandwidth=0.58,
         band_mhz=(3.7, 6.7), aperture_mm=10.9,
-        focus_mm=40.0, elevation_aperture_mm=7.0, elevation_focus_mm=40.0,
+        focus_mm=40.0, element_mm=0.171, elevation_aperture_mm=7.0, elevation_focus_mm=40.0,
     ),
     "hockey_stick": LinearProbe(
         width_mm=22.8, depth_mm=35.0, frequency_mhz=11.0, fractional_bandwidth=0.7,
         band_mhz=(7.15, 14.85), aperture_mm=8.5, focus_mm=20.0,
-        elevation_aperture_mm=4.0, elevation_focus_mm=15.0,
+        element_mm=0.178, elevation_aperture_mm=4.0, elevation_focus_mm=15.0,
     ),
     "matrix": PhasedProbe(  # 3000 elements half a wavelength apart; its elevational focus is electronic
         field_of_view_deg=90.0, depth_mm=140.0, frequency_mhz=3.0, fractional_bandwidth=0.8,

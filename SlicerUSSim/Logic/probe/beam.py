@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from SlicerUSSim.Logic.base.declaration import Declared, Shown, parameter
+from SlicerUSSim.Logic.probe.lens import LensBeam, lens_beam
 
 NOMINAL_SPEED_M_S = 1540.0
 #: -6 dB width of the main lobe of a uniform aperture, in wavelengths x f-number
@@ -103,6 +104,15 @@ class Beam(Declared):
         "none: only side lobes", unit="dB", bounds=(-100, 0),
         note="They and the side lobes fill cysts; they fall off smoothly over 48 wavelengths x f-number to either side",
     )  # fmt: skip
+    element_mm: float | None = parameter(
+        None, "Element", "Lateral size of the elements: larger ones send and receive less along steered lines; none: "
+        "half a wavelength", unit="mm", bounds=(0.01, 10),
+    )  # fmt: skip
+    directivity: str = parameter(
+        "soft", "Directivity", "What steered lines lose. soft: their elements are in a soft baffle, which takes the "
+        "cosine of the angle both ways besides, as measured on arrays; rigid: what elements of their size lose; "
+        "none: nothing, as if a gain made up for it", choices=("soft", "rigid", "none"),
+    )  # fmt: skip
     elevation_aperture_mm: float = parameter(
         7.0, "Elevational aperture", "Height of the elements, in the elevation direction", unit="mm", bounds=(0.5, 100)
     )
@@ -146,22 +156,45 @@ class Beam(Declared):
         sigma_mhz = self.received_bandwidth * self.received_mhz / FWHM_PER_SIGMA
         return NOMINAL_SPEED_M_S * 1e-3 / (4.0 * np.pi * sigma_mhz)
 
-    def beam_sigma_mm(self, depth_mm) -> tuple[np.ndarray, np.ndarray]:
-        """(lateral, elevational) standard deviation of the two-way beam amplitude at `depth_mm` along a scan line."""
-        depth = np.asarray(depth_mm, dtype=float)
-        transmit, receive = self.lateral_sigmas_mm(depth)
-        lateral = transmit * receive / np.hypot(transmit, receive)
-        return lateral, self._gaussian_beam(depth, *self.elevation_beam())
+    def beam_sigma_mm(self, depth_mm, cosine: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
+        """(lateral, elevational) standard deviation of the two-way beam amplitude at `depth_mm` along a scan line.
 
-    def lateral_sigmas_mm(self, depth_mm) -> tuple[np.ndarray, np.ndarray]:
-        """(transmit, receive) standard deviations of the lateral one-way beams at `depth_mm` along a scan line."""
+        The aperture of a steered line is foreshortened by the `cosine` of its angle to the normal of the face.
+        """
         depth = np.asarray(depth_mm, dtype=float)
-        zones = self.transmit_zones()
+        transmit, receive = self.lateral_sigmas_mm(depth, cosine)
+        lateral = transmit * receive / np.hypot(transmit, receive)
+        sigma = self.lens().sigma_mm.astype(float)
+        return lateral, np.interp(depth, np.linspace(0.0, self.displayed_mm, len(sigma)), sigma)
+
+    def lateral_sigmas_mm(self, depth_mm, cosine: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
+        """(transmit, receive) standard deviations of the lateral one-way beams, as for beam_sigma_mm."""
+        depth = np.asarray(depth_mm, dtype=float)
+        zones = [(sigma / cosine, focus, length / cosine**2) for sigma, focus, length in self.transmit_zones()]
         if zones:
             transmit = np.min([self._gaussian_beam(depth, *zone) for zone in zones], axis=0)
         else:
-            transmit = self._focused_everywhere(depth, *self.compounded_beam())
-        return transmit, self._focused_everywhere(depth, *self.receive_beam())
+            transmit = self._focused_everywhere(depth, *self.compounded_beam()) / cosine
+        return transmit, self._focused_everywhere(depth, *self.receive_beam()) / cosine
+
+    def steered_level(self, angle_rad) -> np.ndarray:
+        """Amplitude of echoes along lines at these angles to the normal of the face, re a line along it.
+
+        Elements w wide send and receive sinc(w sin a / wavelength), in a soft baffle cos a of that (A. R. Selfridge, G.
+        S. Kino, B. T. Khuri-Yakub, Appl. Phys. Lett. 37(1), 1980). The beam, wider by 1 / cos a, keeps its power of
+        speckle, so that the echo of a point is lowered by the elements alone.
+        """
+        sine, cosine = np.sin(angle_rad), np.cos(angle_rad)
+        if self.directivity == "none":
+            return np.ones_like(cosine)
+        width = 0.5 * self.wavelength_mm if self.element_mm is None else self.element_mm
+
+        def pattern(mhz: float) -> np.ndarray:
+            of_baffle = cosine if self.directivity == "soft" else 1.0
+            return np.sinc(width * mhz * 1e3 / NOMINAL_SPEED_M_S * sine) * of_baffle
+
+        sent = pattern(self.frequency_mhz)
+        return (sent**2 if self.harmonic else sent) * pattern(self.received_mhz) / np.sqrt(cosine)
 
     def speckle_sigma_mm(self, depth_mm) -> np.ndarray:
         """Lateral sigma of the uncurved beam whose speckle correlates over the same distance.
@@ -178,14 +211,16 @@ class Beam(Declared):
         per_f_number = MAIN_LOBE * widening(self.receive_apodization) * self.wavelength_mm / FWHM_PER_SIGMA
         return per_f_number * self.receive_f_number, per_f_number / self.aperture_mm
 
-    def elevation_beam(self) -> tuple[float, float, float]:
-        """(sigma at the focus, focus, Rayleigh length) of the two-way elevational beam, millimetres."""
-        sigma, focus, rayleigh = self.elevation_waist()
-        if not self.harmonic:
-            return sigma / np.sqrt(2.0), focus, rayleigh
-        # 1 / s^2 of the product is 2 / s^2 (1 + b^2) for the square of the transmitted and 1 / s^2 (1/4 + b^2) for the
-        # received beam, b in Rayleigh lengths: about 6 / (s^2 (1 + 2 b^2)), exactly so at the focus and far from it.
-        return sigma / np.sqrt(6.0), focus, rayleigh / np.sqrt(2.0)
+    @property
+    def lens_height_mm(self) -> float:
+        """Size of the elevational aperture; elements farther aside than the focus is deep hardly contribute."""
+        return min(self.elevation_aperture_mm, self.elevation_focus_mm / LEAST_F_NUMBER)
+
+    def lens(self) -> LensBeam:
+        """The two-way elevational beam, by the diffraction integral of the lens."""
+        spread = float(self.received_bandwidth / FWHM_PER_SIGMA)
+        height = self.lens_height_mm
+        return lens_beam(self.wavelength_mm, spread, height, self.elevation_focus_mm, self.displayed_mm, self.harmonic)
 
     def harmonic_level(self, depth_mm) -> np.ndarray:
         """Amplitude of the second harmonic at `depth_mm` re the fundamental, 1 at the transmit focus.
@@ -253,6 +288,11 @@ class Beam(Declared):
     @property
     def face_mm(self) -> float:
         """Lateral size of all elements that can transmit, defined by each kind."""
+        raise NotImplementedError
+
+    @property
+    def displayed_mm(self) -> float:
+        """Largest distance from line_at's origin within the imaged field, defined by each kind."""
         raise NotImplementedError
 
     def transmit_waist(self) -> tuple[float, float, float]:
