@@ -20,6 +20,8 @@ from SlicerUSSim.Logic.probe.beam import FWHM_PER_SIGMA
 if TYPE_CHECKING:
     from pyopencl import Buffer
 
+#: Standard deviations of a pulse beyond which nothing is left of it
+_PULSE_SIGMAS = 8.0
 #: Decibels of amplitude in a neper
 DB_PER_NEPER = 20.0 / np.log(10.0)
 
@@ -209,9 +211,12 @@ def ring_down(probe: Probe, depth_mm: np.ndarray, axial_sigma_mm: float, cycles_
     places = np.arange(0.0, 2.0 * probe.ring_down_mm, apart_mm)
     level_db = probe.ring_down_db - 40.0 * places / probe.ring_down_mm
     echoes = 10.0 ** (level_db / 20.0) * (-1.0) ** np.arange(len(places)) * np.exp(-2j * np.pi * cycles_per_mm * places)
-    pulses = np.exp(-0.5 * ((depth_mm[:, None] - places) / axial_sigma_mm) ** 2)
-    level = probe.harmonic_level(depth_mm) if probe.harmonic else 1.0
-    return (level * (pulses @ echoes)).astype(np.complex64)
+    ringing = np.zeros(len(depth_mm), np.complex64)
+    near_mm = depth_mm[depth_mm < places[-1] + _PULSE_SIGMAS * axial_sigma_mm]
+    pulses = np.exp(-0.5 * ((near_mm[:, None] - places) / axial_sigma_mm) ** 2)
+    level = probe.harmonic_level(near_mm) if probe.harmonic else 1.0
+    ringing[: len(near_mm)] = level * (pulses * echoes).sum(axis=1)  # no BLAS: its threads wait for those of the device
+    return ringing
 
 
 def pulse_taps(sigma: float) -> np.ndarray:
