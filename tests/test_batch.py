@@ -211,7 +211,10 @@ def test_a_slice_is_the_volume_at_the_pixels_and_the_centre_its_mean(made):
         slice_under_probe(volume, frame.grid, frame.probe_to_ras), sample(volume, points[..., :3]), atol=1e-9
     )
     whole = volume.with_array((1000.0 * volume.array).astype(np.int16))  # whose values are rounded
-    found, exact = slice_under_probe(whole, frame.grid, frame.probe_to_ras), volume.with_array(whole.array.astype(float))
+    found, exact = (
+        slice_under_probe(whole, frame.grid, frame.probe_to_ras),
+        volume.with_array(whole.array.astype(float)),
+    )
     assert found.dtype == np.int16
     np.testing.assert_allclose(found, sample(exact, points[..., :3]), atol=0.501)
 
