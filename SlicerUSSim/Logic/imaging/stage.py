@@ -10,7 +10,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
@@ -95,6 +95,13 @@ class DeviceFrame:
     def download(self, signal: str) -> np.ndarray:
         """A copy on the host of "iq", "envelope", "grey" (scan lines, samples) or "image" (rows, columns)."""
         return self.medium.device.download(*self._signal(signal))
+
+    def on_demand(self, signal: str, samples: int) -> Any:
+        """What gives (scan lines, samples) of it when called, and keeps its buffer for that."""
+        buffer, shape, kind = self._signal(signal)
+        device = self.medium.device
+        loan = device.lend(buffer)
+        return lambda: device.download(loan.buffer, shape, kind)[:, :samples]
 
     def start_download(self, signal: str) -> Callable[[], np.ndarray]:
         """The same without waiting, see Device.start_download."""
