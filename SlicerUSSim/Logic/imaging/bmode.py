@@ -141,7 +141,7 @@ class Compressor(Stage):
         #: Likewise of the time-gain compensation
         self._gains: tuple[tuple, Buffer] | None = None
         #: Of the gain by line
-        self._across: tuple[bytes, Buffer] | None = None
+        self._across: tuple[tuple, Buffer] | None = None
 
     def run(self, frame: DeviceFrame) -> None:
         """Enqueue the grey levels of every line: the frame's `envelope` and `grey`."""
@@ -179,12 +179,12 @@ class Compressor(Stage):
 
     def _compensation(self, frame: DeviceFrame) -> Buffer:
         """float32 [sample] dB of time-gain compensation, from where a line leaves the face."""
-        display, samples, rises_mm = frame.display, frame.line_shape[1], frame.display.tgc_reach * frame.probe.depth_mm
+        display, probe, samples = frame.display, frame.probe, frame.line_shape[1]
         sample_mm, mhz, shift = (float(frame.acquisition[n]) for n in ("sample_mm", "frequency_mhz", "downshift"))
-        depth_mm = np.arange(samples) * sample_mm
-        sliders = gains_along(display, frame.probe, depth_mm)
-        key = (samples, rises_mm, display.tgc_db_cm_mhz, sample_mm, mhz, shift, sliders.tobytes())
+        key = display, probe, samples, sample_mm, mhz, shift
         if self._gains is None or self._gains[0] != key:
+            depth_mm, rises_mm = np.arange(samples) * sample_mm, display.tgc_reach * probe.depth_mm
+            sliders = gains_along(display, probe, depth_mm)
             path_cm = 0.2 * np.minimum(depth_mm, rises_mm)  # both ways
             loss = display.tgc_db_cm_mhz * mhz * path_cm / DB_PER_NEPER
             gains = DB_PER_NEPER * (loss - gain_of_band(shift, loss))
@@ -193,9 +193,9 @@ class Compressor(Stage):
 
     def _line_gains(self, frame: DeviceFrame) -> Buffer:
         """float32 [scan line] dB."""
-        gains = gains_across(frame.display, frame.probe, frame.line_shape[0])
-        if self._across is None or self._across[0] != gains.tobytes():
-            self._across = gains.tobytes(), self.device.upload(gains)
+        key = frame.display, frame.probe, frame.line_shape[0]
+        if self._across is None or self._across[0] != key:
+            self._across = key, self.device.upload(gains_across(*key))
         return self._across[1]
 
 

@@ -403,9 +403,9 @@ class Workspace:
 
     def get(self, name: str, nbytes: int) -> Buffer:
         """A buffer of at least `nbytes`, with the content of its last use."""
-        held = self._buffers[name] = [each for each in self._buffers.get(name, []) if each.size >= nbytes]
+        held = self._buffers.get(name, [])
         for buffer in held:
-            if not self._device.is_lent(buffer):
+            if buffer.size >= nbytes and not self._device.is_lent(buffer):
                 return buffer
-        held.append(self._device.empty(nbytes))
-        return held[-1]
+        self._buffers[name] = [*(each for each in held if each.size >= nbytes), self._device.empty(nbytes)]
+        return self._buffers[name][-1]
