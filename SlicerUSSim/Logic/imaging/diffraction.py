@@ -9,6 +9,7 @@ from functools import lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy import fft
 from scipy.special import erfc
 
 from SlicerUSSim.Logic.opencl.layout import CONSTANTS
@@ -20,7 +21,7 @@ if TYPE_CHECKING:
 
 _DEPTHS, _DISTANCES, _STEP = (CONSTANTS[f"LOBE_{name}"] for name in ("DEPTHS", "DISTANCES", "STEP"))
 _POINTS, _PADDED = 512, 4096  # of an aperture, and of its Fourier transform
-_PLANE_POINTS, _PLANE_FREQUENCIES = 256, 9  # of both apertures, and of the pulse, for the echoes of planes
+_PLANE_POINTS, _PLANE_FREQUENCIES, _PLANE_TIMES = 256, 9, 31  # of both apertures, and of the pulse, for planes
 _LEAST_PLANE = 1e-4  # of these, re a square plane
 _BEYOND_SIGMAS = 2.0  # what is closer to the axis belongs to the main beam
 _GAUSSIAN_SIGMAS = 6.0  # that has nothing beyond these
@@ -213,8 +214,7 @@ def _plane_echo(
     step = (sent + (sent if received is None else received))[:, None] / _PLANE_POINTS
     place = step * np.arange(_PLANE_POINTS + 1)
     across = np.arange(_PLANE_POINTS + 1) / (2 * _PLANE_POINTS * step)
-    frequency = np.maximum(1.0 + spread * np.linspace(-2.5, 2.5, _PLANE_FREQUENCIES), 0.1)
-    f = frequency[:, None, None]
+    f = np.linspace(max(1.0 - 2.5 * spread, 0.1), 1.0 + 2.5 * spread, _PLANE_FREQUENCIES)[:, None, None]
 
     def opening(size: np.ndarray) -> np.ndarray:
         return np.clip(0.5 + (0.5 * size[:, None] - place) / step, 0.0, 1.0)
@@ -227,11 +227,10 @@ def _plane_echo(
         pairs *= _spectrum(opening(received) * weights, np.zeros_like(place))
     pairs *= phasor(2.0 * np.pi * wavelength_mm / f * (depth[:, None] * across**2))
     echo = cosines(pairs, kind=1)[..., :_PLANE_POINTS]
-    time = np.linspace(-0.5, 0.5, 32) * (_PLANE_FREQUENCIES - 1) / (frequency[-1] - frequency[0])
-    pulse = np.exp(-0.5 * ((frequency - 1.0) / spread) ** 2) / np.sqrt(frequency)
-    waves = (pulse * np.exp(-2j * np.pi * np.outer(time, frequency))).astype(np.complex64)
-    # Depth by depth, products are too small for threads, which would wait for those of the device.
-    peak = np.abs(waves @ np.moveaxis(echo, 1, 0)).max(axis=1)
+    # At times evenly on both sides of 0; without BLAS, whose threads wait for those of the device
+    late = np.exp(-1j * np.pi / _PLANE_TIMES * np.arange(_PLANE_FREQUENCIES))[:, None, None]
+    pulse = (late * np.exp(-0.5 * ((f - 1.0) / spread) ** 2) / np.sqrt(f)).astype(np.complex64)
+    peak = np.abs(np.asarray(fft.fft(echo * pulse, n=_PLANE_TIMES, axis=0))).max(axis=0)
     tilt = np.linspace(0.0, 1.0, CONSTANTS["PLANE_TILTS"]) ** 2
     ways = zip(depth, place[:, :_PLANE_POINTS], peak, strict=True)
     found = np.array([np.interp(2.0 * s * tilt, at, of / of[0], right=0.0) for s, at, of in ways])
