@@ -77,9 +77,33 @@ inline float4 rates_in_cell(__global const float4 *acoustics, __global const ush
   return along_z[0] + f.z * (along_z[1] - along_z[0]);
 }
 
+// The same where all tissue is soft: extra path and nepers per mm alone.
+inline float2 soft_rates(__global const float4 *acoustics, __global const ushort *cell, int nx, int nxy, float3 f) {
+  float2 along_z[2];
+  for (int z = 0; z < 2; z++) {
+    __global const ushort *near = cell + z * nxy, *far = near + nx;
+    const float2 a = acoustics[near[0] & LABEL_MASK].xy, b = acoustics[near[1] & LABEL_MASK].xy;
+    const float2 c = acoustics[far[0] & LABEL_MASK].xy, d = acoustics[far[1] & LABEL_MASK].xy;
+    const float2 before = a + f.x * (b - a), behind = c + f.x * (d - c);
+    along_z[z] = before + f.y * (behind - before);
+  }
+  return along_z[0] + f.z * (along_z[1] - along_z[0]);
+}
+
 // What a border takes from an amplitude, both ways, in nepers.
 inline float border_nepers(float impedance, float other_impedance) {
   return -log_fast(fmax(1.0f - square_reflection(impedance, other_impedance), 1e-6f));
+}
+
+// Stored depths that lines need of the ray at an angle from a point of a flat face whose lines begin in its middle: no
+// traced line goes where the ray, or the one before it, has left the sector of them. All of other faces.
+inline int depths_needed(Frame frame, float along, float angle) {
+  const int depths = frame->fan_depths;
+  if (frame->linear || frame->apex_radius_mm > 0.0f) return depths;
+  const float reach = -frame->first_line + frame->guard_lines * frame->line_spacing / frame->lateral_rays;
+  const float beyond = fabs(angle) - frame->fan_angle_step - reach, inwards = angle < 0.0f ? along : -along;
+  if (beyond <= 0.0f) return depths;
+  return (int)fmin((float)depths, fmax(inwards, 0.0f) * cos_of(reach) / sin_of(beyond) / frame->fan_step + 3.0f);
 }
 
 // One work-item follows one ray of a fan. Global size (angles, points, rows). Look-ups are trilinear, so that sums over
@@ -115,7 +139,8 @@ __kernel void fans(Frame frame, __global const ushort *voxels, __global const fl
   float4 sum = (float4)(0.0f);
   float lean = 0.0f;
   vstore4(sum, 0, to);
-  for (int depth = 1; depth < depths; depth += 8) {
+  const int needed = all_soft ? depths_needed(frame, along, own) : depths;
+  for (int depth = 1; depth < needed; depth += 8) {
     // Eight look-ups at once, which are nearly always in one tissue.
     const float8 path = (depth - 0.5f + (float8)(0, 1, 2, 3, 4, 5, 6, 7)) * length;
     // Over eight of them it is nearly linear.
@@ -137,7 +162,21 @@ __kernel void fans(Frame frame, __global const ushort *voxels, __global const fl
       vstore8(y - convert_float8(j), 0, fy);
       vstore8(z - convert_float8(k), 0, fz);
     }
-    for (int n = 0; n < min(8, depths - depth); n++) {
+    for (int n = 0; n < min(8, depths - depth) && all_soft; n++) {
+      float2 rate = soft.xy;
+      if (differs) {
+        __global const ushort *cell = voxels + here[n];
+        const int first = cell[0];
+        label = first & LABEL_MASK;
+        rate = soft.xy = acoustics[label].xy;
+        if (!(first & SAME_LABEL)) rate = soft_rates(acoustics, cell, nx, nxy, (float3)(fx[n], fy[n], fz[n]));
+      }
+      const float turned = rate.x * turn_per_rate[n];
+      sum += (float4)(length * rate.x, length * rate.y, 0.0f, length * (lean + 0.5f * turned));
+      lean += turned;
+      vstore4(sum, depth + n, to);
+    }
+    for (int n = 0; n < min(8, depths - depth) && !all_soft; n++) {
       float2 rate = soft.xy;
       float strong = 0.0f, bone = 0.0f, excess = 0.0f;
       int is_strong = 0, is_seen = 0;  // as strong

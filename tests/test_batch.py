@@ -163,6 +163,38 @@ def test_a_draft_has_level_and_structures_of_the_full_image(made, draft):
     assert db * (drafts["image"][tissue].mean() - drafts["image"][fluid].mean()) > 10.0
 
 
+def test_signals_are_downloaded_when_asked_for_whatever_comes_after(made, monkeypatch):
+    shapes, download = [], made.device.download
+    monkeypatch.setattr(made.device, "download", lambda *of: shapes.append(of[1]) or download(*of))
+    expected = made.simulate_batch(PROBE, POSES, display=SMALL, outputs=("iq", "envelope", "bmode"))
+    smooth = replace(SMALL, smoothing_axial_mm=0.4)
+    shapes.clear()
+    frames = [made.simulate(PROBE, pose, SMALL, noise_seed=n) for n, pose in enumerate(POSES)]
+    assert shapes.count((64, 80)) == 3 and len(shapes) == 9  # images, overflows and three signals of the first frame
+    made.simulate(PROBE, POSES[0], smooth)
+    list(made.sweep(PROBE, POSES, smooth))
+    pickled = pickle.loads(pickle.dumps(frames[1]))
+    for n, frame in enumerate(frames):
+        for name, arrays in expected.items():
+            np.testing.assert_array_equal(getattr(frame, name), arrays[n])
+            np.testing.assert_array_equal(getattr(pickled, name), arrays[1])
+    assert frames[0].iq is frames[0].iq
+    shapes.clear()
+    for pose in POSES * 3:
+        frame = made.simulate(PROBE, pose, SMALL)
+    assert len(shapes) == 18, "a frame whose name gets the next one is not downloaded"
+    assert frame.iq.shape == expected["iq"][0].shape and len(shapes) == 19
+
+
+def test_frames_that_come_and_go_share_buffers(made, monkeypatch):
+    made.simulate(PROBE, POSES[0], SMALL)
+    sizes, empty = [], made.device.empty
+    monkeypatch.setattr(made.device, "empty", lambda size: sizes.append(size) or empty(size))
+    for pose in POSES * 4:
+        frame = made.simulate(PROBE, pose, SMALL)
+    assert len(sizes) <= 3 and frame.image.any(), "one more buffer for each signal"
+
+
 # ---- manners ---------------------------------------------------------------------------------------------------------
 
 
@@ -210,6 +242,13 @@ def test_a_slice_is_the_volume_at_the_pixels_and_the_centre_its_mean(made):
     np.testing.assert_allclose(
         slice_under_probe(volume, frame.grid, frame.probe_to_ras), sample(volume, points[..., :3]), atol=1e-9
     )
+    whole = volume.with_array((1000.0 * volume.array).astype(np.int16))  # whose values are rounded
+    found, exact = (
+        slice_under_probe(whole, frame.grid, frame.probe_to_ras),
+        volume.with_array(whole.array.astype(float)),
+    )
+    assert found.dtype == np.int16
+    np.testing.assert_allclose(found, sample(exact, points[..., :3]), atol=0.501)
 
 
 def test_the_examples_of_three_users_run(tmp_path):

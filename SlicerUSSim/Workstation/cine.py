@@ -75,7 +75,7 @@ class Cine:
             kept.clear()
         kept.append(new)
         get_event_loop().run_in_executor(None, lambda: setattr(new, "echoes", Echoes.of(frame)))
-        size = frame.iq.nbytes // 2 + taken.image.nbytes
+        size = taken.image.nbytes + next((one.echoes.parts.nbytes for one in kept if one.echoes), 0)
         while new.seconds - kept[0].seconds > KEPT_S or len(kept) * size > _MOST_BYTES:
             kept.popleft()
         self._set(index=len(kept) - 1)

@@ -28,8 +28,8 @@ OUTPUTS: dict[str, tuple[type[np.generic], str, bool]] = {
     "envelope": (np.float32, "envelope", False),
     "bmode": (np.uint8, "grey", False),
 }
-#: Steps of the displacement of lines
-_SHIFT_STEP_MM = 0.25
+#: Steps of the displacement of lines, and a distance beyond all volumes
+_SHIFT_STEP_MM, _FAR_MM = 0.25, 1e6
 #: Part of the free memory that arrays may have; larger ones are files
 _MOST_OF_MEMORY = 0.5
 
@@ -172,36 +172,41 @@ def _imaged(
     """
     probe, grid, record = frame.probe, frame.grid, frame.acquisition
     depth = np.arange(0.0, probe.displayed_mm + _SHIFT_STEP_MM, _SHIFT_STEP_MM)
-    places = np.full((len(counts), len(depth), 3), np.nan, np.float32)
-    for there, line, count in zip(places, segments, counts, strict=True):
-        direct = line[:count][line["reflections"][:count] == 0]
-        if len(direct):
-            piece = np.maximum(np.searchsorted(direct["depth_mm"], depth, side="right") - 1, 0)
-            along = (depth - direct["depth_mm"][piece]) / direct["depth_per_mm"][piece]
-            there[:] = direct["start"][piece] + along[:, None] * direct["direction"][piece]
-            there[along > direct["length_mm"][piece] + _SHIFT_STEP_MM] = np.nan
-    lateral, guard = int(record["lateral_rays"]), int(record["guard_lines"])
-    origin, direction = probe.line_at(
-        probe.first_line + probe.line_spacing * (np.arange(len(counts)) - guard) / lateral
-    )
+    lines, lateral, guard = np.arange(len(counts)), int(record["lateral_rays"]), int(record["guard_lines"])
+    is_direct = (np.arange(segments.shape[1]) < counts[:, None]) & (segments["reflections"] == 0)
+    direct, line = segments[is_direct], np.nonzero(is_direct)[0]
+    # Depths of one line after those of another
+    ends = np.searchsorted(line * _FAR_MM + direct["depth_mm"], lines[:, None] * _FAR_MM + depth, side="right")
+    piece = np.minimum(np.maximum(ends - 1, np.searchsorted(line, lines)[:, None]), len(direct) - 1)
+    along = (depth - direct["depth_mm"][piece]) / direct["depth_per_mm"][piece]
+    origin, direction = probe.line_at(probe.first_line + probe.line_spacing * (lines - guard) / lateral)
     straight = (origin[:, None] + depth[:, None] * direction[:, None]) @ pose[:3, :3].T + pose[:3, 3]
-    shift = ((places - straight) @ labels.ras_to_ijk[:3, :3].T).astype(np.float32)
-    line, at = _nearest(probe, grid, lateral, guard, len(counts))
+    shift = direct["start"][piece] + along[..., None] * direct["direction"][piece] - straight
+    is_seen = is_direct.any(axis=1)[:, None] & (along <= direct["length_mm"][piece] + _SHIFT_STEP_MM)
+    shift = np.where(is_seen[..., None], shift @ labels.ras_to_ijk[:3, :3].T, _FAR_MM).astype(np.float32)
+
+    row, column, nearest = _nearest(probe, grid, lateral, guard, len(counts))
     to_ijk = (labels.ras_to_ijk @ pose @ grid.image_to_probe).astype(np.float32)
-    columns, rows = np.arange(grid.columns, dtype=np.float32)[:, None], np.arange(grid.rows, dtype=np.float32)
-    ijk = shift[line, at] + (columns * to_ijk[:3, 0] + to_ijk[:3, 3]) + (rows[:, None] * to_ijk[:3, 1])[:, None]
-    seen = np.isfinite(ijk[..., 0]) & _field(probe, grid)
-    index = np.rint(ijk[seen]).astype(np.intp).T[::-1]
-    inside = np.all((index >= 0) & (index < np.array(labels.array.shape)[:, None]), axis=0)
+    inside, index = np.ones(len(row), bool), []
+    for axis, size in enumerate(labels.array.shape[::-1]):
+        place = shift[..., axis].ravel().take(nearest)
+        place += column * to_ijk[axis, 0] + to_ijk[axis, 3]
+        place += row * to_ijk[axis, 1]
+        index.append(np.rint(place, out=place).astype(np.intp))
+        inside &= (place >= 0) & (place < size)
     found = np.zeros((grid.rows, grid.columns), np.uint8)
-    found[seen] = np.where(inside, labels.array[tuple(np.where(inside, index, 0))], 0)
+    found[_field(probe, grid)] = np.where(inside, labels.array[tuple(np.where(inside, at, 0) for at in index[::-1])], 0)
     return found
 
 
 @lru_cache(maxsize=4)
-def _nearest(probe: Probe, grid: ImageGrid, lateral: int, guard: int, traced: int) -> tuple[np.ndarray, np.ndarray]:
-    """(rows, columns) numbers of the traced line and of the depth, in _SHIFT_STEP_MM, that are nearest to a pixel."""
-    position, along = _places(probe, grid)
+def _nearest(
+    probe: Probe, grid: ImageGrid, lateral: int, guard: int, traced: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Of the pixels in the imaged field: float32 row, column, and which of (traced lines, depths) is nearest."""
+    position, along = (of[_field(probe, grid)] for of in _places(probe, grid))
     line = np.rint((position - probe.first_line) / probe.line_spacing * lateral).astype(int) + guard
     depth = np.rint(np.clip(along, 0.0, probe.displayed_mm) / _SHIFT_STEP_MM).astype(int)
-    return np.clip(line, 0, traced - 1), depth
+    depths = len(np.arange(0.0, probe.displayed_mm + _SHIFT_STEP_MM, _SHIFT_STEP_MM))
+    row, column = (of.astype(np.float32) for of in np.nonzero(_field(probe, grid)))
+    return row, column, np.clip(line, 0, traced - 1) * depths + depth

@@ -20,6 +20,8 @@ from SlicerUSSim.Logic.probe.beam import FWHM_PER_SIGMA
 if TYPE_CHECKING:
     from pyopencl import Buffer
 
+#: Standard deviations of a pulse beyond which nothing is left of it
+_PULSE_SIGMAS = 8.0
 #: Decibels of amplitude in a neper
 DB_PER_NEPER = 20.0 / np.log(10.0)
 
@@ -139,7 +141,7 @@ class Compressor(Stage):
         #: Likewise of the time-gain compensation
         self._gains: tuple[tuple, Buffer] | None = None
         #: Of the gain by line
-        self._across: tuple[bytes, Buffer] | None = None
+        self._across: tuple[tuple, Buffer] | None = None
 
     def run(self, frame: DeviceFrame) -> None:
         """Enqueue the grey levels of every line: the frame's `envelope` and `grey`."""
@@ -177,12 +179,12 @@ class Compressor(Stage):
 
     def _compensation(self, frame: DeviceFrame) -> Buffer:
         """float32 [sample] dB of time-gain compensation, from where a line leaves the face."""
-        display, samples, rises_mm = frame.display, frame.line_shape[1], frame.display.tgc_reach * frame.probe.depth_mm
+        display, probe, samples = frame.display, frame.probe, frame.line_shape[1]
         sample_mm, mhz, shift = (float(frame.acquisition[n]) for n in ("sample_mm", "frequency_mhz", "downshift"))
-        depth_mm = np.arange(samples) * sample_mm
-        sliders = gains_along(display, frame.probe, depth_mm)
-        key = (samples, rises_mm, display.tgc_db_cm_mhz, sample_mm, mhz, shift, sliders.tobytes())
+        key = display, probe, samples, sample_mm, mhz, shift
         if self._gains is None or self._gains[0] != key:
+            depth_mm, rises_mm = np.arange(samples) * sample_mm, display.tgc_reach * probe.depth_mm
+            sliders = gains_along(display, probe, depth_mm)
             path_cm = 0.2 * np.minimum(depth_mm, rises_mm)  # both ways
             loss = display.tgc_db_cm_mhz * mhz * path_cm / DB_PER_NEPER
             gains = DB_PER_NEPER * (loss - gain_of_band(shift, loss))
@@ -191,9 +193,9 @@ class Compressor(Stage):
 
     def _line_gains(self, frame: DeviceFrame) -> Buffer:
         """float32 [scan line] dB."""
-        gains = gains_across(frame.display, frame.probe, frame.line_shape[0])
-        if self._across is None or self._across[0] != gains.tobytes():
-            self._across = gains.tobytes(), self.device.upload(gains)
+        key = frame.display, frame.probe, frame.line_shape[0]
+        if self._across is None or self._across[0] != key:
+            self._across = key, self.device.upload(gains_across(*key))
         return self._across[1]
 
 
@@ -209,9 +211,12 @@ def ring_down(probe: Probe, depth_mm: np.ndarray, axial_sigma_mm: float, cycles_
     places = np.arange(0.0, 2.0 * probe.ring_down_mm, apart_mm)
     level_db = probe.ring_down_db - 40.0 * places / probe.ring_down_mm
     echoes = 10.0 ** (level_db / 20.0) * (-1.0) ** np.arange(len(places)) * np.exp(-2j * np.pi * cycles_per_mm * places)
-    pulses = np.exp(-0.5 * ((depth_mm[:, None] - places) / axial_sigma_mm) ** 2)
-    level = probe.harmonic_level(depth_mm) if probe.harmonic else 1.0
-    return (level * (pulses @ echoes)).astype(np.complex64)
+    ringing = np.zeros(len(depth_mm), np.complex64)
+    near_mm = depth_mm[depth_mm < places[-1] + _PULSE_SIGMAS * axial_sigma_mm]
+    pulses = np.exp(-0.5 * ((near_mm[:, None] - places) / axial_sigma_mm) ** 2)
+    level = probe.harmonic_level(near_mm) if probe.harmonic else 1.0
+    ringing[: len(near_mm)] = level * (pulses * echoes).sum(axis=1)  # no BLAS: its threads wait for those of the device
+    return ringing
 
 
 def pulse_taps(sigma: float) -> np.ndarray:

@@ -5,26 +5,26 @@ J. W. Goodman, Introduction to Fourier Optics, sections 4.2 and 4.4 (docs/physic
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy import fft
-from scipy.ndimage import gaussian_filter1d
 from scipy.special import erfc
 
 from SlicerUSSim.Logic.opencl.layout import CONSTANTS
 from SlicerUSSim.Logic.probe.beam import FWHM_PER_SIGMA, MAIN_LOBE, apodized_pattern
+from SlicerUSSim.Logic.probe.lens import cosines, phasor
 
 if TYPE_CHECKING:
     from SlicerUSSim.Logic.probe.arrays import Probe
 
 _DEPTHS, _DISTANCES, _STEP = (CONSTANTS[f"LOBE_{name}"] for name in ("DEPTHS", "DISTANCES", "STEP"))
 _POINTS, _PADDED = 512, 4096  # of an aperture, and of its Fourier transform
-_PLANE_POINTS, _PLANE_FREQUENCIES = 256, 9  # of both apertures, and of the pulse, for the echoes of planes
+_PLANE_POINTS, _PLANE_FREQUENCIES, _PLANE_TIMES = 256, 9, 31  # of both apertures, and of the pulse, for planes
 _LEAST_PLANE = 1e-4  # of these, re a square plane
 _BEYOND_SIGMAS = 2.0  # what is closer to the axis belongs to the main beam
+_GAUSSIAN_SIGMAS = 6.0  # that has nothing beyond these
 #: Variance by which side_lobes.cl widens lobes: of a node's lines and of the interpolation between nodes, in squared
 #: distances of nodes (1/12 + 0.105), and of the table's mean over one lobe and its interpolation (1/12 + 0.75^2 / 12),
 #: in squared wavelengths x f-number
@@ -51,18 +51,15 @@ def lobes_of(probe: Probe) -> np.ndarray:
     column = np.arange(_DISTANCES)
 
     unit = probe.wavelength_mm * np.maximum(probe.receive_f_number, depth / probe.aperture_mm)
-    x, amplitude = _transmitted(probe, depth, unit)
-    pattern = (amplitude * apodized_pattern(x / unit[:, None], probe.receive_apodization)) ** 2
-    tails = _tails(x, pattern, sigma)
+    step, amplitude = _transmitted(probe, depth, unit)
+    place = (step / unit).astype(np.float32)[:, None] * np.arange(amplitude.shape[1], dtype=np.float32)
+    pattern = (amplitude * apodized_pattern(place, probe.receive_apodization)).astype(float) ** 2
+    at = _STEP * column + np.array([[-0.5], [0.5]])  # of the lobe over which power is averaged
+    near, far = np.moveaxis(_excess(step, pattern, sigma, unit[:, None, None] * np.maximum(at, 0.0)), 1, 0)
     place = column / (_DISTANCES - 1)
     clutter = 0.5 * probe.clutter_power / (_STEP * (_DISTANCES - 1)) * (1.0 + np.cos(np.pi * place))
     fading = 0.5 + 0.5 * np.cos(np.pi * np.clip(4.0 * place - 3.0, 0.0, 1.0))  # the table ends smoothly
-    lateral = [
-        _density(tail, _STEP * scale * column, scale) * scale * fading + clutter
-        for tail, scale in zip(tails, unit, strict=True)
-    ]
-
-    return np.sqrt(lateral).astype(np.float32)
+    return np.sqrt(0.5 * (near - far) * fading + clutter).astype(np.float32)
 
 
 @lru_cache(maxsize=16)
@@ -83,20 +80,22 @@ def lateral_weights(probe: Probe) -> np.ndarray:
     place = column / (_DISTANCES - 1)
     clutter = 0.5 * probe.clutter_power / (_STEP * (_DISTANCES - 1)) * (1.0 + np.cos(np.pi * place))
     power = np.maximum(lobes_of(probe).astype(float) ** 2 - clutter, 0.0)
-    fine = np.arange(_FINER * (_DISTANCES - 1) + 1) / _FINER
-    rows = []
-    for row, width in zip(power, np.sqrt(variance), strict=True):
-        peak = int(row.argmax())  # nearer the axis is the main beam, which hides lobes
-        wanted = np.exp(np.interp(np.maximum(fine, peak), column, np.log(row + _LEAST_POWER)))
-        made = wanted
-        for _ in range(_SHARPENED):
-            made = made * wanted / gaussian_filter1d(made, width * _FINER / _STEP, mode="mirror")
-        rows.append(np.where(column > peak, np.maximum(made[::_FINER] - _LEAST_POWER, 0.0), row))
-    return np.sqrt(np.array(rows) + clutter).astype(np.float32)
+    peak = power.argmax(axis=1)[:, None]  # nearer the axis is the main beam, which hides lobes
+    known = np.log(np.where(column < peak, np.take_along_axis(power, peak, axis=1), power) + _LEAST_POWER)
+    part = np.arange(_FINER) / _FINER
+    between = known[:, :-1, None] + part * np.diff(known, axis=1)[..., None]
+    made = wanted = np.exp(np.append(between.reshape(_DEPTHS, -1), known[:, -1:], axis=1))
+    # Mirrored at both ends, a Gaussian filter is a product with the coefficients of cosines.
+    waves = np.linspace(0.0, np.pi * _FINER / _STEP, wanted.shape[1])
+    filtered = np.exp(-0.5 * np.outer(variance, waves**2)) / (2 * (len(waves) - 1))
+    for _ in range(_SHARPENED):
+        made = made * wanted / np.maximum(cosines(cosines(made, kind=1) * filtered, kind=1), _LEAST_POWER)
+    rows = np.where(column > peak, np.maximum(made[:, ::_FINER] - _LEAST_POWER, 0.0), power)
+    return np.sqrt(rows + clutter).astype(np.float32)
 
 
 def _transmitted(probe: Probe, depth: np.ndarray, unit: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """((depths, n) lateral distances in mm, from 0 on; amplitude there) of what is transmitted and has its harmonic.
+    """((depths,) mm, and (depths, n) amplitudes so far apart, from the axis on) of what is transmitted or its harmonic.
 
     `unit` (depths,) is the wavelength x f-number of reception, in millimetres.
     """
@@ -104,17 +103,17 @@ def _transmitted(probe: Probe, depth: np.ndarray, unit: np.ndarray) -> tuple[np.
     if len(zones) == 0:
         least, slope = probe.compounded_beam()
         own = np.maximum(least, slope * depth) * FWHM_PER_SIGMA / MAIN_LOBE
-        x = np.outer(np.minimum(unit, own) * _POINTS / _PADDED, np.arange(_PADDED // 2))
-        return x, np.abs(np.sinc(x / own[:, None]))  # each wave is plane, and so is its harmonic
+        step = np.minimum(unit, own) * _POINTS / _PADDED
+        return step, np.sinc(np.outer(step / own, np.arange(_PADDED // 2)))  # each wave is plane, and so its harmonic
     focus, aperture = zones[probe.zone_at(depth)].T
-    x, amplitude = _focused_once(probe.wavelength_mm, aperture, focus, depth, octaves=int(probe.harmonic))
-    return x, amplitude**2 if probe.harmonic else amplitude
+    step, amplitude = _focused_once(probe.wavelength_mm, aperture, focus, depth, octaves=int(probe.harmonic))
+    return step, amplitude**2 if probe.harmonic else amplitude
 
 
 def _focused_once(
     wavelength: float, aperture: np.ndarray, focus: np.ndarray, depth: np.ndarray, octaves: int = 0
 ) -> tuple[np.ndarray, np.ndarray]:
-    """((depths, n) distances from the axis in mm, from 0 on; amplitude there) of a uniform aperture, by Fresnel.
+    """((depths,) mm, and (depths, n) amplitudes so far apart, from the axis on) of a uniform aperture, by Fresnel.
 
     The field is that of a frequency `octaves` lower, at the distances of this wavelength; the others are (depths,). So
     near the face that points are too far apart, it is the shadow of the aperture: that of farther away, as much wider.
@@ -122,42 +121,42 @@ def _focused_once(
     nearest = 1.0 / (1.0 / focus + 0.5 * _POINTS * wavelength / aperture**2)
     far = np.maximum(depth, nearest)
     wider = np.where(depth < nearest, (focus - depth) / (focus - nearest), 1.0)
-    point = ((np.arange(_POINTS) + 0.5) / _POINTS - 0.5) * aperture[:, None]
+    point = (np.arange(_POINTS // 2) + 0.5) / _POINTS * aperture[:, None]
     phase = np.pi / (2**octaves * wavelength) * (1.0 / far - 1.0 / focus)[:, None] * point**2
-    field = np.asarray(fft.fft(np.exp(1j * phase).astype(np.complex64), 2**octaves * _PADDED, axis=1))
-    field = field[:, : _PADDED // 2]
+    field = cosines(phasor(phase), n=2**octaves * _PADDED // 2)[..., : _PADDED // 2]  # all is even
     step = wider * wavelength * far * _POINTS / (aperture * _PADDED)
-    return step[:, None] * np.arange(_PADDED // 2), np.abs(field).astype(float)
+    return step, np.abs(field)
 
 
-def _tails(x: np.ndarray, pattern: np.ndarray, sigma: np.ndarray) -> list[Callable[[np.ndarray], np.ndarray]]:
-    """For each depth a function of distances: by how much a pattern has more power beyond them than a Gaussian.
+def _excess(step: np.ndarray, pattern: np.ndarray, sigma: np.ndarray, at: np.ndarray) -> np.ndarray:
+    """By how much a pattern has more power beyond the distances `at` (depths, ...) than a Gaussian.
 
-    `sigma` (depths,) is that of the Gaussian's amplitude. The excess falls with the distance, to 0; what is near the
-    axis belongs to the main beam.
+    The pattern (depths, n) is at distances `step` (depths,) apart, from the axis on; `sigma` (depths,) is that of the
+    Gaussian's amplitude. The excess falls with the distance, to 0; what is near the axis belongs to the main beam.
     """
-    inside = np.cumsum(pattern, axis=1) - 0.5 * (pattern + pattern[:, :1])
-    inside -= np.gradient(pattern, axis=1) / 12.0  # Euler and Maclaurin's correction of the sums
-    beyond, density = 1.0 - inside / inside[:, -1:], pattern / inside[:, -1:]
-    excess = beyond - erfc(x / sigma[:, None])
+    inside = 0.5 * (pattern + pattern[:, :1])
+    inside += np.gradient(pattern, axis=1) / 12.0  # Euler and Maclaurin's correction of the sums
+    inside = np.subtract(np.cumsum(pattern, axis=1), inside, out=inside)
+    total = inside[:, -1:].copy()
+    beyond = np.subtract(1.0, np.divide(inside, total, out=inside), out=inside)
+    excess, wide = beyond.copy(), int(_GAUSSIAN_SIGMAS * (sigma / step).max()) + 1
+    excess[:, :wide] -= erfc(np.outer(step / sigma, np.arange(pattern.shape[1])[:wide]))
     # The last point before the nearest distance that counts moves there, along a cubic.
-    nearest, row = _BEYOND_SIGMAS * sigma, np.arange(len(x))
-    n = np.minimum((nearest / x[:, 1]).astype(int), x.shape[1] - 2)
-    t, rise = nearest / x[:, 1] - n, beyond[row, n + 1] - beyond[row, n]
-    bent = (1.0 - t) * (-density[row, n] - rise) + t * (density[row, n + 1] + rise)
-    at_nearest = beyond[row, n] + t * rise + t * (1.0 - t) * bent
-    x, excess[row, n] = x.copy(), at_nearest - erfc(_BEYOND_SIGMAS)
-    x[row, n] = nearest
+    nearest, row = _BEYOND_SIGMAS * sigma / step, np.arange(len(step))
+    n = np.minimum(nearest.astype(int), pattern.shape[1] - 2)
+    t, rise = nearest - n, beyond[row, n + 1] - beyond[row, n]
+    density = [pattern[row, n + k] / total[:, 0] for k in (0, 1)]
+    bent = (1.0 - t) * (-density[0] - rise) + t * (density[1] + rise)
+    excess[row, n] = beyond[row, n] + t * rise + t * (1.0 - t) * bent - erfc(_BEYOND_SIGMAS)
     excess = np.maximum.accumulate(np.maximum(excess, 0.0)[:, ::-1], axis=1)[:, ::-1]
-    return [
-        lambda at, of=of, power=power, least=least: np.interp(np.maximum(at, least), of, power)
-        for of, power, least in zip(x, excess, nearest, strict=True)
-    ]
 
-
-def _density(tail: Callable[[np.ndarray], np.ndarray], at: np.ndarray, window: float) -> np.ndarray:
-    """The power per millimetre on either side at distances `at`, averaged over a window."""
-    return 0.5 * (tail(np.maximum(at - 0.5 * window, 0.0)) - tail(at + 0.5 * window)) / window
+    nearest, n, t = (each.reshape(-1, *(1,) * (at.ndim - 1)) for each in (nearest, n, t))
+    place = np.maximum(at / step.reshape(nearest.shape), nearest)
+    before = np.minimum(place.astype(int), pattern.shape[1] - 2)
+    part = np.minimum(place - before, 1.0)
+    part = np.where(before == n, (part - t) / (1.0 - t), part)
+    low, high = (excess[row.reshape(n.shape), before + k] for k in (0, 1))
+    return low + part * (high - low)
 
 
 @lru_cache(maxsize=16)
@@ -176,7 +175,7 @@ def plane_echoes(probe: Probe) -> np.ndarray:
     rows, tilts = CONSTANTS["PLANE_DEPTHS"], CONSTANTS["PLANE_TILTS"]
     if probe.harmonic:
         return np.full((rows, tilts, 2), np.nan, np.float32)
-    depth = probe.displayed_mm * np.maximum(np.arange(rows), 0.5) / (rows - 1)
+    depth = _plane_depths(probe.displayed_mm)
     received = np.minimum(probe.aperture_mm, depth / probe.receive_f_number)
     zones = np.array(probe.transmit_apertures())
     if len(zones):
@@ -185,35 +184,59 @@ def plane_echoes(probe: Probe) -> np.ndarray:
         least, slope = probe.compounded_beam()
         wide = np.maximum(least, slope * depth) * FWHM_PER_SIGMA / MAIN_LOBE
         focus, sent = depth, depth * probe.wavelength_mm / wide
-    lens = np.full(rows, probe.lens_height_mm), 1.0 / depth - 1.0 / probe.elevation_focus_mm
-    lateral = (sent, 1.0 / depth - 1.0 / focus), (received, 0.0 * depth)
-    found = [
-        _plane_echo(probe, depth, *apertures, apodization)
-        for apertures, apodization in ((lateral, probe.receive_apodization), ((lens, lens), 0.0))
-    ]
-    return np.log2(np.maximum(np.stack(found, axis=-1), _LEAST_PLANE)).astype(np.float32)
+    pulse = probe.wavelength_mm, float(probe.received_bandwidth / FWHM_PER_SIGMA)
+    lateral = _plane_echo(*pulse, depth, sent, 1.0 / depth - 1.0 / focus, received, probe.receive_apodization)
+    elevational = _lens_echo(*pulse, probe.displayed_mm, probe.lens_height_mm, probe.elevation_focus_mm)
+    return np.stack([lateral, elevational], axis=-1)
+
+
+@lru_cache(maxsize=16)
+def _lens_echo(wavelength_mm: float, spread: float, depth_mm: float, height_mm: float, focus_mm: float) -> np.ndarray:
+    """(PLANE_DEPTHS, PLANE_TILTS) of plane_echoes by elevational tilt, of which probes often have the same."""
+    depth = _plane_depths(depth_mm)
+    return _plane_echo(wavelength_mm, spread, depth, np.full(len(depth), height_mm), 1.0 / depth - 1.0 / focus_mm)
+
+
+def _plane_depths(depth_mm: float) -> np.ndarray:
+    rows = CONSTANTS["PLANE_DEPTHS"]
+    return depth_mm * np.maximum(np.arange(rows), 0.5) / (rows - 1)
 
 
 def _plane_echo(
-    probe: Probe, depth: np.ndarray, sent: tuple[np.ndarray, np.ndarray], received: tuple[np.ndarray, np.ndarray],
-    apodization: float,
+    wavelength_mm: float, spread: float, depth: np.ndarray, sent: np.ndarray, bend: np.ndarray,
+    received: np.ndarray | None = None, apodization: float = 0.0,
 ) -> np.ndarray:  # fmt: skip
-    """(depths, tilts) peaks of the integral of plane_echoes; apertures are (sizes in mm, bends 1 / s - 1 / F)."""
-    step = (sent[0] + received[0])[:, None] / _PLANE_POINTS
-    place, across = (np.fft.fftfreq(2 * _PLANE_POINTS, per) for per in (0.5 / _PLANE_POINTS, 1.0))
-    place, across = step * place, across / step
-    one, other = (np.clip(0.5 + (0.5 * size[:, None] - np.abs(place)) / step, 0.0, 1.0) for size, _ in (sent, received))
-    other *= 1.0 - apodization * np.sin(np.pi * place / received[0][:, None]) ** 2
-    spread = float(probe.received_bandwidth / FWHM_PER_SIGMA)
-    frequency = np.maximum(1.0 + spread * np.linspace(-2.5, 2.5, _PLANE_FREQUENCIES), 0.1)
-    time = np.linspace(-0.5, 0.5, 32) * (_PLANE_FREQUENCIES - 1) / (frequency[-1] - frequency[0])
-    echo: np.ndarray = np.zeros((1, 1, 1))
-    for f in frequency:
-        length = probe.wavelength_mm / f
-        pairs = np.exp(2j * np.pi * length * depth[:, None] * across**2 - 0.5 * ((f - 1.0) / spread) ** 2) / np.sqrt(f)
-        for weight, (_, bend) in ((one, sent), (other, received)):
-            pairs = pairs * np.fft.fft(weight * np.exp(1j * np.pi / length * bend[:, None] * place**2), axis=1)
-        echo = echo + np.fft.ifft(pairs, axis=1)[:, :_PLANE_POINTS, None] * np.exp(-2j * np.pi * f * time)
-    peak, tilt = np.abs(echo).max(axis=-1), np.linspace(0.0, 1.0, CONSTANTS["PLANE_TILTS"]) ** 2
+    """(depths, tilts) float32 exponents of two of the peaks of the integral of plane_echoes.
+
+    `sent` are sizes in mm, with the `bend` 1 / s - 1 / F; `received` those of apertures that are in focus at each of
+    the depths, by default the same as sends. All is even, so that transforms are those by cosines.
+    """
+    step = (sent + (sent if received is None else received))[:, None] / _PLANE_POINTS
+    place = step * np.arange(_PLANE_POINTS + 1)
+    across = np.arange(_PLANE_POINTS + 1) / (2 * _PLANE_POINTS * step)
+    f = np.linspace(max(1.0 - 2.5 * spread, 0.1), 1.0 + 2.5 * spread, _PLANE_FREQUENCIES)[:, None, None]
+
+    def opening(size: np.ndarray) -> np.ndarray:
+        return np.clip(0.5 + (0.5 * size[:, None] - place) / step, 0.0, 1.0)
+
+    pairs = _spectrum(opening(sent), np.pi / wavelength_mm * f * (bend[:, None] * place**2))
+    if received is None:
+        pairs *= pairs
+    else:
+        weights = 1.0 - apodization * np.sin(np.pi * place / received[:, None]) ** 2
+        pairs *= _spectrum(opening(received) * weights, np.zeros_like(place))
+    pairs *= phasor(2.0 * np.pi * wavelength_mm / f * (depth[:, None] * across**2))
+    echo = cosines(pairs, kind=1)[..., :_PLANE_POINTS]
+    # At times evenly on both sides of 0; without BLAS, whose threads wait for those of the device
+    late = np.exp(-1j * np.pi / _PLANE_TIMES * np.arange(_PLANE_FREQUENCIES))[:, None, None]
+    pulse = (late * np.exp(-0.5 * ((f - 1.0) / spread) ** 2) / np.sqrt(f)).astype(np.complex64)
+    peak = np.abs(np.asarray(fft.fft(echo * pulse, n=_PLANE_TIMES, axis=0))).max(axis=0)
+    tilt = np.linspace(0.0, 1.0, CONSTANTS["PLANE_TILTS"]) ** 2
     ways = zip(depth, place[:, :_PLANE_POINTS], peak, strict=True)
-    return np.array([np.interp(2.0 * s * tilt, at, of / of[0], right=0.0) for s, at, of in ways])
+    found = np.array([np.interp(2.0 * s * tilt, at, of / of[0], right=0.0) for s, at, of in ways])
+    return np.log2(np.maximum(found, _LEAST_PLANE)).astype(np.float32)
+
+
+def _spectrum(weight: np.ndarray, phase: np.ndarray) -> np.ndarray:
+    """complex64, of an even wave from the axis on."""
+    return cosines(weight.astype(np.float32) * phasor(phase), kind=1)

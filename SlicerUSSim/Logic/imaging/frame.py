@@ -7,6 +7,7 @@ import os
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -20,6 +21,8 @@ from SlicerUSSim.Logic.probe.arrays import Probe
 from SlicerUSSim.Logic.probe.beam import NOMINAL_SPEED_M_S
 from SlicerUSSim.Logic.probe.image_grid import ImageGrid
 
+#: Fields that may be on the device still
+_SIGNALS = ("iq", "envelope", "bmode")
 #: Largest of the numbers of Echoes, well within float16
 _LARGEST = 2.0**15
 
@@ -27,6 +30,8 @@ _LARGEST = 2.0**15
 @dataclass(frozen=True, eq=False)
 class Frame:
     """One simulated image with its geometry and the signals from which it was computed.
+
+    Simulated signals (iq, envelope, bmode) are downloaded from the device when they are first asked for.
 
     Parameters
     ----------
@@ -57,6 +62,15 @@ class Frame:
     probe: Probe | None = field(default=None, repr=False)
     patient: Volume | None = field(default=None, repr=False)
     reference_speed_m_s: float = NOMINAL_SPEED_M_S
+
+    def download(self) -> None:
+        """Take what is still on the device to the host, for example before a fork."""
+        for name in _SIGNALS:
+            getattr(self, name)
+
+    def __getstate__(self) -> dict:
+        self.download()
+        return self.__dict__
 
     @cached_property
     def rf(self) -> np.ndarray:
@@ -129,6 +143,22 @@ class Frame:
     def to_vtk(self):
         """The image as a vtkImageData of one slice in patient space (RAS)."""
         return self.to_volume().to_vtk()
+
+
+def _on_demand(name: str) -> property:
+    """A field that may be given as a function, which is called for its value once."""
+
+    def value(frame: Frame) -> np.ndarray:
+        held: Any = frame.__dict__[name]
+        if callable(held):
+            held = frame.__dict__[name] = held()
+        return held
+
+    return property(value, lambda frame, held: frame.__dict__.__setitem__(name, held))
+
+
+for _name in _SIGNALS:
+    setattr(Frame, _name, _on_demand(_name))
 
 
 @dataclass(frozen=True, eq=False)

@@ -42,6 +42,9 @@ class Scatterers(Stage):
         self.lines = EchoLines(device)
         size = 4 * (3 + CONSTANTS["UNEVEN_WORDS"]) * CONSTANTS["MAX_TISSUES"]
         self._sites = [device.empty(size) for _ in range(2)]
+        # What the tables in them depend on, and whether some tissue varies
+        self._tables_made_for: tuple | None = None
+        self._is_uneven = False
         self._lobes = device.empty(ACQUISITION.itemsize)
         self._beams = [Tables(device) for _ in range(2)]  # the main beam's and that of its lobes
 
@@ -67,23 +70,23 @@ class Scatterers(Stage):
         main, lobes = (
             buffer.get(frame.probe, table) for buffer, table in zip(self._beams, beam_tables(frame.probe), strict=True)
         )
-        table = unevenness_table(tissues)
-        variant += ["UNEVEN"] if is_uneven(table) else []
-        uneven, none_dark = table.ravel(), np.zeros(CONSTANTS["MAX_TISSUES"], np.float32)
-        self.device.write(
-            self._sites[0], np.concatenate([lattice_sites(tissues, frame.acquisition).ravel(), none_dark, uneven])
-        )
+        record = elevational_lobe_record(frame.acquisition)
+        made_for = frame.medium.version, tissues.tobytes(), float(record["cell_mm"])
+        if self._tables_made_for != made_for:
+            table = unevenness_table(tissues)
+            self._is_uneven, self._tables_made_for = is_uneven(table), made_for
+            of_darkness = np.zeros(CONSTANTS["MAX_TISSUES"]), frame.medium.quieter(DARK)
+            for buffer, of, dark in zip(self._sites, (frame.acquisition, record), of_darkness, strict=True):
+                parts = lattice_sites(tissues, of).ravel(), dark.astype(np.float32), table.ravel()
+                self.device.write(buffer, np.concatenate(parts))
+        variant += ["UNEVEN"] if self._is_uneven else []
         self._enqueue(
             frame, lines, frame.acquisition_buffer, self._sites[0],
             [*variant, f"CHUNK={self.device.chunk}"], (samples // self.device.chunk, traced), [main, *end],
         )  # fmt: skip
         if frame.settings.side_lobes:
-            record = elevational_lobe_record(frame.acquisition)
             self.device.write(self._lobes, record)
-            chunk, together = _LOBE_CHUNKS * self.device.chunk, lines_together(record, frame.probe)
-            dark = frame.medium.quieter(DARK).astype(np.float32)
-            sites = np.concatenate([lattice_sites(tissues, record).ravel(), dark, uneven])
-            self.device.write(self._sites[1], sites)
+            chunk, together = _LOBE_CHUNKS * self.device.chunk, lines_together(int(record["lateral_rays"]), frame.probe)
             self._enqueue(
                 frame, lines, self._lobes, self._sites[1], [*variant, "LOBES", f"CHUNK={chunk}"],
                 (-(-samples // chunk), -(-traced // together)), [lobes, *end, np.int32(together)],

@@ -6,6 +6,7 @@ The main lobe of a beam is a Gaussian. What an aperture of finite size has besid
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -83,9 +84,10 @@ def elevational_lobe_record(acquisition: np.ndarray) -> np.ndarray:
     return record
 
 
-def lines_together(acquisition: np.ndarray, probe: Probe) -> int:
+@lru_cache(maxsize=16)
+def lines_together(lateral_rays: int, probe: Probe) -> int:
     """Traced lines whose elevational lobes follow the path of the one in the middle."""
     middle = 0.5 * probe.depth_mm
-    apart = float(probe.line_distance_mm(middle)) / int(acquisition["lateral_rays"])
+    apart = float(probe.line_distance_mm(middle)) / lateral_rays
     lines = _TOGETHER_SIGMAS * float(probe.beam_sigma_mm(middle)[0]) / apart
     return int(np.clip(round(lines), 1, _MOST_TOGETHER))

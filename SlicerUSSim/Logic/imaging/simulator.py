@@ -5,12 +5,14 @@ from __future__ import annotations
 import logging
 import os
 import warnings
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from threading import RLock
 from time import perf_counter
 from typing import TYPE_CHECKING, Any, TypeVar
+from weakref import ref
 
 import numpy as np
 
@@ -46,6 +48,8 @@ from SlicerUSSim.Logic.tissue.texture import Texture
 if TYPE_CHECKING:
     from pyopencl import Buffer
 
+#: Frames whose signals stay on the device: one, and the one before, which goes when its name gets the next
+_ON_DEVICE = 2
 #: Beyond all fields
 _FAR_MM = 1e6
 #: Part of an image beyond the volume, in tissue, of which the user is told
@@ -143,6 +147,8 @@ class UltrasoundSimulator:
         #: Measure every stage (Frame.timings_ms); the host then waits for each stage.
         self.profiling = False
         self._has_told_of_end = False
+        # The last frames, whose signals may still be on the device
+        self._recent: deque[ref[Frame]] = deque()
         # Threads may share a simulator: its buffers hold one frame at a time
         self._lock = RLock()
 
@@ -197,25 +203,28 @@ class UltrasoundSimulator:
             frame = self._rendered(probe, pose, display, grid, timings, noise_seed)
             self._warn_if_empty(probe, pose)  # while the device computes
             with self._timed("download", timings):
-                samples = self._sample_count(frame.probe, frame.settings)
-                iq, envelope, bmode = (frame.download(name)[:, :samples] for name in ("iq", "envelope", "grey"))
                 image = self._persisted(frame.download("image"), probe, display, frame.grid)
                 self._warn_if_overflown()
-
-        return Frame(
-            iq=iq,
-            envelope=envelope,
-            bmode=bmode,
-            image=image,
-            sample_interval_mm=self._sample_mm(frame.probe, frame.settings),
-            cycles_per_mm=self._cycles_per_mm(probe),
-            grid=frame.grid,
-            probe_to_ras=pose,
-            timings_ms=timings,
-            probe=probe,
-            patient=self.medium.labels,
-            reference_speed_m_s=frame.settings.reference_speed_m_s,
-        )
+            samples = self._sample_count(frame.probe, frame.settings)
+            iq, envelope, bmode = (frame.on_demand(name, samples) for name in ("iq", "envelope", "grey"))
+            made = Frame(
+                iq=iq,
+                envelope=envelope,
+                bmode=bmode,
+                image=image,
+                sample_interval_mm=self._sample_mm(frame.probe, frame.settings),
+                cycles_per_mm=self._cycles_per_mm(probe),
+                grid=frame.grid,
+                probe_to_ras=pose,
+                timings_ms=timings,
+                probe=probe,
+                patient=self.medium.labels,
+                reference_speed_m_s=frame.settings.reference_speed_m_s,
+            )
+            self._recent.append(ref(made))
+            if len(self._recent) > _ON_DEVICE and (oldest := self._recent.popleft()()) is not None:
+                oldest.download()
+        return made
 
     def simulate_batch(
         self,

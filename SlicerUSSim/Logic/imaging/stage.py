@@ -10,7 +10,8 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, ClassVar
+from functools import lru_cache
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
@@ -86,15 +87,18 @@ class DeviceFrame:
     @property
     def display_record(self) -> np.ndarray:
         """() record of layout.DISPLAY: what `display` says, which kernels take by value."""
-        record = np.zeros((), DISPLAY)
-        for name in DISPLAY.names or ():
-            value = getattr(self.display, name)
-            record[name] = np.nan if value is None else value
-        return record
+        return _record_of(self.display)
 
     def download(self, signal: str) -> np.ndarray:
         """A copy on the host of "iq", "envelope", "grey" (scan lines, samples) or "image" (rows, columns)."""
         return self.medium.device.download(*self._signal(signal))
+
+    def on_demand(self, signal: str, samples: int) -> Any:
+        """What gives (scan lines, samples) of it when called, and keeps its buffer for that."""
+        buffer, shape, kind = self._signal(signal)
+        device = self.medium.device
+        loan = device.lend(buffer)
+        return lambda: device.download(loan.buffer, shape, kind)[:, :samples]
 
     def start_download(self, signal: str) -> Callable[[], np.ndarray]:
         """The same without waiting, see Device.start_download."""
@@ -103,6 +107,15 @@ class DeviceFrame:
     def _signal(self, signal: str) -> tuple[Buffer, tuple[int, int], type[np.generic]]:
         shape = (self.grid.rows, self.grid.columns) if signal == "image" else self.line_shape
         return getattr(self, signal), shape, _SIGNAL_TYPES[signal]
+
+
+@lru_cache(maxsize=16)
+def _record_of(display: DisplaySettings) -> np.ndarray:
+    record = np.zeros((), DISPLAY)
+    for name in DISPLAY.names or ():
+        value = getattr(display, name)
+        record[name] = np.nan if value is None else value
+    return record
 
 
 _SIGNAL_TYPES = {"iq": np.complex64, "envelope": np.float32, "grey": np.uint8, "image": np.uint8}

@@ -95,16 +95,17 @@ class ImageLogic:
         preset, patient, pose = imaged.preset, patient_of(labels_node), imaged.patient.pose(probe_to_world)
         seed = seed_of_pose(pose) if number is None else number
 
-        def compute() -> tuple[Frame, list[Warning]]:
+        def compute() -> tuple[Frame, bool, list[Warning]]:
             # Collected within the work, since Python collects warnings for all threads together.
             with collected_warnings() as caught:
                 simulator = self._patient.simulator(imaged)
-                return simulator.simulate(preset.probe, pose, preset.display, noise_seed=seed), caught
+                frame = simulator.simulate(preset.probe, pose, preset.display, noise_seed=seed)
+                return frame, not frame.iq.any(), caught
 
-        frame, warnings = self._patient.work.do(compute)
+        frame, is_silent, warnings = self._patient.work.do(compute)
         for warning in warnings:
             warned(warning)
-        is_empty = any(isinstance(warning, EmptyViewWarning) for warning in warnings) or not frame.iq.any()
+        is_empty = any(isinstance(warning, EmptyViewWarning) for warning in warnings) or is_silent
         time = datetime.now(timezone.utc).isoformat(timespec="milliseconds")
         return TakenImage(
             frame.image, frame.grid, probe_to_world, preset, patient, anatomy, time, is_empty, output_node,

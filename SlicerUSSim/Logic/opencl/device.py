@@ -13,6 +13,7 @@ from pathlib import Path
 from threading import RLock
 from time import perf_counter
 from typing import TYPE_CHECKING, TypeAlias
+from weakref import WeakValueDictionary
 
 import numpy as np
 
@@ -33,6 +34,13 @@ DeviceChoice: TypeAlias = "str | DeviceInfo | Device | None"
 _ZERO = np.zeros(1, np.float32)
 #: How often a program is built whose cached file is damaged
 _ATTEMPTS = 4
+
+
+class Loan:
+    """As long as it is referenced, no Workspace gives its buffer for other content."""
+
+    def __init__(self, buffer: Buffer) -> None:
+        self.buffer = buffer
 
 
 class Device:
@@ -82,6 +90,7 @@ class Device:
         self.profiling = False
         self._events: list[tuple[str, Event]] = []
         self._writes: deque[Event] = deque(maxlen=64)
+        self._loans: WeakValueDictionary[Buffer, Loan] = WeakValueDictionary()
         self._kernels: dict[tuple, dict[str, Kernel]] = {}
         # A kernel keeps its arguments until it is enqueued, and all simulators of a device share it
         self._lock = RLock()
@@ -257,6 +266,14 @@ class Device:
 
         return wait
 
+    def lend(self, buffer: Buffer) -> Loan:
+        """The loan of a buffer of a Workspace, which keeps its content."""
+        return self._loans.setdefault(buffer, Loan(buffer))
+
+    def is_lent(self, buffer: Buffer) -> bool:
+        """Whether somebody has its loan."""
+        return buffer in self._loans
+
     def take_profile(self) -> dict[str, float]:
         """Milliseconds per kernel since the last call (requires profiling)."""
         self.queue.finish()
@@ -375,15 +392,20 @@ def kernel_folder() -> Path:
 
 
 class Workspace:
-    """Named buffers of one stage, kept between frames and replaced only by larger ones."""
+    """Named buffers of one stage, kept between frames and replaced only by larger ones.
+
+    While some are lent (Device.lend), there are others of the same name.
+    """
 
     def __init__(self, device: Device) -> None:
         self._device = device
-        self._buffers: dict[str, Buffer] = {}
+        self._buffers: dict[str, list[Buffer]] = {}
 
     def get(self, name: str, nbytes: int) -> Buffer:
         """A buffer of at least `nbytes`, with the content of its last use."""
-        buffer = self._buffers.get(name)
-        if buffer is None or buffer.size < nbytes:
-            buffer = self._buffers[name] = self._device.empty(nbytes)
-        return buffer
+        held = self._buffers.get(name, [])
+        for buffer in held:
+            if buffer.size >= nbytes and not self._device.is_lent(buffer):
+                return buffer
+        self._buffers[name] = [*(each for each in held if each.size >= nbytes), self._device.empty(nbytes)]
+        return self._buffers[name][-1]

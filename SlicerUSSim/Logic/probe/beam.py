@@ -331,6 +331,8 @@ def apodized_pattern(u: np.ndarray, apodization: float) -> np.ndarray:
     The weights are 1 - a + a cos(pi x)^2 for x from -1/2 to 1/2: the transform of a constant and of a cosine.
     """
     half = 0.5 * apodization
+    if not apodization:
+        return np.sinc(u)
     return np.sinc(u) + 0.5 * half / (1.0 - half) * (np.sinc(u - 1.0) + np.sinc(u + 1.0))
 
 

@@ -12,6 +12,8 @@ from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.probe.arrays import Probe
 from SlicerUSSim.Logic.probe.image_grid import ImageGrid
 
+#: Rows of an image that are sampled together, so that their arrays stay in a processor's cache
+_ROWS_AT_ONCE = 32
 _log = logging.getLogger(__name__)
 
 
@@ -226,8 +228,26 @@ def sample(volume: Volume, points_ras: np.ndarray, order: int = 1) -> np.ndarray
 
 
 def slice_under_probe(volume: Volume, grid: ImageGrid, probe_to_ras: np.ndarray, order: int = 1) -> np.ndarray:
-    """(rows, columns) values of `volume` at the pixels of a probe's image."""
-    to_ijk = volume.ras_to_ijk @ probe_to_ras @ grid.image_to_probe
-    matrix = to_ijk[[2, 1, 0, 3]][:, [2, 1, 0, 3]]  # of (0, row, column), whose coordinates scipy does not store
-    shape = (1, grid.rows, grid.columns)
-    return ndimage.affine_transform(volume.array, matrix, output_shape=shape, order=order, cval=0)[0]
+    """(rows, columns) values of `volume` at the pixels of a probe's image, as of sample()."""
+    array, to_ijk = volume.array, volume.ras_to_ijk @ probe_to_ras @ grid.image_to_probe
+    _, height, width = array.shape
+    flat, last = array.reshape(-1), np.array(array.shape[::-1])[:, None, None] - 1
+    corners = [step + behind for behind in (0, width * height) for step in (0, 1, width, width + 1)]
+    across = to_ijk[:3, 0, None] * np.arange(grid.columns)
+    found = np.empty((grid.rows, grid.columns), array.dtype)
+    kind = array.dtype if array.dtype.kind == "f" else np.float32
+    for first in range(0, grid.rows, _ROWS_AT_ONCE):
+        rows = np.arange(first, min(first + _ROWS_AT_ONCE, grid.rows))
+        place = (to_ijk[:3, 1, None] * rows + to_ijk[:3, 3, None])[..., None] + across[:, None]
+        cell = (place if order else place + 0.5).astype(int)
+        np.clip(cell, 0, np.maximum(last - order, 0), out=cell)
+        at = (cell[2] * height + cell[1]) * width + cell[0]
+        if order == 0:
+            values = flat.take(at)
+        else:
+            values = [flat.take(at + corner, mode="clip").astype(kind) for corner in corners]
+            for part in (place - cell).astype(kind):
+                values = [low + part * (high - low) for low, high in zip(values[::2], values[1::2], strict=True)]
+            values = values[0] if array.dtype.kind == "f" else np.floor(values[0] + 0.5)
+        found[rows] = np.where(((place < 0) | (place > last)).any(axis=0), 0, values)
+    return found
