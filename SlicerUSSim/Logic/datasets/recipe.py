@@ -1,0 +1,383 @@
+"""Recipe: what a data set is made of, read from TOML and checked: errors name the line and the key."""
+
+from __future__ import annotations
+
+import hashlib
+import re
+import sys
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, fields
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from SlicerUSSim.Logic.base.declaration import Declared, Parameter, built, parameter, parameters_of, short
+from SlicerUSSim.Logic.base.errors import SimulationError, either, require, require_package
+from SlicerUSSim.Logic.base.files import read_text
+from SlicerUSSim.Logic.datasets.draws import Draw, generator
+from SlicerUSSim.Logic.imaging.preset import Preset, preset_parameters
+from SlicerUSSim.Logic.mri.pathology import LESIONS
+from SlicerUSSim.Logic.mri.segmentation_settings import SegmentationSettings
+from SlicerUSSim.Logic.placement.views import VIEWS
+from SlicerUSSim.Logic.probe.arrays import PROBES, Probe
+from SlicerUSSim.Logic.tissue.presets import TISSUES
+from SlicerUSSim.Logic.tissue.tissue import Tissue
+
+#: {output: what it is}; those of simulate_batch, and what is computed from the patient
+OUTPUTS = {
+    "image": "B-mode", "labels": "tissue of every pixel", "labels_as_imaged": "the same where travel time and refraction "
+    "put it", "depth": "mm along the scan line", "iq": "baseband signal", "rf": "radio-frequency signal",
+    "envelope": "envelope along the scan lines", "bmode": "grey levels along the scan lines",
+    "clean": "mean of images with other speckle and noise", "mri": "MRI or CT in the image plane",
+    "attenuation": "one-way dB along straight lines", "travel_time": "µs there and back along straight lines",
+    "walls": "reflection coefficient of the border at a pixel",
+}  # fmt: skip
+FORMATS = ("zarr", "hdf5", "png", "tracked")
+#: Recipes that come with the package, by name
+READY = {path.stem: path for path in sorted((Path(__file__).parent / "recipes").glob("*.toml"))}
+#: Bundled patients, which are no files
+BUNDLED = ("mni152", "synthetic")
+ALL = "all"
+#: Probes that are drawn for a set: the record of a new one takes 20 ms
+PROBE_POOL = 16
+_MOST_PER_SHARD = 64
+#: Parameters that are fixed: all images have one size, and a simulator is built with them
+_FIXED = (
+    "display.image_size", "settings.quality", "settings.partial_volume", "settings.mri_modulation_db",
+    "settings.reference_speed_m_s",
+)  # fmt: skip
+_DEGREES = {"unit": "°", "bounds": (-180.0, 180.0)}
+
+
+@dataclass(frozen=True)
+class SetSettings(Declared):
+    """What a recipe says before its tables."""
+
+    images: int = parameter(label="Images", tip="Number of images", bounds=(1, 10**9))
+    seed: int = parameter(0, "Seed", "With its number the seed of all that is drawn for an image", bounds=(0, 2**32 - 1))
+    outputs: tuple[str, ...] = parameter(("image", "labels"), "Outputs", "What is kept of every image")
+    format: str = parameter("zarr", "Format", "Format of the files", choices=FORMATS)
+    shard: int | None = parameter(
+        None, "Shard", "Images of a task and file; none: up to 64", bounds=(1, 100_000), can_be_none=True
+    )
+    looks: int = parameter(16, "Looks", "Images of which a clean one is the mean", bounds=(2, 256))
+    title: str = parameter("Simulated ultrasound", "Title", "Title of the set")
+    licence: str = parameter("", "Licence", "Licence of the set")
+
+
+@dataclass(frozen=True)
+class PatientSettings(Declared):
+    """One of [[patients]]."""
+
+    file: str = parameter(label="File", tip="MRI, CT or label map, beside the recipe, or mni152 or synthetic")
+    share: float = parameter(1.0, "Share", "Of the images, re those of the others", bounds=(0.001, 1000))
+    ventricles: bool = parameter(False, "Ventricles", "Label the ventricles of an MRI apart from other CSF")
+    add: tuple[str, ...] = parameter((), "Add", "Masks laid over the labels, as tumour=mask.nii.gz")
+    licence: str = parameter("", "Licence", "Licence of the file")
+    citation: str = parameter("", "Citation", "How the file is cited")
+
+
+@dataclass(frozen=True)
+class PoseSettings(Declared):
+    """[pose]: where a probe stands. Angles and places but `on`, `file` and `within_deg` may be distributions."""
+
+    on: str = parameter(
+        "craniotomy", "On", "Where poses begin", choices=("craniotomy", "skin", "surface", "view", "path", "sequence")
+    )
+    view: str = parameter("temporal", "View", "Standard view", choices=tuple(VIEWS))
+    file: str = parameter("", "File", "Curve (.mrk.json) of a path, or tracked sequence")
+    transform: str = parameter("ProbeToReference", "Transform", "Pose of the probe in a tracked sequence")
+    within_deg: float = parameter(
+        90.0, "Within", "Of the surface, so far from the top of the head", unit="°", bounds=(1, 180)
+    )
+    aim: str = parameter("", "Aim", "Tissue at whose innermost place the probe looks")
+    right_deg: float = parameter(0.0, "Right", "Moved over the surface to the right", **_DEGREES)
+    front_deg: float = parameter(0.0, "Front", "Moved over the surface to the front", **_DEGREES)
+    rock_deg: float = parameter(0.0, "Rock", "Turned in the image plane", **_DEGREES)
+    tilt_deg: float = parameter(0.0, "Tilt", "Turned out of the image plane", **_DEGREES)
+    rotate_deg: float = parameter(0.0, "Rotate", "Turned about the axis", **_DEGREES)
+    lift_mm: float = parameter(0.0, "Lift", "Drawn back along its axis", unit="mm", bounds=(-20, 50))
+
+
+@dataclass(frozen=True)
+class LesionSettings(Declared):
+    """[lesions]: balls with a rough surface, each in a part of the images; all but `each` may be distributions."""
+
+    each: int = parameter(4, "Each", "Lesions of every patient, one at a time", bounds=(1, 10_000))
+    tissue: str = parameter("tumour", "Tissue", "What it is", choices=tuple(n for n in LESIONS if n != "brats"))
+    radius_mm: float = parameter(10.0, "Radius", "Mean radius", unit="mm", bounds=(2, 50))
+    depth_mm: float = parameter(25.0, "Depth", "Of its middle below the brain's surface", unit="mm", bounds=(0, 80))
+    roughness: float = parameter(0.25, "Roughness", "Deviation of its radius by the radius", bounds=(0, 0.6))
+
+
+_PROBE = Parameter(
+    name="name", type=str, label="Name", tip="Probe", default="phased", choices=tuple(PROBES)
+)
+#: Keys of draws that are none of a tissue begin with these
+SECTIONS = ("pose", "probe", "display", "settings", "lesions")
+_ON_START = ("on", "file", "transform", "within_deg", "aim")
+
+
+@dataclass(frozen=True)
+class Case:
+    """A patient, with one lesion or none, in a run of shards."""
+
+    number: int
+    patient: int
+    #: Shards from the first to before the last
+    first: int
+    last: int
+
+
+@dataclass(frozen=True, eq=False)
+class Recipe:
+    """A checked recipe. Image i depends on (seed, i) alone; images of one patient follow each other.
+
+    >>> from SlicerUSSim.Logic.datasets import Recipe
+    >>> recipe = Recipe.of_text('images = 100\\n[[patients]]\\nfile = "mni152"\\n[display]\\ngain_db = {uniform = [-6, 6]}')
+    >>> recipe.shards, round(recipe.drawn(7)["display.gain_db"], 3) == round(recipe.drawn(7)["display.gain_db"], 3)
+    (2, True)
+    """
+
+    settings: SetSettings
+    patients: tuple[PatientSettings, ...]
+    segmentations: tuple[SegmentationSettings, ...]
+    pose: PoseSettings
+    lesions: LesionSettings | None
+    #: {"display.gain_db": Draw, "pose.rock_deg": Draw, "white matter.mu0": Draw, ...}
+    draws: Mapping[str, Draw]
+    text: str
+    #: Files are beside it
+    folder: Path
+
+    @classmethod
+    def read(cls, path: str | Path) -> Recipe:
+        """From a file, or one of READY by its name. Raises SimulationError that names file, line and key."""
+        path = READY.get(str(path), Path(path))
+        try:
+            text = read_text(path)
+        except (OSError, UnicodeDecodeError) as error:
+            expected = f"expected a recipe in TOML, or one of {', '.join(READY)}"
+            raise SimulationError(f"{path}: cannot be read ({getattr(error, 'strerror', error)}), {expected}") from None
+        return cls.of_text(text, str(path), path.parent)
+
+    @classmethod
+    def of_text(cls, text: str, source: str = "recipe", folder: Path | None = None) -> Recipe:
+        """From TOML; relative files are in `folder`."""
+        return _Reader(text, source, folder or Path()).recipe()
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 of its text."""
+        return hashlib.sha256(self.text.encode()).hexdigest()
+
+    @cached_property
+    def shard(self) -> int:
+        """Images of a shard, but for the last."""
+        s = self.settings
+        return s.shard or max(min(_MOST_PER_SHARD, s.images // (len(self.patients) * self.variants)), 1)
+
+    @property
+    def variants(self) -> int:
+        """Lesions of a patient."""
+        return self.lesions.each if self.lesions else 1
+
+    @property
+    def shards(self) -> int:
+        """Number of shards."""
+        return -(-self.settings.images // self.shard)
+
+    def images_of(self, shard: int) -> range:
+        """Numbers of the images of a shard."""
+        return range(shard * self.shard, min((shard + 1) * self.shard, self.settings.images))
+
+    @cached_property
+    def cases(self) -> tuple[Case, ...]:
+        """Patients and lesions in their order; each has one shard at least."""
+        shares = [patient.share / self.variants for patient in self.patients for _ in range(self.variants)]
+        ends = [round(sum(shares[: n + 1]) / sum(shares) * self.shards) for n in range(len(shares))]
+        starts = [0, *ends[:-1]]
+        require(
+            all(a < b for a, b in zip(starts, ends, strict=True)),
+            f"{self.settings.images} images are {self.shards} shards for {len(ends)} patients with their lesions, "
+            "expected one for each at least; lower shard, or make more images",
+        )
+        return tuple(
+            Case(n, n // self.variants, *both) for n, both in enumerate(zip(starts, ends, strict=True))
+        )
+
+    def case_of(self, shard: int) -> Case:
+        """The case of a shard."""
+        return next(case for case in self.cases if case.first <= shard < case.last)
+
+    def drawn(self, image: int) -> dict[str, Any]:
+        """{"section.name": value} of an image but for its tissues; "probe" is its place in `probes`."""
+        found = {
+            key: draw(generator(self.settings.seed, image, key))
+            for key, draw in self.draws.items() if key.startswith(("pose.", "display.", "settings."))
+        }  # fmt: skip
+        return found | {"probe": int(generator(self.settings.seed, image, "probe").integers(len(self.probes)))}
+
+    @cached_property
+    def probes(self) -> tuple[Probe, ...]:
+        """The probes of the set; one if none of their values is drawn."""
+        draws = {key.removeprefix("probe."): draw for key, draw in self.draws.items() if key.startswith("probe.")}
+        count = 1 if all(draw.is_fixed for draw in draws.values()) else PROBE_POOL
+        found = []
+        for number in range(count):
+            values = {name: draw(generator(self.settings.seed, number, f"pool {name}")) for name, draw in draws.items()}
+            preset = Preset(PROBES[values.pop("name", "phased")])
+            found.append(preset.changed("probe", **values).probe if values else preset.probe)
+        return tuple(found)
+
+    def lesion(self, case: Case) -> dict[str, Any]:
+        """The drawn values of the lesion of a case."""
+        draws = {key.removeprefix("lesions."): draw for key, draw in self.draws.items() if key.startswith("lesions.")}
+        return {name: draw(generator(self.settings.seed, case.number, f"lesion {name}")) for name, draw in draws.items()}
+
+
+class _Reader:
+    """Checks the values of a TOML text."""
+
+    def __init__(self, text: str, source: str, folder: Path) -> None:
+        self.text, self.source, self.folder = text, source, folder
+        self.values = _parsed(text, source)
+        self.lines = dict(_lines(text))
+        self.draws: dict[str, Draw] = {}
+
+    def at(self, *path: object) -> str:
+        """File and line of a key, or of the table around it."""
+        place = next((path[:n] for n in range(len(path), 0, -1) if path[:n] in self.lines), None)
+        return f"{self.source}: line {self.lines[place]}" if place else self.source
+
+    def recipe(self) -> Recipe:
+        tables = {"patients", "pose", "probe", "display", "settings", "tissues", "lesions"}
+        plain = {key: value for key, value in self.values.items() if key not in tables}
+        settings = self.plain(SetSettings, plain, (), tables)
+        self.check_outputs(settings)
+        patients = self.values.get("patients", [])
+        is_list = isinstance(patients, list) and bool(patients) and all(isinstance(one, dict) for one in patients)
+        require(is_list, f"{self.at('patients')}: patients is {short(patients)}, expected [[patients]] with file = ...")
+        segmentations = []
+        for number, patient in enumerate(patients):
+            place = ("patients", number, "segmentation")
+            chosen = patient.pop("segmentation", {})
+            self.plain(SegmentationSettings, chosen, place)
+            segmentations.append(SegmentationSettings.of(None, **chosen))
+        found = tuple(self.plain(PatientSettings, one, ("patients", n)) for n, one in enumerate(patients))
+        pose = self.drawn(PoseSettings, "pose", _ON_START)
+        require(
+            (pose.on in ("path", "sequence")) == bool(pose.file),
+            f"{self.at('pose')}: on is {pose.on}, which needs {'a' if not pose.file else 'no'} file",
+        )
+        lesions = self.drawn(LesionSettings, "lesions", ("each",)) if "lesions" in self.values else None
+        known = preset_parameters()
+        self.sections({**{key: known[key] for key in known if key != "probe.kind"}, "probe.name": _PROBE})
+        self.tissues()
+        self.draws.setdefault("settings.seed", Draw(known["settings.seed"], "uniform", (0, 2**32 - 1)))
+        self.draws.setdefault("display.image_size", Draw(known["display.image_size"], "fixed", ((256, 256),)))
+        made = Recipe(
+            settings, found, tuple(segmentations), pose, lesions, self.draws, self.text, self.folder
+        )  # fmt: skip
+        try:
+            made.probes, made.cases  # noqa: B018, what cannot be is said here
+        except SimulationError as error:
+            raise SimulationError(f"{self.at('probe')}: {error}") from None
+        return made
+
+    def check_outputs(self, settings: SetSettings) -> None:
+        for name in settings.outputs:
+            require(
+                name in OUTPUTS,
+                f"{self.at('outputs')}: output {short(name)} is unknown, expected some of {', '.join(OUTPUTS)}",
+            )
+        pixels = {"image", "labels", "labels_as_imaged", "clean"}
+        other = [name for name in settings.outputs if name not in pixels]
+        require(
+            settings.format in ("zarr", "hdf5") or not other,
+            f"{self.at('format')}: format {settings.format} holds {either(sorted(pixels))}, and outputs have "
+            f"{', '.join(other)}, expected zarr or hdf5",
+        )
+
+    def plain(self, kind: type, values: Any, place: tuple, tables: set[str] = frozenset()) -> Any:  # type: ignore
+        """A `kind` of fixed values."""
+        require(isinstance(values, dict), f"{self.at(*place)}: is {short(values)}, expected a table")
+        known = {entry.name: entry for entry in parameters_of(kind)}
+        for name, value in values.items():
+            names = [*known, *sorted(tables)]
+            require(name in known, f"{self.at(*place, name)}: {short(name)} is unknown, expected one of {', '.join(names)}")
+            values[name] = tuple(value) if isinstance(value, list) else value
+            known[name].checked(self.at(*place, name), values[name])
+        return built(kind, values, self.at(*place))
+
+    def drawn(self, kind: type, section: str, fixed: tuple[str, ...]) -> Any:
+        """A `kind` with its fixed values; the others become draws."""
+        values = self.values.get(section, {})
+        require(isinstance(values, dict), f"{self.at(section)}: {section} is {short(values)}, expected a table")
+        kept = {name: value for name, value in values.items() if name in fixed or not hasattr(kind, name)}
+        made = self.plain(kind, kept, (section,))
+        for entry in parameters_of(kind):
+            if entry.name not in fixed:
+                value = values.get(entry.name, entry.default)
+                self.draws[f"{section}.{entry.name}"] = Draw.of(value, entry, self.at(section, entry.name))
+        return made
+
+    def sections(self, known: Mapping[str, Parameter]) -> None:
+        for section in ("probe", "display", "settings"):
+            values = self.values.get(section, {})
+            require(isinstance(values, dict), f"{self.at(section)}: {section} is {short(values)}, expected a table")
+            names = [key.partition(".")[2] for key in known if key.startswith(f"{section}.")]
+            for name, value in values.items():
+                key, where = f"{section}.{name}", self.at(section, name)
+                require(key in known, f"{where}: {short(name)} is unknown, expected one of {', '.join(names)}")
+                self.draws[key] = Draw.of(value, known[key], where)
+                is_free = key not in _FIXED or self.draws[key].is_fixed
+                require(is_free, f"{where}: {name} is {short(value)}, expected one value for all images")
+
+    def tissues(self) -> None:
+        known = {entry.name: entry for entry in parameters_of(Tissue) if entry.type is float}
+        values = self.values.get("tissues", {})
+        require(isinstance(values, dict), f"{self.at('tissues')}: tissues is {short(values)}, expected tables by tissue")
+        for tissue, table in values.items():
+            where = self.at("tissues", tissue)
+            require(tissue == ALL or tissue in TISSUES, f"{where}: no tissue {short(tissue)}, expected {ALL} or one of "
+                    f"{', '.join(TISSUES)}")  # fmt: skip
+            require(isinstance(table, dict), f"{where}: {tissue} is {short(table)}, expected a table")
+            for name, value in table.items():
+                where = self.at("tissues", tissue, name)
+                require(name in known, f"{where}: {short(name)} is unknown, expected one of {', '.join(known)}")
+                self.draws[f"{tissue}.{name}"] = Draw.of(value, known[name], where, may_be_relative=True)
+
+
+def _parsed(text: str, source: str) -> dict[str, Any]:
+    if sys.version_info >= (3, 11):
+        import tomllib
+    else:
+        require_package("tomli", "SlicerUSSim[datasets]", "a recipe")
+        import tomli as tomllib
+    try:
+        return tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise SimulationError(f"{source}: is not TOML ({error})") from None
+
+
+def _lines(text: str) -> Iterator[tuple[tuple, int]]:
+    """(path of a key or table, its line) of a TOML text; tables of a list have their number in the path."""
+    table: tuple = ()
+    counts: dict[tuple, int] = {}
+    for number, line in enumerate(text.splitlines(), 1):
+        header = re.match(r"\s*(\[\[?)\s*(.+?)\s*\]", line)
+        key = re.match(r"\s*(\"[^\"]*\"|[\w.-]+)\s*=", line)
+        if header:
+            names = tuple(name.strip('"') for name in re.findall(r'"[^"]*"|[\w-]+', header[2]))
+            if header[1] == "[[":
+                counts[names] = counts.get(names, -1) + 1
+            table = ()
+            for name in names:
+                table = (*table, name)
+                if table in counts:
+                    table = (*table, counts[table])
+            yield table, number
+            yield (table[0],), number
+        elif key:
+            yield (*table, *key[1].strip('"').split(".")), number
