@@ -75,7 +75,8 @@ class Draw:
         if kind in ("uniform", "log_uniform"):
             require(values[0] <= values[1], f"{where}: {kind} is {short(values)}, expected the lower number first")
             require(
-                kind == "uniform" or values[0] > 0, f"{where}: {kind} begins at {short(values[0])}, expected more than 0"
+                kind == "uniform" or values[0] > 0,
+                f"{where}: {kind} begins at {short(values[0])}, expected more than 0",
             )
         return cls(entry, kind, tuple(values), relative)
 
@@ -92,7 +93,9 @@ class Draw:
         if self.kind == "choice":
             return self.values[int(random.integers(len(self.values)))]
         if self.kind == "uniform":
-            found = random.integers(first, last, endpoint=True) if self.entry.type is int else random.uniform(first, last)
+            found = (
+                random.integers(first, last, endpoint=True) if self.entry.type is int else random.uniform(first, last)
+            )
         elif self.kind == "log_uniform":
             found = np.exp(random.uniform(np.log(first), np.log(last)))
         else:

@@ -20,9 +20,7 @@ _WITHIN, _SHELL_MM = ("grey matter", "white matter", "brain"), 1.5
 _WAVES, _FINENESS = 24, 3.0
 
 
-def with_lesion(
-    labels: Volume, names: Sequence[str], drawn: Mapping[str, Any], random: np.random.Generator
-) -> Added:
+def with_lesion(labels: Volume, names: Sequence[str], drawn: Mapping[str, Any], random: np.random.Generator) -> Added:
     """Labels 1, 2, ... called `names` with a lesion at a random place of the drawn depth.
 
     `drawn` are values of LesionSettings. Raises SimulationError if the brain has no place that deep.

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from SlicerUSSim.Logic.base.errors import about_file, require
+from SlicerUSSim.Logic.base.errors import SimulationError, require
 from SlicerUSSim.Logic.base.files import make_folder, written_whole
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.datasets.recipe import BUNDLED, PatientSettings, Recipe
@@ -26,8 +26,15 @@ from SlicerUSSim.Logic.tissue.table import TissueTable
 from SlicerUSSim.Logic.tissue.texture import Texture
 
 VENTRICLE = "ventricle"
+#: Names of the labels in all sets; the label is the place, and the last one is any other tissue
+CLASSES = (*TISSUES, VENTRICLE)
+OTHER = 255
 #: Around what is labelled
 _MARGIN_MM = 5.0
+
+
+class PatientError(SimulationError):
+    """What a patient has not: its images are left out, and those of the others are made."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,14 +60,16 @@ def prepared_path(out: Path, patient: int) -> Path:
 def prepare(recipe: Recipe, patient: int, out: Path, device: str | None = None) -> None:
     """Write what images of a patient are made of, unless it is there.
 
-    Raises SimulationError, which names the file, if it cannot be read or segmented.
+    Raises PatientError, which names the file, if it cannot be read or segmented.
     """
     path = prepared_path(out, patient)
     if path.exists():
         return
-    chosen = recipe.patients[patient]
-    with about_file(chosen.file):
+    try:
         found = _prepared(recipe, patient, device)
+    except SimulationError as error:
+        name = recipe.patients[patient].file
+        raise PatientError(str(error) if name in str(error) else f"{name}: {error}") from None
     make_folder(path.parent)
     with written_whole(path) as partial:
         partial.write_bytes(pickle.dumps(found, protocol=pickle.HIGHEST_PROTOCOL))

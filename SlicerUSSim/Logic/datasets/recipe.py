@@ -40,7 +40,8 @@ BUNDLED = ("mni152", "synthetic")
 ALL = "all"
 #: Probes that are drawn for a set: the record of a new one takes 20 ms
 PROBE_POOL = 16
-_MOST_PER_SHARD = 64
+#: Images of a shard, and bytes of its arrays, of which an image has so many for each of its signals
+_MOST_PER_SHARD, _SHARD_BYTES, _SIGNAL_BYTES = 64, 48e6, 1.6e6
 #: Parameters that are fixed: all images have one size, and a simulator is built with them
 _FIXED = (
     "display.image_size", "settings.quality", "settings.partial_volume", "settings.mri_modulation_db",
@@ -54,7 +55,9 @@ class SetSettings(Declared):
     """What a recipe says before its tables."""
 
     images: int = parameter(label="Images", tip="Number of images", bounds=(1, 10**9))
-    seed: int = parameter(0, "Seed", "With its number the seed of all that is drawn for an image", bounds=(0, 2**32 - 1))
+    seed: int = parameter(
+        0, "Seed", "With its number the seed of all that is drawn for an image", bounds=(0, 2**32 - 1)
+    )
     outputs: tuple[str, ...] = parameter(("image", "labels"), "Outputs", "What is kept of every image")
     format: str = parameter("zarr", "Format", "Format of the files", choices=FORMATS)
     shard: int | None = parameter(
@@ -110,9 +113,7 @@ class LesionSettings(Declared):
     roughness: float = parameter(0.25, "Roughness", "Deviation of its radius by the radius", bounds=(0, 0.6))
 
 
-_PROBE = Parameter(
-    name="name", type=str, label="Name", tip="Probe", default="phased", choices=tuple(PROBES)
-)
+_PROBE = Parameter(name="name", type=str, label="Name", tip="Probe", default="phased", choices=tuple(PROBES))
 #: Keys of draws that are none of a tissue begin with these
 SECTIONS = ("pose", "probe", "display", "settings", "lesions")
 _ON_START = ("on", "file", "transform", "within_deg", "aim")
@@ -175,7 +176,11 @@ class Recipe:
     def shard(self) -> int:
         """Images of a shard, but for the last."""
         s = self.settings
-        return s.shard or max(min(_MOST_PER_SHARD, s.images // (len(self.patients) * self.variants)), 1)
+        rows, columns = self.draws["display.image_size"].values[0]
+        signals = len({"iq", "rf", "envelope", "bmode"} & set(s.outputs))
+        image_bytes = 4 * rows * columns * (len(s.outputs) - signals) + _SIGNAL_BYTES * signals
+        fewest = s.images // (len(self.patients) * self.variants)
+        return s.shard or max(min(_MOST_PER_SHARD, fewest, int(_SHARD_BYTES / image_bytes)), 1)
 
     @property
     def variants(self) -> int:
@@ -202,9 +207,7 @@ class Recipe:
             f"{self.settings.images} images are {self.shards} shards for {len(ends)} patients with their lesions, "
             "expected one for each at least; lower shard, or make more images",
         )
-        return tuple(
-            Case(n, n // self.variants, *both) for n, both in enumerate(zip(starts, ends, strict=True))
-        )
+        return tuple(Case(n, n // self.variants, *both) for n, both in enumerate(zip(starts, ends, strict=True)))
 
     def case_of(self, shard: int) -> Case:
         """The case of a shard."""
@@ -233,7 +236,9 @@ class Recipe:
     def lesion(self, case: Case) -> dict[str, Any]:
         """The drawn values of the lesion of a case."""
         draws = {key.removeprefix("lesions."): draw for key, draw in self.draws.items() if key.startswith("lesions.")}
-        return {name: draw(generator(self.settings.seed, case.number, f"lesion {name}")) for name, draw in draws.items()}
+        return {
+            name: draw(generator(self.settings.seed, case.number, f"lesion {name}")) for name, draw in draws.items()
+        }
 
 
 class _Reader:
@@ -305,7 +310,9 @@ class _Reader:
         known = {entry.name: entry for entry in parameters_of(kind)}
         for name, value in values.items():
             names = [*known, *sorted(tables)]
-            require(name in known, f"{self.at(*place, name)}: {short(name)} is unknown, expected one of {', '.join(names)}")
+            require(
+                name in known, f"{self.at(*place, name)}: {short(name)} is unknown, expected one of {', '.join(names)}"
+            )
             values[name] = tuple(value) if isinstance(value, list) else value
             known[name].checked(self.at(*place, name), values[name])
         return built(kind, values, self.at(*place))
@@ -337,7 +344,9 @@ class _Reader:
     def tissues(self) -> None:
         known = {entry.name: entry for entry in parameters_of(Tissue) if entry.type is float}
         values = self.values.get("tissues", {})
-        require(isinstance(values, dict), f"{self.at('tissues')}: tissues is {short(values)}, expected tables by tissue")
+        require(
+            isinstance(values, dict), f"{self.at('tissues')}: tissues is {short(values)}, expected tables by tissue"
+        )
         for tissue, table in values.items():
             where = self.at("tissues", tissue)
             require(tissue == ALL or tissue in TISSUES, f"{where}: no tissue {short(tissue)}, expected {ALL} or one of "

@@ -11,14 +11,14 @@ from typing import Any
 import numpy as np
 from vtkmodules.util.numpy_support import vtk_to_numpy
 
-from SlicerUSSim.Logic.base.errors import require
+from SlicerUSSim.Logic.base.errors import SimulationError, require
 from SlicerUSSim.Logic.base.settings import DisplaySettings, SimulationSettings
 from SlicerUSSim.Logic.base.transforms import check_rigid
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.datasets.draws import generator
 from SlicerUSSim.Logic.datasets.laid_lesions import with_lesion
 from SlicerUSSim.Logic.datasets.pixel_maps import attenuation_and_time, walls
-from SlicerUSSim.Logic.datasets.prepared import PreparedPatient, load
+from SlicerUSSim.Logic.datasets.prepared import CLASSES, OTHER, PatientError, PreparedPatient, load
 from SlicerUSSim.Logic.datasets.recipe import ALL, SECTIONS, Case, Recipe
 from SlicerUSSim.Logic.imaging.batch import OUTPUTS as SIMULATED
 from SlicerUSSim.Logic.imaging.simulator import UltrasoundSimulator
@@ -47,6 +47,8 @@ class Scene:
         patient = _patient(str(out), case.patient)
         labels, names, tissues, texture = patient.labels, patient.names, patient.tissues, patient.texture
         self.recipe, self.case, self.mri = recipe, case, patient.mri
+        shown = patient.mri is not None or "mri" not in recipe.settings.outputs
+        require(shown, "is a label map, and the output mri needs an MRI or CT")
         if recipe.lesions:
             random = generator(recipe.settings.seed, case.number, "lesion shape")
             added = with_lesion(labels, names, recipe.lesion(case), random)
@@ -143,11 +145,14 @@ class Scene:
 
 
 def scene(recipe: Recipe, out: Path, case: Case) -> Scene:
-    """The scene of a case; the last one is kept."""
+    """The scene of a case; the last one is kept. Raises PatientError if a patient has not what the recipe wants."""
     key = (recipe.digest, str(out), case.number)
     if key not in _kept:
         _kept.clear()  # its memory goes before the next one is built
-        _kept[key] = Scene(recipe, out, case)
+        try:
+            _kept[key] = Scene(recipe, out, case)
+        except SimulationError as error:
+            raise PatientError(f"{recipe.patients[case.patient].file}: {error}") from None
     return _kept[key]
 
 
@@ -180,7 +185,7 @@ def _section(settings: Any, drawn: Mapping[str, Any], section: str) -> Any:
 def render(recipe: Recipe, out: Path, shard: int) -> tuple[dict[str, np.ndarray], list[dict[str, Any]]]:
     """({output: array}, the parameters of each image) of a shard, (images, ...) in their order.
 
-    Besides the recipe's outputs there are "pose", (4, 4) probe_to_ras, and "image_to_probe", (4, 4) from (column, row,
+    Labels are places in CLASSES, which are the same for all patients. Besides the recipe's outputs there are "pose", (4, 4) probe_to_ras, and "image_to_probe", (4, 4) from (column, row,
     0, 1) to the probe's millimetres, float64.
     """
     numbers = recipe.images_of(shard)
@@ -214,7 +219,6 @@ def render(recipe: Recipe, out: Path, shard: int) -> tuple[dict[str, np.ndarray]
         if "walls" in more:
             more["walls"].append(walls(found["labels"][place], table, probe, grid))
         if "mri" in more:
-            require(made.mri is not None, "the output mri needs an MRI or CT, and the patient is a label map")
             assert made.mri is not None
             more["mri"].append(slice_under_probe(made.mri, grid, pose))
         if "clean" in more:
@@ -222,7 +226,11 @@ def render(recipe: Recipe, out: Path, shard: int) -> tuple[dict[str, np.ndarray]
             more["clean"].append(
                 _clean(made, number, probe, pose, displays[place], table, settings[place], recipe.settings.looks)
             )
-    arrays = {name: found[name] for name in simulated if name in wanted}
+    number_of = np.array([CLASSES.index(n) if n in CLASSES else OTHER for n in ("coupling", *made.names)], np.uint8)
+    arrays = {
+        name: number_of[found[name]] if name.startswith("labels") else found[name]
+        for name in simulated if name in wanted
+    }  # fmt: skip
     arrays |= {name: np.stack(values) for name, values in more.items()}
     arrays |= {"pose": np.stack(poses), "image_to_probe": np.stack([grid.image_to_probe for grid in grids])}
     back = np.argsort(order)
