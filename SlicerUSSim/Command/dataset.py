@@ -30,11 +30,11 @@ class _Rate(Share):
 @out_option("Folder of the set; one that this recipe has begun is completed.")
 @click.option(
     "--scheduler", metavar="tcp://HOST:PORT|FILE",
-    help="Scheduler of a Dask cluster (docs/scale.md), by its address or its file (default: processes on this computer).",
+    help="Scheduler of a Dask cluster (docs/scale.md), by its address or file (default: processes on this computer).",
 )  # fmt: skip
 @click.option(
-    "--workers", type=click.IntRange(1, 1024), help="Processes on this computer; 1: without Dask (default: one for each "
-    "core that has memory).",
+    "--workers", type=click.IntRange(1, 1024),
+    help="Processes on this computer; 1: without Dask (default: one for each core that has memory).",
 )  # fmt: skip
 @click.option("--export", type=click.Choice(_EXPORTS), help="Also write the set as COCO, or as nnU-Net v2 reads it.")
 @device_option

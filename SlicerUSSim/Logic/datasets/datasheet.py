@@ -48,7 +48,8 @@ def write_datasheet(recipe: Recipe, out: Path, skipped: Mapping[str, str]) -> No
         "title": settings.title, "licence": settings.licence, "seed": settings.seed, "format": settings.format,
         "images": settings.images, "made": made, "shard": recipe.shard, "checksum": digest,
         "recipe_sha256": recipe.digest, "outputs": {name: OUTPUTS[name] for name in settings.outputs},
-        "labels": {str(n): name for n, name in enumerate(CLASSES) if name in tissues}, "patients": _patients(recipe, out, skipped),
+        "labels": {str(n): name for n, name in enumerate(CLASSES) if name in tissues},
+        "patients": _patients(recipe, out, skipped),
         "made_by": sorted(makers), "devices": sorted(devices), "versions": _versions(),
         "warnings": sorted(warnings), "shards": shards,
     }  # fmt: skip
@@ -90,11 +91,12 @@ def _page(recipe: Recipe, manifest: Mapping[str, Any]) -> str:
     lines = [
         f"# {settings.title}", "",
         f"{manifest['made']} of {settings.images} B-mode images, simulated by SlicerUSSim "
-        f"{', '.join(manifest['made_by'])} from the recipe `recipe.toml` with seed {settings.seed}. Nothing in them was "
-        "measured by a scanner: a model that is trained on them has to be tested on real images.",
+        f"{', '.join(manifest['made_by'])} from the recipe `recipe.toml` with seed {settings.seed}. No scanner "
+        "measured them: test on real images what you train on these.",
         "", f"Licence: {settings.licence or 'not given; that of the sources applies'}", "", "## Content", "",
         *(f"- `{name}`: {about}" for name, about in manifest["outputs"].items()),
-        "- `pose`: (4, 4) from the probe to the patient, RAS mm; `image_to_probe`: (4, 4) from (column, row, 0, 1) to mm",
+        "- `pose`: (4, 4) from the probe to the patient, RAS mm",
+        "- `image_to_probe`: (4, 4) from (column, row, 0, 1) to the probe's mm",
         "- `shards/*.json`: parameters drawn for each image, and the SHA-256 of its arrays",
         "", f"Format: {settings.format}, {recipe.shard} images in a shard. Labels: places in `labels` of `{MANIFEST}`: "
         + ", ".join(f"{number} {name}" for number, name in manifest["labels"].items()) + ".",

@@ -14,7 +14,7 @@ from SlicerUSSim.Logic.base.errors import require
 
 #: {name: what it is given by}
 KINDS = {
-    "uniform": "[low, high]", "log_uniform": "[low, high] above 0", "normal": "[mean, deviation], cut off at the bounds",
+    "uniform": "[low, high]", "log_uniform": "[low, high] above 0", "normal": "[mean, deviation]",
     "choice": "[value, ...]",
 }  # fmt: skip
 _OPTIONS = ("unit", "relative")
@@ -40,7 +40,7 @@ class Draw:
 
     @classmethod
     def of(cls, value: Any, entry: Parameter, where: str, *, may_be_relative: bool = False) -> Draw:
-        """From the value of a recipe. Raises SimulationError that begins with `where` for what the parameter refuses."""
+        """From a recipe's value. Raises SimulationError that begins with `where` for what the parameter refuses."""
         if not isinstance(value, Mapping):
             return cls(entry, "fixed", (entry.checked(where, tuple(value) if isinstance(value, list) else value),))
         given = [name for name in value if name not in _OPTIONS]
@@ -74,10 +74,7 @@ class Draw:
             values = [checking.checked(where, tuple(one) if isinstance(one, list) else one) for one in values]
         if kind in ("uniform", "log_uniform"):
             require(values[0] <= values[1], f"{where}: {kind} is {short(values)}, expected the lower number first")
-            require(
-                kind == "uniform" or values[0] > 0,
-                f"{where}: {kind} begins at {short(values[0])}, expected more than 0",
-            )
+            require(kind == "uniform" or values[0] > 0, f"{where}: {kind} is {short(values)}, expected more than 0")
         return cls(entry, kind, tuple(values), relative)
 
     @property

@@ -19,8 +19,8 @@ _LABELS = ("labels_as_imaged", "labels")
 def export_coco(folder: str | os.PathLike) -> Path:
     """The file of annotations of a set in COCO's format, written into its folder `coco` with the images as PNG.
 
-    Each connected region of a tissue is an object, with its box, area in pixels and mask (run lengths). Labels are those
-    as imaged, if the set has them. Raises SimulationError for a set without images or labels.
+    Each connected region of a tissue is an object, with its box, area in pixels and mask (run lengths). Labels are
+    those as imaged, if the set has them. Raises SimulationError for a set without images or labels.
     """
     images, labels, out = _opened(folder, "coco")
     entries, objects = [], []

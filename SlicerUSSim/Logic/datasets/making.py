@@ -125,8 +125,8 @@ def make_dataset(
     progress : called after every shard; may raise errors.Cancelled.
     task : what renders and writes a shard; another one measures what is around it.
 
-    Patients that cannot be read are left out, see Made.skipped. Raises SimulationError for a folder with another set, if
-    a file cannot be written, if a package is missing, and if the scheduler is gone; the same call then goes on.
+    Patients that cannot be read are left out, see Made.skipped. Raises SimulationError for a folder with another set,
+    if a file cannot be written, if a package is missing, and if the scheduler is gone; the same call then goes on.
     """
     require_format(recipe)
     folder = _own_folder(recipe, Path(out))
@@ -219,9 +219,9 @@ def _cluster(scheduler: str | None, workers: int | None) -> Iterator[Any]:
     from distributed import Client, LocalCluster
 
     if scheduler is not None:
-        where = {"address": scheduler} if "://" in scheduler else {"scheduler_file": scheduler}
-        require("://" in scheduler or Path(scheduler).is_file(), f"--scheduler is {scheduler!r}, expected tcp://HOST:PORT "
-                "or the file that a scheduler has written")  # fmt: skip
+        where: dict[str, Any] = {"address": scheduler} if "://" in scheduler else {"scheduler_file": scheduler}
+        is_one = "://" in scheduler or Path(scheduler).is_file()
+        require(is_one, f"--scheduler is {scheduler!r}, expected tcp://HOST:PORT, or a scheduler's file")
         try:
             client = Client(**where, timeout=_ANSWER_S)
         except (OSError, TimeoutError, ValueError) as error:
@@ -230,10 +230,10 @@ def _cluster(scheduler: str | None, workers: int | None) -> Iterator[Any]:
     else:
         cores = str(max((os.cpu_count() or 1) // (workers or 1), 1))
         environment = {"POCL_CPU_MAX_CU_COUNT": cores, "POCL_MAX_PTHREAD_COUNT": cores, "OMP_NUM_THREADS": cores}
+        plain: dict[str, Any] = {"dashboard_address": None, "silence_logs": logging.CRITICAL, "memory_limit": 0}
         cluster = LocalCluster(
-            n_workers=workers, threads_per_worker=1, processes=True, memory_limit=0, dashboard_address=None,
-            silence_logs=logging.CRITICAL, env=environment, local_directory=tempfile.gettempdir(),
-        )  # fmt: skip
+            n_workers=workers, threads_per_worker=1, env=environment, local_directory=tempfile.gettempdir(), **plain
+        )
         client = Client(cluster)
     with cluster:
         try:

@@ -12,7 +12,7 @@ import numpy as np
 from SlicerUSSim.Logic.base.errors import SimulationError, require
 from SlicerUSSim.Logic.base.files import make_folder, written_whole
 from SlicerUSSim.Logic.base.volume import Volume
-from SlicerUSSim.Logic.datasets.recipe import BUNDLED, PatientSettings, Recipe
+from SlicerUSSim.Logic.datasets.recipe import BUNDLED, Recipe
 from SlicerUSSim.Logic.mri.masks import read_mask
 from SlicerUSSim.Logic.mri.modality import segment_image
 from SlicerUSSim.Logic.mri.pathology import add_tissues, texture_below
@@ -91,7 +91,7 @@ def _prepared(recipe: Recipe, number: int, device: str | None) -> PreparedPatien
     if chosen.file not in BUNDLED and is_label_file(path, image):
         require(not chosen.ventricles, "is a label map; ventricles are looked for in an MRI")
         found = read_label_file(path, image)
-        labels, names, tissues, mri = found.labels, found.names(), found.tissues, None
+        labels, names, tissues, mri = found.labels, found.names, found.tissues, None
     else:
         segmentation = segment_image(image, recipe.segmentations[number], device=device)
         labels, names, mri = segmentation.labels, segmentation.tissue_names, image

@@ -5,8 +5,8 @@ from __future__ import annotations
 import hashlib
 import re
 import sys
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, fields
+from collections.abc import Collection, Iterator, Mapping
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -25,14 +25,16 @@ from SlicerUSSim.Logic.tissue.tissue import Tissue
 
 #: {output: what it is}; those of simulate_batch, and what is computed from the patient
 OUTPUTS = {
-    "image": "B-mode", "labels": "tissue of every pixel", "labels_as_imaged": "the same where travel time and refraction "
-    "put it", "depth": "mm along the scan line", "iq": "baseband signal", "rf": "radio-frequency signal",
+    "image": "B-mode", "labels": "tissue of every pixel", "labels_as_imaged": "the same as displaced by travel time",
+    "depth": "mm along the scan line", "iq": "baseband signal", "rf": "radio-frequency signal",
     "envelope": "envelope along the scan lines", "bmode": "grey levels along the scan lines",
     "clean": "mean of images with other speckle and noise", "mri": "MRI or CT in the image plane",
     "attenuation": "one-way dB along straight lines", "travel_time": "µs there and back along straight lines",
     "walls": "reflection coefficient of the border at a pixel",
 }  # fmt: skip
 FORMATS = ("zarr", "hdf5", "png", "tracked")
+#: Outputs of the formats of pictures
+_PICTURES = ("image", "labels", "labels_as_imaged", "clean")
 #: Recipes that come with the package, by name
 READY = {path.stem: path for path in sorted((Path(__file__).parent / "recipes").glob("*.toml"))}
 #: Bundled patients, which are no files
@@ -135,8 +137,8 @@ class Recipe:
     """A checked recipe. Image i depends on (seed, i) alone; images of one patient follow each other.
 
     >>> from SlicerUSSim.Logic.datasets import Recipe
-    >>> recipe = Recipe.of_text('images = 100\\n[[patients]]\\nfile = "mni152"\\n[display]\\ngain_db = {uniform = [-6, 6]}')
-    >>> recipe.shards, round(recipe.drawn(7)["display.gain_db"], 3) == round(recipe.drawn(7)["display.gain_db"], 3)
+    >>> recipe = Recipe.of_text('images = 100\\n[[patients]]\\nfile = "mni152"\\n[display]\\ngain_db = 3')
+    >>> recipe.shards, recipe.drawn(7) == recipe.drawn(7)
     (2, True)
     """
 
@@ -255,10 +257,21 @@ class _Reader:
         place = next((path[:n] for n in range(len(path), 0, -1) if path[:n] in self.lines), None)
         return f"{self.source}: line {self.lines[place]}" if place else self.source
 
+    def table(self, *path: object, given: Any = None) -> dict[str, Any]:
+        """A table; of this path at the top, unless it is given."""
+        values = self.values.get(str(path[0]), {}) if given is None else given
+        require(isinstance(values, dict), f"{self.at(*path)}: {path[-1]} is {short(values)}, expected a table")
+        return values
+
+    def known(self, names: Collection[str], *path: object) -> str:
+        """Where a key is, which is one of these."""
+        where = self.at(*path)
+        require(path[-1] in names, f"{where}: {short(path[-1])} is unknown, expected one of {', '.join(names)}")
+        return where
+
     def recipe(self) -> Recipe:
-        tables = {"patients", "pose", "probe", "display", "settings", "tissues", "lesions"}
-        plain = {key: value for key, value in self.values.items() if key not in tables}
-        settings = self.plain(SetSettings, plain, (), tables)
+        tables = ("patients", "pose", "probe", "display", "settings", "tissues", "lesions")
+        settings = self.plain(SetSettings, {k: v for k, v in self.values.items() if k not in tables}, (), tables)
         self.check_outputs(settings)
         patients = self.values.get("patients", [])
         is_list = isinstance(patients, list) and bool(patients) and all(isinstance(one, dict) for one in patients)
@@ -266,14 +279,14 @@ class _Reader:
         segmentations = []
         for number, patient in enumerate(patients):
             place = ("patients", number, "segmentation")
-            chosen = patient.pop("segmentation", {})
+            chosen = self.table(*place, given=patient.pop("segmentation", {}))
             self.plain(SegmentationSettings, chosen, place)
             segmentations.append(SegmentationSettings.of(None, **chosen))
         found = tuple(self.plain(PatientSettings, one, ("patients", n)) for n, one in enumerate(patients))
         pose = self.drawn(PoseSettings, "pose", _ON_START)
         require(
             (pose.on in ("path", "sequence")) == bool(pose.file),
-            f"{self.at('pose')}: on is {pose.on}, which needs {'a' if not pose.file else 'no'} file",
+            f"{self.at('pose')}: on is {pose.on}, which needs {'no' if pose.file else 'a'} file",
         )
         lesions = self.drawn(LesionSettings, "lesions", ("each",)) if "lesions" in self.values else None
         known = preset_parameters()
@@ -281,80 +294,59 @@ class _Reader:
         self.tissues()
         self.draws.setdefault("settings.seed", Draw(known["settings.seed"], "uniform", (0, 2**32 - 1)))
         self.draws.setdefault("display.image_size", Draw(known["display.image_size"], "fixed", ((256, 256),)))
-        made = Recipe(
-            settings, found, tuple(segmentations), pose, lesions, self.draws, self.text, self.folder
-        )  # fmt: skip
+        made = Recipe(settings, found, tuple(segmentations), pose, lesions, self.draws, self.text, self.folder)
         try:
-            made.probes, made.cases  # noqa: B018, what cannot be is said here
+            assert made.probes and made.cases  # what cannot be is said here
         except SimulationError as error:
             raise SimulationError(f"{self.at('probe')}: {error}") from None
         return made
 
     def check_outputs(self, settings: SetSettings) -> None:
         for name in settings.outputs:
-            require(
-                name in OUTPUTS,
-                f"{self.at('outputs')}: output {short(name)} is unknown, expected some of {', '.join(OUTPUTS)}",
-            )
-        pixels = {"image", "labels", "labels_as_imaged", "clean"}
-        other = [name for name in settings.outputs if name not in pixels]
+            is_known = name in OUTPUTS
+            require(is_known, f"{self.at('outputs')}: output {short(name)} is unknown, expected {', '.join(OUTPUTS)}")
+        other = ", ".join(name for name in settings.outputs if name not in _PICTURES)
         require(
             settings.format in ("zarr", "hdf5") or not other,
-            f"{self.at('format')}: format {settings.format} holds {either(sorted(pixels))}, and outputs have "
-            f"{', '.join(other)}, expected zarr or hdf5",
+            f"{self.at('format')}: format {settings.format} holds {either(_PICTURES)}, and outputs have {other}, "
+            "expected zarr or hdf5",
         )
 
-    def plain(self, kind: type, values: Any, place: tuple, tables: set[str] = frozenset()) -> Any:  # type: ignore
-        """A `kind` of fixed values."""
-        require(isinstance(values, dict), f"{self.at(*place)}: is {short(values)}, expected a table")
+    def plain(self, kind: type, values: dict, place: tuple, tables: Collection[str] = ()) -> Any:
+        """A `kind` of fixed values; beside them there may be tables."""
         known = {entry.name: entry for entry in parameters_of(kind)}
         for name, value in values.items():
-            names = [*known, *sorted(tables)]
-            require(
-                name in known, f"{self.at(*place, name)}: {short(name)} is unknown, expected one of {', '.join(names)}"
-            )
+            where = self.known([*known, *tables], *place, name)
             values[name] = tuple(value) if isinstance(value, list) else value
-            known[name].checked(self.at(*place, name), values[name])
+            known[name].checked(where, values[name])
         return built(kind, values, self.at(*place))
 
-    def drawn(self, kind: type, section: str, fixed: tuple[str, ...]) -> Any:
+    def drawn(self, kind: type, section: str, fixed: Collection[str]) -> Any:
         """A `kind` with its fixed values; the others become draws."""
-        values = self.values.get(section, {})
-        require(isinstance(values, dict), f"{self.at(section)}: {section} is {short(values)}, expected a table")
-        kept = {name: value for name, value in values.items() if name in fixed or not hasattr(kind, name)}
-        made = self.plain(kind, kept, (section,))
-        for entry in parameters_of(kind):
-            if entry.name not in fixed:
+        values, entries = self.table(section), parameters_of(kind)
+        free = {entry.name for entry in entries if entry.name not in fixed}
+        made = self.plain(kind, {name: value for name, value in values.items() if name not in free}, (section,))
+        for entry in entries:
+            if entry.name in free:
                 value = values.get(entry.name, entry.default)
                 self.draws[f"{section}.{entry.name}"] = Draw.of(value, entry, self.at(section, entry.name))
         return made
 
     def sections(self, known: Mapping[str, Parameter]) -> None:
         for section in ("probe", "display", "settings"):
-            values = self.values.get(section, {})
-            require(isinstance(values, dict), f"{self.at(section)}: {section} is {short(values)}, expected a table")
             names = [key.partition(".")[2] for key in known if key.startswith(f"{section}.")]
-            for name, value in values.items():
-                key, where = f"{section}.{name}", self.at(section, name)
-                require(key in known, f"{where}: {short(name)} is unknown, expected one of {', '.join(names)}")
+            for name, value in self.table(section).items():
+                key, where = f"{section}.{name}", self.known(names, section, name)
                 self.draws[key] = Draw.of(value, known[key], where)
                 is_free = key not in _FIXED or self.draws[key].is_fixed
                 require(is_free, f"{where}: {name} is {short(value)}, expected one value for all images")
 
     def tissues(self) -> None:
         known = {entry.name: entry for entry in parameters_of(Tissue) if entry.type is float}
-        values = self.values.get("tissues", {})
-        require(
-            isinstance(values, dict), f"{self.at('tissues')}: tissues is {short(values)}, expected tables by tissue"
-        )
-        for tissue, table in values.items():
-            where = self.at("tissues", tissue)
-            require(tissue == ALL or tissue in TISSUES, f"{where}: no tissue {short(tissue)}, expected {ALL} or one of "
-                    f"{', '.join(TISSUES)}")  # fmt: skip
-            require(isinstance(table, dict), f"{where}: {tissue} is {short(table)}, expected a table")
-            for name, value in table.items():
-                where = self.at("tissues", tissue, name)
-                require(name in known, f"{where}: {short(name)} is unknown, expected one of {', '.join(known)}")
+        for tissue, given in self.table("tissues").items():
+            self.known((ALL, *TISSUES), "tissues", tissue)
+            for name, value in self.table("tissues", tissue, given=given).items():
+                where = self.known(known, "tissues", tissue, name)
                 self.draws[f"{tissue}.{name}"] = Draw.of(value, known[name], where, may_be_relative=True)
 
 
@@ -363,7 +355,7 @@ def _parsed(text: str, source: str) -> dict[str, Any]:
         import tomllib
     else:
         require_package("tomli", "SlicerUSSim[datasets]", "a recipe")
-        import tomli as tomllib
+        import tomli as tomllib  # type: ignore[import-not-found]
     try:
         return tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:

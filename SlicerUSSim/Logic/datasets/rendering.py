@@ -147,13 +147,14 @@ class Scene:
 def scene(recipe: Recipe, out: Path, case: Case) -> Scene:
     """The scene of a case; the last one is kept. Raises PatientError if a patient has not what the recipe wants."""
     key = (recipe.digest, str(out), case.number)
-    if key not in _kept:
+    found = _kept.get(key)
+    if found is None:
         _kept.clear()  # its memory goes before the next one is built
         try:
-            _kept[key] = Scene(recipe, out, case)
+            found = _kept[key] = Scene(recipe, out, case)
         except SimulationError as error:
             raise PatientError(f"{recipe.patients[case.patient].file}: {error}") from None
-    return _kept[key]
+    return found
 
 
 _kept: dict[tuple, Scene] = {}
@@ -185,8 +186,8 @@ def _section(settings: Any, drawn: Mapping[str, Any], section: str) -> Any:
 def render(recipe: Recipe, out: Path, shard: int) -> tuple[dict[str, np.ndarray], list[dict[str, Any]]]:
     """({output: array}, the parameters of each image) of a shard, (images, ...) in their order.
 
-    Labels are places in CLASSES, which are the same for all patients. Besides the recipe's outputs there are "pose", (4, 4) probe_to_ras, and "image_to_probe", (4, 4) from (column, row,
-    0, 1) to the probe's millimetres, float64.
+    Labels are places in CLASSES, which are the same for all patients. Besides the recipe's outputs there are "pose",
+    (4, 4) probe_to_ras, and "image_to_probe", (4, 4) from (column, row, 0, 1) to the probe's millimetres, float64.
     """
     numbers = recipe.images_of(shard)
     made = scene(recipe, out, recipe.case_of(shard))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -59,6 +60,7 @@ def checksums(arrays: Mapping[str, np.ndarray]) -> dict[str, str]:
 def _zarr(recipe: Recipe, out: Path, shard: int, arrays: Mapping[str, np.ndarray], _: dict) -> None:
     """Zarr v3: an array per output of all images, a chunk per image, a file per shard."""
     import zarr
+    from zarr.errors import ContainsArrayError
 
     numbers = recipe.images_of(shard)
     path = out / "images.zarr"
@@ -68,10 +70,8 @@ def _zarr(recipe: Recipe, out: Path, shard: int, arrays: Mapping[str, np.ndarray
                 zarr.open_group(path, mode="a", zarr_format=3)
             inner = values.shape[1:]
             shape, chunks, shards = ((first, *inner) for first in (recipe.settings.images, 1, recipe.shard))
-            try:
+            with suppress(ContainsArrayError):
                 zarr.create_array(path, name=name, shape=shape, chunks=chunks, shards=shards, dtype=values.dtype)
-            except zarr.errors.ContainsArrayError:
-                pass
         zarr.open_array(path, path=name, mode="r+")[numbers.start : numbers.stop] = values
 
 
@@ -125,7 +125,7 @@ def read_arrays(out: Path, format_: str, shard: int, numbers: range, names: tupl
         import h5py
 
         with h5py.File(out / f"shard-{shard:06d}.h5", "r") as file:
-            return {name: file[name][:] for name in names}
+            return {name: np.array(file[name]) for name in names}
     pictures = [name for name in names if name not in _GEOMETRY]
     if format_ == "tracked":
         read = {name: TrackedSequence.read(out / f"{name}-{shard:06d}.igs.mha") for name in pictures}

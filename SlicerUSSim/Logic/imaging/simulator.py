@@ -227,7 +227,7 @@ class UltrasoundSimulator:
         out: Mapping[str, np.ndarray] | None = None,
         noise_seed: int | Sequence[int] = 0,
     ) -> dict[str, np.ndarray]:
-        """{output: array} of images at `poses` (n, 4, 4); image i is that of simulate() with noise_seed + i, or its own.
+        """{output: array} of images at `poses` (n, 4, 4); image i has the noise_seed + i, or its own.
 
         One image is prepared while the device computes the one before, and nothing else than the outputs is downloaded.
 
