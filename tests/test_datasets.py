@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
 import time
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,14 +16,23 @@ import pytest
 from click.testing import CliRunner
 
 from SlicerUSSim.Command.cli import main
-from SlicerUSSim.Logic import SimulationError, TrackedSequence, Volume
-from SlicerUSSim.Logic.datasets import READY, Recipe, SimulatedImages, export_coco, export_nnunet, make_dataset
-from SlicerUSSim.Logic.datasets import making as making_module
+from SlicerUSSim.Logic import DisplaySettings, SimulationError, TrackedSequence
+from SlicerUSSim.Logic.datasets import (
+    READY,
+    Recipe,
+    SimulatedImages,
+    export_coco,
+    export_nnunet,
+    make_dataset,
+    making as making_module,
+)
 from SlicerUSSim.Logic.datasets.draws import Draw, generator
 from SlicerUSSim.Logic.datasets.prepared import CLASSES
 from SlicerUSSim.Logic.datasets.rendering import Scene, render
 from SlicerUSSim.Logic.datasets.writers import record_path
 from SlicerUSSim.Logic.imaging.preset import preset_parameters
+from SlicerUSSim.Logic.mri.samples import head_mri
+from SlicerUSSim.Logic.probe import pose_looking_at
 from SlicerUSSim.Logic.probe.surface import PatientSurface
 from SlicerUSSim.Logic.tissue.presets import TISSUES
 from tests.conftest import block, name_labels
@@ -69,8 +78,8 @@ def folder(tmp_path_factory) -> Path:
         inner = np.where((np.abs(x) - 9) ** 2 + (y / 3) ** 2 + z**2 < 25, 1, 3)
         return np.select([radius > 48, radius > 40], [0, 2], inner)
 
-    for name in ("brain", "second"):
-        block(labels, (54, 58, 54), 2.0).write(folder / f"{name}.nii.gz")
+    for name, shift in (("brain", 0.0), ("second", 1.3)):
+        block(lambda x, y, z, d=shift: labels(x + d, y + d, z), (54, 58, 54), 2.0).write(folder / f"{name}.nii.gz")
         name_labels(folder / f"{name}.nii.gz", ["csf", "grey matter", "white matter"])
     (folder / "broken.nii.gz").write_bytes(b"this is no image")
     return folder
@@ -90,13 +99,22 @@ def recipe(folder: Path, more: str = VARIED, *, outputs="image labels", format_=
         ("images = 0", "line 1: images is 0, expected a whole number between 1 and"),
         ("images = 5\nimage = 3", "line 2: 'image' is unknown, expected one of images, seed"),
         ("images = 5", r"patients is \[\], expected \[\[patients\]\] with file"),
-        ("images = ", "is not TOML .*line 1|is not TOML"),
+        ("images = ", r"is not TOML \(Invalid value"),
         ("images = 5\noutputs = ['image', 'colour']", "line 2: output 'colour' is unknown, expected image, labels"),
-        ("P\n[display]\ngain_db = {uniform = [-600, 6]}", "line 5: gain_db is -600, expected a number between -200 and"),
-        ("P\n[display]\n\ngain_db = {uniform = [6, -6]}", "line 6: uniform is .6, -6., expected the lower number first"),
-        ("P\n[display]\ngain_db = {uniform = [0, 6], unit = 'mm'}", "line 5: gain_db is in 'mm', expected its unit, 'dB'"),
+        (
+            "P\n[display]\ngain_db = {uniform = [-600, 6]}",
+            "line 5: gain_db is -600, expected a number between -200 and",
+        ),
+        (
+            "P\n[display]\n\ngain_db = {uniform = [6, -6]}",
+            "line 6: uniform is .6.0, -6.0., expected the lower number first",
+        ),
+        (
+            "P\n[display]\ngain_db = {uniform = [0, 6], unit = 'mm'}",
+            "line 5: gain_db is in 'mm', expected its unit, 'dB'",
+        ),
         ("P\n[display]\ngain_db = {about = 3}", "line 5: gain_db is .*expected a number .*or one of {uniform = .low"),
-        ("P\n[display]\ngain_db = {log_uniform = [0, 3]}", "line 5: log_uniform is .*expected more than 0|more than 0"),
+        ("P\n[display]\ngain_db = {log_uniform = [0, 3]}", "line 5: log_uniform is .*expected more than 0"),
         ("P\n[display]\nlook = {uniform = ['even', 'even']}", "look has no uniform distribution, expected {choice"),
         ("P\n[display]\nimage_size = {choice = [[8, 8], [9, 9]]}", "line 5: image_size is .*one value for all images"),
         ("P\n[pose]\nrock_deg = {normal = [0, -1]}", "line 5: the deviation is -1, expected a number from 0 on"),
@@ -105,14 +123,20 @@ def recipe(folder: Path, more: str = VARIED, *, outputs="image labels", format_=
         ("P\n[probe]\nname = 'convexx'", "line 5: name is 'convexx', expected one of phased, convex"),
         ("P\n[probe]\nbeams = 3", "line 5: 'beams' is unknown, expected one of"),
         ("P\n[tissues.'gray matter']\nmu0 = 1", "line 4: 'gray matter' is unknown, expected one of all, coupling, csf"),
-        ("P\n[tissues.all]\nmu0 = {uniform = [0, 200], relative = true}", "line 5: mu0 is 200, expected .*0 and 100"),
+        (
+            "P\n[tissues.all]\nmu0 = {uniform = [0, 200], relative = true}",
+            "line 5: mu0 is 200, expected a number between 0 and 100",
+        ),
         ("P\n[display]\ngain_db = {uniform = [0, 1], relative = true}", "line 5: relative is True, expected true, for"),
         ("P\nlicence = 3", "line 4: licence is 3, expected text"),
         ("P\n[patients.segmentation]\nclasses = 9", "line 5: classes is 9, expected a whole number between 3 and 4"),
         ("P\n[[patients]]\nfiles = 'b'", "line 5: 'files' is unknown, expected one of file"),
         ("P\n[lesions]\neach = 9", "5 images are 5 shards for 9 patients with their lesions, expected one for each"),
         ("P\n[pose]\nrock_deg = 200", "line 5: rock_deg is 200, expected a number between -180 and 180"),
-        ("images = 5\nformat = 'png'\noutputs = ['image', 'rf']", "line 2: format png holds image, .* have rf, expected"),
+        (
+            "images = 5\nformat = 'png'\noutputs = ['image', 'rf']",
+            "line 2: format png holds image, .* have rf, expected",
+        ),
     ],
 )
 def test_a_recipe_names_the_line_and_the_key_of_what_is_wrong(text, says):
@@ -137,7 +161,7 @@ def test_draws_stay_within_bounds_and_have_their_distribution():
 
 
 def test_a_draw_depends_on_seed_image_and_key_alone(folder):
-    plain, more = recipe(folder), recipe(folder, VARIED + "[display.more]\n".replace("[display.more]\n", ""))
+    plain, more = recipe(folder), recipe(folder, f"{VARIED}texture_db = 3.0\n")
     other = recipe(folder, VARIED.replace("rock_deg = {normal = [0, 8]}", "tilt_deg = {normal = [0, 8]}"))
     assert plain.drawn(7) == more.drawn(7) != plain.drawn(8)
     same = set(plain.drawn(7)) & set(other.drawn(7)) - {"pose.rock_deg", "pose.tilt_deg"}
@@ -149,7 +173,7 @@ def test_ready_recipes_are_read_and_name_their_purpose():
     for name in READY:
         made = Recipe.read(name)
         assert made.settings.title and made.settings.images >= 500 and len(made.draws) > 5
-    with pytest.raises(SimulationError, match="none.toml: cannot be read .*or one of brain-tumour, denoising"):
+    with pytest.raises(SimulationError, match=r"none.toml: cannot be read .*or one of brain-tumour, denoising"):
         Recipe.read("none.toml")
 
 
@@ -183,7 +207,7 @@ def test_images_of_a_set_are_those_that_its_parameters_say(plain, folder):
     assert 0.7 <= values["grey matter.mu0"] / TISSUES["grey matter"].mu0 <= 1.4
     assert 0.3 <= values["white matter.attenuation_db_cm_mhz"] <= 0.7
     np.testing.assert_allclose(images[7]["pose"], made.pose(7, drawn))
-    display = replace(making_display(drawn), image_size=(48, 64))
+    display = DisplaySettings(gain_db=drawn["display.gain_db"], image_size=(48, 64))
     with made.simulator.with_tissues(tissues):
         made.simulator.settings = made.settings(drawn)
         probe = recipe(folder).probes[values["probe"]]
@@ -193,15 +217,9 @@ def test_images_of_a_set_are_those_that_its_parameters_say(plain, folder):
     np.testing.assert_allclose(images[7]["image_to_probe"], frame.image_to_probe)
 
 
-def making_display(drawn):
-    from SlicerUSSim.Logic import DisplaySettings
-
-    return DisplaySettings(gain_db=drawn["display.gain_db"])
-
-
 def test_every_output_is_of_the_images_pixels_or_lines(folder, tmp_path):
     names = "image labels depth iq rf envelope bmode clean attenuation travel_time walls"
-    made = recipe(folder, "looks = 2\n"[:0] + '[pose]\non = "surface"\n', outputs=names, format_="hdf5")
+    made = recipe(folder, '[pose]\non = "surface"\n', outputs=names, format_="hdf5")
     making_module.prepare(made, 0, tmp_path)
     arrays, _ = render(made, tmp_path, 1)
     assert set(arrays) == {*names.split(), "pose", "image_to_probe"}
@@ -215,21 +233,23 @@ def test_every_output_is_of_the_images_pixels_or_lines(folder, tmp_path):
     assert 0.1 * depth_cm * mhz < deepest < 0.8 * depth_cm * mhz
     borders = np.diff(arrays["labels"].astype(int), axis=1)[:, :, :-1] != 0
     assert arrays["walls"].max() == pytest.approx(0.03, abs=0.02) and (arrays["walls"][:, :-1, :-1] > 0)[borders].any()
-    np.testing.assert_allclose(np.abs(arrays["rf"]).max(), np.abs(arrays["iq"]).max(), rtol=0.1)
+    assert np.mean(arrays["rf"] ** 2) == pytest.approx(0.5 * np.mean(np.abs(arrays["iq"]) ** 2), rel=0.2)
     roughness = [np.abs(np.diff(arrays[name].astype(float), axis=2)).mean() for name in ("image", "clean")]
-    assert roughness[1] < 0.5 * roughness[0] and arrays["clean"].mean() == pytest.approx(arrays["image"].mean(), rel=0.1)
+    assert roughness[1] < 0.7 * roughness[0] and arrays["clean"].mean() == pytest.approx(
+        arrays["image"].mean(), rel=0.1
+    )
 
 
 @pytest.mark.parametrize("on", ["craniotomy", "view", "path", "sequence", "lesion"])
 def test_poses_stand_where_the_recipe_says(folder, tmp_path, on):
-    more, within = f'[pose]\non = "{on}"\n', 3.0
+    more = f'[pose]\non = "{on}"\n'
     if on == "path":
         points = [{"position": [x, 0.0, 50.0]} for x in (-30, 0, 30)]
         markup = {"type": "Curve", "coordinateSystem": "RAS", "controlPoints": points}
         (folder / "curve.mrk.json").write_text(json.dumps({"markups": [markup]}))
         more += 'file = "curve.mrk.json"\n'
     if on == "sequence":
-        poses = [making_pose(x) for x in (0.0, 5.0)]
+        poses = [pose_looking_at((x, 0, 50), (x, 0, 0)) for x in (0.0, 5.0)]
         transforms = tuple({"ProbeToReference": pose} for pose in poses)
         TrackedSequence(np.zeros((2, 8, 8), np.uint8), transforms, [0.0, 1.0]).write(folder / "s.igs.mha")
         more += 'file = "s.igs.mha"\n'
@@ -245,7 +265,7 @@ def test_poses_stand_where_the_recipe_says(folder, tmp_path, on):
     if on == "sequence":
         np.testing.assert_allclose(faces[[0, 1, 2], 0], [0.0, 5.0, 0.0])
     else:
-        assert max(away) < within
+        assert max(away) < 3.0
     if on == "path":
         assert np.diff(faces[:, 0]) == pytest.approx([1.0, 1.0], abs=0.3) or np.diff(faces[:, 0]).max() < 0
     if on == "lesion":
@@ -257,15 +277,10 @@ def test_poses_stand_where_the_recipe_says(folder, tmp_path, on):
         assert (other.simulator.medium.labels.array != labels.array).any()
 
 
-def making_pose(x: float) -> np.ndarray:
-    from SlicerUSSim.Logic.probe import pose_looking_at
-
-    return pose_looking_at((x, 0, 50), (x, 0, 0))
-
-
 def test_ventricles_are_a_label_of_their_own(tmp_path):
-    text = 'images = 2\n[[patients]]\nfile = "synthetic"\nventricles = true\n[display]\nimage_size = [48, 64]\n'
-    made = make_dataset(Recipe.of_text(text + '[settings]\nquality = "draft"\n'), tmp_path / "set", workers=1)
+    head_mri(3.0).write(tmp_path / "head.nii.gz")
+    text = 'images = 2\n[[patients]]\nfile = "head.nii.gz"\nventricles = true\n[display]\nimage_size = [48, 64]\n'
+    made = make_dataset(Recipe.of_text(text, folder=tmp_path), tmp_path / "set", workers=1)
     labels = SimulatedImages(made.folder)[0]["labels"]
     assert "ventricle" in made.folder.joinpath("README.md").read_text()
     assert (labels == CLASSES.index("ventricle")).any()
@@ -315,7 +330,9 @@ def test_a_patient_that_cannot_be_read_is_left_out_and_listed(folder, tmp_path):
     text = START.format(outputs='"image"', format="zarr", file="brain.nii.gz")
     text += '[[patients]]\nfile = "broken.nii.gz"\n[[patients]]\nfile = "second.nii.gz"\n'
     (folder / "three.toml").write_text(text)
-    result = CliRunner().invoke(main, ["dataset", str(folder / "three.toml"), "-o", str(tmp_path / "s"), "--workers", "1"])
+    result = CliRunner().invoke(
+        main, ["dataset", str(folder / "three.toml"), "-o", str(tmp_path / "s"), "--workers", "1"]
+    )
     assert result.exit_code == 1 and "left out: " in result.stderr and "broken.nii.gz" in result.stderr
     images = SimulatedImages(tmp_path / "s")
     assert len(images) == 8 and "broken.nii.gz" in (tmp_path / "s" / "README.md").read_text()
@@ -329,15 +346,19 @@ def test_a_patient_that_cannot_be_read_is_left_out_and_listed(folder, tmp_path):
     ("more", "says"),
     [
         ('[pose]\naim = "tumour"\n', r"aim is 'tumour', which is not labelled, expected one of csf, grey matter"),
-        ("[lesions]\neach = 1\ndepth_mm = 80\n", r"depth_mm is 80, and the brain has no tissue so deep, expected at most"),
-        ('[pose]\non = "surface"\nwithin_deg = 1\n', r"within_deg is 1, and the surface has no point so near to its top"),
+        (
+            "[lesions]\neach = 1\ndepth_mm = 80\n",
+            r"depth_mm is 80, and the brain has no tissue so deep, expected at most",
+        ),
+        (
+            '[pose]\non = "surface"\nwithin_deg = 0.001\n',
+            r"within_deg is 0.001, and the surface has no point so near to its top",
+        ),
     ],
 )
 def test_what_a_patient_has_not_is_said_and_no_image_is_made(folder, tmp_path, more, says):
-    made = make_dataset(recipe(folder, more), tmp_path / "s", workers=1)
-    assert made.progress.done == 0
-    with pytest.raises(AssertionError if "surface" in more and made.skipped == {} else SimulationError, match=says):
-        raise SimulationError(made.skipped["brain.nii.gz"])
+    made = make_dataset(recipe(folder, more, file="second.nii.gz"), tmp_path / "s", workers=1)
+    assert made.progress.done == 0 and re.search(says, made.skipped["second.nii.gz"])
 
 
 def test_a_full_disk_ends_the_run_in_one_line(folder, tmp_path, monkeypatch):
@@ -346,7 +367,9 @@ def test_a_full_disk_ends_the_run_in_one_line(folder, tmp_path, monkeypatch):
 
     monkeypatch.setattr("SlicerUSSim.Logic.datasets.writers._zarr", full)
     (folder / "one.toml").write_text(recipe(folder).text)
-    result = CliRunner().invoke(main, ["dataset", str(folder / "one.toml"), "-o", str(tmp_path / "s"), "--workers", "1"])
+    result = CliRunner().invoke(
+        main, ["dataset", str(folder / "one.toml"), "-o", str(tmp_path / "s"), "--workers", "1"]
+    )
     assert result.exit_code == 2 and "shard 0 cannot be written (No space left on device)" in result.stderr
     assert not record_path(tmp_path / "s", 0).exists()
 
@@ -374,7 +397,9 @@ def test_exports_are_what_coco_and_nnunet_read(plain):
 
 def test_without_a_package_one_line_says_which_extra_to_install(folder, tmp_path, monkeypatch):
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None if name == "zarr" else name)
-    with pytest.raises(SimulationError, match=r"format zarr needs SlicerUSSim\[datasets\]; install it with: pip install"):
+    with pytest.raises(
+        SimulationError, match=r"format zarr needs SlicerUSSim\[datasets\]; install it with: pip install"
+    ):
         make_dataset(recipe(folder), tmp_path / "s", workers=1)
 
 
@@ -411,10 +436,14 @@ def killing_task(out: str, files: str, shard: int) -> tuple[int, float]:
 
 @pytest.mark.slow
 def test_two_thousand_images_survive_a_killed_worker(folder, tmp_path, distributed):
-    many = Recipe.of_text(recipe(folder).text.replace("images = 12", "images = 2000").replace("shard = 4", ""), folder=folder)
+    many = Recipe.of_text(
+        recipe(folder).text.replace("images = 12", "images = 2000").replace("shard = 4", ""), folder=folder
+    )
     for name, workers, task in (("one", 1, making_module.render_task), ("two", 2, killing_task)):
         assert make_dataset(many, tmp_path / name, workers=workers, task=task).progress.done == 2000
-    assert (tmp_path / "two" / "patients" / "killed").exists() and checksum(tmp_path / "one") == checksum(tmp_path / "two")
+    assert (tmp_path / "two" / "patients" / "killed").exists() and checksum(tmp_path / "one") == checksum(
+        tmp_path / "two"
+    )
 
 
 def slow_task(out: str, files: str, shard: int) -> tuple[int, float]:
@@ -440,7 +469,7 @@ def test_a_scheduler_that_is_gone_is_reported_within_ten_seconds(plain, folder, 
     try:
         while not file.exists():
             time.sleep(0.1)
-        with pytest.raises(SimulationError, match="the scheduler is gone .*the same command goes on"):
+        with pytest.raises(SimulationError, match=r"the scheduler is gone .*the same command goes on"):
             make_dataset(recipe(folder), tmp_path / "s", scheduler=str(file), progress=end, task=slow_task)
         assert time.perf_counter() - gone[0] < 10.0
     finally:
@@ -452,7 +481,7 @@ def test_a_scheduler_that_is_gone_is_reported_within_ten_seconds(plain, folder, 
 
 
 def test_a_scheduler_that_does_not_answer_is_one_line(folder, tmp_path, distributed):
-    with pytest.raises(SimulationError, match="no scheduler answers at tcp://127.0.0.1:9"):
+    with pytest.raises(SimulationError, match=r"no scheduler answers at tcp://127.0.0.1:9"):
         make_dataset(recipe(folder), tmp_path / "s", scheduler="tcp://127.0.0.1:9")
-    with pytest.raises(SimulationError, match="--scheduler is 'nowhere.json', expected tcp://HOST:PORT, or"):
+    with pytest.raises(SimulationError, match=r"--scheduler is 'nowhere.json', expected tcp://HOST:PORT, or"):
         make_dataset(recipe(folder), tmp_path / "t", scheduler="nowhere.json")

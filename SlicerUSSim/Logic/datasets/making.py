@@ -244,33 +244,34 @@ def _cluster(scheduler: str | None, workers: int | None) -> Iterator[Any]:
 
 
 def _completed(client: Any, work: tuple[Callable, Iterator[int]], waiting: dict[Any, int]) -> Iterator[tuple[Any, int]]:
-    """(future, shard) of shards as they are done; the others are cancelled if the loop ends before.
+    """(future, shard) of shards as they are done; `waiting` are those that are not.
 
     Raises SimulationError if the scheduler is gone.
     """
     task, shards = work
-    asked = perf_counter()
+    asked, threads = -_ASKED_EVERY_S, 0
     try:
         while True:
-            for shard in islice(shards, max(2 * sum(client.nthreads().values()), 4) - len(waiting)):
+            if perf_counter() - asked > _ASKED_EVERY_S:
+                about = client.sync(client.scheduler.identity, n_workers=-1, callback_timeout=_ANSWER_S)
+                asked, threads = perf_counter(), sum(one["nthreads"] for one in about["workers"].values())
+            for shard in islice(shards, max(2 * threads, 4) - len(waiting)):
                 waiting[client.submit(task, shard, key=f"shard-{uuid4().hex}", pure=False)] = shard
             if not waiting:
                 return
             done = [future for future in waiting if future.done()]
             for future in done:
+                if future.cancelled():  # by a connection that was lost
+                    raise CancelledError("it has lost a shard")
                 yield future, waiting.pop(future)
             if not done:
                 sleep(0.02)
-            if perf_counter() - asked > _ASKED_EVERY_S:
-                client.sync(client.scheduler.identity, callback_timeout=_ANSWER_S)
-                asked = perf_counter()
     except (OSError, TimeoutError, CancelledError) as error:
         raise SimulationError(
             f"the scheduler is gone ({_first_line(error)}); what is written stays, and the same command goes on"
         ) from None
     finally:
-        with suppress(Exception):
-            client.cancel(list(waiting))
+        waiting.clear()  # which takes the tasks back
 
 
 def _of_worker(error: BaseException, shard: int) -> BaseException:

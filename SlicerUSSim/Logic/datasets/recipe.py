@@ -93,7 +93,7 @@ class PoseSettings(Declared):
     file: str = parameter("", "File", "Curve (.mrk.json) of a path, or tracked sequence")
     transform: str = parameter("ProbeToReference", "Transform", "Pose of the probe in a tracked sequence")
     within_deg: float = parameter(
-        90.0, "Within", "Of the surface, so far from the top of the head", unit="°", bounds=(1, 180)
+        90.0, "Within", "Of the surface, so far from the top of the head", unit="°", bounds=(0, 180)
     )
     aim: str = parameter("", "Aim", "Tissue at whose innermost place the probe looks")
     right_deg: float = parameter(0.0, "Right", "Moved over the surface to the right", **_DEGREES)

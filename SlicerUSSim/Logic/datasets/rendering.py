@@ -94,7 +94,7 @@ class Scene:
             pose = aimed_at(pose, self.target)
         pose = turned(pose, rock_deg=rock, tilt_deg=tilt, rotate_deg=rotate)
         pose[:3, 3] -= drawn["pose.lift_mm"] * pose[:3, 1]
-        return pose
+        return pose.astype(np.float32).astype(float)  # as it is written
 
     def settings(self, drawn: Mapping[str, Any]) -> SimulationSettings:
         """The simulation's settings of an image."""
@@ -187,7 +187,7 @@ def render(recipe: Recipe, out: Path, shard: int) -> tuple[dict[str, np.ndarray]
     """({output: array}, the parameters of each image) of a shard, (images, ...) in their order.
 
     Labels are places in CLASSES, which are the same for all patients. Besides the recipe's outputs there are "pose",
-    (4, 4) probe_to_ras, and "image_to_probe", (4, 4) from (column, row, 0, 1) to the probe's millimetres, float64.
+    (4, 4) probe_to_ras, and "image_to_probe", (4, 4) from (column, row, 0, 1) to the probe's millimetres, float32.
     """
     numbers = recipe.images_of(shard)
     made = scene(recipe, out, recipe.case_of(shard))
@@ -233,7 +233,8 @@ def render(recipe: Recipe, out: Path, shard: int) -> tuple[dict[str, np.ndarray]
         for name in simulated if name in wanted
     }  # fmt: skip
     arrays |= {name: np.stack(values) for name, values in more.items()}
-    arrays |= {"pose": np.stack(poses), "image_to_probe": np.stack([grid.image_to_probe for grid in grids])}
+    arrays["pose"] = np.stack(poses).astype(np.float32)
+    arrays["image_to_probe"] = np.stack([grid.image_to_probe for grid in grids]).astype(np.float32)
     back = np.argsort(order)
     arrays = {name: values[back] for name, values in arrays.items()}
     return arrays, [{"image": number, **values} for number, values in zip(numbers, parameters, strict=True)]

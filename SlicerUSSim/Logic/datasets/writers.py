@@ -131,8 +131,8 @@ def read_arrays(out: Path, format_: str, shard: int, numbers: range, names: tupl
         read = {name: TrackedSequence.read(out / f"{name}-{shard:06d}.igs.mha") for name in pictures}
         first = next(iter(read.values()))
         found: dict[str, Any] = {name: sequence.images for name, sequence in read.items()}
-        found["pose"] = np.stack([first.transforms[n]["ProbeToReference"] for n in range(len(first))])
-        found["image_to_probe"] = np.stack([first.transforms[n]["ImageToProbe"] for n in range(len(first))])
+        for name, transform in zip(_GEOMETRY, ("ProbeToReference", "ImageToProbe"), strict=True):
+            found[name] = np.stack([each[transform] for each in first.transforms]).astype(np.float32)
         return {name: found[name] for name in names}
     from PIL import Image
 
@@ -141,4 +141,4 @@ def read_arrays(out: Path, format_: str, shard: int, numbers: range, names: tupl
         for name in pictures
     }
     texts = [json.loads((out / "parameters" / f"{number:08d}.json").read_text()) for number in numbers]
-    return found | {name: np.array([text[name] for text in texts]) for name in names if name in _GEOMETRY}
+    return found | {name: np.array([text[name] for text in texts], np.float32) for name in names if name in _GEOMETRY}
