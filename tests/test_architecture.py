@@ -39,6 +39,10 @@ HEAVY = {
     "skimage": set(),
     "nlopt": set(),
     "slicer": {"mrml", "module", "Widget", "Workstation"},
+    "distributed": set(),
+    "zarr": set(),
+    "h5py": set(),
+    "gymnasium": {"gym"},
 }
 #: Lines of Python that a room, or a folder beside the product, may have. Raising one is a decision: the commit says
 #: what users get for it.
@@ -181,7 +185,7 @@ def room_of(module: str) -> str:
         return PACKAGE
     if parts[0] == "Logic":
         return parts[1] if len(parts) > 1 else "Logic"
-    return parts[0] if parts[0] in ("Widget", "Workstation", "Command") else "module"
+    return parts[0] if parts[0] in ("Widget", "Workstation", "Command", "gym") else "module"
 
 
 def _called(node: ast.Call) -> str:

@@ -12,7 +12,7 @@ from SlicerUSSim.Command.options import device_option, out_option
 from SlicerUSSim.Command.progress import Share, note
 
 if TYPE_CHECKING:
-    from SlicerUSSim.Logic.datasets.making import Progress
+    from SlicerUSSim.Logic.datasets.making import Made
 
 _EXPORTS = ("coco", "nnunet")
 
@@ -20,9 +20,9 @@ _EXPORTS = ("coco", "nnunet")
 class _Rate(Share):
     """A progress bar with images per second and the time left."""
 
-    def __call__(self, progress: Progress) -> None:  # type: ignore[override]
-        self._show(f"{'dataset: ' if self.bar.disable else ''}{progress}")
-        super().__call__(progress.done / progress.images)
+    def __call__(self, made: Made) -> None:  # type: ignore[override]
+        self._show(f"{'dataset: ' if self.bar.disable else ''}{made}")
+        super().__call__(made.done / made.images)
 
 
 @click.command()
@@ -63,5 +63,5 @@ def dataset(
     if export is not None:
         note(f"wrote {(export_coco if export == 'coco' else export_nnunet)(out)}")
     memory = f", at most {made.peak_mb:.0f} MB in a process" if made.peak_mb else ""
-    note(f"wrote {out} ({made.progress.done} images, {made.progress.rate:.1f} images/s{memory})")
+    note(f"wrote {out} ({made.done} images, {made.rate:.1f} images/s{memory})")
     ctx.exit(1 if made.skipped else 0)

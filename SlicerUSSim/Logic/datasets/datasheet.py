@@ -47,7 +47,8 @@ def write_datasheet(recipe: Recipe, out: Path, skipped: Mapping[str, str]) -> No
     manifest = {
         "title": settings.title, "licence": settings.licence, "seed": settings.seed, "format": settings.format,
         "images": settings.images, "made": made, "shard": recipe.shard, "checksum": digest,
-        "recipe_sha256": recipe.digest, "outputs": {name: OUTPUTS[name] for name in settings.outputs},
+        "recipe_sha256": hashlib.sha256(recipe.text.encode()).hexdigest(),
+        "outputs": {name: OUTPUTS[name] for name in settings.outputs},
         "labels": {str(n): name for n, name in enumerate(CLASSES) if name in tissues},
         "patients": _patients(recipe, out, skipped),
         "made_by": sorted(makers), "devices": sorted(devices), "versions": _versions(),

@@ -14,11 +14,11 @@ import numpy as np
 from SlicerUSSim.Logic.base.errors import require
 from SlicerUSSim.Logic.base.files import read_json
 from SlicerUSSim.Logic.datasets.datasheet import MANIFEST
-from SlicerUSSim.Logic.datasets.writers import checksums, read_arrays, record_path
+from SlicerUSSim.Logic.datasets.writers import GEOMETRY, checksums, read_arrays, record_path
 
 
 class SimulatedImages:
-    """The images of a set: a map-style dataset of PyTorch, which need not be installed.
+    """The images of a set in Zarr or HDF5: a map-style dataset of PyTorch, which need not be installed.
 
     Item n is {output: array}, with "pose", "image_to_probe" and "number", the number of the image.
 
@@ -39,23 +39,17 @@ class SimulatedImages:
         self.folder, self.transform = Path(folder), transform
         require((self.folder / MANIFEST).exists(), f"{folder}: has no {MANIFEST}, expected a set of `ussim dataset`")
         self.manifest = read_json(self.folder / MANIFEST, most_bytes=2**30)
-        known = list(self.manifest["outputs"])
+        shards, known = self.manifest["shards"], list(self.manifest["outputs"])
         self.outputs = tuple(known if outputs is None else outputs)
-        for name in self.outputs:
-            require(name in known, f"{folder}: has no output {name!r}, expected some of {', '.join(known)}")
-        every = {one["patient"] for one in self.manifest["shards"].values()}
-        for name in patients or ():
-            require(name in every, f"{folder}: has no patient {name!r}, expected some of {', '.join(sorted(every))}")
-        self._shards = [
-            (int(shard), range(*one["images"])) for shard, one in self.manifest["shards"].items()
-            if patients is None or one["patient"] in patients
-        ]  # fmt: skip
+        every = sorted({one["patient"] for one in shards.values()})
+        for kind, wanted, there in (("output", self.outputs, known), ("patient", patients or (), every)):
+            for name in wanted:
+                require(name in there, f"{folder}: has no {kind} {name!r}, expected some of {', '.join(there)}")
+        kept = {shard: one for shard, one in shards.items() if patients is None or one["patient"] in patients}
+        self._shards = [(int(shard), range(*one["images"])) for shard, one in kept.items()]
         self._ends = np.cumsum([len(numbers) for _, numbers in self._shards]).tolist()
-
-    @property
-    def labels(self) -> dict[int, str]:
-        """{label: tissue}."""
-        return {int(label): name for label, name in self.manifest["labels"].items()}
+        #: {label: tissue}
+        self.labels: dict[int, str] = {int(label): name for label, name in self.manifest["labels"].items()}
 
     def __len__(self) -> int:
         return self._ends[-1] if self._ends else 0
@@ -63,38 +57,30 @@ class SimulatedImages:
     def __getitem__(self, index: int) -> Any:
         if not -len(self) <= index < len(self):
             raise IndexError(f"image {index} of {len(self)}")
-        index %= len(self)
-        place = bisect_right(self._ends, index)
+        place = bisect_right(self._ends, index % len(self))
         shard, numbers = self._shards[place]
-        within = index - (self._ends[place] - len(numbers))
-        number = numbers[within]
-        names = (*self.outputs, "pose", "image_to_probe")
-        if self.manifest["format"] in ("zarr", "png"):  # which read one image as fast as its part of a shard
-            arrays = read_arrays(self.folder, self.manifest["format"], shard, range(number, number + 1), names)
-            within = 0
+        number, within = numbers[index % len(self) - self._ends[place]], 0  # from the end of the shard
+        form, names = self.manifest["format"], (*self.outputs, *GEOMETRY)
+        if form == "hdf5":
+            arrays, within = _shard(self.folder, form, shard, numbers, names), number - numbers.start
         else:
-            arrays = _shard(str(self.folder), self.manifest["format"], shard, numbers, names)
+            arrays = read_arrays(self.folder, form, shard, range(number, number + 1), names)
         item = {name: values[within] for name, values in arrays.items()} | {"number": number}
         return item if self.transform is None else self.transform(item)
 
     def parameters(self) -> list[dict[str, Any]]:
         """What was drawn for each image, in their order."""
-        return [
-            one for shard, _ in self._shards
-            for one in read_json(record_path(self.folder, shard), most_bytes=2**30)["parameters"]
-        ]  # fmt: skip
+        records = (read_json(record_path(self.folder, shard), most_bytes=2**30) for shard, _ in self._shards)
+        return [one for record in records for one in record["parameters"]]
 
     def damaged(self) -> list[int]:
         """The shards whose arrays have not the checksums of the manifest."""
-        found = []
-        for shard, numbers in self._shards:
-            wanted = self.manifest["shards"][str(shard)]["checksums"]
-            arrays = read_arrays(self.folder, self.manifest["format"], shard, numbers, tuple(wanted))
-            if checksums(arrays) != wanted:
-                found.append(shard)
-        return found
+        wanted = {shard: self.manifest["shards"][str(shard)]["checksums"] for shard, _ in self._shards}
+        form = self.manifest["format"]
+        return [
+            shard for shard, numbers in self._shards
+            if checksums(read_arrays(self.folder, form, shard, numbers, tuple(wanted[shard]))) != wanted[shard]
+        ]  # fmt: skip
 
 
-@lru_cache(maxsize=4)
-def _shard(folder: str, format_: str, shard: int, numbers: range, names: tuple[str, ...]) -> dict[str, np.ndarray]:
-    return read_arrays(Path(folder), format_, shard, numbers, names)
+_shard = lru_cache(maxsize=4)(read_arrays)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import re
 import sys
 from collections.abc import Collection, Iterator, Mapping
@@ -57,14 +56,10 @@ class SetSettings(Declared):
     """What a recipe says before its tables."""
 
     images: int = parameter(label="Images", tip="Number of images", bounds=(1, 10**9))
-    seed: int = parameter(
-        0, "Seed", "With its number the seed of all that is drawn for an image", bounds=(0, 2**32 - 1)
-    )
+    seed: int = parameter(0, "Seed", "Seed of all that is drawn", bounds=(0, 2**32 - 1))
     outputs: tuple[str, ...] = parameter(("image", "labels"), "Outputs", "What is kept of every image")
     format: str = parameter("zarr", "Format", "Format of the files", choices=FORMATS)
-    shard: int | None = parameter(
-        None, "Shard", "Images of a task and file; none: up to 64", bounds=(1, 100_000), can_be_none=True
-    )
+    shard: int | None = parameter(None, "Shard", "Images of a file; none: up to 64", bounds=(1, 100_000))
     looks: int = parameter(16, "Looks", "Images of which a clean one is the mean", bounds=(2, 256))
     title: str = parameter("Simulated ultrasound", "Title", "Title of the set")
     licence: str = parameter("", "Licence", "Licence of the set")
@@ -92,9 +87,7 @@ class PoseSettings(Declared):
     view: str = parameter("temporal", "View", "Standard view", choices=tuple(VIEWS))
     file: str = parameter("", "File", "Curve (.mrk.json) of a path, or tracked sequence")
     transform: str = parameter("ProbeToReference", "Transform", "Pose of the probe in a tracked sequence")
-    within_deg: float = parameter(
-        90.0, "Within", "Of the surface, so far from the top of the head", unit="°", bounds=(0, 180)
-    )
+    within_deg: float = parameter(90.0, "Within", "Of the surface, so far from its top", unit="°", bounds=(0, 180))
     aim: str = parameter("", "Aim", "Tissue at whose innermost place the probe looks")
     right_deg: float = parameter(0.0, "Right", "Moved over the surface to the right", **_DEGREES)
     front_deg: float = parameter(0.0, "Front", "Moved over the surface to the front", **_DEGREES)
@@ -170,9 +163,8 @@ class Recipe:
         return _Reader(text, source, folder or Path()).recipe()
 
     @property
-    def digest(self) -> str:
-        """SHA-256 of its text."""
-        return hashlib.sha256(self.text.encode()).hexdigest()
+    def _variants(self) -> int:
+        return self.lesions.each if self.lesions else 1
 
     @cached_property
     def shard(self) -> int:
@@ -181,13 +173,8 @@ class Recipe:
         rows, columns = self.draws["display.image_size"].values[0]
         signals = len({"iq", "rf", "envelope", "bmode"} & set(s.outputs))
         image_bytes = 4 * rows * columns * (len(s.outputs) - signals) + _SIGNAL_BYTES * signals
-        fewest = s.images // (len(self.patients) * self.variants)
+        fewest = s.images // (len(self.patients) * self._variants)
         return s.shard or max(min(_MOST_PER_SHARD, fewest, int(_SHARD_BYTES / image_bytes)), 1)
-
-    @property
-    def variants(self) -> int:
-        """Lesions of a patient."""
-        return self.lesions.each if self.lesions else 1
 
     @property
     def shards(self) -> int:
@@ -201,7 +188,7 @@ class Recipe:
     @cached_property
     def cases(self) -> tuple[Case, ...]:
         """Patients and lesions in their order; each has one shard at least."""
-        shares = [patient.share / self.variants for patient in self.patients for _ in range(self.variants)]
+        shares = [patient.share / self._variants for patient in self.patients for _ in range(self._variants)]
         ends = [round(sum(shares[: n + 1]) / sum(shares) * self.shards) for n in range(len(shares))]
         starts = [0, *ends[:-1]]
         require(
@@ -209,7 +196,7 @@ class Recipe:
             f"{self.settings.images} images are {self.shards} shards for {len(ends)} patients with their lesions, "
             "expected one for each at least; lower shard, or make more images",
         )
-        return tuple(Case(n, n // self.variants, *both) for n, both in enumerate(zip(starts, ends, strict=True)))
+        return tuple(Case(n, n // self._variants, *both) for n, both in enumerate(zip(starts, ends, strict=True)))
 
     def case_of(self, shard: int) -> Case:
         """The case of a shard."""
@@ -226,21 +213,23 @@ class Recipe:
     @cached_property
     def probes(self) -> tuple[Probe, ...]:
         """The probes of the set; one if none of their values is drawn."""
-        draws = {key.removeprefix("probe."): draw for key, draw in self.draws.items() if key.startswith("probe.")}
-        count = 1 if all(draw.is_fixed for draw in draws.values()) else PROBE_POOL
+        is_fixed = all(draw.is_fixed for key, draw in self.draws.items() if key.startswith("probe."))
         found = []
-        for number in range(count):
-            values = {name: draw(generator(self.settings.seed, number, f"pool {name}")) for name, draw in draws.items()}
+        for number in range(1 if is_fixed else PROBE_POOL):
+            values = self._of_section("probe", number)
             preset = Preset(PROBES[values.pop("name", "phased")])
             found.append(preset.changed("probe", **values).probe if values else preset.probe)
         return tuple(found)
 
     def lesion(self, case: Case) -> dict[str, Any]:
         """The drawn values of the lesion of a case."""
-        draws = {key.removeprefix("lesions."): draw for key, draw in self.draws.items() if key.startswith("lesions.")}
+        return self._of_section("lesions", case.number)
+
+    def _of_section(self, section: str, number: int) -> dict[str, Any]:
         return {
-            name: draw(generator(self.settings.seed, case.number, f"lesion {name}")) for name, draw in draws.items()
-        }
+            key.partition(".")[2]: draw(generator(self.settings.seed, number, f"of {key}"))
+            for key, draw in self.draws.items() if key.startswith(f"{section}.")
+        }  # fmt: skip
 
 
 class _Reader:

@@ -7,11 +7,10 @@ import json
 from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from SlicerUSSim.Logic.base.errors import SimulationError, require_package
+from SlicerUSSim.Logic.base.errors import SimulationError, require, require_package
 from SlicerUSSim.Logic.base.files import make_folder, write_json, written_whole
 from SlicerUSSim.Logic.datasets.recipe import Recipe
 from SlicerUSSim.Logic.imaging.figures import write_png
@@ -20,16 +19,16 @@ from SlicerUSSim.Logic.tracked.sequence import SIMULATED, TrackedSequence
 EXTRA = "SlicerUSSim[datasets]"
 #: The recipe in the folder of its set
 RECIPE = "recipe.toml"
-#: {format: (module, its package)} that it needs
-_NEEDS = {"zarr": ("zarr", EXTRA), "hdf5": ("h5py", EXTRA)}
+#: {format: the module that it needs}
+_NEEDS = {"zarr": "zarr", "hdf5": "h5py"}
 #: Written with every image
-_GEOMETRY = ("pose", "image_to_probe")
+GEOMETRY = ("pose", "image_to_probe")
 
 
 def require_format(recipe: Recipe) -> None:
     """Raise SimulationError that names the extra to install if the recipe's format needs a package that is missing."""
     if recipe.settings.format in _NEEDS:
-        require_package(*_NEEDS[recipe.settings.format], f"format {recipe.settings.format}")
+        require_package(_NEEDS[recipe.settings.format], EXTRA, f"format {recipe.settings.format}")
 
 
 def record_path(out: Path, shard: int) -> Path:
@@ -42,10 +41,9 @@ def write_shard(recipe: Recipe, out: Path, shard: int, arrays: Mapping[str, np.n
 
     Raises SimulationError if a file cannot be written, as on a full disk.
     """
+    write = {"zarr": _zarr, "hdf5": _hdf5, "png": _png, "tracked": _tracked}[recipe.settings.format]
     try:
-        {"zarr": _zarr, "hdf5": _hdf5, "png": _png, "tracked": _tracked}[recipe.settings.format](
-            recipe, out, shard, arrays, record
-        )
+        write(recipe, out, shard, arrays, record)
         make_folder(record_path(out, shard).parent)
         write_json(record_path(out, shard), record | {"checksums": checksums(arrays)})
     except OSError as error:
@@ -62,14 +60,13 @@ def _zarr(recipe: Recipe, out: Path, shard: int, arrays: Mapping[str, np.ndarray
     import zarr
     from zarr.errors import ContainsArrayError
 
-    numbers = recipe.images_of(shard)
-    path = out / "images.zarr"
+    numbers, path = recipe.images_of(shard), out / "images.zarr"
     for name, values in arrays.items():
         if not (path / name / "zarr.json").exists():  # another worker may write the same at the same time
-            if not (path / "zarr.json").exists():
-                zarr.open_group(path, mode="a", zarr_format=3)
-            inner = values.shape[1:]
-            shape, chunks, shards = ((first, *inner) for first in (recipe.settings.images, 1, recipe.shard))
+            zarr.open_group(path, mode="a", zarr_format=3)
+            shape, chunks, shards = (
+                (first, *values.shape[1:]) for first in (recipe.settings.images, 1, recipe.shard)
+            )  # fmt: skip
             with suppress(ContainsArrayError):
                 zarr.create_array(path, name=name, shape=shape, chunks=chunks, shards=shards, dtype=values.dtype)
         zarr.open_array(path, path=name, mode="r+")[numbers.start : numbers.stop] = values
@@ -79,66 +76,48 @@ def _hdf5(recipe: Recipe, out: Path, shard: int, arrays: Mapping[str, np.ndarray
     """A file per shard with a dataset per output, compressed by image."""
     import h5py
 
-    with written_whole(out / f"shard-{shard:06d}.h5") as partial, h5py.File(partial, "w") as file:
+    with written_whole(_h5(out, shard)) as partial, h5py.File(partial, "w") as file:
         for name, values in arrays.items():
-            file.create_dataset(
-                name, data=values, chunks=(1, *values.shape[1:]), compression="gzip", compression_opts=1
-            )
-        file.attrs["images"] = [recipe.images_of(shard).start, recipe.images_of(shard).stop]
+            chunks = (1, *values.shape[1:])
+            file.create_dataset(name, data=values, chunks=chunks, compression="gzip", compression_opts=1)
+
+
+def _h5(out: Path, shard: int) -> Path:
+    return out / f"shard-{shard:06d}.h5"
 
 
 def _png(recipe: Recipe, out: Path, shard: int, arrays: Mapping[str, np.ndarray], record: dict) -> None:
     """A picture per image and output, and its pose and parameters as JSON."""
     for place, number in enumerate(recipe.images_of(shard)):
-        for name in set(arrays) - set(_GEOMETRY):
+        for name in set(arrays) - set(GEOMETRY):
             write_png(make_folder(out / name) / f"{number:08d}.png", arrays[name][place])
-        geometry = {name: arrays[name][place].tolist() for name in _GEOMETRY}
+        geometry = {name: arrays[name][place].tolist() for name in GEOMETRY}
         write_json(make_folder(out / "parameters") / f"{number:08d}.json", record["parameters"][place] | geometry)
 
 
 def _tracked(recipe: Recipe, out: Path, shard: int, arrays: Mapping[str, np.ndarray], record: dict) -> None:
     """A tracked sequence per shard and output."""
-    transforms = tuple(
-        {"ProbeToReference": pose, "ImageToProbe": matrix}
-        for pose, matrix in zip(arrays["pose"], arrays["image_to_probe"], strict=True)
-    )
-    numbers = recipe.images_of(shard)
+    geometry = zip(*(arrays[name] for name in GEOMETRY), strict=True)
+    transforms = tuple({"ProbeToReference": pose, "ImageToProbe": matrix} for pose, matrix in geometry)
     texts = tuple({"Parameters": json.dumps(one, separators=(",", ":"))} for one in record["parameters"])
-    for name in set(arrays) - set(_GEOMETRY):
-        sequence = TrackedSequence(
-            arrays[name], transforms, np.arange(numbers.start, numbers.stop, dtype=float),
-            fields={SIMULATED: "dataset"}, frame_fields=texts,
-        )  # fmt: skip
-        sequence.write(out / f"{name}-{shard:06d}.igs.mha")
+    times = np.array(recipe.images_of(shard), float)
+    for name in set(arrays) - set(GEOMETRY):
+        about = {"fields": {SIMULATED: "dataset"}, "frame_fields": texts}
+        TrackedSequence(arrays[name], transforms, times, **about).write(out / f"{name}-{shard:06d}.igs.mha")
 
 
-def read_arrays(out: Path, format_: str, shard: int, numbers: range, names: tuple[str, ...]) -> dict[str, np.ndarray]:
-    """{output: (images, ...)} of a shard as it was written."""
-    if format_ == "zarr":
+def read_arrays(out: Path, form: str, shard: int, numbers: range, names: tuple[str, ...]) -> dict[str, np.ndarray]:
+    """{output: (images, ...)} of a shard as it was written, of Zarr only those with these numbers.
+
+    Raises SimulationError for a format of pictures.
+    """
+    require(form in _NEEDS, f"{out}: has the format {form}, which other programs read, expected {' or '.join(_NEEDS)}")
+    if form == "zarr":
         import zarr
 
-        return {
-            name: np.asarray(zarr.open_array(out / "images.zarr", path=name, mode="r")[numbers.start : numbers.stop])
-            for name in names
-        }
-    if format_ == "hdf5":
-        import h5py
+        part = slice(numbers.start, numbers.stop)
+        return {name: np.asarray(zarr.open_array(out / "images.zarr", path=name, mode="r")[part]) for name in names}
+    import h5py
 
-        with h5py.File(out / f"shard-{shard:06d}.h5", "r") as file:
-            return {name: np.array(file[name]) for name in names}
-    pictures = [name for name in names if name not in _GEOMETRY]
-    if format_ == "tracked":
-        read = {name: TrackedSequence.read(out / f"{name}-{shard:06d}.igs.mha") for name in pictures}
-        first = next(iter(read.values()))
-        found: dict[str, Any] = {name: sequence.images for name, sequence in read.items()}
-        for name, transform in zip(_GEOMETRY, ("ProbeToReference", "ImageToProbe"), strict=True):
-            found[name] = np.stack([each[transform] for each in first.transforms]).astype(np.float32)
-        return {name: found[name] for name in names}
-    from PIL import Image
-
-    found = {
-        name: np.stack([np.asarray(Image.open(out / name / f"{number:08d}.png")) for number in numbers])
-        for name in pictures
-    }
-    texts = [json.loads((out / "parameters" / f"{number:08d}.json").read_text()) for number in numbers]
-    return found | {name: np.array([text[name] for text in texts], np.float32) for name in names if name in _GEOMETRY}
+    with h5py.File(_h5(out, shard), "r") as file:
+        return {name: np.array(file[name]) for name in names}
