@@ -1,17 +1,18 @@
-"""Train on simulated images of one head, find the ventricles in those of another: python examples/find_ventricles.py
+"""Train on simulated images of one head, find the ventricles in those of another.
 
     pip install "SlicerUSSim[datasets]" scikit-learn
     python examples/find_ventricles.py FOLDER [MRI] [IMAGES] [CONTRAST]
 
 A random forest learns pixels of IMAGES (500) simulated images of the MNI152 brain, by the recipe `ventricles`, and is
-tested on a tenth as many of another head: MRI, a T1 if CONTRAST does not say t1gd or t2; by default one that was drawn. Prints the Dice coefficient of
-all pixels together, with that of the best single threshold on grey levels beside it.
+tested on a tenth as many of another head: MRI, of CONTRAST t1 (default), t1gd or t2, or one that was drawn. Prints the
+Dice coefficient of all pixels together, with that of the best single threshold on grey levels beside it.
 """
 
 from __future__ import annotations
 
 import re
 import sys
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -43,7 +44,7 @@ def features(item: dict[str, np.ndarray]) -> np.ndarray:
         square = ndimage.gaussian_filter(image**2 * field, sigma) / weight
         found += [mean, np.sqrt(np.maximum(square - mean**2, 0.0)), ndimage.gaussian_gradient_magnitude(mean, 1.0)]
     bands = [found[1 + 3 * n] for n in range(len(SIGMAS))]
-    found += [low - high for low, high in zip(bands, bands[1:], strict=False)]
+    found += [low - high for low, high in pairwise(bands)]
     return np.stack(found, axis=-1)
 
 

@@ -30,7 +30,7 @@ _FOUND, _FARTHEST = 10.0, (8.0, 8.0, 4.0, 4.0, 6.0)
 class FindView(gymnasium.Env):
     """A probe on the surface of a patient, whose image an agent sees, and a view that it is to find.
 
-    Observation: (rows, columns, 1) uint8, a B-mode image of draft quality. Action: (5,) from -1 to 1, parts of STEP_DEG.
+    Observation: (rows, columns, 1) uint8, a B-mode image. Action: (5,) from -1 to 1, parts of STEP_DEG.
     Reward: the millimetres by which the probe came nearer to the target, a radian counted as 60 mm, and 10 when it is
     there, which ends the episode. `info` has "distance_mm" and "probe_to_ras".
 
@@ -56,8 +56,8 @@ class FindView(gymnasium.Env):
     metadata = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012, as Gymnasium declares it
 
     def __init__(
-        self, view: str = "craniotomy", *, simulator: UltrasoundSimulator | None = None, probe: Probe = PROBES["phased"],
-        image_size: tuple[int, int] = (128, 160), within_mm: float = 4.0, steps: int = 100,
+        self, view: str = "craniotomy", *, simulator: UltrasoundSimulator | None = None,
+        probe: Probe = PROBES["phased"], image_size: tuple[int, int] = (128, 160), within_mm: float = 4.0, steps: int = 100,
         render_mode: str | None = None,
     ) -> None:  # fmt: skip
         require_between("FindView", "within_mm", within_mm, 0.1, 100.0)
@@ -78,7 +78,7 @@ class FindView(gymnasium.Env):
         return self._image(), self._about()
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        """The image after a motion, the reward, whether the target is found, whether the steps are used up, and more."""
+        """(image after a motion, reward, whether the target is found, whether the steps are used up, info)."""
         before = self.distance_mm()
         self._pose = self._moved(self._pose, np.clip(np.asarray(action, float), -1.0, 1.0))
         self._step += 1

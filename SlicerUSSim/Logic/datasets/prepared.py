@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from scipy import ndimage
 
 from SlicerUSSim.Logic.base.errors import SimulationError, require
 from SlicerUSSim.Logic.base.files import make_folder, written_whole
@@ -16,6 +17,7 @@ from SlicerUSSim.Logic.datasets.recipe import BUNDLED, Recipe
 from SlicerUSSim.Logic.mri.masks import read_mask
 from SlicerUSSim.Logic.mri.modality import segment_image
 from SlicerUSSim.Logic.mri.pathology import add_tissues, texture_below
+from SlicerUSSim.Logic.mri.refinement import on_grid
 from SlicerUSSim.Logic.mri.samples import demo_mri, head_mri
 from SlicerUSSim.Logic.mri.segmentation import Segmentation
 from SlicerUSSim.Logic.mri.sheets.head import Head
@@ -26,9 +28,8 @@ from SlicerUSSim.Logic.tissue.table import TissueTable
 from SlicerUSSim.Logic.tissue.texture import Texture
 
 VENTRICLE = "ventricle"
-#: Names of the labels in all sets; the label is the place, and the last one is any other tissue
-CLASSES = (*TISSUES, VENTRICLE)
-OTHER = 255
+#: Names of the labels in all sets: the label is the place; and that of a tissue which is none of them
+CLASSES, OTHER = (*TISSUES, VENTRICLE), 255
 #: Around what is labelled
 _MARGIN_MM = 5.0
 
@@ -48,7 +49,7 @@ class PreparedPatient:
     texture: Texture | None
     #: The MRI or CT on the grid of the labels, float32; None for a label map, or if no output shows it
     mri: Volume | None
-    #: SHA-256 of its file; "" for one that is bundled
+    #: SHA-256 of its file; "" for one that is bundled, or a folder
     digest: str
 
 
@@ -57,7 +58,7 @@ def prepared_path(out: Path, patient: int) -> Path:
     return out / "patients" / f"{patient:04d}.pickle"
 
 
-def prepare(recipe: Recipe, patient: int, out: Path, device: str | None = None) -> None:
+def prepare(recipe: Recipe, patient: int, out: Path) -> None:
     """Write what images of a patient are made of, unless it is there.
 
     Raises PatientError, which names the file, if it cannot be read or segmented.
@@ -66,7 +67,7 @@ def prepare(recipe: Recipe, patient: int, out: Path, device: str | None = None) 
     if path.exists():
         return
     try:
-        found = _prepared(recipe, patient, device)
+        found = _prepared(recipe, patient)
     except SimulationError as error:
         name = recipe.patients[patient].file
         raise PatientError(str(error) if name in str(error) else f"{name}: {error}") from None
@@ -80,64 +81,52 @@ def load(out: Path, patient: int) -> PreparedPatient:
     return pickle.loads(prepared_path(out, patient).read_bytes())
 
 
-def _prepared(recipe: Recipe, number: int, device: str | None) -> PreparedPatient:
-    chosen = recipe.patients[number]
-    digest, texture, path = "", None, recipe.folder / chosen.file
-    if chosen.file in BUNDLED:
-        image = demo_mri()[0] if chosen.file == BUNDLED[0] else head_mri()
-    else:
-        image = Volume.read(path)
-        digest = file_digest(path) if path.is_file() else ""
-    if chosen.file not in BUNDLED and is_label_file(path, image):
+def _prepared(recipe: Recipe, number: int) -> PreparedPatient:
+    chosen, settings = recipe.patients[number], recipe.segmentations[number]
+    texture, mri, path = None, None, recipe.folder / chosen.file
+    is_file = chosen.file not in BUNDLED
+    image = Volume.read(path) if is_file else demo_mri()[0] if chosen.file == BUNDLED[0] else head_mri()
+    if is_file and is_label_file(path, image):
         require(not chosen.ventricles, "is a label map; ventricles are looked for in an MRI")
         found = read_label_file(path, image)
-        labels, names, tissues, mri = found.labels, found.names, found.tissues, None
+        labels, names, tissues = found.labels, found.tissues.names_by_label(), found.tissues
     else:
-        segmentation = segment_image(image, recipe.segmentations[number], device=device)
-        labels, names, mri = segmentation.labels, segmentation.tissue_names, image
+        segmentation = segment_image(image, settings)
+        labels, names, mri, texture = segmentation.labels, segmentation.tissue_names, image, segmentation.texture()
+        tissues = TissueTable.brain(names)
         if chosen.ventricles:
-            labels, names = with_ventricles(image, segmentation, recipe.segmentations[number].contrast)
-        texture = segmentation.texture()
-        tissues = TissueTable.brain([name for name in names if name != VENTRICLE])
-        if chosen.ventricles:  # their walls are membranes, as those of other CSF
-            csf = replace(TISSUES["csf"], name=VENTRICLE)
-            assert tissues.membrane is not None
-            membrane = replace(tissues.membrane, fluids=(*tissues.membrane.fluids, VENTRICLE))
-            tissues = TissueTable({**tissues, len(names): csf}, membrane)
+            labels, names, tissues = with_ventricles(image, segmentation, settings.contrast, tissues)
     masks = [_mask(text, recipe.folder) for text in chosen.add]
     if masks:
         added = add_tissues(labels, names, masks, has_brain_mask=mri is not None)
         texture = None if texture is None else texture_below(texture, image, labels, added.labels)
         labels, names, tissues = added.labels, added.tissue_names, added.table(tissues)
-    whole = labels
-    labels = _cut(labels)
-    texture = None if texture is None else texture.on_grid_of(labels, whole)
-    shown = mri is not None and "mri" in recipe.settings.outputs
-    mri = _on_grid(mri, labels) if shown and mri is not None else None
-    return PreparedPatient(labels, tuple(names), tissues, texture, mri, digest)
+    part = _cut(labels)
+    texture = None if texture is None else texture.on_grid_of(part, labels)
+    if mri is not None:
+        is_shown = "mri" in recipe.settings.outputs
+        mri = part.with_array(on_grid(mri.with_array(mri.array.astype(np.float32)), part)) if is_shown else None
+    digest = hashlib.sha256(path.read_bytes()).hexdigest() if is_file and path.is_file() else ""
+    return PreparedPatient(part, tuple(names), tissues, texture, mri, digest)
 
 
-def file_digest(path: Path) -> str:
-    """SHA-256 of a file."""
-    with path.open("rb") as file:
-        found = hashlib.sha256()
-        while block := file.read(2**20):
-            found.update(block)
-    return found.hexdigest()
+def with_ventricles(
+    image: Volume, segmentation: object, contrast: str, tissues: TissueTable
+) -> tuple[Volume, tuple[str, ...], TissueTable]:
+    """(labels, their names, their tissues) with one more label: CSF in the ventricles, whose walls are membranes.
 
-
-def with_ventricles(image: Volume, segmentation, contrast: str) -> tuple[Volume, tuple[str, ...]]:
-    """(labels, their names) with one more label: CSF in the ventricles.
-
-    Raises SimulationError for a CT, a FLAIR, and where the atlas did not lead.
+    Raises SimulationError for a CT, a FLAIR, and where there are none.
     """
     require(isinstance(segmentation, Segmentation), "is a CT; ventricles are looked for in an MRI")
+    assert isinstance(segmentation, Segmentation) and tissues.membrane is not None
     head = Head.of(image, segmentation, contrast)
-    labels, names = segmentation.labels, segmentation.tissue_names
-    inside = _sampled(head.image.with_array(ventricles(head).astype(np.uint8)), labels, order=0) > 0
+    labels, names = segmentation.labels, (*segmentation.tissue_names, VENTRICLE)
+    inside = on_grid(head.image.with_array(ventricles(head).astype(np.float32)), labels) > 0.5
     inside &= labels.array == names.index("csf") + 1
     require(bool(inside.any()), "no ventricles are found")
-    return labels.with_array(np.where(inside, len(names) + 1, labels.array).astype(np.uint8)), (*names, VENTRICLE)
+    labels = labels.with_array(np.where(inside, len(names), labels.array).astype(np.uint8))
+    membrane = replace(tissues.membrane, fluids=(*tissues.membrane.fluids, VENTRICLE))
+    return labels, names, TissueTable({**tissues, len(names): replace(TISSUES["csf"], name=VENTRICLE)}, membrane)
 
 
 def _mask(text: str, folder: Path) -> tuple[str, Volume, str]:
@@ -148,24 +137,10 @@ def _mask(text: str, folder: Path) -> tuple[str, Volume, str]:
 
 def _cut(labels: Volume) -> Volume:
     """The part of labels that is labelled."""
-    require(bool((labels.array > 0).any()), "has no labels, expected a patient")
+    boxes = ndimage.find_objects((labels.array > 0).astype(np.uint8))
+    require(bool(boxes), "has no labels, expected a patient")
     margin = np.ceil(_MARGIN_MM / np.asarray(labels.spacing_mm)[::-1]).astype(int)
-    box = []
-    for axis in range(3):
-        along = np.flatnonzero((labels.array > 0).any(axis=tuple({0, 1, 2} - {axis})))
-        box.append(slice(max(along[0] - margin[axis], 0), along[-1] + 1 + margin[axis]))
+    box = tuple(slice(max(part.start - m, 0), part.stop + m) for part, m in zip(boxes[0], margin, strict=True))
     matrix = labels.ijk_to_ras.copy()
     matrix[:3, 3] = (matrix @ [*(part.start for part in box[::-1]), 1.0])[:3]
-    return Volume(np.ascontiguousarray(labels.array[tuple(box)]), matrix)
-
-
-def _sampled(volume: Volume, grid: Volume, order: int) -> np.ndarray:
-    """(k, j, i) values of a volume at the voxels of a grid."""
-    from scipy import ndimage
-
-    to_ijk = (volume.ras_to_ijk @ grid.ijk_to_ras)[[2, 1, 0, 3]][:, [2, 1, 0, 3]]
-    return ndimage.affine_transform(volume.array, to_ijk, output_shape=grid.array.shape, order=order, cval=0)
-
-
-def _on_grid(volume: Volume, grid: Volume) -> Volume:
-    return grid.with_array(_sampled(volume.with_array(volume.array.astype(np.float32)), grid, order=1))
+    return Volume(np.ascontiguousarray(labels.array[box]), matrix)

@@ -1,4 +1,4 @@
-"""Scenes: the simulator of a patient with or without a lesion, and where probes stand on it. A worker keeps the last."""
+"""Scenes: the simulator of a patient, with a lesion or none, and where probes stand on it. A worker keeps the last."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ class Scene:
         if is_open:
             opening = disc_opening(labels, names, self.start, disc_diameter_mm(recipe.probes[0]) + _WIDER_MM)
             labels = opened(labels, names, opening)[0]
-        self._labels = labels
+        self._view = cache(lambda name: view_pose(labels, names, name)[0])
         fixed = recipe.drawn(0)
         settings = section_of(SimulationSettings(), fixed, "settings")
         if "skin" in names and not is_open and "settings.contact_gap_mm" not in fixed:
@@ -129,10 +129,6 @@ class Scene:
         kept = points[np.degrees(np.arctan2(np.hypot(x, y), z)) <= within]
         require(len(kept) > 0, f"[pose] within_deg is {within:g}, and the surface has no point so near to its top")
         return kept
-
-    @cache  # noqa: B019, as long as the scene
-    def _view(self, name: str) -> np.ndarray:
-        return view_pose(self._labels, self.names, name)[0]
 
     def _listed(self) -> list[np.ndarray]:
         chosen = self.recipe.pose
