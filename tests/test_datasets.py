@@ -120,7 +120,7 @@ def recipe(folder: Path, more: str = VARIED, *, outputs="image labels", format_=
         ("P\n[display]\nlook = {uniform = ['even', 'even']}", "look has no uniform distribution, expected {choice"),
         ("P\n[display]\nimage_size = {choice = [[8, 8], [9, 9]]}", "line 5: image_size is .*one value for all images"),
         ("P\n[pose]\nrock_deg = {normal = [0, -1]}", "line 5: the deviation is -1, expected a number from 0 on"),
-        ("P\n[pose]\non = 'path'", "line 4: on is path, which needs a file"),
+        ("P\n[pose]\non = 'path'", "line 5: on is path, which needs a file"),
         ("P\n[pose]\nwithin_deg = {uniform = [0, 90]}", "line 5: within_deg is"),
         ("P\n[probe]\nname = 'convexx'", "line 5: name is 'convexx', expected one of phased, convex"),
         ("P\n[probe]\nbeams = 3", "line 5: 'beams' is unknown, expected one of"),

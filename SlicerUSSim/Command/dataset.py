@@ -12,16 +12,14 @@ from SlicerUSSim.Command.options import device_option, out_option
 from SlicerUSSim.Command.progress import Share, note
 
 if TYPE_CHECKING:
-    from SlicerUSSim.Logic.datasets.making import Made
-
-_EXPORTS = ("coco", "nnunet")
+    from SlicerUSSim.Logic.datasets import Made
 
 
 class _Rate(Share):
     """A progress bar with images per second and the time left."""
 
     def __call__(self, made: Made) -> None:  # type: ignore[override]
-        self._show(f"{'dataset: ' if self.bar.disable else ''}{made}")
+        self._show(str(made))
         super().__call__(made.done / made.images)
 
 
@@ -36,7 +34,9 @@ class _Rate(Share):
     "--workers", type=click.IntRange(1, 1024),
     help="Processes on this computer; 1: without Dask (default: one for each core that has memory).",
 )  # fmt: skip
-@click.option("--export", type=click.Choice(_EXPORTS), help="Also write the set as COCO, or as nnU-Net v2 reads it.")
+@click.option(
+    "--export", type=click.Choice(("coco", "nnunet")), help="Also write the set as COCO, or as nnU-Net v2 reads it."
+)
 @device_option
 @click.pass_context
 def dataset(
@@ -48,9 +48,7 @@ def dataset(
     Image n is the same whoever makes it. The same command goes on with a set that was interrupted. The exit status is 1
     if a patient was left out.
     """
-    from SlicerUSSim.Logic.datasets.exports import export_coco, export_nnunet
-    from SlicerUSSim.Logic.datasets.making import make_dataset
-    from SlicerUSSim.Logic.datasets.recipe import Recipe
+    from SlicerUSSim.Logic.datasets import Recipe, export_coco, export_nnunet, make_dataset
 
     if device is not None:
         os.environ["USSIM_DEVICE"] = device  # workers have it, too

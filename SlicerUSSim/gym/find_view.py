@@ -57,8 +57,8 @@ class FindView(gymnasium.Env):
 
     def __init__(
         self, view: str = "craniotomy", *, simulator: UltrasoundSimulator | None = None,
-        probe: Probe = PROBES["phased"], image_size: tuple[int, int] = (128, 160), within_mm: float = 4.0, steps: int = 100,
-        render_mode: str | None = None,
+        probe: Probe = PROBES["phased"], image_size: tuple[int, int] = (128, 160), within_mm: float = 4.0,
+        steps: int = 100, render_mode: str | None = None,
     ) -> None:  # fmt: skip
         require_between("FindView", "within_mm", within_mm, 0.1, 100.0)
         self.simulator = simulator or _demo_simulator()

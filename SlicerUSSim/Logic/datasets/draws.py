@@ -17,7 +17,6 @@ KINDS = {
     "uniform": "[low, high]", "log_uniform": "[low, high] above 0", "normal": "[mean, deviation]",
     "choice": "[value, ...]",
 }  # fmt: skip
-_OPTIONS = ("unit", "relative")
 #: Of the preset's value, for relative numbers
 _FACTORS = (0.0, 100.0)
 
@@ -43,12 +42,10 @@ class Draw:
         """From a recipe's value. Raises SimulationError that begins with `where` for what the parameter refuses."""
         if not isinstance(value, Mapping):
             return cls(entry, "fixed", (entry.checked(where, tuple(value) if isinstance(value, list) else value),))
-        given = [name for name in value if name not in _OPTIONS]
+        given = [name for name in value if name not in ("unit", "relative")]
         wanted = ", ".join(f"{{{name} = {of}}}" for name, of in KINDS.items())
-        require(
-            len(given) == 1 and given[0] in KINDS,
-            f"{where}: {entry.name} is {short(dict(value))}, expected {entry.expected}, or one of {wanted}",
-        )
+        what = f"{where}: {entry.name} is {short(dict(value))}, expected {entry.expected}, or one of {wanted}"
+        require(len(given) == 1 and given[0] in KINDS, what)
         kind, values, unit = given[0], value[given[0]], value.get("unit", entry.unit)
         require(unit == entry.unit, f"{where}: {entry.name} is in {short(unit)}, expected its unit, {entry.unit!r}")
         relative = value.get("relative", False)

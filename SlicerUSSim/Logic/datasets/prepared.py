@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import pickle
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -49,8 +48,6 @@ class PreparedPatient:
     texture: Texture | None
     #: The MRI or CT on the grid of the labels, float32; None for a label map, or if no output shows it
     mri: Volume | None
-    #: SHA-256 of its file; "" for one that is bundled, or a folder
-    digest: str
 
 
 def prepared_path(out: Path, patient: int) -> Path:
@@ -106,8 +103,7 @@ def _prepared(recipe: Recipe, number: int) -> PreparedPatient:
     if mri is not None:
         is_shown = "mri" in recipe.settings.outputs
         mri = part.with_array(on_grid(mri.with_array(mri.array.astype(np.float32)), part)) if is_shown else None
-    digest = hashlib.sha256(path.read_bytes()).hexdigest() if is_file and path.is_file() else ""
-    return PreparedPatient(part, tuple(names), tissues, texture, mri, digest)
+    return PreparedPatient(part, tuple(names), tissues, texture, mri)
 
 
 def with_ventricles(

@@ -8,7 +8,7 @@ from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from SlicerUSSim.Logic.base.declaration import Declared, Parameter, built, parameter, parameters_of, short
 from SlicerUSSim.Logic.base.errors import SimulationError, either, require, require_package
@@ -46,7 +46,8 @@ _MOST_PER_SHARD, _SHARD_BYTES, _SIGNAL_BYTES = 64, 48e6, 1.6e6
 #: Parameters that are fixed: all images have one size, and a simulator is built with them
 _FIXED = (
     "display.image_size", "settings.quality", "settings.partial_volume", "settings.mri_modulation_db",
-    "settings.reference_speed_m_s",
+    "settings.reference_speed_m_s", "pose.on", "pose.file", "pose.transform", "pose.within_deg", "pose.aim",
+    "lesions.each",
 )  # fmt: skip
 _DEGREES = {"unit": "°", "bounds": (-180.0, 180.0)}
 
@@ -111,16 +112,13 @@ class LesionSettings(Declared):
 _PROBE = Parameter(name="name", type=str, label="Name", tip="Probe", default="phased", choices=tuple(PROBES))
 #: Keys of draws that are none of a tissue begin with these
 SECTIONS = ("pose", "probe", "display", "settings", "lesions")
-_ON_START = ("on", "file", "transform", "within_deg", "aim")
 
 
-@dataclass(frozen=True)
-class Case:
-    """A patient, with one lesion or none, in a run of shards."""
+class Case(NamedTuple):
+    """A patient, with one lesion or none, in the shards from the first to before the last."""
 
     number: int
     patient: int
-    #: Shards from the first to before the last
     first: int
     last: int
 
@@ -272,17 +270,11 @@ class _Reader:
             self.plain(SegmentationSettings, chosen, place)
             segmentations.append(SegmentationSettings.of(None, **chosen))
         found = tuple(self.plain(PatientSettings, one, ("patients", n)) for n, one in enumerate(patients))
-        pose = self.drawn(PoseSettings, "pose", _ON_START)
-        require(
-            (pose.on in ("path", "sequence")) == bool(pose.file),
-            f"{self.at('pose')}: on is {pose.on}, which needs {'no' if pose.file else 'a'} file",
-        )
-        lesions = self.drawn(LesionSettings, "lesions", ("each",)) if "lesions" in self.values else None
-        known = preset_parameters()
-        self.sections({**{key: known[key] for key in known if key != "probe.kind"}, "probe.name": _PROBE})
-        self.tissues()
-        self.draws.setdefault("settings.seed", Draw(known["settings.seed"], "uniform", (0, 2**32 - 1)))
-        self.draws.setdefault("display.image_size", Draw(known["display.image_size"], "fixed", ((256, 256),)))
+        self.sections()
+        pose, lesions = self.first(PoseSettings, "pose"), self.first(LesionSettings, "lesions")
+        needs = f"on is {pose.on}, which needs {'no' if pose.file else 'a'} file"
+        require((pose.on in ("path", "sequence")) == bool(pose.file), f"{self.at('pose', 'on')}: {needs}")
+        lesions = lesions if "lesions" in self.values else None
         made = Recipe(settings, found, tuple(segmentations), pose, lesions, self.draws, self.text, self.folder)
         try:
             assert made.probes and made.cases  # what cannot be is said here
@@ -295,11 +287,8 @@ class _Reader:
             is_known = name in OUTPUTS
             require(is_known, f"{self.at('outputs')}: output {short(name)} is unknown, expected {', '.join(OUTPUTS)}")
         other = ", ".join(name for name in settings.outputs if name not in _PICTURES)
-        require(
-            settings.format in ("zarr", "hdf5") or not other,
-            f"{self.at('format')}: format {settings.format} holds {either(_PICTURES)}, and outputs have {other}, "
-            "expected zarr or hdf5",
-        )
+        holds = f"format {settings.format} holds {either(_PICTURES)}, and outputs have {other}, expected zarr or hdf5"
+        require(settings.format in ("zarr", "hdf5") or not other, f"{self.at('format')}: {holds}")
 
     def plain(self, kind: type, values: dict, place: tuple, tables: Collection[str] = ()) -> Any:
         """A `kind` of fixed values; beside them there may be tables."""
@@ -310,33 +299,31 @@ class _Reader:
             known[name].checked(where, values[name])
         return built(kind, values, self.at(*place))
 
-    def drawn(self, kind: type, section: str, fixed: Collection[str]) -> Any:
-        """A `kind` with its fixed values; the others become draws."""
-        values, entries = self.table(section), parameters_of(kind)
-        free = {entry.name for entry in entries if entry.name not in fixed}
-        made = self.plain(kind, {name: value for name, value in values.items() if name not in free}, (section,))
-        for entry in entries:
-            if entry.name in free:
-                value = values.get(entry.name, entry.default)
-                self.draws[f"{section}.{entry.name}"] = Draw.of(value, entry, self.at(section, entry.name))
-        return made
+    def first(self, kind: type, section: str) -> Any:
+        """A `kind` with what is fixed, and some value for the rest."""
+        return kind(**{entry.name: self.draws[f"{section}.{entry.name}"].values[0] for entry in parameters_of(kind)})
 
-    def sections(self, known: Mapping[str, Parameter]) -> None:
-        for section in ("probe", "display", "settings"):
+    def sections(self) -> None:
+        preset, own = preset_parameters(), {"pose": PoseSettings, "lesions": LesionSettings}
+        extra = {f"{section}.{one.name}": one for section, kind in own.items() for one in parameters_of(kind)}
+        known = {key: preset[key] for key in preset if key != "probe.kind"} | {"probe.name": _PROBE} | extra
+        for section in SECTIONS:
             names = [key.partition(".")[2] for key in known if key.startswith(f"{section}.")]
             for name, value in self.table(section).items():
                 key, where = f"{section}.{name}", self.known(names, section, name)
                 self.draws[key] = Draw.of(value, known[key], where)
                 is_free = key not in _FIXED or self.draws[key].is_fixed
                 require(is_free, f"{where}: {name} is {short(value)}, expected one value for all images")
-
-    def tissues(self) -> None:
-        known = {entry.name: entry for entry in parameters_of(Tissue) if entry.type is float}
+        numbers = {entry.name: entry for entry in parameters_of(Tissue) if entry.type is float}
         for tissue, given in self.table("tissues").items():
             self.known((ALL, *TISSUES), "tissues", tissue)
             for name, value in self.table("tissues", tissue, given=given).items():
-                where = self.known(known, "tissues", tissue, name)
-                self.draws[f"{tissue}.{name}"] = Draw.of(value, known[name], where, may_be_relative=True)
+                where = self.known(numbers, "tissues", tissue, name)
+                self.draws[f"{tissue}.{name}"] = Draw.of(value, numbers[name], where, may_be_relative=True)
+        for key, entry in extra.items():
+            self.draws.setdefault(key, Draw(entry, "fixed", (entry.default,)))
+        self.draws.setdefault("settings.seed", Draw(known["settings.seed"], "uniform", (0, 2**32 - 1)))
+        self.draws.setdefault("display.image_size", Draw(known["display.image_size"], "fixed", ((256, 256),)))
 
 
 def _parsed(text: str, source: str) -> dict[str, Any]:
@@ -365,9 +352,7 @@ def _lines(text: str) -> Iterator[tuple[tuple, int]]:
             table = ()
             for name in names:
                 table = (*table, name)
-                if table in counts:
-                    table = (*table, counts[table])
-            yield table, number
-            yield (table[0],), number
+                table = (*table, counts[table]) if table in counts else table
+            yield from ((table, number), (table[:1], number))
         elif key:
             yield (*table, *key[1].strip('"').split(".")), number

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -31,76 +31,73 @@ def render(recipe: Recipe, out: Path, shard: int) -> tuple[dict[str, np.ndarray]
     Labels are places in CLASSES, which are the same for all patients. Besides the recipe's outputs there are "pose",
     (4, 4) probe_to_ras, and "image_to_probe", (4, 4) from (column, row, 0, 1) to the probe's millimetres, float32.
     """
-    numbers = recipe.images_of(shard)
-    made = scene(recipe, out, recipe.case_of(shard))
-    parameters = [recipe.drawn(number) for number in numbers]
+    made, wanted = scene(recipe, out, recipe.case_of(shard)), set(recipe.settings.outputs)
+    drawn = [(number, recipe.drawn(number)) for number in recipe.images_of(shard)]
     # Images of one probe follow each other, since its geometry is kept for a few probes alone
-    order = sorted(range(len(numbers)), key=lambda n: parameters[n]["probe"])
-    probes = [recipe.probes[parameters[n]["probe"]] for n in order]
-    poses = [made.pose(numbers[n], parameters[n]) for n in order]
-    displays = [section_of(DisplaySettings(), parameters[n], "display") for n in order]
-    settings = [made.settings(parameters[n]) for n in order]
-    tables = []
-    for n in order:
-        table, values = made.tissues(numbers[n])
-        parameters[n].update(values)
-        tables.append(table)
-    wanted = recipe.settings.outputs
-    simulated = [name for name in SIMULATED if name in wanted or (name == "labels" and "walls" in wanted)]
-    noise = [numbers[n] % 2**32 for n in order]
-    found = made.simulator.simulate_batch(
-        probes, poses, display=displays, tissues=tables, settings=settings, outputs=simulated or ["image"],
-        noise_seed=noise,
-    )  # fmt: skip
-    more: dict[str, list[np.ndarray]] = {name: [] for name in wanted if name not in SIMULATED}
-    grids = [ImageGrid.for_probe(probe, shown.image_size) for probe, shown in zip(probes, displays, strict=True)]
-    for place, (probe, grid, pose, table) in enumerate(zip(probes, grids, poses, tables, strict=True)):
-        if {"attenuation", "travel_time"} & set(more):
-            both = attenuation_and_time(made.simulator.medium.labels, table, probe, grid, pose)
-            for name, values in zip(("attenuation", "travel_time"), both, strict=True):
-                more.get(name, []).append(values)
-        if "walls" in more:
-            more["walls"].append(walls(found["labels"][place], table, probe, grid))
-        if "mri" in more:
-            assert made.mri is not None
-            more["mri"].append(slice_under_probe(made.mri, grid, pose))
-        if "clean" in more:
-            number = numbers[order[place]]
-            more["clean"].append(
-                _clean(made, number, probe, pose, displays[place], table, settings[place], recipe.settings.looks)
-            )
+    shots = [_Shot.of(made, *one) for one in sorted(drawn, key=lambda one: one[1]["probe"])]
+    simulated = [name for name in SIMULATED if name in wanted | ({"labels"} if "walls" in wanted else set())]
+    arrays = _simulated(made, shots, simulated or ["image"], [shot.number % 2**32 for shot in shots])
+    labels, of_pixels = made.simulator.medium.labels, arrays.get("labels")
+    more: dict[str, list[np.ndarray]] = {name: [] for name in recipe.settings.outputs if name not in SIMULATED}
+    for place, shot in enumerate(shots):
+        for name, values in more.items():
+            if name in ("attenuation", "travel_time"):
+                values.append(along_lines(name, labels, shot.tissues, shot.probe, shot.grid, shot.pose))
+            elif name == "walls" and of_pixels is not None:
+                values.append(walls(of_pixels[place], shot.tissues, shot.probe, shot.grid))
+            elif name == "mri" and made.mri is not None:
+                values.append(slice_under_probe(made.mri, shot.grid, shot.pose))
+            elif name == "clean":
+                seeds = generator(recipe.settings.seed, shot.number, "looks").integers(0, 2**32, recipe.settings.looks)
+                looks = [replace(shot, settings=replace(shot.settings, seed=int(seed))) for seed in seeds]
+                images = _simulated(made, looks, ["image"], seeds.tolist())["image"]
+                values.append(np.rint(images.mean(axis=0)).astype(np.uint8))
     number_of = np.array([CLASSES.index(n) if n in CLASSES else OTHER for n in ("coupling", *made.names)], np.uint8)
-    arrays = {
-        name: number_of[found[name]] if name.startswith("labels") else found[name]
-        for name in simulated if name in wanted
-    }  # fmt: skip
+    arrays = {name: number_of[a] if name.startswith("labels") else a for name, a in arrays.items() if name in wanted}
     arrays |= {name: np.stack(values) for name, values in more.items()}
-    arrays["pose"] = np.stack(poses).astype(np.float32)
-    arrays["image_to_probe"] = np.stack([grid.image_to_probe for grid in grids]).astype(np.float32)
-    back = np.argsort(order)
-    arrays = {name: values[back] for name, values in arrays.items()}
-    return arrays, [{"image": number, **values} for number, values in zip(numbers, parameters, strict=True)]
+    arrays["pose"] = np.stack([shot.pose for shot in shots]).astype(np.float32)
+    arrays["image_to_probe"] = np.stack([shot.grid.image_to_probe for shot in shots]).astype(np.float32)
+    back = np.argsort([shot.number for shot in shots])
+    return {name: values[back] for name, values in arrays.items()}, [shots[place].parameters for place in back]
 
 
-def _clean(
-    made: Scene, number: int, probe: Probe, pose: np.ndarray, display: DisplaySettings, table: TissueTable,
-    settings: SimulationSettings, looks: int,
-) -> np.ndarray:  # fmt: skip
-    """(rows, columns) uint8 mean of images with other speckle and noise."""
-    seeds = generator(made.recipe.settings.seed, number, "looks").integers(0, 2**32, looks)
-    many = made.simulator.simulate_batch(
-        probe, [pose] * looks, display=display, tissues=table,
-        settings=[replace(settings, seed=int(seed)) for seed in seeds], noise_seed=[int(seed) for seed in seeds],
-    )  # fmt: skip
-    return np.rint(many["image"].mean(axis=0)).astype(np.uint8)
+@dataclass(frozen=True, eq=False)
+class _Shot:
+    """What one image is made of."""
+
+    number: int
+    probe: Probe
+    pose: np.ndarray
+    display: DisplaySettings
+    settings: SimulationSettings
+    tissues: TissueTable
+    parameters: dict[str, Any]
+
+    @classmethod
+    def of(cls, made: Scene, number: int, drawn: dict[str, Any]) -> _Shot:
+        probe, display = made.recipe.probes[drawn["probe"]], section_of(DisplaySettings(), drawn, "display")
+        tissues, values = made.tissues(number)
+        parameters = {"image": number, **drawn, **values}
+        return cls(number, probe, made.pose(number, drawn), display, made.settings(drawn), tissues, parameters)
+
+    @property
+    def grid(self) -> ImageGrid:
+        return ImageGrid.for_probe(self.probe, self.display.image_size)
 
 
-def attenuation_and_time(
-    labels: Volume, tissues: TissueTable, probe: Probe, grid: ImageGrid, pose: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """((rows, columns) float32 dB one way at the received frequency, µs there and back), nan outside the imaged field.
+def _simulated(made: Scene, shots: list[_Shot], outputs: list[str], noise: list[int]) -> dict[str, np.ndarray]:
+    """{output: (shots, ...)} of simulate_batch."""
+    given = {name: [getattr(shot, name) for shot in shots] for name in ("display", "settings", "tissues")}
+    probes, poses = [shot.probe for shot in shots], [shot.pose for shot in shots]
+    return made.simulator.simulate_batch(probes, poses, outputs=outputs, noise_seed=noise, **given)
 
-    Along straight scan lines from the face, in steps of 0.5 mm: without refraction.
+
+def along_lines(
+    name: str, labels: Volume, tissues: TissueTable, probe: Probe, grid: ImageGrid, pose: np.ndarray
+) -> np.ndarray:
+    """(rows, columns) float32 "attenuation", dB one way at the received frequency, or "travel_time", µs there and back.
+
+    nan outside the imaged field. Along straight scan lines from the face, in steps of 0.5 mm: without refraction.
     """
     position, along = probe.line_positions(), np.arange(0.0, probe.displayed_mm, _STEP_MM)
     origin, direction = probe.line_at(position)
@@ -109,15 +106,13 @@ def attenuation_and_time(
     index = np.rint(points @ matrix[:3, :3].T + matrix[:3, 3]).astype(np.intp)[..., ::-1]
     inside = np.all((index >= 0) & (index < labels.array.shape), axis=-1)
     found = np.where(inside, labels.array[tuple(np.moveaxis(np.where(inside[..., None], index, 0), -1, 0))], 0)
-    attenuation, slowness = np.zeros((2, 256), np.float32)
+    per_mm = np.zeros(256, np.float32)
     for label, tissue in tissues.items():
-        attenuation[label] = 0.1 * tissue.attenuation_db_cm_mhz * probe.received_mhz
-        slowness[label] = 2e3 / tissue.speed_of_sound_m_s
+        decibels = 0.1 * tissue.attenuation_db_cm_mhz * probe.received_mhz
+        per_mm[label] = decibels if name == "attenuation" else 2e3 / tissue.speed_of_sound_m_s
     step = _STEP_MM * (along >= probe.line_starts_mm(position)[:, None])
     field, line, at = _nearest_steps(probe, grid, len(along))
-    sums = (np.cumsum(values[found] * step, axis=1) for values in (attenuation, slowness))
-    decibels, microseconds = (np.where(field, each[line, at], np.nan).astype(np.float32) for each in sums)
-    return decibels, microseconds
+    return np.where(field, np.cumsum(per_mm[found] * step, axis=1)[line, at], np.nan).astype(np.float32)
 
 
 @lru_cache(maxsize=4)
