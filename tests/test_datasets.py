@@ -30,7 +30,7 @@ from SlicerUSSim.Logic.datasets import (
 from SlicerUSSim.Logic.datasets.draws import Draw, generator
 from SlicerUSSim.Logic.datasets.prepared import CLASSES
 from SlicerUSSim.Logic.datasets.rendering import render
-from SlicerUSSim.Logic.datasets.scenes import Scene
+from SlicerUSSim.Logic.datasets.placed import Scene
 from SlicerUSSim.Logic.datasets.writers import record_path
 from SlicerUSSim.Logic.imaging.preset import preset_parameters
 from SlicerUSSim.Logic.mri.samples import head_mri

@@ -14,7 +14,7 @@ from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.datasets.draws import generator
 from SlicerUSSim.Logic.datasets.prepared import CLASSES, OTHER
 from SlicerUSSim.Logic.datasets.recipe import Recipe
-from SlicerUSSim.Logic.datasets.scenes import Scene, scene, section_of
+from SlicerUSSim.Logic.datasets.placed import Scene, scene, section_of
 from SlicerUSSim.Logic.imaging.batch import OUTPUTS as SIMULATED
 from SlicerUSSim.Logic.probe.arrays import Probe
 from SlicerUSSim.Logic.probe.image_grid import ImageGrid
