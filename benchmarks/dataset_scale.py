@@ -20,9 +20,9 @@ import numpy as np
 from SlicerUSSim.Logic.base.settings import DisplaySettings
 from SlicerUSSim.Logic.datasets import Recipe, make_dataset
 from SlicerUSSim.Logic.datasets.making import render_task
+from SlicerUSSim.Logic.datasets.placed import scene, section_of
 from SlicerUSSim.Logic.datasets.prepared import prepare
 from SlicerUSSim.Logic.datasets.rendering import render
-from SlicerUSSim.Logic.datasets.placed import scene, section_of
 from SlicerUSSim.Logic.datasets.writers import record_path, write_shard
 
 #: Seconds that the slowed-down renderer takes for a shard, and its shards for each worker

@@ -55,7 +55,7 @@ def dice(found: np.ndarray, true: np.ndarray) -> float:
 
 def find_ventricles(train: SimulatedImages, test: SimulatedImages) -> tuple[float, float]:
     """(Dice of a random forest, Dice of the best threshold on smoothed grey levels) on `test`."""
-    from sklearn.ensemble import RandomForestClassifier
+    from sklearn.ensemble import RandomForestClassifier  # type: ignore[import-not-found]
 
     label = next(number for number, name in train.labels.items() if name == "ventricle")
     random, inputs, outputs = np.random.default_rng(0), [], []

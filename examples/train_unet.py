@@ -16,11 +16,11 @@ from SlicerUSSim.Logic.datasets import SimulatedImages
 
 def train(folder: Path, tissue: str = "ventricle", epochs: int = 10) -> float:
     """The mean Dice coefficient of the last epoch on the test images."""
-    import torch
-    from monai.losses import DiceCELoss
-    from monai.metrics import DiceMetric
-    from monai.networks.nets import UNet
-    from monai.transforms import Compose, EnsureChannelFirstd, Lambdad, ScaleIntensityRanged, ToTensord
+    import torch  # type: ignore[import-not-found]
+    from monai.losses import DiceCELoss  # type: ignore[import-not-found]
+    from monai.metrics import DiceMetric  # type: ignore[import-not-found]
+    from monai.networks.nets import UNet  # type: ignore[import-not-found]
+    from monai.transforms import Compose, EnsureChannelFirstd, Lambdad, ScaleIntensityRanged, ToTensord  # type: ignore[import-not-found]
 
     label = next(number for number, name in SimulatedImages(folder).labels.items() if name == tissue)
     steps = Compose([
@@ -54,4 +54,4 @@ def train(folder: Path, tissue: str = "ventricle", epochs: int = 10) -> float:
 
 
 if __name__ == "__main__":
-    train(Path(sys.argv[1]), *sys.argv[2:3], *map(int, sys.argv[3:4]))
+    train(Path(sys.argv[1]), *sys.argv[2:3], **({"epochs": int(sys.argv[3])} if len(sys.argv) > 3 else {}))

@@ -28,16 +28,16 @@ from SlicerUSSim.Logic.datasets import (
     making as making_module,
 )
 from SlicerUSSim.Logic.datasets.draws import Draw, generator
+from SlicerUSSim.Logic.datasets.placed import Scene
 from SlicerUSSim.Logic.datasets.prepared import CLASSES
 from SlicerUSSim.Logic.datasets.rendering import render
-from SlicerUSSim.Logic.datasets.placed import Scene
 from SlicerUSSim.Logic.datasets.writers import record_path
 from SlicerUSSim.Logic.imaging.preset import preset_parameters
 from SlicerUSSim.Logic.mri.samples import head_mri
 from SlicerUSSim.Logic.probe import pose_looking_at
 from SlicerUSSim.Logic.probe.surface import PatientSurface
 from SlicerUSSim.Logic.tissue.presets import TISSUES
-from tests.conftest import block, name_labels
+from tests.conftest import block, example, name_labels
 
 zarr = pytest.importorskip("zarr", reason="data sets need: pip install '.[datasets]'")
 pytest.importorskip("h5py", reason="data sets need: pip install '.[datasets]'")
@@ -279,6 +279,7 @@ def test_poses_stand_where_the_recipe_says(folder, tmp_path, on):
         assert (other.simulator.medium.labels.array != labels.array).any()
 
 
+@pytest.mark.slow
 def test_ventricles_are_a_label_of_their_own(tmp_path):
     head_mri(3.0).write(tmp_path / "head.nii.gz")
     text = 'images = 2\n[[patients]]\nfile = "head.nii.gz"\nventricles = true\n[display]\nimage_size = [48, 64]\n'
@@ -417,10 +418,21 @@ def test_without_a_package_one_line_says_which_extra_to_install(folder, tmp_path
         make_dataset(recipe(folder), tmp_path / "s", workers=1)
 
 
-def test_pytorch_reads_a_set(plain):
+def test_pytorch_and_monai_read_a_set(plain):
     torch = pytest.importorskip("torch", reason="needs PyTorch")
     loader = torch.utils.data.DataLoader(SimulatedImages(plain, ["image", "labels"]), batch_size=4)
     assert next(iter(loader))["image"].shape == (4, 48, 64)
+    pytest.importorskip("monai", reason="needs MONAI")
+    assert 0.0 < example("train_unet").train(plain, "white matter", epochs=2) <= 1.0
+
+
+@pytest.mark.slow
+def test_a_forest_finds_ventricles_of_another_head_better_than_a_threshold(tmp_path):
+    pytest.importorskip("sklearn", reason="needs scikit-learn")
+    found = example("find_ventricles")
+    train, test = found.made(tmp_path / "a", "mni152", 100, 1), found.made(tmp_path / "b", "synthetic", 12, 2)
+    forest, threshold = found.find_ventricles(train, test)
+    assert forest > max(threshold, 0.2)
 
 
 # ---- Dask ------------------------------------------------------------------------------------------------------------

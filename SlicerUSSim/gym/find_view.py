@@ -123,4 +123,4 @@ def _scene(simulator: UltrasoundSimulator, view: str) -> tuple[PatientSurface, n
     return PatientSurface(labels), pose
 
 
-gymnasium.register("SlicerUSSim/FindView-v0", entry_point=FindView)
+gymnasium.register("SlicerUSSim/FindView-v0", entry_point="SlicerUSSim.gym.find_view:FindView")

@@ -48,7 +48,7 @@ def _run_lengths(mask: np.ndarray) -> list[int]:
     """Lengths of runs of 0 and 1 by columns, beginning with 0, as COCO has them."""
     flat = np.concatenate([[0], mask.T.ravel().astype(np.int8)])
     changes = np.flatnonzero(np.diff(flat))
-    return np.diff([0, *changes, mask.size]).tolist()
+    return np.diff(np.concatenate([[0], changes, [mask.size]])).tolist()
 
 
 def export_nnunet(folder: str | os.PathLike) -> Path:

@@ -68,7 +68,7 @@ class SetSettings(Declared):
 
 @dataclass(frozen=True)
 class PatientSettings(Declared):
-    """One of [[patients]]."""
+    """One of `[[patients]]`."""
 
     file: str = parameter(label="File", tip="MRI, CT or label map, beside the recipe, or mni152 or synthetic")
     share: float = parameter(1.0, "Share", "Of the images, re those of the others", bounds=(0.001, 1000))
@@ -80,7 +80,7 @@ class PatientSettings(Declared):
 
 @dataclass(frozen=True)
 class PoseSettings(Declared):
-    """[pose]: where a probe stands. Angles and places but `on`, `file` and `within_deg` may be distributions."""
+    """Where a probe stands: `[pose]`; angles, places and `view` may be distributions."""
 
     on: str = parameter(
         "craniotomy", "On", "Where poses begin", choices=("craniotomy", "skin", "surface", "view", "path", "sequence")
@@ -100,7 +100,7 @@ class PoseSettings(Declared):
 
 @dataclass(frozen=True)
 class LesionSettings(Declared):
-    """[lesions]: balls with a rough surface, each in a part of the images; all but `each` may be distributions."""
+    """Balls with a rough surface, each in a part of the images: `[lesions]`; all but `each` may be distributions."""
 
     each: int = parameter(4, "Each", "Lesions of every patient, one at a time", bounds=(1, 10_000))
     tissue: str = parameter("tumour", "Tissue", "What it is", choices=tuple(n for n in LESIONS if n != "brats"))

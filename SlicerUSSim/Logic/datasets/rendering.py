@@ -12,9 +12,9 @@ import numpy as np
 from SlicerUSSim.Logic.base.settings import DisplaySettings, SimulationSettings
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.datasets.draws import generator
+from SlicerUSSim.Logic.datasets.placed import Scene, scene, section_of
 from SlicerUSSim.Logic.datasets.prepared import CLASSES, OTHER
 from SlicerUSSim.Logic.datasets.recipe import Recipe
-from SlicerUSSim.Logic.datasets.placed import Scene, scene, section_of
 from SlicerUSSim.Logic.imaging.batch import OUTPUTS as SIMULATED
 from SlicerUSSim.Logic.probe.arrays import Probe
 from SlicerUSSim.Logic.probe.image_grid import ImageGrid
@@ -87,7 +87,9 @@ class _Shot:
 
 def _simulated(made: Scene, shots: list[_Shot], outputs: list[str], noise: list[int]) -> dict[str, np.ndarray]:
     """{output: (shots, ...)} of simulate_batch."""
-    given = {name: [getattr(shot, name) for shot in shots] for name in ("display", "settings", "tissues")}
+    given: dict[str, Any] = {
+        name: [getattr(shot, name) for shot in shots] for name in ("display", "settings", "tissues")
+    }
     probes, poses = [shot.probe for shot in shots], [shot.pose for shot in shots]
     return made.simulator.simulate_batch(probes, poses, outputs=outputs, noise_seed=noise, **given)
 
