@@ -22,7 +22,7 @@ from SlicerUSSim.Logic.datasets import Recipe, make_dataset
 from SlicerUSSim.Logic.datasets.making import render_task
 from SlicerUSSim.Logic.datasets.placed import scene, section_of
 from SlicerUSSim.Logic.datasets.prepared import prepare
-from SlicerUSSim.Logic.datasets.rendering import render
+from SlicerUSSim.Logic.datasets.rendering import _Shot, render
 from SlicerUSSim.Logic.datasets.writers import record_path, write_shard
 
 #: Seconds that the slowed-down renderer takes for a shard, and its shards for each worker
@@ -109,8 +109,7 @@ def main(images: int) -> None:
         write_ms = 1e3 * (perf_counter() - began) / recipe.shard
         made, began = scene(recipe, out, recipe.cases[0]), perf_counter()
         for number in range(recipe.shard):
-            drawn = recipe.drawn(number)
-            made.pose(number, drawn), made.tissues(number), made.settings(drawn)
+            _Shot.of(made, number, recipe.drawn(number))
         draw_ms = 1e3 * (perf_counter() - began) / recipe.shard
         record_path(out, 0).unlink()
         began = perf_counter()

@@ -1,4 +1,4 @@
-"""Train a small U-Net of MONAI on a set of `ussim dataset`: python examples/train_unet.py FOLDER [TISSUE] [EPOCHS]
+"""Train a small U-Net of MONAI on a set of `ussim dataset`: python examples/train_unet.py FOLDER [TISSUE]
 
     pip install "SlicerUSSim[datasets]" monai
     ussim dataset ventricles -o FOLDER && python examples/train_unet.py FOLDER ventricle
@@ -54,4 +54,4 @@ def train(folder: Path, tissue: str = "ventricle", epochs: int = 10) -> float:
 
 
 if __name__ == "__main__":
-    train(Path(sys.argv[1]), *sys.argv[2:3], **({"epochs": int(sys.argv[3])} if len(sys.argv) > 3 else {}))
+    train(Path(sys.argv[1]), *sys.argv[2:3])

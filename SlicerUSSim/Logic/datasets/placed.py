@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cache, lru_cache
@@ -16,7 +17,7 @@ from SlicerUSSim.Logic.base.settings import SimulationSettings
 from SlicerUSSim.Logic.base.transforms import check_rigid
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.datasets.draws import generator
-from SlicerUSSim.Logic.datasets.prepared import PatientError, PreparedPatient, load
+from SlicerUSSim.Logic.datasets.prepared import PatientError, load
 from SlicerUSSim.Logic.datasets.recipe import ALL, SECTIONS, Case, Recipe
 from SlicerUSSim.Logic.imaging.simulator import UltrasoundSimulator
 from SlicerUSSim.Logic.mri.markups import markup_points
@@ -46,7 +47,7 @@ class Scene:
     """The simulator of a case, and where probes stand on it. Raises SimulationError if they cannot."""
 
     def __init__(self, recipe: Recipe, out: Path, case: Case) -> None:
-        patient = _patient(str(out), case.patient)
+        patient = load(out, case.patient)
         labels, names, tissues, texture = patient.labels, patient.names, patient.tissues, patient.texture
         self.recipe, self.case, self.mri = recipe, case, patient.mri
         has_mri = patient.mri is not None or "mri" not in recipe.settings.outputs
@@ -71,6 +72,7 @@ class Scene:
         if "skin" in names and not is_open and "settings.contact_gap_mm" not in fixed:
             settings = replace(settings, contact_gap_mm=GEL_MM)
         self.simulator = UltrasoundSimulator(labels, tissues, settings, None, texture)
+        self.simulator.texture = None  # the device has it, and nobody pickles this simulator
         self._settings, self._tissues = settings, tissues
         self._poses = self._listed() if chosen.file else []
         self._places = self._surface_places() if chosen.on == "surface" else np.zeros((0, 3))
@@ -146,7 +148,8 @@ def scene(recipe: Recipe, out: Path, case: Case) -> Scene:
     key = (recipe.text, str(out), case.number)
     found = _kept.get(key)
     if found is None:
-        _kept.clear()  # its memory goes before the next one is built
+        _kept.clear()
+        gc.collect()  # its memory goes before the next one is built
         try:
             found = _kept[key] = Scene(recipe, out, case)
         except SimulationError as error:
@@ -155,13 +158,8 @@ def scene(recipe: Recipe, out: Path, case: Case) -> Scene:
 
 
 @lru_cache(maxsize=1)
-def _patient(out: str, number: int) -> PreparedPatient:
-    return load(Path(out), number)
-
-
-@lru_cache(maxsize=1)
 def _surface(out: str, number: int, is_open: bool) -> PatientSurface:
-    patient = _patient(out, number)
+    patient = load(Path(out), number)
     return PatientSurface(without_outside(patient.labels, patient.names) if is_open else patient.labels)
 
 
@@ -183,7 +181,7 @@ def with_lesion(labels: Volume, names: Sequence[str], drawn: Mapping[str, Any], 
     `drawn` are values of LesionSettings. Raises SimulationError if the brain has no place that deep.
     """
     brain = without_outside(labels, names).array > 0
-    depth = distance_to(~np.pad(brain, 1), labels.spacing_mm)[1:-1, 1:-1, 1:-1]
+    depth = distance_to(~np.pad(brain, 1), labels.spacing_mm)[1:-1, 1:-1, 1:-1].astype(np.float32)
     where = np.isin(labels.array, labels_of(names, _WITHIN)) & (abs(depth - drawn["depth_mm"]) <= _SHELL_MM)
     places = np.flatnonzero(where)
     require(

@@ -42,7 +42,7 @@ ALL = "all"
 #: Probes that are drawn for a set: the record of a new one takes 20 ms
 PROBE_POOL = 16
 #: Images of a shard, and bytes of its arrays, of which an image has so many for each of its signals
-_MOST_PER_SHARD, _SHARD_BYTES, _SIGNAL_BYTES = 64, 48e6, 1.6e6
+_MOST_PER_SHARD, _SHARD_BYTES, _SIGNAL_BYTES = 64, 24e6, 1.6e6
 #: Parameters that are fixed: all images have one size, and a simulator is built with them
 _FIXED = (
     "display.image_size", "settings.quality", "settings.partial_volume", "settings.mri_modulation_db",
