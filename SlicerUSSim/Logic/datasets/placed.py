@@ -5,11 +5,12 @@ from __future__ import annotations
 import gc
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from functools import cache, lru_cache
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy import ndimage
 
 from SlicerUSSim.Logic.base.errors import SimulationError, require
 from SlicerUSSim.Logic.base.neighbourhood import distance_to
@@ -21,7 +22,7 @@ from SlicerUSSim.Logic.datasets.prepared import PatientError, load
 from SlicerUSSim.Logic.datasets.recipe import ALL, SECTIONS, Case, Recipe
 from SlicerUSSim.Logic.imaging.simulator import UltrasoundSimulator
 from SlicerUSSim.Logic.mri.markups import markup_points
-from SlicerUSSim.Logic.mri.pathology import Added, add_tissue, innermost_ras, texture_below
+from SlicerUSSim.Logic.mri.pathology import Added, innermost_ras
 from SlicerUSSim.Logic.mri.segmentation_settings import GEL_MM
 from SlicerUSSim.Logic.placement.craniotomy import default_pose, disc_diameter_mm, disc_opening, opened, without_outside
 from SlicerUSSim.Logic.placement.views import view_pose
@@ -35,12 +36,14 @@ from SlicerUSSim.Logic.tracked.sequence import TrackedSequence
 _WIDER_MM = 30.0
 #: Kinds of markups that are paths
 _PATHS = ("Curve", "ClosedCurve", "Line", "Fiducial")
-#: Where the middle of a lesion may lie, and how far from the wanted depth, mm
-_WITHIN, _SHELL_MM = ("grey matter", "white matter", "brain"), 1.5
+#: Where the middle of a lesion may lie, in which steps it is looked for, and how far from the wanted depth, mm
+_WITHIN, _COARSE_MM, _SHELL_MM = ("grey matter", "white matter", "brain"), 2.0, 1.5
 #: Waves over the sphere that make its surface rough, and their numbers per radian
 _WAVES, _FINENESS = 24, 3.0
 #: The scene of this process, by recipe, folder and case
 _kept: dict[tuple, Scene] = {}
+#: The surface of the last patient
+_surfaces: dict[tuple, PatientSurface] = {}
 
 
 class Scene:
@@ -55,12 +58,17 @@ class Scene:
         if recipe.lesions:
             random = generator(recipe.settings.seed, case.number, "lesion shape")
             added = with_lesion(labels, names, recipe.lesion(case), random)
-            if texture is not None:
-                texture = texture_below(texture, labels, labels, added.labels)
+            for certain in (texture.second_share, texture.deviation, texture.volume_share) if texture else ():
+                if certain is not None:
+                    certain[added.labels.array != labels.array] = 0
             labels, names, tissues = added.labels, added.tissue_names, added.table(tissues)
         chosen, self.names = recipe.pose, names
         is_open = chosen.on == "craniotomy" and "skin" in names
-        self.surface = _surface(str(out), case.patient, is_open)
+        key = (str(out), case.patient, is_open)
+        if key not in _surfaces:  # the next lesion is in the same patient
+            _surfaces.clear()
+            _surfaces[key] = PatientSurface(without_outside(labels, names) if is_open else labels)
+        self.surface = _surfaces[key]
         self.target = _innermost(labels, names, chosen.aim) if chosen.aim else None
         self.start = default_pose(labels, names, recipe.probes[0], is_open=is_open, target_ras=self.target)
         if is_open:
@@ -157,16 +165,11 @@ def scene(recipe: Recipe, out: Path, case: Case) -> Scene:
     return found
 
 
-@lru_cache(maxsize=1)
-def _surface(out: str, number: int, is_open: bool) -> PatientSurface:
-    patient = load(Path(out), number)
-    return PatientSurface(without_outside(patient.labels, patient.names) if is_open else patient.labels)
-
-
 def _innermost(labels: Volume, names: tuple[str, ...], tissue: str) -> np.ndarray:
-    inside = np.isin(labels.array, labels_of(names, (tissue,)))
-    require(inside.any(), f"[pose] aim is {tissue!r}, which is not labelled, expected one of {', '.join(names)}")
-    return innermost_ras(inside, labels)
+    inside = np.equal(labels.array, names.index(tissue) + 1 if tissue in names else 255)
+    boxes = ndimage.find_objects(inside.astype(np.uint8))
+    require(bool(boxes), f"[pose] aim is {tissue!r}, which is not labelled, expected one of {', '.join(names)}")
+    return innermost_ras(inside[boxes[0]], labels, [part.start for part in boxes[0]])
 
 
 def section_of(settings: Any, drawn: Mapping[str, Any], section: str) -> Any:
@@ -180,18 +183,21 @@ def with_lesion(labels: Volume, names: Sequence[str], drawn: Mapping[str, Any], 
 
     `drawn` are values of LesionSettings. Raises SimulationError if the brain has no place that deep.
     """
-    brain = without_outside(labels, names).array > 0
-    depth = distance_to(~np.pad(brain, 1), labels.spacing_mm)[1:-1, 1:-1, 1:-1].astype(np.float32)
-    where = np.isin(labels.array, labels_of(names, _WITHIN)) & (abs(depth - drawn["depth_mm"]) <= _SHELL_MM)
+    spacing = np.asarray(labels.spacing_mm)[::-1]
+    step = np.maximum(np.rint(_COARSE_MM / spacing), 1).astype(int)
+    coarse = tuple(slice(None, None, n) for n in step)
+    # Of parts of the volume, since what is computed of all of it takes 300 MB
+    brain = without_outside(labels.with_array(labels.array[coarse]), names).array > 0
+    depth = distance_to(~np.pad(brain, 1), (step * spacing)[::-1])[1:-1, 1:-1, 1:-1]
+    where = np.isin(labels.array[coarse], labels_of(names, _WITHIN)) & (abs(depth - drawn["depth_mm"]) <= _SHELL_MM)
     places = np.flatnonzero(where)
     require(
         places.size > 0,
         f"[lesions] depth_mm is {drawn['depth_mm']:g}, and the brain has no tissue so deep, expected at most "
         f"{depth.max():.0f}",
     )
-    middle = np.array(np.unravel_index(int(places[random.integers(places.size)]), labels.array.shape))
+    middle = step * np.array(np.unravel_index(int(places[random.integers(places.size)]), where.shape))
     waves, phases = random.normal(0.0, _FINENESS, (_WAVES, 3)), random.uniform(0.0, 2.0 * np.pi, _WAVES)
-    spacing = np.asarray(labels.spacing_mm)[::-1]
     reach = np.ceil(drawn["radius_mm"] * 2.5 / spacing).astype(int)
     low, high = np.maximum(middle - reach, 0), np.minimum(middle + reach + 1, labels.array.shape)
     box = tuple(slice(a, b) for a, b in zip(low, high, strict=True))
@@ -199,6 +205,8 @@ def with_lesion(labels: Volume, names: Sequence[str], drawn: Mapping[str, Any], 
     away = np.linalg.norm(offset, axis=-1)
     rough = np.cos(offset / np.maximum(away, 1e-6)[..., None] @ waves.T + phases).sum(axis=-1) * np.sqrt(2.0 / _WAVES)
     radius = drawn["radius_mm"] * np.clip(1.0 + drawn["roughness"] * rough, 0.3, 2.4)
-    mask = np.zeros(labels.array.shape, np.uint8)
-    mask[box] = (away <= radius) & brain[box]
-    return add_tissue(labels, names, labels.with_array(mask), drawn["tissue"], source="the lesion")
+    names = (*names, *({drawn["tissue"]} - set(names)))
+    array = labels.array.copy()
+    inside = without_outside(labels.with_array(array[box]), names).array > 0
+    array[box][(away <= radius) & inside] = names.index(drawn["tissue"]) + 1
+    return Added(labels.with_array(array), names)

@@ -69,13 +69,14 @@ def prepare(recipe: Recipe, patient: int, out: Path) -> None:
         name = recipe.patients[patient].file
         raise PatientError(str(error) if name in str(error) else f"{name}: {error}") from None
     make_folder(path.parent)
-    with written_whole(path) as partial:
-        partial.write_bytes(pickle.dumps(found, protocol=pickle.HIGHEST_PROTOCOL))
+    with written_whole(path) as partial, partial.open("wb") as file:
+        pickle.dump(found, file, protocol=pickle.HIGHEST_PROTOCOL)
 
 
 def load(out: Path, patient: int) -> PreparedPatient:
     """The patient that prepare() wrote, in a set that this user made."""
-    return pickle.loads(prepared_path(out, patient).read_bytes())
+    with prepared_path(out, patient).open("rb") as file:
+        return pickle.load(file)
 
 
 def _prepared(recipe: Recipe, number: int) -> PreparedPatient:
