@@ -28,7 +28,7 @@ from SlicerUSSim.Logic.placement.craniotomy import default_pose, disc_diameter_m
 from SlicerUSSim.Logic.placement.views import view_pose
 from SlicerUSSim.Logic.probe.poses import aimed_at, turned
 from SlicerUSSim.Logic.probe.surface import PatientSurface
-from SlicerUSSim.Logic.tissue.names import labels_of
+from SlicerUSSim.Logic.tissue.names import OUTSIDE, labels_of
 from SlicerUSSim.Logic.tissue.table import TissueTable
 from SlicerUSSim.Logic.tracked.sequence import TrackedSequence
 
@@ -187,7 +187,8 @@ def with_lesion(labels: Volume, names: Sequence[str], drawn: Mapping[str, Any], 
     step = np.maximum(np.rint(_COARSE_MM / spacing), 1).astype(int)
     coarse = tuple(slice(None, None, n) for n in step)
     # Of parts of the volume, since what is computed of all of it takes 300 MB
-    brain = without_outside(labels.with_array(labels.array[coarse]), names).array > 0
+    outside = [0, *labels_of(names, OUTSIDE)]
+    brain = ~np.isin(labels.array[coarse], outside)
     depth = distance_to(~np.pad(brain, 1), (step * spacing)[::-1])[1:-1, 1:-1, 1:-1]
     where = np.isin(labels.array[coarse], labels_of(names, _WITHIN)) & (abs(depth - drawn["depth_mm"]) <= _SHELL_MM)
     places = np.flatnonzero(where)
@@ -207,6 +208,5 @@ def with_lesion(labels: Volume, names: Sequence[str], drawn: Mapping[str, Any], 
     radius = drawn["radius_mm"] * np.clip(1.0 + drawn["roughness"] * rough, 0.3, 2.4)
     names = (*names, *({drawn["tissue"]} - set(names)))
     array = labels.array.copy()
-    inside = without_outside(labels.with_array(array[box]), names).array > 0
-    array[box][(away <= radius) & inside] = names.index(drawn["tissue"]) + 1
+    array[box][(away <= radius) & ~np.isin(array[box], outside)] = names.index(drawn["tissue"]) + 1
     return Added(labels.with_array(array), names)
