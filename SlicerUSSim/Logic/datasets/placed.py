@@ -202,9 +202,10 @@ def with_lesion(labels: Volume, names: Sequence[str], drawn: Mapping[str, Any], 
     reach = np.ceil(drawn["radius_mm"] * 2.5 / spacing).astype(int)
     low, high = np.maximum(middle - reach, 0), np.minimum(middle + reach + 1, labels.array.shape)
     box = tuple(slice(a, b) for a, b in zip(low, high, strict=True))
-    offset = (np.moveaxis(np.mgrid[box], 0, -1) - middle) * spacing
+    offset = (np.moveaxis(np.mgrid[box], 0, -1) - middle) * spacing.astype(np.float32)
     away = np.linalg.norm(offset, axis=-1)
-    rough = np.cos(offset / np.maximum(away, 1e-6)[..., None] @ waves.T + phases).sum(axis=-1) * np.sqrt(2.0 / _WAVES)
+    ways = (offset / np.maximum(away, 1e-6)[..., None]).astype(np.float32)
+    rough = sum(np.cos(ways @ wave + phase) for wave, phase in zip(waves, phases, strict=True)) * np.sqrt(2.0 / _WAVES)
     radius = drawn["radius_mm"] * np.clip(1.0 + drawn["roughness"] * rough, 0.3, 2.4)
     names = (*names, *({drawn["tissue"]} - set(names)))
     array = labels.array.copy()
