@@ -218,10 +218,12 @@ def _on_dask(
 def _client(scheduler: str | None, workers: int) -> Iterator[Any]:
     """A client of the scheduler, or of new processes on this computer, each with its part of the cores."""
     require_package("distributed", EXTRA, "more than one process")
+    from dask import config
     from distributed import Client, LocalCluster
 
     cluster: Any = nullcontext()
     if scheduler is None:
+        config.set({"distributed.nanny.pre-spawn-environ.MALLOC_ARENA_MAX": 2})  # or workers keep what they freed
         cores = str(max((os.cpu_count() or 1) // workers, 1))
         cluster = LocalCluster(
             n_workers=workers, threads_per_worker=1, memory_limit=0, dashboard_address="127.0.0.1:0",  # type: ignore
