@@ -48,12 +48,12 @@ HEAVY = {
 #: what users get for it.
 BUDGETS = {
     "base": 3350, "opencl": 1295, "probe": 1520, "tissue": 2070, "tracked": 1935, "mri": 7470, "placement": 845,
-    "imaging": 5330, "datasets": 1625, "fitting": 3695, "vtk": 505, "mrml": 4780, "Widget": 3045, "Workstation": 5795,
+    "imaging": 5330, "datasets": 1630, "fitting": 3695, "vtk": 505, "mrml": 4780, "Widget": 3045, "Workstation": 5795,
     "Command": 2895, "gym": 140, "module": 430, "validation": 6055, "benchmarks": 3935, "tests": 29300,
     "tests/reference": 460,
 }  # fmt: skip
 #: Lines of all of SlicerUSSim/, and of kernels/
-LARGEST_PRODUCT, LARGEST_KERNELS = 46_690, 5_600
+LARGEST_PRODUCT, LARGEST_KERNELS = 46_695, 5_600
 #: Packages of the checkout that use the product and are not installed with it
 CHECKOUT = {"validation", "benchmarks", "tests", "examples"}
 

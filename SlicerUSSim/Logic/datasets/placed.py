@@ -5,7 +5,6 @@ from __future__ import annotations
 import gc
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +24,6 @@ from SlicerUSSim.Logic.mri.markups import markup_points
 from SlicerUSSim.Logic.mri.pathology import Added, innermost_ras
 from SlicerUSSim.Logic.mri.segmentation_settings import GEL_MM
 from SlicerUSSim.Logic.placement.craniotomy import default_pose, disc_diameter_mm, disc_opening, opened, without_outside
-from SlicerUSSim.Logic.placement.views import view_pose
 from SlicerUSSim.Logic.probe.poses import aimed_at, turned
 from SlicerUSSim.Logic.probe.surface import PatientSurface
 from SlicerUSSim.Logic.tissue.names import OUTSIDE, labels_of
@@ -74,7 +72,7 @@ class Scene:
         if is_open:
             opening = disc_opening(labels, names, self.start, disc_diameter_mm(recipe.probes[0]) + _WIDER_MM)
             labels = opened(labels, names, opening)[0]
-        self._view = cache(lambda name: view_pose(labels, names, name)[0])
+        self._views = patient.views
         fixed = recipe.drawn(0)
         settings = section_of(SimulationSettings(), fixed, "settings")
         if "skin" in names and not is_open and "settings.contact_gap_mm" not in fixed:
@@ -92,7 +90,7 @@ class Scene:
         if self._poses:
             pose = self._poses[(image - self.case.first * self.recipe.shard) % len(self._poses)]
         elif chosen.on == "view":
-            pose = self._view(drawn["pose.view"])
+            pose = self._views[drawn["pose.view"]].copy()
         elif chosen.on == "surface":
             random = generator(self.recipe.settings.seed, image, "place")
             pose = self.surface.slid(pose, self._places[int(random.integers(len(self._places)))])

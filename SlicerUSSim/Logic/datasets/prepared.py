@@ -21,6 +21,7 @@ from SlicerUSSim.Logic.mri.samples import demo_mri, head_mri
 from SlicerUSSim.Logic.mri.segmentation import Segmentation
 from SlicerUSSim.Logic.mri.sheets.head import Head
 from SlicerUSSim.Logic.mri.sheets.regions import ventricles
+from SlicerUSSim.Logic.placement.views import view_pose
 from SlicerUSSim.Logic.tissue.label_sources import is_label_file, read_label_file
 from SlicerUSSim.Logic.tissue.presets import TISSUES
 from SlicerUSSim.Logic.tissue.table import TissueTable
@@ -48,6 +49,8 @@ class PreparedPatient:
     texture: Texture | None
     #: The MRI or CT on the grid of the labels, float32; None for a label map, or if no output shows it
     mri: Volume | None
+    #: {name: (4, 4) probe_to_ras} of the standard views of the recipe, which would take workers 1 GB
+    views: dict[str, np.ndarray]
 
 
 def prepared_path(out: Path, patient: int) -> Path:
@@ -104,7 +107,9 @@ def _prepared(recipe: Recipe, number: int) -> PreparedPatient:
     if mri is not None:
         is_shown = "mri" in recipe.settings.outputs
         mri = part.with_array(on_grid(mri.with_array(mri.array.astype(np.float32)), part)) if is_shown else None
-    return PreparedPatient(part, tuple(names), tissues, texture, mri)
+    wanted = set(recipe.draws["pose.view"].values if recipe.pose.on == "view" else ())
+    views: dict[str, np.ndarray] = {name: view_pose(part, names, name)[0] for name in wanted}
+    return PreparedPatient(part, tuple(names), tissues, texture, mri, views)
 
 
 def with_ventricles(
