@@ -130,7 +130,7 @@ class Recipe:
     >>> from SlicerUSSim.Logic.datasets import Recipe
     >>> recipe = Recipe.of_text('images = 100\\n[[patients]]\\nfile = "mni152"\\n[display]\\ngain_db = 3')
     >>> recipe.shards, recipe.drawn(7) == recipe.drawn(7)
-    (2, True)
+    (3, True)
     """
 
     settings: SetSettings
