@@ -63,12 +63,13 @@ PAGES = {
     "Use": [
         "docs/slicer",
         "docs/workstation",
+        "docs/datasets",
         "docs/security",
         "docs/probes",
         "docs/reference/command",
         "docs/reference/index",
     ],
-    "How it works": ["docs/brain", "docs/physics", "docs/optimization", "docs/performance"],
+    "How it works": ["docs/brain", "docs/physics", "docs/optimization", "docs/performance", "docs/scale"],
     "Change it": ["docs/architecture", "docs/developer", "CONTRIBUTING", "CHANGELOG"],
 }
 

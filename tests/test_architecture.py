@@ -39,16 +39,21 @@ HEAVY = {
     "skimage": set(),
     "nlopt": set(),
     "slicer": {"mrml", "module", "Widget", "Workstation"},
+    "distributed": set(),
+    "zarr": set(),
+    "h5py": set(),
+    "gymnasium": {"gym"},
 }
 #: Lines of Python that a room, or a folder beside the product, may have. Raising one is a decision: the commit says
 #: what users get for it.
 BUDGETS = {
     "base": 3350, "opencl": 1305, "probe": 1690, "tissue": 2070, "tracked": 1935, "mri": 7470, "placement": 845,
-    "imaging": 5350, "fitting": 3695, "vtk": 505, "mrml": 4780, "Widget": 3045, "Workstation": 5795, "Command": 2835,
-    "module": 430, "validation": 6630, "benchmarks": 3805, "tests": 28845, "tests/reference": 505,
+    "imaging": 5350, "datasets": 1630, "fitting": 3695, "vtk": 505, "mrml": 4780, "Widget": 3045, "Workstation": 5795,
+    "Command": 2895, "gym": 140, "module": 430, "validation": 6630, "benchmarks": 3935, "tests": 29300,
+    "tests/reference": 505,
 }  # fmt: skip
 #: Lines of all of SlicerUSSim/, and of kernels/
-LARGEST_PRODUCT, LARGEST_KERNELS = 45_060, 5_840
+LARGEST_PRODUCT, LARGEST_KERNELS = 46_695, 5_840
 #: Packages of the checkout that use the product and are not installed with it
 CHECKOUT = {"validation", "benchmarks", "tests", "examples"}
 
@@ -181,7 +186,7 @@ def room_of(module: str) -> str:
         return PACKAGE
     if parts[0] == "Logic":
         return parts[1] if len(parts) > 1 else "Logic"
-    return parts[0] if parts[0] in ("Widget", "Workstation", "Command") else "module"
+    return parts[0] if parts[0] in ("Widget", "Workstation", "Command", "gym") else "module"
 
 
 def _called(node: ast.Call) -> str:

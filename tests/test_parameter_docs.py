@@ -18,6 +18,7 @@ from SlicerUSSim.Command.cli import main
 from SlicerUSSim.Command.options import rare_keys
 from SlicerUSSim.Logic.base.declaration import Declared, Parameter, parameters_of
 from SlicerUSSim.Logic.base.settings import DisplaySettings, SimulationSettings
+from SlicerUSSim.Logic.datasets.recipe import LesionSettings, PatientSettings, PoseSettings, SetSettings
 from SlicerUSSim.Logic.fitting.fit_settings import FitSettings
 from SlicerUSSim.Logic.fitting.image_similarity import SimilaritySettings
 from SlicerUSSim.Logic.mri.segmentation_settings import SegmentationSettings, SheetSettings
@@ -66,6 +67,9 @@ SECTIONS: list[tuple[str, type[Declared], str]] = [
      "preset of `ussim optimize`, which has the options `--frames` and `--free`, too."),
     ("Similarity", SimilaritySettings, "The cost of a fit ([optimization.md](optimization.md#cost-function)); set in "
      "Python only."),
+    ("Recipe", SetSettings, "Of a data set, before the tables of its recipe ([datasets.md](datasets.md))."),
+    *((f"Recipe: {name}", kind, f"{(kind.__doc__ or '').splitlines()[0]}") for name, kind in
+      (("patients", PatientSettings), ("pose", PoseSettings), ("lesions", LesionSettings))),
     ("Panel", PanelSettings, "Further values of the panel that are saved with a scene ([slicer.md](slicer.md))."),
 ]  # fmt: skip
 

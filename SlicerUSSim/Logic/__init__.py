@@ -1,7 +1,7 @@
 """The public interface: `from SlicerUSSim.Logic import UltrasoundSimulator`.
 
 One room per subject, each with a face of its own: base, opencl, probe, tissue, tracked, mri, placement, imaging,
-fitting, vtk, mrml. Names are imported when they are first used, so that importing this package costs nothing.
+datasets, fitting, vtk, mrml. Names are imported when they are first used, so that importing this package costs nothing.
 """
 
 from typing import TYPE_CHECKING

@@ -25,6 +25,7 @@ OUTPUTS: dict[str, tuple[type[np.generic], str, bool]] = {
     "labels_as_imaged": (np.uint8, "", True),
     "depth": (np.float32, "", True),
     "iq": (np.complex64, "iq", False),
+    "rf": (np.float32, "iq", False),
     "envelope": (np.float32, "envelope", False),
     "bmode": (np.uint8, "grey", False),
 }
@@ -158,6 +159,11 @@ def fetched(name: str, frame: DeviceFrame, pose: np.ndarray, samples: int) -> Ca
         counts = start(tree.segment_counts, (traced,), np.int32)
         return lambda: _imaged(frame, labels, pose, segments(), counts())
     signal = frame.start_download(OUTPUTS[name][1])
+    if name == "rf":
+        record = frame.acquisition
+        cycles = np.arange(samples) * float(record["sample_mm"]) * float(record["cycles_per_mm"])
+        carrier = np.exp(2j * np.pi * cycles).astype(np.complex64)
+        return lambda: (signal()[:, :samples] * carrier).real
     return signal if name == "image" else lambda: signal()[:, :samples]
 
 

@@ -233,22 +233,23 @@ class UltrasoundSimulator:
         *,
         display: DisplaySettings | Sequence[DisplaySettings] | None = None,
         tissues: TissueTable | Sequence[TissueTable] | None = None,
+        settings: SimulationSettings | Sequence[SimulationSettings] | None = None,
         outputs: Sequence[str] = ("image",),
         out: Mapping[str, np.ndarray] | None = None,
-        noise_seed: int = 0,
+        noise_seed: int | Sequence[int] = 0,
     ) -> dict[str, np.ndarray]:
-        """{output: array} of images at `poses` (n, 4, 4); image i is that of simulate() with noise_seed + i.
+        """{output: array} of images at `poses` (n, 4, 4); image i has the noise_seed + i, or its own.
 
         One image is prepared while the device computes the one before, and nothing else than the outputs is downloaded.
 
         Parameters
         ----------
-        probes, display, tissues : one for all images, or one for each; tissues by default the simulator's. The images
-            do not follow each other: display.persistence has no effect.
+        probes, display, tissues, settings : one for all images, or one for each; tissues and settings by default the
+            simulator's. The images do not follow each other: display.persistence has no effect.
         outputs : some of "image" (n, rows, columns) uint8; "labels", the tissue labels at the places of the pixels, and
             "labels_as_imaged", where travel time and refraction put them, both (n, rows, columns) uint8 and 0 outside
             the imaged field; "depth" (n, rows, columns) float32, mm along the scan line, nan outside; "iq" complex64,
-            "envelope" float32 and "bmode" uint8 (n, scan_lines, samples).
+            "rf", its real signal, and "envelope" float32, and "bmode" uint8 (n, scan_lines, samples).
         out : {output: array} to write to, as np.memmap. Without it arrays for which memory is short are temporary files
             (in TMPDIR), which go with them.
 
@@ -269,18 +270,20 @@ class UltrasoundSimulator:
         require_kind("poses", poses, Iterable, "of (4, 4) probe_to_ras")
         poses = [check_rigid(f"pose {number}", pose) for number, pose in enumerate(poses)]
         require(bool(poses), "the batch has no pose, expected at least one")
-        probes, displays, tables = (
+        probes, displays, tables, each = (
             one_per_image(name, given, kind, len(poses))
             for name, given, kind in (
                 ("probes", probes, Probe), ("display", display, DisplaySettings), ("tissues", tissues, TissueTable),
+                ("settings", settings or self.settings, SimulationSettings),
             )
         )  # fmt: skip
+        noise_seeds = range(noise_seed, noise_seed + len(poses)) if isinstance(noise_seed, int) else noise_seed
         grids = [
             ImageGrid.for_probe(probe, shown and shown.image_size)
             for probe, shown in zip(probes, displays, strict=True)
         ]
         pixels = same_shapes([(grid.rows, grid.columns) for grid in grids])
-        lines = [self._signal_shape(*worked(probe, self.settings, pixels[1])) for probe in probes]
+        lines = [self._signal_shape(*worked(*both, pixels[1])) for both in zip(probes, each, strict=True)]
         has_signals = not all(OUTPUTS[name][2] for name in outputs if name in OUTPUTS)
         arrays = arrays_for(outputs, len(poses), pixels, same_shapes(lines) if has_signals else lines[0], out)
         for probe in dict.fromkeys(probes):
@@ -292,9 +295,10 @@ class UltrasoundSimulator:
                 if table is not before:
                     self.set_tissues(table)
                     before = table
+                self.settings = each[number]
                 if "labels_as_imaged" in arrays:
                     self.forget_echoes()  # they need the rays, too
-                yield probes[number], poses[number], displays[number], grids[number], noise_seed + number
+                yield probes[number], poses[number], displays[number], grids[number], noise_seeds[number]
 
         def start(number: int, frame: DeviceFrame) -> Callable[[], None]:
             fetching = {name: fetched(name, frame, poses[number], lines[number][1]) for name in arrays}
@@ -306,9 +310,10 @@ class UltrasoundSimulator:
             return complete
 
         with ExitStack() as stack:
-            if tissues is not None:  # of this batch alone
+            if tissues is not None or settings is not None:  # of this batch alone
                 stack.enter_context(self._lock)
                 stack.enter_context(self.with_tissues(self.medium.tissues))
+                stack.callback(setattr, self, "settings", self.settings)
             self._in_turn(jobs(), start)
         self._warn_if_overflown(len(poses))
         return arrays

@@ -1,0 +1,65 @@
+"""`ussim dataset`."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from SlicerUSSim.Command.options import device_option, out_option
+from SlicerUSSim.Command.progress import Share, note
+
+if TYPE_CHECKING:
+    from SlicerUSSim.Logic.datasets import Made
+
+
+class _Rate(Share):
+    """A progress bar with images per second and the time left."""
+
+    def __call__(self, made: Made) -> None:  # type: ignore[override]
+        self._show(str(made))
+        super().__call__(made.done / made.images)
+
+
+@click.command()
+@click.argument("recipe")
+@out_option("Folder of the set; one that this recipe has begun is completed.")
+@click.option(
+    "--scheduler", metavar="tcp://HOST:PORT|FILE",
+    help="Scheduler of a Dask cluster (docs/scale.md), by its address or file (default: processes on this computer).",
+)  # fmt: skip
+@click.option(
+    "--workers", type=click.IntRange(1, 1024),
+    help="Processes on this computer; 1: without Dask (default: one for each core that has memory).",
+)  # fmt: skip
+@click.option(
+    "--export", type=click.Choice(("coco", "nnunet")), help="Also write the set as COCO, or as nnU-Net v2 reads it."
+)
+@device_option
+@click.pass_context
+def dataset(
+    ctx: click.Context, recipe: str, out: Path, scheduler: str | None, workers: int | None, export: str | None,
+    device: str | None,
+) -> None:  # fmt: skip
+    """Make many labelled images from a recipe, a TOML file or the name of one that comes with the package.
+
+    Image n is the same whoever makes it. The same command goes on with a set that was interrupted. The exit status is 1
+    if a patient was left out.
+    """
+    from SlicerUSSim.Logic.datasets import Recipe, export_coco, export_nnunet, make_dataset
+
+    if device is not None:
+        os.environ["USSIM_DEVICE"] = device  # workers have it, too
+    read = Recipe.read(recipe)
+    note(f"{recipe}: {read.settings.images} images of {len(read.cases)} cases in {read.shards} shards of {read.shard}")
+    with _Rate("dataset") as progress:
+        made = make_dataset(read, out, scheduler=scheduler, workers=workers, progress=progress)
+    for why in made.skipped.values():
+        note(f"left out: {why}")
+    if export is not None:
+        note(f"wrote {(export_coco if export == 'coco' else export_nnunet)(out)}")
+    memory = f", at most {made.peak_mb:.0f} MB in a process" if made.peak_mb else ""
+    note(f"wrote {out} ({made.done} images, {made.rate:.1f} images/s{memory})")
+    ctx.exit(1 if made.skipped else 0)

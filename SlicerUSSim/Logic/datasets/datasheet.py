@@ -1,0 +1,107 @@
+"""Manifest and datasheet of a set: what is in it, what it was made of and by, and what is missing."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import platform
+from collections.abc import Iterable, Mapping
+from importlib.metadata import distributions
+from pathlib import Path
+from typing import Any
+
+from SlicerUSSim.Logic.base.files import read_json, write_json, written_whole
+from SlicerUSSim.Logic.base.version import __version__
+from SlicerUSSim.Logic.datasets.prepared import CLASSES
+from SlicerUSSim.Logic.datasets.recipe import BUNDLED, OUTPUTS, Recipe
+from SlicerUSSim.Logic.datasets.writers import record_path
+
+MANIFEST = "manifest.json"
+#: (licence, citation) of the bundled patients
+_SOURCES = {
+    BUNDLED[0]: ("that of mni152.txt in the package", "MNI152 2009a (Fonov et al., NeuroImage 54, 2011), from nilearn"),
+    BUNDLED[1]: ("Apache-2.0", "drawn by SlicerUSSim"),
+}
+_LIBRARIES = {"numpy", "pyopencl", "zarr", "h5py", "distributed"}
+_PAGE = """# {title}
+
+{made} of {images} B-mode images, simulated by SlicerUSSim {makers} from the recipe `recipe.toml` with seed {seed}. No
+scanner measured them: test on real images what you train on these.
+
+Licence: {licence}
+
+## Content
+
+{outputs}
+- `pose`: (4, 4) from the probe to the patient, RAS mm; `image_to_probe`: (4, 4) from (column, row, 0, 1) to mm
+- `shards/*.json`: parameters drawn for each image, and the SHA-256 of its arrays
+
+Format: {format}, {shard} images in a shard. Labels: {labels}. Checksum of all arrays: `{checksum}`.
+
+## Sources
+
+{patients}
+
+Acoustic values of tissues: with their sources in SlicerUSSim.
+
+## Made on
+
+{devices}
+"""
+
+
+def write_datasheet(recipe: Recipe, out: Path, skipped: Mapping[str, str]) -> None:
+    """Write manifest.json and README.md of what is in the folder."""
+    for rest in out.glob("images.zarr/**/*.partial"):  # of workers that were killed
+        rest.unlink(missing_ok=True)
+    shards, settings = {}, recipe.settings
+    kept: dict[str, set[str]] = {"device": set(), "version": set(), "warnings": set(), "tissues": {"coupling"}}
+    for shard in range(recipe.shards):
+        if record_path(out, shard).exists():
+            record = read_json(record_path(out, shard), most_bytes=2**30)
+            shards[str(shard)] = {name: record[name] for name in ("images", "patient", "case", "checksums")}
+            for name, values in kept.items():
+                values |= {record[name]} if isinstance(record[name], str) else set(record[name])
+    sums = json.dumps([one["checksums"] for one in shards.values()])
+    found = {one.name: one.version for one in distributions() if one.name in _LIBRARIES}
+    manifest = {
+        "title": settings.title, "licence": settings.licence or "that of the sources", "seed": settings.seed,
+        "format": settings.format, "images": settings.images, "shard": recipe.shard,
+        "made": sum(one["images"][1] - one["images"][0] for one in shards.values()), "checksum": _sha256(sums.encode()),
+        "recipe_sha256": _sha256(recipe.text.encode()), "outputs": {name: OUTPUTS[name] for name in settings.outputs},
+        "labels": {str(n): name for n, name in enumerate(CLASSES) if name in kept["tissues"]},
+        "patients": [_patient(recipe, number, skipped) for number in range(len(recipe.patients))],
+        "made_by": sorted(kept["version"]), "devices": sorted(kept["device"]), "warnings": sorted(kept["warnings"]),
+        "versions": {"SlicerUSSim": __version__, "Python": platform.python_version(), **found}, "shards": shards,
+    }  # fmt: skip
+    write_json(out / MANIFEST, manifest)
+    lines = [
+        f"`{one['file']}`: {one['citation']}; licence: {one['licence']}{one['missing_because'] and '; MISSING: '}"
+        f"{one['missing_because']}" for one in manifest["patients"]
+    ]  # fmt: skip
+    texts = {
+        "outputs": _listed(f"`{name}`: {about}" for name, about in manifest["outputs"].items()),
+        "labels": ", ".join(f"{number} {name}" for number, name in manifest["labels"].items()),
+        "patients": _listed(lines), "devices": _listed((*manifest["devices"], *manifest["warnings"])),
+        "makers": ", ".join(manifest["made_by"]),
+    }  # fmt: skip
+    with written_whole(out / "README.md") as partial:
+        partial.write_text(_PAGE.format(**{**manifest, **texts}), encoding="utf-8")
+
+
+def _patient(recipe: Recipe, number: int, skipped: Mapping[str, str]) -> dict[str, Any]:
+    patient = recipe.patients[number]
+    path, (licence, citation) = recipe.folder / patient.file, _SOURCES.get(patient.file, ("not given", "not given"))
+    return {
+        "file": patient.file, "sha256": _sha256(path.read_bytes()) if path.is_file() else "",
+        "licence": patient.licence or licence, "citation": patient.citation or citation,
+        "missing_because": skipped.get(patient.file, ""),
+    }  # fmt: skip
+
+
+def _sha256(content: bytes) -> str:
+    return hashlib.sha256(content).hexdigest()
+
+
+def _listed(lines: Iterable[str]) -> str:
+    return "\n".join(f"- {line}" for line in lines)

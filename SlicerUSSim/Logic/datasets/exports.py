@@ -1,0 +1,78 @@
+"""Exports of a set: COCO and nnU-Net v2."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+from scipy import ndimage
+
+from SlicerUSSim.Logic.base.errors import require
+from SlicerUSSim.Logic.base.files import make_folder, write_json
+from SlicerUSSim.Logic.datasets.reader import SimulatedImages
+from SlicerUSSim.Logic.imaging.figures import write_png
+
+_LABELS = ("labels_as_imaged", "labels")
+
+
+def export_coco(folder: str | os.PathLike) -> Path:
+    """The file of annotations of a set in COCO's format, written into its folder `coco` with the images as PNG.
+
+    Each connected region of a tissue is an object, with its box, area in pixels and mask (run lengths). Labels are
+    those as imaged, if the set has them. Raises SimulationError for a set without images or labels.
+    """
+    images, labels, out = _opened(folder, "coco")
+    entries, objects = [], []
+    for item in images:
+        name, (rows, columns) = f"{item['number']:08d}.png", item["image"].shape
+        write_png(make_folder(out / "images") / name, item["image"])
+        entries.append({"id": item["number"], "file_name": name, "height": rows, "width": columns})
+        for label in np.unique(item[labels][item[labels] > 0]).tolist():
+            parts, _ = ndimage.label(item[labels] == label)  # type: ignore[misc]
+            for number, (down, across) in enumerate(ndimage.find_objects(parts), 1):
+                mask = parts == number
+                objects.append({
+                    "id": len(objects) + 1, "image_id": item["number"], "category_id": label, "iscrowd": 0,
+                    "bbox": [across.start, down.start, across.stop - across.start, down.stop - down.start],
+                    "area": int(mask.sum()), "segmentation": {"size": [rows, columns], "counts": _run_lengths(mask)},
+                })  # fmt: skip
+    categories = [{"id": label, "name": name} for label, name in images.labels.items() if label]
+    about = {"description": images.manifest["title"], "version": images.manifest["checksum"]}
+    content = {"info": about, "images": entries, "annotations": objects, "categories": categories}
+    write_json(out / "annotations.json", content)
+    return out / "annotations.json"
+
+
+def _run_lengths(mask: np.ndarray) -> list[int]:
+    """Lengths of runs of 0 and 1 by columns, beginning with 0, as COCO has them."""
+    flat = np.concatenate([[0], mask.T.ravel().astype(np.int8)])
+    changes = np.flatnonzero(np.diff(flat))
+    return np.diff(np.concatenate([[0], changes, [mask.size]])).tolist()
+
+
+def export_nnunet(folder: str | os.PathLike) -> Path:
+    """The folder Dataset001_SlicerUSSim of a set, as nnU-Net v2 reads it from its nnUNet_raw: PNG, one channel.
+
+    Labels are numbered anew, without gaps; those as imaged, if the set has them. Raises SimulationError for a set
+    without images or labels.
+    """
+    images, labels, out = _opened(folder, "Dataset001_SlicerUSSim")
+    new = np.zeros(256, np.uint8)
+    known = [label for label in images.labels if label]
+    new[known] = range(1, len(known) + 1)
+    for item in images:
+        case = f"image_{item['number']:08d}"
+        write_png(make_folder(out / "imagesTr") / f"{case}_0000.png", item["image"])
+        write_png(make_folder(out / "labelsTr") / f"{case}.png", new[item[labels]])
+    names = {"background": 0} | {images.labels[label]: int(new[label]) for label in known}
+    values = {"channel_names": {"0": "ultrasound"}, "labels": names, "numTraining": len(images), "file_ending": ".png"}
+    write_json(out / "dataset.json", values)
+    return out
+
+
+def _opened(folder: str | os.PathLike, name: str) -> tuple[SimulatedImages, str, Path]:
+    images = SimulatedImages(folder)
+    labels = next((each for each in _LABELS if each in images.outputs), None)
+    require("image" in images.outputs and labels, f"{folder}: has no images with labels, expected both to export them")
+    return images, str(labels), make_folder(Path(folder) / name)
