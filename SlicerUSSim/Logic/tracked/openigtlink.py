@@ -320,7 +320,7 @@ class TrackerLink:
 
     def _take(self, peer: _Peer, header: dict[str, Any], packed: bytes, body: bytes | None) -> None:
         """A message; `body` is None for a kind that is not read."""
-        kind, device = header["message_type"], header["device_name"]
+        kind = header["message_type"]
         peer.version = max(peer.version, min(header["header_version"], 2))
         if body is None:
             self._notice(f"messages of type {kind} are passed over")

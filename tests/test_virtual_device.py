@@ -1,0 +1,346 @@
+"""The virtual ultrasound device, with a client of its own on loopback: what PlusServer answers, and what it sends."""
+
+from __future__ import annotations
+
+import struct
+import threading
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from SlicerUSSim.Logic import SimulationError, TrackedSequence, Volume
+from SlicerUSSim.Logic.imaging.preset import Preset
+from SlicerUSSim.Logic.probe.poses import turned
+from SlicerUSSim.Logic.tissue.presets import TISSUES
+from tests.conftest import block, simulator
+from tests.openigtlink_client import StrictClient, packed
+from tests.test_tracking import free_port, until
+
+pytest.importorskip("pyigtl", reason="OpenIGTLink comes with pyigtl: pip install '.[serve]'")
+
+from SlicerUSSim.Logic.device import Recorder, VirtualDevice
+from SlicerUSSim.Logic.tracked.openigtlink import Address, TrackerLink
+
+POSE = turned(np.eye(4), rock_deg=20)
+POSE[:3, 3] = [2.0, -25.0, 1.0]
+PRESET = Preset().changed("display", image_size=(96, 80)).changed("probe", scan_lines=32, depth_mm=50.0)
+
+
+class Running:
+    """A device with its port, whose images go on in a thread."""
+
+    def __init__(self, folder: Path) -> None:
+        made = simulator(block(lambda x, y, z: 1.0 + (x > 0)), TISSUES["liver"], TISSUES["fat"])
+        self.port = free_port()
+        address = Address("127.0.0.1", self.port, listen=True)
+        self.device = VirtualDevice(made, PRESET, [POSE], address, folder)
+        self.thread = threading.Thread(target=self.device.run)
+
+    def __enter__(self) -> Running:
+        self.thread.start()
+        return self
+
+    def __exit__(self, *_) -> None:
+        self.device.stop()
+        self.thread.join()
+
+
+@pytest.fixture(scope="module")
+def running(tmp_path_factory):
+    with Running(tmp_path_factory.mktemp("recordings")) as made:
+        yield made
+
+
+@pytest.fixture
+def client(running):
+    with StrictClient(running.port) as made:
+        yield made
+
+
+def command(name: str, inner: str = "", **attributes: str) -> str:
+    text = "".join(f' {key}="{value}"' for key, value in attributes.items())
+    return f'<Command Name="{name}"{text}>{inner}</Command>'
+
+
+def parameters(*names: str, **values: str) -> str:
+    asked = [f'<Parameter Name="{name}"/>' for name in names]
+    return "".join(asked + [f'<Parameter Name="{name}" Value="{value}"/>' for name, value in values.items()])
+
+
+# ---- what it sends ---------------------------------------------------------------------------------------------------
+
+
+def test_image_and_pose_have_one_time_and_the_calibration_comes_once(client):
+    kinds = [client.receive() for _ in range(7)]
+    assert [(one.kind, one.device) for one in kinds] == [
+        ("TRANSFORM", "ImageToProbe"), *[("TRANSFORM", "ProbeToReference"), ("IMAGE", "Image_Reference")] * 3
+    ]  # fmt: skip
+    calibration, pose, image = kinds[:3]
+    assert calibration.stamp == pose.stamp == image.stamp < kinds[3].stamp
+    assert {one.version for one in kinds} == {1}  # to a client that has not sent another
+    pixels, matrix = image.image
+    assert pixels.shape == (96, 80) and pixels.max() > 50
+    place, placed = pose.matrix @ calibration.matrix, matrix
+    assert np.allclose(place[:3, [0, 1, 3]], placed[:3, [0, 1, 3]], atol=1e-3)
+    assert np.allclose(pose.matrix, POSE, atol=1e-5)
+    client.send("GET_STATUS", "", b"")
+    client.next("STATUS")
+    assert client.next("TRANSFORM").metadata == {"TransformStatus": "OK", "TransformValid": "1"}
+
+
+def test_status_and_capabilities_are_told(client):
+    client.send("GET_STATUS", "Any", b"", version=1)
+    status = client.next("STATUS")
+    assert struct.unpack(">Hq20s", status.content[:30]) == (1, 0, bytes(20)) and status.content[30:] == b"\0"
+    client.send("GET_CAPABIL", "", b"")
+    content = client.next("CAPABILITY").content
+    names = {content[n : n + 12].rstrip(b"\0").decode() for n in range(0, len(content), 12)}
+    assert {"IMAGE", "TRANSFORM", "COMMAND", "STATUS"} < names
+
+
+def test_any_client_moves_the_probe_one_at_a_time(running):
+    with StrictClient(running.port) as first, StrictClient(running.port) as second:
+        one, other = POSE @ np.diag([1.0, 1, 1, 1]), turned(POSE, tilt_deg=5.0)
+        one[:3, 3] += [1.0, 0.0, 0.0]
+        first.move(one)
+        until(lambda: np.allclose(second.next("TRANSFORM", "ProbeToReference").matrix, one, atol=1e-4))
+        before = running.device.link.received
+        second.move(other)
+        second.move(other, "StylusToReference")
+        until(lambda: "of which two send ProbeToReference: the first is followed" in running.device.link.status)
+        assert running.device.link.received == before
+    with StrictClient(running.port) as third:  # the others have gone
+        until(lambda: running.device.link.clients == 1)
+        third.move(POSE, "RobotToReference")
+        until(lambda: np.allclose(third.next("TRANSFORM", "ProbeToReference").matrix, POSE, atol=1e-4))
+
+
+def test_a_client_that_does_not_read_holds_nobody():
+    """It gets the newest image when it reads again, and what waits for it is one image."""
+    port = free_port()
+    link = TrackerLink("127.0.0.1", port, print, listen=True)
+    try:
+        with StrictClient(port, receive_buffer=4096) as idle, StrictClient(port) as other:
+            idle.checks_crc = other.checks_crc = False
+            until(lambda: link.clients == 2)
+            for number in range(60):
+                link.send(Volume(np.full((1, 700, 700), number, np.uint8), np.eye(4)))
+                while other.next("IMAGE").image[0][0, 0] != number:
+                    pass
+            got = []
+            while not got or got[-1] != 59:
+                got.append(int(idle.next("IMAGE").image[0][0, 0]))
+            assert len(got) < 10 and got == sorted(got) and link.left_out >= 60 - len(got)
+    finally:
+        link.stop()
+
+
+# ---- commands --------------------------------------------------------------------------------------------------------
+
+
+def test_parameters_are_read_as_plus_writes_them(client):
+    names = ("DepthMm", "GainPercent", "FrequencyMhz", "DynRangeDb", "FocusDepthPercent", "FocusDepthMm", "ImageSize")
+    reply = client.command(command("GetUsParameter", parameters(*names), UsDeviceId="VideoDevice"))
+    uid, name, element = reply.command
+    assert (uid, name, reply.device, reply.version, element.tag) == (1, "GetUsParameter", "", 2, "CommandReply")
+    frequency = f"{PRESET.probe.frequency_mhz:g}"
+    values = dict(zip(names, ("50", "50", frequency, "55", "60", "30", "80 96 1 "), strict=True))
+    assert reply.metadata == {**values, "Status": "SUCCESS"}
+    found = [(one.tag, one.get("Name"), one.get("Success"), one.get("Value")) for one in element]
+    assert found == [("Parameter", name, "true", values[name]) for name in names]
+
+
+def test_parameters_that_are_not_there_fail_in_the_words_of_plus(client):
+    reply = client.command(command("GetUsParameter", parameters("PowerDb", "DepthMm", "Depth"), UsDeviceId=""))
+    assert reply.metadata == {
+        "DepthMm": "50", "Error": "PowerDb is not set. Invalid parameter Depth. ", "Status": "FAIL"
+    }  # fmt: skip
+    assert [one.get("Success") for one in reply.command[2]] == ["false", "true", "false"]
+    reply = client.command(command("GetUsParameter", parameters("DepthMm"), UsDeviceId="Sonix"))
+    assert reply.metadata == {
+        "Error": "Device Sonix is not found.", "Message": "Command failed. See error message.", "Status": "FAIL"
+    }  # fmt: skip
+    _, _, element = reply.command
+    assert element.attrib == {
+        "Name": "GetUsParameter", "Status": "FAIL", "Error": "Device Sonix is not found.",
+        "Message": "Command failed. See error message.",
+    }  # fmt: skip
+
+
+def test_parameters_that_are_set_change_image_and_calibration(client, running):
+    wanted = parameters(GainPercent="75", DepthMm="40", TimeGainCompensation="-3 0 6", FocusDepthPercent="50")
+    reply = client.command(command("SetUsParameter", wanted, UsDeviceId="VideoDevice"))
+    names = ["DepthMm", "FocusDepthPercent", "GainPercent", "TimeGainCompensation"]
+    assert [one.get("Name") for one in reply.command[2]] == names  # in the order of std::map
+    assert reply.metadata == {**dict.fromkeys(names, "SUCCESS"), "Status": "SUCCESS"}
+    calibration = client.next("TRANSFORM", "ImageToProbe").matrix
+    assert client.next("IMAGE").image[0].shape == (96, 80)  # as before, in other millimetres
+    assert np.isclose(calibration[0, 0], calibration[1, 1])
+    reply = client.command(command("GetUsParameter", parameters(*names), UsDeviceId=""))
+    assert [reply.metadata[name] for name in names] == ["40", "50", "75", "-3 0 6 "]
+    undo = parameters(GainPercent="50", DepthMm="50", FocusDepthMm="30", TimeGainCompensation="0 0 0")
+    assert client.command(command("SetUsParameter", undo)).metadata["Status"] == "SUCCESS"
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "error"),
+    [
+        ("DepthMm", "deep", "Failed to parse DepthMm. "),
+        ("DepthMm", "-5", "Failed to set DepthMm. "),
+        ("DepthMm", "nan", "Failed to set DepthMm. "),
+        ("GainPercent", "120", "Failed to set GainPercent. "),
+        ("PowerDb", "3", "Failed to set PowerDb. "),
+        ("Depth", "50", "Invalid parameter Depth. "),
+        ("TimeGainCompensation", "1 2", "Failed to parse TimeGainCompensation."),
+    ],
+)
+def test_what_cannot_be_set_is_said_and_changes_nothing(client, running, name, value, error):
+    before = running.device.transforms()["ImageToProbe"]
+    reply = client.command(command("SetUsParameter", parameters(**{name: value}), UsDeviceId="VideoDevice"))
+    assert reply.metadata == {name: "FAIL", "Error": error, "Status": "FAIL"}
+    assert np.array_equal(running.device.transforms()["ImageToProbe"], before)
+
+
+@pytest.mark.parametrize(
+    ("text", "message", "error"),
+    [
+        (command("RequestDeviceIds"), "VideoDevice,CaptureDevice", None),
+        (command("RequestDeviceIds", DeviceType="VirtualCapture"), "CaptureDevice", None),
+        (command("RequestDeviceIds", DeviceType="VirtualVolumeReconstructor"), "", None),
+        (command("RequestDeviceIds", DeviceType="Toaster"), "Command failed, see error message.",
+         "Unknown device type requested."),
+        (command("RequestChannelIds"), "TrackedVideoStream", None),
+        (command("requestchannelids"), None, None),
+        (command("RequestDeviceChannelIds", DeviceId="VideoDevice"), "TrackedVideoStream,", None),
+        (command("RequestDeviceChannelIds", DeviceId="X"), "Command failed, see error message.",
+         "Device with id: X not found."),
+        (command("GetTransform", TransformName="ProbeToTracker"), "Command failed. See error message.",
+         "GetTransform (ProbeToTracker) Failed. Transform not found."),
+        (command("StartRecording", CaptureDeviceId="Other"), "Command failed. See error message.",
+         "VirtualCapture has not been found (Other), StartRecording"),
+        (command("StopRecording", CaptureDeviceId="CaptureDevice"), "Command failed. See error message.",
+         "VirtualCapture (CaptureDevice) StopRecording No frames to record."),
+        (command("SuspendRecording", ChannelId="TrackedVideoStream"), "Command failed. See error message.",
+         "VirtualCapture (CaptureDevice) SuspendRecording Suspend recording failed: recording to file is not in "
+         "progress."),
+        (command("Version"), "Success.", None),
+    ],
+)  # fmt: skip
+def test_other_commands_are_answered_in_the_words_of_plus(client, text, message, error):
+    reply = client.command(text)
+    element = reply.command[2]
+    if message is None:  # names of commands are as they are written
+        error, message = "Unknown command type requested.", ""
+    assert element.get("Message") == reply.metadata["Message"] == message
+    assert element.get("Error") == reply.metadata.get("Error") == error
+    assert element.get("Status") == reply.metadata["Status"] == ("SUCCESS" if error is None else "FAIL")
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("GetUsParameter", "<Command Name="), ("GetUsParameter", "no XML"), ("ReconstructVolume", None),
+        ("GetUsParameter", "<Order Name='GetUsParameter'/>"), ("GetUsParameter", command("SetUsParameter")),
+        ("GetTransform", command("GetTransform")), ("StartRecording", command("StartRecording")),
+        ("GetUsParameter", "<!DOCTYPE x [<!ENTITY a 'b'>]>" + command("GetUsParameter")),
+    ],
+)  # fmt: skip
+def test_bad_xml_and_unknown_commands_get_the_answer_of_plus(client, name, text):
+    reply = client.command(text or command(name), name)
+    uid, no_name, element = reply.command
+    assert (uid, no_name) == (1, "")
+    said = {"Name": "", "Status": "FAIL", "Error": "Unknown command type requested.", "Message": ""}
+    assert element.attrib == said
+    assert reply.metadata == {"Error": said["Error"], "Message": "", "Status": "FAIL"}
+
+
+def test_what_plus_does_not_answer_is_not_answered(client, running):
+    """A command that came before, one without a name or text, half a message, a kind that nobody knows."""
+    client.command(command("Version"), uid=7)
+    client.send_command(command("Version"), uid=7)
+    client.send_command(command("Version"), name="", uid=8)
+    client.send("COMMAND", "", struct.pack(">I128sHI", 9, b"Version", 3, 0))
+    client.send("COMMAND", "", b"short")
+    client.send("NDARRAY", "x", bytes(1000))
+    assert client.command(command("Version"), uid=10).command[0] == 10  # the next that comes
+    with StrictClient(running.port) as other:
+        whole = packed("COMMAND", "", struct.pack(">I128sHI", 1, b"Version", 3, 26) + command("Version")[:26].encode())
+        other.socket.sendall(whole[:100])
+        assert client.command(command("Version"), uid=11).command[0] == 11
+        other.next("IMAGE")  # goes on
+        other.socket.sendall(whole[100:])
+        assert other.next("RTS_COMMAND").metadata["Status"] == "FAIL"
+
+
+def test_older_clients_get_strings(client):
+    reply = client.string_command(command("RequestChannelIds"), "CMD_12")
+    assert (reply.device, reply.version) == ("ACK_12", 1)
+    assert reply.string == '<CommandReply Status="SUCCESS" Message="TrackedVideoStream" />'
+    reply = client.string_command("<x", "cmd_13")
+    assert reply.device == "cmd"
+    assert reply.string == '<CommandReply Status="FAIL" Message="Error attempting to process command." />'
+    reply = client.string_command(command("Version"), "CMD")
+    words = "Malformed DeviceName. Expected CMD_cmdId (ex: CMD_001)"
+    assert (reply.device, reply.string) == ("ACK", f'<CommandReply Status="FAIL" Message="{words}" />')
+    reply = client.string_command(command("GetUsParameter", parameters("DepthMm")), "CMD_14")
+    assert "&lt;Parameter Name=&quot;DepthMm&quot; Success=&quot;true&quot; Value=&quot;50&quot;/&gt;" in reply.string
+
+
+def test_transforms_are_composed_on_request(client, running):
+    reply = client.command(command("GetTransform", TransformName="ImageToReference"))
+    known = running.device.transforms()
+    values = np.array(reply.metadata["ImageToReference"].split(), float).reshape(4, 4)
+    assert np.allclose(values, known["ProbeToReference"] @ known["ImageToProbe"], atol=1e-4)
+    assert (reply.metadata["persistent"], reply.metadata["error"]) == ("false", "-1")
+    assert reply.metadata["Message"] == "GetTransform (ImageToReference) Command successful."
+
+
+# ---- recordings ------------------------------------------------------------------------------------------------------
+
+
+def test_what_was_sent_is_recorded_and_read_again(client, running):
+    folder, first = running.device.recorder._folder, {}
+    start = command("StartRecording", CaptureDeviceId="CaptureDevice", OutputFilename="../../sweep.igs.mha")
+    reply = client.command(start)
+    assert reply.metadata["Message"] == "VirtualCapture (CaptureDevice) StartRecording successful."
+    assert "already in progress" in client.command(start).metadata["Error"]
+    until(lambda: running.device.recorder.count > 5)
+    client.command(command("SuspendRecording", CaptureDeviceId="CaptureDevice"))
+    count = running.device.recorder.count
+    for _ in range(4):
+        client.next("IMAGE")
+    assert running.device.recorder.count == count
+    client.command(command("ResumeRecording", CaptureDeviceId="CaptureDevice"))
+    until(lambda: running.device.recorder.count > count)
+    seen = {image.stamp: image.image[0] for image in (client.next("IMAGE") for _ in range(8))}
+    reply = client.command(command("StopRecording", CaptureDeviceId="CaptureDevice"))
+    path = folder / "sweep.igs.mha"
+    sequence = TrackedSequence.read(path)
+    words = f"VirtualCapture (CaptureDevice) StopRecording Recording {len(sequence)} frames successful to file {path}"
+    assert reply.metadata["Message"] == words and not (folder.parent.parent / "sweep.igs.mha").exists()
+    assert np.allclose(sequence.pose(0, "ProbeToReference"), POSE, atol=1e-5) and sequence.is_simulated
+    assert sequence.has_pose(0, "ImageToReference")
+    first = {round(stamp, 4): number for number, stamp in enumerate(sequence.timestamps.tolist())}
+    both = [(first[key], image) for stamp, image in seen.items() if (key := round(stamp / 2**32, 4)) in first]
+    assert len(both) > 3 and all(np.array_equal(sequence.images[number], image) for number, image in both)
+    again = client.command(start)  # an existing file stays
+    assert again.metadata["Error"].endswith("StartRecording Failed to open file ../../sweep.igs.mha.")
+
+
+def test_a_recording_that_cannot_be_written_is_kept_for_another_name(tmp_path):
+    recorder = Recorder(tmp_path)
+    with pytest.raises(SimulationError, match="unknown sequence format"):
+        recorder.start("sweep.avi")
+    recorder.start("sweep.igs.mha", compress=True)
+    for number in range(3):
+        recorder.add(np.full((4, 5), number, np.uint8), float(number), {"ProbeToReference": POSE})
+    with pytest.raises(SimulationError, match="expected \\(4, 5\\)"):
+        recorder.add(np.zeros((5, 5), np.uint8), 3.0, {})
+    with pytest.raises(SimulationError, match="unknown sequence format"):
+        recorder.stop("sweep.xyz")
+    assert recorder.stop("other.igs.mha") == (tmp_path / "other.igs.mha", 3)
+    assert TrackedSequence.read(tmp_path / "other.igs.mha").images[:, 0, 0].tolist() == [0, 1, 2]
+    assert [path.name for path in tmp_path.iterdir()] == ["other.igs.mha"]
+    with pytest.raises(SimulationError, match="nothing was recorded"):
+        recorder.stop()
