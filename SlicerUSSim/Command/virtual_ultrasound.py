@@ -69,7 +69,7 @@ def device(patient: DeviceOptions, out: Path) -> None:
     It takes an MRI, a label map, or a scene of the module (.mrb); without one it shows the demo brain. It sends IMAGE,
     ProbeToReference and ImageToProbe, follows a TRANSFORM, and answers the commands of PlusServer.
     """
-    from SlicerUSSim.Logic.base.files import require_folder
+    from SlicerUSSim.Logic.base.files import make_folder, require_folder
     from SlicerUSSim.Logic.device.virtual_device import VirtualDevice
     from SlicerUSSim.Logic.tracked.openigtlink import Address, require_usable
 
@@ -83,7 +83,7 @@ def device(patient: DeviceOptions, out: Path) -> None:
     poses = [pose] if patient.path is None else _poses(patient.path, examination.simulator.medium.labels)
     say_contact(examination, preset.probe, poses[:1])
     examination.simulator.simulate(preset.probe, poses[0], preset.display)  # builds kernels
-    made = VirtualDevice(examination.simulator, preset, poses, address, out.resolve(), patient.igtl_device)
+    made = VirtualDevice(examination.simulator, preset, poses, address, make_folder(out.resolve()), patient.igtl_device)
     note(f"a client may connect to {address}; recordings go to {out.resolve()}")
     telling = threading.Thread(target=_tell, args=(made,), daemon=True)
     telling.start()
