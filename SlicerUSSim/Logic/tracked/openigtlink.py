@@ -200,7 +200,7 @@ class TrackerLink:
         self._stopping = True
         self._wake()
         self._thread.join()
-        self._worker.shutdown()
+        self._worker.shutdown(wait=False, cancel_futures=True)
         for end in (self._listener, self._wake_in, self._wake_out):
             if end is not None:
                 end.close()
