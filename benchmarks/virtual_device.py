@@ -31,6 +31,8 @@ from SlicerUSSim.Logic.tracked.openigtlink import Address, TrackerLink
 
 _HZ, _PORT = 50.0, 28944
 _HEADER = struct.Struct(">H12s20sIIQQ")
+#: Seconds for which poses are sent after the end
+_LATER_S = 10.0
 #: Seconds that each client takes for an image
 _CLIENTS = {"sends poses": 0.0, "reads": 0.0, "reads too": 0.0, "is slow": 0.2}
 
@@ -104,6 +106,7 @@ def _client(port: int, pause: float, seconds: float, poses: list[np.ndarray]) ->
                 wrong += last != (whole, part)
                 latencies.append(time.time() - whole - part / 2**32)
                 time.sleep(pause)
+        stopping.wait(_LATER_S if poses else 0.0)  # the others may have begun later
         stopping.set()
         sender.join()
     return images, wrong, latencies

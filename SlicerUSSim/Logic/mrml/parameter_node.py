@@ -63,7 +63,7 @@ class PanelSettings(Declared):
         choices=tuple(VIEWS), shown=True,
     )  # fmt: skip
     calibration_text: str = parameter(
-        "", "Calibration", "Instead of a transform: the file of a Plus configuration (.xml), or the 16 numbers of "
+        "", "Or file, or numbers", "Instead of a transform: the file of a Plus configuration (.xml), or the 16 numbers of "
         "ImageToProbe by rows", shown=True,
     )  # fmt: skip
     face_pixel: str = parameter(
