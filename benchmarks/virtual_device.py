@@ -48,7 +48,7 @@ def main() -> None:
     image = np.full((1, 512, 660), 90, np.uint8)
 
     def send(pose: np.ndarray) -> None:
-        link.send(Volume(image, pose), pose, np.eye(4))
+        link.send(Volume(image, pose), {"ImageToProbe": np.eye(4), "ProbeToReference": pose})
 
     link = TrackerLink("127.0.0.1", _PORT, send, listen=True)
     _measure("link alone", link, poses, arguments.seconds, link.stop)

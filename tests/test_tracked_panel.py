@@ -58,17 +58,16 @@ def streamed(scene):
 
 def test_the_face_follows_from_the_calibration_and_its_pixel():
     pixel = np.linalg.inv(GRID.image_to_probe)[:2, 3]
-    found = face_of_calibration(IMAGE_TO_PROBE, face_pixel=pixel)
-    assert np.allclose(found.face_to_probe, FACE_TO_PROBE, atol=1e-9)
-    assert np.allclose(found.pixel_spacing_mm, GRID.pixel_spacing_mm)
-    assert "pixels of" in found.words[0] and "(as given)" in found.words[1]
+    pose, words = face_of_calibration(IMAGE_TO_PROBE, face_pixel=pixel)
+    assert np.allclose(pose, FACE_TO_PROBE, atol=1e-9) and "(as given)" in words[1]
+    assert words[0] == "pixels of {:.3g} x {:.3g} mm".format(*GRID.pixel_spacing_mm)
 
 
 def test_the_face_is_found_in_the_image_or_taken_from_its_first_row():
-    found = face_of_calibration(IMAGE_TO_PROBE, IMAGE[None])
-    assert np.allclose(found.face_to_probe, FACE_TO_PROBE, atol=0.6) and "of a field" in found.words[1]
-    found = face_of_calibration(IMAGE_TO_PROBE, np.zeros((1, 220, 260), np.uint8))
-    assert found.face_pixel == (129.5, -0.5) and "no field was found" in found.words[1]
+    pose, words = face_of_calibration(IMAGE_TO_PROBE, IMAGE[None])
+    assert np.allclose(pose, FACE_TO_PROBE, atol=0.6) and "of a field" in words[1]
+    _, words = face_of_calibration(IMAGE_TO_PROBE, np.zeros((1, 220, 260), np.uint8))
+    assert words[1] == "face at column 129.5, row -0.5 (the middle of the first row, no field was found)"
 
 
 @pytest.mark.parametrize(
@@ -86,8 +85,8 @@ def test_a_calibration_in_metres_or_skewed_is_refused(change, words):
 
 def test_a_mirrored_calibration_is_said():
     mirrored = IMAGE_TO_PROBE @ np.diag([1.0, 1.0, -1.0, 1.0])
-    found = face_of_calibration(mirrored, face_pixel=(10, 0))
-    assert found.words[-1].startswith("the calibration mirrors") and np.linalg.det(found.face_to_probe) > 0
+    pose, words = face_of_calibration(mirrored, face_pixel=(10, 0))
+    assert words[-1].startswith("the calibration mirrors") and np.linalg.det(pose) > 0
 
 
 def test_a_tracker_moves_the_face_and_the_streamed_image_lies_in_its_plane(panel):

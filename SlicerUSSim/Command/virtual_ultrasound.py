@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import importlib.util
-import threading
-import time
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -28,11 +26,10 @@ if TYPE_CHECKING:
     import numpy as np
 
     from SlicerUSSim.Logic.base import Volume
-    from SlicerUSSim.Logic.device import VirtualDevice
 
 _PORT = 18944
-#: Transform of a path, and seconds between two looks at the state
-_POSE, _LOOK_EVERY_S = "ProbeToReference", 0.3
+#: Transform of a path
+_POSE = "ProbeToReference"
 
 
 @dataclass(frozen=True)
@@ -84,23 +81,11 @@ def device(patient: DeviceOptions, out: Path) -> None:
     say_contact(examination, preset.probe, poses[:1])
     examination.simulator.simulate(preset.probe, poses[0], preset.display)  # builds kernels
     made = VirtualDevice(examination.simulator, preset, poses, address, make_folder(out.resolve()), patient.igtl_device)
-    note(f"a client may connect to {address}; recordings go to {out.resolve()}")
-    telling = threading.Thread(target=_tell, args=(made,), daemon=True)
-    telling.start()
+    note(f"a client may connect to {address}; recordings go to {out.resolve()} (-v tells who comes and goes)")
     try:
         made.run()
     finally:
         made.stop()
-
-
-def _tell(made: VirtualDevice) -> None:
-    """Say who is connected, whenever that changes."""
-    said = ""
-    while True:
-        if made.link.status != said:
-            said = made.link.status
-            note(said)
-        time.sleep(_LOOK_EVERY_S)
 
 
 def _with_file(patient: DeviceOptions, folder: Path) -> DeviceOptions:

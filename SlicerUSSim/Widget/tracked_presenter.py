@@ -63,15 +63,15 @@ class TrackedPresenter:
             tracked: Any = required(parameters.tracked, "no tracked transform chosen, such as ProbeToReference")
             check_rigid(named(tracked), node_to_parent(tracked))
             matrix, source = self._calibration()
-            found = face_of_calibration(matrix, self._images(), self._face_pixel())
+            face_to_probe, words = face_of_calibration(matrix, self._images(), self._face_pixel())
             face: Any = node_called(panel.logic.scene, "LinearTransform", _FACE_NAME)
             face.SetAttribute(_FACE, "1")
-            face.SetMatrixTransformToParent(vtk_matrix(found.face_to_probe))
+            face.SetMatrixTransformToParent(vtk_matrix(face_to_probe))
             face.SetAndObserveTransformNodeID(tracked.GetID())
             parameters.probe_transform = face
             self._place_images(matrix, tracked)
             self.done = _("{source} below {name!r}: {words}").format(
-                source=source, name=tracked.GetName(), words="; ".join(found.words)
+                source=source, name=tracked.GetName(), words="; ".join(words)
             )
 
     def _calibration(self) -> tuple[np.ndarray, str]:

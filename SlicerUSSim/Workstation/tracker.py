@@ -62,8 +62,7 @@ class Tracker:
     def send(self, taken: TakenImage) -> None:
         """Send an image with its position (RAS), if there is a tracker; to clients with its transforms."""
         if self._link is not None:
-            place = (taken.probe_to_world, taken.grid.image_to_probe) if self._is_device else ()
-            self._link.send(taken.volume(), *place)
+            self._link.send(taken.volume(), self._transforms() if self._is_device else {})
 
     def stop(self) -> None:
         """Close the connection."""
@@ -103,7 +102,7 @@ class Tracker:
         taken = self._logic.taken
         if taken is None:
             return {}
-        return {"ProbeToReference": taken.probe_to_world, "ImageToProbe": taken.grid.image_to_probe}
+        return {"ImageToProbe": taken.grid.image_to_probe, "ProbeToReference": taken.probe_to_world}
 
     async def _tell(self, link: TrackerLink) -> None:
         while self._link is link:

@@ -10,9 +10,8 @@ import logging
 import re
 import struct
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
 from xml.etree import ElementTree
 from xml.sax.saxutils import escape
 
@@ -36,9 +35,6 @@ _TYPES = {
     "UsSimulator": ULTRASOUND, "VirtualCapture": CAPTURE, "VirtualDiscCapture": CAPTURE,
     "VirtualBufferedCapture": CAPTURE, "VirtualMixer": "", "VirtualVolumeReconstructor": "", "FakeTracker": "",
 }  # fmt: skip
-#: Commands with one implementation
-_GET, _SET, _TRANSFORM, _VERSION = ("GetUsParameter",), ("SetUsParameter",), ("GetTransform",), ("Version",)
-_IDS = ("RequestChannelIds", "RequestDeviceIds", "RequestInputDeviceIds", "RequestDeviceChannelIds")
 #: Of recordings that are in progress, or not, and the command then fails
 _RECORDING_ERRORS = {
     "StartRecording": (True, "Recording to file is already in progress."),
@@ -46,8 +42,12 @@ _RECORDING_ERRORS = {
     "ResumeRecording": (True, "Resume recording failed: recording to file is already in progress."),
 }
 _STOP = "StopRecording"
-_RECORDING = (*_RECORDING_ERRORS, _STOP)
-_FAMILIES = (_GET, _SET, _TRANSFORM, _VERSION, _IDS, _RECORDING)
+#: {command: its method}; and attributes of which Plus needs one
+_METHODS = {
+    "GetUsParameter": "_get", "SetUsParameter": "_set", "GetTransform": "_transform", "Version": "_version",
+    "RequestChannelIds": "_ids", "RequestDeviceIds": "_ids", **dict.fromkeys((*_RECORDING_ERRORS, _STOP), "_record"),
+}  # fmt: skip
+_NEEDS = {"_transform": ("TransformName",), "_record": ("CaptureDeviceId", "ChannelId")}
 #: Commands of a client that are remembered: one that comes again is ignored
 _RECENT = 10
 _FAILED, _FAILED_IDS = "Command failed. See error message.", "Command failed, see error message."
@@ -131,54 +131,35 @@ class PlusCommands:
 
     def _executed(self, name: str, text: str) -> tuple[_Reply, str]:
         """(reply, name in the XML); without a name for what is no command."""
+        element, method = _parsed(text), _METHODS.get(name, "")
         unknown = _Reply("", "Unknown command type requested."), ""
-        element = _parsed(text)
-        family = next((family for family in _FAMILIES if name in family), None)
-        if element is None or family is None:
+        if element is None or not method or not any(map(element.get, _NEEDS.get(method, ("Name",)))):
             return unknown
         given = element.get("Name", "")
-        found = next((known for known in family if known.lower() == given.lower()), None)
-        needs = {_TRANSFORM: ("TransformName",), _RECORDING: ("CaptureDeviceId", "ChannelId")}.get(family)
-        if found is None or (needs and not any(element.get(attribute) for attribute in needs)):
+        found = next((known for known in _METHODS if known.lower() == given.lower()), "")
+        if _METHODS.get(found) != method:
             return unknown
-        methods: dict[tuple[str, ...], Callable[[str, ElementTree.Element], _Reply]] = {
-            _GET: self._get, _SET: self._set, _TRANSFORM: self._transform, _VERSION: self._version, _IDS: self._ids,
-            _RECORDING: self._record,
-        }  # fmt: skip
-        return methods[family](found, element), given
+        device = element.get("UsDeviceId", "")
+        if method in ("_get", "_set") and device not in ("", ULTRASOUND):
+            return _Reply(_FAILED, f"Device {device} is not found."), given
+        return getattr(self, method)(found, element), given
 
     # ---- imaging parameters ------------------------------------------------------------------------------------
 
     def _get(self, _: str, element: ElementTree.Element) -> _Reply:
-        device = element.get("UsDeviceId", "")
-        if device not in ("", ULTRASOUND):
-            return _Reply(_FAILED, f"Device {device} is not found.")
-        preset, grid = self._preset()
-        parts, errors, metadata = [], "", {}
-        for name in (one.get("Name") for one in _children(element)):
-            if name is None:
-                continue
+        (preset, grid), found = self._preset(), []
+        for name, _value in _parameters(element):
             value = parameter_text(preset, grid, name)
-            if value is None:
-                parts.append(f'<Parameter Name="{_encoded(name)}" Success="false"/>')
-                errors += f"{name} is not set. " if name in KNOWN else f"Invalid parameter {name}. "
-            else:
-                parts.append(f'<Parameter Name="{_encoded(name)}" Success="true" Value="{value}"/>')
-                metadata[name] = value
-        return _Reply("", errors or None, metadata, f"<CommandReply>{''.join(parts)}</CommandReply>")
+            wrong = f"{name} is not set. " if name in KNOWN else f"Invalid parameter {name}. "
+            found.append((name, wrong if value is None else "", value))
+        return _parameter_reply(found, True)
 
     def _set(self, _: str, element: ElementTree.Element) -> _Reply:
-        device = element.get("UsDeviceId", "")
-        if device not in ("", ULTRASOUND):
-            return _Reply(_FAILED, f"Device {device} is not found.")
-        wanted = {one.get("Name"): one.get("Value") for one in _children(element)}
-        parts, errors, metadata = [], "", {}
-        for name, value in sorted((name, value) for name, value in wanted.items() if name and value is not None):
-            error = self._set_one(name, value)
-            parts.append(f'<Parameter Name="{_encoded(name)}" Success="{"false" if error else "true"}"/>')
-            metadata[name] = "FAIL" if error else "SUCCESS"
-            errors += error
-        return _Reply("", errors or None, metadata, f"<CommandReply>{''.join(parts)}</CommandReply>")
+        wanted = {name: value for name, value in _parameters(element) if value is not None}
+        errors = {name: self._set_one(name, value) for name, value in sorted(wanted.items())}
+        return _parameter_reply(
+            [(name, error, "FAIL" if error else "SUCCESS") for name, error in errors.items()], False
+        )
 
     def _set_one(self, name: str, value: str) -> str:
         """An error, or ""."""
@@ -199,18 +180,11 @@ class PlusCommands:
         devices = [ULTRASOUND, CAPTURE] if self._recorder is not None else [ULTRASOUND]
         if name == "RequestChannelIds":
             return _Reply(CHANNEL, metadata={CHANNEL: CHANNEL})
-        if name == "RequestDeviceIds":
-            kind = element.get("DeviceType", "")
-            if kind and kind not in _TYPES:
-                return _Reply(_FAILED_IDS, "Unknown device type requested.")
-            found = [device for device in devices if not kind or device == _TYPES[kind]]
-            return _Reply(",".join(found), metadata={device: device for device in found})
-        device = element.get("DeviceId", "")
-        if name == "RequestInputDeviceIds" and device:  # so it is in Plus
-            return _Reply(_FAILED_IDS, "Unknown device id requested.")
-        if device not in devices:
-            return _Reply(_FAILED_IDS, f"Device with id: {device} not found.")
-        return _Reply(f"{CHANNEL},")  # a capture device has that of its input
+        kind = element.get("DeviceType", "")
+        if kind and kind not in _TYPES:
+            return _Reply(_FAILED_IDS, "Unknown device type requested.")
+        found = [device for device in devices if not kind or device == _TYPES[kind]]
+        return _Reply(",".join(found), metadata={device: device for device in found})
 
     def _transform(self, _: str, element: ElementTree.Element) -> _Reply:
         name = element.get("TransformName", "")
@@ -295,8 +269,22 @@ def _parsed(text: str) -> ElementTree.Element | None:
     return element if element.tag.lower() == "command" else None
 
 
-def _children(element: ElementTree.Element) -> list[Any]:
-    return [child for child in element if child.tag.lower() == "parameter"]
+def _parameters(element: ElementTree.Element) -> list[tuple[str, str | None]]:
+    """(name, value) of the parameters in a command."""
+    found = [child for child in element if child.tag.lower() == "parameter"]
+    return [(child.get("Name", ""), child.get("Value")) for child in found if child.get("Name")]
+
+
+def _parameter_reply(found: Sequence[tuple[str, str, str | None]], has_values: bool) -> _Reply:
+    """The reply of GetUsParameter and SetUsParameter to (name, error or "", value in the metadata)."""
+    content = "".join(
+        f'<Parameter Name="{_encoded(name)}" Success="{"false" if error else "true"}"'
+        + (f' Value="{value}"/>' if has_values and value is not None else "/>")
+        for name, error, value in found
+    )
+    metadata = {name: value for name, _, value in found if value is not None}
+    errors = "".join(error for _, error, _ in found)
+    return _Reply("", errors or None, metadata, f"<CommandReply>{content}</CommandReply>")
 
 
 def _encoded(text: str) -> str:

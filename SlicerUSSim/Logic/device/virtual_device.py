@@ -99,9 +99,10 @@ class VirtualDevice:
             self._said.add(text)
             _log.warning("%s", text)
         self.made += 1
-        self.link.send(Volume(frame.image[None], pose @ grid.slice_to_probe), pose, grid.image_to_probe, stamp=stamp)
+        transforms = {"ImageToProbe": grid.image_to_probe, "ProbeToReference": pose}
+        self.link.send(Volume(frame.image[None], pose @ grid.slice_to_probe), transforms, stamp=stamp)
         try:
-            self.recorder.add(frame.image, stamp, {"ProbeToReference": pose, "ImageToProbe": grid.image_to_probe})
+            self.recorder.add(frame.image, stamp, transforms)
         except (SimulationError, OSError) as error:
             self.recorder.pause(True)
             _log.warning("the recording is suspended: %s", error)

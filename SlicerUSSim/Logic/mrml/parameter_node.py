@@ -63,8 +63,8 @@ class PanelSettings(Declared):
         choices=tuple(VIEWS), shown=True,
     )  # fmt: skip
     calibration_text: str = parameter(
-        "", "Or file, or numbers", "Instead of a transform: the file of a Plus configuration (.xml), or the 16 numbers of "
-        "ImageToProbe by rows", shown=True,
+        "", "Or file, or numbers", "Instead of a transform: the file of a Plus configuration (.xml), or the 16 "
+        "numbers of ImageToProbe by rows", shown=True,
     )  # fmt: skip
     face_pixel: str = parameter(
         "", "Face in the image", "Column and row of the middle of the probe's face, such as 320 12; empty: it is "

@@ -292,23 +292,12 @@ def face_pose(image_to_world: np.ndarray, face_pixel: Sequence[float], path: str
     return check_rigid(path, pose)
 
 
-@dataclass(frozen=True, eq=False)
-class FaceCalibration:
-    """What a calibration ImageToProbe says of the probe's face."""
-
-    #: (4, 4) rigid, from this package's probe frame, at the face, to that of the tracked sensor, which Plus calls Probe
-    face_to_probe: np.ndarray
-    #: (column, row) millimetres of a pixel, and pixel of the middle of the face
-    pixel_spacing_mm: tuple[float, float]
-    face_pixel: tuple[float, float]
-    #: What was taken, in lines
-    words: tuple[str, ...]
-
-
 def face_of_calibration(
     image_to_probe: np.ndarray, images: np.ndarray | None = None, face_pixel: Sequence[float] | None = None
-) -> FaceCalibration:
-    """The place of the probe's face from a calibration (4, 4), of pixels (column, row, 0, 1) to the sensor, mm.
+) -> tuple[np.ndarray, tuple[str, ...]]:
+    """((4, 4) rigid, from the probe frame, at the face, to the tracked sensor, which Plus calls Probe; what was taken).
+
+    `image_to_probe` is a calibration (4, 4), of pixels (column, row, 0, 1) to the sensor, mm.
 
     The face is at `face_pixel`, or else looked for in `images` (n, rows, columns), or else in the middle of their first
     row. Raises SimulationError for a skewed calibration, for pixels of another size than scanners have, as of a
@@ -339,4 +328,4 @@ def face_of_calibration(
     ]
     if np.linalg.det(image_to_probe[:3, :3]) < 0.0:
         words.append("the calibration mirrors: if left and right of the image are wrong, it is")
-    return FaceCalibration(pose, spacing, (float(place[0]), float(place[1])), tuple(words))
+    return pose, tuple(words)

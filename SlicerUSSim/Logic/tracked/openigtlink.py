@@ -175,17 +175,14 @@ class TrackerLink:
         return len(self._peers)
 
     def send(
-        self, image: Volume, probe_to_reference: np.ndarray | None = None, image_to_probe: np.ndarray | None = None,
-        *, stamp: float | None = None,
-    ) -> None:  # fmt: skip
+        self, image: Volume, transforms: Mapping[str, np.ndarray] = MappingProxyType({}), *, stamp: float | None = None
+    ) -> None:
         """Send an image with its position (RAS) to all; one that is still waiting to be sent is replaced.
 
-        Before it go TRANSFORM messages with the same time: ProbeToReference and, to each client once and when it
-        changes, ImageToProbe, both (4, 4). `stamp` are seconds since 1970, by default now.
+        Before it go `transforms` {name: (4, 4)} with the same time, of which ImageToProbe to each client once and when
+        it changes. `stamp` are seconds since 1970, by default now.
         """
-        frame = _Outgoing(
-            self._image_name, image, probe_to_reference, image_to_probe, time.time() if stamp is None else stamp
-        )
+        frame = _Outgoing(self._image_name, image, dict(transforms), time.time() if stamp is None else stamp)
         with self._lock:
             self._newest = frame
             for peer in self._peers:
@@ -389,7 +386,7 @@ class TrackerLink:
         return "the client" if len(self._peers) < 2 else f"{len(self._peers)} clients"
 
     def _wake(self) -> None:
-        with suppress(BlockingIOError):  # it has been woken often enough
+        with suppress(OSError):  # it has been woken often enough, or was stopped
             self._wake_out.send(b"!")
 
     def _awake(self) -> None:
@@ -414,7 +411,7 @@ class _Peer:
         self.frame: _Outgoing | None = None
         #: Commands that the worker has
         self.asked = 0
-        self._calibration: bytes | None = None
+        self._calibration = b""
 
     def fileno(self) -> int:
         return self.socket.fileno()
@@ -440,11 +437,11 @@ class _Peer:
             self.sending = memoryview(self.replies.pop(0))
         elif self.frame is not None:
             frame, self.frame = self.frame, None
-            parts = [frame.packed(self.version)]
-            if frame.calibration not in (None, self._calibration):
-                parts.insert(0, frame.packed_calibration(self.version))
-                self._calibration = frame.calibration
-            self.sending = memoryview(b"".join(parts))
+            parts = dict(frame.packed(self.version))
+            if frame.calibration == self._calibration:
+                parts.pop("ImageToProbe", None)
+            self._calibration = frame.calibration
+            self.sending = memoryview(b"".join(parts.values()))
 
     def receive(self, now: float) -> Iterator[tuple[dict[str, Any], bytes, bytes | None]]:
         """(fields of the header, header, body) of every message that is complete; None for bodies that are not read.
@@ -486,40 +483,26 @@ class _Peer:
 class _Outgoing:
     """An image and its transforms, packed once for all clients with the same version."""
 
-    def __init__(
-        self, name: str, image: Volume, probe_to_reference: np.ndarray | None, image_to_probe: np.ndarray | None,
-        stamp: float,
-    ) -> None:  # fmt: skip
-        self._name, self._image, self._pose, self._stamp = name, image, probe_to_reference, stamp
-        self._image_to_probe = image_to_probe
-        #: Changes with ImageToProbe; None without
-        self.calibration = None if image_to_probe is None else image_to_probe.tobytes()
-        self._packed: dict[int, bytes] = {}
+    def __init__(self, name: str, image: Volume, transforms: dict[str, np.ndarray], stamp: float) -> None:
+        self._name, self._image, self._transforms, self._stamp = name, image, transforms, stamp
+        #: Changes with ImageToProbe; empty without
+        self.calibration = transforms["ImageToProbe"].tobytes() if "ImageToProbe" in transforms else b""
+        self._packed: dict[int, dict[str, bytes]] = {}
 
-    def packed(self, version: int) -> bytes:
-        """ProbeToReference, if it is known, and the image."""
-        from pyigtl import ImageMessage
+    def packed(self, version: int) -> dict[str, bytes]:
+        """{name: message}, in the order in which they are sent."""
+        from pyigtl import ImageMessage, TransformMessage
 
         if version not in self._packed:
-            pose = b"" if self._pose is None else self._transform("ProbeToReference", self._pose, version)
-            image = ImageMessage(self._image.array, self._image.ijk_to_ras, "ras", self._stamp, self._name)
-            image.header_version = version
-            self._packed[version] = pose + image.pack()
+            parts = {name: TransformMessage(matrix) for name, matrix in self._transforms.items()}
+            if version > 1:
+                for part in parts.values():
+                    part.metadata = {"TransformStatus": "OK", "TransformValid": "1"}  # as Plus
+            parts[self._name] = ImageMessage(self._image.array, self._image.ijk_to_ras, "ras")
+            for name, part in parts.items():
+                part.device_name, part.timestamp, part.header_version = name, self._stamp, version
+            self._packed[version] = {name: part.pack() for name, part in parts.items()}
         return self._packed[version]
-
-    def packed_calibration(self, version: int) -> bytes:
-        """ImageToProbe."""
-        assert self._image_to_probe is not None
-        return self._transform("ImageToProbe", self._image_to_probe, version)
-
-    def _transform(self, name: str, matrix: np.ndarray, version: int) -> bytes:
-        from pyigtl import TransformMessage
-
-        message = TransformMessage(matrix, timestamp=self._stamp, device_name=name)
-        message.header_version = version
-        if version > 1:
-            message.metadata = {"TransformStatus": "OK", "TransformValid": "1"}  # as Plus
-        return message.pack()
 
 
 def _is_command(device: str) -> bool:
