@@ -57,7 +57,7 @@ def streamed(scene):
 
 
 def test_the_face_follows_from_the_calibration_and_its_pixel():
-    pixel = np.linalg.inv(GRID.image_to_probe)[:2, 3]
+    pixel = np.linalg.inv(GRID.image_to_probe)[:2, 3].tolist()
     pose, words = face_of_calibration(IMAGE_TO_PROBE, face_pixel=pixel)
     assert np.allclose(pose, FACE_TO_PROBE, atol=1e-9) and "(as given)" in words[1]
     assert words[0] == "pixels of {:.3g} x {:.3g} mm".format(*GRID.pixel_spacing_mm)

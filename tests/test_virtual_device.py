@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+import json
+import socket
 import struct
 import threading
 from pathlib import Path
 
 import numpy as np
 import pytest
+from click.testing import CliRunner
 
-from SlicerUSSim.Logic import SimulationError, TrackedSequence, Volume
+from SlicerUSSim.Command.cli import main
+from SlicerUSSim.Logic import SimulationError, TissueTable, TrackedSequence, Volume
 from SlicerUSSim.Logic.imaging.preset import Preset
 from SlicerUSSim.Logic.probe.poses import turned
 from SlicerUSSim.Logic.tissue.presets import TISSUES
+from SlicerUSSim.Logic.tissue.table import write_label_files
 from tests.conftest import block, simulator
 from tests.openigtlink_client import StrictClient, packed
 from tests.test_tracking import free_port, until
@@ -341,3 +346,94 @@ def test_a_recording_that_cannot_be_written_is_kept_for_another_name(tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["other.igs.mha"]
     with pytest.raises(SimulationError, match="nothing was recorded"):
         recorder.stop()
+
+
+# ---- the command -----------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def command_device(monkeypatch, tmp_path):
+    """The device of `ussim device` with these arguments, after which it does not run; and what was said."""
+
+    def make(*arguments: object) -> tuple[VirtualDevice | None, str]:
+        made: list[VirtualDevice] = []
+        monkeypatch.setattr(VirtualDevice, "run", lambda device: made.append(device))
+        port = [] if "--port" in arguments else ["--port", free_port()]
+        done = CliRunner().invoke(main, [*map(str, ("device", *arguments, "-o", tmp_path / "out", *port))])
+        assert done.exit_code == (0 if made else 2), done.output
+        return (made[0] if made else None), done.stderr
+
+    return make
+
+
+@pytest.fixture(scope="module")
+def labels(tmp_path_factory) -> Path:
+    path = tmp_path_factory.mktemp("labels") / "labels.nii.gz"
+    tissues = TissueTable.named(["grey matter", "white matter"])
+    volume = block(lambda x, y, z: np.where(x**2 + y**2 + z**2 < 25**2, 1.0 + (x > 0), 0.0), spacing_mm=2.0)
+    write_label_files(path, volume, tissues)
+    return path
+
+
+def test_the_command_opens_labels_with_a_path_of_poses(command_device, labels, tmp_path):
+    poses = [turned(POSE, tilt_deg=float(tilt)) for tilt in range(3)]
+    path = tmp_path / "path.seq.mha"
+    transforms = tuple({"ProbeToReference": pose} for pose in poses)
+    TrackedSequence(np.zeros((3, 1, 1), np.uint8), transforms, np.arange(3.0)).write(path)
+    device, said = command_device(labels, "--path", path, "--gain", 4, "--probe", "linear")
+    assert device is not None and "a client may connect to 127.0.0.1:" in said
+    assert np.allclose(device._poses, poses, atol=1e-6)
+    assert device._preset.display.gain_db == 4.0 and device._preset.probe.is_linear
+    assert any(np.allclose(device.pose, pose, atol=1e-6) for pose in poses)
+    curve = {"markups": [{"type": "Curve", "coordinateSystem": "RAS", "coordinateUnits": "mm", "controlPoints": [
+        {"position": [-10.0, 0.0, 24.0]}, {"position": [10.0, 0.0, 24.0]}]}]}  # fmt: skip
+    (tmp_path / "path.mrk.json").write_text(json.dumps(curve))
+    device, _ = command_device(labels, "--path", tmp_path / "path.mrk.json")
+    assert device is not None and len(device._poses) > 15
+
+
+@pytest.mark.slow
+def test_the_command_without_a_file_has_the_demo_brain(command_device):
+    device, said = command_device("--set", "segmentation.classes=3")
+    assert device is not None and "skull-stripped brain" in said
+
+
+def test_the_command_refuses_what_cannot_be_used(command_device, labels, tmp_path):
+    (tmp_path / "poses.txt").write_text("1 2 3")
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        for arguments, words in (
+            ((labels, "--port", taken.getsockname()[1]), "choose another address"),
+            ((labels, "--path", tmp_path / "poses.txt"), "poses.txt"),
+            ((labels, "--path", labels), "has no ProbeToReference, expected poses of the probe"),
+            ((tmp_path / "nothing.nii.gz",), "nothing.nii.gz"),
+            ((tmp_path / "nothing.mrb",), "nothing.mrb"),
+        ):
+            device, said = command_device(*arguments)
+            assert device is None and words in said and len(said.strip().splitlines()[-1:]) == 1, said
+
+
+@pytest.mark.slow
+def test_the_command_opens_a_scene_of_the_module(command_device, tmp_path):
+    slicer = pytest.importorskip("slicer")
+    core = pytest.importorskip("trame_slicer.core", reason="scenes come with: pip install '.[serve]'")
+    from SlicerUSSim.Logic.mrml.label_nodes import write_labels
+    from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic
+    from SlicerUSSim.Logic.mrml.nodes import set_node_to_world
+
+    app = core.SlicerApp()
+    app.register_module_logic(slicer.vtkSlicerSequencesLogic())
+    logic = UltrasoundSceneLogic(app.scene)
+    node = app.scene.AddNewNodeByClass("vtkMRMLSegmentationNode", "Tissues")
+    volume = block(lambda x, y, z: 1.0 + (x > 0), spacing_mm=3.0)
+    write_labels(node, volume, ["grey matter", "white matter"], node)
+    probe = app.scene.AddNewNodeByClass("vtkMRMLLinearTransformNode", "Probe")
+    set_node_to_world(probe, POSE)
+    logic.parameters.labels, logic.parameters.probe_transform = node, probe
+    logic.preset = logic.preset.changed("display", gain_db=5.0).changed("probe", kind="linear", depth_mm=40.0)
+    assert app.io_manager.write_scene(tmp_path / "study.mrb")
+    device, _ = command_device(tmp_path / "study.mrb")
+    assert device is not None and np.allclose(device.pose, POSE, atol=1e-5)
+    assert device._preset.display.gain_db == 5.0 and device._preset.probe == logic.preset.probe
+    frame = device._simulator.simulate(device._preset.probe, device.pose, device._preset.display)
+    image = app.scene.AddNewNodeByClass("vtkMRMLScalarVolumeNode", "Image")
+    assert np.array_equal(frame.labels(), logic.simulate(node, probe, image).labels())

@@ -494,7 +494,7 @@ class _Outgoing:
         from pyigtl import ImageMessage, TransformMessage
 
         if version not in self._packed:
-            parts = {name: TransformMessage(matrix) for name, matrix in self._transforms.items()}
+            parts: dict[str, Any] = {name: TransformMessage(matrix) for name, matrix in self._transforms.items()}
             if version > 1:
                 for part in parts.values():
                     part.metadata = {"TransformStatus": "OK", "TransformValid": "1"}  # as Plus
