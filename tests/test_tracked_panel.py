@@ -93,7 +93,12 @@ def test_a_tracker_moves_the_face_and_the_streamed_image_lies_in_its_plane(panel
     scene, parameters = panel.logic.scene, panel.parameters
     parameters.calibration = transform(scene, "ImageToProbe", IMAGE_TO_PROBE)
     parameters.real = streamed(scene)
+    view, composite = (scene.AddNewNodeByClass(f"vtkMRMLSlice{kind}Node") for kind in ("", "Composite"))
+    view.SetLayoutName("Red")
+    composite.SetLayoutName("Red")
+    panel.view.sliceNode = lambda: view
     panel.tracking.useCalibration()
+    assert composite.GetBackgroundVolumeID() == parameters.real.GetID() and panel.fits.canBlink()
     face = parameters.probe_transform
     assert not panel.view.errors and face.GetName() == "Probe face"
     assert np.allclose(probe_pose(face), SENSOR @ FACE_TO_PROBE, atol=0.6)

@@ -22,10 +22,11 @@ from tests.conftest import block, simulator
 from tests.openigtlink_client import StrictClient, packed
 from tests.test_tracking import free_port, until
 
-pytest.importorskip("pyigtl", reason="OpenIGTLink comes with pyigtl: pip install '.[serve]'")
+pyigtl = pytest.importorskip("pyigtl", reason="OpenIGTLink comes with pyigtl: pip install '.[serve]'")
 
-from SlicerUSSim.Logic.device import Recorder, VirtualDevice
-from SlicerUSSim.Logic.tracked.openigtlink import Address, TrackerLink
+from SlicerUSSim.Logic.device import Recorder, VirtualDevice  # noqa: E402
+from SlicerUSSim.Logic.tracked import openigtlink  # noqa: E402
+from SlicerUSSim.Logic.tracked.openigtlink import Address, TrackerLink  # noqa: E402
 
 POSE = turned(np.eye(4), rock_deg=20)
 POSE[:3, 3] = [2.0, -25.0, 1.0]
@@ -94,6 +95,28 @@ def test_image_and_pose_have_one_time_and_the_calibration_comes_once(client):
     assert client.next("TRANSFORM").metadata == {"TransformStatus": "OK", "TransformValid": "1"}
 
 
+def test_pyigtl_and_nodes_of_slicer_place_the_image_as_its_matrix(running):
+    """As in SlicerIGT: the image in pixels below ImageToProbe below ProbeToReference."""
+    slicer = pytest.importorskip("slicer")
+    from SlicerUSSim.Logic.base.vtk_data import vtk_matrix
+    from SlicerUSSim.Logic.mrml.nodes import node_to_world
+
+    client = pyigtl.OpenIGTLinkClient("127.0.0.1", running.port)
+    try:
+        names = "ProbeToReference", "ImageToProbe", "Image_Reference"
+        pose, calibration, image = (until(lambda name=name: client.wait_for_message(name, timeout=1)) for name in names)
+    finally:
+        client.stop()
+    scene, above = slicer.vtkMRMLScene(), None
+    for message in (pose, calibration):
+        node = scene.AddNewNodeByClass("vtkMRMLLinearTransformNode", message.device_name)
+        node.SetMatrixTransformToParent(vtk_matrix(message.matrix))
+        node.SetAndObserveTransformNodeID(None if above is None else above.GetID())
+        above = node
+    placed = node_to_world(above)
+    assert np.allclose(placed[:, [0, 1, 3]], image.ijk_to_world_matrix[:, [0, 1, 3]], atol=1e-3)
+
+
 def test_status_and_capabilities_are_told(client):
     client.send("GET_STATUS", "Any", b"", version=1)
     status = client.next("STATUS")
@@ -119,6 +142,21 @@ def test_any_client_moves_the_probe_one_at_a_time(running):
         until(lambda: running.device.link.clients == 1)
         third.move(POSE, "RobotToReference")
         until(lambda: np.allclose(third.next("TRANSFORM", "ProbeToReference").matrix, POSE, atol=1e-4))
+
+
+def test_another_client_moves_the_probe_when_the_tracker_has_stopped(running, monkeypatch):
+    monkeypatch.setattr(openigtlink, "_SILENT_S", 0.0)
+    with StrictClient(running.port) as first, StrictClient(running.port) as second:
+        for client, x in ((first, 1.0), (second, 2.0), (first, 3.0)):
+            pose = POSE.copy()
+            pose[0, 3] = x
+            client.move(pose)
+            until(lambda pose=pose: np.allclose(running.device.pose, pose, atol=1e-5))
+        second.move(np.diag([2.0, 2.0, 2.0, 1.0]))
+        until(lambda: "is not rigid" in running.device.link.status)
+        assert np.allclose(running.device.pose, pose, atol=1e-5)
+        first.move(POSE)
+        until(lambda: np.allclose(running.device.pose, POSE, atol=1e-5))
 
 
 def test_a_client_that_does_not_read_holds_nobody():

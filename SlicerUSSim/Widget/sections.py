@@ -321,7 +321,7 @@ def _fit(panel: PanelPresenter) -> tuple[Row, ...]:
             Control("compareNumber", "choice", tip=_("Number of the fitted image"), enabled=fits.canCompare),
             Control(
                 "blink", "tick", _("Blink"), _("Alternate between real and simulated image twice a second"),
-                enabled=fits.canCompare,
+                enabled=fits.canBlink,
             ),
         ),
     )  # fmt: skip

@@ -12,6 +12,7 @@ from SlicerUSSim.Logic.base.transforms import check_rigid
 from SlicerUSSim.Logic.base.vtk_data import vtk_matrix
 from SlicerUSSim.Logic.mrml.fit_nodes import sequence_of
 from SlicerUSSim.Logic.mrml.nodes import (
+    composite_of,
     ijk_to_ras,
     is_driven_by_other,
     named,
@@ -70,6 +71,9 @@ class TrackedPresenter:
             face.SetAndObserveTransformNodeID(tracked.GetID())
             parameters.probe_transform = face
             self._place_images(matrix, tracked)
+            composite = None if (view := panel.view.sliceNode()) is None else composite_of(view)
+            if composite is not None and parameters.real is not None and parameters.real.IsA("vtkMRMLVolumeNode"):
+                composite.SetBackgroundVolumeID(parameters.real.GetID())  # which Blink uncovers
             self.done = _("{source} below {name!r}: {words}").format(
                 source=source, name=tracked.GetName(), words="; ".join(words)
             )
