@@ -368,6 +368,13 @@ def test_what_was_sent_is_recorded_and_read_again(client, running):
     assert again.metadata["Error"].endswith("StartRecording Failed to open file ../../sweep.igs.mha.")
 
 
+def test_a_recording_that_was_not_stopped_is_written_at_the_end(tmp_path, caplog):
+    with Running(tmp_path) as made:
+        made.device.recorder.start("sweep.igs.mha")
+        until(lambda: made.device.recorder.count > 2)
+    assert len(TrackedSequence.read(tmp_path / "sweep.igs.mha")) > 2 and "was not stopped" in caplog.text
+
+
 def test_a_recording_that_cannot_be_written_is_kept_for_another_name(tmp_path):
     recorder = Recorder(tmp_path)
     with pytest.raises(SimulationError, match="unknown sequence format"):

@@ -10,9 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from SlicerUSSim.Logic.base.declaration import Shown, parameter_of
-from SlicerUSSim.Logic.base.errors import SimulationError, require, required
-from SlicerUSSim.Logic.base.settings import DisplaySettings
+from SlicerUSSim.Logic.base.errors import SimulationError, require
 from SlicerUSSim.Logic.imaging.preset import Preset
 from SlicerUSSim.Logic.probe.image_grid import ImageGrid
 
@@ -25,6 +23,8 @@ _TGC, _SIZE, _GAIN, _FOCUS = "TimeGainCompensation", "ImageSize", "GainPercent",
 #: Parameters of Plus that this device does not have
 _NOT_SET = ("Intensity", "Contrast", "PowerDb", "SectorPercent", "ZoomFactor", "Voltage")
 KNOWN = (*_NUMBERS, _TGC, _SIZE, _GAIN, _FOCUS, *_NOT_SET)
+#: 50 % are 0 dB; 0 % and 100 % are the ends of the panel's slider
+_DB_PER_PERCENT = 0.8
 #: Sliders of the gain by depth that have the gains at the face, in the middle and at the image depth
 _TGC_SLIDERS = (1.0, 4.0, 5.0, 8.0)
 
@@ -37,8 +37,7 @@ def parameter_text(preset: Preset, grid: ImageGrid, name: str) -> str | None:
         value = getattr(getattr(preset, section), field)
         return None if value is None else f"{value:g}"
     if name == _GAIN:
-        low, high = _gain_range()
-        return f"{100.0 * (preset.display.gain_db - low) / (high - low):g}"
+        return f"{50.0 + preset.display.gain_db / _DB_PER_PERCENT:g}"
     if name == _FOCUS:
         return None if probe.focus_mm is None else f"{100.0 * probe.focus_mm / probe.depth_mm:g}"
     if name == _SIZE:
@@ -66,8 +65,7 @@ def changed_parameter(preset: Preset, name: str, text: str) -> Preset:
         return preset.changed(section, **{field: value})
     if name == _GAIN:
         require(0.0 <= value <= 100.0, f"{name} is {text}, expected 0 to 100")
-        low, high = _gain_range()
-        return preset.changed("display", gain_db=low + (high - low) * value / 100.0)
+        return preset.changed("display", gain_db=(value - 50.0) * _DB_PER_PERCENT)
     if name == _FOCUS:
         return preset.changed("probe", focus_mm=preset.probe.depth_mm * value / 100.0)
     if name == _TGC:
@@ -84,10 +82,3 @@ def fixed_grid(preset: Preset, like: ImageGrid) -> ImageGrid:
     pixel = max((right - left) / like.columns, (bottom - top) / like.rows)
     left = 0.5 * (left + right - pixel * like.columns)
     return replace(like, left_mm=left, top_mm=top, pixel_spacing_mm=(pixel, pixel))
-
-
-def _gain_range() -> tuple[float, float]:
-    """Gains of 0 % and 100 %, dB: those of the panel's slider."""
-    shown = required(parameter_of(DisplaySettings, "gain_db").shown, "the gain is not shown")
-    assert isinstance(shown, Shown)
-    return shown.low, shown.high

@@ -108,9 +108,11 @@ class VirtualDevice:
             _log.warning("the recording is suspended: %s", error)
 
     def stop(self) -> None:
-        """End run(), and close the connections."""
+        """End run(), close the connections, and write a recording that was not stopped."""
         self._stopping.set()
         self.link.stop()
+        if self.recorder.count:
+            _log.warning("a recording was not stopped: written to %s (%d images)", *self.recorder.stop())
 
     def _move(self, pose: np.ndarray) -> None:
         self._moved = pose

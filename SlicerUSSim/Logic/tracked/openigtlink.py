@@ -135,16 +135,9 @@ class TrackerLink:
     """
 
     def __init__(
-        self,
-        host: str,
-        port: int,
-        moved: Callable[[np.ndarray], None],
-        *,
-        device: str | None = None,
-        listen: bool = False,
-        image_name: str = "SlicerUSSim",
-        answering: Callable[[], Answer] | None = None,
-    ) -> None:
+        self, host: str, port: int, moved: Callable[[np.ndarray], None], *, device: str | None = None,
+        listen: bool = False, image_name: str = "SlicerUSSim", answering: Callable[[], Answer] | None = None,
+    ) -> None:  # fmt: skip
         self._address, self._moved = Address(host, port, listen), moved
         _require_pyigtl()
         self._chosen = self._device = device
