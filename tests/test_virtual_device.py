@@ -302,6 +302,9 @@ def test_what_plus_does_not_answer_is_not_answered(client, running):
     client.send_command(command("Version"), name="", uid=8)
     client.send("COMMAND", "", struct.pack(">I128sHI", 9, b"Version", 3, 0))
     client.send("COMMAND", "", b"short")
+    client.socket.sendall(
+        packed("COMMAND", "", b"no extended header", version=1).replace(b"\0\1COMMAND", b"\0\2COMMAND")
+    )
     client.send("NDARRAY", "x", bytes(1000))
     assert client.command(command("Version"), uid=10).command[0] == 10  # the next that comes
     with StrictClient(running.port) as other:

@@ -325,17 +325,17 @@ class TrackerLink:
             kinds = b"".join(struct.pack("12s", name.encode()) for name in _CAPABILITIES)
             peer.replies.append(Message("CAPABILITY", "", kinds).packed(1))
         elif peer.answer is not None:
-            answer, message = peer.answer, _unpacked(header, body)
+            answer = peer.answer
             peer.asked += 1
-            self._worker.submit(lambda: self._reply(peer, answer, message))
+            self._worker.submit(lambda: self._reply(peer, lambda: answer(_unpacked(header, body))))
 
-    def _reply(self, peer: _Peer, answer: Answer, message: Message) -> None:
-        """Answer a command, in the worker: some take long."""
+    def _reply(self, peer: _Peer, answer: Callable[[], Sequence[Message]]) -> None:
+        """Answer a command, in the worker: some take long. One that cannot be read is not answered."""
         found: Sequence[Message] = ()
         try:
-            found = answer(message)
-        except Exception:
-            _log.exception("OpenIGTLink: a command failed")
+            found = answer()
+        except Exception as error:
+            _log.warning("OpenIGTLink: a command is not answered: %r", error)
         with self._lock:
             peer.replies += [reply.packed(peer.version) for reply in found]
             peer.asked -= 1
