@@ -8,7 +8,7 @@ import pytest
 slicer = pytest.importorskip("slicer", reason="MRML nodes come with slicer-core: pip install '.[slicer]'")
 
 from SlicerUSSim.Logic import SimulationError, Volume  # noqa: E402
-from SlicerUSSim.Logic.base.vtk_data import vtk_matrix  # noqa: E402
+from SlicerUSSim.Logic.base.vtk_data import matrix_array, vtk_matrix  # noqa: E402
 from SlicerUSSim.Logic.mrml.label_nodes import write_labels  # noqa: E402
 from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic  # noqa: E402
 from SlicerUSSim.Logic.mrml.nodes import node_to_world, probe_pose, write_volume  # noqa: E402
@@ -16,7 +16,9 @@ from SlicerUSSim.Logic.probe.arrays import PROBES  # noqa: E402
 from SlicerUSSim.Logic.probe.image_grid import ImageGrid  # noqa: E402
 from SlicerUSSim.Logic.probe.poses import turned  # noqa: E402
 from SlicerUSSim.Logic.tracked.images import face_of_calibration  # noqa: E402
+from SlicerUSSim.Widget.interface import by_widget  # noqa: E402
 from SlicerUSSim.Widget.presenter import PanelPresenter  # noqa: E402
+from SlicerUSSim.Widget.sections import panel_sections  # noqa: E402
 from tests.conftest import block  # noqa: E402
 from tests.test_presenter import PlainView  # noqa: E402
 
@@ -110,6 +112,7 @@ def test_a_tracker_moves_the_face_and_the_streamed_image_lies_in_its_plane(panel
     parameters.tracked.SetMatrixTransformToParent(vtk_matrix(moved))
     panel.view.waiting.pop()()
     assert np.allclose(panel.logic.taken.probe_to_world, probe_pose(face)) and not panel.view.errors
+    assert np.allclose(matrix_array(view.GetSliceToRAS())[:3, 0], probe_pose(face)[:3, 0])
     panel.placing.placeAtView()
     assert "the tracker moves the probe" in panel.view.errors[-1]
     assert np.allclose(node_to_world(face), panel.logic.taken.probe_to_world)
@@ -148,6 +151,12 @@ def test_what_is_missing_or_wrong_is_said(panel):
         probe_pose(panel.parameters.probe_transform)
     panel.parameters.probe_transform = transform(panel.logic.scene, "ProbeToTracker", SENSOR)
     assert panel.tracking.text().startswith("Check: 'ProbeToTracker' is the pose of the sensor")
+
+
+def test_a_page_of_the_browser_cannot_name_a_calibration_file(panel):
+    page = PanelPresenter(panel.logic, PlainView(), handles=False)
+    names = {"calibrationTextLineEdit", "useCalibrationButton", "sendImagesButton"}
+    assert names <= set(by_widget(panel_sections(panel))) and not names & set(by_widget(panel_sections(page)))
 
 
 def test_a_slice_view_that_volume_reslice_driver_moves_stays(panel):

@@ -233,7 +233,8 @@ def _tissues(panel: PanelPresenter) -> tuple[Row, ...]:
     )  # fmt: skip
 
 
-def _tracked(panel: PanelPresenter) -> tuple[Row, ...]:
+def _tracker(panel: PanelPresenter) -> tuple[Row, ...]:
+    """Of Slicer alone: the page has a tracker of its own, and a page must not name files of the server."""
     tracking = panel.tracking
     return (
         node(
@@ -260,6 +261,12 @@ def _tracked(panel: PanelPresenter) -> tuple[Row, ...]:
         Control(
             "tracked", "words", tip=_("What the calibration was taken for, and what to check"), shows=tracking.text,
         ),
+    )  # fmt: skip
+
+
+def _tracked(panel: PanelPresenter) -> tuple[Row, ...]:
+    return (
+        *(_tracker(panel) if panel.placing.handles else ()),
         node(
             "probe_transform", _("Probe transform"), _("Linear transform of the probe [mm], such as a tracker's: x to "
             "the right of the image, y along its depth, origin in the middle of the probe face"), new_node=_("Probe"),
