@@ -43,12 +43,12 @@ HEAVY = {
 #: Lines of Python that a room, or a folder beside the product, may have. Raising one is a decision: the commit says
 #: what users get for it.
 BUDGETS = {
-    "base": 3350, "opencl": 1295, "probe": 1520, "tissue": 2070, "tracked": 2235, "mri": 7470, "placement": 845,
-    "imaging": 5320, "device": 595, "fitting": 3695, "vtk": 505, "mrml": 4805, "Widget": 3235, "Workstation": 5840,
+    "base": 3350, "opencl": 1295, "probe": 1520, "tissue": 2070, "tracked": 2230, "mri": 7470, "placement": 845,
+    "imaging": 5320, "device": 595, "fitting": 3695, "vtk": 505, "mrml": 4805, "Widget": 3235, "Workstation": 5825,
     "Command": 2980, "module": 430, "validation": 6055, "benchmarks": 3930, "tests": 29660, "tests/reference": 460,
 }  # fmt: skip
 #: Lines of all of SlicerUSSim/, and of kernels/
-LARGEST_PRODUCT, LARGEST_KERNELS = 46_165, 5_600
+LARGEST_PRODUCT, LARGEST_KERNELS = 46_145, 5_600
 #: Packages of the checkout that use the product and are not installed with it
 CHECKOUT = {"validation", "benchmarks", "tests", "examples"}
 

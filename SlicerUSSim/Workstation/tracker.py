@@ -7,13 +7,11 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable, Mapping
-from concurrent.futures import Future, TimeoutError as NotInTime
 from typing import TypeVar
 
 import numpy as np
 from trame_server.utils.asynchronous import get_event_loop
 
-from SlicerUSSim.Logic.base.errors import SimulationError
 from SlicerUSSim.Logic.device.plus_commands import PlusCommands
 from SlicerUSSim.Logic.imaging.preset import Preset
 from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic
@@ -42,7 +40,7 @@ class Tracker:
         self, shared: SharedState, tasks: Tasks, move: Callable[[np.ndarray], None], logic: UltrasoundSceneLogic
     ) -> None:
         self._shared, self._tasks, self._move, self._logic = shared, tasks, move, logic
-        self._is_device = False
+        self._is_device, self._loop = False, get_event_loop()
         self._link: TrackerLink | None = None
         self._telling: asyncio.Task | None = None
 
@@ -57,7 +55,7 @@ class Tracker:
         self._link = TrackerLink(
             host, port, self._moved, device=device, listen=listen, answering=commands.session if listen else None
         )
-        self._telling = get_event_loop().create_task(self._tell(self._link))
+        self._telling = self._loop.create_task(self._tell(self._link))
 
     def send(self, taken: TakenImage) -> None:
         """Send an image with its position (RAS), if there is a tracker; to clients with its transforms."""
@@ -76,20 +74,12 @@ class Tracker:
     # ---- commands, in a thread of the link ---------------------------------------------------------------------
 
     def _in_loop(self, function: Callable[[], T]) -> T:
-        """What `function` returns in the event loop, where nodes are used."""
-        result: Future[T] = Future()
+        """What `function` returns in the event loop, where nodes are used. Raises TimeoutError if the page is busy."""
 
-        def run() -> None:
-            try:
-                result.set_result(function())
-            except Exception as error:
-                result.set_exception(error)
+        async def run() -> T:
+            return function()
 
-        self._tasks.tell(run)
-        try:
-            return result.result(_PATIENCE_S)
-        except NotInTime:
-            raise SimulationError(f"the page was busy for {_PATIENCE_S:g} s") from None
+        return asyncio.run_coroutine_threadsafe(run(), self._loop).result(_PATIENCE_S)
 
     def _preset(self) -> tuple[Preset, ImageGrid]:
         preset = self._in_loop(lambda: self._logic.preset)

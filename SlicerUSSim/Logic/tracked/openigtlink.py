@@ -203,7 +203,8 @@ class TrackerLink:
                 if self._peers or self._listener is not None:
                     self._attend()
                 else:
-                    self._connect()
+                    self._say(self.status or f"connecting to {self._address}")
+                    self._accept(socket.create_connection(self._address[:2], timeout=_STALLED_S))
             except OSError as error:
                 self._lost(error)
         for peer in self._peers:
@@ -248,10 +249,6 @@ class TrackerLink:
             peer.frame = self._newest
             self._peers.append(peer)
         self._tell()
-
-    def _connect(self) -> None:
-        self._say(self.status or f"connecting to {self._address}")
-        self._accept(socket.create_connection((self._address.host, self._address.port), timeout=_STALLED_S))
 
     def _drop(self, peer: _Peer, error: Exception) -> None:
         peer.socket.close()
