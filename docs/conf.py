@@ -62,6 +62,8 @@ toc_object_entries_show_parents = "hide"
 PAGES = {
     "Use": [
         "docs/slicer",
+        "docs/tracked-ultrasound",
+        "docs/device",
         "docs/workstation",
         "docs/datasets",
         "docs/security",

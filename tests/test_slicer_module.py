@@ -814,7 +814,7 @@ def test_what_a_first_image_needs_is_one_screen_of_440_pixels(session):
     opened = [section for section in sections if not section.property("collapsed")]
     assert [section.property("text") for section in opened] == ["Patient", "Probe", "Ultrasound"]
     last = opened[-1]
-    assert last.y() + last.height() <= 700 and session.parent.width() == 440 and len(session.panel._controls) < 110
+    assert last.y() + last.height() <= 700 and session.parent.width() == 440 and len(session.panel._controls) < 116
     for section in sections:
         section.setCollapsed(False)
     session.process()
@@ -838,6 +838,29 @@ def test_what_a_first_image_needs_is_one_screen_of_440_pixels(session):
         session.parent.resize(440, session.parent.sizeHint().height())
         session.process()
         session.parent.grab().toImage().save(str(Path(folder) / "slicer-panel.png"))
+
+
+def test_a_tracked_probe_is_set_up_in_its_section(session):
+    tracked, calibration = (session.add("LinearTransform", name) for name in ("ProbeToReference", "ImageToProbe"))
+    vtk_matrix = session.logic_module("base.vtk_data").vtk_matrix
+    calibration.SetMatrixTransformToParent(vtk_matrix(np.diag([0.2, 0.2, 0.2, 1])))
+    session.ui.trackedSelector.setCurrentNode(tracked)
+    session.ui.calibrationSelector.setCurrentNode(calibration)
+    session.ui.facePixelLineEdit.setText("310 15")
+    session.ui.facePixelLineEdit.editingFinished.emit()
+    session.ui.useCalibrationButton.click()
+    session.process()
+    assert "pixels of 0.2 x 0.2 mm; face at column 310.0, row 15.0 (as given)" in session.ui.trackedLabel.text()
+    assert session.parameters.probe_transform.GetParentTransformNode() is tracked and not session.app.errors
+    session.ui.sendImagesButton.click()
+    assert "no image yet" in session.app.errors.pop()
+    if folder := os.environ.get("USSIM_PICTURES"):
+        for section in session.parent.findChildren(stand_in.CollapsibleButton):
+            section.setCollapsed(section.property("text") != "Tracked ultrasound")
+        session.parent.show()
+        session.parent.resize(440, 360)
+        session.process()
+        session.parent.grab().toImage().save(str(Path(folder) / "slicer-tracked.png"))
 
 
 def test_image_and_probe_are_in_the_3d_views_until_switched_off(session):

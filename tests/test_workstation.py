@@ -28,8 +28,10 @@ from SlicerUSSim.Logic.base.errors import required  # noqa: E402
 from SlicerUSSim.Logic.base.volume import read_image_file  # noqa: E402
 from SlicerUSSim.Logic.probe.poses import pose_looking_at  # noqa: E402
 from SlicerUSSim.Workstation.state import NAMES, value_of  # noqa: E402
+from tests.openigtlink_client import StrictClient  # noqa: E402
 from tests.served import Served, refused  # noqa: E402
 from tests.test_grown_lesions import CENTRE  # noqa: E402
+from tests.test_tracking import free_port  # noqa: E402
 from validation.brain_phantoms import phantom, tissue_maps, with_low_grade_tumour  # noqa: E402
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
@@ -707,6 +709,33 @@ def test_a_tracker_moves_the_probe_and_gets_every_image_with_its_matrix(page, tr
     assert np.allclose(middle, target[:3, 3], atol=0.5) and np.allclose(down, target[:3, 1], atol=1e-3)
     assert message.image.max() > 50
     page.get_by_text("following ProbeToReference").wait_for()
+
+
+@pytest.mark.slow
+def test_clients_see_the_page_as_an_ultrasound_device(browser, files):
+    port = free_port()
+    with serving(str(files / "head.nii.gz"), "--igtl", f":{port}") as address:
+        page = opened(browser, address)
+        with StrictClient(port) as client, StrictClient(port) as robot:
+            client.checks_crc = robot.checks_crc = False
+            assert client.next("IMAGE").device == "SlicerUSSim"
+            wanted = '<Parameter Name="DepthMm" Value="80"/><Parameter Name="GainPercent" Value="60"/>'
+            reply = client.command(f'<Command Name="SetUsParameter">{wanted}</Command>')
+            assert reply.metadata == {"DepthMm": "SUCCESS", "GainPercent": "SUCCESS", "Status": "SUCCESS"}
+            asked = '<Parameter Name="DepthMm"/><Parameter Name="GainPercent"/>'
+            reply = client.command(f'<Command Name="GetUsParameter">{asked}</Command>')
+            assert reply.metadata == {"DepthMm": "80", "GainPercent": "60", "Status": "SUCCESS"}
+            calibration = robot.next("TRANSFORM", "ImageToProbe").matrix
+            place = robot.next("TRANSFORM", "ProbeToReference").matrix
+            image, matrix = robot.next("IMAGE").image
+            assert np.allclose((place @ calibration)[:, [0, 1, 3]], matrix[:, [0, 1, 3]], atol=1e-3) and image.any()
+            place[0, 3] += 1.5
+            robot.move(place)
+            moved = robot.next("TRANSFORM", "ProbeToReference").matrix
+            while not np.allclose(moved, place, atol=1e-3):
+                moved = robot.next("TRANSFORM", "ProbeToReference").matrix
+            page.get_by_text("connected to 2 clients, following ProbeToReference").wait_for()
+        page.close()
 
 
 # ---- more than one page, reload, errors ------------------------------------------------------------------------------

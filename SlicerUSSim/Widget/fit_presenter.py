@@ -166,6 +166,10 @@ class FitPresenter:
     def canCompare(self) -> bool:
         return self._fit is not None
 
+    def canBlink(self) -> bool:
+        real: Any = self._panel.parameters.real
+        return self.canCompare() or (real is not None and real.IsA("vtkMRMLVolumeNode"))
+
     def compare(self, kind: str, number: int) -> None:
         """Show one image of the fit in the slice view; `kind` is one of fit_nodes.COMPARED."""
         with self._panel.shown():

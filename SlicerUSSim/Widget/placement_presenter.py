@@ -8,6 +8,7 @@ from SlicerUSSim.Logic.base.errors import require, required
 from SlicerUSSim.Logic.mrml.nodes import display_of
 from SlicerUSSim.Widget.interface import PanelHost, tr as _
 from SlicerUSSim.Widget.notes import OPENED, PLACED, VIEW, Notes, checks
+from SlicerUSSim.Widget.tracked_presenter import is_face
 
 
 class PlacementPresenter:
@@ -48,6 +49,8 @@ class PlacementPresenter:
         See UltrasoundSceneLogic.placeProbe for `where`.
         """
         parameters = self._panel.parameters
+        is_moved = parameters.probe_transform is not None and is_face(parameters.probe_transform)
+        require(not is_moved, "the tracker moves the probe; choose another probe transform, or none, to place it")
         with self._panel.made(parameters.probe_transform, "LinearTransform", "Probe") as probe:
             line = self._panel.logic.placeProbe(parameters.labels, probe, **where)
         parameters.probe_transform = probe

@@ -19,6 +19,7 @@ from SlicerUSSim.Widget.notes import Notes
 from SlicerUSSim.Widget.placement_presenter import PlacementPresenter
 from SlicerUSSim.Widget.segment_presenter import SegmentPresenter
 from SlicerUSSim.Widget.tissue_presenter import TissuePresenter
+from SlicerUSSim.Widget.tracked_presenter import TrackedPresenter
 from SlicerUSSim.Widget.value_presenter import ValuePresenter
 
 
@@ -41,6 +42,7 @@ class PanelPresenter(PanelHost):
         self.values = ValuePresenter(self, self.placing)
         self.images = ImagePresenter(self, self.notes, self.placing)
         self.fits = FitPresenter(self, self.values, self.tissues)
+        self.tracking = TrackedPresenter(self)
 
     def chooseDefaultNodes(self) -> None:
         """Select the first volume of the scene as the MRI, if none is selected."""
@@ -68,7 +70,7 @@ class PanelPresenter(PanelHost):
         """Release what is kept in memory of the last patient, with notes and fit; nodes stay."""
         self.logic.forgetPatient()
         self.view.showStatus("")
-        self.images.sequenceDone = ""
+        self.images.sequenceDone = self.tracking.done = ""
         self.fits.forget()
         self.segmenting.forget()
         self.lesions.forget()

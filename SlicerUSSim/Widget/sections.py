@@ -233,8 +233,40 @@ def _tissues(panel: PanelPresenter) -> tuple[Row, ...]:
     )  # fmt: skip
 
 
+def _tracker(panel: PanelPresenter) -> tuple[Row, ...]:
+    """Of Slicer alone: the page has a tracker of its own, and a page must not name files of the server."""
+    tracking = panel.tracking
+    return (
+        node(
+            "tracked", _("Tracked transform"), _("What the tracker measures of the sensor on the probe, such as "
+            "ProbeToReference of Plus"),
+        ),
+        node(
+            "calibration", _("Calibration"), _("ImageToProbe: from pixels of the real image to the sensor, mm; none: "
+            "the text below"),
+        ),
+        *values("scene.calibration_text", "scene.face_pixel"),
+        (
+            button(
+                "useCalibration", _("Use calibration"),
+                _("Let the tracked transform move the probe's face, whose place follows from the calibration"),
+                tracking.useCalibration,
+            ),
+            button(
+                "sendImages", _("Send images"),
+                _("Start an OpenIGTLink server that sends the image and the probe's transform (needs the extension "
+                  "SlicerOpenIGTLink)"), tracking.sendImages,
+            ),
+        ),
+        Control(
+            "tracked", "words", tip=_("What the calibration was taken for, and what to check"), shows=tracking.text,
+        ),
+    )  # fmt: skip
+
+
 def _tracked(panel: PanelPresenter) -> tuple[Row, ...]:
     return (
+        *(_tracker(panel) if panel.placing.handles else ()),
         node(
             "probe_transform", _("Probe transform"), _("Linear transform of the probe [mm], such as a tracker's: x to "
             "the right of the image, y along its depth, origin in the middle of the probe face"), new_node=_("Probe"),
@@ -296,7 +328,7 @@ def _fit(panel: PanelPresenter) -> tuple[Row, ...]:
             Control("compareNumber", "choice", tip=_("Number of the fitted image"), enabled=fits.canCompare),
             Control(
                 "blink", "tick", _("Blink"), _("Alternate between real and simulated image twice a second"),
-                enabled=fits.canCompare,
+                enabled=fits.canBlink,
             ),
         ),
     )  # fmt: skip

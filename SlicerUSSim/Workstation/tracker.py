@@ -1,20 +1,31 @@
-"""Tracker: a TrackerLink that moves the probe and sends the images, with its state on the page."""
+"""Tracker: a TrackerLink that moves the probe and sends the images, with its state on the page.
+
+Where it waits for clients it is an ultrasound device, which answers their commands.
+"""
 
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from typing import TypeVar
 
 import numpy as np
 from trame_server.utils.asynchronous import get_event_loop
 
+from SlicerUSSim.Logic.device.plus_commands import PlusCommands
+from SlicerUSSim.Logic.imaging.preset import Preset
+from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic
 from SlicerUSSim.Logic.mrml.taken_image import TakenImage
+from SlicerUSSim.Logic.probe.image_grid import ImageGrid
 from SlicerUSSim.Logic.tracked.openigtlink import TrackerLink, parse_address
 from SlicerUSSim.Workstation.state import SharedState
 from SlicerUSSim.Workstation.tasks import Tasks
 
 #: Seconds between two checks of the connection's state.
 _LOOK_EVERY_S = 0.3
+#: Seconds that a command waits for the event loop
+_PATIENCE_S = 5.0
+T = TypeVar("T")
 
 
 class Tracker:
@@ -25,8 +36,11 @@ class Tracker:
     move : called in the event loop with the pose (4, 4) from the tracker.
     """
 
-    def __init__(self, shared: SharedState, tasks: Tasks, move: Callable[[np.ndarray], None]) -> None:
-        self._shared, self._tasks, self._move = shared, tasks, move
+    def __init__(
+        self, shared: SharedState, tasks: Tasks, move: Callable[[np.ndarray], None], logic: UltrasoundSceneLogic
+    ) -> None:
+        self._shared, self._tasks, self._move, self._logic = shared, tasks, move, logic
+        self._is_device, self._loop = False, get_event_loop()
         self._link: TrackerLink | None = None
         self._telling: asyncio.Task | None = None
 
@@ -36,13 +50,17 @@ class Tracker:
         Raises SimulationError for an invalid address, and for one at which it cannot listen.
         """
         host, port, listen = parse_address(address)
-        self._link = TrackerLink(host, port, self._moved, device=device, listen=listen)
-        self._telling = get_event_loop().create_task(self._tell(self._link))
+        self._is_device = listen
+        commands = PlusCommands(self._preset, self._change, self._transforms)
+        self._link = TrackerLink(
+            host, port, self._moved, device=device, listen=listen, answering=commands.session if listen else None
+        )
+        self._telling = self._loop.create_task(self._tell(self._link))
 
     def send(self, taken: TakenImage) -> None:
-        """Send an image with its position (RAS), if there is a tracker."""
+        """Send an image with its position (RAS), if there is a tracker; to clients with its transforms."""
         if self._link is not None:
-            self._link.send(taken.volume())
+            self._link.send(taken.volume(), self._transforms() if self._is_device else {})
 
     def stop(self) -> None:
         """Close the connection."""
@@ -52,6 +70,29 @@ class Tracker:
 
     def _moved(self, pose: np.ndarray) -> None:
         self._tasks.tell(lambda: self._move(pose))
+
+    # ---- commands, in a thread of the link ---------------------------------------------------------------------
+
+    def _in_loop(self, function: Callable[[], T]) -> T:
+        """What `function` returns in the event loop, where nodes are used. Raises TimeoutError if the page is busy."""
+
+        async def run() -> T:
+            return function()
+
+        return asyncio.run_coroutine_threadsafe(run(), self._loop).result(_PATIENCE_S)
+
+    def _preset(self) -> tuple[Preset, ImageGrid]:
+        preset = self._in_loop(lambda: self._logic.preset)
+        return preset, ImageGrid.for_probe(preset.probe, preset.display.image_size)
+
+    def _change(self, preset: Preset) -> None:
+        self._in_loop(lambda: setattr(self._logic, "preset", preset))
+
+    def _transforms(self) -> Mapping[str, np.ndarray]:
+        taken = self._logic.taken
+        if taken is None:
+            return {}
+        return {"ImageToProbe": taken.grid.image_to_probe, "ProbeToReference": taken.probe_to_world}
 
     async def _tell(self, link: TrackerLink) -> None:
         while self._link is link:

@@ -78,7 +78,7 @@ class Workstation:
         probe.told = self._poses.show
         self._comparison = comparison = Comparison(shared, probe.move, tasks.tell)
         presenter.fits.following = comparison.follow
-        self._tracker = Tracker(shared, tasks, probe.move)
+        self._tracker = Tracker(shared, tasks, probe.move, logic)
         self._cine = cine = Cine(panel, comparison, probe.move)
         self._images = ImageFlow(panel, self._views, comparison, cine, self._tracker, stamps)
         nodes = FileNodes(logic, tasks, files)

@@ -147,7 +147,12 @@ def set_node_to_world(transform_node, matrix: np.ndarray) -> None:
 def probe_pose(transform_node) -> np.ndarray:
     """(4, 4) probe_to_ras of a transform node with all its parents. Raises SimulationError unless it is rigid."""
     require_node(transform_node, "vtkMRMLTransformNode", use="probe transform")
-    return check_rigid(named(transform_node), node_to_world(transform_node))
+    try:
+        return check_rigid(named(transform_node), node_to_world(transform_node))
+    except SimulationError as error:
+        is_calibration = (transform_node.GetName() or "").startswith("ImageTo")
+        hint = "; it is a calibration: choose it as such below Tracked ultrasound" if is_calibration else ""
+        raise SimulationError(f"{error}{hint}") from None
 
 
 def pose_in_labels(labels_node, probe_to_world: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -273,13 +278,16 @@ def write_body(model_node, probe: Probe) -> None:
 def show_in_slice(slice_node, volume_node, probe_to_world: np.ndarray, probe: Probe, fit: bool, behind=None) -> None:
     """Move a slice view to the image plane, oriented as on a scanner, and overlay the image on its background.
 
-    `fit` also zooms to the imaged field; `behind` is another volume for the background.
+    `fit` also zooms to the imaged field; `behind` is another volume for the background. A view that Volume Reslice
+    Driver moves (SlicerIGT) stays where that has it.
     """
     left, right, top, bottom = probe.image_bounds_mm()
     view = probe_to_world @ np.diag([1.0, -1.0, -1.0, 1.0])  # a view's second axis points up, the probe's down
     view[:3, 3] = (probe_to_world @ [0.5 * (left + right), 0.5 * (top + bottom), 0.0, 1.0])[:3]
-    slice_node.GetSliceToRAS().DeepCopy(vtk_matrix(view))
-    if fit:
+    is_driven = is_driven_by_other(slice_node)
+    if not is_driven:
+        slice_node.GetSliceToRAS().DeepCopy(vtk_matrix(view))
+    if fit and not is_driven:
         width, height, thickness = slice_node.GetFieldOfView()
         scale = max((right - left) / width, (bottom - top) / height) * 1.05
         slice_node.SetFieldOfView(width * scale, height * scale, thickness)
@@ -292,6 +300,11 @@ def show_in_slice(slice_node, volume_node, probe_to_world: np.ndarray, probe: Pr
     if composite.GetForegroundVolumeID() != volume_node.GetID():
         composite.SetForegroundVolumeID(volume_node.GetID())
         composite.SetForegroundOpacity(1.0)
+
+
+def is_driven_by_other(slice_node) -> bool:
+    """Whether Volume Reslice Driver moves a slice view."""
+    return bool(slice_node.GetAttribute("VolumeResliceDriver.Driver"))
 
 
 def composite_of(slice_node):

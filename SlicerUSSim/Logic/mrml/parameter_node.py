@@ -62,6 +62,14 @@ class PanelSettings(Declared):
         next(iter(VIEWS)), "Standard view", "; ".join(f"{name}: {view.tip}" for name, view in VIEWS.items()),
         choices=tuple(VIEWS), shown=True,
     )  # fmt: skip
+    calibration_text: str = parameter(
+        "", "Or file, or numbers", "Instead of a transform: the file of a Plus configuration (.xml), or the 16 "
+        "numbers of ImageToProbe by rows", shown=True,
+    )  # fmt: skip
+    face_pixel: str = parameter(
+        "", "Face in the image", "Column and row of the middle of the probe's face, such as 320 12; empty: it is "
+        "looked for in the real images", shown=True,
+    )  # fmt: skip
     preset_pose: bool = parameter(
         False, "Pose in presets", "Save preset saves the pose of the probe, too; a preset with a pose moves the probe "
         "there when it is loaded", shown=True,
@@ -200,6 +208,9 @@ class SceneParameters:
     #: Of a craniotomy; none: a disc under the probe
     opening = NodeParameter("vtkMRMLMarkupsNode", "vtkMRMLSegmentationNode", "vtkMRMLLabelMapVolumeNode")
     probe_transform = NodeParameter("vtkMRMLLinearTransformNode")
+    #: What a tracker measures, such as ProbeToReference, and the calibration of the image, ImageToProbe
+    tracked = NodeParameter("vtkMRMLLinearTransformNode")
+    calibration = NodeParameter("vtkMRMLLinearTransformNode")
     output = NodeParameter("vtkMRMLScalarVolumeNode")
     outline = NodeParameter("vtkMRMLModelNode")
     real = NodeParameter("vtkMRMLSequenceNode", "vtkMRMLScalarVolumeNode")

@@ -25,6 +25,8 @@ _LEAST_SHOWN, _BLACK = 0.02, 4
 #: Least area of a given probe's field by that of what images show, which may have other bright areas beside it, and
 #: largest area by that of an image, which may be cropped
 _LEAST_AREA, _MOST_AREA = 1 / 3, 4.0
+#: Least and largest size of a pixel of a scanner's image, millimetres
+_PIXELS_MM = 0.005, 3.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,7 +106,7 @@ class TrackedImages:
         if sequence.has_images:
             for number, image in zip(kept, images, strict=True):
                 require(int(image.max()) > 0, f"image {number} of the sequence is black")
-            spacing = _pixel_spacing(matrices[0], path)
+            spacing = pixel_spacing(matrices[0], path)
             # All images of the recording show more of the field than the few that are fitted
             every = _as_uint8(spread_images(sequence.images))
             if field is None:
@@ -129,7 +131,8 @@ class TrackedImages:
             field = replace(field, mask=seen)
         field = required(field, "the sequence has poses without images, expected images")
         to_ras = np.eye(4) if reference_to_ras is None else check_rigid("reference_to_ras", reference_to_ras)
-        poses = [to_ras @ _probe_pose(matrix, field, path) for matrix in matrices]
+        at_face = np.linalg.inv(field.image_to_probe)[:2, 3].tolist()
+        poses = [to_ras @ face_pose(matrix, at_face, path) for matrix in matrices]
         window = rows, columns = field.window
         left, top = (field.image_to_probe @ [columns.start - 0.5, rows.start - 0.5, 0.0, 1.0])[:2]
         size = field.image_to_probe[0, 0], field.image_to_probe[1, 1]
@@ -172,7 +175,7 @@ def pixels_for_poses(sequence: TrackedSequence, path: str, probe: Probe) -> tupl
     if source == "Image" and sequence.has_pose(first, "ImageToProbe"):
         matrix = sequence.pose(first, "ImageToProbe")
         require(
-            _is_upright(matrix, _pixel_spacing(matrix, "ImageToProbe")),
+            _is_upright(matrix, pixel_spacing(matrix, "ImageToProbe")),
             "the sequence has no images that show the probe's place in them, and ImageToProbe is not in the probe's "
             f"own frame; expected {name} of that frame, and no calibration",
         )
@@ -209,7 +212,7 @@ def _as_uint8(images: np.ndarray) -> np.ndarray:
     return images.round().astype(np.uint8)
 
 
-def _pixel_spacing(image_to_world: np.ndarray, path: str) -> tuple[float, float]:
+def pixel_spacing(image_to_world: np.ndarray, path: str) -> tuple[float, float]:
     """(column, row) size of a pixel in millimetres. Raises SimulationError unless pixels are rectangles."""
     x, y = image_to_world[:3, 0], image_to_world[:3, 1]
     size = float(np.linalg.norm(x)), float(np.linalg.norm(y))
@@ -274,14 +277,55 @@ def _require_size(field: ImagedField, images: np.ndarray, spacing: tuple[float, 
     )
 
 
-def _probe_pose(image_to_world: np.ndarray, field: ImagedField, path: str) -> np.ndarray:
-    """(4, 4) rigid probe_to_world from (4, 4) image_to_world; the image frame is in pixels, the probe frame in mm."""
-    in_pixels = np.linalg.inv(field.image_to_probe)
+def face_pose(image_to_world: np.ndarray, face_pixel: Sequence[float], path: str) -> np.ndarray:
+    """(4, 4) rigid probe_to_world from (4, 4) image_to_world, whose pixels may have any size.
+
+    `face_pixel` is (column, row) of the middle of the probe's face; `path` names the map in errors.
+    """
     pose = np.eye(4)
     for axis in range(2):
         column = image_to_world[:3, axis]
         pose[:3, axis] = column / np.linalg.norm(column)
     pose[:3, 2] = np.cross(pose[:3, 0], pose[:3, 1])
     pose[:3, :3] = nearest_rotation(pose[:3, :3])
-    pose[:3, 3] = (image_to_world @ [in_pixels[0, 3], in_pixels[1, 3], 0.0, 1.0])[:3]
+    pose[:3, 3] = (image_to_world @ [*face_pixel, 0.0, 1.0])[:3]
     return check_rigid(path, pose)
+
+
+def face_of_calibration(
+    image_to_probe: np.ndarray, images: np.ndarray | None = None, face_pixel: Sequence[float] | None = None
+) -> tuple[np.ndarray, tuple[str, ...]]:
+    """((4, 4) rigid, from the probe frame, at the face, to the tracked sensor, which Plus calls Probe; what was taken).
+
+    `image_to_probe` is a calibration (4, 4), of pixels (column, row, 0, 1) to the sensor, mm.
+
+    The face is at `face_pixel`, or else looked for in `images` (n, rows, columns), or else in the middle of their first
+    row. Raises SimulationError for a skewed calibration, for pixels of another size than scanners have, as of a
+    calibration in metres, and if nothing says where the face is.
+    """
+    spacing = pixel_spacing(image_to_probe, "ImageToProbe")
+    low, high = _PIXELS_MM
+    require(
+        low <= min(spacing) and max(spacing) <= high,
+        f"ImageToProbe has pixels of {spacing[0]:.3g} x {spacing[1]:.3g} mm, expected {low:g} to {high:g} mm; is it in "
+        "metres, or is it no calibration of an image?",
+    )
+    if face_pixel is not None:
+        place, how = face_pixel, "as given"
+    else:
+        images = required(images, "where the face is in the image is not known: choose real images, or give its pixel")
+        try:
+            found = estimate_field(images, spacing)
+            place, how = np.linalg.inv(found.image_to_probe)[:2, 3].tolist(), f"found in {found.overlap:.0%} of a field"
+        except SimulationError as error:
+            _log.info("%s", error)
+            place, how = (0.5 * (images.shape[2] - 1), -0.5), "the middle of the first row, no field was found"
+    pose = face_pose(image_to_probe, place, "ImageToProbe")
+    words = [
+        f"pixels of {spacing[0]:.3g} x {spacing[1]:.3g} mm",
+        f"face at column {place[0]:.1f}, row {place[1]:.1f} ({how})",
+        f"{np.linalg.norm(pose[:3, 3]):.1f} mm from the sensor",
+    ]
+    if np.linalg.det(image_to_probe[:3, :3]) < 0.0:
+        words.append("the calibration mirrors: if left and right of the image are wrong, it is")
+    return pose, tuple(words)
