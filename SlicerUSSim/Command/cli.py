@@ -16,6 +16,7 @@ from typing import Any
 
 import click
 
+from SlicerUSSim.Command.approach import approach
 from SlicerUSSim.Command.demo import demo
 from SlicerUSSim.Command.interrupts import end_at_signals
 from SlicerUSSim.Command.optimize import optimize
@@ -121,7 +122,7 @@ def check(ctx: click.Context, device: str | None) -> None:
     ctx.exit(1 if result.wrong else 0)
 
 
-for command in (check, demo, devices, optimize, segment, serve, simulate, sweep, volume):
+for command in (approach, check, demo, devices, optimize, segment, serve, simulate, sweep, volume):
     main.add_command(untrusted_option(verbose_option(command), hidden=True))
     if rare_keys(command):
         command.epilog = f"Further keys of --set: {', '.join(rare_keys(command))}."

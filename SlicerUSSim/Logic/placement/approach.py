@@ -7,9 +7,12 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
 
 import numpy as np
 from scipy import ndimage
+from scipy.spatial import KDTree
 
 from SlicerUSSim.Logic.base.declaration import Declared, parameter
 from SlicerUSSim.Logic.base.errors import either, require
@@ -55,21 +58,24 @@ _VOXELS = 600
 _APART_MM = 25.0
 
 
+def _weight(default: float, label: str, tip: str) -> Any:
+    option = f"{label.lower().replace(' ', '-')}-weight"
+    return parameter(default, f"Weight: {label.lower()}", tip, unit="mm", bounds=(0, 1000), option=option)
+
+
 @dataclass(frozen=True)
 class ApproachWeights(Declared):
     """Weights of the cost by which plan_approach ranks candidates, each in millimetres of brain that are as bad."""
 
-    brain: float = parameter(1.0, "Brain", "Each millimetre of brain before the target", bounds=(0, 1000))
-    outside: float = parameter(0.5, "Outside", "Each millimetre of skin, scalp and bone", bounds=(0, 1000))
-    ventricle: float = parameter(
-        5.0, "Ventricle", "Each millimetre of fluid more than 15 mm below the brain's surface", bounds=(0, 1000)
-    )
-    vessel: float = parameter(5.0, "Vessel", "Each millimetre of a vessel, or of what enhances", bounds=(0, 1000))
-    air: float = parameter(10.0, "Air", "Each millimetre of air in the head, as of a sinus", bounds=(0, 1000))
-    other_side: float = parameter(3.0, "Other side", "Each millimetre in the middle plane of the brain (4 mm) or beyond it", bounds=(0, 1000))
-    angle: float = parameter(0.2, "Angle", "Each degree between probe and the brain's normal", bounds=(0, 1000))
-    unseen: float = parameter(2.0, "Not seen", "Each percent of the target outside of the field", bounds=(0, 1000))
-    unfocused: float = parameter(0.05, "Not in focus", "Each percent outside of the focal zone", bounds=(0, 1000))
+    brain_weight: float = _weight(1.0, "Brain", "Each millimetre of brain before the target")
+    outside_weight: float = _weight(0.5, "Outside", "Each millimetre of skin, scalp and bone")
+    ventricle_weight: float = _weight(5.0, "Ventricle", "Each millimetre of fluid more than 15 mm below the brain's surface")
+    vessel_weight: float = _weight(5.0, "Vessel", "Each millimetre of a vessel, or of what enhances")
+    air_weight: float = _weight(10.0, "Air", "Each millimetre of air in the head, as of a sinus")
+    other_side_weight: float = _weight(3.0, "Other side", "Each millimetre in the middle plane of the brain (4 mm) or beyond it")
+    angle_weight: float = _weight(0.2, "Angle", "Each degree between probe and normal of the brain's surface")
+    unseen_weight: float = _weight(2.0, "Unseen", "Each percent of the target outside of the field")
+    unfocused_weight: float = _weight(0.05, "Unfocused", "Each percent of the target outside of the focal zone")
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,10 +93,18 @@ class Target:
     #: Of its uppermost point below the nearest place of the brain's surface
     depth_mm: float
 
-    @property
-    def gap_mm(self) -> float:
+    @cached_property
+    def _gap_mm(self) -> float:
         """About the distance between its points."""
         return float(np.cbrt(1000.0 * self.volume_ml / len(self.points_ras)))
+
+    @cached_property
+    def _tree(self) -> KDTree:
+        return KDTree(self.points_ras)
+
+    def away_mm(self, points_ras: np.ndarray) -> np.ndarray:
+        """(...) distances of (..., 3) places to the target, 0 in it; exact to about the size of a voxel."""
+        return np.maximum(self._tree.query(points_ras)[0] - self._gap_mm, 0.0)
 
     @property
     def text(self) -> str:
@@ -134,7 +148,7 @@ class Candidate:
     @property
     def text(self) -> str:
         """One line."""
-        path = ", ".join(f"{name} {mm:.0f}" for name, mm in self.path_mm.items() if mm >= 0.5)
+        path = ", ".join(f"{name} {mm:.0f}" for name, mm in self.path_mm.items() if mm >= 1.0)
         contrast = "" if self.contrast_db is None else f"; contrast {self.contrast_db:+.0f} dB"
         disc = f"; disc of {self.opening_mm:.0f} mm" if self.opening_mm else ""
         return (
@@ -421,4 +435,4 @@ def _costs(
         "vessel": ways.millimetres(_VESSELS), "air": ways.millimetres(("air",)), "other_side": ways.other_side_mm,
         "angle": angles, "unseen": 100.0 * (1.0 - seen), "unfocused": 100.0 * (1.0 - focused),
     }  # fmt: skip
-    return {name: getattr(weights, name) * amount for name, amount in amounts.items()}
+    return {name: getattr(weights, f"{name}_weight") * amount for name, amount in amounts.items()}

@@ -1,0 +1,58 @@
+"""`ussim approach`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from SlicerUSSim.Command.options import check_outputs, gathered, out_option, overwrite_option
+from SlicerUSSim.Command.patient_options import RARE, PatientOptions, open_examination
+from SlicerUSSim.Command.progress import note
+from SlicerUSSim.Logic.base.declaration import parameters_of
+from SlicerUSSim.Logic.base.errors import SimulationError, require
+from SlicerUSSim.Logic.placement.approach import NO_ADVICE, ApproachWeights
+
+_WEIGHTS = " ".join(entry.name for entry in parameters_of(ApproachWeights))
+
+
+@click.command()
+@gathered(f"{RARE} seed {_WEIGHTS}", patient=PatientOptions, approach=ApproachWeights)
+@click.option(
+    "--target", metavar="TISSUE|R,A,S", help="What is to be seen: a tissue, or a point in mm (default: the largest "
+    "lesion).",
+)  # fmt: skip
+@out_option("Report: .html")
+@overwrite_option
+def approach(patient: PatientOptions, approach: ApproachWeights, target: str | None, out: Path) -> None:
+    """Plan from where a probe sees a lesion best: candidates with ways, openings and images. No medical advice."""
+    from SlicerUSSim.Logic.imaging.approach_images import simulated_approach, write_approach_report
+    from SlicerUSSim.Logic.placement.approach import plan_approach
+
+    require(out.suffix.lower() == ".html", f"--out is {str(out)!r}, expected a file .html")
+    check_outputs(out)
+    what = target_of(target)
+    require(patient.craniotomy == "none", f"--craniotomy is {patient.craniotomy}, expected none: the plan opens a head")
+    examination = open_examination(patient)
+    simulator, probe = examination.simulator, examination.probe
+    labels, names = simulator.medium.labels, simulator.medium.tissues.names_by_label()
+    plan = plan_approach(labels, names, probe, what, weights=approach)
+    plan = simulated_approach(plan, simulator, probe, examination.display)
+    weights = {entry.name: getattr(approach, entry.name) for entry in parameters_of(ApproachWeights)}
+    write_approach_report(out, plan, labels, names, probe, subtitle=patient.source, weights=weights)
+    for line in (plan.target.text, *(candidate.text for candidate in plan.candidates), NO_ADVICE):
+        click.echo(line)
+    note(f"wrote {out} ({len(plan.candidates)} candidates of {plan.compared} ways)")
+
+
+def target_of(text: str | None) -> str | tuple[float, ...] | None:
+    """A tissue, or a point (R, A, S) in mm of "12,-15,8". Raises SimulationError for other numbers."""
+    if text is None or "," not in text:
+        return text
+    try:
+        point = tuple(float(part) for part in text.split(","))
+    except ValueError:
+        point = ()
+    if len(point) != 3:
+        raise SimulationError(f"the target is {text!r}, expected a tissue, or R,A,S in mm such as 12,-15,8")
+    return point
