@@ -7,10 +7,10 @@ from pathlib import Path
 import click
 
 from SlicerUSSim.Command.options import check_outputs, gathered, out_option, overwrite_option
-from SlicerUSSim.Command.patient_options import RARE, PatientOptions, open_examination
+from SlicerUSSim.Command.patient_options import RARE, PatientOptions, open_examination, target_of
 from SlicerUSSim.Command.progress import note
 from SlicerUSSim.Logic.base.declaration import parameters_of
-from SlicerUSSim.Logic.base.errors import SimulationError, require
+from SlicerUSSim.Logic.base.errors import require
 from SlicerUSSim.Logic.placement.approach import NO_ADVICE, ApproachWeights
 
 _WEIGHTS = " ".join(entry.name for entry in parameters_of(ApproachWeights))
@@ -43,16 +43,3 @@ def approach(patient: PatientOptions, approach: ApproachWeights, target: str | N
     for line in (plan.target.text, *(candidate.text for candidate in plan.candidates), NO_ADVICE):
         click.echo(line)
     note(f"wrote {out} ({len(plan.candidates)} candidates of {plan.compared} ways)")
-
-
-def target_of(text: str | None) -> str | tuple[float, ...] | None:
-    """A tissue, or a point (R, A, S) in mm of "12,-15,8". Raises SimulationError for other numbers."""
-    if text is None or "," not in text:
-        return text
-    try:
-        point = tuple(float(part) for part in text.split(","))
-    except ValueError:
-        point = ()
-    if len(point) != 3:
-        raise SimulationError(f"the target is {text!r}, expected a tissue, or R,A,S in mm such as 12,-15,8")
-    return point

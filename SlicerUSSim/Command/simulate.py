@@ -9,11 +9,13 @@ import click
 
 from SlicerUSSim.Command.options import check_outputs, gathered, out_option, overwrite_option
 from SlicerUSSim.Command.patient_options import (
+    APPROACH,
     RARE,
     RARE_BESIDE,
     PatientOptions,
     open_examination_at,
     pose_option,
+    pose_or_approach,
     say_contact,
 )
 from SlicerUSSim.Command.progress import Share, note
@@ -23,17 +25,23 @@ from SlicerUSSim.Logic.base.errors import require
 
 @click.command()
 @gathered(RARE, patient=PatientOptions)
-@pose_option
+@pose_or_approach
+@click.option(
+    "--approach", metavar="TISSUE|R,A,S", help="In place of a pose: the first candidate of an approach to this lesion "
+    "or point (mm), through its opening in a whole head (see `ussim approach`).",
+)  # fmt: skip
 @out_option("Image: .png .mha .nrrd .nii.gz or .vti")
 @overwrite_option
-def simulate(patient: PatientOptions, pose: str, out: Path) -> None:
+def simulate(patient: PatientOptions, pose: str | None, approach: str | None, out: Path) -> None:
     """Simulate one B-mode image from an MRI or a label map at a given pose."""
     from SlicerUSSim.Logic.base.volume import require_image_name
     from SlicerUSSim.Logic.imaging.figures import write_png
 
     require_image_name(out, also=(".png",))
     check_outputs(out)
-    examination, probe_to_ras = open_examination_at(patient, pose, one_image=True)
+    require((pose is None) != (approach is None), "expected exactly one of --pose and --approach")
+    at = f"{APPROACH}{approach}" if pose is None else pose
+    examination, probe_to_ras = open_examination_at(patient, at, one_image=True)
     say_contact(examination, examination.probe, [probe_to_ras])
     frame = examination.simulator.simulate(examination.probe, probe_to_ras, examination.display)
     if out.suffix.lower() == ".png":

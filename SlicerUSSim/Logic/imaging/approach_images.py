@@ -34,8 +34,8 @@ _STYLE = """body { background: #161616; color: #e4e4e4; font: 15px/1.5 system-ui
 max-width: 1180px; padding: 0 1rem } table { border-collapse: collapse } td, th { text-align: left; padding: .2rem .7rem;
 border-bottom: 1px solid #3a3a3a } .pair { display: flex; gap: 1rem; align-items: end } img { height: 380px;
 background: #000 } figure { margin: 0 } .dim, figcaption { color: #9a9a9a } .advice { color: #ffc83d }"""
-#: Fewer samples are no mean
-_FEWEST = 30
+#: Fewer samples are no mean; an envelope has at least this much noise
+_FEWEST, _LEAST = 30, 1e-6
 
 
 def simulated_approach(
@@ -68,23 +68,23 @@ def simulated_approach(
 def _contrast_db(
     envelope: np.ndarray, probe: Probe, probe_to_ras: np.ndarray, target: Target, brain: Volume
 ) -> float | None:
-    """Mean power of an envelope (scan_lines, samples) in the target above that in the brain around it, dB."""
+    """Mean level, dB, of an envelope (scan_lines, samples) in the target above that in the brain around it."""
     lines, samples = envelope.shape
     origin, direction = probe.line_at(replace(probe, scan_lines=lines).line_positions())
     along = (np.arange(samples) + 0.5) * probe.displayed_mm / samples
     points = origin[:, None] + along[:, None] * direction[:, None]
     ras = points @ probe_to_ras[:3, :3].T + probe_to_ras[:3, 3]
     near = np.linalg.norm(ras - target.centre_ras, axis=-1) <= target.size_mm + _AROUND_MM[1]
-    power, places = envelope[near].astype(float) ** 2, ras[near]
+    level, places = 20.0 * np.log10(np.maximum(envelope[near], _LEAST)), ras[near]
     if not len(places):
         return None
     away = target.away_mm(places)
     inside = away <= 0.0
     low, high = _AROUND_MM
     around = (away > low) & (away <= high) & (sample(brain, places, order=0) > 0)
-    if inside.sum() < _FEWEST or around.sum() < _FEWEST or not power[around].any():
+    if inside.sum() < _FEWEST or around.sum() < _FEWEST:
         return None
-    return float(10.0 * np.log10(power[inside].mean() / power[around].mean()))
+    return float(level[inside].mean() - level[around].mean())
 
 
 # ---- pictures and report ---------------------------------------------------------------------------------------------
@@ -138,14 +138,18 @@ def write_approach_report(
 
     `labels` are the closed ones, called `names`. Raises SimulationError for candidates without images.
     """
-    opened = opened_for(labels, names, approach.candidates)
+    target = approach.target
+    planes = [
+        tissues_in_plane(candidate, target, opened_for(labels, names, [candidate]), names, probe)
+        for candidate in approach.candidates
+    ]
     parts = [
         f"""<h2>Candidate {number}</h2><p>{html.escape(candidate.text)}</p><div class="pair"><figure>
-<img alt="simulated image {number}" src="{png_url(outlined(candidate, approach.target, probe))}">
+<img alt="simulated image {number}" src="{png_url(outlined(candidate, target, probe))}">
 <figcaption>simulated</figcaption></figure><figure><img alt="tissues {number}"
-src="{png_url(tissues_in_plane(candidate, approach.target, opened, names, probe))}">
+src="{png_url(plane)}">
 <figcaption>tissues in its plane, with the opening, the way and the field</figcaption></figure></div>"""
-        for number, candidate in enumerate(approach.candidates, 1)
+        for number, (candidate, plane) in enumerate(zip(approach.candidates, planes, strict=True), 1)
     ]
     heads = ["candidate", "cost", *approach.candidates[0].costs]
     rows = [

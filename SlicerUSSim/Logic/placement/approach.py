@@ -52,8 +52,8 @@ _THICKEST_MM, _BELOW, _BEHIND = 35.0, -0.5, -0.4
 _MIDDLE_MM = 4.0
 #: A probe is tilted so far at most; a disc is so much wider than the face at most, and keeps so much room on each side
 _TILT_DEG, _WIDEST_MM, _CLEAR_MM = 35.0, 15.0, 2.0
-#: Voxels that stand for a target
-_VOXELS = 600
+#: Voxels that stand for a target, and radius of a ball as large as the space around one, in their distances
+_VOXELS, _HALF = 600, 0.62
 #: Candidates stand so far apart that their openings hardly overlap, mm
 _APART_MM = 25.0
 
@@ -104,7 +104,7 @@ class Target:
 
     def away_mm(self, points_ras: np.ndarray) -> np.ndarray:
         """(...) distances of (..., 3) places to the target, 0 in it; exact to about the size of a voxel."""
-        return np.maximum(self._tree.query(points_ras)[0] - self._gap_mm, 0.0)
+        return np.maximum(self._tree.query(points_ras)[0] - _HALF * self._gap_mm, 0.0)
 
     @property
     def text(self) -> str:
@@ -152,7 +152,7 @@ class Candidate:
         contrast = "" if self.contrast_db is None else f"; contrast {self.contrast_db:+.0f} dB"
         disc = f"; disc of {self.opening_mm:.0f} mm" if self.opening_mm else ""
         return (
-            f"R {self.entry_ras[0]:.0f}, A {self.entry_ras[1]:.0f}, S {self.entry_ras[2]:.0f}: {100 * self.seen:.0f} % "
+            f"{_place(self.entry_ras)}: {100 * self.seen:.0f} % "
             f"seen, {100 * self.focused:.0f} % in focus, {self.angle_deg:.0f}° to the surface; mm on the way: "
             f"{path or 'none'}{disc}{contrast}; cost {self.cost:.0f}"
         )
@@ -166,6 +166,11 @@ class Approach:
     candidates: tuple[Candidate, ...]
     #: Number of ways that were compared
     compared: int
+
+
+def _place(ras: np.ndarray) -> str:
+    """In words; a value that is almost 0 has no sign."""
+    return ", ".join(f"{axis} {round(mm) + 0.0:.0f}" for axis, mm in zip("RAS", ras.tolist(), strict=True))
 
 
 def find_target(labels: Volume, names: Sequence[str], what: str | Sequence[float] | Volume | None = None) -> Target:
@@ -235,7 +240,7 @@ def plan_approach(
     costs = _costs(weights, ways, angles, seen, focused)
     total = np.sum(list(costs.values()), axis=0)
     from_below = (np.minimum(outward[:, 2], normals[:, 2]) < _BELOW) & (normals[:, 1] > _BEHIND)
-    has_skull = bool(labels_of(names, SKULL))
+    has_skull = bool(np.isin(labels.array, labels_of(names, SKULL)).any())
     closed = bone > 0.0 if has_skull else np.ones(len(faces), bool)
     for unusual in (from_below, ~closed, has_skull & ways.are_cut, ways.outside_mm > _THICKEST_MM, angles > FARTHEST_DEG):
         total = total + np.where(unusual, 1e4, 0.0)  # last of all, but there if nothing else is
@@ -297,9 +302,13 @@ def _target(labels: Volume, names: Sequence[str], what, surface: PatientSurface)
         places = np.argwhere(inside)
         points, voxel_ml = places[:, ::-1] @ grid.ijk_to_ras[:3, :3].T + grid.ijk_to_ras[:3, 3], grid.voxel_ml
     centre, size = points.mean(axis=0), np.ptp(points, axis=0).max() + np.cbrt(1000.0 * voxel_ml)
-    volume, points = len(points) * voxel_ml, points[:: max(len(points) // _VOXELS, 1)]
+    volume = len(points) * voxel_ml
+    if len(points) > _VOXELS:  # those on a coarser grid
+        step = int(np.ceil(np.cbrt(len(points) / _VOXELS)))
+        on_grid = (places % step == 0).all(axis=1)
+        points = points[on_grid] if on_grid.any() else points[:: step**3]
     is_in = sample(labels, points, order=0) > 0
-    place = f"R {centre[0]:.0f}, A {centre[1]:.0f}, S {centre[2]:.0f} mm"
+    place = f"{_place(centre)} mm"
     require(is_in.mean() >= 0.5, f"the {name} about {place} lies outside of the head, expected a target in it")
     return Target(name, points, centre, float(volume), float(size), float(surface.distances_mm(points).min()))
 
