@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import json
 import re
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,7 +10,7 @@ from click.testing import CliRunner
 from PIL import Image
 
 from SlicerUSSim.Command.cli import main
-from SlicerUSSim.Logic import SimulationError, TissueTable, UltrasoundSimulator, Volume
+from SlicerUSSim.Logic import SimulationError, TissueTable, Volume
 from SlicerUSSim.Logic.imaging.approach_images import outlined, simulated_approach
 from SlicerUSSim.Logic.placement import ApproachWeights, find_target, plan_approach
 from SlicerUSSim.Logic.placement.approach import NO_ADVICE, VENTRICLE, opened_for
@@ -151,8 +149,7 @@ def test_images_of_the_candidates_show_the_contrast_of_the_target(ill):
     for tissue, is_brighter in (("tumour", True), ("cyst", False)):
         names = (*ILL[: TUMOUR - 1], tissue, ILL[-1])
         plan = plan_approach(ill, names, PHASED, tissue, offered=2)
-        simulator = UltrasoundSimulator(ill, TissueTable.named(names))
-        shown = simulated_approach(plan, simulator, PHASED).candidates
+        shown = simulated_approach(plan, ill, TissueTable.named(names), PHASED).candidates
         for candidate in shown:
             assert candidate.image is not None and candidate.image.max() > 100 and candidate.contrast_db is not None
             assert (candidate.contrast_db > 4.0) if is_brighter else (candidate.contrast_db < -4.0)
@@ -161,7 +158,7 @@ def test_images_of_the_candidates_show_the_contrast_of_the_target(ill):
         depth = (rows + 0.5) * 90.0 / 256
         middle = np.linalg.norm(plan.target.centre_ras - shown[0].probe_to_ras[:3, 3])
         assert [depth.min(), depth.max()] == pytest.approx([middle - 8.0, middle + 8.0], abs=2.0)
-        assert columns.mean() == pytest.approx(128, abs=4) and simulator.medium.labels.array.max() == ill.array.max()
+        assert columns.mean() == pytest.approx(128, abs=4)
 
 
 def test_the_command_writes_a_report_and_simulates_the_first_candidate(ill, tmp_path):

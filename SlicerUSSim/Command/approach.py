@@ -37,7 +37,10 @@ def approach(patient: PatientOptions, approach: ApproachWeights, target: str | N
     simulator, probe = examination.simulator, examination.probe
     labels, names = simulator.medium.labels, simulator.medium.tissues.names_by_label()
     plan = plan_approach(labels, names, probe, what, weights=approach)
-    plan = simulated_approach(plan, simulator, probe, examination.display)
+    plan = simulated_approach(
+        plan, labels, simulator.medium.tissues, probe, simulator.settings, examination.display,
+        device=simulator.device, texture=simulator.texture, sheets=simulator.medium.sheets,
+    )  # fmt: skip
     weights = {entry.name: getattr(approach, entry.name) for entry in parameters_of(ApproachWeights)}
     write_approach_report(out, plan, labels, names, probe, subtitle=patient.source, weights=weights)
     for line in (plan.target.text, *(candidate.text for candidate in plan.candidates), NO_ADVICE):

@@ -30,6 +30,8 @@ _VALUES = (
     ("text", "editingFinished"),
 )  # fmt: skip
 _BLINK_MS = 500
+#: Of small pictures, three of which are side by side
+_PICTURE_WIDTH = 130
 #: Style of results, and of those with something to check
 _RESULT = "QLabel { background: #e8f4e8; color: #202020; padding: 2px }"
 _TO_CHECK = "QLabel { background: #fff7df; color: #202020; padding: 2px }"
@@ -166,6 +168,9 @@ class Panel:
             self._show_tissues()
         elif control.kind == "list":
             self._show_free()
+        elif control.kind == "picture" and control.shows:
+            url = control.shows()
+            widget.setText(f'<img src="{url}" width="{_PICTURE_WIDTH}">' if url else "")
         elif control.kind == "words" and control.shows:
             self._show_words(widget, control.shows())
         elif control.shows:

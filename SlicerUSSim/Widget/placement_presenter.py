@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Callable
+from typing import Any, TypeVar
+
+import numpy as np
 
 from SlicerUSSim.Logic.base.errors import require, required
-from SlicerUSSim.Logic.mrml.nodes import display_of
+from SlicerUSSim.Logic.mrml.nodes import display_of, set_node_to_world
 from SlicerUSSim.Widget.interface import PanelHost, tr as _
 from SlicerUSSim.Widget.notes import OPENED, PLACED, VIEW, Notes, checks
+
+T = TypeVar("T")
 
 
 class PlacementPresenter:
@@ -47,9 +52,17 @@ class PlacementPresenter:
 
         See UltrasoundSceneLogic.placeProbe for `where`.
         """
+        labels, logic = self._panel.parameters.labels, self._panel.logic
+        return self._moved(lambda probe: logic.placeProbe(labels, probe, **where))
+
+    def putAt(self, probe_to_world: np.ndarray) -> None:
+        """Move the probe's transform, or a new one if none is selected, to a pose (4, 4)."""
+        self._moved(lambda probe: set_node_to_world(probe, probe_to_world))
+
+    def _moved(self, move: Callable[[Any], T]) -> T:
         parameters = self._panel.parameters
         with self._panel.made(parameters.probe_transform, "LinearTransform", "Probe") as probe:
-            line = self._panel.logic.placeProbe(parameters.labels, probe, **where)
+            line = move(probe)
         parameters.probe_transform = probe
         display = display_of(probe)
         if display is not None:

@@ -126,6 +126,12 @@ def _words(control: Control) -> Any:
     return result
 
 
+def _picture(control: Control) -> Any:
+    result = qt.QLabel("")
+    result.setAlignment(qt.Qt.AlignCenter)
+    return result
+
+
 def _scrolled(label: Any) -> Any:
     result = qt.QScrollArea()
     result.setProperty("widgetResizable", True)
@@ -163,6 +169,7 @@ _MAKERS = {
     "words": _words,
     "table": _table,
     "list": _list,
+    "picture": _picture,
 }
 
 

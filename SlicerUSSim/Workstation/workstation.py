@@ -108,6 +108,9 @@ class Workstation:
             placing.placeAtView: partial(patient.place, placing.placeAtView),
             placing.approach: partial(patient.place, placing.approach),
         }
+        panel.own_actions[presenter.approach.openHere] = partial(
+            patient.place, partial(patient.then_show, presenter.approach.openHere)
+        )
         for action in (segmenting.segment, lesions.addTissues, placing.openCraniotomy, placing.closeCraniotomy):
             panel.own_actions[action] = partial(patient.then_show, action)
         self._answer_pages(stamps)

@@ -12,16 +12,20 @@ from scipy import ndimage
 
 from SlicerUSSim.Logic.base.errors import required
 from SlicerUSSim.Logic.base.files import written_whole
-from SlicerUSSim.Logic.base.settings import DisplaySettings
+from SlicerUSSim.Logic.base.settings import DisplaySettings, SimulationSettings
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.imaging.figures import html_table, png_url
 from SlicerUSSim.Logic.imaging.simulator import UltrasoundSimulator
+from SlicerUSSim.Logic.opencl.device import DeviceChoice
 from SlicerUSSim.Logic.placement.approach import NO_ADVICE, Approach, Candidate, Target, opened_for
 from SlicerUSSim.Logic.probe.arrays import Probe
 from SlicerUSSim.Logic.probe.image_grid import ImageGrid
 from SlicerUSSim.Logic.probe.poses import sample, slice_under_probe
 from SlicerUSSim.Logic.tissue.names import OUTSIDE, labels_of
 from SlicerUSSim.Logic.tissue.presets import colour_of
+from SlicerUSSim.Logic.tissue.surfels import Surfels
+from SlicerUSSim.Logic.tissue.table import TissueTable
+from SlicerUSSim.Logic.tissue.texture import Texture
 
 #: (rows, columns) of the images
 _PIXELS = (256, 256)
@@ -39,19 +43,28 @@ _FEWEST, _LEAST = 30, 1e-6
 
 
 def simulated_approach(
-    approach: Approach, simulator: UltrasoundSimulator, probe: Probe, display: DisplaySettings | None = None
+    approach: Approach,
+    labels: Volume,
+    tissues: TissueTable,
+    probe: Probe,
+    settings: SimulationSettings | None = None,
+    display: DisplaySettings | None = None,
+    *,
+    device: DeviceChoice = None,
+    texture: Texture | None = None,
+    sheets: Surfels | None = None,
 ) -> Approach:
     """The candidates with their images and the contrasts of the target, from one batch of drafts.
 
-    `simulator` is that of the closed head, or of the brain alone; it stays as it is. All openings are made in one label
-    map, which the batch shares. A contrast is None where target or brain around it are not in the field.
+    `labels` are those of the closed head, or of the brain alone, and with what follows as for UltrasoundSimulator. All
+    openings are made in one label map, which the batch shares. A contrast is None where target or brain around it are
+    not in the field.
     """
-    labels, tissues = simulator.medium.labels, simulator.medium.tissues
     names = tissues.names_by_label()
-    settings = replace(simulator.settings, quality="draft", contact_gap_mm=None)  # saline fills the openings
     drafts = UltrasoundSimulator(
-        opened_for(labels, names, approach.candidates), tissues, settings, simulator.device, simulator.texture,
-        simulator.medium.sheets,
+        opened_for(labels, names, approach.candidates), tissues,
+        replace(settings or SimulationSettings(), quality="draft", contact_gap_mm=None),  # saline fills the openings
+        device, texture, sheets,
     )  # fmt: skip
     shown = replace(display or DisplaySettings(), image_size=_PIXELS, persistence=0.0)
     poses = [candidate.probe_to_ras for candidate in approach.candidates]

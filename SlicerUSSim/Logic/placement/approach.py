@@ -6,7 +6,7 @@ Straight ways from all directions are compared by a cost in millimetres (docs/ap
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -92,6 +92,8 @@ class Target:
     size_mm: float
     #: Of its uppermost point below the nearest place of the brain's surface
     depth_mm: float
+    #: 1 in it, with a margin of a voxel
+    region: Volume = field(repr=False)
 
     @cached_property
     def _gap_mm(self) -> float:
@@ -166,6 +168,25 @@ class Approach:
     candidates: tuple[Candidate, ...]
     #: Number of ways that were compared
     compared: int
+
+    def moved(self, matrix: np.ndarray) -> Approach:
+        """The same in another frame, to which a rigid `matrix` (4, 4) leads; depths and sizes stay."""
+
+        def at(ras: np.ndarray) -> np.ndarray:
+            return ras @ matrix[:3, :3].T + matrix[:3, 3]
+
+        target, region = self.target, self.target.region
+        return replace(
+            self,
+            target=replace(
+                target, points_ras=at(target.points_ras), centre_ras=at(target.centre_ras),
+                region=Volume(region.array, matrix @ region.ijk_to_ras),
+            ),
+            candidates=tuple(
+                replace(way, probe_to_ras=matrix @ way.probe_to_ras, entry_ras=at(way.entry_ras))
+                for way in self.candidates
+            ),
+        )  # fmt: skip
 
 
 def _place(ras: np.ndarray) -> str:
@@ -297,10 +318,9 @@ def _target(labels: Volume, names: Sequence[str], what, surface: PatientSurface)
             parts, _ = ndimage.label(labels.array == label)  # type: ignore[misc]
             inside = parts == int(sample(labels.with_array(parts), point[None], order=0)[0])
     if name == "point":
-        points, voxel_ml = point + _POINT_MM * _ball(), 4e-3 / 3.0 * np.pi * _POINT_MM**3 / len(_ball())
-    else:
-        places = np.argwhere(inside)
-        points, voxel_ml = places[:, ::-1] @ grid.ijk_to_ras[:3, :3].T + grid.ijk_to_ras[:3, 3], grid.voxel_ml
+        grid, inside = _ball(point)
+    places = np.argwhere(inside)
+    points, voxel_ml = places[:, ::-1] @ grid.ijk_to_ras[:3, :3].T + grid.ijk_to_ras[:3, 3], grid.voxel_ml
     centre, size = points.mean(axis=0), np.ptp(points, axis=0).max() + np.cbrt(1000.0 * voxel_ml)
     volume = len(points) * voxel_ml
     if len(points) > _VOXELS:  # those on a coarser grid
@@ -310,7 +330,8 @@ def _target(labels: Volume, names: Sequence[str], what, surface: PatientSurface)
     is_in = sample(labels, points, order=0) > 0
     place = f"{_place(centre)} mm"
     require(is_in.mean() >= 0.5, f"the {name} about {place} lies outside of the head, expected a target in it")
-    return Target(name, points, centre, float(volume), float(size), float(surface.distances_mm(points).min()))
+    depth = float(surface.distances_mm(points).min())
+    return Target(name, points, centre, float(volume), float(size), depth, _cropped(grid, inside, places))
 
 
 def _labelled_target(labels: Volume, names: Sequence[str], wanted: str | None) -> tuple[str, np.ndarray]:
@@ -334,11 +355,21 @@ def _largest_part(inside: np.ndarray) -> np.ndarray:
     return parts == np.bincount(parts.ravel())[1:].argmax() + 1
 
 
-def _ball() -> np.ndarray:
-    """(n, 3) places in a ball of radius 1."""
-    axis = np.linspace(-1.0, 1.0, 7)
-    points = np.stack(np.meshgrid(axis, axis, axis), axis=-1).reshape(-1, 3)
-    return points[np.linalg.norm(points, axis=1) <= 1.0]
+def _ball(centre_ras: np.ndarray) -> tuple[Volume, np.ndarray]:
+    """(a grid of 1 mm, (k, j, i) bool) of a ball for a point."""
+    axis = np.arange(-_POINT_MM - 1.0, _POINT_MM + 1.5)
+    matrix = np.eye(4)
+    matrix[:3, 3] = centre_ras + axis[0]
+    away = np.linalg.norm(np.stack(np.meshgrid(axis, axis, axis), axis=-1), axis=-1)
+    return Volume(away.astype(np.float32), matrix), away <= _POINT_MM
+
+
+def _cropped(grid: Volume, inside: np.ndarray, places: np.ndarray) -> Volume:
+    low, high = places.min(axis=0), places.max(axis=0) + 1
+    box = tuple(slice(first, last) for first, last in zip(low, high, strict=True))
+    matrix = grid.ijk_to_ras.copy()
+    matrix[:3, 3] = grid.ijk_to_ras[:3] @ [*(low[::-1] - 1), 1.0]
+    return Volume(np.pad(inside[box].astype(np.uint8), 1), matrix)
 
 
 # ---- ways ------------------------------------------------------------------------------------------------------------
