@@ -13,7 +13,8 @@ from SlicerUSSim.Command.cli import main
 from SlicerUSSim.Logic import SimulationError, TissueTable, Volume
 from SlicerUSSim.Logic.imaging.approach_images import outlined, simulated_approach
 from SlicerUSSim.Logic.placement import ApproachWeights, find_target, plan_approach
-from SlicerUSSim.Logic.placement.approach import NO_ADVICE, VENTRICLE, opened_for
+from SlicerUSSim.Logic.placement.approach import VENTRICLE, opened_for
+from SlicerUSSim.Logic.placement.approach_weights import NO_ADVICE
 from SlicerUSSim.Logic.placement.craniotomy import face_width_mm, without_outside
 from SlicerUSSim.Logic.probe import PROBES
 from SlicerUSSim.Logic.probe.poses import sample
@@ -70,7 +71,9 @@ def test_a_way_around_a_ventricle_is_taken_unless_that_costs_nothing(head):  # n
     around = plan_approach(labels, ILL, PHASED, "tumour").candidates[0]
     assert VENTRICLE not in around.path_mm and around.costs["ventricle"] == 0.0
     free = ApproachWeights(ventricle_weight=0.0, brain_weight=0.0, angle_weight=1.0)
-    near = [candidate for candidate in plan_approach(labels, ILL, PHASED, "tumour", weights=free, offered=40).candidates]
+    near = [
+        candidate for candidate in plan_approach(labels, ILL, PHASED, "tumour", weights=free, offered=40).candidates
+    ]
     through = [candidate for candidate in near if VENTRICLE in candidate.path_mm]
     assert through and through[0].path_mm[VENTRICLE] == pytest.approx(12.0, abs=4.0)
     assert all(candidate.costs["ventricle"] == 0.0 for candidate in near)

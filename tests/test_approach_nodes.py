@@ -8,7 +8,7 @@ import pytest
 slicer = pytest.importorskip("slicer", reason="MRML nodes come with slicer-core: pip install '.[slicer]'")
 
 from SlicerUSSim.Logic.mrml.nodes import nodes_of_class, probe_pose  # noqa: E402
-from SlicerUSSim.Logic.placement.approach import NO_ADVICE  # noqa: E402
+from SlicerUSSim.Logic.placement.approach_weights import NO_ADVICE  # noqa: E402
 from SlicerUSSim.Logic.placement.craniotomy import face_width_mm  # noqa: E402
 from SlicerUSSim.Widget.interface import by_widget  # noqa: E402
 from SlicerUSSim.Widget.sections import panel_sections  # noqa: E402
@@ -28,7 +28,9 @@ def bench(head) -> Bench:  # noqa: F811
 
 def models(bench: Bench) -> dict[str, np.ndarray]:
     """{name: (3, 2) bounds} of the models of the approach."""
-    found = [node for node in nodes_of_class(bench.scene, "vtkMRMLModelNode") if node.GetName() in ("Target", "Approach")]
+    found = [
+        node for node in nodes_of_class(bench.scene, "vtkMRMLModelNode") if node.GetName() in ("Target", "Approach")
+    ]
     return {node.GetName(): np.array(node.GetPolyData().GetBounds()).reshape(3, 2) for node in found}
 
 

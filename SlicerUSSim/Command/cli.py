@@ -16,7 +16,6 @@ from typing import Any
 
 import click
 
-from SlicerUSSim.Command.approach import approach
 from SlicerUSSim.Command.demo import demo
 from SlicerUSSim.Command.interrupts import end_at_signals
 from SlicerUSSim.Command.optimize import optimize
@@ -24,7 +23,7 @@ from SlicerUSSim.Command.options import about_key, device_option, rare_keys, unt
 from SlicerUSSim.Command.progress import Share, note
 from SlicerUSSim.Command.segment import segment
 from SlicerUSSim.Command.serve import serve
-from SlicerUSSim.Command.simulate import simulate, sweep, volume
+from SlicerUSSim.Command.simulate import approach, simulate, sweep, volume
 from SlicerUSSim.Logic.base.errors import is_our_warning, user_message
 from SlicerUSSim.Logic.base.version import __version__
 

@@ -157,8 +157,9 @@ def open_examination(
 ) -> Examination:
     """The Examination of a command's options. An MRI is segmented, with a progress bar.
 
-    `pose` is a (4, 4) probe_to_ras, one of STANDARD_VIEWS, AUTO: a view through a craniotomy, of what --add laid
-    over the labels if there is something, or APPROACH and a target. With `one_image` only what an image at this pose shows is prepared.
+    `pose` is a (4, 4) probe_to_ras, one of STANDARD_VIEWS, APPROACH and a target, or AUTO: a view through a craniotomy,
+    of what --add laid over the labels if there is something. With `one_image` only what an image at this pose shows is
+    prepared.
     Fast checks come before slow computations. Raises SimulationError for inconsistent options.
     """
     import logging  # imported here to keep --help fast
@@ -261,7 +262,8 @@ def _placed(
     labels, names, settings, probe = added.labels, added.tissue_names, preset.settings, preset.probe
     at, is_open, line = None, craniotomy.is_wanted, ""
     if isinstance(pose, str) and pose.startswith(APPROACH):
-        from SlicerUSSim.Logic.placement.approach import NO_ADVICE, opened_for, plan_approach
+        from SlicerUSSim.Logic.placement.approach import opened_for, plan_approach
+        from SlicerUSSim.Logic.placement.approach_weights import NO_ADVICE
 
         require(not is_open, f"--craniotomy is {craniotomy.text} with --approach, expected none: it opens the head")
         plan = plan_approach(labels, names, probe, target_of(pose.removeprefix(APPROACH)))

@@ -11,7 +11,8 @@ from SlicerUSSim.Logic.imaging.figures import png_url
 from SlicerUSSim.Logic.mrml.approach_logic import ring
 from SlicerUSSim.Logic.mrml.nodes import control_points
 from SlicerUSSim.Logic.mrml.parameter_node import LARGEST, POINT
-from SlicerUSSim.Logic.placement.approach import NO_ADVICE, Approach, Candidate
+from SlicerUSSim.Logic.placement.approach import Approach, Candidate
+from SlicerUSSim.Logic.placement.approach_weights import NO_ADVICE
 from SlicerUSSim.Widget.interface import PanelHost, tr as _
 from SlicerUSSim.Widget.placement_presenter import PlacementPresenter
 

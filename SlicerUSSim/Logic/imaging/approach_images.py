@@ -17,7 +17,8 @@ from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.imaging.figures import html_table, png_url
 from SlicerUSSim.Logic.imaging.simulator import UltrasoundSimulator
 from SlicerUSSim.Logic.opencl.device import DeviceChoice
-from SlicerUSSim.Logic.placement.approach import NO_ADVICE, Approach, Candidate, Target, opened_for
+from SlicerUSSim.Logic.placement.approach import Approach, Candidate, Target, opened_for
+from SlicerUSSim.Logic.placement.approach_weights import NO_ADVICE
 from SlicerUSSim.Logic.probe.arrays import Probe
 from SlicerUSSim.Logic.probe.image_grid import ImageGrid
 from SlicerUSSim.Logic.probe.poses import sample, slice_under_probe
@@ -35,8 +36,8 @@ _YELLOW, _WHITE = (255, 200, 61), (255, 255, 255)
 #: What a picture of the tissues shows around the field: to both sides, and behind the face, mm
 _WIDE_MM, _BEHIND_MM, _PIXEL_MM = 60.0, 40.0, 0.5
 _STYLE = """body { background: #161616; color: #e4e4e4; font: 15px/1.5 system-ui, sans-serif; margin: 2rem auto;
-max-width: 1180px; padding: 0 1rem } table { border-collapse: collapse } td, th { text-align: left; padding: .2rem .7rem;
-border-bottom: 1px solid #3a3a3a } .pair { display: flex; gap: 1rem; align-items: end } img { height: 380px;
+max-width: 1180px; padding: 0 1rem } table { border-collapse: collapse } td, th { text-align: left;
+padding: .2rem .7rem; border-bottom: 1px solid #3a3a3a } .pair { display: flex; gap: 1rem; align-items: end } img { height: 380px;
 background: #000 } figure { margin: 0 } .dim, figcaption { color: #9a9a9a } .advice { color: #ffc83d }"""
 #: Fewer samples are no mean; an envelope has at least this much noise
 _FEWEST, _LEAST = 30, 1e-6
@@ -70,11 +71,10 @@ def simulated_approach(
     poses = [candidate.probe_to_ras for candidate in approach.candidates]
     batch = drafts.simulate_batch(probe, poses, display=shown, outputs=("image", "envelope"))
     brain = labels.with_array(np.isin(labels.array, labels_of(names, OUTSIDE), invert=True) & (labels.array > 0))
-    seen = [
-        replace(candidate, image=image, contrast_db=_contrast_db(envelope, probe, candidate.probe_to_ras, approach.target,
-                                                                 brain))
-        for candidate, image, envelope in zip(approach.candidates, batch["image"], batch["envelope"], strict=True)
-    ]  # fmt: skip
+    seen = []
+    for candidate, image, envelope in zip(approach.candidates, batch["image"], batch["envelope"], strict=True):
+        contrast = _contrast_db(envelope, probe, candidate.probe_to_ras, approach.target, brain)
+        seen.append(replace(candidate, image=image, contrast_db=contrast))
     return replace(approach, candidates=tuple(seen))
 
 

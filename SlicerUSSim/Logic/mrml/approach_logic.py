@@ -13,8 +13,8 @@ from vtkmodules.vtkCommonDataModel import vtkCellArray, vtkPolyData
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.imaging.approach_images import simulated_approach
 from SlicerUSSim.Logic.mrml.craniotomy_nodes import closed_labels, surface_of
-from SlicerUSSim.Logic.mrml.nodes import display_of, nodes_of_class, require_node
 from SlicerUSSim.Logic.mrml.label_nodes import LABEL_CLASSES
+from SlicerUSSim.Logic.mrml.nodes import display_of, nodes_of_class, require_node
 from SlicerUSSim.Logic.mrml.patient_logic import PatientLogic
 from SlicerUSSim.Logic.placement.approach import Approach, Candidate, plan_approach
 

@@ -8,17 +8,16 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 from scipy import ndimage
 from scipy.spatial import KDTree
 
-from SlicerUSSim.Logic.base.declaration import Declared, parameter
 from SlicerUSSim.Logic.base.errors import either, require
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.mri.pathology import LESIONS, tissue_to_add
 from SlicerUSSim.Logic.placement.aiming import FARTHEST_DEG, largest_lesion, on_surface
+from SlicerUSSim.Logic.placement.approach_weights import ApproachWeights
 from SlicerUSSim.Logic.placement.bone_before_probe import SKULL
 from SlicerUSSim.Logic.placement.craniotomy import (
     ROOM_MM,
@@ -31,10 +30,8 @@ from SlicerUSSim.Logic.placement.craniotomy import (
 from SlicerUSSim.Logic.probe.arrays import Probe
 from SlicerUSSim.Logic.probe.poses import pose_looking_at, sample
 from SlicerUSSim.Logic.probe.surface import PatientSurface
-from SlicerUSSim.Logic.tissue.names import OUTSIDE, labels_of
+from SlicerUSSim.Logic.tissue.names import labels_of
 
-#: What every list of candidates says
-NO_ADVICE = "A simulation for research and teaching, and no medical advice."
 #: Names of the parts of a way that no tissue has: fluid near the surface, and deep in the brain
 SULCI, VENTRICLE = "sulci", "ventricle or cistern"
 _FLUID, _VESSELS = ("csf", "leptomeninges"), ("blood", "enhancing")
@@ -56,26 +53,6 @@ _TILT_DEG, _WIDEST_MM, _CLEAR_MM = 35.0, 15.0, 2.0
 _VOXELS, _HALF = 600, 0.62
 #: Candidates stand so far apart that their openings hardly overlap, mm
 _APART_MM = 25.0
-
-
-def _weight(default: float, label: str, tip: str) -> Any:
-    option = f"{label.lower().replace(' ', '-')}-weight"
-    return parameter(default, f"Weight: {label.lower()}", tip, unit="mm", bounds=(0, 1000), option=option)
-
-
-@dataclass(frozen=True)
-class ApproachWeights(Declared):
-    """Weights of the cost by which plan_approach ranks candidates, each in millimetres of brain that are as bad."""
-
-    brain_weight: float = _weight(1.0, "Brain", "Each millimetre of brain before the target")
-    outside_weight: float = _weight(0.5, "Outside", "Each millimetre of skin, scalp and bone")
-    ventricle_weight: float = _weight(5.0, "Ventricle", "Each millimetre of fluid more than 15 mm below the brain's surface")
-    vessel_weight: float = _weight(5.0, "Vessel", "Each millimetre of a vessel, or of what enhances")
-    air_weight: float = _weight(10.0, "Air", "Each millimetre of air in the head, as of a sinus")
-    other_side_weight: float = _weight(3.0, "Other side", "Each millimetre in the middle plane of the brain (4 mm) or beyond it")
-    angle_weight: float = _weight(0.2, "Angle", "Each degree between probe and normal of the brain's surface")
-    unseen_weight: float = _weight(2.0, "Unseen", "Each percent of the target outside of the field")
-    unfocused_weight: float = _weight(0.05, "Unfocused", "Each percent of the target outside of the focal zone")
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,7 +106,7 @@ class Candidate:
     depth_mm: float
     #: Between the probe's axis and the normal of the brain's surface
     angle_deg: float
-    #: Shares of the target, 0 to 1: within the field of a probe that is tilted in the opening, and within the focal zone
+    #: Shares of the target, 0 to 1: in the field of a probe that is tilted in the opening, and in the focal zone
     seen: float
     focused: float
     #: Tilt to both sides that this takes, and diameter of the disc that is to be opened; 0 without a skull
@@ -259,33 +236,38 @@ def plan_approach(
     allowed = np.minimum(np.rad2deg(np.arctan2(0.5 * _WIDEST_MM - _CLEAR_MM, bone)), _TILT_DEG)
     seen, focused, _ = _views(probe, target, poses, allowed)
     costs = _costs(weights, ways, angles, seen, focused)
-    total = np.sum(list(costs.values()), axis=0)
-    from_below = (np.minimum(outward[:, 2], normals[:, 2]) < _BELOW) & (normals[:, 1] > _BEHIND)
     has_skull = bool(np.isin(labels.array, labels_of(names, SKULL)).any())
-    closed = bone > 0.0 if has_skull else np.ones(len(faces), bool)
-    for unusual in (from_below, ~closed, has_skull & ways.are_cut, ways.outside_mm > _THICKEST_MM, angles > FARTHEST_DEG):
-        total = total + np.where(unusual, 1e4, 0.0)  # last of all, but there if nothing else is
-    chosen: list[int] = []
-    for number in np.argsort(total, kind="stable"):
-        if all(np.linalg.norm(faces[number] - faces[other]) >= _APART_MM for other in chosen):
-            chosen.append(int(number))
-        if len(chosen) == offered or (chosen and total[number] >= 1e4 > total[chosen[0]]):
-            break
+    from_below = (np.minimum(outward[:, 2], normals[:, 2]) < _BELOW) & (normals[:, 1] > _BEHIND)
+    is_shut = has_skull & ((bone == 0.0) | ways.are_cut)  # where the image cuts the head
+    unusual = from_below | is_shut | (ways.outside_mm > _THICKEST_MM) | (angles > FARTHEST_DEG)
+    total = np.sum(list(costs.values()), axis=0) + np.where(unusual, np.inf, 0.0)
+    if unusual.all():  # then the best of these, alone
+        total, offered = np.sum(list(costs.values()), axis=0), 1
     candidates = []
-    for number in (n for n in chosen if total[n] < 1e4 or n == chosen[0]):
-        upright = surface.slid(poses[number], faces[number])
-        pose = on_surface(poses[number], upright, probe, surface)
-        share, sharp, needed = (each[0] for each in _views(probe, target, pose[None], allowed[number : number + 1]))
+    for number in _apart(faces, total, offered):
+        pose = on_surface(poses[number], surface.slid(poses[number], faces[number]), probe, surface)
+        share, sharp, needed = (float(each[0]) for each in _views(probe, target, pose[None], allowed[[number]]))
         room = 2.0 * (_CLEAR_MM + bone[number] * np.tan(np.deg2rad(needed)))
+        disc = face_width_mm(probe) + float(np.clip(room, ROOM_MM, _WIDEST_MM))
+        parts = {name: float(part[number]) for name, part in costs.items()}
         candidates.append(
             Candidate(
                 pose, ways.starts[number], ways.path(number), float(ways.inside_mm[number]), float(angles[number]),
-                float(share), float(sharp), float(needed),
-                face_width_mm(probe) + float(np.clip(room, ROOM_MM, _WIDEST_MM)) if ways.outside_mm[number] and has_skull else 0.0,
-                {name: float(part[number]) for name, part in costs.items()},
+                share, sharp, needed, disc if has_skull else 0.0, parts,
             )
         )  # fmt: skip
     return Approach(target, tuple(candidates), len(outward))
+
+
+def _apart(faces: np.ndarray, total: np.ndarray, count: int) -> list[int]:
+    """Numbers of the `count` best places (n, 3) by a finite cost (n,), so far apart that openings hardly overlap."""
+    chosen: list[int] = []
+    for number in np.argsort(total, kind="stable"):
+        if len(chosen) == count or not np.isfinite(total[number]):
+            break
+        if all(np.linalg.norm(faces[number] - faces[other]) >= _APART_MM for other in chosen):
+            chosen.append(int(number))
+    return chosen
 
 
 def opened_for(labels: Volume, names: Sequence[str], candidates: Iterable[Candidate]) -> Volume:
