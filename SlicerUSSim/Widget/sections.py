@@ -229,6 +229,10 @@ def _approach(panel: PanelPresenter) -> tuple[Row, ...]:
                 "seconds); a simulation, and no medical advice"), approach.plan, panel.canSimulate,
             ),
         ),
+        Control(
+            "approachNotes", "words", tip=_("The target, and what is known of the chosen candidate"),
+            shows=approach.text, depends=("tissues",),
+        ),
         tuple(
             Control(
                 f"candidate{number + 1}", "picture", tip=_("Simulated image with the outline of the target"),
@@ -243,10 +247,6 @@ def _approach(panel: PanelPresenter) -> tuple[Row, ...]:
                 partial(approach.canChoose, number),
             )
             for number in numbers
-        ),
-        Control(
-            "approachNotes", "words", tip=_("The target, and what is known of the chosen candidate"),
-            shows=approach.text, depends=("tissues",),
         ),
         (
             button(

@@ -9,6 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 from scipy import ndimage
+from scipy.spatial import KDTree
 
 from SlicerUSSim.Logic.base.errors import required
 from SlicerUSSim.Logic.base.files import written_whole
@@ -30,15 +31,16 @@ from SlicerUSSim.Logic.tissue.texture import Texture
 
 #: (rows, columns) of the images
 _PIXELS = (256, 256)
-#: The brain around a target is that so far from it, mm
-_AROUND_MM = (2.0, 10.0)
+#: The brain around a target is that so far from its voxels, mm
+_AROUND_MM = (4.0, 12.0)
 _YELLOW, _WHITE = (255, 200, 61), (255, 255, 255)
 #: What a picture of the tissues shows around the field: to both sides, and behind the face, mm
 _WIDE_MM, _BEHIND_MM, _PIXEL_MM = 60.0, 40.0, 0.5
 _STYLE = """body { background: #161616; color: #e4e4e4; font: 15px/1.5 system-ui, sans-serif; margin: 2rem auto;
 max-width: 1180px; padding: 0 1rem } table { border-collapse: collapse } td, th { text-align: left;
-padding: .2rem .7rem; border-bottom: 1px solid #3a3a3a } .pair { display: flex; gap: 1rem; align-items: end } img { height: 380px;
-background: #000 } figure { margin: 0 } .dim, figcaption { color: #9a9a9a } .advice { color: #ffc83d }"""
+padding: .2rem .7rem; border-bottom: 1px solid #3a3a3a } .pair { display: flex; gap: 1rem; align-items: end }
+img { height: 380px; background: #000 } figure { margin: 0 }
+.dim, figcaption { color: #9a9a9a } .advice { color: #ffc83d }"""
 #: Fewer samples are no mean; an envelope has at least this much noise
 _FEWEST, _LEAST = 30, 1e-6
 
@@ -91,10 +93,9 @@ def _contrast_db(
     level, places = 20.0 * np.log10(np.maximum(envelope[near], _LEAST)), ras[near]
     if not len(places):
         return None
-    away = target.away_mm(places)
-    inside = away <= 0.0
+    inside, away = target.holds(places), KDTree(target.points_ras).query(places)[0]
     low, high = _AROUND_MM
-    around = (away > low) & (away <= high) & (sample(brain, places, order=0) > 0)
+    around = ~inside & (away > low) & (away <= high) & (sample(brain, places, order=0) > 0)
     if inside.sum() < _FEWEST or around.sum() < _FEWEST:
         return None
     return float(level[inside].mean() - level[around].mean())
@@ -137,7 +138,7 @@ def _with_outline(picture: np.ndarray, candidate: Candidate, target: Target, gri
     columns, rows = np.meshgrid(np.arange(grid.columns), np.arange(grid.rows))
     matrix = candidate.probe_to_ras @ grid.image_to_probe
     ras = np.stack([columns, rows], axis=-1) @ matrix[:3, :2].T + matrix[:3, 3]
-    inside = target.away_mm(ras) <= 0.0
+    inside = target.holds(ras)
     picture = picture.copy()
     picture[inside & ~ndimage.binary_erosion(inside)] = _YELLOW  # type: ignore[operator]
     return picture

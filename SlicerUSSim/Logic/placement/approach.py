@@ -7,11 +7,9 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 
 import numpy as np
 from scipy import ndimage
-from scipy.spatial import KDTree
 
 from SlicerUSSim.Logic.base.errors import either, require
 from SlicerUSSim.Logic.base.volume import Volume
@@ -49,8 +47,8 @@ _THICKEST_MM, _BELOW, _BEHIND = 35.0, -0.5, -0.4
 _MIDDLE_MM = 4.0
 #: A probe is tilted so far at most; a disc is so much wider than the face at most, and keeps so much room on each side
 _TILT_DEG, _WIDEST_MM, _CLEAR_MM = 35.0, 15.0, 2.0
-#: Voxels that stand for a target, and radius of a ball as large as the space around one, in their distances
-_VOXELS, _HALF = 600, 0.62
+#: Voxels that stand for a target, and places on the line to each that are looked at
+_VOXELS, _LOOKS = 150, 20
 #: Candidates stand so far apart that their openings hardly overlap, mm
 _APART_MM = 25.0
 
@@ -72,18 +70,9 @@ class Target:
     #: 1 in it, with a margin of a voxel
     region: Volume = field(repr=False)
 
-    @cached_property
-    def _gap_mm(self) -> float:
-        """About the distance between its points."""
-        return float(np.cbrt(1000.0 * self.volume_ml / len(self.points_ras)))
-
-    @cached_property
-    def _tree(self) -> KDTree:
-        return KDTree(self.points_ras)
-
-    def away_mm(self, points_ras: np.ndarray) -> np.ndarray:
-        """(...) distances of (..., 3) places to the target, 0 in it; exact to about the size of a voxel."""
-        return np.maximum(self._tree.query(points_ras)[0] - _HALF * self._gap_mm, 0.0)
+    def holds(self, points_ras: np.ndarray) -> np.ndarray:
+        """(...) bool: whether (..., 3) places are in it."""
+        return sample(self.region, points_ras, order=0) > 0
 
     @property
     def text(self) -> str:
@@ -234,7 +223,7 @@ def plan_approach(
     angles = np.rad2deg(np.arccos(np.clip((outward * normals).sum(axis=1), -1.0, 1.0)))
     bone = ways.millimetres(SKULL)
     allowed = np.minimum(np.rad2deg(np.arctan2(0.5 * _WIDEST_MM - _CLEAR_MM, bone)), _TILT_DEG)
-    seen, focused, _ = _views(probe, target, poses, allowed)
+    seen, focused, _ = _views(probe, target, poses, allowed, labels, names)
     costs = _costs(weights, ways, angles, seen, focused)
     has_skull = bool(np.isin(labels.array, labels_of(names, SKULL)).any())
     from_below = (np.minimum(outward[:, 2], normals[:, 2]) < _BELOW) & (normals[:, 1] > _BEHIND)
@@ -246,7 +235,7 @@ def plan_approach(
     candidates = []
     for number in _apart(faces, total, offered):
         pose = on_surface(poses[number], surface.slid(poses[number], faces[number]), probe, surface)
-        share, sharp, needed = (float(each[0]) for each in _views(probe, target, pose[None], allowed[[number]]))
+        share, sharp, needed = (float(each[0]) for each in _views(probe, target, pose[None], allowed[[number]], labels, names))
         room = 2.0 * (_CLEAR_MM + bone[number] * np.tan(np.deg2rad(needed)))
         disc = face_width_mm(probe) + float(np.clip(room, ROOM_MM, _WIDEST_MM))
         parts = {name: float(part[number]) for name, part in costs.items()}
@@ -429,20 +418,25 @@ def _aimed(face: np.ndarray, target: Target) -> np.ndarray:
 
 
 def _views(
-    probe: Probe, target: Target, poses: np.ndarray, allowed_deg: np.ndarray
+    probe: Probe, target: Target, poses: np.ndarray, allowed_deg: np.ndarray, labels: Volume, names: Sequence[str]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """(share seen, share seen in the focal zone, tilt for that in degrees), each (n,), of poses (n, 4, 4).
 
     The probe is tilted about the lateral axis of its face by up to `allowed_deg` (n,). The focal zone is that within
-    half of the depth of field, 3.5 wavelengths times the square of the f-number, of the focus.
+    half of the depth of field, 3.5 wavelengths times the square of the f-number, of the focus. What lies behind bone or
+    air in the brain is not seen.
     """
+    shares = np.linspace(0.1, 0.97, _LOOKS)[:, None, None, None]  # bone at the face is opened
+    faces = poses[:, None, :3, 3]
+    between = sample(labels, faces + shares * (target.points_ras - faces), order=0)
+    is_clear = ~np.isin(between, labels_of(names, (*SKULL, "air"))).any(axis=0)
     to_probe = np.linalg.inv(poses)
     x, y, z = np.moveaxis(target.points_ras @ np.swapaxes(to_probe[:, :3, :3], 1, 2) + to_probe[:, None, :3, 3], -1, 0)
     tilt, depth = np.abs(np.rad2deg(np.arctan2(z, y))), np.hypot(y, z)
     # A slice has a thickness, in which a place is seen without a tilt
     thick = 0.5 * probe.elevation_aperture_mm
     tilt = np.where((np.abs(z) <= thick) & (y > 0.0), 0.0, tilt)
-    is_seen = probe.holds(x, depth) & (tilt <= allowed_deg[:, None])
+    is_seen = is_clear & probe.holds(x, depth) & (tilt <= allowed_deg[:, None])
     zone = 3.5 * probe.wavelength_mm * (probe.focus_mm / probe.aperture_mm) ** 2
     in_focus = is_seen & (np.abs(depth - probe.focus_mm) <= zone)
     return is_seen.mean(axis=1), in_focus.mean(axis=1), np.where(is_seen, tilt, 0.0).max(axis=1)
