@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -162,6 +163,14 @@ def test_images_of_the_candidates_show_the_contrast_of_the_target(ill):
         middle = np.linalg.norm(plan.target.centre_ras - shown[0].probe_to_ras[:3, 3])
         assert [depth.min(), depth.max()] == pytest.approx([middle - 8.0, middle + 8.0], abs=2.0)
         assert columns.mean() == pytest.approx(128, abs=4)
+
+
+def test_the_example_of_the_page_runs(capsys):
+    page = (Path(__file__).parents[1] / "docs/approach.md").read_text(encoding="utf-8")
+    (code,) = re.findall(r"^```python\n(.*?)^```", page, flags=re.DOTALL | re.MULTILINE)
+    exec(compile(code, "docs/approach.md", "exec"), {})
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) == 4 and lines[0].startswith("tumour: 16 mm, ") and "contrast +" in lines[1]
 
 
 def test_the_command_writes_a_report_and_simulates_the_first_candidate(ill, tmp_path):
