@@ -36,11 +36,6 @@ class PlacementPresenter:
         with self._panel.acting():
             self._place(VIEW, view=self._panel.parameters.panel.view)
 
-    def approach(self) -> None:
-        """Place the probe on the brain, where the skull is to be opened or is open, over a lesion if there is one."""
-        with self._panel.acting():
-            self._place(PLACED, will_open=True)
-
     def _place(self, what: str, **where: Any) -> None:
         require(self._panel.parameters.labels is not None, "no label map chosen, expected one to put the probe on")
         line = self.put(**where)

@@ -109,11 +109,6 @@ def _probe(panel: PanelPresenter) -> tuple[Row, ...]:
         ),
         (
             button(
-                "approach", _("Approach lesion"),
-                _("Place the probe on the brain over the largest lesion that was added to the tissues, where Open "
-                  "skull opens; in an opening, aim at the lesion below it"), placing.approach, panel.canSimulate,
-            ),
-            button(
                 "openCraniotomy", _("Open skull"),
                 _("Replace skin, scalp and skull in the opening by the coupling medium, in new labels; the tissues "
                   "need skin and skull: tick their box below Lesions and other images before Segment"),

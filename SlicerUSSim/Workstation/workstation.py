@@ -106,7 +106,6 @@ class Workstation:
             segmenting.undoSegment: patient.undo_segment,
             placing.placeProbe: partial(patient.place, placing.placeProbe),
             placing.placeAtView: partial(patient.place, placing.placeAtView),
-            placing.approach: partial(patient.place, placing.approach),
         }
         panel.own_actions[presenter.approach.openHere] = partial(
             patient.place, partial(patient.then_show, presenter.approach.openHere)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -16,6 +15,7 @@ from SlicerUSSim.Logic.mrml.craniotomy_nodes import closed_labels, surface_of
 from SlicerUSSim.Logic.mrml.label_nodes import LABEL_CLASSES
 from SlicerUSSim.Logic.mrml.nodes import display_of, nodes_of_class, require_node
 from SlicerUSSim.Logic.mrml.patient_logic import PatientLogic
+from SlicerUSSim.Logic.mrml.sheet_nodes import read_sheets
 from SlicerUSSim.Logic.placement.approach import Approach, Candidate, plan_approach
 
 #: Attribute of a model node of this module: what it shows
@@ -41,19 +41,16 @@ class ApproachLogic:
         imaged = self._patient.imaged(closed_labels(labels_node))
         patient, preset = imaged.patient, imaged.preset
         placed = Volume(patient.labels.array, np.linalg.inv(patient.world_to_patient) @ patient.labels.ijk_to_ras)
+        chosen: Any = self._patient.parameters.sheets
+        sheets = None if chosen is None else read_sheets(chosen, np.eye(4), self._patient.parameters.sheet.kinds)
         work, device = self._patient.work, self._patient.device
         plan = work.doAside(lambda: plan_approach(placed, patient.names, preset.probe, what))
-        seen = work.do(
+        return work.do(
             lambda: simulated_approach(
-                plan.moved(patient.world_to_patient), patient.labels, imaged.tissues, preset.probe, preset.settings,
-                preset.display, device=device, texture=imaged.texture, sheets=imaged.sheets,
+                plan, placed, imaged.tissues, preset.probe, preset.settings, preset.display, device=device,
+                texture=imaged.texture, sheets=sheets,
             )
         )  # fmt: skip
-        ways = zip(plan.candidates, seen.candidates, strict=True)
-        return replace(
-            plan,
-            candidates=tuple(replace(way, image=same.image, contrast_db=same.contrast_db) for way, same in ways),
-        )
 
     def showApproach(self, approach: Approach, candidate: Candidate) -> None:
         """Show the target, the way of a candidate and the rim of its opening in the 3D views and slices."""

@@ -6,7 +6,7 @@ Straight ways from all directions are compared by a cost in millimetres (docs/ap
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 from scipy import ndimage
@@ -47,6 +47,8 @@ _THICKEST_MM, _BELOW, _BEHIND = 35.0, -0.5, -0.4
 _MIDDLE_MM = 4.0
 #: A probe is tilted so far at most; a disc is so much wider than the face at most, and keeps so much room on each side
 _TILT_DEG, _WIDEST_MM, _CLEAR_MM = 35.0, 15.0, 2.0
+#: Share of all directions in which the surface is met from a place within it
+_FROM_INSIDE = 0.9
 #: Voxels that stand for a target, and places on the line to each that are looked at
 _VOXELS, _LOOKS = 150, 20
 #: Candidates stand so far apart that their openings hardly overlap, mm
@@ -67,7 +69,7 @@ class Target:
     size_mm: float
     #: Of its uppermost point below the nearest place of the brain's surface
     depth_mm: float
-    #: 1 in it, with a margin of a voxel
+    #: 1 in it
     region: Volume = field(repr=False)
 
     def holds(self, points_ras: np.ndarray) -> np.ndarray:
@@ -135,43 +137,10 @@ class Approach:
     #: Number of ways that were compared
     compared: int
 
-    def moved(self, matrix: np.ndarray) -> Approach:
-        """The same in another frame, to which a rigid `matrix` (4, 4) leads; depths and sizes stay."""
-
-        def at(ras: np.ndarray) -> np.ndarray:
-            return ras @ matrix[:3, :3].T + matrix[:3, 3]
-
-        target, region = self.target, self.target.region
-        return replace(
-            self,
-            target=replace(
-                target, points_ras=at(target.points_ras), centre_ras=at(target.centre_ras),
-                region=Volume(region.array, matrix @ region.ijk_to_ras),
-            ),
-            candidates=tuple(
-                replace(way, probe_to_ras=matrix @ way.probe_to_ras, entry_ras=at(way.entry_ras))
-                for way in self.candidates
-            ),
-        )  # fmt: skip
-
 
 def _place(ras: np.ndarray) -> str:
     """In words; a value that is almost 0 has no sign."""
     return ", ".join(f"{axis} {round(mm) + 0.0:.0f}" for axis, mm in zip("RAS", ras.tolist(), strict=True))
-
-
-def find_target(labels: Volume, names: Sequence[str], what: str | Sequence[float] | Volume | None = None) -> Target:
-    """The target among labels 1, 2, ... called `names`.
-
-    Parameters
-    ----------
-    what : a tissue, of which it is the largest region; a point (3,) RAS mm, the lesion there or a ball of 3 mm around
-        it; a mask on any grid, not 0 inside; or None, the largest lesion.
-
-    Raises SimulationError if there is no lesion, for an unknown tissue, and for a target outside the head.
-    """
-    require_brain(names)
-    return _target(labels, names, what, PatientSurface(without_outside(labels, names)))
 
 
 def plan_approach(
@@ -211,11 +180,12 @@ def plan_approach(
     weights = weights or ApproachWeights()
     ground = without_outside(labels, names)
     surface = PatientSurface(ground)
-    target = _target(labels, names, what, surface)
+    target = find_target(labels, names, what, surface)
     outward = _directions(compared)
     entries = [surface.hit(target.centre_ras + _LONGEST_MM * way, target.centre_ras) for way in outward]
     met = np.array([entry is not None for entry in entries])
-    require(met.any(), f"the {target.name} lies outside of the brain's surface, expected a target in the head")
+    wrong = f"the {target.name} lies outside of the brain's surface, expected a target in the brain"
+    require(met.mean() > _FROM_INSIDE, wrong)
     outward, faces = outward[met], np.array([entry for entry in entries if entry is not None])
     normals = np.array([surface.normal(face) for face in faces])
     ways = _Ways(labels, names, target, outward, faces, surface)
@@ -235,7 +205,8 @@ def plan_approach(
     candidates = []
     for number in _apart(faces, total, offered):
         pose = on_surface(poses[number], surface.slid(poses[number], faces[number]), probe, surface)
-        share, sharp, needed = (float(each[0]) for each in _views(probe, target, pose[None], allowed[[number]], labels, names))
+        views = _views(probe, target, pose[None], allowed[[number]], labels, names)
+        share, sharp, needed = (float(each[0]) for each in views)
         room = 2.0 * (_CLEAR_MM + bone[number] * np.tan(np.deg2rad(needed)))
         disc = face_width_mm(probe) + float(np.clip(room, ROOM_MM, _WIDEST_MM))
         parts = {name: float(part[number]) for name, part in costs.items()}
@@ -272,12 +243,22 @@ def opened_for(labels: Volume, names: Sequence[str], candidates: Iterable[Candid
 # ---- the target ------------------------------------------------------------------------------------------------------
 
 
-def _target(labels: Volume, names: Sequence[str], what, surface: PatientSurface) -> Target:
+def find_target(
+    labels: Volume, names: Sequence[str], what: str | Sequence[float] | Volume | None = None,
+    surface: PatientSurface | None = None,
+) -> Target:  # fmt: skip
+    """The target among labels 1, 2, ... called `names`.
+
+    `what` is a tissue, of which it is the largest region; a point (3,) RAS mm, the lesion there or a ball of 3 mm around
+    it; a mask on any grid, not 0 inside; or None, the largest lesion. `surface` is that of the brain. Raises
+    SimulationError if there is no lesion, for an unknown tissue, and for a target outside the head.
+    """
+    require_brain(names)
+    surface = surface or PatientSurface(without_outside(labels, names))
     name, inside, grid = "target", np.zeros(0, bool), labels
     if isinstance(what, Volume):
-        grid, inside = what, np.nan_to_num(what.array) != 0
+        grid, inside = what, _largest_part(np.nan_to_num(what.array) != 0)
         require(inside.any(), "the mask of the target is empty, expected voxels inside")
-        inside = _largest_part(inside)
     elif what is None or isinstance(what, str):
         name, inside = _labelled_target(labels, names, what)
     else:
@@ -299,14 +280,14 @@ def _target(labels: Volume, names: Sequence[str], what, surface: PatientSurface)
         on_grid = (places % step == 0).all(axis=1)
         points = points[on_grid] if on_grid.any() else points[:: step**3]
     is_in = sample(labels, points, order=0) > 0
-    place = f"{_place(centre)} mm"
-    require(is_in.mean() >= 0.5, f"the {name} about {place} lies outside of the head, expected a target in it")
-    depth = float(surface.distances_mm(points).min())
-    return Target(name, points, centre, float(volume), float(size), depth, _cropped(grid, inside, places))
+    where = f"the {name} about {_place(centre)} mm lies outside of the head, expected a target in it"
+    require(is_in.mean() >= 0.5, where)
+    depth, region = float(surface.distances_mm(points).min()), grid.with_array(inside.astype(np.uint8))
+    return Target(name, points, centre, float(volume), float(size), depth, region)
 
 
 def _labelled_target(labels: Volume, names: Sequence[str], wanted: str | None) -> tuple[str, np.ndarray]:
-    """(name, (k, j, i) bool) of the largest region of a tissue, with what it encloses, or of the largest lesion."""
+    """(name, (k, j, i) bool) of the largest region of a tissue, or of the largest lesion."""
     if wanted is not None:
         name = tissue_to_add(wanted, names)
         inside = np.isin(labels.array, labels_of(names, (name,)))
@@ -321,7 +302,7 @@ def _labelled_target(labels: Volume, names: Sequence[str], wanted: str | None) -
 
 def _largest_part(inside: np.ndarray) -> np.ndarray:
     parts, count = ndimage.label(inside)  # type: ignore[misc]
-    if count == 1:
+    if count < 2:
         return inside
     return parts == np.bincount(parts.ravel())[1:].argmax() + 1
 
@@ -333,14 +314,6 @@ def _ball(centre_ras: np.ndarray) -> tuple[Volume, np.ndarray]:
     matrix[:3, 3] = centre_ras + axis[0]
     away = np.linalg.norm(np.stack(np.meshgrid(axis, axis, axis), axis=-1), axis=-1)
     return Volume(away.astype(np.float32), matrix), away <= _POINT_MM
-
-
-def _cropped(grid: Volume, inside: np.ndarray, places: np.ndarray) -> Volume:
-    low, high = places.min(axis=0), places.max(axis=0) + 1
-    box = tuple(slice(first, last) for first, last in zip(low, high, strict=True))
-    matrix = grid.ijk_to_ras.copy()
-    matrix[:3, 3] = grid.ijk_to_ras[:3] @ [*(low[::-1] - 1), 1.0]
-    return Volume(np.pad(inside[box].astype(np.uint8), 1), matrix)
 
 
 # ---- ways ------------------------------------------------------------------------------------------------------------
