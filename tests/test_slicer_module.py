@@ -802,6 +802,29 @@ def test_reloading_the_module_brings_new_code(module):
         module.__dict__.update(again.__dict__ | {"app": module.app})
 
 
+def test_a_plan_is_shown_as_pictures_to_press(session):
+    session.segmented()
+    nodes, pathology = session.logic_module("mrml.label_nodes"), session.logic_module("mri.pathology")
+    node = session.parameters.labels
+    found = nodes.read_labels(node, session.logic.preset.tissues)
+    k, j, i = np.indices(found.labels.array.shape)
+    middle = np.argwhere(found.labels.array > 0).mean(axis=0)
+    ball = found.labels.with_array((np.linalg.norm(np.stack([k, j, i], -1) - middle, axis=-1) < 3.0).astype(np.uint8))
+    added = pathology.add_tissue(found.labels, found.names, ball, "tumour")
+    nodes.write_labels(node, added.labels, added.tissue_names, node)
+    assert not session.ui.candidate1Picture.isEnabled()
+    session.ui.planButton.click()
+    session.process()
+    pictures = [session.ui.candidate1Picture, session.ui.candidate2Picture, session.ui.candidate3Picture]
+    assert all(picture.isEnabled() and not picture.icon().isNull() for picture in pictures)
+    assert session.ui.approachNotesLabel.text().startswith("tumour: ")
+    pictures[1].click()
+    assert "Candidate 2: " in session.ui.approachNotesLabel.text()
+    before = session.parameters.probe_transform.GetMatrixTransformToParent().GetElement(0, 3)
+    session.ui.openHereButton.click()
+    assert session.parameters.probe_transform.GetMatrixTransformToParent().GetElement(0, 3) != before
+
+
 def test_what_a_first_image_needs_is_one_screen_of_440_pixels(session):
     session.segmented()
     session.ui.liveCheckBox.setChecked(True)
@@ -814,7 +837,7 @@ def test_what_a_first_image_needs_is_one_screen_of_440_pixels(session):
     opened = [section for section in sections if not section.property("collapsed")]
     assert [section.property("text") for section in opened] == ["Patient", "Probe", "Ultrasound"]
     last = opened[-1]
-    assert last.y() + last.height() <= 700 and session.parent.width() == 440 and len(session.panel._controls) < 110
+    assert last.y() + last.height() <= 700 and session.parent.width() == 440 and len(session.panel._controls) < 116
     for section in sections:
         section.setCollapsed(False)
     session.process()

@@ -215,7 +215,7 @@ def _other_images(panel: PanelPresenter) -> tuple[Row, ...]:
 
 
 def _approach(panel: PanelPresenter) -> tuple[Row, ...]:
-    approach, numbers = panel.approach, range(CANDIDATES)
+    approach = panel.approach
     return (
         (
             _("Target"), value("scene.target"),
@@ -230,18 +230,12 @@ def _approach(panel: PanelPresenter) -> tuple[Row, ...]:
         ),
         tuple(
             Control(
-                f"candidate{number + 1}", "picture", tip=_("Simulated image with the outline of the target"),
-                shows=partial(approach.picture, number), depends=("tissues",),
+                f"candidate{number + 1}", "picture", _("Candidate {number}").format(number=number + 1),
+                _("Simulated image with the outline of the target; press it to see way and opening in the views"),
+                shows=partial(approach.picture, number), action=partial(approach.choose, number),
+                enabled=partial(approach.canChoose, number), depends=("tissues",),
             )
-            for number in numbers
-        ),
-        tuple(
-            button(
-                f"candidate{number + 1}", _("Candidate {number}").format(number=number + 1),
-                _("Show its way and its opening in the views"), partial(approach.choose, number),
-                partial(approach.canChoose, number),
-            )
-            for number in numbers
+            for number in range(CANDIDATES)
         ),
         (
             button(

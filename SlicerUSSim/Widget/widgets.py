@@ -16,7 +16,7 @@ import slicer
 from SlicerUSSim.Widget.interface import Control, Section, by_widget, tr as _
 
 _PAGE_STEPS = 10
-_TABLE_HEIGHT, _LIST_HEIGHT = 220, 140
+_TABLE_HEIGHT, _LIST_HEIGHT, _PICTURE_SIZE = 220, 140, 110
 #: The most that a result or warning takes; the rest is scrolled
 WORDS_HEIGHT = 72
 
@@ -127,8 +127,10 @@ def _words(control: Control) -> Any:
 
 
 def _picture(control: Control) -> Any:
-    result = qt.QLabel("")
-    result.setAlignment(qt.Qt.AlignCenter)
+    result = qt.QToolButton()
+    result.setText(control.label)
+    result.setToolButtonStyle(qt.Qt.ToolButtonTextUnderIcon)
+    result.setIconSize(qt.QSize(_PICTURE_SIZE, _PICTURE_SIZE))
     return result
 
 

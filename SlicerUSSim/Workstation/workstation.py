@@ -107,9 +107,8 @@ class Workstation:
             placing.placeProbe: partial(patient.place, placing.placeProbe),
             placing.placeAtView: partial(patient.place, placing.placeAtView),
         }
-        panel.own_actions[presenter.approach.openHere] = partial(
-            patient.place, partial(patient.then_show, presenter.approach.openHere)
-        )
+        open_here = presenter.approach.openHere
+        panel.own_actions[open_here] = lambda: patient.place(lambda: patient.then_show(open_here))
         for action in (segmenting.segment, lesions.addTissues, placing.openCraniotomy, placing.closeCraniotomy):
             panel.own_actions[action] = partial(patient.then_show, action)
         self._answer_pages(stamps)

@@ -249,8 +249,8 @@ def find_target(
 ) -> Target:  # fmt: skip
     """The target among labels 1, 2, ... called `names`.
 
-    `what` is a tissue, of which it is the largest region; a point (3,) RAS mm, the lesion there or a ball of 3 mm around
-    it; a mask on any grid, not 0 inside; or None, the largest lesion. `surface` is that of the brain. Raises
+    `what` is a tissue, of which it is the largest region; a point (3,) RAS mm, the lesion there or a ball of 3 mm
+    around it; a mask on any grid, not 0 inside; or None, the largest lesion. `surface` is that of the brain. Raises
     SimulationError if there is no lesion, for an unknown tissue, and for a target outside the head.
     """
     require_brain(names)
