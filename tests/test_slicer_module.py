@@ -820,9 +820,12 @@ def test_a_plan_is_shown_as_pictures_to_press(session):
     assert session.ui.approachNotesLabel.text().startswith("tumour: ")
     pictures[1].click()
     assert "Candidate 2: " in session.ui.approachNotesLabel.text()
-    before = session.parameters.probe_transform.GetMatrixTransformToParent().GetElement(0, 3)
+    assert session.parameters.probe_transform is None
     session.ui.openHereButton.click()
-    assert session.parameters.probe_transform.GetMatrixTransformToParent().GetElement(0, 3) != before
+    inward = session.parameters.probe_transform.GetMatrixTransformToParent()
+    way = (found.labels.ijk_to_ras @ [*middle[::-1], 1.0])[:3] - [inward.GetElement(row, 3) for row in range(3)]
+    axis = [inward.GetElement(row, 1) for row in range(3)]
+    assert axis @ way == pytest.approx(np.linalg.norm(way), abs=1.0)
 
 
 def test_what_a_first_image_needs_is_one_screen_of_440_pixels(session):
