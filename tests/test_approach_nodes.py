@@ -47,6 +47,8 @@ def test_the_panel_lists_candidates_and_opens_the_skull_at_one(bench):
     shown = models(bench)
     np.testing.assert_allclose(shown["Target"].mean(axis=1), target, atol=1.5)
     np.testing.assert_allclose(np.ptp(shown["Target"], axis=1), 16.0, atol=3.0)
+    (model,) = [node for node in nodes_of_class(bench.scene, "vtkMRMLModelNode") if node.GetName() == "Target"]
+    assert model.GetPolyData().GetPointData().GetScalars() is None  # in its own colour
     approach.choose(1)
     moved = models(bench)
     assert len(moved) == 2 and np.abs(moved["Approach"] - shown["Approach"]).max() > 5.0

@@ -124,6 +124,7 @@ def surface_of(removed: Volume) -> Any:
     edges = vtkFlyingEdges3D()
     edges.SetInputData(Volume(padded, matrix).to_vtk())
     edges.SetValue(0, 0.5)
+    edges.ComputeScalarsOff()  # views would colour it by them
     smooth = vtkWindowedSincPolyDataFilter()
     smooth.SetInputConnection(edges.GetOutputPort())
     smooth.SetNumberOfIterations(12)
