@@ -331,17 +331,12 @@ class _Ways:
         self, labels: Volume, names: Sequence[str], target: Target, outward: np.ndarray, faces: np.ndarray,
         surface: PatientSurface,
     ) -> None:  # fmt: skip
-        self._names = names
         distance = np.arange(0.0, _LONGEST_MM, _STEP_MM)
         points = target.centre_ras + distance[:, None] * outward[:, None]
         found = sample(labels, points, order=0).astype(int)
         steps = np.arange(len(distance))
         to_face = np.linalg.norm(faces - target.centre_ras, axis=1)
-        reach = np.linalg.norm(target.points_ras - target.centre_ras, axis=1)
-        own = np.bincount(sample(labels, target.points_ras, order=0).astype(int)).argmax()
-        is_target = (found == own) & (distance <= reach.max() + 1.0)
-        is_target[:, 0] = True
-        first = np.where(is_target, steps, 0).max(axis=1)
+        first = np.where(target.holds(points), steps, 0).max(axis=1)
         last = np.minimum(np.where(found > 0, steps, 0).max(axis=1), len(distance) - 5)
         self._labels = np.where((steps > first[:, None]) & (steps <= last[:, None]), found, 0)
         in_brain = distance < to_face[:, None]
