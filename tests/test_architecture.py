@@ -43,12 +43,12 @@ HEAVY = {
 #: Lines of Python that a room, or a folder beside the product, may have. Raising one is a decision: the commit says
 #: what users get for it.
 BUDGETS = {
-    "base": 3350, "opencl": 1295, "probe": 1520, "tissue": 2070, "tracked": 1935, "mri": 7470, "placement": 845,
-    "imaging": 5320, "fitting": 3695, "vtk": 505, "mrml": 4780, "Widget": 3045, "Workstation": 5795, "Command": 2835,
-    "module": 430, "validation": 6055, "benchmarks": 3805, "tests": 28685, "tests/reference": 460,
+    "base": 3350, "opencl": 1295, "probe": 1530, "tissue": 2070, "tracked": 1935, "mri": 7470, "placement": 1320,
+    "imaging": 5535, "fitting": 3695, "vtk": 505, "mrml": 4900, "Widget": 3235, "Workstation": 5795, "Command": 2905,
+    "module": 430, "validation": 6055, "benchmarks": 3805, "tests": 29080, "tests/reference": 460,
 }  # fmt: skip
 #: Lines of all of SlicerUSSim/, and of kernels/
-LARGEST_PRODUCT, LARGEST_KERNELS = 44_850, 5_600
+LARGEST_PRODUCT, LARGEST_KERNELS = 45_950, 5_600
 #: Packages of the checkout that use the product and are not installed with it
 CHECKOUT = {"validation", "benchmarks", "tests", "examples"}
 
