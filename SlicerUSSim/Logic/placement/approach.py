@@ -210,13 +210,15 @@ def plan_approach(
         room = 2.0 * (_CLEAR_MM + bone[number] * np.tan(np.deg2rad(needed)))
         disc = face_width_mm(probe) + float(np.clip(room, ROOM_MM, _WIDEST_MM))
         parts = {name: float(part[number]) for name, part in costs.items()}
+        parts["unseen"] = 100.0 * weights.unseen_weight * (1.0 - share)  # which the place of the face changes
+        parts["unfocused"] = 100.0 * weights.unfocused_weight * (1.0 - sharp)
         candidates.append(
             Candidate(
                 pose, ways.starts[number], ways.path(number), float(ways.inside_mm[number]), float(angles[number]),
                 share, sharp, needed, disc if has_skull else 0.0, parts,
             )
         )  # fmt: skip
-    return Approach(target, tuple(candidates), len(outward))
+    return Approach(target, tuple(sorted(candidates, key=lambda candidate: candidate.cost)), len(outward))
 
 
 def _apart(faces: np.ndarray, total: np.ndarray, count: int) -> list[int]:
@@ -394,12 +396,13 @@ def _views(
     half of the depth of field, 3.5 wavelengths times the square of the f-number, of the focus. What lies behind bone or
     air in the brain is not seen.
     """
-    shares = np.linspace(0.1, 0.97, _LOOKS)[:, None, None, None]  # bone at the face is opened
-    faces = poses[:, None, :3, 3]
-    between = sample(labels, faces + shares * (target.points_ras - faces), order=0)
-    is_clear = ~np.isin(between, labels_of(names, (*SKULL, "air"))).any(axis=0)
     to_probe = np.linalg.inv(poses)
     x, y, z = np.moveaxis(target.points_ras @ np.swapaxes(to_probe[:, :3, :3], 1, 2) + to_probe[:, None, :3, 3], -1, 0)
+    shares, faces = np.linspace(0.05, 0.97, _LOOKS)[:, None, None], poses[:, None, :3, 3]
+    between = sample(labels, faces + shares[..., None] * (target.points_ras - faces), order=0)
+    half = 0.5 * (face_width_mm(probe) + ROOM_MM)
+    is_opened = (shares * np.hypot(x, z) <= half) & (shares * y <= half)  # bone there is removed
+    is_clear = ~(np.isin(between, labels_of(names, (*SKULL, "air"))) & ~is_opened).any(axis=0)
     tilt, depth = np.abs(np.rad2deg(np.arctan2(z, y))), np.hypot(y, z)
     # A slice has a thickness, in which a place is seen without a tilt
     thick = 0.5 * probe.elevation_aperture_mm
