@@ -115,7 +115,8 @@ def test_a_target_is_a_tissue_a_mask_a_point_or_the_largest_lesion(ill):
 
 
 def test_targets_of_all_sizes_and_places_are_planned(head):  # noqa: F811
-    for place, radius in (((0.0, 0.0, 54.0), 5.0), ((10.0, -20.0, 30.0), 1.2), ((0.0, 0.0, 0.0), 25.0)):
+    large = ((30.0, 0.0, 25.0), 18.0)  # its rim is beside the opening, below bone that is not before it
+    for place, radius in (((0.0, 0.0, 54.0), 5.0), large, ((10.0, -20.0, 30.0), 1.2), ((0.0, 0.0, 0.0), 25.0)):
         labels = with_ball(head, np.array(place), radius)
         best = plan_approach(labels, ILL, PHASED, "tumour").candidates[0]
         assert best.seen > (0.95 if radius < 20.0 else 0.5) and best.depth_mm >= 0.0
