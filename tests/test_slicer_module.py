@@ -822,7 +822,8 @@ def test_a_plan_is_shown_as_pictures_to_press(session):
     assert "Candidate 2: " in session.ui.approachNotesLabel.text()
     assert session.parameters.probe_transform is None
     session.ui.openHereButton.click()
-    inward = session.parameters.probe_transform.GetMatrixTransformToParent()
+    probe: typing.Any = session.parameters.probe_transform
+    inward = probe.GetMatrixTransformToParent()
     way = (found.labels.ijk_to_ras @ [*middle[::-1], 1.0])[:3] - [inward.GetElement(row, 3) for row in range(3)]
     axis = [inward.GetElement(row, 1) for row in range(3)]
     assert axis @ way == pytest.approx(np.linalg.norm(way), abs=1.0)
