@@ -139,6 +139,7 @@ def test_only_a_target_that_cannot_be_found_is_refused(head, ill):  # noqa: F811
         (ill, ILL, "cyst", "the labels have no cyst, expected tumour"),
         (ill, ILL, "teapot", "no tissue is called 'teapot'"),
         (ill, ILL, (0.0, 0.0, 120.0), "the point about R 0, A 0, S 120 mm lies outside of the head"),
+        (head, NAMES, (0.0, 0.0, 65.0), "the point lies outside of the brain's surface"),  # in bone
         (ill, ILL, (0.0, np.nan, 0.0), "expected R, A, S in mm"),
         (ill, ILL, ill.with_array(np.zeros_like(ill.array)), "the mask of the target is empty"),
         (ill, ("liver", "muscle"), None, "no tissue of a brain"),

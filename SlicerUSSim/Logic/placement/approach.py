@@ -164,17 +164,6 @@ def plan_approach(
 
     The face of the probe stands on the brain. Without a head nothing is opened, and entries are on the brain. Planned
     in a second; imaging.approach_images adds images and contrasts. It is a simulation and no medical advice.
-
-    >>> import numpy as np
-    >>> from SlicerUSSim.Logic import Volume
-    >>> from SlicerUSSim.Logic.placement import plan_approach
-    >>> from SlicerUSSim.Logic.probe import PROBES
-    >>> labels = np.ones((60, 60, 60), np.uint8)  # k, j, i: a cube of 120 mm
-    >>> labels[46:52, 26:32, 26:32] = 2
-    >>> brain = Volume(labels, np.diag([2.0, 2.0, 2.0, 1.0]))
-    >>> best = plan_approach(brain, ["white matter", "tumour"], PROBES["phased"]).candidates[0]
-    >>> best.seen, bool(best.entry_ras[2] > 110)  # from above
-    (1.0, True)
     """
     require_brain(names)
     weights = weights or ApproachWeights()
@@ -215,7 +204,7 @@ def plan_approach(
         candidates.append(
             Candidate(
                 pose, ways.starts[number], ways.path(number), float(ways.inside_mm[number]), float(angles[number]),
-                share, sharp, needed, disc if has_skull else 0.0, parts,
+                share, sharp, needed, disc if bone[number] else 0.0, parts,
             )
         )  # fmt: skip
     return Approach(target, tuple(sorted(candidates, key=lambda candidate: candidate.cost)), len(outward))
