@@ -23,6 +23,7 @@ from SlicerUSSim.Logic.fitting.fit_settings import FitSettings
 from SlicerUSSim.Logic.fitting.image_similarity import SimilaritySettings
 from SlicerUSSim.Logic.mri.segmentation_settings import SegmentationSettings, SheetSettings
 from SlicerUSSim.Logic.mrml.parameter_node import PanelSettings
+from SlicerUSSim.Logic.placement.approach_weights import ApproachWeights
 from SlicerUSSim.Logic.probe.arrays import PROBE_KINDS, Probe, probe_kind
 from SlicerUSSim.Logic.probe.beam import Beam
 from SlicerUSSim.Logic.tissue.tissue import Membrane, Tissue
@@ -65,6 +66,8 @@ SECTIONS: list[tuple[str, type[Declared], str]] = [
      "([sheets.md](sheets.md))."),
     ("Fit", FitSettings, "Fit of simulated to real images ([optimization.md](optimization.md)). `fit` in the "
      "preset of `ussim optimize`, which has the options `--frames` and `--free`, too."),
+    ("Approach", ApproachWeights, "Weights of the cost of ways to a target ([approach.md](approach.md)); `approach` in "
+     "the preset of `ussim approach`."),
     ("Similarity", SimilaritySettings, "The cost of a fit ([optimization.md](optimization.md#cost-function)); set in "
      "Python only."),
     ("Recipe", SetSettings, "Of a data set, before the tables of its recipe ([datasets.md](datasets.md))."),

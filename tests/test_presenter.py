@@ -188,7 +188,8 @@ def test_every_control_shows_something_and_says_whether_it_can_be_used(presenter
     own = {"loadPreset", "savePreset", "assignTissue", "editTissues", "layout"}  # of the view
     for control in controls.values():
         assert control.shows is None or control.shows() is not None, control.name
-        assert (control.action is not None) == (control.kind == "button" and control.name not in own), control.name
+        is_pressed = control.kind in ("button", "picture") and control.name not in own
+        assert (control.action is not None) == is_pressed, control.name
         for method, given in ((control.action, False), (control.sets, True)):
             if method is not None:
                 needs = [

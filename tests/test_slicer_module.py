@@ -802,6 +802,33 @@ def test_reloading_the_module_brings_new_code(module):
         module.__dict__.update(again.__dict__ | {"app": module.app})
 
 
+def test_a_plan_is_shown_as_pictures_to_press(session):
+    session.segmented()
+    nodes, pathology = session.logic_module("mrml.label_nodes"), session.logic_module("mri.pathology")
+    node = session.parameters.labels
+    found = nodes.read_labels(node, session.logic.preset.tissues)
+    k, j, i = np.indices(found.labels.array.shape)
+    middle = np.argwhere(found.labels.array > 0).mean(axis=0)
+    ball = found.labels.with_array((np.linalg.norm(np.stack([k, j, i], -1) - middle, axis=-1) < 3.0).astype(np.uint8))
+    added = pathology.add_tissue(found.labels, found.names, ball, "tumour")
+    nodes.write_labels(node, added.labels, added.tissue_names, node)
+    assert not session.ui.candidate1Picture.isEnabled()
+    session.ui.planButton.click()
+    session.process()
+    pictures = [session.ui.candidate1Picture, session.ui.candidate2Picture, session.ui.candidate3Picture]
+    assert all(picture.isEnabled() and not picture.icon().isNull() for picture in pictures)
+    assert session.ui.approachNotesLabel.text().startswith("tumour: ")
+    pictures[1].click()
+    assert "Candidate 2: " in session.ui.approachNotesLabel.text()
+    assert session.parameters.probe_transform is None
+    session.ui.openHereButton.click()
+    probe: typing.Any = session.parameters.probe_transform
+    inward = probe.GetMatrixTransformToParent()
+    way = (found.labels.ijk_to_ras @ [*middle[::-1], 1.0])[:3] - [inward.GetElement(row, 3) for row in range(3)]
+    axis = [inward.GetElement(row, 1) for row in range(3)]
+    assert axis @ way == pytest.approx(np.linalg.norm(way), abs=1.0)
+
+
 def test_what_a_first_image_needs_is_one_screen_of_440_pixels(session):
     session.segmented()
     session.ui.liveCheckBox.setChecked(True)

@@ -24,7 +24,7 @@ from SlicerUSSim.Command.options import about_key, device_option, rare_keys, unt
 from SlicerUSSim.Command.progress import Share, note
 from SlicerUSSim.Command.segment import segment
 from SlicerUSSim.Command.serve import serve
-from SlicerUSSim.Command.simulate import simulate, sweep, volume
+from SlicerUSSim.Command.simulate import approach, simulate, sweep, volume
 from SlicerUSSim.Command.virtual_ultrasound import device
 from SlicerUSSim.Logic.base.errors import is_our_warning, user_message
 from SlicerUSSim.Logic.base.version import __version__
@@ -123,7 +123,8 @@ def check(ctx: click.Context, device: str | None) -> None:
     ctx.exit(1 if result.wrong else 0)
 
 
-for command in (check, dataset, demo, device, devices, optimize, segment, serve, simulate, sweep, volume):
+commands = (approach, check, dataset, demo, device, devices, optimize, segment, serve, simulate, sweep, volume)
+for command in commands:
     main.add_command(untrusted_option(verbose_option(command), hidden=True))
     if rare_keys(command):
         command.epilog = f"Further keys of --set: {', '.join(rare_keys(command))}."

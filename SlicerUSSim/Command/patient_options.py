@@ -24,7 +24,7 @@ from SlicerUSSim.Command.options import declared, declared_parameters, require_n
 from SlicerUSSim.Command.progress import note
 from SlicerUSSim.Command.set_option import Changes
 from SlicerUSSim.Command.sheet_options import DrawnSheets
-from SlicerUSSim.Logic.base.errors import require, required
+from SlicerUSSim.Logic.base.errors import SimulationError, require, required
 from SlicerUSSim.Logic.base.settings import DisplaySettings, SimulationSettings
 
 if TYPE_CHECKING:
@@ -40,12 +40,15 @@ if TYPE_CHECKING:
 AUTO = "auto"
 STANDARD_VIEWS = ("temporal", "temporal-left", "fontanelle", "fontanelle-sagittal")
 _VIEWS = f"{', '.join(STANDARD_VIEWS)} (temporal: from the right)"
-pose_option = click.option(
-    "--pose", required=True,
+#: Begins the pose that is the first candidate of an approach to what follows
+APPROACH = "approach:"
+_POSE: dict[str, Any] = dict(
     help='File with probe_to_ras (4 x 4 in JSON, 16 numbers in text, or a Slicer transform), "auto": a coronal '
     "view through a craniotomy, of what --add laid over the labels if there is something, or a standard view: "
     f"{_VIEWS}.",
 )  # fmt: skip
+pose_option = click.option("--pose", required=True, **_POSE)
+pose_or_approach = click.option("--pose", **_POSE)
 
 
 #: Parameters that no command has an option for, and those that a command with further options has none for
@@ -109,6 +112,19 @@ class PatientOptions(ImageOptions):
         return changes.to_preset(preset)
 
 
+def target_of(text: str | None) -> str | tuple[float, ...] | None:
+    """A tissue, or a point (R, A, S) in mm of "12,-15,8". Raises SimulationError for other numbers."""
+    if text is None or "," not in text:
+        return text
+    try:
+        point = tuple(float(part) for part in text.split(","))
+    except ValueError:
+        point = ()
+    if len(point) != 3:
+        raise SimulationError(f"the target is {text!r}, expected a tissue, or R,A,S in mm such as 12,-15,8")
+    return point
+
+
 def named_probe(name_or_path: str) -> Probe:
     """The probe of PROBES by its name, or read from a JSON file.
 
@@ -141,8 +157,9 @@ def open_examination(
 ) -> Examination:
     """The Examination of a command's options. An MRI is segmented, with a progress bar.
 
-    `pose` is a (4, 4) probe_to_ras, one of STANDARD_VIEWS, or AUTO: a view through a craniotomy, of what --add laid
-    over the labels if there is something. With `one_image` only what an image at this pose shows is prepared.
+    `pose` is a (4, 4) probe_to_ras, one of STANDARD_VIEWS, APPROACH and a target, or AUTO: a view through a craniotomy,
+    of what --add laid over the labels if there is something. With `one_image` only what an image at this pose shows is
+    prepared.
     Fast checks come before slow computations. Raises SimulationError for inconsistent options.
     """
     import logging  # imported here to keep --help fast
@@ -244,7 +261,17 @@ def _placed(
 
     labels, names, settings, probe = added.labels, added.tissue_names, preset.settings, preset.probe
     at, is_open, line = None, craniotomy.is_wanted, ""
-    if isinstance(pose, str):
+    if isinstance(pose, str) and pose.startswith(APPROACH):
+        from SlicerUSSim.Logic.placement.approach import opened_for, plan_approach
+        from SlicerUSSim.Logic.placement.approach_weights import NO_ADVICE
+
+        require(not is_open, f"--craniotomy is {craniotomy.text} with --approach, expected none: it opens the head")
+        plan = plan_approach(labels, names, probe, target_of(pose.removeprefix(APPROACH)))
+        best = plan.candidates[0]
+        labels, pose, is_open = opened_for(labels, names, [best]), best.probe_to_ras, best.opening_mm > 0.0
+        for line in (plan.target.text, best.text, NO_ADVICE):
+            note(f"approach: {line}")
+    elif isinstance(pose, str):
         from SlicerUSSim.Logic.placement.craniotomy import default_pose, middle_of  # a pose from a file does not wait
 
         if craniotomy.is_file:
@@ -296,11 +323,11 @@ def open_examination_at(
 ) -> tuple[Examination, np.ndarray]:
     """(Examination, (4, 4) probe_to_ras) of a command's options.
 
-    The pose is a file, AUTO or one of STANDARD_VIEWS, see open_examination.
+    The pose is a file, AUTO, one of STANDARD_VIEWS, or APPROACH with a target, see open_examination.
     """
     from SlicerUSSim.Logic.tracked.pose_files import read_pose
 
-    is_chosen = pose == AUTO or pose in STANDARD_VIEWS
+    is_chosen = pose == AUTO or pose in STANDARD_VIEWS or pose.startswith(APPROACH)
     require(
         is_chosen or (pose != "" and Path(pose).exists()),
         f"--pose is {pose!r} (no such file), expected a file with the pose (.json, .txt, .tfm, .h5), {AUTO}, "

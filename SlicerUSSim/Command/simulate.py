@@ -1,4 +1,4 @@
-"""`ussim simulate`, `ussim sweep` and `ussim volume`."""
+"""`ussim simulate`, `ussim approach`, `ussim sweep` and `ussim volume`."""
 
 from __future__ import annotations
 
@@ -9,31 +9,45 @@ import click
 
 from SlicerUSSim.Command.options import check_outputs, gathered, out_option, overwrite_option
 from SlicerUSSim.Command.patient_options import (
+    APPROACH,
     RARE,
     RARE_BESIDE,
     PatientOptions,
+    open_examination,
     open_examination_at,
     pose_option,
+    pose_or_approach,
     say_contact,
+    target_of,
 )
 from SlicerUSSim.Command.progress import Share, note
 from SlicerUSSim.Command.sequence_options import RARE_OF_SEQUENCE, SequenceOptions, open_tracked
+from SlicerUSSim.Logic.base.declaration import parameters_of
 from SlicerUSSim.Logic.base.errors import require
+from SlicerUSSim.Logic.placement.approach_weights import NO_ADVICE, ApproachWeights
+
+_WEIGHTS = " ".join(entry.name for entry in parameters_of(ApproachWeights))
 
 
 @click.command()
 @gathered(RARE, patient=PatientOptions)
-@pose_option
+@pose_or_approach
+@click.option(
+    "--approach", metavar="TISSUE|R,A,S", help="In place of a pose: the first candidate of an approach to this lesion "
+    "or point (mm), through its opening in a whole head (see `ussim approach`).",
+)  # fmt: skip
 @out_option("Image: .png .mha .nrrd .nii.gz or .vti")
 @overwrite_option
-def simulate(patient: PatientOptions, pose: str, out: Path) -> None:
+def simulate(patient: PatientOptions, pose: str | None, approach: str | None, out: Path) -> None:
     """Simulate one B-mode image from an MRI or a label map at a given pose."""
     from SlicerUSSim.Logic.base.volume import require_image_name
     from SlicerUSSim.Logic.imaging.figures import write_png
 
     require_image_name(out, also=(".png",))
     check_outputs(out)
-    examination, probe_to_ras = open_examination_at(patient, pose, one_image=True)
+    require((pose is None) != (approach is None), "expected exactly one of --pose and --approach")
+    at = f"{APPROACH}{approach}" if pose is None else pose
+    examination, probe_to_ras = open_examination_at(patient, at, one_image=True)
     say_contact(examination, examination.probe, [probe_to_ras])
     frame = examination.simulator.simulate(examination.probe, probe_to_ras, examination.display)
     if out.suffix.lower() == ".png":
@@ -41,6 +55,38 @@ def simulate(patient: PatientOptions, pose: str, out: Path) -> None:
     else:
         frame.to_volume().write(out)
     note(f"wrote {out} ({frame.image.shape[1]}x{frame.image.shape[0]})")
+
+
+@click.command()
+@gathered(f"{RARE} seed {_WEIGHTS}", patient=PatientOptions, approach=ApproachWeights)
+@click.option(
+    "--target", metavar="TISSUE|R,A,S", help="What is to be seen: a tissue, or a point in mm (default: the largest "
+    "lesion).",
+)  # fmt: skip
+@out_option("Report: .html")
+@overwrite_option
+def approach(patient: PatientOptions, approach: ApproachWeights, target: str | None, out: Path) -> None:
+    """Plan from where a probe sees a lesion best: candidates with ways, openings and images. No medical advice."""
+    from SlicerUSSim.Logic.imaging.approach_images import simulated_approach, write_approach_report
+    from SlicerUSSim.Logic.placement.approach import plan_approach
+
+    require(out.suffix.lower() == ".html", f"--out is {str(out)!r}, expected a file .html")
+    check_outputs(out)
+    what = target_of(target)
+    require(patient.craniotomy == "none", f"--craniotomy is {patient.craniotomy}, expected none: the plan opens a head")
+    examination = open_examination(patient)
+    simulator, probe = examination.simulator, examination.probe
+    labels, names = simulator.medium.labels, simulator.medium.tissues.names_by_label()
+    plan = plan_approach(labels, names, probe, what, weights=approach)
+    plan = simulated_approach(
+        plan, labels, simulator.medium.tissues, probe, simulator.settings, examination.display,
+        device=simulator.device, texture=simulator.texture, sheets=simulator.medium.sheets,
+    )  # fmt: skip
+    weights = {entry.name: getattr(approach, entry.name) for entry in parameters_of(ApproachWeights)}
+    write_approach_report(out, plan, labels, names, probe, subtitle=patient.source, weights=weights)
+    for line in (plan.target.text, *(candidate.text for candidate in plan.candidates), NO_ADVICE):
+        click.echo(line)
+    note(f"wrote {out} ({len(plan.candidates)} candidates of {plan.compared} ways)")
 
 
 @click.command()

@@ -28,11 +28,12 @@ except ImportError:  # outside of 3D Slicer
 tr: Callable[[str], str] = _in_slicer
 _ = tr  # the name that Slicer's tools look for
 
-Kind = Literal["slider", "number", "tick", "choice", "text", "node", "button", "words", "table", "list"]
+Kind = Literal["slider", "number", "tick", "choice", "text", "node", "button", "words", "table", "list", "picture"]
 #: Suffix of the widget's name, by kind of control.
 _WIDGETS: dict[Kind, str] = {
     "slider": "Slider", "number": "SpinBox", "tick": "CheckBox", "choice": "ComboBox", "text": "LineEdit",
     "node": "Selector", "button": "Button", "words": "Label", "table": "Table", "list": "List",
+    "picture": "Picture",
 }  # fmt: skip
 
 

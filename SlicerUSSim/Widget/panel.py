@@ -5,6 +5,7 @@ Widgets are read and written with property() and setProperty(), which exist in P
 
 from __future__ import annotations
 
+from base64 import b64decode
 from collections.abc import Callable, Collection
 from contextlib import contextmanager
 from functools import partial
@@ -166,6 +167,10 @@ class Panel:
             self._show_tissues()
         elif control.kind == "list":
             self._show_free()
+        elif control.kind == "picture" and control.shows:
+            picture = qt.QPixmap()
+            picture.loadFromData(b64decode(control.shows().partition(",")[2]))
+            widget.setIcon(qt.QIcon(picture))
         elif control.kind == "words" and control.shows:
             self._show_words(widget, control.shows())
         elif control.shows:
@@ -193,7 +198,7 @@ class Panel:
                 widget.currentNodeChanged.connect(self._changed(self._choose_node, control, widget))
             elif control.value:
                 _signal_of(widget).connect(self._changed(self._set_value, control, widget))
-            elif control.kind == "button":
+            elif control.action or control.kind == "button":
                 widget.clicked.connect(self._changed(self._press, control, widget))
             elif control.sets:
                 _signal_of(widget).connect(self._changed(self._act, control, widget))

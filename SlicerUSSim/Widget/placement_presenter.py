@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Callable
+from typing import Any, TypeVar
+
+import numpy as np
 
 from SlicerUSSim.Logic.base.errors import require, required
-from SlicerUSSim.Logic.mrml.nodes import display_of
+from SlicerUSSim.Logic.mrml.nodes import display_of, set_node_to_world
 from SlicerUSSim.Widget.interface import PanelHost, tr as _
 from SlicerUSSim.Widget.notes import OPENED, PLACED, VIEW, Notes, checks
 from SlicerUSSim.Widget.tracked_presenter import is_face
+
+T = TypeVar("T")
 
 
 class PlacementPresenter:
@@ -32,11 +37,6 @@ class PlacementPresenter:
         with self._panel.acting():
             self._place(VIEW, view=self._panel.parameters.panel.view)
 
-    def approach(self) -> None:
-        """Place the probe on the brain, where the skull is to be opened or is open, over a lesion if there is one."""
-        with self._panel.acting():
-            self._place(PLACED, will_open=True)
-
     def _place(self, what: str, **where: Any) -> None:
         require(self._panel.parameters.labels is not None, "no label map chosen, expected one to put the probe on")
         line = self.put(**where)
@@ -48,11 +48,19 @@ class PlacementPresenter:
 
         See UltrasoundSceneLogic.placeProbe for `where`.
         """
+        labels, logic = self._panel.parameters.labels, self._panel.logic
+        return self._moved(lambda probe: logic.placeProbe(labels, probe, **where))
+
+    def putAt(self, probe_to_world: np.ndarray) -> None:
+        """Move the probe's transform, or a new one if none is selected, to a pose (4, 4)."""
+        self._moved(lambda probe: set_node_to_world(probe, probe_to_world))
+
+    def _moved(self, move: Callable[[Any], T]) -> T:
         parameters = self._panel.parameters
         is_moved = parameters.probe_transform is not None and is_face(parameters.probe_transform)
         require(not is_moved, "the tracker moves the probe; choose another probe transform, or none, to place it")
         with self._panel.made(parameters.probe_transform, "LinearTransform", "Probe") as probe:
-            line = self._panel.logic.placeProbe(parameters.labels, probe, **where)
+            line = move(probe)
         parameters.probe_transform = probe
         display = display_of(probe)
         if display is not None:

@@ -11,6 +11,7 @@ from typing import Any
 from SlicerUSSim.Logic.mrml.fitting_nodes import fits
 from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic
 from SlicerUSSim.Logic.mrml.nodes import nodes_of_class
+from SlicerUSSim.Widget.approach_presenter import ApproachPresenter
 from SlicerUSSim.Widget.fit_presenter import FitPresenter
 from SlicerUSSim.Widget.image_presenter import ImagePresenter
 from SlicerUSSim.Widget.interface import PanelHost, PanelView
@@ -39,6 +40,7 @@ class PanelPresenter(PanelHost):
         self.segmenting = SegmentPresenter(self, self.notes, label_maps)
         self.lesions = LesionPresenter(self, self.notes, self.segmenting)
         self.placing = PlacementPresenter(self, self.notes, handles)
+        self.approach = ApproachPresenter(self, self.placing)
         self.values = ValuePresenter(self, self.placing)
         self.images = ImagePresenter(self, self.notes, self.placing)
         self.fits = FitPresenter(self, self.values, self.tissues)
@@ -74,4 +76,6 @@ class PanelPresenter(PanelHost):
         self.fits.forget()
         self.segmenting.forget()
         self.lesions.forget()
+        self.approach.forget()
+        self.logic.hideApproach()
         self.notes.set()

@@ -12,6 +12,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterable
 from dataclasses import replace
+from functools import partial
 
 from SlicerUSSim.Logic.base.declaration import Parameter, Shown
 from SlicerUSSim.Logic.imaging.preset import preset_parameters
@@ -19,6 +20,7 @@ from SlicerUSSim.Logic.mrml.fit_nodes import COMPARED
 from SlicerUSSim.Logic.mrml.parameter_node import SceneParameters
 from SlicerUSSim.Logic.probe.arrays import PROBES
 from SlicerUSSim.Logic.tissue.presets import TISSUES
+from SlicerUSSim.Widget.approach_presenter import CANDIDATES
 from SlicerUSSim.Widget.interface import Can, Control, Kind, Row, Section, tr as _
 from SlicerUSSim.Widget.presenter import PanelPresenter
 from SlicerUSSim.Widget.tissue_presenter import COLUMN_PARAMETERS
@@ -42,6 +44,7 @@ def panel_sections(panel: PanelPresenter) -> tuple[Section, ...]:
         Section(_("Probe"), True, _probe(panel)),
         Section(_("Ultrasound"), True, _ultrasound(panel)),
         Section(_("Lesions and other images"), False, _other_images(panel)),
+        Section(_("Approach"), False, _approach(panel)),
         Section(_("Beam and display"), False, (*_of_preset("probe"), *_of_preset("display"))),
         Section(_("Tissues"), False, _tissues(panel)),
         Section(_("Tracked ultrasound"), False, _tracked(panel)),
@@ -105,11 +108,6 @@ def _probe(panel: PanelPresenter) -> tuple[Row, ...]:
             ),
         ),
         (
-            button(
-                "approach", _("Approach lesion"),
-                _("Place the probe on the brain over the largest lesion that was added to the tissues, where Open "
-                  "skull opens; in an opening, aim at the lesion below it"), placing.approach, panel.canSimulate,
-            ),
             button(
                 "openCraniotomy", _("Open skull"),
                 _("Replace skin, scalp and skull in the opening by the coupling medium, in new labels; the tissues "
@@ -212,6 +210,44 @@ def _other_images(panel: PanelPresenter) -> tuple[Row, ...]:
         node(
             "opening", _("Opening"), _("What Open skull opens instead of a disc under the probe: a closed curve or "
             "other markups, whose points are a polygon over the skin, or a label map or segmentation"),
+        ),
+    )  # fmt: skip
+
+
+def _approach(panel: PanelPresenter) -> tuple[Row, ...]:
+    approach = panel.approach
+    return (
+        (
+            _("Target"), value("scene.target"),
+            button(
+                "plan", _("Plan"), _("Compare straight ways to the target, and simulate the image of the best (some "
+                "seconds); a simulation, and no medical advice"), approach.plan, panel.canSimulate,
+            ),
+        ),
+        Control(
+            "approachNotes", "words", tip=_("The target, and what is known of the chosen candidate"),
+            shows=approach.text, depends=("tissues",),
+        ),
+        tuple(
+            Control(
+                f"candidate{number + 1}", "picture", _("Candidate {number}").format(number=number + 1),
+                _("Simulated image with the outline of the target; press it to see way and opening in the views"),
+                shows=partial(approach.picture, number), action=partial(approach.choose, number),
+                enabled=partial(approach.canChoose, number), depends=("tissues",),
+            )
+            for number in range(CANDIDATES)
+        ),
+        (
+            button(
+                "openHere", _("Open here"),
+                _("Place and aim the probe as the candidate says, and open the skull there, if one is labelled"),
+                approach.openHere, partial(approach.canChoose, 0),
+            ),
+            button(
+                "drawOpening", _("Draw opening"),
+                _("A closed curve around the opening, whose points you can move; then press Open skull"),
+                approach.drawOpening, partial(approach.canChoose, 0),
+            ),
         ),
     )  # fmt: skip
 

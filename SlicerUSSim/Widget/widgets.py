@@ -16,7 +16,7 @@ import slicer
 from SlicerUSSim.Widget.interface import Control, Section, by_widget, tr as _
 
 _PAGE_STEPS = 10
-_TABLE_HEIGHT, _LIST_HEIGHT = 220, 140
+_TABLE_HEIGHT, _LIST_HEIGHT, _PICTURE_SIZE = 220, 140, 110
 #: The most that a result or warning takes; the rest is scrolled
 WORDS_HEIGHT = 72
 
@@ -126,6 +126,14 @@ def _words(control: Control) -> Any:
     return result
 
 
+def _picture(control: Control) -> Any:
+    result = qt.QToolButton()
+    result.setText(control.label)
+    result.setToolButtonStyle(qt.Qt.ToolButtonTextUnderIcon)
+    result.setIconSize(qt.QSize(_PICTURE_SIZE, _PICTURE_SIZE))
+    return result
+
+
 def _scrolled(label: Any) -> Any:
     result = qt.QScrollArea()
     result.setProperty("widgetResizable", True)
@@ -163,6 +171,7 @@ _MAKERS = {
     "words": _words,
     "table": _table,
     "list": _list,
+    "picture": _picture,
 }
 
 

@@ -57,6 +57,9 @@ def control_html(control: Control) -> str:
     if control.kind == "words":
         lines = f"""v-for="line in ({key} ?? '').split('\\n')" :class="{{faint: line.includes('(not determined')}}\""""
         return f"""<div id="{name}" class="ussim-words" title="{tip}"><div {lines}>{{{{ line }}}}</div></div>"""
+    if control.kind == "picture":
+        return f"""<button class="ussim-button ussim-picture" id="{name}" v-show="{key}" title="{tip}"
+            :disabled="{disabled}" @click="trigger('press', ['{name}'])"><img :src="{key}" alt="">{label}</button>"""
     if control.kind == "table":
         return _tissue_table(control)
     return f"""<div title="{tip}">{label}<div class="ussim-free" id="{name}">

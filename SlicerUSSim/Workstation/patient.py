@@ -222,7 +222,7 @@ class OpenPatient:
             self.labels_ready()
         return is_changed
 
-    def place(self, action: Callable[[], None]) -> None:
+    def place(self, action: Callable[[], object]) -> None:
         """Run an action that places the probe, and look at it."""
         action()
         self._probe.look()

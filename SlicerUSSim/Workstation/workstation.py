@@ -106,8 +106,9 @@ class Workstation:
             segmenting.undoSegment: patient.undo_segment,
             placing.placeProbe: partial(patient.place, placing.placeProbe),
             placing.placeAtView: partial(patient.place, placing.placeAtView),
-            placing.approach: partial(patient.place, placing.approach),
         }
+        open_here = presenter.approach.openHere
+        panel.own_actions[open_here] = lambda: patient.place(lambda: patient.then_show(open_here))
         for action in (segmenting.segment, lesions.addTissues, placing.openCraniotomy, placing.closeCraniotomy):
             panel.own_actions[action] = partial(patient.then_show, action)
         self._answer_pages(stamps)

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import base64
 import html
 import io
 import os
-from collections.abc import Iterable, Sequence
 from pathlib import Path
 from string import Template
 from tempfile import TemporaryDirectory
@@ -20,7 +18,7 @@ from SlicerUSSim.Logic.fitting.optimization import AGAIN, STAGES, AppearanceResu
 from SlicerUSSim.Logic.fitting.parameters import Parameter
 from SlicerUSSim.Logic.fitting.speckle_fit import SpeckleFit
 from SlicerUSSim.Logic.fitting.texture_costs import TextureReference
-from SlicerUSSim.Logic.imaging.figures import require_matplotlib
+from SlicerUSSim.Logic.imaging.figures import data_url, html_table, png_url, require_matplotlib
 from SlicerUSSim.Logic.imaging.simulator import UltrasoundSimulator
 from SlicerUSSim.Logic.probe.poses import slice_under_probe
 from SlicerUSSim.Logic.tissue.presets import colour_of
@@ -123,8 +121,8 @@ def grey_levels_per_tissue(
 def _trio(
     number: int, real: np.ndarray, before: np.ndarray, after: np.ndarray, was, is_now, texture_was, texture
 ) -> str:
-    before_png, after_png, real_png = (_png(image) for image in (before, after, real))
-    difference = _png(np.clip(127.5 + 0.5 * (after.astype(float) - real), 0, 255).astype(np.uint8))
+    before_png, after_png, real_png = (png_url(image) for image in (before, after, real))
+    difference = png_url(np.clip(127.5 + 0.5 * (after.astype(float) - real), 0, 255).astype(np.uint8))
     caption = (
         f"Image {number}: cost {was.total:.4f} → {is_now.total:.4f} (histograms {was.bhattacharyya:.3f} → "
         f"{is_now.bhattacharyya:.3f}, difference {was.sad:.3f} → {is_now.sad:.3f}), texture T1 "
@@ -156,7 +154,7 @@ def _predicted(prediction: Prediction, reference: str) -> str:
         for source, *values in prediction.rows()
     ]
     return f"""<h2>Images that were not fitted</h2>
-{_table(heads, rows)}
+{html_table(heads, rows, own=FITTED)}
 <p class="dim">The predicted images cost {prediction.of_uniform:.2f} of what one uniform tissue without anatomy, fitted
 in the same way, costs there; {html.escape(reference)} neighbours are the images before and after in the recording. With
 texture: + T1 + T2 / 2.</p>"""
@@ -176,18 +174,7 @@ def _speckle(speckle: SpeckleFit) -> str:
     return f"""<h2>Fit of the speckle</h2>
 <p class="dim">The grey map is that of the images alone. Smoothing and texture are found by T1 + T2 / 2, and smoothing
 once more with the width of the speckle. The fit by the paper's cost began with what is below.</p>
-{_table(["step", "found"], speckle.rows(), "words")}"""
-
-
-def _table(heads: Sequence[str], rows: Iterable[Sequence[str]], kind: str = "") -> str:
-    """A table of texts; the rows of the simulated images stand out."""
-
-    def row(cells: Sequence[str], tag: str = "td") -> str:
-        shown = ' class="own"' if cells[0] == FITTED else ""
-        return f"<tr{shown}>" + "".join(f"<{tag}>{html.escape(cell)}</{tag}>" for cell in cells) + "</tr>"
-
-    body = "\n".join(row(cells) for cells in rows)
-    return f'<table class="{kind}">{row(heads, "th")}\n{body}</table>'
+{html_table(["step", "found"], speckle.rows(), "words")}"""
 
 
 def _explained(parameter: Parameter) -> str:
@@ -301,22 +288,10 @@ def _geometry(tracked: TrackedImages) -> str:
     with TemporaryDirectory() as folder:
         picture = Path(folder) / "field.png"
         draw_field(picture, whole, tracked.field)
-        return _data_url(picture.read_bytes())
-
-
-def _png(image: np.ndarray) -> str:
-    from PIL import Image
-
-    data = io.BytesIO()
-    Image.fromarray(image).save(data, "PNG", optimize=True)
-    return _data_url(data.getvalue())
+        return data_url(picture.read_bytes())
 
 
 def _figure_png(figure) -> str:
     data = io.BytesIO()
     figure.savefig(data, format="png", facecolor=_PAPER)
-    return _data_url(data.getvalue())
-
-
-def _data_url(png: bytes) -> str:
-    return "data:image/png;base64," + base64.b64encode(png).decode()
+    return data_url(data.getvalue())

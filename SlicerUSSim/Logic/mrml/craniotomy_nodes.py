@@ -77,7 +77,7 @@ def show_flap(labels_node: Any, removed: Volume) -> Any:
         name = scene.GenerateUniqueName(f"{labels_node.GetName()} removed")
         model = scene.AddNewNodeByClass("vtkMRMLModelNode", name)
         labels_node.SetNodeReferenceID(_FLAP, model.GetID())
-    model.SetAndObservePolyData(_surface(removed))
+    model.SetAndObservePolyData(surface_of(removed))
     mark_as_result(model, FLAP)
     follow_labels(labels_node)
     display = display_of(model)
@@ -113,7 +113,7 @@ def follow_labels(labels_node: Any) -> None:
         model.SetAndObserveTransformNodeID(None if parent is None else parent.GetID())
 
 
-def _surface(removed: Volume) -> Any:
+def surface_of(removed: Volume) -> Any:
     """The surface of a mask as vtkPolyData, in the frame of the mask's matrix."""
     places = np.argwhere(removed.array)
     low, high = places.min(axis=0), places.max(axis=0) + 1
@@ -124,6 +124,7 @@ def _surface(removed: Volume) -> Any:
     edges = vtkFlyingEdges3D()
     edges.SetInputData(Volume(padded, matrix).to_vtk())
     edges.SetValue(0, 0.5)
+    edges.ComputeScalarsOff()  # views would colour it by them
     smooth = vtkWindowedSincPolyDataFilter()
     smooth.SetInputConnection(edges.GetOutputPort())
     smooth.SetNumberOfIterations(12)

@@ -7,6 +7,7 @@ from typing import Any, Concatenate, Generic, ParamSpec, TypeVar, overload
 
 from SlicerUSSim.Logic.imaging.frame import Frame
 from SlicerUSSim.Logic.imaging.preset import Preset
+from SlicerUSSim.Logic.mrml.approach_logic import ApproachLogic
 from SlicerUSSim.Logic.mrml.craniotomy_nodes import hide_flap
 from SlicerUSSim.Logic.mrml.fit_logic import FitLogic
 from SlicerUSSim.Logic.mrml.grown_nodes import LesionGrowth
@@ -60,6 +61,7 @@ class UltrasoundSceneLogic:
         self.labels = SegmentLogic(patients, self.live)
         self.sequences = SequenceLogic(patients, images, self.live)
         self.fits = FitLogic(patients)
+        self.approaches = ApproachLogic(patients)
         self.parameters = patients.parameters
 
     tissues, settings = _Of("patients", PatientLogic.tissues), _Of("patients", PatientLogic.settings)
@@ -89,6 +91,9 @@ class UltrasoundSceneLogic:
     sequenceIsOfTissues = _Of("sequences", SequenceLogic.sequenceIsOfTissues)
     optimize, applyFit = _Of("fits", FitLogic.optimize), _Of("fits", FitLogic.applyFit)
     revertFit, writeRegistration = _Of("fits", FitLogic.revertFit), _Of("fits", FitLogic.writeRegistration)
+    planApproach = _Of("approaches", ApproachLogic.planApproach)
+    showApproach = _Of("approaches", ApproachLogic.showApproach)
+    hideApproach = _Of("approaches", ApproachLogic.hideApproach)
     showFit, showFitInSlice = _Of("fits", FitLogic.showFit), _Of("fits", FitLogic.showFitInSlice)
 
     @property

@@ -23,6 +23,8 @@ MODULE_NAME = "USSim"
 #: Choices of PanelSettings.lesion_size, and one of lesion_as
 SMALLER, LARGER = "smaller", "larger"
 BY_LOOK = "by its look"
+#: Choices of PanelSettings.target besides tissues
+LARGEST, POINT = "largest lesion", "a point"
 _OWNER = "scene"
 S = TypeVar("S", bound=Declared)
 
@@ -57,6 +59,10 @@ class PanelSettings(Declared):
     lesion_size: str = parameter(
         SMALLER, "Lesion size", "smaller: to half of its contrast; larger: to the foot of its border, up to 3 mm "
         "farther out", choices=(SMALLER, LARGER), shown=True,
+    )  # fmt: skip
+    target: str = parameter(
+        LARGEST, "Target", "What Plan looks for a way to: the largest lesion, that of a tissue, or a point that is "
+        "clicked in a slice view", choices=(LARGEST, *LESION_TISSUES, POINT), shown=True,
     )  # fmt: skip
     view: str = parameter(
         next(iter(VIEWS)), "Standard view", "; ".join(f"{name}: {view.tip}" for name, view in VIEWS.items()),

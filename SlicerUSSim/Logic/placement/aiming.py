@@ -45,7 +45,7 @@ def opening_pose(
     if seen:
         place, name = seen[0]
         angle = _off_axis_deg(pose, place)
-        return _on_surface(aimed_at(pose, place), pose, probe, surface), (
+        return on_surface(aimed_at(pose, place), pose, probe, surface), (
             f"aimed at the {name}, {angle:.0f} degrees off the surface's normal"
         )
     place, name = min(targets, key=lambda target: _off_axis_deg(pose, target[0]))
@@ -58,8 +58,25 @@ def opening_pose(
     )
 
 
+def largest_lesion(labels: Volume, names: Sequence[str]) -> tuple[str, np.ndarray] | None:
+    """(its most frequent tissue, (k, j, i) bool) of the largest lesion in labels; None without one."""
+    for box, where, tissue in _parts(labels, names):
+        inside = np.zeros(labels.array.shape, bool)
+        inside[box] = where
+        return tissue, inside
+    return None
+
+
 def _lesions(labels: Volume, names: Sequence[str]) -> list[tuple[np.ndarray, str]]:
     """((3,) RAS mm of the innermost voxel, most frequent tissue) of the lesions in labels, the largest first."""
+    return [
+        (innermost_ras(where, labels, [part.start for part in box]), tissue)
+        for box, where, tissue in _parts(labels, names)
+    ]
+
+
+def _parts(labels: Volume, names: Sequence[str]) -> list[tuple[tuple[slice, ...], np.ndarray, str]]:
+    """(box, (k, j, i) bool in it, most frequent tissue) of the lesions in labels, the largest first."""
     for group in LESION_GROUPS:
         parts, _ = ndimage.label(np.isin(labels.array, labels_of(names, group)))  # type: ignore[misc]
         if ENHANCING in group:
@@ -71,7 +88,7 @@ def _lesions(labels: Volume, names: Sequence[str]) -> list[tuple[np.ndarray, str
             box = boxes[number]
             where = parts[box] == number + 1
             tissue = names[int(np.bincount(labels.array[box][where]).argmax()) - 1]
-            found.append((innermost_ras(where, labels, [part.start for part in box]), tissue))
+            found.append((box, where, tissue))
         if found:
             return found
     return []
@@ -96,7 +113,7 @@ def _off_axis_deg(pose: np.ndarray, place: np.ndarray) -> float:
     return float(np.rad2deg(np.arctan2(np.linalg.norm(np.cross(pose[:3, 1], way)), pose[:3, 1] @ way)))
 
 
-def _on_surface(turned: np.ndarray, upright: np.ndarray, probe: Probe, surface: PatientSurface) -> np.ndarray:
+def on_surface(turned: np.ndarray, upright: np.ndarray, probe: Probe, surface: PatientSurface) -> np.ndarray:
     """A turned probe, drawn back along its axis so that no edge of its face is pressed into the surface."""
     allowed, pose = max(_PRESSED_MM, _pressed_mm(upright, probe, surface)), turned.copy()
     for _ in range(4):  # the surface is curved

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, cast
 
 import numpy as np
@@ -82,18 +83,28 @@ class PatientSurface:
         self._locator.SetDataSet(self.polydata)
         self._locator.BuildLocator()
         progress(0.8)
-        #: The same surface with fewer triangles, for rendering without a GPU
-        self.coarse_polydata: vtkPolyData = _with_fewer_triangles(self.polydata)
         low, high = points.min(axis=0), points.max(axis=0)
         #: (3,) the middle of the patient's bounding box, the origin of angles()
         self.centre = 0.5 * (low + high)
         self._radius = float(np.linalg.norm(high - low))
+
+    @cached_property
+    def coarse_polydata(self) -> vtkPolyData:
+        """The same surface with fewer triangles, for rendering without a GPU; it takes as long as the rest."""
+        return _with_fewer_triangles(self.polydata)
 
     def nearest(self, point) -> np.ndarray:
         """(3,) the point of the surface closest to `point`."""
         closest, cell, part, distance = [0.0, 0.0, 0.0], _written(0), _written(0), _written(0.0)
         self._locator.FindClosestPoint(list(map(float, point)), closest, cell, part, distance)
         return np.array(closest)
+
+    def distances_mm(self, points, at_most_mm: float = np.inf) -> np.ndarray:
+        """(n,) distances of (n, 3) points to the nearest corners of the surface's triangles, which are 2 mm wide.
+
+        Those that are larger than `at_most_mm` are inf, which takes less time.
+        """
+        return self._tree.query(points, distance_upper_bound=at_most_mm)[0]
 
     def hit(self, start, end) -> np.ndarray | None:
         """(3,) the first intersection of the line from `start` to `end` with the surface, or None."""
