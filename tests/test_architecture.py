@@ -45,7 +45,7 @@ HEAVY = {
 BUDGETS = {
     "base": 3350, "opencl": 1305, "probe": 1690, "tissue": 2070, "tracked": 1935, "mri": 7470, "placement": 845,
     "imaging": 5350, "fitting": 3695, "vtk": 505, "mrml": 4780, "Widget": 3045, "Workstation": 5795, "Command": 2835,
-    "module": 430, "validation": 6630, "benchmarks": 3805, "tests": 28845, "tests/reference": 505,
+    "module": 430, "validation": 6630, "benchmarks": 3805, "tests": 28855, "tests/reference": 505,
 }  # fmt: skip
 #: Lines of all of SlicerUSSim/, and of kernels/
 LARGEST_PRODUCT, LARGEST_KERNELS = 45_060, 5_840
