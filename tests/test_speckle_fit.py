@@ -66,11 +66,18 @@ def test_smoothing_and_texture_are_found_by_the_costs_of_texture(tracked):
     assert found.display.smoothing_lateral_deg == pytest.approx(0.5, abs=0.25)
     assert found.texture_factor in (0.5, 1.0, 1.4)  # not 0: the true tissue is uneven
     depths, display = (15.0, 23.0, 32.0, 41.0), replace(found.display, image_size=TRUE.image_size)
-    real, misfits = speckle_widths(tracked[1].images, PROBE, tracked[1].grid, depths), []
-    for seed in range(2, 6):  # the true parameters have 0.06, by chance from 0.02 to 0.09
-        images = [simulator(found.tissues, seed).simulate(PROBE, pose, display).image for pose in tracked[1].poses]
-        misfits.append(width_misfit(speckle_widths(images, PROBE, tracked[1].grid, depths), real))
-    assert np.mean(misfits) < 0.07
+    real = speckle_widths(tracked[1].images, PROBE, tracked[1].grid, depths)
+
+    def misfit(tissues: TissueTable, display: DisplaySettings) -> float:
+        """Mean over four seeds: single ones of the truth have 0.02 to 0.09."""
+        images = [
+            [simulator(tissues, seed).simulate(PROBE, pose, display).image for pose in tracked[1].poses]
+            for seed in range(2, 6)
+        ]
+        return float(np.mean([width_misfit(speckle_widths(i, PROBE, tracked[1].grid, depths), real) for i in images]))
+
+    assert misfit(found.tissues, display) < misfit(TISSUES, TRUE) + 0.02
+    assert misfit(TISSUES, replace(PLAIN, image_size=TRUE.image_size)) > misfit(TISSUES, TRUE) + 0.1
     unlike = [replace(width, lateral_mm=1.2 * width.lateral_mm) for width in real]
     assert width_misfit(unlike, real) == pytest.approx(0.5 * np.log(1.2))
     unknown = [replace(width, axial_mm=np.nan, lateral_mm=np.nan) for width in real]
