@@ -50,7 +50,7 @@ BUDGETS = {
     "base": 3360, "opencl": 1325, "probe": 1755, "tissue": 2065, "tracked": 2230, "mri": 7470, "placement": 1310,
     "imaging": 5665, "device": 595, "datasets": 1630, "fitting": 3675, "vtk": 505, "mrml": 4920, "Widget": 3420,
     "Workstation": 5855, "Command": 3120, "gym": 140, "module": 430, "validation": 6620, "benchmarks": 4055,
-    "tests": 30915, "tests/reference": 505,
+    "tests": 30920, "tests/reference": 505,
 }  # fmt: skip
 #: Lines of all of SlicerUSSim/, and of kernels/
 LARGEST_PRODUCT, LARGEST_KERNELS = 49_430, 5_880
