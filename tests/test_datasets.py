@@ -221,8 +221,15 @@ def test_images_of_a_set_are_those_that_its_parameters_say(plain, folder):
 
 def test_every_output_is_of_the_images_pixels_or_lines(folder, tmp_path):
     names = "image labels depth iq rf envelope bmode clean attenuation travel_time walls"
-    made = recipe(folder, '[pose]\non = "surface"\n', outputs=names, format_="hdf5")
+    more = '[pose]\non = "surface"\n'
+    made = recipe(folder, more, outputs=names, format_="hdf5")
     making_module.prepare(made, 0, tmp_path)
+    with pytest.raises(SimulationError, match="rf has 2.0 samples per cycle, .* quality full"):
+        render(made, tmp_path, 1)
+    text = START.replace("draft", "full").format(
+        outputs=", ".join(f'"{name}"' for name in names.split()), format="hdf5", file="brain.nii.gz"
+    )
+    made = Recipe.of_text(text + more, "r.toml", folder)
     arrays, _ = render(made, tmp_path, 1)
     assert set(arrays) == {*names.split(), "pose", "image_to_probe"}
     inside = np.isfinite(arrays["depth"])

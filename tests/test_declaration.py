@@ -331,7 +331,7 @@ def test_a_rare_parameter_is_a_key_of_set_and_preset(tmp_path):
     """An image took 36 options, and a fit 56; a tenth of them is used often."""
     for name, command in main.commands.items():
         said = ussim(name, "--help").output
-        assert len(re.findall(r"^  -", said, re.MULTILINE)) <= 25, name
+        assert len(re.findall(r"^  -", said, re.MULTILINE)) <= 26, name
         assert all(known in " ".join(said.split()) for known in rare_keys(command))
     assert "Gain [dB]: brightness of all echoes (default: the preset's, 0)." in " ".join(
         ussim("simulate", "--help").output.split()

@@ -161,8 +161,12 @@ def fetched(name: str, frame: DeviceFrame, pose: np.ndarray, samples: int) -> Ca
     signal = frame.start_download(OUTPUTS[name][1])
     if name == "rf":
         record = frame.acquisition
-        cycles = np.arange(samples) * float(record["sample_mm"]) * float(record["cycles_per_mm"])
-        carrier = np.exp(2j * np.pi * cycles).astype(np.complex64)
+        cycles = float(record["sample_mm"]) * float(record["cycles_per_mm"])
+        require(
+            cycles < 0.45,
+            f"rf has {1 / cycles:.1f} samples per cycle, expected more than 2.2; take iq, or quality full",
+        )
+        carrier = np.exp(2j * np.pi * cycles * np.arange(samples)).astype(np.complex64)
         return lambda: (signal()[:, :samples] * carrier).real
     return signal if name == "image" else lambda: signal()[:, :samples]
 
