@@ -63,9 +63,8 @@ def test_a_batch_has_the_bits_of_single_images(made, quality, varied):
     own = made.medium.tissues
     tables = [own, own.replace("speckle", mu0=0.5), own] if varied else None
     try:
-        found = made.simulate_batch(
-            probes, POSES, display=displays, tissues=tables, outputs=list(OUTPUTS), noise_seed=7
-        )
+        outputs = [name for name in OUTPUTS if (name, quality) != ("rf", "draft")]
+        found = made.simulate_batch(probes, POSES, display=displays, tissues=tables, outputs=outputs, noise_seed=7)
         assert made.medium.tissues == own
         for n, pose in enumerate(POSES):
             probe, display = (probes[n], displays[n]) if varied else (probes, displays)
@@ -76,7 +75,7 @@ def test_a_batch_has_the_bits_of_single_images(made, quality, varied):
             np.testing.assert_array_equal(found["labels"][n], frame.labels())
     finally:
         made.settings = before
-    assert {name: array.dtype for name, array in found.items()} == {name: OUTPUTS[name][0] for name in OUTPUTS}
+    assert {name: array.dtype for name, array in found.items()} == {name: OUTPUTS[name][0] for name in outputs}
 
 
 def test_labels_and_depth_are_those_of_the_places_of_the_pixels(made):

@@ -6,6 +6,7 @@ import os
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from functools import lru_cache
+from operator import index
 from typing import Any
 
 import numpy as np
@@ -50,6 +51,21 @@ def one_per_image(name: str, given: Any, kind: type, count: int) -> list:
     return values
 
 
+def seeds_of(noise_seed: int | Sequence[int], count: int) -> list[int]:
+    """The seed of every image. Raises SimulationError for other than a number, or one for each, from 0 to 2**32 - 1."""
+    try:
+        first = index(noise_seed)  # type: ignore[arg-type]
+    except TypeError:
+        seeds = [index(seed) for seed in noise_seed] if isinstance(noise_seed, Sequence | np.ndarray) else []
+    else:
+        seeds = list(range(first, first + count))
+    require(
+        len(seeds) == count and all(0 <= seed < 2**32 for seed in seeds),
+        f"noise_seed is {noise_seed!r:.60}, expected a whole number from 0, or one for each of {count} poses",
+    )
+    return seeds
+
+
 def same_shapes(shapes: Sequence[tuple]) -> tuple:
     """The shape of all images. Raises SimulationError that names the first of another shape."""
     other = next((number for number, shape in enumerate(shapes) if shape != shapes[0]), None)
@@ -69,19 +85,22 @@ def arrays_for(
 
     Raises SimulationError for unknown outputs, for an `out` of another shape or type, and if neither has room.
     """
+    require(not isinstance(outputs, str), f"outputs are {outputs!r}, expected a list such as [{outputs!r}]")
     for name in outputs:
         require(name in OUTPUTS, f"output {name!r} is unknown, expected some of {', '.join(OUTPUTS)}")
     shapes = {name: (count, *(pixels if OUTPUTS[name][2] else lines)) for name in outputs}
     if out is not None:
         require(
             isinstance(out, Mapping) and set(out) == set(outputs),
-            f"out has {', '.join(map(str, out))}, expected a dict with an array for each of {', '.join(outputs)}",
+            f"out is {list(out) if isinstance(out, Mapping) else type(out).__name__}, expected a dict with an array "
+            f"for each of {', '.join(outputs)}",
         )
         for name, array in out.items():
             kind = np.dtype(OUTPUTS[name][0])
             is_right = isinstance(array, np.ndarray) and (array.shape, array.dtype) == (shapes[name], kind)
             found = f"{_times(array.shape)} {array.dtype}" if isinstance(array, np.ndarray) else type(array).__name__
             require(is_right, f"out[{name!r}] is {found}, expected {_times(shapes[name])} {kind}")
+            require(array.flags.writeable, f"out[{name!r}] is read-only, expected an array that can be written")
         return dict(out)
     size = sum(int(np.prod(shapes[name])) * np.dtype(OUTPUTS[name][0]).itemsize for name in outputs)
     make = _filed if size > _MOST_OF_MEMORY * free_memory() else np.empty

@@ -74,7 +74,10 @@ class Frame:
 
     @cached_property
     def rf(self) -> np.ndarray:
-        """(scan_lines, samples) complex64 analytic RF signal; its real part is the sampled echo signal."""
+        """(scan_lines, samples) complex64 analytic RF signal; its real part is the sampled echo signal.
+
+        A draft has two samples per cycle, which cannot hold it: take `iq`, or quality "full".
+        """
         depth = np.arange(self.iq.shape[1]) * self.sample_interval_mm
         return self.iq * np.exp(2j * np.pi * self.cycles_per_mm * depth).astype(np.complex64)
 
@@ -94,8 +97,10 @@ class Frame:
         return self.grid.image_to_probe
 
     def labels(self) -> np.ndarray:
-        """(rows, columns) tissue labels of the patient in the image plane, at the places of the pixels; 0 outside the
-        imaged field. Where refraction and travel time put them is labels_as_imaged of simulate_batch.
+        """(rows, columns) tissue labels of the patient in the image plane, at the places of the pixels.
+
+        They are 0 outside the imaged field and the patient's volume; `simulator.medium.tissues.names_by_label()` has
+        their names. Where refraction and travel time put them is labels_as_imaged of simulate_batch.
 
         Raises SimulationError for a frame without its probe and patient.
         """

@@ -23,7 +23,7 @@ from SlicerUSSim.Logic.base.transforms import check_rigid
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.imaging import stages
 from SlicerUSSim.Logic.imaging.aperture import Aperture, aperture_fields
-from SlicerUSSim.Logic.imaging.batch import OUTPUTS, arrays_for, fetched, one_per_image, same_shapes
+from SlicerUSSim.Logic.imaging.batch import OUTPUTS, arrays_for, fetched, one_per_image, same_shapes, seeds_of
 from SlicerUSSim.Logic.imaging.bmode import downshift, log_band_above, pulse_taps
 from SlicerUSSim.Logic.imaging.compounding import Compounder, sweep_grid
 from SlicerUSSim.Logic.imaging.contact import line_contact
@@ -196,6 +196,7 @@ class UltrasoundSimulator:
         whole number of 32 bits.
         """
         require_kind("probe", probe, Probe, "a ConvexProbe, LinearProbe or PhasedProbe")
+        require_kind("display", display or DisplaySettings(), DisplaySettings)
         pose = check_rigid("probe_to_ras", probe_to_ras)
         self.warn_if_slow(probe)
         timings: dict[str, float] = {}
@@ -277,7 +278,7 @@ class UltrasoundSimulator:
                 ("settings", settings or self.settings, SimulationSettings),
             )
         )  # fmt: skip
-        noise_seeds = range(noise_seed, noise_seed + len(poses)) if isinstance(noise_seed, int) else noise_seed
+        noise_seeds = seeds_of(noise_seed, len(poses))
         grids = [
             ImageGrid.for_probe(probe, shown and shown.image_size)
             for probe, shown in zip(probes, displays, strict=True)

@@ -27,7 +27,7 @@ from vtkmodules.vtkCommonMath import vtkMatrix4x4
 from vtkmodules.vtkCommonTransforms import vtkLinearTransform, vtkMatrixToLinearTransform, vtkTransform
 from vtkmodules.vtkFiltersGeneral import vtkTransformPolyDataFilter
 
-from SlicerUSSim.Logic.base.errors import Cancelled, SimulationError, require, user_message
+from SlicerUSSim.Logic.base.errors import Cancelled, SimulationError, require, require_kind, user_message
 from SlicerUSSim.Logic.base.settings import DisplaySettings, SimulationSettings
 from SlicerUSSim.Logic.base.transforms import check_rigid
 from SlicerUSSim.Logic.base.volume import Volume
@@ -161,6 +161,7 @@ class SegmentationFilter(_ImageFilter):
 
     def SetSettings(self, settings: SegmentationSettings) -> None:
         """What is segmented and how; by default what SegmentationSettings has."""
+        require_kind("settings", settings, SegmentationSettings)
         self._change("_settings", settings)
 
     GetSettings = _getter("_settings", "The SegmentationSettings.")
@@ -308,6 +309,7 @@ class UltrasoundSimulationFilter(_ImageFilter):
 
     def SetProbe(self, probe: Probe) -> None:
         """A LinearProbe, ConvexProbe or PhasedProbe."""
+        require_kind("probe", probe, Probe, "PROBES has typical ones")
         if probe != self._probe:
             self._placed_outline.SetInputData(outline_polydata(probe))
         self._change("_probe", probe)
@@ -340,15 +342,18 @@ class UltrasoundSimulationFilter(_ImageFilter):
 
     def SetTissues(self, tissues: TissueTable) -> None:
         """Acoustic parameters of the labels; default: presets of the brain, for labels that have names or are known."""
+        require_kind("tissues", tissues, TissueTable, "TissueTable.brain makes one")
         self._change("_tissues", tissues)
         self._change("_are_numbered", True)
 
     def SetSettings(self, settings: SimulationSettings) -> None:
         """Settings of the physical model."""
+        require_kind("settings", settings, SimulationSettings)
         self._change("_settings", settings)
 
     def SetDisplay(self, display: DisplaySettings) -> None:
         """Gain, dynamic range, time gain compensation, noise, image size."""
+        require_kind("display", display, DisplaySettings)
         self._change("_display", display)
 
     def SetPreset(self, preset: Preset) -> None:
@@ -363,7 +368,7 @@ class UltrasoundSimulationFilter(_ImageFilter):
         return Preset(self._probe, self._display, self._settings, self._tissues)
 
     def SetTexture(self, texture: Texture | None) -> None:
-        """Texture from the MRI (Segmentation.texture), for settings that use it."""
+        """Texture from the MRI (Segmentation.texture), which UltrasoundSimulator.from_mri also takes; default: none."""
         self._change("_texture", texture)
 
     def SetSheetsData(self, surface: vtkPolyData | None) -> None:
@@ -380,8 +385,8 @@ class UltrasoundSimulationFilter(_ImageFilter):
         self._change("_field_alpha", bool(on))
 
     def GetFrame(self) -> Frame | None:
-        """The frame of the last update: RF, envelope, image, pose."""
-        return self._frame
+        """The frame of the last update: RF, envelope, image, pose; None after an error."""
+        return self._frame if self.GetOutput().GetNumberOfPoints() else None
 
     def GetPicture(self) -> vtkImageData:
         """The image, updated, for vtkPNGWriter and other writers of pictures: its last row first, without its place.
@@ -389,7 +394,7 @@ class UltrasoundSimulationFilter(_ImageFilter):
         Empty after an error of the update.
         """
         self.Update()
-        picture, frame = vtkImageData(), self._frame
+        picture, frame = vtkImageData(), self.GetFrame()
         if frame is not None:
             picture.SetDimensions(frame.grid.columns, frame.grid.rows, 1)
             picture.SetSpacing(*frame.pixel_spacing_mm, 1.0)
