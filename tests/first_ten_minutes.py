@@ -148,7 +148,7 @@ def main(head_file: Path) -> None:
     presenter.logic.preset = preset
     nodes.real = real
     presenter.values.setValue("scene.fit_free", "gain_db")
-    presenter.values.setValue("scene.fit_evaluations", 20)
+    presenter.values.setValue("scene.fit_evaluations", 60)
     with step("fit"):
         presenter.fits.fit()
         presenter.fits.apply()

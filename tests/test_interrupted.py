@@ -36,7 +36,7 @@ def test_an_interrupted_fit_leaves_nothing_half_done(tmp_path):
     inputs = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
     command = (
         "optimize labels.nii.gz --sequence tracked.igs.mha --probe probe.json --free gain_db "
-        "--set fit.restarts=0 --set fit.evaluations=1000 -o out.json"
+        "--set fit.restarts=0 --set fit.evaluations=100000 -o out.json"
     )
     process = subprocess.Popen(
         [sys.executable, "-m", "SlicerUSSim.Command", *command.split()], cwd=tmp_path, text=True,

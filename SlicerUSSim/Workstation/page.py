@@ -291,7 +291,8 @@ def _player() -> str:
       <span id="sequence-text">Real {{{{ {sequence.name} }}}} ({{{{ {sequence.numbers} }}}})</span>
       <span role="group" aria-label="Comparison" id="comparison">{modes}</span>
       <span id="similarity" title="Cost of the paper for the simulated and the real image; 0 if they are equal">
-      {{{{ {sequence.is_elsewhere} ? 'the probe is not at this image' : {sequence.similarity} }}}}</span></div>
+      {{{{ {sequence.similarity} && {sequence.is_elsewhere} ? 'the probe is not at this image'
+      : {sequence.similarity} }}}}</span></div>
     <div class="ussim-bar" id="cine-none" v-if="{cine.length} === 1 && {NAMES.image.status} === 'FROZEN'">
       No cine: in the last 10 s nothing moved, or depth or probe changed</div>
     <div class="ussim-bar" id="cine" v-if="{cine.length} > 1 && {NAMES.image.status} === 'FROZEN'">
