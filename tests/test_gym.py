@@ -61,11 +61,11 @@ def test_a_seed_repeats_an_episode_and_steps_end_it(patient):
 def test_environments_are_vectorised_and_registered(patient):
     import SlicerUSSim.gym
 
-    assert SlicerUSSim.gym.FindView.__module__ == "SlicerUSSim.gym.find_view"
     many = gymnasium.make_vec("SlicerUSSim/FindView-v0", num_envs=2, simulator=patient, image_size=SIZE)
     images, _ = many.reset(seed=1)
     assert images.shape == (2, *SIZE, 1) and (images[0] != images[1]).any()
     assert many.step(many.action_space.sample())[1].shape == (2,)
+    assert SlicerUSSim.gym.FindView.__module__ == "SlicerUSSim.gym.find_view"
 
 
 def test_what_makes_no_environment_is_said(patient):

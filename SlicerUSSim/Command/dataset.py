@@ -10,6 +10,7 @@ import click
 
 from SlicerUSSim.Command.options import device_option, out_option
 from SlicerUSSim.Command.progress import Share, note
+from SlicerUSSim.Logic.base.errors import require
 
 if TYPE_CHECKING:
     from SlicerUSSim.Logic.datasets import Made
@@ -53,6 +54,12 @@ def dataset(
     if device is not None:
         os.environ["USSIM_DEVICE"] = device  # workers have it, too
     read = Recipe.read(recipe)
+    if export is not None:
+        outputs, can = read.settings.outputs, read.settings.format in ("zarr", "hdf5")
+        require(
+            can and "image" in outputs and any(name.startswith("labels") for name in outputs),
+            f"{recipe}: --export needs the outputs image and labels, and the format zarr or hdf5",
+        )
     note(f"{recipe}: {read.settings.images} images of {len(read.cases)} cases in {read.shards} shards of {read.shard}")
     with _Rate("dataset") as progress:
         made = make_dataset(read, out, scheduler=scheduler, workers=workers, progress=progress)

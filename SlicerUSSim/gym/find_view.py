@@ -121,6 +121,3 @@ def _scene(simulator: UltrasoundSimulator, view: str) -> tuple[PatientSurface, n
     labels, names = simulator.medium.labels, simulator.medium.tissues.names_by_label()
     pose = craniotomy_pose(labels, PROBES["phased"]) if view == "craniotomy" else view_pose(labels, names, view)[0]
     return PatientSurface(labels), pose
-
-
-gymnasium.register("SlicerUSSim/FindView-v0", entry_point="SlicerUSSim.gym.find_view:FindView")

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import logging
 import os
+import signal
+import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import CancelledError
 from contextlib import contextmanager, nullcontext, suppress
@@ -215,6 +217,18 @@ def _on_dask(
 
 
 @contextmanager
+def _without_interrupts() -> Iterator[None]:
+    """Processes that begin here ignore Ctrl-C, which a terminal sends to all: this process hears it and ends them."""
+    is_main = threading.current_thread() is threading.main_thread()
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN) if is_main else None
+    try:
+        yield
+    finally:
+        if is_main:
+            signal.signal(signal.SIGINT, before or signal.SIG_DFL)
+
+
+@contextmanager
 def _client(scheduler: str | None, workers: int) -> Iterator[Any]:
     """A client of the scheduler, or of new processes on this computer, each with its part of the cores."""
     require_package("distributed", EXTRA, "more than one process")
@@ -225,11 +239,12 @@ def _client(scheduler: str | None, workers: int) -> Iterator[Any]:
     if scheduler is None:
         config.set({"distributed.nanny.pre-spawn-environ.MALLOC_ARENA_MAX": 2})  # or workers keep what they freed
         cores = str(max((os.cpu_count() or 1) // workers, 1))
-        cluster = LocalCluster(
-            n_workers=workers, threads_per_worker=1, memory_limit=0, dashboard_address="127.0.0.1:0",  # type: ignore
-            env=dict.fromkeys(("POCL_CPU_MAX_CU_COUNT", "POCL_MAX_PTHREAD_COUNT", "OMP_NUM_THREADS"), cores),
-            silence_logs=logging.CRITICAL,
-        )  # fmt: skip
+        with _without_interrupts():
+            cluster = LocalCluster(
+                n_workers=workers, threads_per_worker=1, memory_limit=0, dashboard_address="127.0.0.1:0",  # type: ignore
+                env=dict.fromkeys(("POCL_CPU_MAX_CU_COUNT", "POCL_MAX_PTHREAD_COUNT", "OMP_NUM_THREADS"), cores),
+                silence_logs=logging.CRITICAL,
+            )  # fmt: skip
         client = Client(cluster)
     else:
         where: dict[str, Any] = {"address": scheduler} if "://" in scheduler else {"scheduler_file": scheduler}

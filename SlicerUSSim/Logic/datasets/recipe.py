@@ -192,7 +192,7 @@ class Recipe:
         require(
             all(a < b for a, b in zip(starts, ends, strict=True)),
             f"{self.settings.images} images are {self.shards} shards for {len(ends)} patients with their lesions, "
-            "expected one for each at least; lower shard, or make more images",
+            "expected one for each at least; make more images, or lower shard or lesions.each",
         )
         return tuple(Case(n, n // self._variants, *both) for n, both in enumerate(zip(starts, ends, strict=True)))
 
@@ -222,6 +222,11 @@ class Recipe:
     def lesion(self, case: Case) -> dict[str, Any]:
         """The drawn values of the lesion of a case."""
         return self._of_section("lesions", case.number)
+
+    def drawn_for_many(self, probe: int, case: Case) -> dict[str, Any]:
+        """{"section.name": value} of a probe and a lesion, which several images have."""
+        values = {"probe": self._of_section("probe", probe), "lesions": self.lesion(case)}
+        return {f"{section}.{name}": value for section in values for name, value in values[section].items()}
 
     def _of_section(self, section: str, number: int) -> dict[str, Any]:
         return {
@@ -276,10 +281,11 @@ class _Reader:
         require((pose.on in ("path", "sequence")) == bool(pose.file), f"{self.at('pose', 'on')}: {needs}")
         lesions = lesions if "lesions" in self.values else None
         made = Recipe(settings, found, tuple(segmentations), pose, lesions, self.draws, self.text, self.folder)
-        try:
-            assert made.probes and made.cases  # what cannot be is said here
-        except SimulationError as error:
-            raise SimulationError(f"{self.at('probe')}: {error}") from None
+        for key, what in (("probe", "probes"), ("images", "cases")):
+            try:
+                getattr(made, what)  # what cannot be is said here
+            except SimulationError as error:
+                raise SimulationError(f"{self.at(key)}: {error}") from None
         return made
 
     def check_outputs(self, settings: SetSettings) -> None:

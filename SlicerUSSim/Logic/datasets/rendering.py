@@ -77,7 +77,8 @@ class _Shot:
     def of(cls, made: Scene, number: int, drawn: dict[str, Any]) -> _Shot:
         probe, display = made.recipe.probes[drawn["probe"]], section_of(DisplaySettings(), drawn, "display")
         tissues, values = made.tissues(number)
-        parameters = {"image": number, **drawn, **values}
+        of_many = made.recipe.drawn_for_many(drawn["probe"], made.case)
+        parameters = {"image": number, **drawn, **of_many, **values}
         return cls(number, probe, made.pose(number, drawn), display, made.settings(drawn), tissues, parameters)
 
     @property
