@@ -50,16 +50,15 @@ def dataset(
     if a patient was left out.
     """
     from SlicerUSSim.Logic.datasets import Recipe, export_coco, export_nnunet, make_dataset
+    from SlicerUSSim.Logic.datasets.exports import labels_to_export
 
     if device is not None:
         os.environ["USSIM_DEVICE"] = device  # workers have it, too
     read = Recipe.read(recipe)
-    if export is not None:
-        outputs, can = read.settings.outputs, read.settings.format in ("zarr", "hdf5")
-        require(
-            can and "image" in outputs and any(name.startswith("labels") for name in outputs),
-            f"{recipe}: --export needs the outputs image and labels, and the format zarr or hdf5",
-        )
+    if export is not None:  # before hours of work
+        labels_to_export(read.settings.outputs, recipe)
+        kind = read.settings.format
+        require(kind in ("zarr", "hdf5"), f"{recipe}: the format is {kind}, expected zarr or hdf5 to export the set")
     note(f"{recipe}: {read.settings.images} images of {len(read.cases)} cases in {read.shards} shards of {read.shard}")
     with _Rate("dataset") as progress:
         made = make_dataset(read, out, scheduler=scheduler, workers=workers, progress=progress)

@@ -51,14 +51,9 @@ class Registration:
         return SequenceRecord(sequence, Path(path).name.split(".")[0])
 
     @property
-    def is_waiting(self) -> bool:
-        """Whether there is a recording whose place in the patient is not known yet."""
-        return self.recording is not None and self._logic.parameters.real is None
-
-    @property
     def doubt(self) -> str:
         """What is assumed or not known of the recording's place, or ""."""
-        if self.is_waiting:
+        if self.recording is not None and self._logic.parameters.real is None:
             return "The real ultrasound is not calibrated: its place in the patient is not known"
         is_assumed = self.recording is not None and not self._from[_REGISTRATION]
         return "The real ultrasound is not registered: its frame is taken for the patient's" if is_assumed else ""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Collection
 from pathlib import Path
 
 import numpy as np
@@ -46,8 +47,7 @@ def export_coco(folder: str | os.PathLike) -> Path:
 
 def _run_lengths(mask: np.ndarray) -> list[int]:
     """Lengths of runs of 0 and 1 by columns, beginning with 0, as COCO has them."""
-    flat = np.concatenate([[0], mask.T.ravel().astype(np.int8)])
-    changes = np.flatnonzero(np.diff(flat))
+    changes = np.flatnonzero(np.diff(mask.T.ravel().astype(np.int8), prepend=0))
     return np.diff(np.concatenate([[0], changes, [mask.size]])).tolist()
 
 
@@ -73,6 +73,11 @@ def export_nnunet(folder: str | os.PathLike) -> Path:
 
 def _opened(folder: str | os.PathLike, name: str) -> tuple[SimulatedImages, str, Path]:
     images = SimulatedImages(folder)
-    labels = next((each for each in _LABELS if each in images.outputs), None)
-    require("image" in images.outputs and labels, f"{folder}: has no images with labels, expected both to export them")
-    return images, str(labels), make_folder(Path(folder) / name)
+    return images, labels_to_export(images.outputs, str(folder)), make_folder(Path(folder) / name)
+
+
+def labels_to_export(outputs: Collection[str], where: str) -> str:
+    """Which of a set's outputs are exported as labels. Raises SimulationError without labels or images."""
+    labels = next((each for each in _LABELS if each in outputs), None)
+    require("image" in outputs and labels, f"{where}: has no images with labels, expected both to export them")
+    return str(labels)

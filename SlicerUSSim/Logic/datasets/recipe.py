@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from SlicerUSSim.Logic.base.declaration import Declared, Parameter, built, parameter, parameters_of, short
-from SlicerUSSim.Logic.base.errors import SimulationError, either, require, require_package
+from SlicerUSSim.Logic.base.errors import SimulationError, about_file, either, require, require_package
 from SlicerUSSim.Logic.base.files import read_text
 from SlicerUSSim.Logic.datasets.draws import Draw, generator
 from SlicerUSSim.Logic.imaging.preset import Preset, preset_parameters
@@ -282,10 +282,8 @@ class _Reader:
         lesions = lesions if "lesions" in self.values else None
         made = Recipe(settings, found, tuple(segmentations), pose, lesions, self.draws, self.text, self.folder)
         for key, what in (("probe", "probes"), ("images", "cases")):
-            try:
+            with about_file(self.at(key)):
                 getattr(made, what)  # what cannot be is said here
-            except SimulationError as error:
-                raise SimulationError(f"{self.at(key)}: {error}") from None
         return made
 
     def check_outputs(self, settings: SetSettings) -> None:

@@ -15,7 +15,7 @@ from SlicerUSSim.Logic.datasets.draws import generator
 from SlicerUSSim.Logic.datasets.placed import Scene, scene, section_of
 from SlicerUSSim.Logic.datasets.prepared import CLASSES, OTHER
 from SlicerUSSim.Logic.datasets.recipe import Recipe
-from SlicerUSSim.Logic.imaging.batch import OUTPUTS as SIMULATED
+from SlicerUSSim.Logic.imaging.batch import OUTPUTS as SIMULATED, lines_of_pixels
 from SlicerUSSim.Logic.probe.arrays import Probe
 from SlicerUSSim.Logic.probe.image_grid import ImageGrid
 from SlicerUSSim.Logic.probe.poses import slice_under_probe
@@ -77,8 +77,7 @@ class _Shot:
     def of(cls, made: Scene, number: int, drawn: dict[str, Any]) -> _Shot:
         probe, display = made.recipe.probes[drawn["probe"]], section_of(DisplaySettings(), drawn, "display")
         tissues, values = made.tissues(number)
-        of_many = made.recipe.drawn_for_many(drawn["probe"], made.case)
-        parameters = {"image": number, **drawn, **of_many, **values}
+        parameters = {"image": number, **drawn, **made.recipe.drawn_for_many(drawn["probe"], made.case), **values}
         return cls(number, probe, made.pose(number, drawn), display, made.settings(drawn), tissues, parameters)
 
     @property
@@ -121,9 +120,7 @@ def along_lines(
 @lru_cache(maxsize=4)
 def _nearest_steps(probe: Probe, grid: ImageGrid, steps: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """(rows, columns) the imaged field, and the scan line and step nearest to a pixel."""
-    (x, y), (dx, dy) = (grid.left_mm, grid.top_mm), grid.pixel_spacing_mm
-    columns, rows = np.meshgrid(np.arange(grid.columns) + 0.5, np.arange(grid.rows) + 0.5)
-    position, along = probe.line_through(x + dx * columns, y + dy * rows)
+    position, along = lines_of_pixels(probe, grid)
     line = np.rint((position - probe.first_line) / probe.line_spacing).astype(int)
     at = np.rint(np.nan_to_num(along) / _STEP_MM).astype(int)
     return grid.field(probe), np.clip(line, 0, probe.scan_lines - 1), np.clip(at, 0, steps - 1)

@@ -55,10 +55,9 @@ def seeds_of(noise_seed: int | Sequence[int], count: int) -> list[int]:
     """The seed of every image. Raises SimulationError for other than a number, or one for each, from 0 to 2**32 - 1."""
     try:
         first = index(noise_seed)  # type: ignore[arg-type]
+        seeds = list(range(first, first + count))
     except TypeError:
         seeds = [index(seed) for seed in noise_seed] if isinstance(noise_seed, Sequence | np.ndarray) else []
-    else:
-        seeds = list(range(first, first + count))
     require(
         len(seeds) == count and all(0 <= seed < 2**32 for seed in seeds),
         f"noise_seed is {noise_seed!r:.60}, expected a whole number from 0, or one for each of {count} poses",
@@ -135,6 +134,11 @@ def _times(shape: Sequence[int]) -> str:
     return " x ".join(map(str, shape))
 
 
+def on_carrier(iq: np.ndarray, cycles: float) -> np.ndarray:
+    """(scan_lines, samples) complex64 analytic RF signal of a baseband signal; `cycles` of the carrier are a sample."""
+    return iq * np.exp(2j * np.pi * cycles * np.arange(iq.shape[1])).astype(np.complex64)
+
+
 # ---- labels and depths -----------------------------------------------------------------------------------------------
 
 
@@ -153,12 +157,12 @@ def _field(probe: Probe, grid: ImageGrid) -> np.ndarray:
 @lru_cache(maxsize=4)
 def depth_of_pixels(probe: Probe, grid: ImageGrid) -> np.ndarray:
     """(rows, columns) float32 millimetres along the scan line from the face; nan outside the imaged field."""
-    position, along = _places(probe, grid)
+    position, along = lines_of_pixels(probe, grid)
     return np.where(_field(probe, grid), along - probe.line_starts_mm(position), np.nan).astype(np.float32)
 
 
-def _places(probe: Probe, grid: ImageGrid) -> tuple[np.ndarray, np.ndarray]:
-    """Probe.line_through of all pixels, (rows, columns) each."""
+def lines_of_pixels(probe: Probe, grid: ImageGrid) -> tuple[np.ndarray, np.ndarray]:
+    """Probe.line_through of the centres of all pixels, (rows, columns) each."""
     (x, y), (dx, dy) = (grid.left_mm, grid.top_mm), grid.pixel_spacing_mm
     columns, rows = np.meshgrid(np.arange(grid.columns) + 0.5, np.arange(grid.rows) + 0.5)
     return probe.line_through(x + dx * columns, y + dy * rows)
@@ -179,14 +183,10 @@ def fetched(name: str, frame: DeviceFrame, pose: np.ndarray, samples: int) -> Ca
         return lambda: _imaged(frame, labels, pose, segments(), counts())
     signal = frame.start_download(OUTPUTS[name][1])
     if name == "rf":
-        record = frame.acquisition
-        cycles = float(record["sample_mm"]) * float(record["cycles_per_mm"])
-        require(
-            cycles < 0.45,
-            f"rf has {1 / cycles:.1f} samples per cycle, expected more than 2.2; take iq, or quality full",
-        )
-        carrier = np.exp(2j * np.pi * cycles * np.arange(samples)).astype(np.complex64)
-        return lambda: (signal()[:, :samples] * carrier).real
+        cycles = float(frame.acquisition["sample_mm"]) * float(frame.acquisition["cycles_per_mm"])
+        too_few = f"rf has {1 / cycles:.1f} samples per cycle, expected more than 2.2; take iq, or quality full"
+        require(cycles < 0.45, too_few)
+        return lambda: np.real(on_carrier(signal()[:, :samples], cycles))
     return signal if name == "image" else lambda: signal()[:, :samples]
 
 
@@ -233,7 +233,7 @@ def _nearest(
     probe: Probe, grid: ImageGrid, lateral: int, guard: int, traced: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Of the pixels in the imaged field: float32 row, column, and which of (traced lines, depths) is nearest."""
-    position, along = (of[_field(probe, grid)] for of in _places(probe, grid))
+    position, along = (of[_field(probe, grid)] for of in lines_of_pixels(probe, grid))
     line = np.rint((position - probe.first_line) / probe.line_spacing * lateral).astype(int) + guard
     depth = np.rint(np.clip(along, 0.0, probe.displayed_mm) / _SHIFT_STEP_MM).astype(int)
     depths = len(np.arange(0.0, probe.displayed_mm + _SHIFT_STEP_MM, _SHIFT_STEP_MM))

@@ -15,7 +15,7 @@ from SlicerUSSim.Logic.base.errors import required
 from SlicerUSSim.Logic.base.files import written_whole
 from SlicerUSSim.Logic.base.ultrasound_dicom import ultrasound_dicom
 from SlicerUSSim.Logic.base.volume import Volume, require_image_name
-from SlicerUSSim.Logic.imaging.batch import geometric_labels
+from SlicerUSSim.Logic.imaging.batch import geometric_labels, on_carrier
 from SlicerUSSim.Logic.imaging.figures import write_png
 from SlicerUSSim.Logic.probe.arrays import Probe
 from SlicerUSSim.Logic.probe.beam import NOMINAL_SPEED_M_S
@@ -78,8 +78,7 @@ class Frame:
 
         A draft has two samples per cycle, which cannot hold it: take `iq`, or quality "full".
         """
-        depth = np.arange(self.iq.shape[1]) * self.sample_interval_mm
-        return self.iq * np.exp(2j * np.pi * self.cycles_per_mm * depth).astype(np.complex64)
+        return on_carrier(self.iq, self.cycles_per_mm * self.sample_interval_mm)
 
     @property
     def sampling_rate_hz(self) -> float:

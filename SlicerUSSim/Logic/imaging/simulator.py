@@ -196,7 +196,8 @@ class UltrasoundSimulator:
         whole number of 32 bits.
         """
         require_kind("probe", probe, Probe, "a ConvexProbe, LinearProbe or PhasedProbe")
-        require_kind("display", display or DisplaySettings(), DisplaySettings)
+        if display is not None:
+            require_kind("display", display, DisplaySettings)
         pose = check_rigid("probe_to_ras", probe_to_ras)
         self.warn_if_slow(probe)
         timings: dict[str, float] = {}
