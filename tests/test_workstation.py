@@ -124,7 +124,9 @@ def loaded(page: Page) -> None:
 @pytest.fixture(scope="module")
 def first_page(browser, url):
     problems: list[str] = []
-    yield opened(browser, url, problems), problems
+    page = opened(browser, url, problems)
+    settled(page)  # the sequence, whose depth the probe takes, comes after the first image
+    yield page, problems
 
 
 @pytest.fixture
@@ -134,7 +136,6 @@ def page(first_page, files):
     dismiss_messages(page)
     close_drawer(page)
     page.mouse.move(600, 500)  # away from what shows tips
-    settled(page)  # the sequence comes after the first image
     open_head(page, files)
     if not shown(page, "liveCheckBox"):  # a test that failed has left it so
         click(page, "#live")
