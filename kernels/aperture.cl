@@ -59,36 +59,27 @@ inline float4 rates_beside(float4 soft, float4 tissue) {
   return (float4)(tissue.x, soft.y, 0.0f, tissue.y - soft.y);
 }
 
-// Extra path and nepers per mm at the fraction f of a cell of voxels, its part that is tissue which bends, and the
-// nepers per mm that strong tissue takes more: linear between the eight labels.
-inline float4 rates_in_cell(__global const float4 *acoustics, __global const ushort *cell, int nx, int nxy, float3 f,
-                            float4 soft, int all_soft) {
-  float4 along_y[2], along_z[2];
-  for (int z = 0; z < 2; z++) {
-    for (int y = 0; y < 2; y++) {
-      __global const ushort *row = cell + y * nx + z * nxy;
-      const float4 left = acoustics[row[0] & LABEL_MASK], right = acoustics[row[1] & LABEL_MASK];
-      const float4 a = all_soft ? (float4)(left.xy, 0.0f, 0.0f) : rates_beside(soft, left);
-      const float4 b = all_soft ? (float4)(right.xy, 0.0f, 0.0f) : rates_beside(soft, right);
-      along_y[y] = a + f.x * (b - a);
-    }
-    along_z[z] = along_y[0] + f.y * (along_y[1] - along_y[0]);
+// At the fraction f of a cell of voxels, linear between the eight labels: extra path and nepers per mm, its part that
+// is tissue which bends, and the nepers per mm that strong tissue takes more; the first two alone where all tissue is
+// soft.
+#define DEFINE_IN_CELL(floats, name, RATES)                                                                    \
+  inline floats name(__global const float4 *acoustics, __global const ushort *cell, int nx, int nxy, float3 f, \
+                     float4 soft) {                                                                            \
+    floats along_y[2], along_z[2];                                                                             \
+    for (int z = 0; z < 2; z++) {                                                                              \
+      for (int y = 0; y < 2; y++) {                                                                            \
+        __global const ushort *row = cell + y * nx + z * nxy;                                                  \
+        const floats a = RATES(acoustics[row[0] & LABEL_MASK]), b = RATES(acoustics[row[1] & LABEL_MASK]);     \
+        along_y[y] = a + f.x * (b - a);                                                                        \
+      }                                                                                                        \
+      along_z[z] = along_y[0] + f.y * (along_y[1] - along_y[0]);                                               \
+    }                                                                                                          \
+    return along_z[0] + f.z * (along_z[1] - along_z[0]);                                                       \
   }
-  return along_z[0] + f.z * (along_z[1] - along_z[0]);
-}
-
-// The same where all tissue is soft: extra path and nepers per mm alone.
-inline float2 soft_rates(__global const float4 *acoustics, __global const ushort *cell, int nx, int nxy, float3 f) {
-  float2 along_z[2];
-  for (int z = 0; z < 2; z++) {
-    __global const ushort *near = cell + z * nxy, *far = near + nx;
-    const float2 a = acoustics[near[0] & LABEL_MASK].xy, b = acoustics[near[1] & LABEL_MASK].xy;
-    const float2 c = acoustics[far[0] & LABEL_MASK].xy, d = acoustics[far[1] & LABEL_MASK].xy;
-    const float2 before = a + f.x * (b - a), behind = c + f.x * (d - c);
-    along_z[z] = before + f.y * (behind - before);
-  }
-  return along_z[0] + f.z * (along_z[1] - along_z[0]);
-}
+#define BESIDE_SOFT(tissue) rates_beside(soft, tissue)
+#define OF_SOFT(tissue) (tissue).xy
+DEFINE_IN_CELL(float4, rates_in_cell, BESIDE_SOFT)
+DEFINE_IN_CELL(float2, soft_rates, OF_SOFT)
 
 // What a border takes from an amplitude, both ways, in nepers.
 inline float border_nepers(float impedance, float other_impedance) {
@@ -169,7 +160,7 @@ __kernel void fans(Frame frame, __global const ushort *voxels, __global const fl
         const int first = cell[0];
         label = first & LABEL_MASK;
         rate = soft.xy = acoustics[label].xy;
-        if (!(first & SAME_LABEL)) rate = soft_rates(acoustics, cell, nx, nxy, (float3)(fx[n], fy[n], fz[n]));
+        if (!(first & SAME_LABEL)) rate = soft_rates(acoustics, cell, nx, nxy, (float3)(fx[n], fy[n], fz[n]), soft);
       }
       const float turned = rate.x * turn_per_rate[n];
       sum += (float4)(length * rate.x, length * rate.y, 0.0f, length * (lean + 0.5f * turned));
@@ -186,22 +177,17 @@ __kernel void fans(Frame frame, __global const ushort *voxels, __global const fl
         const int first = cell[0];
         const int is_mixed = !(first & SAME_LABEL);
         const int corner = (f.x > 0.5f) + (f.y > 0.5f ? nx : 0) + (f.z > 0.5f ? nxy : 0);
-        const int nearest = (is_mixed && !all_soft ? cell[corner] : first) & LABEL_MASK;
+        const int nearest = (is_mixed ? cell[corner] : first) & LABEL_MASK;
         const float4 found = acoustics[nearest];
         const int begins = depth + n == 1 && !is_covered(soft.z, found.z);
-        const int goes_on = all_soft || begins || is_soft(soft.z, soft.w, found.z, found.w);
+        const int goes_on = begins || is_soft(soft.z, soft.w, found.z, found.w);
         if (goes_on) {
           soft = found;
           label = nearest;
         }
-        if (is_mixed) {
-          const float4 in_cell = rates_in_cell(acoustics, cell, nx, nxy, f, soft, all_soft);
-          rate = in_cell.xy;
-          bone = in_cell.z;
-          excess = in_cell.w;
-        } else {
-          rate = soft.xy;
-        }
+        const float4 in_cell =
+            is_mixed ? rates_in_cell(acoustics, cell, nx, nxy, f, soft) : (float4)(soft.xy, 0.0f, 0.0f);
+        rate = in_cell.xy, bone = in_cell.z, excess = in_cell.w;
         is_strong = !goes_on;
         if (is_strong || was_strong) strong = border_nepers(was_strong ? impedance : soft.w, found.w);
         impedance = found.w;

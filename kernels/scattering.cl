@@ -236,8 +236,7 @@ inline Sheet nearest_sheet(Frame frame, __global const uint *planes, float3 at, 
   const int x = at.x > 0.5f, y = at.y > 0.5f, z = at.z > 0.5f;
   *offset = at - (float3)(x, y, z);
   __global const uint *words = planes + PLANE_WORDS * (x + frame->dims[0] * (y + frame->dims[1] * z));
-  const Sheet sheet = {words[0], PLANE_WORDS == 2 ? words[1] : 0u};
-  return sheet;
+  return (Sheet){words[0], PLANE_WORDS == 2 ? words[1] : 0u};
 }
 
 // Whether a scatterer is in a sheet, at this offset from its voxel; and the normal, of the length of a gradient
@@ -804,31 +803,48 @@ inline float mirrored_power(Frame frame, float path, float4 tube, float cosine) 
               mirrored_beam(from_lens, frame->elevation_rayleigh, tube.z, tube.w));
 }
 
-// The widths and gains of a piece of a segment between two lengths along it, linear between those at the ends.
+// Of a piece of a segment at one of its ends, linear between them: see Piece
+typedef struct {
+  float tall, turned, gain, reach_e;
+} End;
+
+// At a length along the segment, where the strip is `width` wide.
+inline End end_at(const Patient *patient, __global const Segment *segment, const Strips *strips, const Piece *piece,
+                  float along, float width) {
+  Frame frame = patient->frame;
+  const float path = segment->path_mm + along;
+  float band;
+  const float frequency = band_after(frame, segment->loss + segment->loss_per_mm * along, &band);
+  // beam.cl knows the displayed depth alone, which differs from the path where sound is slower or faster.
+  const float shown = fmax(piece->depth0 + piece->slope * along, strips->begins);
+  const float wide = lateral_sigma(frame, shown - strips->begins, 1.0f / frequency, strips->cosine);
+  const float apart = fmax(width / strips->lines, 1e-4f) * line_distance(frame, shown);
+  const float stretch = elevation_stretch(frame, path, 1.0f / frequency);
+  const float widest = patient->beam[2 * LOBE_DEPTHS * LENS_DISTANCES + LOBE_DEPTHS];  // distance of the last column
+  const float left = mirrored_power(frame, path, tube_after(vload4(0, segment->tube), along), strips->cosine);
+  // Unit energy of the point spread function for all widths: sqrt(1 / (sigma_l sigma_e)) times the scale. The
+  // weights of beam.cl have unit sum, that is apart / (sqrt(2 pi) sigma_l) at the peak, so that a strip of width
+  // `apart` has the power apart / sigma_l of both at the displayed depth. A pulse covers 1 / slope of its length.
+  const float gain = log2_scalar(segment->weight * segment->attenuation * frame->speckle_scale * 2.50662827f);
+  // The table has the square root of the power per millimetre, where a Gaussian beam has 1 / (sqrt(pi) sigma_e).
+  const float power = piece->slope * wide * left / (0.56418958f * stretch * apart);
+  return (End){(LENS_DISTANCES - 1) / (widest * stretch), frame->wavefront_curvature == 0.0f ? 0.0f : frequency,
+               gain + LOG2_E * (band - segment->decay_per_mm * along) + 0.5f * log2_scalar(power),
+               stretch * reach_of_lens(frame, patient->beam, path)};
+}
+
+// The widths and gains of a piece of a segment between two lengths along it.
 inline void set_ends(const Patient *patient, __global const Segment *segment, const Strips *strips, float low,
                      float high, float to_apex, Piece *piece) {
   Frame frame = patient->frame;
-  const float path_low = segment->path_mm + low, path_high = segment->path_mm + high;
-  const float loss_low = segment->loss + segment->loss_per_mm * low;
-  const float loss_high = segment->loss + segment->loss_per_mm * high;
-  float band_low, band_high;
-  const float frequency_low = band_after(frame, loss_low, &band_low);
-  const float frequency_high = band_after(frame, loss_high, &band_high);
-  // beam.cl knows the displayed depth alone, which differs from the path where sound is slower or faster.
-  const float shown_low = fmax(piece->depth0 + piece->slope * low, strips->begins);
-  const float shown_high = fmax(piece->depth0 + piece->slope * high, strips->begins);
-  const float wide_low = lateral_sigma(frame, shown_low - strips->begins, 1.0f / frequency_low, strips->cosine);
-  const float wide_high = lateral_sigma(frame, shown_high - strips->begins, 1.0f / frequency_high, strips->cosine);
   piece->low = low;
-  piece->path0 = path_low;
+  piece->path0 = segment->path_mm + low;
   piece->span = 1.0f / fmax(high - low, 1e-6f);
   piece->bend = frame->linear ? 0.0f : 0.5f / fmax(to_apex + low, 1.0f);
 #ifdef LOBES
-  const float step = frame->line_spacing / frame->lateral_rays;
-  const float nominal0 = frame->linear ? step : step * to_apex, nominal1 = frame->linear ? 0.0f : step;
-  const float before = strips->line - strips->left + 0.5f;
-  const float2 left_border = -before * (float2)(nominal0, nominal1);
-  const float2 right_border = (strips->lines - before) * (float2)(nominal0, nominal1);
+  const float step = frame->line_spacing / frame->lateral_rays, before = strips->line - strips->left + 0.5f;
+  const float2 nominal = frame->linear ? (float2)(step, 0.0f) : (float2)(step * to_apex, step);
+  const float2 left_border = -before * nominal, right_border = (strips->lines - before) * nominal;
 #else
   const float4 to_left = vload4(0, segment->left), to_right = vload4(0, segment->right);
   const float2 left_border = to_left.xy, right_border = to_right.xy;
@@ -838,35 +854,13 @@ inline void set_ends(const Patient *patient, __global const Segment *segment, co
   piece->middle0 = middle.x, piece->middle1 = middle.y;
   piece->half0 = (0.5f + SHARED) * across.x, piece->half1 = (0.5f + SHARED) * across.y;
   const float2 ends = (float2)(low, high), width = across.x + across.y * ends;
-  const float2 apart = fmax(width / strips->lines, 1e-4f);
   const float2 reach = fabs(middle.x + middle.y * ends) + (0.5f + SHARED) * width;
-  piece->reach_l = fmax(reach.x, reach.y);
-  // The table has the square root of the power per millimetre, where a Gaussian beam has 1 / (sqrt(pi) sigma_e).
-  const float stretch_low = elevation_stretch(frame, path_low, 1.0f / frequency_low);
-  const float stretch_high = elevation_stretch(frame, path_high, 1.0f / frequency_high);
-  const float tall_low = 0.56418958f * stretch_low, tall_high = 0.56418958f * stretch_high;
-  const float widest = patient->beam[2 * LOBE_DEPTHS * LENS_DISTANCES + LOBE_DEPTHS];  // distance of the last column
-  piece->tall0 = (LENS_DISTANCES - 1) / (widest * stretch_low);
-  piece->tall1 = (LENS_DISTANCES - 1) / (widest * stretch_high) - piece->tall0;
-  piece->reach_e = fmax(stretch_low * reach_of_lens(frame, patient->beam, path_low),
-                        stretch_high * reach_of_lens(frame, patient->beam, path_high));
-  piece->turned0 = frame->wavefront_curvature == 0.0f ? 0.0f : frequency_low;
-  piece->turned1 = frame->wavefront_curvature == 0.0f ? 0.0f : frequency_high - frequency_low;
-  // Unit energy of the point spread function for all widths: sqrt(1 / (sigma_l sigma_e)) times the scale. The
-  // weights of beam.cl have unit sum, that is apart / (sqrt(2 pi) sigma_l) at the peak, so that a strip of width
-  // `apart` has the power apart / sigma_l of both at the displayed depth. A pulse covers 1 / slope of its length.
-  const float gain = log2_scalar(segment->weight * segment->attenuation * frame->speckle_scale * 2.50662827f);
-  const float decay = LOG2_E * segment->decay_per_mm;
-  const float4 tube = vload4(0, segment->tube);
-  const float left_low = mirrored_power(frame, path_low, tube_after(tube, low), strips->cosine);
-  const float left_high = mirrored_power(frame, path_high, tube_after(tube, high), strips->cosine);
-  piece->gain0 =
-      gain + LOG2_E * band_low - decay * low +
-      0.5f * log2_scalar(piece->slope * wide_low * left_low / (tall_low * apart.x * line_distance(frame, shown_low)));
-  piece->gain1 = gain + LOG2_E * band_high - decay * high +
-                 0.5f * log2_scalar(piece->slope * wide_high * left_high /
-                                    (tall_high * apart.y * line_distance(frame, shown_high))) -
-                 piece->gain0;
+  const End near = end_at(patient, segment, strips, piece, low, width.x);
+  const End far = end_at(patient, segment, strips, piece, high, width.y);
+  piece->reach_l = fmax(reach.x, reach.y), piece->reach_e = fmax(near.reach_e, far.reach_e);
+  piece->tall0 = near.tall, piece->tall1 = far.tall - near.tall;
+  piece->turned0 = near.turned, piece->turned1 = far.turned - near.turned;
+  piece->gain0 = near.gain, piece->gain1 = far.gain - near.gain;
 }
 
 ONE_BY_ONE
