@@ -78,18 +78,11 @@ class Segmentation:
     _filtered: np.ndarray = field(repr=False)
     #: (classes, voxels of the brain)
     _shares: np.ndarray = field(repr=False)
-    #: Number of the labels that are outside the brain
-    _labels_outside: int = 0
 
     @property
     def atlas(self) -> AtlasFit | None:
         """The registered atlas by which tissues were led; None without one."""
         return self.evidence.atlas
-
-    @property
-    def brain_names(self) -> tuple[str, ...]:
-        """Names of the labels in the brain, which are the first of tissue_names."""
-        return self.tissue_names[: len(self.tissue_names) - self._labels_outside]
 
     @property
     def _in_brain(self) -> np.ndarray:
@@ -292,7 +285,7 @@ def segment_mri(
         labels[middles] = len(names) + 1
         tissue_names = (*names, "leptomeninges")
         _log.info("thin sulci: %d voxels become leptomeninges", int(middles.sum()))
-    whole, brain_labels = images[0].with_array(part.whole(labels)), len(tissue_names)
+    whole = images[0].with_array(part.whole(labels))
     if settings.outside:
         around = find_outside(images[0], foreground, lambda share: told(end + (1.0 - end) * share))
         whole, tissue_names = around.over(whole, tissue_names)
@@ -336,7 +329,6 @@ def segment_mri(
         corrected=as_given(np.where(part.inside, part.images[0].array + np.float32(above), np.float32(0.0))).array,
         _filtered=as_given(filtered[0][0]).array,
         _shares=found.posteriors[:, as_given(number).array[brain.mask.array > 0]],
-        _labels_outside=len(tissue_names) - brain_labels,
     )
 
 

@@ -98,11 +98,6 @@ def write_image(taken: TakenImage, transform_node=None) -> None:
     taken.node.EndModify(was_modifying)
 
 
-def about_as_json(volume_node) -> str:
-    """What the image in a volume node is of, as write_image keeps it; "" of a volume that is no such image."""
-    return volume_node.GetAttribute(_ABOUT) or ""
-
-
 def about_image(volume_node) -> dict[str, Any]:
     """What the image in a volume node is of, see TakenImage.about; {} of a volume that is no such image.
 
