@@ -39,4 +39,6 @@ def errors_mm(mri: Volume, evaluations: int = 300) -> tuple[float, float]:
 
 
 if __name__ == "__main__":
+    if len(sys.argv) < 2:
+        sys.exit(__doc__)
     print("{:.1f} mm before, {:.1f} mm after".format(*errors_mm(Volume.read(sys.argv[1]))))

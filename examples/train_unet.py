@@ -54,4 +54,6 @@ def train(folder: Path, tissue: str = "ventricle", epochs: int = 10) -> float:
 
 
 if __name__ == "__main__":
+    if len(sys.argv) < 2:
+        sys.exit(__doc__)
     train(Path(sys.argv[1]), sys.argv[2] if len(sys.argv) > 2 else "ventricle")

@@ -35,6 +35,8 @@ def write_pairs(mri: Volume, out: Path, images: int, seed: int = 0) -> None:
 
 
 if __name__ == "__main__":
+    if len(sys.argv) < 3:
+        sys.exit(__doc__)
     count = int(sys.argv[3]) if len(sys.argv) > 3 else 100
     started = perf_counter()
     write_pairs(Volume.read(sys.argv[1]), Path(sys.argv[2]), count)

@@ -35,4 +35,6 @@ def write_picture(mri: vtkImageData, path: str) -> UltrasoundSimulationFilter:
 
 
 if __name__ == "__main__":
+    if len(sys.argv) < 3:
+        sys.exit(__doc__)
     write_picture(Volume.read(sys.argv[1]).to_vtk(), sys.argv[2])
