@@ -237,14 +237,17 @@ def test_a_membrane_goes_on_beyond_the_end_of_a_label_map(spacing_mm):
     assert 0.5 < power[outside].mean() / power[~outside].mean() < 2.0
 
 
-def test_the_end_of_a_label_map_is_no_border_and_is_told_of_once(caplog):
-    """Tissue goes on with its level and without a wall, whether the map ends in the depth or beside the lines."""
+def test_the_end_of_a_label_map_is_not_a_border_and_is_reported_once(caplog):
+    """Tissue continues with its level and without a wall, whether the map ends in the depth or beside the lines."""
     whole, short = (simulator(block(lambda x, y, z: 1 + 0 * x, half), SPECKLE) for half in ((40,) * 3, (12, 12, 20)))
     probe = LinearProbe(30, 40, scan_lines=61, focus_mm=20, elevation_focus_mm=20)
-    images = [made.simulate(probe, rigid(np.eye(3), [0, -10, 0])).iq for made in (whole, short, short)]
-    np.testing.assert_allclose(images[1], images[0], atol=1e-3 * np.abs(images[0]).max())
+    shallow = replace(probe, depth_mm=23.0)
+    views = (whole, probe), (short, shallow), (short, shallow), (short, probe), (short, probe)
+    images = [made.simulate(seen_by, rigid(np.eye(3), [0, -10, 0])).iq for made, seen_by in views]
+    np.testing.assert_allclose(images[4], images[0], atol=1e-3 * np.abs(images[0]).max())
     told = [record.getMessage() for record in caplog.records if "beyond the volume" in record.getMessage()]
-    assert told == ["57 % of the image is beyond the volume, whose tissue goes on from its end"]
+    end = "% of the image is beyond the volume: it continues what is at the volume's end, not the patient"
+    assert told == [f"27 {end}", f"57 {end}"]  # again once the share has doubled
 
 
 @pytest.mark.parametrize("thickness", [0.6, 1.6])

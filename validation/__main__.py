@@ -5,6 +5,7 @@ Writes tables and figures. The exit status is 1 if a value is out of its limits.
 
 from __future__ import annotations
 
+import logging
 from pathlib import Path
 
 import click
@@ -27,12 +28,16 @@ _TABLES, _SUMMARY = "report.md", "report.json"
     help="Folder for the report.",
 )
 @click.option(
-    "--only", multiple=True, metavar="TEXT", help="Run only checks with this text in their names; may be repeated."
+    "--only",
+    multiple=True,
+    metavar="TEXT",
+    help="Run only checks with this text in their names, as the report lists them; may be repeated.",
 )
 @device_option
 @overwrite_option
 @click.pass_context
 def main(ctx: click.Context, out: Path, only: tuple[str, ...], device: str | None) -> None:
+    logging.getLogger("SlicerUSSim.Logic.imaging.simulator").setLevel(logging.ERROR)  # phantoms may end in the image
     checks = chosen_checks(only)
     check_results(out, (_TABLES, _SUMMARY, *(check.picture for check in checks)))
     with results_of(out) as folder:

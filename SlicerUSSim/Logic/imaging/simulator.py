@@ -146,7 +146,7 @@ class UltrasoundSimulator:
         self._shown: tuple[tuple, np.ndarray] | None = None
         #: Measure every stage (Frame.timings_ms); the host then waits for each stage.
         self.profiling = False
-        self._has_told_of_end = False
+        self._told_share = 0.0  # of an image beyond the volume
         # The last frames, whose signals may still be on the device
         self._recent: deque[ref[Frame]] = deque()
         # Threads may share a simulator: its buffers hold one frame at a time
@@ -707,11 +707,11 @@ class UltrasoundSimulator:
                 "the probe looks past the volume: the image has only what goes on beyond its end", EmptyViewWarning,
                 stacklevel=stacklevel,
             )  # fmt: skip
-        elif not self._has_told_of_end and ((voxels.min(axis=1) < -0.5) | (voxels.max(axis=1) > size - 0.5)).any():
+        elif self._told_share < 0.5 and ((voxels.min(axis=1) < -0.5) | (voxels.max(axis=1) > size - 0.5)).any():
             self._tell_of_end(probe, pose)
 
     def _tell_of_end(self, probe: Probe, pose: np.ndarray) -> None:
-        """Log, once, how much of the imaged field is beyond the volume where tissue goes on from its end."""
+        """Log how much of the imaged field is beyond the volume; again only once that has doubled."""
         labels, depth = self.medium.labels, np.linspace(0.0, probe.depth_mm, 33)
         origins, directions = probe.origins_mm()[::4, :, None], probe.directions()[::4, :, None]
         place, to_voxel = np.moveaxis(origins + depth * directions, 1, -1).reshape(-1, 3), labels.ras_to_ijk @ pose
@@ -719,9 +719,10 @@ class UltrasoundSimulator:
         inside = np.clip(np.rint(voxel).astype(int), 0, np.array(labels.array.shape[::-1]) - 1)
         is_beyond = (np.abs(voxel - inside) > 0.5).any(axis=1) & (labels.array[tuple(inside.T[::-1])] != 0)
         share = float(is_beyond.mean())
-        if share > _TOLD_SHARE:
-            self._has_told_of_end = True
-            _log.warning("%.0f %% of the image is beyond the volume, whose tissue goes on from its end", 100.0 * share)
+        if share > max(_TOLD_SHARE, 2.0 * self._told_share):
+            self._told_share = share
+            end = "%.0f %% of the image is beyond the volume: it continues what is at the volume's end, not the patient"
+            _log.warning(end, 100.0 * share)
 
     def _warn_if_overflown(self, frames: int = 1) -> None:
         lines, traced = self.tracer.overflown_lines(), frames * self.tracer.shape[0]
