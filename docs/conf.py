@@ -71,8 +71,23 @@ PAGES = {
         "docs/reference/command",
         "docs/reference/index",
     ],
-    "How it works": ["docs/brain", "docs/physics", "docs/optimization", "docs/performance", "docs/scale"],
-    "Change it": ["docs/architecture", "docs/developer", "CONTRIBUTING", "CHANGELOG"],
+    "How it works": [
+        "docs/brain",
+        "docs/physics",
+        "docs/optimization",
+        "docs/performance",
+        "docs/scale",
+        "docs/comparison",
+    ],
+    "Change it": [
+        "docs/architecture",
+        "docs/developer",
+        "CONTRIBUTING",
+        "CODE_OF_CONDUCT",
+        "TECH_DEBT",
+        "docs/release",
+        "CHANGELOG",
+    ],
 }
 
 _NAMED = {page for pages in PAGES.values() for page in pages}

@@ -15,7 +15,7 @@ import pytest
 from SlicerUSSim.Command.cli import main
 
 ROOT = Path(__file__).parents[1]
-PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
+PAGES = [*(ROOT / f"{name}.md" for name in ("README", "CONTRIBUTING", "TECH_DEBT")), *sorted(ROOT.glob("docs/*.md"))]
 TOP_FOLDERS = ("SlicerUSSim", "kernels", "validation", "tests", "benchmarks", "examples", "docs")
 #: {path: text}
 SOURCES = {
