@@ -135,7 +135,7 @@ def test_any_client_moves_the_probe_one_at_a_time(running):
         until(lambda: "of which two send ProbeToReference: the first is followed" in running.device.link.status)
         assert running.device.link.received == before
     with StrictClient(running.port) as third:  # the others have gone
-        until(lambda: running.device.link.clients == 1)
+        until(lambda: running.device.len(link.peers) == 1)
         third.move(POSE, "RobotToReference")
         until(lambda: np.allclose(third.next("TRANSFORM", "ProbeToReference").matrix, POSE, atol=1e-4))
 
@@ -162,7 +162,7 @@ def test_a_client_that_does_not_read_holds_nobody():
     try:
         with StrictClient(port, receive_buffer=4096) as idle, StrictClient(port) as other:
             idle.checks_crc = other.checks_crc = False
-            until(lambda: link.clients == 2)
+            until(lambda: len(link.peers) == 2)
             for number in range(60):
                 link.send(Volume(np.full((1, 700, 700), number, np.uint8), np.eye(4)))
                 while other.next("IMAGE").image[0][0, 0] != number:

@@ -366,6 +366,10 @@ def _fit(panel: PanelPresenter) -> tuple[Row, ...]:
                 "blink", "tick", _("Blink"), _("Alternate between real and simulated image twice a second"),
                 enabled=fits.canBlink,
             ),
+            Control(
+                "difference", "tick", _("Difference"), _("Show where the real image in the background is brighter or "
+                "darker than the simulated one; grey: no difference"), enabled=fits.canBlink, sets=fits.showDifference,
+            ),
         ),
     )  # fmt: skip
 

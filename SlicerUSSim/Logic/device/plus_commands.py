@@ -20,7 +20,6 @@ from SlicerUSSim.Logic.base.errors import SimulationError, require
 from SlicerUSSim.Logic.device.imaging_parameters import NOT_SET, changed_parameter, imaging_parameters
 from SlicerUSSim.Logic.device.recorder import Recorder
 from SlicerUSSim.Logic.imaging.preset import Preset
-from SlicerUSSim.Logic.tracked.openigtlink import Message
 from SlicerUSSim.Logic.tracked.sequence import TrackedSequence
 
 _log = logging.getLogger(__name__)
@@ -67,11 +66,14 @@ class PlusCommands:
             "StartRecording": self._start, "StopRecording": self._stop,
         }  # fmt: skip
 
-    def answer(self, command: Message) -> Message | None:
-        """The reply to a COMMAND; none to one without a name or a text. Raises struct.error if it is too short."""
-        uid, padded, _, length = _COMMAND.unpack_from(command.content)
+    def answer(self, command: bytes) -> tuple[bytes, Mapping[str, str]] | None:
+        """(content, metadata) of the reply to the content of a COMMAND; None to one without a name or a text.
+
+        Raises struct.error for a content that is too short.
+        """
+        uid, padded, _, length = _COMMAND.unpack_from(command)
         name = padded.split(b"\0")[0].decode(errors="replace")
-        text = command.content[_COMMAND.size : _COMMAND.size + length].decode(errors="replace").rstrip("\0")
+        text = command[_COMMAND.size : _COMMAND.size + length].decode(errors="replace").rstrip("\0")
         if not name or not text:
             return None
         element, execute = _parsed(text), self._commands.get(name)
@@ -90,8 +92,7 @@ class PlusCommands:
             content = Element("CommandReply", {"Name": name, **said, "Message": reply.message})
             metadata["Message"] = reply.message
         body = ElementTree.tostring(content, "us-ascii", short_empty_elements=False)
-        packed = _COMMAND.pack(uid, name.encode(), _ASCII, len(body)) + body
-        return command._replace(kind="RTS_COMMAND", content=packed, metadata=dict(sorted(metadata.items())))
+        return _COMMAND.pack(uid, name.encode(), _ASCII, len(body)) + body, dict(sorted(metadata.items()))
 
     # ---- imaging parameters ------------------------------------------------------------------------------------
 

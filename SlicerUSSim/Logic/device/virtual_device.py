@@ -77,7 +77,7 @@ class VirtualDevice:
         """Make images until stop() is called."""
         number = 0
         while not self._stopping.is_set():
-            if not self.link.clients and not self.recorder.is_recording:
+            if not self.link.peers and not self.recorder.is_recording:
                 self._stopping.wait(_LOOK_EVERY_S)
                 continue
             begun = time.monotonic()

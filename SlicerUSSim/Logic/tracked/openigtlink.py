@@ -38,8 +38,9 @@ _LARGEST_BYTES = 1 << 28
 _SEND_BUFFER = 1 << 17
 #: Code, subcode, name and text of STATUS
 _STATUS_OK = struct.pack(">Hq20sx", 1, 0, b"")
-#: Kinds of messages in CAPABILITY
-_KINDS = ("IMAGE", "TRANSFORM", "STATUS", "GET_STATUS", "CAPABILITY", "GET_CAPABIL", "COMMAND", "RTS_COMMAND")
+#: Kinds of messages in CAPABILITY, 12 bytes each
+_KINDS = b"IMAGE", b"TRANSFORM", b"STATUS", b"GET_STATUS", b"CAPABILITY", b"GET_CAPABIL", b"COMMAND", b"RTS_COMMAND"
+_CAPABILITIES = b"".join(kind.ljust(12, b"\0") for kind in _KINDS)
 #: Messages with poses that are not read
 _OTHER_POSES = ("TDATA", "QTDATA", "POSITION")
 #: In metadata, whether a pose is valid: 1 or 0, and OK or else what is wrong (Plus)
@@ -85,42 +86,12 @@ def require_usable(address: Address) -> None:
         _listening(address).close()
 
 
-class Message(NamedTuple):
-    """A message other than images and poses, such as a command and its reply."""
-
-    kind: str
-    device: str
-    content: bytes = b""
-    #: Left out of version 1
-    metadata: Mapping[str, str] = MappingProxyType({})
-    #: Of the header
-    version: int = 1
-
-    @classmethod
-    def of(cls, header: dict[str, Any], body: bytes) -> Message:
-        """A message that came. Raises what pyigtl does for a damaged one."""
-        from pyigtl.messages import MessageBase
-
-        base, content = cast(Any, MessageBase()), []
-        base._unpack_content = content.append
-        base.unpack(header, body)
-        return cls(base.message_type, base.device_name, content[0], base.metadata, base.header_version)
-
-    def packed(self) -> bytes:
-        """The message as it is sent."""
-        from pyigtl.messages import MessageBase
-
-        base = cast(Any, MessageBase(device_name=self.device))
-        base._message_type, base.header_version = self.kind, self.version
-        base._pack_content = lambda: self.content
-        if self.version > 1:  # pyigtl writes ASCII alone
-            plain = (text.encode("ascii", "xmlcharrefreplace").decode() for text in self.metadata.values())
-            base.metadata = dict(zip(self.metadata, plain, strict=True))
-        return base.pack()
+#: Content of a COMMAND -> content and metadata of its reply
+Answer = Callable[[bytes], tuple[bytes, Mapping[str, str]] | None]
 
 
 class _Peer(NamedTuple):
-    """One end of a connection that is there."""
+    """Who is connected."""
 
     socket: socket.socket
     #: Held while a message is sent
@@ -137,18 +108,11 @@ class _Peer(NamedTuple):
 
 
 class _Outgoing(NamedTuple):
-    """An image with its transforms, as messages; ImageToProbe apart."""
+    """An image with its transforms, as messages."""
 
-    calibration: bytes
+    #: ImageToProbe as a matrix, which tells whether it has changed, and as a message; empty without
+    calibration: tuple[bytes, bytes]
     others: bytes
-
-    def after(self, before: _Outgoing | None) -> bytes:
-        """What a peer gets that had another one before: ImageToProbe only if it has changed, but for its time."""
-        from pyigtl.messages import MessageBase
-
-        begin = MessageBase.IGTL_HEADER_SIZE
-        is_known = before is not None and before.calibration[begin:] == self.calibration[begin:]
-        return self.others if is_known else self.calibration + self.others
 
 
 class TrackerLink:
@@ -163,15 +127,14 @@ class TrackerLink:
     device : name of the TRANSFORM to follow (default: the first received). One client at a time moves the probe.
     listen : wait for clients to connect, instead of connecting to a peer.
     image_name : device name of the IMAGE messages.
-    answer : called with every COMMAND, in a thread of its client; returns the reply, if any.
+    answer : called with the content of every COMMAND, in a thread of its client; returns that of the reply, if any.
 
     Raises SimulationError without pyigtl, and with `listen` for a port that is in use.
     """
 
     def __init__(
         self, host: str, port: int, moved: Callable[[np.ndarray], None], *, device: str | None = None,
-        listen: bool = False, image_name: str = "SlicerUSSim",
-        answer: Callable[[Message], Message | None] = lambda command: None,
+        listen: bool = False, image_name: str = "SlicerUSSim", answer: Answer = lambda content: None,
     ) -> None:  # fmt: skip
         self._address, self._moved = Address(host, port, listen), moved
         _require_pyigtl()
@@ -183,7 +146,8 @@ class TrackerLink:
         self.received = self.dropped = self.sent = 0
         self._refused = 0  # poses since the last that was used
         self._passed_over: set[str] = set()
-        self._peers: list[_Peer] = []
+        #: Who is connected
+        self.peers: list[_Peer] = []
         self._leader: tuple[_Peer, float] | None = None  # who moves the probe, and when it did last
         self._newest: _Outgoing | None = None
         self._changed = threading.Condition()  # another image, or another peer
@@ -191,11 +155,6 @@ class TrackerLink:
         self._listener = _listening(self._address) if listen else None
         self._thread = threading.Thread(target=self._listen if listen else self._connect, daemon=True)
         self._thread.start()
-
-    @property
-    def clients(self) -> int:
-        """The number of peers that are connected."""
-        return len(self._peers)
 
     def send(
         self, image: Volume, transforms: Mapping[str, np.ndarray] = MappingProxyType({}), stamp: float | None = None
@@ -209,7 +168,8 @@ class TrackerLink:
 
         stamp = time.time() if stamp is None else stamp
         packed = {name: TransformMessage(matrix, stamp, name).pack() for name, matrix in transforms.items()}
-        calibration = packed.pop("ImageToProbe", b"")
+        matrix = transforms["ImageToProbe"].tobytes() if "ImageToProbe" in transforms else b""
+        calibration = matrix, packed.pop("ImageToProbe", b"")
         placed = ImageMessage(image.array, image.ijk_to_ras, "ras", stamp, self._image_name).pack()
         with self._changed:
             self._newest = _Outgoing(calibration, b"".join([*packed.values(), placed]))
@@ -219,9 +179,9 @@ class TrackerLink:
         """Close the connections and wait for the threads to end; further calls have no effect."""
         self._stopping.set()
         with self._changed:
-            for peer in self._peers:
+            for peer in self.peers:
                 peer.close()
-            self._changed.wait_for(lambda: not self._peers, _STALLED_S)
+            self._changed.wait_for(lambda: not self.peers, _STALLED_S)
         self._thread.join()
         if self._listener is not None:
             self._listener.close()
@@ -260,7 +220,7 @@ class TrackerLink:
         end.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         end.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SEND_BUFFER)
         peer = _Peer(end, threading.Lock())
-        self._peers.append(peer)
+        self.peers.append(peer)
         self._tell()
         threading.Thread(target=self._send_images, args=(peer,), daemon=True).start()
         try:
@@ -268,7 +228,7 @@ class TrackerLink:
                 self._receive(peer)
         finally:
             with self._changed, end:
-                self._peers.remove(peer)
+                self.peers.remove(peer)
                 if self._leader is not None and self._leader[0] is peer:
                     self._leader = None
                     self._device = self._chosen if self._address.listen else self._device
@@ -278,7 +238,9 @@ class TrackerLink:
         before: _Outgoing | None = None
         try:
             while (newest := self._after(before, peer)) is not None:
-                peer.send(newest.after(before))
+                matrix, calibration = newest.calibration
+                is_known = before is not None and before.calibration[0] == matrix
+                peer.send(newest.others if is_known else calibration + newest.others)
                 before = newest
                 self.sent += 1
         except OSError as error:
@@ -288,15 +250,15 @@ class TrackerLink:
     def _after(self, before: _Outgoing | None, peer: _Peer) -> _Outgoing | None:
         """The newest image, when it is another one; None when the connection has ended."""
         with self._changed:
-            self._changed.wait_for(lambda: self._newest is not before or peer not in self._peers)
-            return self._newest if peer in self._peers else None
+            self._changed.wait_for(lambda: self._newest is not before or peer not in self.peers)
+            return self._newest if peer in self.peers else None
 
     # ---- status ------------------------------------------------------------------------------------------------
 
     def _tell(self) -> None:
         """Say who is connected."""
         following = f", following {self._device}" if self._leader is not None else ""
-        if self._peers:
+        if self.peers:
             self._say(f"connected to {self._peer_name}{following}")
         else:
             self._say(f"waiting for a connection at {self._address}")
@@ -324,7 +286,7 @@ class TrackerLink:
     def _peer_name(self) -> str:
         if not self._address.listen:
             return str(self._address)
-        return "the client" if len(self._peers) < 2 else f"{len(self._peers)} clients"
+        return "the client" if len(self.peers) < 2 else f"{len(self.peers)} clients"
 
     # ---- messages ----------------------------------------------------------------------------------------------
 
@@ -341,26 +303,23 @@ class TrackerLink:
         if kind == "TRANSFORM":
             with self._changed:
                 self._take_pose(peer, header, packed, body)
-        elif kind in ("COMMAND", "GET_STATUS", "GET_CAPABIL"):
+        elif kind == "COMMAND":
             try:
-                reply = self._reply(Message.of(header, body))
-            except Exception as error:
-                _log.warning("OpenIGTLink: a message of type %s is not answered: %r", kind, error)
+                reply = self._answer(_content_of(header, body))
+            except Exception as error:  # of pyigtl too, for one that it cannot parse
+                _log.warning("OpenIGTLink: a command is not answered: %r", error)
                 return
             if reply is not None:
-                peer.send(reply.packed())
+                peer.send(_packed("RTS_COMMAND", header, *reply))
+        elif kind == "GET_STATUS":
+            peer.send(_packed("STATUS", header, _STATUS_OK))
+        elif kind == "GET_CAPABIL":
+            peer.send(_packed("CAPABILITY", {**header, "header_version": 1}, _CAPABILITIES))  # no other version has it
         else:
             self._notice(f"messages of type {kind} are passed over")
             if kind in _OTHER_POSES and not self.received:
                 remedy = "expected TRANSFORM: configure it to send TRANSFORM messages of the probe's pose"
                 self._say(f"{self._peer_name} sends {kind} messages, {remedy}", logging.WARNING)
-
-    def _reply(self, message: Message) -> Message | None:
-        if message.kind == "GET_STATUS":
-            return Message("STATUS", "", _STATUS_OK, version=message.version)
-        if message.kind == "GET_CAPABIL":  # whose reply has no other version
-            return Message("CAPABILITY", "", b"".join(struct.pack("12s", kind.encode()) for kind in _KINDS))
-        return self._answer(message)
 
     def _take_pose(self, peer: _Peer, header: dict[str, Any], packed: bytes, body: bytes) -> None:
         from pyigtl.messages import CRC64, TransformMessage
@@ -391,6 +350,30 @@ class TrackerLink:
             self._tell()
         self.received += 1
         self._moved(pose)
+
+
+def _content_of(header: dict[str, Any], body: bytes) -> bytes:
+    """The content of a message, without metadata."""
+    from pyigtl.messages import MessageBase
+
+    message, content = cast(Any, MessageBase()), []
+    message._unpack_content = content.append
+    message.unpack(header, body)
+    return content[0]
+
+
+def _packed(
+    kind: str, asked: dict[str, Any], content: bytes, metadata: Mapping[str, str] = MappingProxyType({})
+) -> bytes:
+    """The answer to a message with the header `asked`; to version 1 it is without metadata."""
+    from pyigtl.messages import MessageBase
+
+    message = cast(Any, MessageBase(device_name=asked["device_name"]))
+    message._message_type, message._pack_content = kind, lambda: content
+    message.header_version = min(asked["header_version"], 2)
+    if message.header_version > 1:  # pyigtl writes ASCII alone
+        message.metadata = {key: text.encode("ascii", "xmlcharrefreplace").decode() for key, text in metadata.items()}
+    return message.pack()
 
 
 def _require_pyigtl() -> None:
