@@ -73,7 +73,12 @@ def device(patient: DeviceOptions, out: Path) -> None:
         if not patient.mri_or_labels:
             patient = replace(patient, mri_or_labels=str(Path(folder) / "MNI152.nii.gz"))
             demo_mri()[0].write(patient.mri_or_labels)
-        simulator, preset, pose = _opened(patient)
+        if patient.mri_or_labels.lower().endswith(".mrb"):
+            simulator, preset, pose = _opened_scene(patient)
+        else:
+            examination, pose = open_examination_at(patient, patient.pose)
+            simulator, preset = examination.simulator, patient.changed_preset()
+            say_contact(examination, preset.probe, [pose])
     poses = [pose] if patient.path is None else _poses(patient.path)
     simulator.simulate(preset.probe, poses[0], preset.display)  # builds kernels
     made = VirtualDevice(simulator, preset, poses, address, make_folder(out.resolve()))
@@ -84,18 +89,11 @@ def device(patient: DeviceOptions, out: Path) -> None:
         made.stop()
 
 
-def _opened(patient: DeviceOptions) -> tuple[UltrasoundSimulator, Preset, np.ndarray]:
-    """(simulator, probe and display, (4, 4) probe_to_ras) of a file."""
-    if patient.mri_or_labels.lower().endswith(".mrb"):
-        return _opened_scene(patient)
-    examination, pose = open_examination_at(patient, patient.pose)
-    preset = patient.changed_preset()
-    say_contact(examination, preset.probe, [pose])
-    return examination.simulator, preset, pose
-
-
 def _opened_scene(patient: DeviceOptions) -> tuple[UltrasoundSimulator, Preset, np.ndarray]:
-    """The same of a scene. Raises SimulationError for one without labels or a probe, and for options of a patient."""
+    """(simulator, probe and display, (4, 4) probe_to_ras) of a scene.
+
+    Raises SimulationError for one without labels or a probe, and for options of a patient or settings.
+    """
     path, given = patient.mri_or_labels, given_options(*set(click.get_current_context().params) - _OWN)
     require(not given, f"{path} is a scene, which has a patient and settings, expected no {', '.join(given)}")
     require_workstation()

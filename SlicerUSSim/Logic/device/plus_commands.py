@@ -16,7 +16,7 @@ from xml.etree.ElementTree import Element, SubElement
 
 import numpy as np
 
-from SlicerUSSim.Logic.base.errors import SimulationError, require
+from SlicerUSSim.Logic.base.errors import SimulationError, require, required
 from SlicerUSSim.Logic.device.imaging_parameters import NOT_SET, changed_parameter, imaging_parameters
 from SlicerUSSim.Logic.device.recorder import Recorder
 from SlicerUSSim.Logic.imaging.preset import Preset
@@ -63,7 +63,7 @@ class PlusCommands:
         self._commands: dict[str, Callable[[Element], _Reply]] = {
             "GetUsParameter": self._get, "SetUsParameter": self._set, "GetTransform": self._transform,
             "RequestDeviceIds": self._device_ids, "RequestChannelIds": lambda command: _ids([CHANNEL]),
-            "StartRecording": self._start, "StopRecording": self._stop,
+            "StartRecording": self._record, "StopRecording": self._record,
         }  # fmt: skip
 
     def answer(self, command: bytes) -> tuple[bytes, Mapping[str, str]] | None:
@@ -93,8 +93,6 @@ class PlusCommands:
             metadata["Message"] = reply.message
         body = ElementTree.tostring(content, "us-ascii", short_empty_elements=False)
         return _COMMAND.pack(uid, name.encode(), _ASCII, len(body)) + body, dict(sorted(metadata.items()))
-
-    # ---- imaging parameters ------------------------------------------------------------------------------------
 
     def _get(self, command: Element) -> _Reply:
         asked, known, content, errors = _asked(command), imaging_parameters(self._preset()), Element("CommandReply"), ""
@@ -128,8 +126,6 @@ class PlusCommands:
             return f"Failed to set {name}. "
         return ""
 
-    # ---- what there is -----------------------------------------------------------------------------------------
-
     def _device_ids(self, command: Element) -> _Reply:
         kind = command.get("DeviceType", "")
         if kind and kind not in _OF_TYPE:
@@ -148,36 +144,23 @@ class PlusCommands:
         metadata = {name: values, "persistent": persistent, "date": "", "error": "-1"}
         return _Reply(f"GetTransform ({name}) Command successful.", metadata=metadata)
 
-    # ---- recording ---------------------------------------------------------------------------------------------
-
-    def _start(self, command: Element) -> _Reply:
-        recorder, begin = self._capture(command)
-        name = command.get("OutputFilename", "")
+    def _record(self, command: Element) -> _Reply:
+        keys = "Name", "CaptureDeviceId", "ChannelId", "OutputFilename"
+        name, device, channel, file = (command.get(key, "") for key in keys)
+        asked, begin = device or channel or "auto-detect", f"VirtualCapture ({CAPTURE}) {name} "
+        recorder = self._recorder if asked in (CAPTURE, CHANNEL) else None
+        recorder = required(recorder, f"VirtualCapture has not been found ({asked}), {name}")
+        if name.lower() == "stoprecording":
+            require(recorder.frames, f"{begin}No frames to record.")
+            path, count = recorder.stop()
+            return _Reply(f"{begin}Recording {count} frames successful to file {path}")
         require(not recorder.is_recording, f"{begin}Recording to file is already in progress.")
         try:
-            recorder.start(name)
+            recorder.start(file)
         except SimulationError as error:
             _log.warning("%s", error)
-            raise SimulationError(f"{begin}Failed to open file {name or '(undefined)'}.") from None
+            raise SimulationError(f"{begin}Failed to open file {file or '(undefined)'}.") from None
         return _Reply(f"{begin}successful.")
-
-    def _stop(self, command: Element) -> _Reply:
-        recorder, begin = self._capture(command)
-        require(recorder.count > 0, f"{begin}No frames to record.")
-        try:
-            path, count = recorder.stop()
-        except SimulationError as error:
-            raise SimulationError(f"{begin}Failed to finalize file: {error}") from None
-        return _Reply(f"{begin}Recording {count} frames successful to file {path}")
-
-    def _capture(self, command: Element) -> tuple[Recorder, str]:
-        """(the recorder, how messages about it begin)."""
-        name, device, channel = (command.get(key, "") for key in ("Name", "CaptureDeviceId", "ChannelId"))
-        is_here = device == CAPTURE if device else channel == CHANNEL
-        if self._recorder is None or not is_here:
-            asked = device or channel or "auto-detect"
-            raise SimulationError(f"VirtualCapture has not been found ({asked}), {name}")
-        return self._recorder, f"VirtualCapture ({CAPTURE}) {name} "
 
 
 def _parsed(text: str) -> Element | None:

@@ -26,12 +26,8 @@ class Recorder:
 
     def _forget(self) -> None:
         self._pixels = tempfile.TemporaryFile()  # noqa: SIM115, since minutes of images do not fit into memory
-        self._poses: list[tuple[float, Mapping[str, np.ndarray]]] = []
-
-    @property
-    def count(self) -> int:
-        """The number of images that wait to be written."""
-        return len(self._poses)
+        #: (seconds, transforms) of the images that wait to be written
+        self.frames: list[tuple[float, Mapping[str, np.ndarray]]] = []
 
     def start(self, name: str) -> None:
         """Begin a recording; without a name it is called after the time.
@@ -52,7 +48,7 @@ class Recorder:
             if self.is_recording:
                 self._shape = image.shape
                 self._pixels.write(image.tobytes())
-                self._poses.append((stamp, transforms))
+                self.frames.append((stamp, transforms))
 
     def stop(self) -> tuple[Path, int]:
         """(the file that was written, number of its images).
@@ -60,11 +56,11 @@ class Recorder:
         Raises SimulationError if nothing was recorded, and if the file cannot be written: nothing is lost then.
         """
         with self._lock:
-            require(self.count > 0, "nothing was recorded")
+            require(self.frames, "nothing was recorded")
             self.is_recording = False
             self._pixels.flush()
-            images = np.memmap(self._pixels, np.uint8, "r", shape=(self.count, *self._shape))
-            stamps, transforms = zip(*self._poses, strict=True)
+            images = np.memmap(self._pixels, np.uint8, "r", shape=(len(self.frames), *self._shape))
+            stamps, transforms = zip(*self.frames, strict=True)
             TrackedSequence(images, transforms, np.array(stamps), fields={SIMULATED: "device"}).write(self._path, False)
             self._forget()
             return self._path, len(images)

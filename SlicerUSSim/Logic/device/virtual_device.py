@@ -97,7 +97,7 @@ class VirtualDevice:
         """End run(), close the connections, and write a recording that was not stopped."""
         self._stopping.set()
         self.link.stop()
-        if self.recorder.count:
+        if self.recorder.frames:
             _log.warning("a recording was not stopped: written to %s (%d images)", *self.recorder.stop())
 
     def _move(self, pose: np.ndarray) -> None:
