@@ -38,8 +38,8 @@ def imaging_parameters(preset: Preset) -> dict[str, str]:
 def changed_parameter(preset: Preset, name: str, text: str) -> Preset:
     """A preset with one of these parameters changed.
 
-    Raises ValueError for a text that is no number, or not three of them for TimeGainCompensation, and SimulationError
-    for a value that is out of range, and for one of NOT_SET.
+    Raises KeyError for an unknown one, ValueError for a text that is no number, or not three of them for
+    TimeGainCompensation, and SimulationError for a value that is out of range, and for one of NOT_SET.
     """
     require(name not in NOT_SET, f"{name} cannot be changed in this device")
     values = [float(part) for part in text.split()]

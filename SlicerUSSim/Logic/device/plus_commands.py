@@ -114,11 +114,10 @@ class PlusCommands:
 
     def _set_one(self, name: str, text: str) -> str:
         """An error, or ""."""
-        preset = self._preset()
-        if name not in NOT_SET and name not in imaging_parameters(preset):
-            return f"Invalid parameter {name}. "
         try:
-            self._change(changed_parameter(preset, name, text))
+            self._change(changed_parameter(self._preset(), name, text))
+        except KeyError:
+            return f"Invalid parameter {name}. "
         except ValueError:
             return f"Failed to parse {name}.{'' if name == 'TimeGainCompensation' else ' '}"
         except SimulationError as error:

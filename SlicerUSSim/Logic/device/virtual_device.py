@@ -21,9 +21,9 @@ from SlicerUSSim.Logic.tracked.openigtlink import Address, TrackerLink
 _log = logging.getLogger(__name__)
 
 #: Name of the IMAGE messages: in Plus' words the image with its place in the frame called Reference
-IMAGE_NAME = "Image_Reference"
-#: Most images per second, as of a scanner; seconds between poses of a path, and between looks for a client
-_MOST_HZ, _STEP_S, _LOOK_EVERY_S = 50.0, 0.05, 0.05
+_IMAGE = "Image_Reference"
+#: Seconds between poses of a path, and between looks for a client
+_STEP_S, _LOOK_EVERY_S = 0.05, 0.05
 
 
 class VirtualDevice:
@@ -48,19 +48,16 @@ class VirtualDevice:
         self.preset = preset.changed("display", image_size=(grid.rows, grid.columns))
         self._simulator = simulator
         self._path, self._begun = [*poses, *poses[-2:0:-1]], time.monotonic()  # there and back
-        self._moved: np.ndarray | None = None  # by a client
         self._stopping = threading.Event()
         self.recorder = Recorder(folder)
         commands = PlusCommands(lambda: self.preset, self.change, self.transforms, self.recorder)
         self.link = TrackerLink(
-            address.host, address.port, self._move, listen=True, image_name=IMAGE_NAME, answer=commands.answer
+            address.host, address.port, self._move, listen=True, image_name=_IMAGE, answer=commands.answer
         )
 
     @property
     def pose(self) -> np.ndarray:
         """(4, 4) probe_to_ras of now."""
-        if self._moved is not None:
-            return self._moved
         return self._path[int((time.monotonic() - self._begun) / _STEP_S) % len(self._path)]
 
     def transforms(self) -> Mapping[str, np.ndarray]:
@@ -77,13 +74,11 @@ class VirtualDevice:
         """Make images until stop() is called."""
         number = 0
         while not self._stopping.is_set():
-            if not self.link.peers and not self.recorder.is_recording:
+            if self.link.peers or self.recorder.is_recording:
+                self._make_image(number)
+                number += 1
+            else:
                 self._stopping.wait(_LOOK_EVERY_S)
-                continue
-            begun = time.monotonic()
-            self._make_image(number)
-            number += 1
-            self._stopping.wait(max(begun + 1.0 / _MOST_HZ - time.monotonic(), 0.0))
 
     def _make_image(self, number: int) -> None:
         """Simulate one image, send it and record it. Its time is that at which the pose was read."""
@@ -101,4 +96,4 @@ class VirtualDevice:
             _log.warning("a recording was not stopped: written to %s (%d images)", *self.recorder.stop())
 
     def _move(self, pose: np.ndarray) -> None:
-        self._moved = pose
+        self._path = [pose]

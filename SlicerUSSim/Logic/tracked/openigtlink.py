@@ -16,6 +16,7 @@ import threading
 import time
 from collections.abc import Callable, Mapping
 from contextlib import suppress
+from functools import partial
 from types import MappingProxyType
 from typing import Any, NamedTuple, cast
 
@@ -88,6 +89,8 @@ def require_usable(address: Address) -> None:
 
 #: Content of a COMMAND -> content and metadata of its reply
 Answer = Callable[[bytes], tuple[bytes, Mapping[str, str]] | None]
+#: Of an image: the matrix ImageToProbe, its message, and those of other transforms and the image
+_Outgoing = tuple[bytes, bytes, bytes]
 
 
 class _Peer(NamedTuple):
@@ -105,14 +108,6 @@ class _Peer(NamedTuple):
         """Let threads that read or send find that the connection has ended."""
         with suppress(OSError):
             self.socket.shutdown(socket.SHUT_RDWR)
-
-
-class _Outgoing(NamedTuple):
-    """An image with its transforms, as messages."""
-
-    #: ImageToProbe as a matrix, which tells whether it has changed, and as a message; empty without
-    calibration: tuple[bytes, bytes]
-    others: bytes
 
 
 class TrackerLink:
@@ -152,8 +147,8 @@ class TrackerLink:
         self._newest: _Outgoing | None = None
         self._changed = threading.Condition()  # another image, or another peer
         self._stopping = threading.Event()
-        self._listener = _listening(self._address) if listen else None
-        self._thread = threading.Thread(target=self._listen if listen else self._connect, daemon=True)
+        run = partial(self._listen, _listening(self._address)) if listen else self._connect
+        self._thread = threading.Thread(target=run, daemon=True)
         self._thread.start()
 
     def send(
@@ -168,11 +163,10 @@ class TrackerLink:
 
         stamp = time.time() if stamp is None else stamp
         packed = {name: TransformMessage(matrix, stamp, name).pack() for name, matrix in transforms.items()}
+        packed[""] = ImageMessage(image.array, image.ijk_to_ras, "ras", stamp, self._image_name).pack()
         matrix = transforms["ImageToProbe"].tobytes() if "ImageToProbe" in transforms else b""
-        calibration = matrix, packed.pop("ImageToProbe", b"")
-        placed = ImageMessage(image.array, image.ijk_to_ras, "ras", stamp, self._image_name).pack()
         with self._changed:
-            self._newest = _Outgoing(calibration, b"".join([*packed.values(), placed]))
+            self._newest = matrix, packed.pop("ImageToProbe", b""), b"".join(packed.values())
             self._changed.notify_all()
 
     def stop(self) -> None:
@@ -183,8 +177,6 @@ class TrackerLink:
                 peer.close()
             self._changed.wait_for(lambda: not self.peers, _STALLED_S)
         self._thread.join()
-        if self._listener is not None:
-            self._listener.close()
 
     # ---- connections: a thread that reads for each, and one that sends images ----------------------------------
 
@@ -198,14 +190,14 @@ class TrackerLink:
                     self._say(f"connection to {self._address} lost ({error}), reconnecting", logging.WARNING)
                     self._stopping.wait(_RETRY_S)
 
-    def _listen(self) -> None:
-        assert self._listener is not None
-        self._listener.settimeout(_RETRY_S)
+    def _listen(self, listener: socket.socket) -> None:
+        listener.settimeout(_RETRY_S)
         self._tell()
-        while not self._stopping.is_set():
-            with suppress(TimeoutError):
-                end, _ = self._listener.accept()
-                threading.Thread(target=self._serve_client, args=(end,), daemon=True).start()
+        with listener:
+            while not self._stopping.is_set():
+                with suppress(TimeoutError):
+                    end, _ = listener.accept()
+                    threading.Thread(target=self._serve_client, args=(end,), daemon=True).start()
 
     def _serve_client(self, end: socket.socket) -> None:
         try:
@@ -238,9 +230,9 @@ class TrackerLink:
         before: _Outgoing | None = None
         try:
             while (newest := self._after(before, peer)) is not None:
-                matrix, calibration = newest.calibration
-                is_known = before is not None and before.calibration[0] == matrix
-                peer.send(newest.others if is_known else calibration + newest.others)
+                matrix, calibration, others = newest
+                is_known = before is not None and before[0] == matrix
+                peer.send(others if is_known else calibration + others)
                 before = newest
                 self.sent += 1
         except OSError as error:
