@@ -10,14 +10,7 @@ from typing import TYPE_CHECKING
 import click
 
 from SlicerUSSim.Command.options import declared, gathered, given_options, out_option
-from SlicerUSSim.Command.patient_options import (
-    AUTO,
-    RARE,
-    RARE_BESIDE,
-    PatientOptions,
-    open_examination_at,
-    say_contact,
-)
+from SlicerUSSim.Command.patient_options import AUTO, RARE, RARE_BESIDE, PatientOptions, open_examination_at
 from SlicerUSSim.Command.progress import note
 from SlicerUSSim.Command.serve import require_workstation
 from SlicerUSSim.Logic.base.errors import require, required
@@ -78,7 +71,6 @@ def device(patient: DeviceOptions, out: Path) -> None:
         else:
             examination, pose = open_examination_at(patient, patient.pose)
             simulator, preset = examination.simulator, patient.changed_preset()
-            say_contact(examination, preset.probe, [pose])
     poses = [pose] if patient.path is None else _poses(patient.path)
     simulator.simulate(preset.probe, poses[0], preset.display)  # builds kernels
     made = VirtualDevice(simulator, preset, poses, address, make_folder(out.resolve()))
@@ -103,17 +95,15 @@ def _opened_scene(patient: DeviceOptions) -> tuple[UltrasoundSimulator, Preset, 
     from SlicerUSSim.Logic.mrml.scene_record import put_nodes, put_values
     from SlicerUSSim.Workstation.scene_files import read_scene
 
-    record = read_scene(path)
-    has_both = "labels" in record.nodes and record.pose is not None
-    require(has_both, f"{path}: expected labels of tissues and a probe; press Segment and Simulate, and save it again")
-    logic = UltrasoundSceneLogic(slicer.vtkMRMLScene(), patient.device)
-    nodes = put_nodes(logic.scene, record)
+    record, logic = read_scene(path), UltrasoundSceneLogic(slicer.vtkMRMLScene(), patient.device)
+    missing = f"{path}: expected labels of tissues and a probe; press Segment and Simulate, and save it again"
+    pose, nodes = required(record.pose, missing), put_nodes(logic.scene, record)
     for node in nodes.values():
         node.HardenTransform()  # so that the patient's frame is the world
     put_values(logic.parameters, record.values)
     logic.parameters.sheets = nodes.get("sheets")
-    imaged = logic.patients.imaged(nodes["labels"])
-    return logic.patients.simulator(imaged), imaged.preset, required(record.pose, "no pose")
+    imaged = logic.patients.imaged(required(nodes.get("labels"), missing))
+    return logic.patients.simulator(imaged), imaged.preset, pose
 
 
 def _poses(path: str) -> list[np.ndarray]:
@@ -122,6 +112,6 @@ def _poses(path: str) -> list[np.ndarray]:
     from SlicerUSSim.Logic.tracked.sequence import TrackedSequence
 
     sequence = TrackedSequence.read(path)
-    numbers = [number for number in range(len(sequence)) if sequence.has_pose(number, _POSE)]
-    require(bool(numbers), f"{path}: has no {_POSE}, expected poses of the probe")
-    return [check_rigid(f"{path}: {_POSE}", sequence.pose(number, _POSE)) for number in numbers]
+    poses = [sequence.pose(number, _POSE) for number in range(len(sequence)) if sequence.has_pose(number, _POSE)]
+    require(poses, f"{path}: has no {_POSE}, expected poses of the probe")
+    return [check_rigid(f"{path}: {_POSE}", pose) for pose in poses]

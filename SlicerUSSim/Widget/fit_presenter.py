@@ -186,8 +186,8 @@ class FitPresenter:
     def showDifference(self, on: bool) -> None:
         """Let grey in the slice view be no difference of foreground and background: half of each, one inverted."""
         composite = self._composite()
-        shown = None if composite is None else self._panel.logic.scene.GetNodeByID(composite.GetForegroundVolumeID())
-        if composite is not None and shown is not None:
+        shown = composite and self._panel.logic.scene.GetNodeByID(composite.GetForegroundVolumeID())
+        if shown:
             display_of(shown).SetAndObserveColorNodeID(f"vtkMRMLColorTableNode{'InvertedGrey' if on else 'Grey'}")
             composite.SetForegroundOpacity(0.5 if on else 1.0)
 

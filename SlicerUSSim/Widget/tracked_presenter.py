@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from SlicerUSSim.Logic.base.errors import SimulationError, required
+from SlicerUSSim.Logic.base.errors import require, required
 from SlicerUSSim.Logic.base.transforms import check_rigid
 from SlicerUSSim.Logic.base.vtk_data import vtk_matrix
 from SlicerUSSim.Logic.mrml.fit_nodes import sequence_of
@@ -65,9 +66,7 @@ class TrackedPresenter:
             parameters.probe_transform = face
             if real is not None and real.IsA("vtkMRMLVolumeNode"):
                 self._show_streamed(real, matrix, tracked)
-            self.done = _("{source} below {name!r}: {words}").format(
-                source=source, name=tracked.GetName(), words="; ".join(words)
-            )
+            self.done = _("{source} below {name!r}: {words}").format(source=source, name=tracked.GetName(), words=words)
 
     def _calibration(self) -> tuple[np.ndarray, str]:
         """((4, 4) ImageToProbe, where it is from)."""
@@ -80,14 +79,10 @@ class TrackedPresenter:
         return required(read_calibration(text).get(_CALIBRATION), f"{text}: has no {_CALIBRATION}"), Path(text).name
 
     def _face_pixel(self) -> tuple[float, float] | None:
-        text = self._panel.parameters.panel.face_pixel.replace(",", " ").split()
-        if not text:
-            return None
-        try:
-            column, row = map(float, text)
-        except ValueError:
-            raise SimulationError(f"Face in the image is {' '.join(text)!r}, expected a column and a row") from None
-        return column, row
+        text = self._panel.parameters.panel.face_pixel.strip()
+        found = re.fullmatch(r"(\d+\.?\d*)[\s,]+(\d+\.?\d*)", text)
+        require(found or not text, f"Face in the image is {text!r}, expected a column and a row")
+        return None if found is None else (float(found[1]), float(found[2]))
 
     def _show_streamed(self, real: Any, image_to_probe: np.ndarray, tracked: Any) -> None:
         """Put a streamed image into the background of the slice view, which Blink uncovers.
@@ -123,10 +118,7 @@ class TrackedPresenter:
 
 
 def _images_of(real: Any) -> np.ndarray | None:
-    """(n, rows, columns) of real images; None without, and for a volume of several slices."""
-    if real is None:
-        return None
-    if real.IsA("vtkMRMLSequenceNode"):
-        return sequence_of(real).images
-    array = read_volume(real, "real image").array
-    return array if len(array) == 1 else None
+    """(n, rows, columns) of real images, if there are any."""
+    if real is None or real.IsA("vtkMRMLSequenceNode"):
+        return None if real is None else sequence_of(real).images
+    return read_volume(real, "real image").array

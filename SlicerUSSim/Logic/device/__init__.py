@@ -5,8 +5,6 @@ from typing import TYPE_CHECKING
 from SlicerUSSim.Logic.base.lazy import lazy_exports
 
 if TYPE_CHECKING:
-    from .plus_commands import PlusCommands as PlusCommands
-    from .recorder import Recorder as Recorder
     from .virtual_device import VirtualDevice as VirtualDevice
 
 lazy_exports(globals())

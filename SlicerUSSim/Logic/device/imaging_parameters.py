@@ -18,9 +18,7 @@ _NUMBERS = {
 }  # fmt: skip
 _FOCUS, _TGC = "FocusDepthPercent", "TimeGainCompensation"
 #: Parameters of Plus that this device does not have
-NOT_SET = (
-    "Intensity", "Contrast", "PowerDb", "SectorPercent", "ZoomFactor", "Voltage", "SoundVelocity", "ImageSize",
-)  # fmt: skip
+NOT_SET = ["Intensity", "Contrast", "PowerDb", "SectorPercent", "ZoomFactor", "Voltage", "SoundVelocity", "ImageSize"]
 
 
 def imaging_parameters(preset: Preset) -> dict[str, str]:

@@ -67,10 +67,7 @@ class PlusCommands:
         }  # fmt: skip
 
     def answer(self, command: bytes) -> tuple[bytes, Mapping[str, str]] | None:
-        """(content, metadata) of the reply to the content of a COMMAND; None to one without a name or a text.
-
-        Raises struct.error for a content that is too short.
-        """
+        """(content, metadata) of the reply to a COMMAND's; None if it is empty. Raises struct.error for half of one."""
         uid, padded, _, length = _COMMAND.unpack_from(command)
         name = padded.split(b"\0")[0].decode(errors="replace")
         text = command[_COMMAND.size : _COMMAND.size + length].decode(errors="replace").rstrip("\0")

@@ -11,7 +11,6 @@ from threading import Lock
 import numpy as np
 
 from SlicerUSSim.Logic.base.errors import require
-from SlicerUSSim.Logic.base.files import require_place
 from SlicerUSSim.Logic.tracked.sequence import SIMULATED, TrackedSequence, require_sequence_name
 
 
@@ -33,12 +32,11 @@ class Recorder:
         """Begin a recording; without a name it is called after the time.
 
         A path in the name is left out: clients are not asked who they are.
-        Raises SimulationError for a name of another format, and for a file that exists or cannot be written.
+        Raises SimulationError for a name of another format, and for a file that exists.
         """
         name = name.replace("\\", "/").rpartition("/")[2] or time.strftime("Recording_%Y%m%d_%H%M%S.igs.mha")
         path = self._folder / name
         require_sequence_name(path)
-        require_place(path)
         require(not path.exists(), f"{path}: exists; give another name")
         self._path, self.is_recording = path, True
 

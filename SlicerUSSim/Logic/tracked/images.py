@@ -294,7 +294,7 @@ def face_pose(image_to_world: np.ndarray, face_pixel: Sequence[float], path: str
 
 def face_of_calibration(
     image_to_probe: np.ndarray, images: np.ndarray | None = None, face_pixel: Sequence[float] | None = None
-) -> tuple[np.ndarray, tuple[str, ...]]:
+) -> tuple[np.ndarray, str]:
     """((4, 4) rigid, from the probe frame, at the face, to the tracked sensor, which Plus calls Probe; what was taken).
 
     `image_to_probe` is a calibration (4, 4), from pixels (column, row, 0, 1) to the sensor, mm. The face is at
@@ -316,11 +316,8 @@ def face_of_calibration(
             _log.info("%s", error)
             place, how = (0.5 * (images.shape[2] - 1), -0.5), "the middle of the first row, no field was found"
     pose = face_pose(image_to_probe, place, "ImageToProbe")
-    words = [
-        size,
-        f"face at column {place[0]:.1f}, row {place[1]:.1f} ({how})",
-        f"{np.linalg.norm(pose[:3, 3]):.1f} mm from the sensor",
-    ]
+    words = f"{size}; face at column {place[0]:.1f}, row {place[1]:.1f} ({how})"
+    words += f"; {np.linalg.norm(pose[:3, 3]):.1f} mm from the sensor"
     if np.linalg.det(image_to_probe[:3, :3]) < 0.0:
-        words.append("the calibration mirrors: if left and right of the image are wrong, it is")
-    return pose, tuple(words)
+        words += "; the calibration mirrors: if left and right of the image are wrong, it is"
+    return pose, words
