@@ -26,8 +26,8 @@ _log = logging.getLogger(__name__)
 
 #: IDs as in the configuration files of Plus
 ULTRASOUND, CAPTURE, CHANNEL = "VideoDevice", "CaptureDevice", "TrackedVideoStream"
-#: Types of devices that clients ask for
-_OF_TYPE = {"UsSimulator": [ULTRASOUND], "VirtualCapture": [CAPTURE], "VirtualVolumeReconstructor": []}
+#: {type that clients ask for: its device}
+_TYPES = {"UsSimulator": ULTRASOUND, "VirtualCapture": CAPTURE, "VirtualVolumeReconstructor": ""}
 #: Id, name, encoding and length of a command before its text
 _COMMAND, _ASCII = struct.Struct(">I128sHI"), 3
 
@@ -124,10 +124,10 @@ class PlusCommands:
 
     def _device_ids(self, command: Element) -> _Reply:
         kind = command.get("DeviceType", "")
-        if kind and kind not in _OF_TYPE:
+        if kind and kind not in _TYPES:
             return _Reply("Command failed, see error message.", "Unknown device type requested.")
-        wanted = _OF_TYPE[kind] if kind else [ULTRASOUND, CAPTURE]
-        return _ids([device for device in wanted if device != CAPTURE or self._recorder is not None])
+        here = [ULTRASOUND] if self._recorder is None else [ULTRASOUND, CAPTURE]
+        return _ids([device for device in here if not kind or device == _TYPES[kind]])
 
     def _transform(self, command: Element) -> _Reply:
         name, no_image = command.get("TransformName", ""), np.zeros((1, 0, 0), np.uint8)
@@ -135,9 +135,8 @@ class PlusCommands:
             matrix = TrackedSequence(no_image, (self._transforms(),), np.zeros(1)).pose(0, name)
         except SimulationError:
             raise SimulationError(f"GetTransform ({name}) Failed. Transform not found.") from None
-        persistent = "true" if name == "ImageToProbe" else "false"
-        values = " ".join(f"{value:g}" for value in matrix.ravel())
-        metadata = {name: values, "persistent": persistent, "date": "", "error": "-1"}
+        values, is_constant = " ".join(f"{value:g}" for value in matrix.ravel()), name == "ImageToProbe"
+        metadata = {name: values, "persistent": str(is_constant).lower(), "date": "", "error": "-1"}
         return _Reply(f"GetTransform ({name}) Command successful.", metadata=metadata)
 
     def _record(self, command: Element) -> _Reply:

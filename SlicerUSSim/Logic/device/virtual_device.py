@@ -20,8 +20,6 @@ from SlicerUSSim.Logic.tracked.openigtlink import Address, TrackerLink
 
 _log = logging.getLogger(__name__)
 
-#: Name of the IMAGE messages: in Plus' words the image with its place in the frame called Reference
-_IMAGE = "Image_Reference"
 #: Seconds between poses of a path, and between looks for a client
 _STEP_S, _LOOK_EVERY_S = 0.05, 0.05
 
@@ -51,9 +49,9 @@ class VirtualDevice:
         self._stopping = threading.Event()
         self.recorder = Recorder(folder)
         commands = PlusCommands(lambda: self.preset, self.change, self.transforms, self.recorder)
-        self.link = TrackerLink(
-            address.host, address.port, self._move, listen=True, image_name=_IMAGE, answer=commands.answer
-        )
+        host, port, _ = address
+        image = "Image_Reference"  # in Plus' words, with its place in the frame called Reference
+        self.link = TrackerLink(host, port, self._move, listen=True, image_name=image, answer=commands.answer)
 
     @property
     def pose(self) -> np.ndarray:

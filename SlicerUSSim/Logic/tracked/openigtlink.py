@@ -245,8 +245,6 @@ class TrackerLink:
             self._changed.wait_for(lambda: self._newest is not before or peer not in self.peers)
             return self._newest if peer in self.peers else None
 
-    # ---- status ------------------------------------------------------------------------------------------------
-
     def _tell(self) -> None:
         """Say who is connected."""
         following = f", following {self._device}" if self._leader is not None else ""
