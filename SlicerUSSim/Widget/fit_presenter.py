@@ -186,7 +186,7 @@ class FitPresenter:
     def showDifference(self, on: bool) -> None:
         """Let grey in the slice view be no difference of foreground and background: half of each, one inverted."""
         composite = self._composite()
-        shown = composite and self._panel.logic.scene.GetNodeByID(composite.GetForegroundVolumeID())
+        shown = composite and self._panel.logic.scene.GetNodeByID(composite.GetForegroundVolumeID() or "")
         if shown:
             display_of(shown).SetAndObserveColorNodeID(f"vtkMRMLColorTableNode{'InvertedGrey' if on else 'Grey'}")
             composite.SetForegroundOpacity(0.5 if on else 1.0)

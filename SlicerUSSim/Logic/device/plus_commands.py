@@ -1,6 +1,7 @@
 """PlusCommands: answers commands of OpenIGTLink clients, such as SlicerOpenIGTLink's, as PlusServer does.
 
-Texts and names of metadata are those of PlusLib (src/PlusServer, 2.9), which answers COMMAND by RTS_COMMAND.
+Texts and names are those of PlusLib (src/PlusServer and vtkPlusUsImagingParameters, 2.9), which answers COMMAND by
+RTS_COMMAND. FocusDepthMm is this device's own.
 """
 
 from __future__ import annotations
@@ -17,7 +18,6 @@ from xml.etree.ElementTree import Element, SubElement
 import numpy as np
 
 from SlicerUSSim.Logic.base.errors import SimulationError, require, required
-from SlicerUSSim.Logic.device.imaging_parameters import NOT_SET, changed_parameter, imaging_parameters
 from SlicerUSSim.Logic.device.recorder import Recorder
 from SlicerUSSim.Logic.imaging.preset import Preset
 from SlicerUSSim.Logic.tracked.sequence import TrackedSequence
@@ -28,6 +28,15 @@ _log = logging.getLogger(__name__)
 ULTRASOUND, CAPTURE, CHANNEL = "VideoDevice", "CaptureDevice", "TrackedVideoStream"
 #: {type that clients ask for: its device}
 _TYPES = {"UsSimulator": ULTRASOUND, "VirtualCapture": CAPTURE, "VirtualVolumeReconstructor": ""}
+#: {name: (section, field, the field's value at 0, its change by 1)}; the gain is that of the panel's slider
+_NUMBERS = {
+    "DepthMm": ("probe", "depth_mm", 0.0, 1.0), "FrequencyMhz": ("probe", "frequency_mhz", 0.0, 1.0),
+    "FocusDepthMm": ("probe", "focus_mm", 0.0, 1.0), "DynRangeDb": ("display", "dynamic_range_db", 0.0, 1.0),
+    "GainPercent": ("display", "gain_db", -40.0, 0.8),
+}  # fmt: skip
+_FOCUS, _TGC = "FocusDepthPercent", "TimeGainCompensation"
+#: Parameters of Plus that this device does not have
+_NOT_SET = ["Intensity", "Contrast", "PowerDb", "SectorPercent", "ZoomFactor", "Voltage", "SoundVelocity", "ImageSize"]
 #: Id, name, encoding and length of a command before its text
 _COMMAND, _ASCII = struct.Struct(">I128sHI"), 3
 
@@ -92,13 +101,13 @@ class PlusCommands:
         return _COMMAND.pack(uid, name.encode(), _ASCII, len(body)) + body, dict(sorted(metadata.items()))
 
     def _get(self, command: Element) -> _Reply:
-        asked, known, content, errors = _asked(command), imaging_parameters(self._preset()), Element("CommandReply"), ""
+        asked, known, content, errors = _asked(command), _parameters(self._preset()), Element("CommandReply"), ""
         for name in asked:
             if name in known:
                 SubElement(content, "Parameter", Name=name, Success="true", Value=known[name])
             else:
                 SubElement(content, "Parameter", Name=name, Success="false")
-                errors += f"{name} is not set. " if name in NOT_SET else f"Invalid parameter {name}. "
+                errors += f"{name} is not set. " if name in _NOT_SET else f"Invalid parameter {name}. "
         return _Reply(error=errors, metadata={name: known[name] for name in asked if name in known}, content=content)
 
     def _set(self, command: Element) -> _Reply:
@@ -112,7 +121,7 @@ class PlusCommands:
     def _set_one(self, name: str, text: str) -> str:
         """An error, or ""."""
         try:
-            self._change(changed_parameter(self._preset(), name, text))
+            self._change(_changed(self._preset(), name, text))
         except KeyError:
             return f"Invalid parameter {name}. "
         except ValueError:
@@ -179,3 +188,34 @@ def _asked(command: Element) -> dict[str, str]:
 
 def _ids(names: list[str]) -> _Reply:
     return _Reply(",".join(names), metadata={name: name for name in names})
+
+
+def _parameters(preset: Preset) -> dict[str, str]:
+    """{name: text, as Plus writes it} of all that this device has."""
+    numbers = {
+        name: (getattr(getattr(preset, section), field) - start) / step
+        for name, (section, field, start, step) in _NUMBERS.items()
+    }
+    numbers[_FOCUS] = 100.0 * numbers["FocusDepthMm"] / numbers["DepthMm"]
+    gains = [getattr(preset.display, f"depth_gain_{slider}_db") for slider in range(1, 9)]
+    compensation = f"{gains[0]:g} {0.5 * (gains[3] + gains[4]):g} {gains[7]:g} "  # face, middle, and image depth
+    return {**{name: f"{value:g}" for name, value in numbers.items()}, _TGC: compensation}
+
+
+def _changed(preset: Preset, name: str, text: str) -> Preset:
+    """A preset with one of these parameters changed.
+
+    Raises KeyError for an unknown one, ValueError for a text that is no number, or not three of them for
+    TimeGainCompensation, and SimulationError for a value that is out of range, and for one of _NOT_SET.
+    """
+    require(name not in _NOT_SET, f"{name} cannot be changed in this device")
+    values = [float(part) for part in text.split()]
+    if name == _TGC:
+        face, middle, depth = values
+        gains = np.interp(range(1, 9), (1, 4, 5, 8), (face, middle, middle, depth)).tolist()
+        return preset.changed("display", **{f"depth_gain_{slider}_db": gain for slider, gain in enumerate(gains, 1)})
+    (value,) = values
+    if name == _FOCUS:
+        name, value = "FocusDepthMm", 0.01 * value * preset.probe.depth_mm
+    section, field, start, step = _NUMBERS[name]
+    return preset.changed(section, **{field: start + step * value})
