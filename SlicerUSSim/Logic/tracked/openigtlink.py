@@ -30,8 +30,8 @@ _log = logging.getLogger(__name__)
 
 #: The default port of OpenIGTLink.
 DEFAULT_PORT = 18944
-#: Seconds between attempts to connect; seconds until a peer that stops within a message, or does not read, is
-#: disconnected; seconds without a pose after which another client may move the probe
+#: Seconds between attempts to connect; seconds until a peer that stops within a message is disconnected; seconds
+#: without a pose after which another client may move the probe
 _RETRY_S, _STALLED_S, _SILENT_S = 0.25, 5.0, 2.0
 #: Limit of the message size; a larger size in a header means that the data are not OpenIGTLink.
 _LARGEST_BYTES = 1 << 28
@@ -101,8 +101,12 @@ class _Peer(NamedTuple):
     sending: threading.Lock
 
     def send(self, packed: bytes) -> None:
+        """Send a message, for as long as it takes: a robot may move the probe without reading anything."""
+        rest = memoryview(packed)
         with self.sending:
-            self.socket.sendall(packed)
+            while rest:
+                with suppress(TimeoutError):
+                    rest = rest[self.socket.send(rest) :]
 
     def close(self) -> None:
         """Let threads that read or send find that the connection has ended."""
@@ -235,8 +239,7 @@ class TrackerLink:
                 peer.send(others if is_known else calibration + others)
                 before = newest
                 self.sent += 1
-        except OSError as error:
-            _log.info("OpenIGTLink: an image is not taken (%s)", error)
+        except OSError:
             peer.close()
 
     def _after(self, before: _Outgoing | None, peer: _Peer) -> _Outgoing | None:
