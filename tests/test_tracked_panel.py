@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from unittest.mock import Mock, call
+
 import numpy as np
 import pytest
 
@@ -46,6 +48,7 @@ def panel():
     volume = block(lambda x, y, z: 1.0 + (x > 0), half_mm=(60, 60, 60), spacing_mm=4.0)
     write_labels(labels, volume, ["grey matter", "white matter"], labels)
     presenter = PanelPresenter(UltrasoundSceneLogic(scene), PlainView())
+    presenter.logic.preset = presenter.logic.preset.changed("probe", kind="linear", scan_lines=16, depth_mm=30.0)
     presenter.parameters.labels = labels
     presenter.parameters.tracked = transform(scene, "ProbeToReference", SENSOR)
     return presenter
@@ -105,7 +108,6 @@ def test_a_tracker_moves_the_face_and_the_streamed_image_lies_in_its_plane(panel
     assert np.allclose(probe_pose(face), SENSOR @ FACE_TO_PROBE, atol=0.6)
     assert "'ImageToProbe' below 'ProbeToReference': pixels of" in panel.tracking.text()
     assert np.allclose(node_to_world(parameters.real), SENSOR @ IMAGE_TO_PROBE)
-    panel.logic.preset = panel.logic.preset.changed("probe", kind="linear", scan_lines=16, depth_mm=30.0)
     panel.images.setLive(True)
     moved = turned(SENSOR, rock_deg=10.0)  # as while a sequence plays
     parameters.tracked.SetMatrixTransformToParent(vtk_matrix(moved))
@@ -177,7 +179,6 @@ def test_a_slice_view_that_volume_reslice_driver_moves_stays(panel):
     scene, parameters = panel.logic.scene, panel.parameters
     parameters.probe_transform = transform(scene, "Probe", SENSOR)
     view, _ = slice_view(panel)
-    panel.logic.preset = panel.logic.preset.changed("probe", kind="linear", scan_lines=16, depth_mm=30.0)
     view.SetAttribute("VolumeResliceDriver.Driver", parameters.tracked.GetID())
     panel.images.simulate()
     assert view.GetSliceToRAS().GetElement(0, 3) == 0.0 and not panel.view.errors
@@ -187,32 +188,16 @@ def test_a_slice_view_that_volume_reslice_driver_moves_stays(panel):
     assert view.GetSliceToRAS().GetElement(0, 3) != 0.0 and panel.tracking.text() == ""
 
 
-class Connector:
-    """What vtkMRMLIGTLConnectorNode of OpenIGTLinkIF is called for."""
-
-    def __init__(self) -> None:
-        self.outgoing, self.port, self.is_on = [], None, False
-
-    def SetTypeServer(self, port: int) -> None:
-        self.port = port
-
-    def RegisterOutgoingMRMLNode(self, node) -> None:
-        self.outgoing.append(node)
-
-    def Start(self) -> None:
-        self.is_on = True
-
-
 def test_the_image_and_the_probe_are_sent_by_openigtlinkif(panel, monkeypatch):
-    scene, parameters, connector = panel.logic.scene, panel.parameters, Connector()
-    parameters.probe_transform = transform(scene, "Probe", SENSOR)
-    panel.logic.preset = panel.logic.preset.changed("probe", kind="linear", scan_lines=16, depth_mm=30.0)
+    parameters, connector = panel.parameters, Mock()
+    parameters.probe_transform = transform(panel.logic.scene, "Probe", SENSOR)
     panel.tracking.sendImages()
     panel.images.simulate()
     panel.tracking.sendImages()
     words = "no image yet", "install the extension SlicerOpenIGTLink"
     assert all(word in error for word, error in zip(words, panel.view.errors, strict=True))
-    monkeypatch.setattr(scene, "AddNewNodeByClass", lambda *_: connector)
+    monkeypatch.setattr(panel.logic.scene, "AddNewNodeByClass", lambda *_: connector)
     panel.tracking.sendImages()
-    assert len(panel.view.errors) == 2 and (connector.port, connector.is_on) == (18944, True)
-    assert connector.outgoing == [parameters.output, parameters.probe_transform]
+    assert len(panel.view.errors) == 2
+    outgoing = [call.RegisterOutgoingMRMLNode(node) for node in (parameters.output, parameters.probe_transform)]
+    assert connector.mock_calls == [call.SetTypeServer(18944), *outgoing, call.Start()]

@@ -73,7 +73,7 @@ class TrackedPresenter:
         node, text = self._panel.parameters.calibration, self._panel.parameters.panel.calibration_text.strip()
         if node is not None:
             return node_to_parent(node), named(node)
-        required(text or None, "no calibration, expected a transform, a Plus configuration or 16 numbers")
+        require(text, "no calibration, expected a transform, a Plus configuration or 16 numbers")
         if Path(text).suffix.lower() != ".xml":
             return matrix_of_text("the calibration", text), _("the calibration")
         return required(read_calibration(text).get(_CALIBRATION), f"{text}: has no {_CALIBRATION}"), Path(text).name
@@ -119,6 +119,6 @@ class TrackedPresenter:
 
 def _images_of(real: Any) -> np.ndarray | None:
     """(n, rows, columns) of real images, if there are any."""
-    if real is None or real.IsA("vtkMRMLSequenceNode"):
-        return None if real is None else sequence_of(real).images
-    return read_volume(real, "real image").array
+    if real is None:
+        return None
+    return sequence_of(real).images if real.IsA("vtkMRMLSequenceNode") else read_volume(real, "real image").array
