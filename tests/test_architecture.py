@@ -50,7 +50,7 @@ BUDGETS = {
     "base": 3360, "opencl": 1325, "probe": 1755, "tissue": 2065, "tracked": 2095, "mri": 7470, "placement": 1310,
     "imaging": 5690, "device": 395, "datasets": 1650, "fitting": 3675, "vtk": 510, "mrml": 4915, "Widget": 3405,
     "Workstation": 5840, "Command": 3090, "gym": 140, "module": 430, "validation": 6620, "benchmarks": 4055,
-    "tests": 30775, "tests/reference": 505,
+    "tests": 30780, "tests/reference": 505,
 }  # fmt: skip
 #: Lines of all of SlicerUSSim/, and of kernels/
 LARGEST_PRODUCT, LARGEST_KERNELS = 49_100, 5_880

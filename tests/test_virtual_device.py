@@ -120,6 +120,7 @@ def test_status_and_capabilities_are_told(client, version):
 
 def test_any_client_moves_the_probe_one_at_a_time(running, monkeypatch):
     device = running.device
+    monkeypatch.setattr(openigtlink, "_SILENT_S", 60.0)  # on a busy machine, too
     with StrictClient(running.port) as first, StrictClient(running.port) as second:
         first.move(turned(POSE, rock_deg=5.0))
         until(lambda: np.allclose(device.pose, turned(POSE, rock_deg=5.0), atol=1e-5))
@@ -272,6 +273,12 @@ def test_what_plus_does_not_answer_is_not_answered(client, running):
         other.next("IMAGE")  # goes on
         other.socket.sendall(whole[100:])
         assert other.next("RTS_COMMAND").command[0] == 12
+        for peer in running.device.link.peers:
+            peer.socket.settimeout(0.1)  # in place of seconds
+        other.socket.sendall(whole[:100])
+        with pytest.raises(ConnectionError):
+            while other.receive():
+                pass
 
 
 def test_transforms_are_composed_on_request(client, running):
