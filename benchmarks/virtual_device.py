@@ -82,8 +82,8 @@ def _measure(
             f"{middle:6.1f} 99 % {high:6.1f} ms, {wrong} images without the time of their pose"
         )
     print(
-        f"{name}: {link.received} poses used, {link.dropped} dropped, {link.sent} images sent, {link.left_out} left "
-        f"out for a busy client; memory {early:.0f} MB at a tenth, {late:.0f} MB at the end"
+        f"{name}: {link.received} poses used, {link.dropped} dropped, {link.sent} images sent; memory {early:.0f} MB "
+        f"at a tenth, {late:.0f} MB at the end"
     )
     stop()
 

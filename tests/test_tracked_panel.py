@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from unittest.mock import Mock, call
+
 import numpy as np
 import pytest
 
@@ -46,9 +48,19 @@ def panel():
     volume = block(lambda x, y, z: 1.0 + (x > 0), half_mm=(60, 60, 60), spacing_mm=4.0)
     write_labels(labels, volume, ["grey matter", "white matter"], labels)
     presenter = PanelPresenter(UltrasoundSceneLogic(scene), PlainView())
+    presenter.logic.preset = presenter.logic.preset.changed("probe", kind="linear", scan_lines=16, depth_mm=30.0)
     presenter.parameters.labels = labels
     presenter.parameters.tracked = transform(scene, "ProbeToReference", SENSOR)
     return presenter
+
+
+def slice_view(panel):
+    """(view, its layers) of the panel."""
+    view, composite = (panel.logic.scene.AddNewNodeByClass(f"vtkMRMLSlice{kind}Node") for kind in ("", "Composite"))
+    view.SetLayoutName("Red")
+    composite.SetLayoutName("Red")
+    panel.view.sliceNode = lambda: view
+    return view, composite
 
 
 def streamed(scene):
@@ -58,18 +70,17 @@ def streamed(scene):
     return node
 
 
-def test_the_face_follows_from_the_calibration_and_its_pixel():
+def test_the_face_is_given_found_in_the_image_or_in_its_first_row():
     pixel = np.linalg.inv(GRID.image_to_probe)[:2, 3].tolist()
     pose, words = face_of_calibration(IMAGE_TO_PROBE, face_pixel=pixel)
-    assert np.allclose(pose, FACE_TO_PROBE, atol=1e-9) and "(as given)" in words[1]
-    assert words[0] == "pixels of {:.3g} x {:.3g} mm".format(*GRID.pixel_spacing_mm)
-
-
-def test_the_face_is_found_in_the_image_or_taken_from_its_first_row():
+    assert np.allclose(pose, FACE_TO_PROBE, atol=1e-9) and "(as given)" in words
+    assert words.startswith("pixels of {:.3g} x {:.3g} mm; ".format(*GRID.pixel_spacing_mm))
     pose, words = face_of_calibration(IMAGE_TO_PROBE, IMAGE[None])
-    assert np.allclose(pose, FACE_TO_PROBE, atol=0.6) and "of a field" in words[1]
+    assert np.allclose(pose, FACE_TO_PROBE, atol=0.6) and "of a field" in words
     _, words = face_of_calibration(IMAGE_TO_PROBE, np.zeros((1, 220, 260), np.uint8))
-    assert words[1] == "face at column 129.5, row -0.5 (the middle of the first row, no field was found)"
+    assert "; face at column 129.5, row -0.5 (the middle of the first row, no field was found); " in words
+    pose, words = face_of_calibration(IMAGE_TO_PROBE @ np.diag([1.0, 1.0, -1.0, 1.0]), face_pixel=(10, 0))
+    assert "; the calibration mirrors: " in words and np.linalg.det(pose) > 0
 
 
 @pytest.mark.parametrize(
@@ -85,20 +96,11 @@ def test_a_calibration_in_metres_or_skewed_is_refused(change, words):
         face_of_calibration(change @ GRID.image_to_probe, face_pixel=(130, 0))
 
 
-def test_a_mirrored_calibration_is_said():
-    mirrored = IMAGE_TO_PROBE @ np.diag([1.0, 1.0, -1.0, 1.0])
-    pose, words = face_of_calibration(mirrored, face_pixel=(10, 0))
-    assert words[-1].startswith("the calibration mirrors") and np.linalg.det(pose) > 0
-
-
 def test_a_tracker_moves_the_face_and_the_streamed_image_lies_in_its_plane(panel):
     scene, parameters = panel.logic.scene, panel.parameters
     parameters.calibration = transform(scene, "ImageToProbe", IMAGE_TO_PROBE)
     parameters.real = streamed(scene)
-    view, composite = (scene.AddNewNodeByClass(f"vtkMRMLSlice{kind}Node") for kind in ("", "Composite"))
-    view.SetLayoutName("Red")
-    composite.SetLayoutName("Red")
-    panel.view.sliceNode = lambda: view
+    view, composite = slice_view(panel)
     panel.tracking.useCalibration()
     assert composite.GetBackgroundVolumeID() == parameters.real.GetID() and panel.fits.canBlink()
     face = parameters.probe_transform
@@ -106,7 +108,6 @@ def test_a_tracker_moves_the_face_and_the_streamed_image_lies_in_its_plane(panel
     assert np.allclose(probe_pose(face), SENSOR @ FACE_TO_PROBE, atol=0.6)
     assert "'ImageToProbe' below 'ProbeToReference': pixels of" in panel.tracking.text()
     assert np.allclose(node_to_world(parameters.real), SENSOR @ IMAGE_TO_PROBE)
-    panel.logic.preset = panel.logic.preset.changed("probe", kind="linear", scan_lines=16, depth_mm=30.0)
     panel.images.setLive(True)
     moved = turned(SENSOR, rock_deg=10.0)  # as while a sequence plays
     parameters.tracked.SetMatrixTransformToParent(vtk_matrix(moved))
@@ -117,6 +118,23 @@ def test_a_tracker_moves_the_face_and_the_streamed_image_lies_in_its_plane(panel
     assert "the tracker moves the probe" in panel.view.errors[-1]
     assert np.allclose(node_to_world(face), panel.logic.taken.probe_to_world)
     panel.images.setLive(False)
+
+
+def test_the_difference_to_the_streamed_image_is_shown_and_ends(panel):
+    scene, real = panel.logic.scene, streamed(panel.logic.scene)
+    colours = slicer.vtkMRMLColorLogic()
+    colours.SetMRMLScene(scene)  # Slicer's own tables
+    _, composite = slice_view(panel)
+    shown = scene.AddNewNodeByClass("vtkMRMLScalarVolumeNode", "Ultrasound")
+    write_volume(shown, Volume(IMAGE[None], np.eye(4)))
+    panel.parameters.real = real
+    panel.fits.showDifference(True)  # of nothing
+    composite.SetForegroundVolumeID(shown.GetID())
+    panel.fits.showDifference(True)
+    assert shown.GetDisplayNode().GetColorNode().GetName() == "InvertedGrey"
+    assert composite.GetForegroundOpacity() == 0.5  # of the inverted one, and of the real one: grey where they agree
+    panel.fits.showDifference(False)
+    assert shown.GetDisplayNode().GetColorNode().GetName() == "Grey" and composite.GetForegroundOpacity() == 1.0
 
 
 def test_a_plus_configuration_or_typed_numbers_are_a_calibration(panel, tmp_path):
@@ -146,11 +164,9 @@ def test_what_is_missing_or_wrong_is_said(panel):
     words = "no calibration", "expected 16", "face is in the image is not known", "expected a column", "no tracked"
     assert len(panel.view.errors) == 5
     assert all(word in error for word, error in zip(words, panel.view.errors, strict=True)), panel.view.errors
-    panel.parameters.probe_transform = panel.parameters.calibration
-    with pytest.raises(SimulationError, match="it is a calibration: choose it as such below Tracked"):
-        probe_pose(panel.parameters.probe_transform)
-    panel.parameters.probe_transform = transform(panel.logic.scene, "ProbeToTracker", SENSOR)
-    assert panel.tracking.text().startswith("Check: 'ProbeToTracker' is the pose of the sensor")
+    for chosen in (panel.parameters.calibration, transform(panel.logic.scene, "ProbeToTracker", SENSOR)):
+        panel.parameters.probe_transform = chosen
+        assert panel.tracking.text().startswith(f"Check: {chosen.GetName()!r} is not the pose of the probe's face")
 
 
 def test_a_page_of_the_browser_cannot_name_a_calibration_file(panel):
@@ -162,10 +178,7 @@ def test_a_page_of_the_browser_cannot_name_a_calibration_file(panel):
 def test_a_slice_view_that_volume_reslice_driver_moves_stays(panel):
     scene, parameters = panel.logic.scene, panel.parameters
     parameters.probe_transform = transform(scene, "Probe", SENSOR)
-    view = scene.AddNewNodeByClass("vtkMRMLSliceNode", "Red")
-    view.SetLayoutName("Red")
-    panel.view.sliceNode = lambda: view
-    panel.logic.preset = panel.logic.preset.changed("probe", kind="linear", scan_lines=16, depth_mm=30.0)
+    view, _ = slice_view(panel)
     view.SetAttribute("VolumeResliceDriver.Driver", parameters.tracked.GetID())
     panel.images.simulate()
     assert view.GetSliceToRAS().GetElement(0, 3) == 0.0 and not panel.view.errors
@@ -175,37 +188,16 @@ def test_a_slice_view_that_volume_reslice_driver_moves_stays(panel):
     assert view.GetSliceToRAS().GetElement(0, 3) != 0.0 and panel.tracking.text() == ""
 
 
-class Connector:
-    """What vtkMRMLIGTLConnectorNode of OpenIGTLinkIF is called for."""
-
-    def __init__(self) -> None:
-        self.outgoing, self.port, self.is_on = [], None, False
-
-    def UnRegister(self, _) -> None: ...
-
-    def SetName(self, name: str) -> None: ...
-
-    def SetTypeServer(self, port: int) -> None:
-        self.port = port
-
-    def RegisterOutgoingMRMLNode(self, node) -> None:
-        self.outgoing.append(node)
-
-    def Start(self) -> None:
-        self.is_on = True
-
-
 def test_the_image_and_the_probe_are_sent_by_openigtlinkif(panel, monkeypatch):
-    scene, parameters, connector = panel.logic.scene, panel.parameters, Connector()
-    parameters.probe_transform = transform(scene, "Probe", SENSOR)
-    panel.logic.preset = panel.logic.preset.changed("probe", kind="linear", scan_lines=16, depth_mm=30.0)
+    parameters, connector = panel.parameters, Mock()
+    parameters.probe_transform = transform(panel.logic.scene, "Probe", SENSOR)
     panel.tracking.sendImages()
     panel.images.simulate()
     panel.tracking.sendImages()
     words = "no image yet", "install the extension SlicerOpenIGTLink"
     assert all(word in error for word, error in zip(words, panel.view.errors, strict=True))
-    monkeypatch.setattr(scene, "CreateNodeByClass", lambda _: connector)
-    monkeypatch.setattr(scene, "AddNode", lambda node: node)
+    monkeypatch.setattr(panel.logic.scene, "AddNewNodeByClass", lambda *_: connector)
     panel.tracking.sendImages()
-    assert len(panel.view.errors) == 2 and (connector.port, connector.is_on) == (18944, True)
-    assert connector.outgoing == [parameters.output, parameters.probe_transform]
+    assert len(panel.view.errors) == 2
+    outgoing = [call.RegisterOutgoingMRMLNode(node) for node in (parameters.output, parameters.probe_transform)]
+    assert connector.mock_calls == [call.SetTypeServer(18944), *outgoing, call.Start()]

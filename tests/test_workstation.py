@@ -718,7 +718,6 @@ def test_clients_see_the_page_as_an_ultrasound_device(browser, files):
     with serving(str(files / "head.nii.gz"), "--igtl", f":{port}") as address:
         page = opened(browser, address)
         with StrictClient(port) as client, StrictClient(port) as robot:
-            client.checks_crc = robot.checks_crc = False
             assert client.next("IMAGE").device == "SlicerUSSim"
             wanted = '<Parameter Name="DepthMm" Value="80"/><Parameter Name="GainPercent" Value="60"/>'
             reply = client.command(f'<Command Name="SetUsParameter">{wanted}</Command>')
@@ -732,9 +731,8 @@ def test_clients_see_the_page_as_an_ultrasound_device(browser, files):
             assert np.allclose((place @ calibration)[:, [0, 1, 3]], matrix[:, [0, 1, 3]], atol=1e-3) and image.any()
             place[0, 3] += 1.5
             robot.move(place)
-            moved = robot.next("TRANSFORM", "ProbeToReference").matrix
-            while not np.allclose(moved, place, atol=1e-3):
-                moved = robot.next("TRANSFORM", "ProbeToReference").matrix
+            while not np.allclose(robot.next("TRANSFORM", "ProbeToReference").matrix, place, atol=1e-3):
+                pass
             page.get_by_text("connected to 2 clients, following ProbeToReference").wait_for()
         page.close()
 

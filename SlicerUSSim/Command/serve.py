@@ -85,7 +85,7 @@ def serve(patient: ServeOptions, recording: TrackingOptions) -> None:
     """
     from SlicerUSSim.Logic.base.volume import Volume
 
-    _require_workstation()
+    require_workstation()
     scene, scene_name, also_open, mri = None, "", None, patient.mri
     if mri is not None and _is_no_image(mri):
         (scene, scene_name), also_open, mri = _opened_first(mri, given_options(*_OF_PATIENT))
@@ -202,7 +202,7 @@ def _opened_first(path: str, options: list[str]) -> tuple[tuple[SceneRecord | No
     return (read_scene(path), Path(path).name), None, None
 
 
-def _require_workstation() -> None:
+def require_workstation() -> None:
     """Raise SimulationError unless the libraries of the workstation are installed."""
     for name in ("trame_slicer", "greenlet"):
         remedy = f'the workstation needs {name}; install it with: pip install "SlicerUSSim[serve]"'

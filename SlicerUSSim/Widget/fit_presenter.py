@@ -12,7 +12,7 @@ from SlicerUSSim.Logic.fitting.search import Progress
 from SlicerUSSim.Logic.fitting.tracked_fit import Fit
 from SlicerUSSim.Logic.imaging.preset import Preset
 from SlicerUSSim.Logic.mrml.fit_nodes import COMPARED, CostPlot
-from SlicerUSSim.Logic.mrml.nodes import composite_of, require_node
+from SlicerUSSim.Logic.mrml.nodes import composite_of, display_of, require_node
 from SlicerUSSim.Logic.mrml.own_results import result_called
 from SlicerUSSim.Logic.tracked.sequence import checked_apart, frame_numbers
 from SlicerUSSim.Widget.interface import PanelHost, tr as _
@@ -179,10 +179,21 @@ class FitPresenter:
 
     def blink(self) -> None:
         """Toggle the foreground of the slice view, which covers the real image in the background."""
-        view = self._panel.view.sliceNode()
-        composite = None if view is None else composite_of(view)
+        composite = self._composite()
         if composite is not None:
             composite.SetForegroundOpacity(0.0 if composite.GetForegroundOpacity() > 0.5 else 1.0)
+
+    def showDifference(self, on: bool) -> None:
+        """Let grey in the slice view be no difference of foreground and background: half of each, one inverted."""
+        composite = self._composite()
+        shown = composite and self._panel.logic.scene.GetNodeByID(composite.GetForegroundVolumeID() or "")
+        if shown:
+            display_of(shown).SetAndObserveColorNodeID(f"vtkMRMLColorTableNode{'InvertedGrey' if on else 'Grey'}")
+            composite.SetForegroundOpacity(0.5 if on else 1.0)
+
+    def _composite(self) -> Any:
+        view = self._panel.view.sliceNode()
+        return None if view is None else composite_of(view)
 
     def _show(self, kind: str, number: int) -> None:
         found, labels = required(self._fit, "nothing to show, fit first")

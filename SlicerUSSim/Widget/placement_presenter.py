@@ -11,7 +11,7 @@ from SlicerUSSim.Logic.base.errors import require, required
 from SlicerUSSim.Logic.mrml.nodes import display_of, set_node_to_world
 from SlicerUSSim.Widget.interface import PanelHost, tr as _
 from SlicerUSSim.Widget.notes import OPENED, PLACED, VIEW, Notes, checks
-from SlicerUSSim.Widget.tracked_presenter import is_face
+from SlicerUSSim.Widget.tracked_presenter import FACE
 
 T = TypeVar("T")
 
@@ -57,9 +57,10 @@ class PlacementPresenter:
 
     def _moved(self, move: Callable[[Any], T]) -> T:
         parameters = self._panel.parameters
-        is_moved = parameters.probe_transform is not None and is_face(parameters.probe_transform)
+        chosen: Any = parameters.probe_transform
+        is_moved = chosen is not None and chosen.GetName() == FACE
         require(not is_moved, "the tracker moves the probe; choose another probe transform, or none, to place it")
-        with self._panel.made(parameters.probe_transform, "LinearTransform", "Probe") as probe:
+        with self._panel.made(chosen, "LinearTransform", "Probe") as probe:
             line = move(probe)
         parameters.probe_transform = probe
         display = display_of(probe)

@@ -273,10 +273,7 @@ def _tracker(panel: PanelPresenter) -> tuple[Row, ...]:
     """Of Slicer alone: the page has a tracker of its own, and a page must not name files of the server."""
     tracking = panel.tracking
     return (
-        node(
-            "tracked", _("Tracked transform"), _("What the tracker measures of the sensor on the probe, such as "
-            "ProbeToReference of Plus"),
-        ),
+        node("tracked", _("Tracked transform"), _("Pose of the sensor on the probe, such as ProbeToReference of Plus")),
         node(
             "calibration", _("Calibration"), _("ImageToProbe: from pixels of the real image to the sensor, mm; none: "
             "the text below"),
@@ -284,19 +281,15 @@ def _tracker(panel: PanelPresenter) -> tuple[Row, ...]:
         *values("scene.calibration_text", "scene.face_pixel"),
         (
             button(
-                "useCalibration", _("Use calibration"),
-                _("Let the tracked transform move the probe's face, whose place follows from the calibration"),
-                tracking.useCalibration,
+                "useCalibration", _("Use calibration"), _("Let the tracked transform move the probe's face, whose "
+                "place follows from the calibration"), tracking.useCalibration,
             ),
             button(
-                "sendImages", _("Send images"),
-                _("Start an OpenIGTLink server that sends the image and the probe's transform (needs the extension "
-                  "SlicerOpenIGTLink)"), tracking.sendImages,
+                "sendImages", _("Send images"), _("Start an OpenIGTLink server that sends the image and the probe's "
+                "transform (needs the extension SlicerOpenIGTLink)"), tracking.sendImages,
             ),
         ),
-        Control(
-            "tracked", "words", tip=_("What the calibration was taken for, and what to check"), shows=tracking.text,
-        ),
+        Control("tracked", "words", tip=_("What was taken for the calibration"), shows=tracking.text),
     )  # fmt: skip
 
 
@@ -365,6 +358,10 @@ def _fit(panel: PanelPresenter) -> tuple[Row, ...]:
             Control(
                 "blink", "tick", _("Blink"), _("Alternate between real and simulated image twice a second"),
                 enabled=fits.canBlink,
+            ),
+            Control(
+                "difference", "tick", _("Difference"), _("Show where the real image in the background is brighter or "
+                "darker than the simulated one; grey: no difference"), enabled=fits.canBlink, sets=fits.showDifference,
             ),
         ),
     )  # fmt: skip

@@ -38,7 +38,7 @@ MODULE = {
 NOT_SHOWN = {
     "sliceViewComboBox", "showInSliceCheckBox", "showIn3dCheckBox", "showProbeCheckBox", "layoutButton",
     "compareComboBox", "compareNumberComboBox", "blinkCheckBox", "statusLabel", "placeButton", "editTissuesButton",
-    "probePresetComboBox", "liveCheckBox", "drawOpeningButton",
+    "probePresetComboBox", "liveCheckBox", "drawOpeningButton", "differenceCheckBox",
 }  # fmt: skip
 #: Controls beside the image, and the gains at eight depths
 _BESIDE = ("gainSlider", "depthSlider", "frequencySlider", "focusSlider", "dynamicRangeSlider")

@@ -7,16 +7,14 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable, Mapping
-from typing import TypeVar
+from typing import Any
 
 import numpy as np
 from trame_server.utils.asynchronous import get_event_loop
 
 from SlicerUSSim.Logic.device.plus_commands import PlusCommands
-from SlicerUSSim.Logic.imaging.preset import Preset
 from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic
 from SlicerUSSim.Logic.mrml.taken_image import TakenImage
-from SlicerUSSim.Logic.probe.image_grid import ImageGrid
 from SlicerUSSim.Logic.tracked.openigtlink import TrackerLink, parse_address
 from SlicerUSSim.Workstation.state import SharedState
 from SlicerUSSim.Workstation.tasks import Tasks
@@ -25,7 +23,6 @@ from SlicerUSSim.Workstation.tasks import Tasks
 _LOOK_EVERY_S = 0.3
 #: Seconds that a command waits for the event loop
 _PATIENCE_S = 5.0
-T = TypeVar("T")
 
 
 class Tracker:
@@ -51,10 +48,11 @@ class Tracker:
         """
         host, port, listen = parse_address(address)
         self._is_device = listen
-        commands = PlusCommands(self._preset, self._change, self._transforms)
-        self._link = TrackerLink(
-            host, port, self._moved, device=device, listen=listen, answering=commands.session if listen else None
-        )
+        commands = PlusCommands(
+            lambda: self._in_loop(lambda: self._logic.preset),
+            lambda preset: self._in_loop(lambda: setattr(self._logic, "preset", preset)), self._transforms,
+        )  # fmt: skip
+        self._link = TrackerLink(host, port, self._moved, device=device, listen=listen, answer=commands.answer)
         self._telling = self._loop.create_task(self._tell(self._link))
 
     def send(self, taken: TakenImage) -> None:
@@ -71,22 +69,16 @@ class Tracker:
     def _moved(self, pose: np.ndarray) -> None:
         self._tasks.tell(lambda: self._move(pose))
 
-    # ---- commands, in a thread of the link ---------------------------------------------------------------------
+    def _in_loop(self, function: Callable[[], Any]) -> Any:
+        """What `function` returns in the event loop, where nodes are used; called in a thread of the link.
 
-    def _in_loop(self, function: Callable[[], T]) -> T:
-        """What `function` returns in the event loop, where nodes are used. Raises TimeoutError if the page is busy."""
+        Raises TimeoutError if the page is busy.
+        """
 
-        async def run() -> T:
+        async def run() -> Any:
             return function()
 
         return asyncio.run_coroutine_threadsafe(run(), self._loop).result(_PATIENCE_S)
-
-    def _preset(self) -> tuple[Preset, ImageGrid]:
-        preset = self._in_loop(lambda: self._logic.preset)
-        return preset, ImageGrid.for_probe(preset.probe, preset.display.image_size)
-
-    def _change(self, preset: Preset) -> None:
-        self._in_loop(lambda: setattr(self._logic, "preset", preset))
 
     def _transforms(self) -> Mapping[str, np.ndarray]:
         taken = self._logic.taken

@@ -5,9 +5,6 @@ from typing import TYPE_CHECKING
 from SlicerUSSim.Logic.base.lazy import lazy_exports
 
 if TYPE_CHECKING:
-    from .imaging_parameters import changed_parameter as changed_parameter, parameter_text as parameter_text
-    from .plus_commands import PlusCommands as PlusCommands
-    from .recorder import Recorder as Recorder
     from .virtual_device import VirtualDevice as VirtualDevice
 
 lazy_exports(globals())

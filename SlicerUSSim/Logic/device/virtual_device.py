@@ -10,9 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from SlicerUSSim.Logic.base.errors import SimulationError, collected_warnings
 from SlicerUSSim.Logic.base.volume import Volume
-from SlicerUSSim.Logic.device.imaging_parameters import fixed_grid
 from SlicerUSSim.Logic.device.plus_commands import PlusCommands
 from SlicerUSSim.Logic.device.recorder import Recorder
 from SlicerUSSim.Logic.imaging.preset import Preset
@@ -22,10 +20,8 @@ from SlicerUSSim.Logic.tracked.openigtlink import Address, TrackerLink
 
 _log = logging.getLogger(__name__)
 
-#: Name of the IMAGE messages: in Plus' words the image with its place in the frame called Reference
-IMAGE_NAME = "Image_Reference"
-#: Most images per second, as of a scanner; seconds between poses of a path, and between looks for a client
-_MOST_HZ, _STEP_S, _LOOK_EVERY_S = 50.0, 0.05, 0.05
+#: Seconds between poses of a path, and between looks for a client
+_STEP_S, _LOOK_EVERY_S = 0.05, 0.05
 
 
 class VirtualDevice:
@@ -37,82 +33,65 @@ class VirtualDevice:
     poses : (4, 4) probe_to_ras; more than one are a path, which goes to and fro until a client sends a pose.
     address : where it listens.
     folder : of recordings.
-    transform : name of the TRANSFORM to follow; None: the first that comes.
 
     The frame Reference is that of the patient, RAS in mm. Raises SimulationError for an address in use.
     """
 
     def __init__(
         self, simulator: UltrasoundSimulator, preset: Preset, poses: Sequence[np.ndarray], address: Address,
-        folder: Path, transform: str | None = None,
+        folder: Path,
     ) -> None:  # fmt: skip
-        self._simulator, self._preset, self._poses = simulator, preset, poses
-        size = preset.display.image_size
-        self._grid = fixed_grid(preset, ImageGrid.for_probe(preset.probe, size))
-        self._moved: np.ndarray | None = None  # by a client
-        self._begun = time.monotonic()
+        grid = ImageGrid.for_probe(preset.probe, preset.display.image_size)
+        #: Probe and display of now; rows and columns stay at another depth
+        self.preset = preset.changed("display", image_size=(grid.rows, grid.columns))
+        self._simulator = simulator
+        self._path, self._begun = [*poses, *poses[-2:0:-1]], time.monotonic()  # there and back
         self._stopping = threading.Event()
-        self._said: set[str] = set()
         self.recorder = Recorder(folder)
-        commands = PlusCommands(lambda: (self._preset, self._grid), self.change, self.transforms, self.recorder)
-        self.link = TrackerLink(
-            address.host, address.port, self._move, device=transform, listen=True, image_name=IMAGE_NAME,
-            answering=commands.session,
-        )  # fmt: skip
-        #: Images made, and the seconds that the last one took
-        self.made, self.seconds = 0, 0.0
+        commands = PlusCommands(lambda: self.preset, self.change, self.transforms, self.recorder)
+        host, port, _ = address
+        image = "Image_Reference"  # in Plus' words, with its place in the frame called Reference
+        self.link = TrackerLink(host, port, self._move, listen=True, image_name=image, answer=commands.answer)
 
     @property
     def pose(self) -> np.ndarray:
         """(4, 4) probe_to_ras of now."""
-        if self._moved is not None:
-            return self._moved
-        there_and_back = [*self._poses, *self._poses[-2:0:-1]]
-        return there_and_back[int((time.monotonic() - self._begun) / _STEP_S) % len(there_and_back)]
+        return self._path[int((time.monotonic() - self._begun) / _STEP_S) % len(self._path)]
 
     def transforms(self) -> Mapping[str, np.ndarray]:
-        """{"ProbeToReference": (4, 4), "ImageToProbe": (4, 4)} of now."""
-        return {"ProbeToReference": self.pose, "ImageToProbe": self._grid.image_to_probe}
+        """{"ImageToProbe": (4, 4), "ProbeToReference": (4, 4)} of now."""
+        grid = ImageGrid.for_probe(self.preset.probe, self.preset.display.image_size)
+        return {"ImageToProbe": grid.image_to_probe, "ProbeToReference": self.pose}
 
     def change(self, preset: Preset) -> None:
         """Use another probe or display from the next image on. Raises SimulationError if that would be too slow."""
         self._simulator.warn_if_slow(preset.probe)
-        self._preset, self._grid = preset, fixed_grid(preset, self._grid)
+        self.preset = preset
 
     def run(self) -> None:
         """Make images until stop() is called."""
+        number = 0
         while not self._stopping.is_set():
-            if not self.link.clients and not self.recorder.is_recording:
+            if self.link.peers or self.recorder.is_recording:
+                self._make_image(number)
+                number += 1
+            else:
                 self._stopping.wait(_LOOK_EVERY_S)
-                continue
-            begun = time.monotonic()
-            self.make_image()
-            self.seconds = time.monotonic() - begun
-            self._stopping.wait(max(1.0 / _MOST_HZ - self.seconds, 0.0))
 
-    def make_image(self) -> None:
+    def _make_image(self, number: int) -> None:
         """Simulate one image, send it and record it. Its time is that at which the pose was read."""
-        preset, grid, pose, stamp = self._preset, self._grid, self.pose, time.time()
-        with collected_warnings() as caught:
-            frame = self._simulator.simulate(preset.probe, pose, preset.display, grid, noise_seed=self.made % 2**31)
-        for text in {str(warning) for warning in caught} - self._said:
-            self._said.add(text)
-            _log.warning("%s", text)
-        self.made += 1
-        transforms = {"ImageToProbe": grid.image_to_probe, "ProbeToReference": pose}
-        self.link.send(Volume(frame.image[None], pose @ grid.slice_to_probe), transforms, stamp=stamp)
-        try:
-            self.recorder.add(frame.image, stamp, transforms)
-        except (SimulationError, OSError) as error:
-            self.recorder.pause(True)
-            _log.warning("the recording is suspended: %s", error)
+        preset, pose, stamp = self.preset, self.pose, time.time()
+        frame = self._simulator.simulate(preset.probe, pose, preset.display, noise_seed=number)
+        transforms = {"ImageToProbe": frame.grid.image_to_probe, "ProbeToReference": pose}
+        self.link.send(Volume(frame.image[None], pose @ frame.grid.slice_to_probe), transforms, stamp)
+        self.recorder.add(frame.image, stamp, transforms)
 
     def stop(self) -> None:
         """End run(), close the connections, and write a recording that was not stopped."""
         self._stopping.set()
         self.link.stop()
-        if self.recorder.count:
+        if self.recorder.frames:
             _log.warning("a recording was not stopped: written to %s (%d images)", *self.recorder.stop())
 
     def _move(self, pose: np.ndarray) -> None:
-        self._moved = pose
+        self._path = [pose]

@@ -147,12 +147,7 @@ def set_node_to_world(transform_node, matrix: np.ndarray) -> None:
 def probe_pose(transform_node) -> np.ndarray:
     """(4, 4) probe_to_ras of a transform node with all its parents. Raises SimulationError unless it is rigid."""
     require_node(transform_node, "vtkMRMLTransformNode", use="probe transform")
-    try:
-        return check_rigid(named(transform_node), node_to_world(transform_node))
-    except SimulationError as error:
-        is_calibration = (transform_node.GetName() or "").startswith("ImageTo")
-        hint = "; it is a calibration: choose it as such below Tracked ultrasound" if is_calibration else ""
-        raise SimulationError(f"{error}{hint}") from None
+    return check_rigid(named(transform_node), node_to_world(transform_node))
 
 
 def pose_in_labels(labels_node, probe_to_world: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -284,14 +279,13 @@ def show_in_slice(slice_node, volume_node, probe_to_world: np.ndarray, probe: Pr
     left, right, top, bottom = probe.image_bounds_mm()
     view = probe_to_world @ np.diag([1.0, -1.0, -1.0, 1.0])  # a view's second axis points up, the probe's down
     view[:3, 3] = (probe_to_world @ [0.5 * (left + right), 0.5 * (top + bottom), 0.0, 1.0])[:3]
-    is_driven = is_driven_by_other(slice_node)
-    if not is_driven:
+    if not is_driven_by_other(slice_node):
         slice_node.GetSliceToRAS().DeepCopy(vtk_matrix(view))
-    if fit and not is_driven:
-        width, height, thickness = slice_node.GetFieldOfView()
-        scale = max((right - left) / width, (bottom - top) / height) * 1.05
-        slice_node.SetFieldOfView(width * scale, height * scale, thickness)
-    slice_node.UpdateMatrices()
+        if fit:
+            width, height, thickness = slice_node.GetFieldOfView()
+            scale = max((right - left) / width, (bottom - top) / height) * 1.05
+            slice_node.SetFieldOfView(width * scale, height * scale, thickness)
+        slice_node.UpdateMatrices()
     composite = composite_of(slice_node)
     if composite is None:
         return

@@ -69,12 +69,10 @@ class PanelSettings(Declared):
         choices=tuple(VIEWS), shown=True,
     )  # fmt: skip
     calibration_text: str = parameter(
-        "", "Or file, or numbers", "Instead of a transform: the file of a Plus configuration (.xml), or the 16 "
-        "numbers of ImageToProbe by rows", shown=True,
+        "", "Or file, or numbers", "A Plus configuration (.xml), or 16 numbers of ImageToProbe by rows", shown=True
     )  # fmt: skip
     face_pixel: str = parameter(
-        "", "Face in the image", "Column and row of the middle of the probe's face, such as 320 12; empty: it is "
-        "looked for in the real images", shown=True,
+        "", "Face in the image", "Column and row of its middle, as 320 12; empty: looked for in real images", shown=True
     )  # fmt: skip
     preset_pose: bool = parameter(
         False, "Pose in presets", "Save preset saves the pose of the probe, too; a preset with a pose moves the probe "

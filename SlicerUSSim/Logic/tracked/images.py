@@ -25,8 +25,8 @@ _LEAST_SHOWN, _BLACK = 0.02, 4
 #: Least area of a given probe's field by that of what images show, which may have other bright areas beside it, and
 #: largest area by that of an image, which may be cropped
 _LEAST_AREA, _MOST_AREA = 1 / 3, 4.0
-#: Least and largest size of a pixel of a scanner's image, millimetres
-_PIXELS_MM = 0.005, 3.0
+#: Least size of a pixel of a scanner's image
+_LEAST_PIXEL_MM = 0.005
 
 
 @dataclass(frozen=True, eq=False)
@@ -294,22 +294,17 @@ def face_pose(image_to_world: np.ndarray, face_pixel: Sequence[float], path: str
 
 def face_of_calibration(
     image_to_probe: np.ndarray, images: np.ndarray | None = None, face_pixel: Sequence[float] | None = None
-) -> tuple[np.ndarray, tuple[str, ...]]:
+) -> tuple[np.ndarray, str]:
     """((4, 4) rigid, from the probe frame, at the face, to the tracked sensor, which Plus calls Probe; what was taken).
 
-    `image_to_probe` is a calibration (4, 4), of pixels (column, row, 0, 1) to the sensor, mm.
-
-    The face is at `face_pixel`, or else looked for in `images` (n, rows, columns), or else in the middle of their first
-    row. Raises SimulationError for a skewed calibration, for pixels of another size than scanners have, as of a
-    calibration in metres, and if nothing says where the face is.
+    `image_to_probe` is a calibration (4, 4), from pixels (column, row, 0, 1) to the sensor, mm. The face is at
+    `face_pixel`, or else looked for in `images` (n, rows, columns), or else in the middle of their first row.
+    Raises SimulationError for a skewed calibration, for pixels of another size than scanners have, as of a calibration
+    in metres, and if nothing says where the face is.
     """
     spacing = pixel_spacing(image_to_probe, "ImageToProbe")
-    low, high = _PIXELS_MM
-    require(
-        low <= min(spacing) and max(spacing) <= high,
-        f"ImageToProbe has pixels of {spacing[0]:.3g} x {spacing[1]:.3g} mm, expected {low:g} to {high:g} mm; is it in "
-        "metres, or is it no calibration of an image?",
-    )
+    size = f"pixels of {spacing[0]:.3g} x {spacing[1]:.3g} mm"
+    require(min(spacing) >= _LEAST_PIXEL_MM, f"ImageToProbe has {size}, expected millimetres; is it in metres?")
     if face_pixel is not None:
         place, how = face_pixel, "as given"
     else:
@@ -321,11 +316,8 @@ def face_of_calibration(
             _log.info("%s", error)
             place, how = (0.5 * (images.shape[2] - 1), -0.5), "the middle of the first row, no field was found"
     pose = face_pose(image_to_probe, place, "ImageToProbe")
-    words = [
-        f"pixels of {spacing[0]:.3g} x {spacing[1]:.3g} mm",
-        f"face at column {place[0]:.1f}, row {place[1]:.1f} ({how})",
-        f"{np.linalg.norm(pose[:3, 3]):.1f} mm from the sensor",
-    ]
+    words = f"{size}; face at column {place[0]:.1f}, row {place[1]:.1f} ({how})"
+    words += f"; {np.linalg.norm(pose[:3, 3]):.1f} mm from the sensor"
     if np.linalg.det(image_to_probe[:3, :3]) < 0.0:
-        words.append("the calibration mirrors: if left and right of the image are wrong, it is")
-    return pose, tuple(words)
+        words += "; the calibration mirrors: if left and right of the image are wrong, it is"
+    return pose, words
