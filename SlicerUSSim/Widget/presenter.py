@@ -66,6 +66,7 @@ class PanelPresenter(PanelHost):
         self.segmenting.followMri()
         self.images.followChoices()
         self.images.showIn3D()
+        self.approach.followProbe()
         self.view.refresh(self.values.changes())
 
     def forgetPatient(self) -> None:
