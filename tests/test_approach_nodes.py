@@ -99,7 +99,7 @@ def test_the_opening_is_a_curve_that_can_be_moved(bench):
     approach = bench.presenter.approach
     approach.plan()
     curve = bench.logic.parameters.opening
-    assert curve.IsA("vtkMRMLMarkupsClosedCurveNode") and curve.GetNumberOfControlPoints() == 16
+    assert curve.IsA("vtkMRMLMarkupsClosedCurveNode") and curve.GetNumberOfControlPoints() == 12
     step = 12.0 * approach.found.candidates[0].probe_to_ras[:3, 0]
     for number, place in enumerate(control_points(curve)):
         curve.SetNthControlPointPositionWorld(number, *(place + step))

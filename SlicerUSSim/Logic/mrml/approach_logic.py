@@ -21,7 +21,7 @@ from SlicerUSSim.Logic.placement.approach import Approach, Candidate, plan_appro
 TARGET, WAY, OPENING = "Approach target", "Approach way", "Approach opening"
 _YELLOW, _BLUE = (1.0, 0.78, 0.24), (0.35, 0.85, 1.0)
 #: Control points of an opening
-_POINTS = 16
+_POINTS = 12
 
 
 class ApproachLogic:
@@ -81,6 +81,7 @@ class ApproachLogic:
             node.AddControlPointWorld(*point)
         if (display := display_of(node)) is not None:
             display.SetSelectedColor(*_BLUE)
+            display.SetGlyphScale(1.5)
             display.SetPointLabelsVisibility(False)
             display.SetPropertiesLabelVisibility(False)
             display.SetSliceProjection(True)
