@@ -16,16 +16,14 @@ from SlicerUSSim.Widget.interface import PanelHost, tr as _
 from SlicerUSSim.Widget.placement_presenter import PlacementPresenter
 from SlicerUSSim.Widget.tracked_presenter import is_face
 
-#: Candidates that a panel has room for
-CANDIDATES = 3
-
 
 class ApproachPresenter:
     """Plans the approach to the chosen target, shows the candidates, and opens the skull at one."""
 
     def __init__(self, panel: PanelHost, placing: PlacementPresenter) -> None:
         self._panel, self._placing = panel, placing
-        self._probe = Observed("TransformModifiedEvent", self._keep)
+        #: The probe that is chosen, which the user may want to be kept in the opening
+        self.probe = Observed("TransformModifiedEvent", self._keep)
         self.forget()
 
     def forget(self) -> None:
@@ -83,9 +81,8 @@ class ApproachPresenter:
         plan = self.found
         if plan is None:
             return ""
-        chosen = _("Candidate {number}: {text}").format(
-            number=self._chosen + 1, text=plan.candidates[self._chosen].text
-        )  # fmt: skip
+        words = plan.candidates[self._chosen].text
+        chosen = _("Candidate {number}: {text}").format(number=self._chosen + 1, text=words)
         return "\n".join((plan.target.text, chosen, _(NO_ADVICE)))
 
     def canChoose(self, number: int) -> tuple[bool, str]:
@@ -97,18 +94,14 @@ class ApproachPresenter:
         panel = self._panel
         with panel.acting():
             plan = required(self.found, "no approach is planned, press Plan first")
-            rim, pose = self._rim(), plan.candidates[self._chosen].probe_to_ras.copy()
-            if len(rim):
-                pose[:3, 3] = rim.mean(axis=0)
+            rim, candidate = self._rim(), plan.candidates[self._chosen]
+            pose = candidate.probe_to_ras.copy()
+            pose[:3, 3] = rim.mean(axis=0) if len(rim) else candidate.entry_ras
             self._placing.putAt(plan.in_opening(panel.preset.probe, pose, rim))
-            if len(rim):
+            if candidate.opening_mm:
                 self._placing.openCraniotomy()
 
     # ---- the probe in the opening --------------------------------------------------------------------------------
-
-    def followProbe(self) -> None:
-        """Observe the probe that is chosen, which the user may want to be kept in the opening."""
-        self._probe.watch(self._panel.parameters.probe_transform)
 
     def _rim(self) -> np.ndarray:
         """(points, 3) world RAS mm of the closed curve that is chosen as the opening; none without one."""
@@ -119,8 +112,8 @@ class ApproachPresenter:
     def _keep(self) -> None:
         plan, parameters = self.found, self._panel.parameters
         probe: Any = parameters.probe_transform
-        if plan is None or not parameters.keep_in_opening or is_face(probe):
+        if plan is None or probe is None or not parameters.panel.keep_in_opening or is_face(probe):
             return
-        self._probe.watch(None)  # this change is none of the user
+        self.probe.watch(None)  # the next change is none of the user
         set_node_to_world(probe, plan.in_opening(self._panel.preset.probe, probe_pose(probe), self._rim()))
-        self._probe.watch(probe)
+        self.probe.watch(probe)

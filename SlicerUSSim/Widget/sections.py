@@ -20,7 +20,6 @@ from SlicerUSSim.Logic.mrml.fit_nodes import COMPARED
 from SlicerUSSim.Logic.mrml.parameter_node import SceneParameters
 from SlicerUSSim.Logic.probe.arrays import PROBES
 from SlicerUSSim.Logic.tissue.presets import TISSUES
-from SlicerUSSim.Widget.approach_presenter import CANDIDATES
 from SlicerUSSim.Widget.interface import Can, Control, Kind, Row, Section, tr as _
 from SlicerUSSim.Widget.presenter import PanelPresenter
 from SlicerUSSim.Widget.tissue_presenter import COLUMN_PARAMETERS
@@ -232,7 +231,7 @@ def _approach(panel: PanelPresenter) -> tuple[Row, ...]:
                 shows=partial(approach.picture, number), action=partial(approach.choose, number),
                 enabled=partial(approach.canChoose, number), depends=("tissues",),
             )
-            for number in range(CANDIDATES)
+            for number in range(3)  # as many as are offered
         ),
         button(
             "openHere", _("Open here"), _("Open the skull in the closed curve, and aim the probe from its middle"),

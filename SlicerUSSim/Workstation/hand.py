@@ -154,7 +154,8 @@ class ProbeHand:
             picked, self._picked = self._picked, None
             picked(_in_slice(view, np.array(view.interactor().GetEventPosition(), float)))
             return True
-        pose, markups = self._pose(), nodes_of_class(view.get_view_node().GetScene(), "vtkMRMLMarkupsDisplayNode")
+        pose, scene = self._pose(), cast(Any, view.get_view_node()).GetScene()
+        markups = nodes_of_class(scene, "vtkMRMLMarkupsDisplayNode")
         if pose is None or any(display.HasActiveComponent() for display in markups):  # a point of a curve is moved
             return False
         pixel, now = np.array(view.interactor().GetEventPosition(), float), monotonic()

@@ -22,11 +22,9 @@ from SlicerUSSim.Logic.tissue.names import OUTSIDE, labels_of
 
 #: (rows, columns) of the images
 _PIXELS = (256, 256)
-#: The brain around a target is that so far from it in the image, mm
-_AROUND_MM = (4.0, 12.0)
+#: The brain around a target is that so far from it in the image, mm; and fewer pixels are no mean
+_AROUND_MM, _FEWEST = (4.0, 12.0), 30
 _YELLOW = (255, 200, 61)
-#: Fewer pixels are no mean
-_FEWEST = 30
 _STYLE = """body { background: #161616; color: #e4e4e4; font: 15px/1.5 system-ui, sans-serif; margin: 2rem auto;
 max-width: 900px; padding: 0 1rem } .dim { color: #9a9a9a } .advice { color: #ffc83d }"""
 

@@ -20,8 +20,6 @@ from SlicerUSSim.Logic.placement.approach import Approach, Candidate, plan_appro
 #: Names of the nodes that show an approach, and their colours
 TARGET, WAY, OPENING = "Approach target", "Approach way", "Approach opening"
 _YELLOW, _BLUE = (1.0, 0.78, 0.24), (0.35, 0.85, 1.0)
-#: Control points of an opening
-_POINTS = 12
 
 
 class ApproachLogic:
@@ -66,7 +64,7 @@ class ApproachLogic:
         self._draw("MarkupsCurve", WAY, np.array([entry, approach.target.centre_ras])).SetLocked(True)
         if not candidate.opening_mm:
             return None
-        turn = np.linspace(0.0, 2.0 * np.pi, _POINTS, endpoint=False)
+        turn = np.linspace(0.0, 2.0 * np.pi, 12, endpoint=False)
         rim = entry + 0.5 * candidate.opening_mm * np.stack([np.cos(turn), np.sin(turn)], axis=1) @ across.T
         return self._draw("MarkupsClosedCurve", OPENING, rim)
 

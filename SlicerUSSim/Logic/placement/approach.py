@@ -31,13 +31,11 @@ _SULCUS_MM = 15.0
 #: A point where no lesion is labelled stands for a ball of this radius, mm
 _POINT_MM = 3
 _STEP_MM, _LONGEST_MM = 0.5, 250.0
-#: The skin is so far from the end of the image at least, mm
-_CUT_MM = 2.0
 #: Ways with more outside the brain lead through face or neck, mm, as do those from below (cosine to the top of the
 #: head) that do not come from behind (to its front)
 _THICKEST_MM, _BELOW, _BEHIND = 35.0, -0.5, -0.4
-#: Falx and sagittal sinus are nearer to the middle plane than this, mm
-_MIDDLE_MM = 4.0
+#: Falx and sagittal sinus are so near to the middle plane; the skin is so far from the end of the image at least, mm
+_MIDDLE_MM, _CUT_MM = 4.0, 2.0
 #: An opening is so much wider than the face. A probe is tilted as this and the thickness of the bone allow, but for a
 #: clearance on each side, mm, and so far at most
 _ROOM_MM, _CLEAR_MM, _TILT_DEG = 15.0, 2.0, 35.0
