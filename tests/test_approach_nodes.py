@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
 slicer = pytest.importorskip("slicer", reason="MRML nodes come with slicer-core: pip install '.[slicer]'")
 
+from vtkmodules.vtkCommonCore import vtkCommand  # noqa: E402
+from vtkmodules.vtkRenderingCore import vtkRenderer, vtkRenderWindow, vtkRenderWindowInteractor  # noqa: E402
+
 from SlicerUSSim.Logic.mrml.approach_logic import OPENING, TARGET, WAY  # noqa: E402
 from SlicerUSSim.Logic.mrml.nodes import control_points, nodes_of_class, probe_pose, set_node_to_world  # noqa: E402
 from SlicerUSSim.Logic.placement.approach_weights import NO_ADVICE  # noqa: E402
 from SlicerUSSim.Logic.placement.craniotomy import face_width_mm  # noqa: E402
+from SlicerUSSim.Logic.probe import PROBES  # noqa: E402
 from SlicerUSSim.Logic.probe.poses import turned  # noqa: E402
 from SlicerUSSim.Widget.interface import by_widget  # noqa: E402
 from SlicerUSSim.Widget.sections import panel_sections  # noqa: E402
@@ -138,6 +144,29 @@ def test_a_probe_that_is_moved_stays_in_the_opening_and_aimed(bench):
     bench.presenter.parametersChanged()
     set_node_to_world(bench.probe, aside)
     np.testing.assert_allclose(probe_pose(bench.probe), aside)
+
+
+def test_on_the_page_a_point_of_the_curve_goes_before_the_probe(bench):
+    hands = pytest.importorskip("SlicerUSSim.Workstation.hand", reason="the page comes with: pip install '.[serve]'")
+    bench.presenter.approach.plan()
+    display = bench.logic.parameters.opening.GetDisplayNode()
+    window, renderer, interactor = vtkRenderWindow(), vtkRenderer(), vtkRenderWindowInteractor()
+    window.SetSize(100, 100)
+    window.AddRenderer(renderer)
+    renderer.GetActiveCamera().SetPosition(0.0, -30.0, 300.0)
+    renderer.GetActiveCamera().SetFocalPoint(0.0, -30.0, 0.0)  # on the body of a probe at the origin
+    view = SimpleNamespace(interactor=lambda: interactor, renderer=lambda: renderer, get_view_node=lambda: display)
+    nothing = lambda *_: None  # noqa: E731
+    hand = hands.ProbeHand(lambda: np.eye(4), nothing, nothing, lambda: True, nothing, nothing)
+    hand.set_probe(PROBES["phased"])
+    hand.attach(view)
+    reached: list[str] = []
+    interactor.AddObserver(vtkCommand.LeftButtonPressEvent, lambda *_: reached.append(display.GetActiveComponentType()))
+    for component in (display.ComponentControlPoint, display.ComponentNone):
+        display.SetActiveComponent(component, 0)
+        interactor.SetEventInformation(50, 50)
+        interactor.InvokeEvent(vtkCommand.LeftButtonPressEvent)
+    assert reached == [display.ComponentControlPoint]
 
 
 def test_another_patient_has_no_plan_of_the_one_before(bench):

@@ -50,7 +50,7 @@ BUDGETS = {
     "base": 3360, "opencl": 1325, "probe": 1750, "tissue": 2065, "tracked": 2230, "mri": 7470, "placement": 1205,
     "imaging": 5575, "device": 595, "datasets": 1650, "fitting": 3685, "vtk": 510, "mrml": 4910, "Widget": 3405,
     "Workstation": 5845, "Command": 3115, "gym": 140, "module": 430, "validation": 6620, "benchmarks": 4055,
-    "tests": 30965, "tests/reference": 505,
+    "tests": 30995, "tests/reference": 505,
 }  # fmt: skip
 #: Lines of all of SlicerUSSim/, and of kernels/
 LARGEST_PRODUCT, LARGEST_KERNELS = 49_230, 5_880
