@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from html import unescape
 from pathlib import Path
 
 import numpy as np
@@ -11,9 +12,9 @@ from click.testing import CliRunner
 from PIL import Image
 
 from SlicerUSSim.Command.cli import main
-from SlicerUSSim.Logic import SimulationError, TissueTable, Volume
-from SlicerUSSim.Logic.imaging.approach_images import outlined, simulated_approach
-from SlicerUSSim.Logic.placement import ApproachWeights, find_target, plan_approach
+from SlicerUSSim.Logic import SimulationError, TissueTable, UltrasoundSimulator, Volume
+from SlicerUSSim.Logic.imaging.approach_images import simulated_approach
+from SlicerUSSim.Logic.placement import ApproachWeights, plan_approach
 from SlicerUSSim.Logic.placement.approach import VENTRICLE, opened_for
 from SlicerUSSim.Logic.placement.approach_weights import NO_ADVICE
 from SlicerUSSim.Logic.placement.craniotomy import face_width_mm, without_outside
@@ -37,14 +38,14 @@ def ill(head) -> Volume:  # noqa: F811
 def test_the_first_way_is_short_and_on_the_side_of_the_target(ill):
     plan = plan_approach(ill, ILL, PHASED, "tumour")
     best = plan.candidates[0]
-    assert plan.compared == 500 and plan.target.name == "tumour" and plan.target.size_mm == pytest.approx(16.0, abs=2.0)
+    assert plan.target.name == "tumour" and plan.target.size_mm == pytest.approx(16.0, abs=2.0)
     assert plan.target.depth_mm == pytest.approx(60.0 - np.linalg.norm(PLACE) - 8.0, abs=3.0)
     away = np.rad2deg(np.arccos(best.entry_ras @ PLACE / np.linalg.norm(best.entry_ras) / np.linalg.norm(PLACE)))
     assert away < 12.0 and np.linalg.norm(best.entry_ras) == pytest.approx(78.0, abs=2.5)  # on the skin
     assert list(best.path_mm) == ["skin", "scalp", "skull", "cancellous bone", "grey matter"]
     assert best.path_mm["scalp"] == pytest.approx(8.0, abs=2.0) and best.path_mm["skull"] == pytest.approx(4.0, abs=1.5)
-    assert best.path_mm["grey matter"] == pytest.approx(best.depth_mm, abs=3.0) and best.angle_deg < 12.0
-    assert best.costs["brain"] == best.depth_mm and best.cost == min(other.cost for other in plan.candidates)
+    assert best.path_mm["grey matter"] == pytest.approx(plan.target.depth_mm, abs=3.0) and best.angle_deg < 12.0
+    assert best.cost == min(other.cost for other in plan.candidates)
     faces = [candidate.probe_to_ras[:3, 3] for candidate in plan.candidates]
     assert len(faces) == 3
     assert min(np.linalg.norm(faces[a] - faces[b]) for a, b in ((0, 1), (0, 2), (1, 2))) > 20.0
@@ -54,8 +55,7 @@ def test_the_first_way_is_short_and_on_the_side_of_the_target(ill):
 def test_through_its_opening_the_probe_sees_the_target(ill, name):
     probe = PROBES[name]
     best = plan_approach(ill, ILL, probe, "tumour").candidates[0]
-    assert best.seen >= 0.95 and face_width_mm(probe) + 10.0 <= best.opening_mm <= face_width_mm(probe) + 15.0
-    assert 0.0 < best.tilt_deg <= 35.0
+    assert best.seen >= 0.95 and best.opening_mm == face_width_mm(probe) + 15.0
     opened = opened_for(ill, ILL, [best])
     voxels = places_of(ill)[ill.array == TUMOUR][::5]
     ways = best.probe_to_ras[:3, 3] + np.linspace(0.0, 1.0, 80)[:, None, None] * (voxels - best.probe_to_ras[:3, 3])
@@ -70,23 +70,18 @@ def test_a_way_around_a_ventricle_is_taken_unless_that_costs_nothing(head):  # n
     lake = (np.abs(places[..., 2] - 28.0) < 6.0) & (np.linalg.norm(places[..., :2], axis=-1) < 40.0)
     labels = labels.with_array(np.where(lake, CSF, labels.array))
     around = plan_approach(labels, ILL, PHASED, "tumour").candidates[0]
-    assert VENTRICLE not in around.path_mm and around.costs["ventricle"] == 0.0
+    assert VENTRICLE not in around.path_mm
     free = ApproachWeights(ventricle_weight=0.0, brain_weight=0.0, angle_weight=1.0)
-    near = [
-        candidate for candidate in plan_approach(labels, ILL, PHASED, "tumour", weights=free, offered=40).candidates
-    ]
+    near = plan_approach(labels, ILL, PHASED, "tumour", weights=free, offered=40).candidates
     through = [candidate for candidate in near if VENTRICLE in candidate.path_mm]
     assert through and through[0].path_mm[VENTRICLE] == pytest.approx(12.0, abs=4.0)
-    assert all(candidate.costs["ventricle"] == 0.0 for candidate in near)
 
 
-def test_the_other_side_of_the_brain_is_avoided_by_its_weight(head):  # noqa: F811
-    place = np.array([9.0, 0.0, 20.0])
-    labels = with_ball(head, place, 5.0)
-    best = plan_approach(labels, ILL, PHASED, "tumour").candidates[0]
-    assert best.probe_to_ras[0, 3] > 4.0 and best.costs["other_side"] == 0.0
-    mirrored = plan_approach(with_ball(head, place * [-1, 1, 1], 5.0), ILL, PHASED, "tumour").candidates[0]
-    assert mirrored.probe_to_ras[0, 3] < -4.0 and mirrored.costs["other_side"] == 0.0
+@pytest.mark.parametrize("side", [1.0, -1.0])
+def test_no_way_leads_through_the_other_side_of_the_brain(head, side):  # noqa: F811
+    labels = with_ball(head, np.array([9.0 * side, 0.0, 20.0]), 5.0)
+    candidates = plan_approach(labels, ILL, PHASED, "tumour").candidates
+    assert len(candidates) == 3 and all(side * candidate.probe_to_ras[0, 3] > 4.0 for candidate in candidates)
 
 
 def test_no_way_leads_from_below_or_where_the_image_ends(head):  # noqa: F811
@@ -102,16 +97,17 @@ def test_no_way_leads_from_below_or_where_the_image_ends(head):  # noqa: F811
         assert candidate.path_mm["skull"] >= 2.0 and candidate.entry_ras[2] < 30.0
 
 
-def test_a_target_is_a_tissue_a_mask_a_point_or_the_largest_lesion(ill):
-    named = find_target(ill, ILL, "tumor")
-    mask = ill.with_array((ill.array == TUMOUR).astype(np.uint8))
-    for what in (None, tuple(PLACE), mask):
-        found = find_target(ill, ILL, what)
-        np.testing.assert_allclose(found.centre_ras, named.centre_ras)
-        assert found.volume_ml == pytest.approx(named.volume_ml) and found.depth_mm == named.depth_mm
-    point = find_target(ill, ILL, (0.0, 0.0, 0.0))
+def test_a_target_is_a_tissue_a_point_or_the_largest_lesion(ill):
+    named = plan_approach(ill, ILL, PHASED, "tumor").target
+    np.testing.assert_allclose(named.centre_ras, PLACE, atol=0.5)
+    for what in (None, tuple(PLACE)):
+        found = plan_approach(ill, ILL, PHASED, what).target
+        np.testing.assert_array_equal(found.region.array, named.region.array)
+        assert found.text == named.text
+    point = plan_approach(ill, ILL, PHASED, (0.0, 5.0, 0.0)).target
     assert point.name == "point" and point.size_mm == pytest.approx(6.0, abs=2.0)
-    assert re.fullmatch(r"tumour: 1\d mm, 2\.\d ml, 1\d mm below the brain's surface", named.text)
+    np.testing.assert_allclose(point.centre_ras, [0.0, 5.0, 0.0], atol=1e-6)
+    assert re.fullmatch(r"tumour: 1\d mm, 1\d mm below the brain's surface", named.text)
 
 
 def test_targets_of_all_sizes_and_places_are_planned(head):  # noqa: F811
@@ -119,7 +115,7 @@ def test_targets_of_all_sizes_and_places_are_planned(head):  # noqa: F811
     for place, radius in (((0.0, 0.0, 54.0), 5.0), large, ((10.0, -20.0, 30.0), 1.2), ((0.0, 0.0, 0.0), 25.0)):
         labels = with_ball(head, np.array(place), radius)
         best = plan_approach(labels, ILL, PHASED, "tumour").candidates[0]
-        assert best.seen > (0.95 if radius < 20.0 else 0.5) and best.depth_mm >= 0.0
+        assert best.seen > (0.95 if radius < 20.0 else 0.5)
     deep = plan_approach(with_ball(head, np.zeros(3), 5.0), ILL, PROBES["linear"], "tumour").candidates[0]
     assert deep.seen == 0.0  # its field is 40 mm deep: told, not refused
 
@@ -135,13 +131,12 @@ def test_a_brain_without_skull_is_approached_from_its_surface(ill):
 def test_only_a_target_that_cannot_be_found_is_refused(head, ill):  # noqa: F811
     cases = (
         (head, NAMES, None, "the labels have no lesion, expected one"),
-        (head, NAMES, "tumour", "the labels have no tumour, expected a lesion"),
-        (ill, ILL, "cyst", "the labels have no cyst, expected tumour"),
+        (head, NAMES, "tumour", "the labels have no tumour, expected a lesion that they have, or one that is added"),
+        (ill, ILL, "cyst", "the labels have no cyst, expected a lesion"),
         (ill, ILL, "teapot", "no tissue is called 'teapot'"),
-        (ill, ILL, (0.0, 0.0, 120.0), "the point about R 0, A 0, S 120 mm lies outside of the head"),
-        (head, NAMES, (0.0, 0.0, 65.0), "the point lies outside of the brain's surface"),  # in bone
+        (ill, ILL, (0.0, 0.0, 120.0), "the point lies outside of the brain, expected a target in it"),
+        (head, NAMES, (0.0, 0.0, 65.0), "the point lies outside of the brain"),  # in bone
         (ill, ILL, (0.0, np.nan, 0.0), "expected R, A, S in mm"),
-        (ill, ILL, ill.with_array(np.zeros_like(ill.array)), "the mask of the target is empty"),
         (ill, ("liver", "muscle"), None, "no tissue of a brain"),
     )
     for labels, names, what, message in cases:
@@ -155,12 +150,11 @@ def test_images_of_the_candidates_show_the_contrast_of_the_target(ill):
     for tissue, is_brighter in (("tumour", True), ("cyst", False)):
         names = (*ILL[: TUMOUR - 1], tissue, ILL[-1])
         plan = plan_approach(ill, names, PHASED, tissue, offered=2)
-        shown = simulated_approach(plan, ill, TissueTable.named(names), PHASED).candidates
+        shown = simulated_approach(plan, UltrasoundSimulator(ill, TissueTable.named(names)), PHASED).candidates
         for candidate in shown:
-            assert candidate.image is not None and candidate.image.max() > 100 and candidate.contrast_db is not None
+            assert candidate.picture.max() > 100 and candidate.contrast_db is not None
             assert (candidate.contrast_db > 4.0) if is_brighter else (candidate.contrast_db < -4.0)
-        picture = outlined(shown[0], plan.target, PHASED)
-        rows, columns = np.nonzero((picture == (255, 200, 61)).all(axis=2))
+        rows, columns = np.nonzero((shown[0].picture == (255, 200, 61)).all(axis=2))
         depth = (rows + 0.5) * 90.0 / 256
         middle = np.linalg.norm(plan.target.centre_ras - shown[0].probe_to_ras[:3, 3])
         assert [depth.min(), depth.max()] == pytest.approx([middle - 8.0, middle + 8.0], abs=2.0)
@@ -181,15 +175,15 @@ def test_the_command_writes_a_report_and_simulates_the_first_candidate(ill, tmp_
     run = CliRunner().invoke(main, ["approach", str(labels), "-o", str(report), "--set", "approach.angle_weight=0.5"])
     assert run.exit_code == 0, run.output
     text = report.read_text(encoding="utf-8")
-    assert text.count("data:image/png;base64,") == 6 and NO_ADVICE in text and NO_ADVICE in run.stdout
-    assert "<td>0.5</td>" in text and text.count("<h2>Candidate") == 3
+    assert text.count("data:image/png;base64,") == 3 and NO_ADVICE in text and NO_ADVICE in run.stdout
+    assert text.count("<h2>Candidate") == 3 and all(line in unescape(text) for line in run.stdout.splitlines())
     image = tmp_path / "image.png"
     run = CliRunner().invoke(main, ["simulate", str(labels), "--approach", "tumour", "-o", str(image)])
     assert run.exit_code == 0 and NO_ADVICE in run.output and "disc of" in run.output, run.output
     pixels = np.asarray(Image.open(image))
     assert pixels[100:200, 250:400].mean() > 20.0
     for arguments, message in (
-        (["--approach", "1,2"], "expected a tissue, or R,A,S in mm"),
+        (["--approach", "1,2"], "expected R, A, S in mm"),
         (["--approach", "tumour", "--pose", "auto"], "expected exactly one of --pose and --approach"),
         (["--approach", "tumour", "--craniotomy", "auto"], "it opens the head"),
     ):

@@ -112,17 +112,12 @@ class PatientOptions(ImageOptions):
         return changes.to_preset(preset)
 
 
-def target_of(text: str | None) -> str | tuple[float, ...] | None:
-    """A tissue, or a point (R, A, S) in mm of "12,-15,8". Raises SimulationError for other numbers."""
-    if text is None or "," not in text:
-        return text
+def target_of(text: str | None) -> str | list[float] | None:
+    """A tissue, or the numbers of "12,-15,8". Raises SimulationError for what is none."""
     try:
-        point = tuple(float(part) for part in text.split(","))
+        return [float(part) for part in text.split(",")] if text and "," in text else text
     except ValueError:
-        point = ()
-    if len(point) != 3:
-        raise SimulationError(f"the target is {text!r}, expected a tissue, or R,A,S in mm such as 12,-15,8")
-    return point
+        raise SimulationError(f"the target is {text!r}, expected a tissue, or R, A, S in mm: 12,-15,8") from None
 
 
 def named_probe(name_or_path: str) -> Probe:

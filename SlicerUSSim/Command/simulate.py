@@ -76,17 +76,13 @@ def approach(patient: PatientOptions, approach: ApproachWeights, target: str | N
     require(patient.craniotomy == "none", f"--craniotomy is {patient.craniotomy}, expected none: the plan opens a head")
     examination = open_examination(patient)
     simulator, probe = examination.simulator, examination.probe
-    labels, names = simulator.medium.labels, simulator.medium.tissues.names_by_label()
-    plan = plan_approach(labels, names, probe, what, weights=approach)
-    plan = simulated_approach(
-        plan, labels, simulator.medium.tissues, probe, simulator.settings, examination.display,
-        device=simulator.device, texture=simulator.texture, sheets=simulator.medium.sheets,
-    )  # fmt: skip
-    weights = {entry.name: getattr(approach, entry.name) for entry in parameters_of(ApproachWeights)}
-    write_approach_report(out, plan, labels, names, probe, subtitle=patient.source, weights=weights)
+    names = simulator.medium.tissues.names_by_label()
+    plan = plan_approach(simulator.medium.labels, names, probe, what, weights=approach)
+    plan = simulated_approach(plan, simulator, probe, examination.display)
+    write_approach_report(out, plan, patient.source)
     for line in (plan.target.text, *(candidate.text for candidate in plan.candidates), NO_ADVICE):
         click.echo(line)
-    note(f"wrote {out} ({len(plan.candidates)} candidates of {plan.compared} ways)")
+    note(f"wrote {out} ({len(plan.candidates)} candidates)")
 
 
 @click.command()

@@ -2,22 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
-from SlicerUSSim.Logic.base.errors import require, required
-from SlicerUSSim.Logic.imaging.approach_images import outlined
+import numpy as np
+
+from SlicerUSSim.Logic.base.errors import required
 from SlicerUSSim.Logic.imaging.figures import png_url
-from SlicerUSSim.Logic.mrml.approach_logic import ring
-from SlicerUSSim.Logic.mrml.nodes import control_points
+from SlicerUSSim.Logic.mrml.nodes import Observed, control_points, probe_pose, set_node_to_world
 from SlicerUSSim.Logic.mrml.parameter_node import LARGEST, POINT
-from SlicerUSSim.Logic.placement.approach import Approach, Candidate
+from SlicerUSSim.Logic.placement.approach import Approach
 from SlicerUSSim.Logic.placement.approach_weights import NO_ADVICE
 from SlicerUSSim.Widget.interface import PanelHost, tr as _
 from SlicerUSSim.Widget.placement_presenter import PlacementPresenter
-
-#: Candidates that a panel has room for
-CANDIDATES = 3
+from SlicerUSSim.Widget.tracked_presenter import is_face
 
 
 class ApproachPresenter:
@@ -25,6 +22,8 @@ class ApproachPresenter:
 
     def __init__(self, panel: PanelHost, placing: PlacementPresenter) -> None:
         self._panel, self._placing = panel, placing
+        #: The probe that is chosen, which the user may want to be kept in the opening
+        self.probe = Observed("TransformModifiedEvent", self._keep)
         self.forget()
 
     def forget(self) -> None:
@@ -45,40 +44,33 @@ class ApproachPresenter:
         """Plan the approach to the target that is chosen; let the user show it in a view, if that is a point."""
         panel, parameters = self._panel, self._panel.parameters
         if parameters.panel.target != POINT:
-            self.planNow()
-            return
+            return self._plan_now()
         with panel.acting():
             if parameters.seed is None:
                 parameters.seed = panel.add("MarkupsFiducial", "Target")
-            panel.view.pickPoint(parameters.seed, self.planNow)
+            panel.view.pickPoint(parameters.seed, self._plan_now)
 
-    def planNow(self) -> None:
-        """The same, of a point the last one of the chosen markups."""
+    def _plan_now(self) -> None:
         panel, parameters = self._panel, self._panel.parameters
         with panel.acting(), panel.working(_("Plan approach")) as progress:
-            labels: Any = required(parameters.labels, "no label map chosen; segment the MRI first")
-            wanted = parameters.panel.target
-            what = None if wanted == LARGEST else wanted
-            if wanted == POINT:
-                points = control_points(required(parameters.seed, "no point chosen, expected one in the lesion"))
-                require(len(points) > 0, "the chosen markups have no point, expected one in the lesion")
-                what = points[-1]
+            labels, what = parameters.labels, parameters.panel.target
+            if what in (LARGEST, POINT):
+                what = None if what == LARGEST else control_points(parameters.seed)[-1]
             progress(0.1)
-            plan = panel.logic.planApproach(labels, what)
-            self._plan, self._labels = plan, panel.logic.closedLabels(labels)
-            probe = panel.preset.probe
-            self._pictures = [png_url(outlined(candidate, plan.target, probe)) for candidate in plan.candidates]
+            self._plan = plan = panel.logic.planApproach(labels, what)
+            self._labels = panel.logic.closedLabels(labels)
+            self._pictures = [png_url(candidate.picture) for candidate in plan.candidates]
             self._choose(0)
 
     def choose(self, number: int) -> None:
-        """Show way and opening of candidate 0, 1, ... in the views."""
+        """Show way and opening of candidate 0, 1, ... in the views; what Open skull opens is then that opening."""
         with self._panel.acting():
             self._choose(number)
 
     def _choose(self, number: int) -> None:
         plan = required(self.found, "no approach is planned, press Plan first")
         self._chosen = number
-        self._panel.logic.showApproach(plan, plan.candidates[number])
+        self._panel.parameters.opening = self._panel.logic.showApproach(plan, plan.candidates[number])
 
     def picture(self, number: int) -> str:
         """The image of a candidate as a data URL; "" without one."""
@@ -89,35 +81,39 @@ class ApproachPresenter:
         plan = self.found
         if plan is None:
             return ""
-        chosen = _("Candidate {number}: {text}").format(number=self._chosen + 1, text=self._candidate(plan).text)
+        words = plan.candidates[self._chosen].text
+        chosen = _("Candidate {number}: {text}").format(number=self._chosen + 1, text=words)
         return "\n".join((plan.target.text, chosen, _(NO_ADVICE)))
-
-    def _candidate(self, plan: Approach) -> Candidate:
-        return plan.candidates[min(self._chosen, len(plan.candidates) - 1)]
 
     def canChoose(self, number: int) -> tuple[bool, str]:
         """(whether there is this candidate, the reason if not)"""
         return self._panel.ready((bool(self.picture(number)), _("Plan an approach first")))
 
     def openHere(self) -> None:
-        """Place and aim the probe as the chosen candidate says, and open the skull there if there is one."""
-        panel, parameters = self._panel, self._panel.parameters
+        """Place the probe in the middle of the opening, aim it, and open the skull there if there is one."""
+        panel = self._panel
         with panel.acting():
-            candidate = self._candidate(required(self.found, "no approach is planned, press Plan first"))
-            self._placing.putAt(candidate.probe_to_ras)
-            if not candidate.opening_mm:
-                return
-            parameters.opening = None
-            parameters.panel = replace(parameters.panel, craniotomy_mm=round(candidate.opening_mm, 1))
-        self._placing.openCraniotomy()
+            plan = required(self.found, "no approach is planned, press Plan first")
+            rim, candidate = self._rim(), plan.candidates[self._chosen]
+            pose = candidate.probe_to_ras.copy()
+            pose[:3, 3] = rim.mean(axis=0) if len(rim) else candidate.entry_ras
+            self._placing.putAt(plan.in_opening(panel.preset.probe, pose, rim))
+            if candidate.opening_mm:
+                self._placing.openCraniotomy()
 
-    def drawOpening(self) -> None:
-        """Choose a closed curve around the opening of the candidate as the opening, whose points can be moved."""
-        panel, parameters = self._panel, self._panel.parameters
-        with panel.acting():
-            candidate = self._candidate(required(self.found, "no approach is planned, press Plan first"))
-            require(candidate.opening_mm, "no skull is labelled, so that there is nothing to open")
-            curve: Any = panel.add("MarkupsClosedCurve", "Opening")
-            for point in ring(candidate).tolist():
-                curve.AddControlPointWorld(*point)
-            parameters.opening = curve
+    # ---- the probe in the opening --------------------------------------------------------------------------------
+
+    def _rim(self) -> np.ndarray:
+        """(points, 3) world RAS mm of the closed curve that is chosen as the opening; none without one."""
+        opening: Any = self._panel.parameters.opening
+        is_curve = opening is not None and opening.IsA("vtkMRMLMarkupsClosedCurveNode")
+        return control_points(opening) if is_curve else np.zeros((0, 3))
+
+    def _keep(self) -> None:
+        plan, parameters = self.found, self._panel.parameters
+        probe: Any = parameters.probe_transform
+        if plan is None or probe is None or not parameters.panel.keep_in_opening or is_face(probe):
+            return
+        self.probe.watch(None)  # the next change is none of the user
+        set_node_to_world(probe, plan.in_opening(self._panel.preset.probe, probe_pose(probe), self._rim()))
+        self.probe.watch(probe)

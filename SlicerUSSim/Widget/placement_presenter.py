@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 
@@ -12,8 +12,6 @@ from SlicerUSSim.Logic.mrml.nodes import display_of, set_node_to_world
 from SlicerUSSim.Widget.interface import PanelHost, tr as _
 from SlicerUSSim.Widget.notes import OPENED, PLACED, VIEW, Notes, checks
 from SlicerUSSim.Widget.tracked_presenter import FACE
-
-T = TypeVar("T")
 
 
 class PlacementPresenter:
@@ -55,7 +53,7 @@ class PlacementPresenter:
         """Move the probe's transform, or a new one if none is selected, to a pose (4, 4)."""
         self._moved(lambda probe: set_node_to_world(probe, probe_to_world))
 
-    def _moved(self, move: Callable[[Any], T]) -> T:
+    def _moved(self, move: Callable[[Any], Any]) -> Any:
         parameters = self._panel.parameters
         chosen: Any = parameters.probe_transform
         is_moved = chosen is not None and chosen.GetName() == FACE

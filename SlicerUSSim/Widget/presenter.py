@@ -66,6 +66,7 @@ class PanelPresenter(PanelHost):
         self.segmenting.followMri()
         self.images.followChoices()
         self.images.showIn3D()
+        self.approach.probe.watch(self.parameters.probe_transform)
         self.view.refresh(self.values.changes())
 
     def forgetPatient(self) -> None:

@@ -20,7 +20,6 @@ from SlicerUSSim.Logic.mrml.fit_nodes import COMPARED
 from SlicerUSSim.Logic.mrml.parameter_node import SceneParameters
 from SlicerUSSim.Logic.probe.arrays import PROBES
 from SlicerUSSim.Logic.tissue.presets import TISSUES
-from SlicerUSSim.Widget.approach_presenter import CANDIDATES
 from SlicerUSSim.Widget.interface import Can, Control, Kind, Row, Section, tr as _
 from SlicerUSSim.Widget.presenter import PanelPresenter
 from SlicerUSSim.Widget.tissue_presenter import COLUMN_PARAMETERS
@@ -219,10 +218,7 @@ def _approach(panel: PanelPresenter) -> tuple[Row, ...]:
     return (
         (
             _("Target"), value("scene.target"),
-            button(
-                "plan", _("Plan"), _("Compare straight ways to the target, and simulate the image of the best (some "
-                "seconds); a simulation, and no medical advice"), approach.plan, panel.canSimulate,
-            ),
+            button("plan", _("Plan"), _("Compare ways to the target (some seconds)"), approach.plan, panel.canSimulate),
         ),
         Control(
             "approachNotes", "words", tip=_("The target, and what is known of the chosen candidate"),
@@ -231,24 +227,17 @@ def _approach(panel: PanelPresenter) -> tuple[Row, ...]:
         tuple(
             Control(
                 f"candidate{number + 1}", "picture", _("Candidate {number}").format(number=number + 1),
-                _("Simulated image with the outline of the target; press it to see way and opening in the views"),
+                _("Image with the outline of the target; press it to see way and opening in the views"),
                 shows=partial(approach.picture, number), action=partial(approach.choose, number),
                 enabled=partial(approach.canChoose, number), depends=("tissues",),
             )
-            for number in range(CANDIDATES)
+            for number in range(3)  # as many as are offered
         ),
-        (
-            button(
-                "openHere", _("Open here"),
-                _("Place and aim the probe as the candidate says, and open the skull there, if one is labelled"),
-                approach.openHere, partial(approach.canChoose, 0),
-            ),
-            button(
-                "drawOpening", _("Draw opening"),
-                _("A closed curve around the opening, whose points you can move; then press Open skull"),
-                approach.drawOpening, partial(approach.canChoose, 0),
-            ),
+        button(
+            "openHere", _("Open here"), _("Open the skull in the closed curve, and aim the probe from its middle"),
+            approach.openHere, partial(approach.canChoose, 0),
         ),
+        value("scene.keep_in_opening"),
     )  # fmt: skip
 
 

@@ -14,6 +14,7 @@ from vtkmodules.vtkCommonDataModel import vtkStaticCellLocator
 
 from SlicerUSSim.Logic.base.errors import SimulationError
 from SlicerUSSim.Logic.base.vtk_data import matrix_array
+from SlicerUSSim.Logic.mrml.nodes import nodes_of_class
 from SlicerUSSim.Logic.probe.arrays import Probe
 from SlicerUSSim.Logic.probe.poses import aimed_at, carried, turned
 from SlicerUSSim.Logic.probe.shape import probe_polydata
@@ -153,8 +154,9 @@ class ProbeHand:
             picked, self._picked = self._picked, None
             picked(_in_slice(view, np.array(view.interactor().GetEventPosition(), float)))
             return True
-        pose = self._pose()
-        if pose is None:
+        pose, scene = self._pose(), cast(Any, view.get_view_node()).GetScene()
+        markups = nodes_of_class(scene, "vtkMRMLMarkupsDisplayNode")
+        if pose is None or any(display.HasActiveComponent() for display in markups):  # a point of a curve is moved
             return False
         pixel, now = np.array(view.interactor().GetEventPosition(), float), monotonic()
         last, where = self._last_press

@@ -155,7 +155,8 @@ class ProbeControl:
         self.labelled = placed, found.names
         try:
             with self._progress("Make the surface") as progress:
-                made = self._tasks.doAside(lambda: _rendered_surface(placed, progress))
+                made = surface = self._tasks.doAside(lambda: PatientSurface(placed, progress))
+                self._tasks.doAside(lambda: surface.coarse_polydata)  # made here, not where views wait for it
         except Cancelled:
             made = None  # that of the labels before is not of these
         if self._surface_version != version:  # of a patient who was closed meanwhile, or of labels of before
@@ -214,10 +215,3 @@ class ProbeControl:
         with self._shared.changing() as now:
             now.pose = SurfacePose(**{name: round(float(getattr(where, name)), 2) for name in _POSE_FIELDS})
         self.told()
-
-
-def _rendered_surface(labels: Volume, progress: Callable[[float], None]) -> PatientSurface:
-    """The surface, with what views render of it: made here, not where they wait for it."""
-    surface = PatientSurface(labels, progress)
-    surface.coarse_polydata  # noqa: B018, a cached property
-    return surface

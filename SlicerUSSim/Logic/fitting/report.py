@@ -5,6 +5,7 @@ from __future__ import annotations
 import html
 import io
 import os
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from string import Template
 from tempfile import TemporaryDirectory
@@ -18,7 +19,7 @@ from SlicerUSSim.Logic.fitting.optimization import AGAIN, STAGES, AppearanceResu
 from SlicerUSSim.Logic.fitting.parameters import Parameter
 from SlicerUSSim.Logic.fitting.speckle_fit import SpeckleFit
 from SlicerUSSim.Logic.fitting.texture_costs import TextureReference
-from SlicerUSSim.Logic.imaging.figures import data_url, html_table, png_url, require_matplotlib
+from SlicerUSSim.Logic.imaging.figures import data_url, png_url, require_matplotlib
 from SlicerUSSim.Logic.imaging.simulator import UltrasoundSimulator
 from SlicerUSSim.Logic.probe.poses import slice_under_probe
 from SlicerUSSim.Logic.tissue.presets import colour_of
@@ -154,7 +155,7 @@ def _predicted(prediction: Prediction, reference: str) -> str:
         for source, *values in prediction.rows()
     ]
     return f"""<h2>Images that were not fitted</h2>
-{html_table(heads, rows, own=FITTED)}
+{_table(heads, rows)}
 <p class="dim">The predicted images cost {prediction.of_uniform:.2f} of what one uniform tissue without anatomy, fitted
 in the same way, costs there; {html.escape(reference)} neighbours are the images before and after in the recording. With
 texture: + T1 + T2 / 2.</p>"""
@@ -174,7 +175,18 @@ def _speckle(speckle: SpeckleFit) -> str:
     return f"""<h2>Fit of the speckle</h2>
 <p class="dim">The grey map is that of the images alone. Smoothing and texture are found by T1 + T2 / 2, and smoothing
 once more with the width of the speckle. The fit by the paper's cost began with what is below.</p>
-{html_table(["step", "found"], speckle.rows(), "words")}"""
+{_table(["step", "found"], speckle.rows(), "words")}"""
+
+
+def _table(heads: Sequence[str], rows: Iterable[Sequence[str]], kind: str = "") -> str:
+    """A table of texts; the rows of the simulated images stand out."""
+
+    def row(cells: Sequence[str], tag: str = "td") -> str:
+        shown = ' class="own"' if cells[0] == FITTED else ""
+        return f"<tr{shown}>" + "".join(f"<{tag}>{html.escape(cell)}</{tag}>" for cell in cells) + "</tr>"
+
+    body = "\n".join(row(cells) for cells in rows)
+    return f'<table class="{kind}">{row(heads, "th")}\n{body}</table>'
 
 
 def _explained(parameter: Parameter) -> str:

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import base64
-import html
 import importlib.util
 import io
 import os
-from collections.abc import Iterable, Sequence
 
 import numpy as np
 
@@ -103,17 +101,6 @@ def png_url(image: np.ndarray) -> str:
 def data_url(png: bytes) -> str:
     """The content of a PNG file as a data URL."""
     return "data:image/png;base64," + base64.b64encode(png).decode()
-
-
-def html_table(heads: Sequence[str], rows: Iterable[Sequence[str]], kind: str = "", own: str | None = None) -> str:
-    """A table of texts of the class `kind`; rows that begin with `own` stand out."""
-
-    def row(cells: Sequence[str], tag: str = "td") -> str:
-        shown = ' class="own"' if cells[0] == own else ""
-        return f"<tr{shown}>" + "".join(f"<{tag}>{html.escape(cell)}</{tag}>" for cell in cells) + "</tr>"
-
-    body = "\n".join(row(cells) for cells in rows)
-    return f'<table class="{kind}">{row(heads, "th")}\n{body}</table>'
 
 
 def _scale_bar(axis, right: float, bottom: float) -> None:

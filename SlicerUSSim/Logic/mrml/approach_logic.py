@@ -1,4 +1,4 @@
-"""ApproachLogic: approaches to a lesion in labels of a scene, and models of target, way and opening in its views."""
+"""ApproachLogic: approaches to a lesion in labels of a scene; target, way and opening in its views."""
 
 from __future__ import annotations
 
@@ -6,24 +6,20 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from vtkmodules.vtkCommonCore import vtkPoints
-from vtkmodules.vtkCommonDataModel import vtkCellArray, vtkPolyData
 
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.imaging.approach_images import simulated_approach
+from SlicerUSSim.Logic.imaging.simulator import UltrasoundSimulator
 from SlicerUSSim.Logic.mrml.craniotomy_nodes import closed_labels, surface_of
 from SlicerUSSim.Logic.mrml.label_nodes import LABEL_CLASSES
-from SlicerUSSim.Logic.mrml.nodes import display_of, nodes_of_class, require_node
+from SlicerUSSim.Logic.mrml.nodes import display_of, node_called, require_node
 from SlicerUSSim.Logic.mrml.patient_logic import PatientLogic
 from SlicerUSSim.Logic.mrml.sheet_nodes import read_sheets
 from SlicerUSSim.Logic.placement.approach import Approach, Candidate, plan_approach
 
-#: Attribute of a model node of this module: what it shows
-_SHOWS = "SlicerUSSim.approach"
-_TARGET, _WAY = "Target", "Approach"
-_COLOURS = {_TARGET: (1.0, 0.78, 0.24), _WAY: (0.35, 0.85, 1.0)}
-#: Points of a ring
-_RING = 16
+#: Names of the nodes that show an approach, and their colours
+TARGET, WAY, OPENING = "Approach target", "Approach way", "Approach opening"
+_YELLOW, _BLUE = (1.0, 0.78, 0.24), (0.35, 0.85, 1.0)
 
 
 class ApproachLogic:
@@ -32,7 +28,7 @@ class ApproachLogic:
     def __init__(self, patient: PatientLogic) -> None:
         self._patient = patient
 
-    def planApproach(self, labels_node, what: str | Sequence[float] | Volume | None = None) -> Approach:
+    def planApproach(self, labels_node, what: str | Sequence[float] | None = None) -> Approach:
         """The best candidates for the probe of the scene, with images; see plan_approach for `what` and errors.
 
         Of labels with an opening it is that of those before.
@@ -45,60 +41,46 @@ class ApproachLogic:
         sheets = None if chosen is None else read_sheets(chosen, np.eye(4), self._patient.parameters.sheet.kinds)
         work, device = self._patient.work, self._patient.device
         plan = work.doAside(lambda: plan_approach(placed, patient.names, preset.probe, what))
-        return work.do(
-            lambda: simulated_approach(
-                plan, placed, imaged.tissues, preset.probe, preset.settings, preset.display, device=device,
-                texture=imaged.texture, sheets=sheets,
-            )
-        )  # fmt: skip
 
-    def showApproach(self, approach: Approach, candidate: Candidate) -> None:
-        """Show the target, the way of a candidate and the rim of its opening in the 3D views and slices."""
-        self._show(_TARGET, surface_of(approach.target.region))
-        ends = np.array([candidate.entry_ras, approach.target.centre_ras])
-        self._show(_WAY, _lines([ends, ring(candidate, closed=True)] if candidate.opening_mm else [ends]))
+        def simulated() -> Approach:
+            closed = UltrasoundSimulator(placed, imaged.tissues, preset.settings, device, imaged.texture, sheets)
+            return simulated_approach(plan, closed, preset.probe, preset.display)
+
+        return work.do(simulated)
+
+    def showApproach(self, approach: Approach, candidate: Candidate) -> Any:
+        """Show the target, the way of a candidate and its opening in the 3D views and slices.
+
+        Returns the closed curve around the opening, whose points can be moved; None without a skull.
+        """
+        self.hideApproach()
+        model = node_called(self._patient.scene, "Model", TARGET)
+        model.SetAndObservePolyData(surface_of(approach.target.region))
+        if (display := display_of(model)) is not None:
+            display.SetColor(*_YELLOW)
+            display.SetOpacity(0.6)
+            display.SetVisibility2D(True)
+        entry, across = candidate.entry_ras, candidate.probe_to_ras[:3, [0, 2]]
+        self._draw("MarkupsCurve", WAY, np.array([entry, approach.target.centre_ras])).SetLocked(True)
+        if not candidate.opening_mm:
+            return None
+        turn = np.linspace(0.0, 2.0 * np.pi, 12, endpoint=False)
+        rim = entry + 0.5 * candidate.opening_mm * np.stack([np.cos(turn), np.sin(turn)], axis=1) @ across.T
+        return self._draw("MarkupsClosedCurve", OPENING, rim)
 
     def hideApproach(self) -> None:
         """Remove what showApproach made."""
-        for node in self._shown():
-            self._patient.scene.RemoveNode(node)
+        for name in (TARGET, WAY, OPENING):
+            self._patient.scene.RemoveNode(self._patient.scene.GetFirstNodeByName(name))
 
-    def _shown(self) -> list[Any]:
-        return [node for node in nodes_of_class(self._patient.scene, "vtkMRMLModelNode") if node.GetAttribute(_SHOWS)]
-
-    def _show(self, what: str, polydata: vtkPolyData) -> None:
-        node = next((node for node in self._shown() if node.GetAttribute(_SHOWS) == what), None)
-        if node is None:
-            node = self._patient.scene.AddNewNodeByClass("vtkMRMLModelNode", what)
-            node.SetAttribute(_SHOWS, what)
-        node.SetAndObservePolyData(polydata)
-        display = display_of(node)
-        if display is not None:
-            display.SetColor(*_COLOURS[what])
-            display.SetOpacity(0.6 if what == _TARGET else 1.0)
-            display.SetLineWidth(3)
-            display.SetVisibility2D(True)
-            if what == _WAY:
-                display.SetLighting(False)
-                display.SetSliceDisplayModeToProjection()
-
-
-def ring(candidate: Candidate, *, closed: bool = False) -> np.ndarray:
-    """(points, 3) RAS mm of the rim of a candidate's opening, at the place where its way begins."""
-    turn = np.linspace(0.0, 2.0 * np.pi, _RING + closed, endpoint=closed)
-    around = np.stack([np.cos(turn), np.sin(turn)], axis=1) @ candidate.probe_to_ras[:3, [0, 2]].T
-    return candidate.entry_ras + 0.5 * candidate.opening_mm * around
-
-
-def _lines(paths: Sequence[np.ndarray]) -> vtkPolyData:
-    """A line along each of the (points, 3)."""
-    points, cells, first = vtkPoints(), vtkCellArray(), 0
-    for path in paths:
-        for place in path.tolist():
-            points.InsertNextPoint(place)
-        cells.InsertNextCell(len(path), list(range(first, first + len(path))))
-        first += len(path)
-    result = vtkPolyData()
-    result.SetPoints(points)
-    result.SetLines(cells)
-    return result
+    def _draw(self, kind: str, name: str, points: np.ndarray) -> Any:
+        node = node_called(self._patient.scene, kind, name)
+        for point in points.tolist():
+            node.AddControlPointWorld(*point)
+        if (display := display_of(node)) is not None:
+            display.SetSelectedColor(*_BLUE)
+            display.SetGlyphScale(1.5)
+            display.SetPointLabelsVisibility(False)
+            display.SetPropertiesLabelVisibility(False)
+            display.SetSliceProjection(True)
+        return node

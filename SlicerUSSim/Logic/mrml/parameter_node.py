@@ -64,6 +64,10 @@ class PanelSettings(Declared):
         LARGEST, "Target", "What Plan looks for a way to: the largest lesion, that of a tissue, or a point that is "
         "clicked in a slice view", choices=(LARGEST, *LESION_TISSUES, POINT), shown=True,
     )  # fmt: skip
+    keep_in_opening: bool = parameter(
+        False, "Keep in the opening, aimed at the target", "A probe that is moved stays on the brain in the opening of "
+        "the approach, and looks at its target", shown=True,
+    )  # fmt: skip
     view: str = parameter(
         next(iter(VIEWS)), "Standard view", "; ".join(f"{name}: {view.tip}" for name, view in VIEWS.items()),
         choices=tuple(VIEWS), shown=True,

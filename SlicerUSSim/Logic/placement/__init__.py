@@ -6,7 +6,7 @@ from SlicerUSSim.Logic.base.lazy import lazy_exports
 
 if TYPE_CHECKING:
     from .aiming import opening_pose as opening_pose
-    from .approach import find_target as find_target, plan_approach as plan_approach
+    from .approach import plan_approach as plan_approach
     from .approach_weights import ApproachWeights as ApproachWeights
     from .bone_before_probe import about_bone as about_bone
     from .craniotomy import default_pose as default_pose, opened as opened

@@ -37,7 +37,7 @@ def opening_pose(
     surface = PatientSurface(ground)
     start = craniotomy_pose(ground, probe, target_ras=target_ras)
     pose = surface.slid(start, surface.nearest(opening_ras))
-    targets = _lesions(labels, names) if target_ras is None else [(np.asarray(target_ras, float), "")]
+    targets = lesions(labels, names) if target_ras is None else [(np.asarray(target_ras, float), "")]
     targets = [(place, name or _name_at(labels, names, place)) for place, name in targets]
     if not targets:
         return pose, ""
@@ -58,25 +58,8 @@ def opening_pose(
     )
 
 
-def largest_lesion(labels: Volume, names: Sequence[str]) -> tuple[str, np.ndarray] | None:
-    """(its most frequent tissue, (k, j, i) bool) of the largest lesion in labels; None without one."""
-    for box, where, tissue in _parts(labels, names):
-        inside = np.zeros(labels.array.shape, bool)
-        inside[box] = where
-        return tissue, inside
-    return None
-
-
-def _lesions(labels: Volume, names: Sequence[str]) -> list[tuple[np.ndarray, str]]:
+def lesions(labels: Volume, names: Sequence[str]) -> list[tuple[np.ndarray, str]]:
     """((3,) RAS mm of the innermost voxel, most frequent tissue) of the lesions in labels, the largest first."""
-    return [
-        (innermost_ras(where, labels, [part.start for part in box]), tissue)
-        for box, where, tissue in _parts(labels, names)
-    ]
-
-
-def _parts(labels: Volume, names: Sequence[str]) -> list[tuple[tuple[slice, ...], np.ndarray, str]]:
-    """(box, (k, j, i) bool in it, most frequent tissue) of the lesions in labels, the largest first."""
     for group in LESION_GROUPS:
         parts, _ = ndimage.label(np.isin(labels.array, labels_of(names, group)))  # type: ignore[misc]
         if ENHANCING in group:
@@ -88,7 +71,7 @@ def _parts(labels: Volume, names: Sequence[str]) -> list[tuple[tuple[slice, ...]
             box = boxes[number]
             where = parts[box] == number + 1
             tissue = names[int(np.bincount(labels.array[box][where]).argmax()) - 1]
-            found.append((box, where, tissue))
+            found.append((innermost_ras(where, labels, [part.start for part in box]), tissue))
         if found:
             return found
     return []

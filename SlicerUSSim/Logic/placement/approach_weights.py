@@ -22,14 +22,9 @@ class ApproachWeights(Declared):
 
     brain_weight: float = _weight(1.0, "Brain", "Each millimetre of brain before the target")
     outside_weight: float = _weight(0.5, "Outside", "Each millimetre of skin, scalp and bone")
-    ventricle_weight: float = _weight(
-        5.0, "Ventricle", "Each millimetre of fluid more than 15 mm below the brain's surface"
-    )
+    ventricle_weight: float = _weight(5.0, "Ventricle", "Each millimetre of fluid that is 15 mm below the surface")
     vessel_weight: float = _weight(5.0, "Vessel", "Each millimetre of a vessel, or of what enhances")
     air_weight: float = _weight(10.0, "Air", "Each millimetre of air in the head, as of a sinus")
-    other_side_weight: float = _weight(
-        3.0, "Other side", "Each millimetre in the middle plane of the brain (4 mm) or beyond it"
-    )
     angle_weight: float = _weight(0.2, "Angle", "Each degree between probe and normal of the brain's surface")
     unseen_weight: float = _weight(2.0, "Unseen", "Each percent of the target outside of the field")
     unfocused_weight: float = _weight(0.05, "Unfocused", "Each percent of the target outside of the focal zone")

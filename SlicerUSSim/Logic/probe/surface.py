@@ -99,12 +99,9 @@ class PatientSurface:
         self._locator.FindClosestPoint(list(map(float, point)), closest, cell, part, distance)
         return np.array(closest)
 
-    def distances_mm(self, points, at_most_mm: float = np.inf) -> np.ndarray:
-        """(n,) distances of (n, 3) points to the nearest corners of the surface's triangles, which are 2 mm wide.
-
-        Those that are larger than `at_most_mm` are inf, which takes less time.
-        """
-        return self._tree.query(points, distance_upper_bound=at_most_mm)[0]
+    def distances_mm(self, points) -> np.ndarray:
+        """(n,) distances of (n, 3) points to the nearest corners of the surface's triangles, which are 2 mm wide."""
+        return self._tree.query(points)[0]
 
     def hit(self, start, end) -> np.ndarray | None:
         """(3,) the first intersection of the line from `start` to `end` with the surface, or None."""
