@@ -11,10 +11,13 @@ from pathlib import Path
 from typing import Any
 
 from SlicerUSSim.Logic.base.files import read_json, write_json, written_whole
+from SlicerUSSim.Logic.base.settings import SimulationSettings
 from SlicerUSSim.Logic.base.version import __version__
 from SlicerUSSim.Logic.datasets.prepared import CLASSES
-from SlicerUSSim.Logic.datasets.recipe import BUNDLED, OUTPUTS, Recipe
+from SlicerUSSim.Logic.datasets.recipe import BUNDLED, OUTPUTS, PatientSettings, Recipe
 from SlicerUSSim.Logic.datasets.writers import record_path
+from SlicerUSSim.Logic.imaging.quality import sample_mm
+from SlicerUSSim.Logic.probe.arrays import Probe
 
 MANIFEST = "manifest.json"
 #: (licence, citation) of the bundled patients
@@ -55,13 +58,15 @@ def write_datasheet(recipe: Recipe, out: Path, skipped: Mapping[str, str]) -> No
     for rest in out.glob("images.zarr/**/*.partial"):  # of workers that were killed
         rest.unlink(missing_ok=True)
     shards, settings = {}, recipe.settings
-    kept: dict[str, set[str]] = {"device": set(), "version": set(), "warnings": set(), "tissues": {"coupling"}}
+    devices, makers, warnings, tissues = set(), set(), set(), {"coupling"}
     for shard in range(recipe.shards):
         if record_path(out, shard).exists():
             record = read_json(record_path(out, shard), most_bytes=2**30)
             shards[str(shard)] = {name: record[name] for name in ("images", "patient", "case", "checksums")}
-            for name, values in kept.items():
-                values |= {record[name]} if isinstance(record[name], str) else set(record[name])
+            devices.add(record["device"])
+            makers.add(record["version"])
+            warnings |= {f"{record['patient']}: {warning}" for warning in record["warnings"]}
+            tissues |= set(record["tissues"])
     sums = json.dumps([one["checksums"] for one in shards.values()])
     found = {one.name: one.version for one in distributions() if one.name in _LIBRARIES}
     manifest = {
@@ -69,33 +74,44 @@ def write_datasheet(recipe: Recipe, out: Path, skipped: Mapping[str, str]) -> No
         "format": settings.format, "images": settings.images, "shard": recipe.shard,
         "made": sum(one["images"][1] - one["images"][0] for one in shards.values()), "checksum": _sha256(sums.encode()),
         "recipe_sha256": _sha256(recipe.text.encode()), "outputs": {name: OUTPUTS[name] for name in settings.outputs},
-        "labels": {str(n): name for n, name in enumerate(CLASSES) if name in kept["tissues"]},
-        "patients": [_patient(recipe, number, skipped) for number in range(len(recipe.patients))],
-        "made_by": sorted(kept["version"]), "devices": sorted(kept["device"]), "warnings": sorted(kept["warnings"]),
+        "labels": {str(n): name for n, name in enumerate(CLASSES) if name in tissues},
+        "patients": [_patient(recipe, one, skipped) for one in recipe.patients],
+        "made_by": sorted(makers), "devices": sorted(devices), "warnings": sorted(warnings),
         "versions": {"SlicerUSSim": __version__, "Python": platform.python_version(), **found}, "shards": shards,
+        "probes": [_scan_lines(*worked) for worked in recipe.worked],
     }  # fmt: skip
     write_json(out / MANIFEST, manifest)
-    lines = [
-        f"`{one['file']}`: {one['citation']}; licence: {one['licence']}{one['missing_because'] and '; MISSING: '}"
-        f"{one['missing_because']}" for one in manifest["patients"]
-    ]  # fmt: skip
     texts = {
         "outputs": _listed(f"`{name}`: {about}" for name, about in manifest["outputs"].items()),
         "labels": ", ".join(f"{number} {name}" for number, name in manifest["labels"].items()),
-        "patients": _listed(lines), "devices": _listed((*manifest["devices"], *manifest["warnings"])),
+        "patients": _listed(
+            f"`{one['file']}`: {one['citation']}; licence: {one['licence']}"
+            + (f"; MISSING: {one['missing_because']}" if one["missing_because"] else "")
+            for one in manifest["patients"]
+        ),
+        "devices": _listed((*manifest["devices"], *manifest["warnings"])),
         "makers": ", ".join(manifest["made_by"]),
     }  # fmt: skip
     with written_whole(out / "README.md") as partial:
         partial.write_text(_PAGE.format(**{**manifest, **texts}), encoding="utf-8")
 
 
-def _patient(recipe: Recipe, number: int, skipped: Mapping[str, str]) -> dict[str, Any]:
-    patient = recipe.patients[number]
+def _patient(recipe: Recipe, patient: PatientSettings, skipped: Mapping[str, str]) -> dict[str, Any]:
     path, (licence, citation) = recipe.folder / patient.file, _SOURCES.get(patient.file, ("not given", "not given"))
     return {
         "file": patient.file, "sha256": _sha256(path.read_bytes()) if path.is_file() else "",
         "licence": patient.licence or licence, "citation": patient.citation or citation,
         "missing_because": skipped.get(patient.file, ""),
+    }  # fmt: skip
+
+
+def _scan_lines(probe: Probe, settings: SimulationSettings) -> dict[str, Any]:
+    """A probe, and where its signals are: sample n of a line is at origin + n sample_mm direction, in its frame."""
+    step_mm = sample_mm(probe, settings)
+    return {
+        **probe.to_dict(), "sample_mm": step_mm, "sampling_mhz": 5e-4 * settings.reference_speed_m_s / step_mm,
+        "samples_per_cycle": settings.samples_per_cycle,
+        "origins_mm": probe.origins_mm().tolist(), "directions": probe.directions().tolist(),
     }  # fmt: skip
 
 

@@ -14,16 +14,30 @@ from SlicerUSSim.Logic.base.files import make_folder, write_json
 from SlicerUSSim.Logic.datasets.reader import SimulatedImages
 from SlicerUSSim.Logic.imaging.figures import write_png
 
-_LABELS = ("labels_as_imaged", "labels")
+
+def labels_to_export(outputs: Collection[str], format_: str, where: str) -> str:
+    """Which of a set's outputs are exported as labels: those as imaged, if it has them.
+
+    Raises SimulationError for a set without labels or images, and in a format that is not read.
+    """
+    labels = next((name for name in ("labels_as_imaged", "labels") if name in outputs), "")
+    has = f"{where}: has {', '.join(outputs)} as {format_}, expected image and labels as zarr or hdf5 to export them"
+    require("image" in outputs and labels and format_ in ("zarr", "hdf5"), has)
+    return labels
+
+
+def _opened(folder: str | os.PathLike) -> tuple[SimulatedImages, str]:
+    images = SimulatedImages(folder)
+    return images, labels_to_export(images.outputs, images.manifest["format"], str(folder))
 
 
 def export_coco(folder: str | os.PathLike) -> Path:
     """The file of annotations of a set in COCO's format, written into its folder `coco` with the images as PNG.
 
-    Each connected region of a tissue is an object, with its box, area in pixels and mask (run lengths). Labels are
-    those as imaged, if the set has them. Raises SimulationError for a set without images or labels.
+    Each connected region of a tissue is an object, with its box, area in pixels and mask (run lengths). Raises
+    SimulationError as labels_to_export.
     """
-    images, labels, out = _opened(folder, "coco")
+    (images, labels), out = _opened(folder), Path(folder) / "coco"
     entries, objects = [], []
     for item in images:
         name, (rows, columns) = f"{item['number']:08d}.png", item["image"].shape
@@ -54,30 +68,16 @@ def _run_lengths(mask: np.ndarray) -> list[int]:
 def export_nnunet(folder: str | os.PathLike) -> Path:
     """The folder Dataset001_SlicerUSSim of a set, as nnU-Net v2 reads it from its nnUNet_raw: PNG, one channel.
 
-    Labels are numbered anew, without gaps; those as imaged, if the set has them. Raises SimulationError for a set
-    without images or labels.
+    Labels are numbered anew, without gaps. Raises SimulationError as labels_to_export.
     """
-    images, labels, out = _opened(folder, "Dataset001_SlicerUSSim")
-    new = np.zeros(256, np.uint8)
-    known = [label for label in images.labels if label]
-    new[known] = range(1, len(known) + 1)
+    (images, labels), out = _opened(folder), Path(folder) / "Dataset001_SlicerUSSim"
+    known = {label: new for new, label in enumerate((label for label in images.labels if label), 1)}
+    new_of = np.array([known.get(label, 0) for label in range(256)], np.uint8)
     for item in images:
         case = f"image_{item['number']:08d}"
         write_png(make_folder(out / "imagesTr") / f"{case}_0000.png", item["image"])
-        write_png(make_folder(out / "labelsTr") / f"{case}.png", new[item[labels]])
-    names = {"background": 0} | {images.labels[label]: int(new[label]) for label in known}
+        write_png(make_folder(out / "labelsTr") / f"{case}.png", new_of[item[labels]])
+    names = {"background": 0} | {images.labels[label]: new for label, new in known.items()}
     values = {"channel_names": {"0": "ultrasound"}, "labels": names, "numTraining": len(images), "file_ending": ".png"}
     write_json(out / "dataset.json", values)
     return out
-
-
-def _opened(folder: str | os.PathLike, name: str) -> tuple[SimulatedImages, str, Path]:
-    images = SimulatedImages(folder)
-    return images, labels_to_export(images.outputs, str(folder)), make_folder(Path(folder) / name)
-
-
-def labels_to_export(outputs: Collection[str], where: str) -> str:
-    """Which of a set's outputs are exported as labels. Raises SimulationError without labels or images."""
-    labels = next((each for each in _LABELS if each in outputs), None)
-    require("image" in outputs and labels, f"{where}: has no images with labels, expected both to export them")
-    return str(labels)

@@ -18,7 +18,7 @@ from SlicerUSSim.Logic.base.transforms import check_rigid
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.datasets.draws import generator
 from SlicerUSSim.Logic.datasets.prepared import PatientError, load
-from SlicerUSSim.Logic.datasets.recipe import ALL, SECTIONS, Case, Recipe
+from SlicerUSSim.Logic.datasets.recipe import ALL, Case, Recipe
 from SlicerUSSim.Logic.imaging.simulator import UltrasoundSimulator
 from SlicerUSSim.Logic.mri.markups import markup_points
 from SlicerUSSim.Logic.mri.pathology import Added, innermost_ras
@@ -36,12 +36,8 @@ _WIDER_MM = 30.0
 _PATHS = ("Curve", "ClosedCurve", "Line", "Fiducial")
 #: Where the middle of a lesion may lie, in which steps it is looked for, and how far from the wanted depth, mm
 _WITHIN, _COARSE_MM, _SHELL_MM = ("grey matter", "white matter", "brain"), 2.0, 1.5
-#: Waves over the sphere that make its surface rough, and their numbers per radian
-_WAVES, _FINENESS = 24, 3.0
 #: The scene of this process, by recipe, folder and case
 _kept: dict[tuple, Scene] = {}
-#: The surface of the last patient
-_surfaces: dict[tuple, PatientSurface] = {}
 
 
 class Scene:
@@ -49,104 +45,99 @@ class Scene:
 
     def __init__(self, recipe: Recipe, out: Path, case: Case) -> None:
         patient = load(out, case.patient)
-        labels, names, tissues, texture = patient.labels, patient.names, patient.tissues, patient.texture
-        self.recipe, self.case, self.mri = recipe, case, patient.mri
-        has_mri = patient.mri is not None or "mri" not in recipe.settings.outputs
+        labels, names, texture = patient.labels, patient.names, patient.texture
+        self.recipe, self.case, self.mri, self.warnings = recipe, case, patient.mri, patient.warnings
+        self._views, self._tissues = patient.views, patient.tissues
+        del patient  # so that what is not needed goes
+        has_mri = self.mri is not None or "mri" not in recipe.settings.outputs
         require(has_mri, "is a label map, and the output mri needs an MRI or CT")
+        drawn = recipe.drawn(case.image)
+        self._settings = replace(SimulationSettings(), **drawn["settings"])
         if recipe.lesions:
             random = generator(recipe.settings.seed, case.number, "lesion shape")
-            added = with_lesion(labels, names, recipe.lesion(case), random)
+            added = with_lesion(labels, names, drawn["lesions"], random)
             for certain in (texture.second_share, texture.deviation, texture.volume_share) if texture else ():
                 if certain is not None:
                     certain[added.labels.array != labels.array] = 0
-            labels, names, tissues = added.labels, added.tissue_names, added.table(tissues)
-        chosen, self.names = recipe.pose, names
-        is_open = chosen.on == "craniotomy" and "skin" in names
-        key = (str(out), case.patient, is_open)
-        if key not in _surfaces:  # the next lesion is in the same patient
-            _surfaces.clear()
-            _surfaces[key] = PatientSurface(without_outside(labels, names) if is_open else labels)
-        self.surface = _surfaces[key]
-        self.target = _innermost(labels, names, chosen.aim) if chosen.aim else None
+            labels, names, self._tissues = added.labels, added.tissue_names, added.table(self._tissues)
+        if texture is not None and not self._settings.mri_modulation_db:
+            texture = replace(texture, deviation=np.broadcast_to(np.float32(0.0), labels.array.shape))  # 20 MB less
+        self.names, self._on, aim = names, recipe.fixed("pose", "on"), recipe.fixed("pose", "aim")
+        is_open = self._on == "craniotomy" and "skin" in names
+        self.surface = PatientSurface(without_outside(labels, names) if is_open else labels)
+        self.target = _innermost(labels, names, aim) if aim else None
         self.start = default_pose(labels, names, recipe.probes[0], is_open=is_open, target_ras=self.target)
         if is_open:
             opening = disc_opening(labels, names, self.start, disc_diameter_mm(recipe.probes[0]) + _WIDER_MM)
             labels = opened(labels, names, opening)[0]
-        self._views = patient.views
-        fixed = recipe.drawn(0)
-        settings = section_of(SimulationSettings(), fixed, "settings")
-        if "skin" in names and not is_open and "settings.contact_gap_mm" not in fixed:
-            settings = replace(settings, contact_gap_mm=GEL_MM)
-        self.simulator = UltrasoundSimulator(labels, tissues, settings, None, texture)
+        if "skin" in names and not is_open and "contact_gap_mm" not in drawn["settings"]:
+            self._settings = replace(self._settings, contact_gap_mm=GEL_MM)
+        self.simulator = UltrasoundSimulator(labels, self._tissues, self._settings, None, texture)
         self.simulator.texture = None  # the device has it, and nobody pickles this simulator
-        self._settings, self._tissues = settings, tissues
-        self._poses = self._listed() if chosen.file else []
-        self._places = self._surface_places() if chosen.on == "surface" else np.zeros((0, 3))
+        self._poses = self._listed() if recipe.fixed("pose", "file") else []
+        self._places = self._surface_places() if self._on == "surface" else np.zeros((0, 3))
 
     def pose(self, image: int, drawn: Mapping[str, Any]) -> np.ndarray:
-        """(4, 4) probe_to_ras of an image."""
-        right, front, *turns = (drawn[f"pose.{name}_deg"] for name in ("right", "front", "rock", "tilt", "rotate"))
-        chosen, pose = self.recipe.pose, self.start
+        """(4, 4) probe_to_ras of an image by what is drawn for `[pose]`."""
+        right, front, *turns = (drawn[f"{name}_deg"] for name in ("right", "front", "rock", "tilt", "rotate"))
+        pose = self.start
         if self._poses:
-            pose = self._poses[(image - self.case.first * self.recipe.shard) % len(self._poses)]
-        elif chosen.on == "view":
-            pose = self._views[drawn["pose.view"]].copy()
-        elif chosen.on == "surface":
+            pose = self._poses[(image - self.case.image) % len(self._poses)]
+        elif self._on == "view":
+            pose = self._views[drawn["view"]]
+        elif self._on == "surface":
             random = generator(self.recipe.settings.seed, image, "place")
             pose = self.surface.slid(pose, self._places[int(random.integers(len(self._places)))])
         if right or front:
             old = self.surface.angles(self.surface.nearest(pose[:3, 3]))
             point = self.surface.at(old[0] + right, old[1] + front)
-            pose = self.surface.slid(pose, point, upright=chosen.on != "view")
+            pose = self.surface.slid(pose, point, upright=self._on != "view")
         if self.target is not None:
             pose = aimed_at(pose, self.target)
         pose = turned(pose, rock_deg=turns[0], tilt_deg=turns[1], rotate_deg=turns[2])
-        pose[:3, 3] -= drawn["pose.lift_mm"] * pose[:3, 1]
+        pose[:3, 3] -= drawn["lift_mm"] * pose[:3, 1]
         return pose.astype(np.float32).astype(float)  # as it is written
 
     def settings(self, drawn: Mapping[str, Any]) -> SimulationSettings:
-        """The simulation's settings of an image."""
-        return section_of(self._settings, drawn, "settings")
+        """The simulation's settings of an image by what is drawn for `[settings]`."""
+        return replace(self._settings, **drawn)
 
-    def tissues(self, image: int) -> tuple[TissueTable, dict[str, float]]:
-        """(tissues of an image, {"white matter.mu0": value} of what was drawn).
+    def tissues(self, image: int) -> tuple[TissueTable, dict[str, dict[str, float]]]:
+        """(tissues of an image, {tissue: {name: value}} of what was drawn).
 
         Of `all`, each tissue with scatterers is drawn by itself; a tissue's own table comes before it.
         """
-        changes: dict[str, dict[str, float]] = {}
-        draws = sorted(self.recipe.draws.items(), key=lambda item: not item[0].startswith(f"{ALL}."))
-        own = {tissue.name: tissue for tissue in self._tissues.all_tissues()}
-        for key, draw in draws:
-            owner, _, name = key.rpartition(".")
-            for tissue in own.values() if owner not in SECTIONS else ():
-                if owner == tissue.name or (owner == ALL and tissue.scatterer_variance > 0.0):
-                    value = draw(generator(self.recipe.settings.seed, image, f"{tissue.name}.{name}"))
-                    factor = getattr(tissue, name) if draw.relative else 1.0
-                    changes.setdefault(tissue.name, {})[name] = draw.cut(value * factor)
-        table = self._tissues
-        for tissue, values in changes.items():
-            table = table.replace(tissue, **values)
-        return table, {f"{tissue}.{name}": one for tissue, values in changes.items() for name, one in values.items()}
+        table, found, seed = self._tissues, {}, self.recipe.settings.seed
+        for tissue in self._tissues.all_tissues():
+            of_all = self.recipe.tissues.get(ALL, {}) if tissue.scatterer_variance > 0.0 else {}
+            draws = {**of_all, **self.recipe.tissues.get(tissue.name, {})}
+            if draws:
+                found[tissue.name] = {
+                    name: draw(generator(seed, image, f"{tissue.name}.{name}"), getattr(tissue, name))
+                    for name, draw in draws.items()
+                }
+                table = table.replace(tissue.name, **found[tissue.name])
+        return table, found
 
     def _surface_places(self) -> np.ndarray:
         from vtkmodules.util.numpy_support import vtk_to_numpy
 
         points = vtk_to_numpy(self.surface.polydata.GetPoints().GetData()).astype(float)
         x, y, z = (points - self.surface.centre).T
-        within = self.recipe.pose.within_deg
+        within = self.recipe.fixed("pose", "within_deg")
         kept = points[np.degrees(np.arctan2(np.hypot(x, y), z)) <= within]
         require(len(kept) > 0, f"[pose] within_deg is {within:g}, and the surface has no point so near to its top")
         return kept
 
     def _listed(self) -> list[np.ndarray]:
-        chosen = self.recipe.pose
-        path = str(self.recipe.folder / chosen.file)
-        if chosen.on == "path":
+        file, transform = (self.recipe.fixed("pose", name) for name in ("file", "transform"))
+        path = str(self.recipe.folder / file)
+        if self._on == "path":
             return self.surface.along(markup_points(path, _PATHS, "a curve")[1])
         sequence = TrackedSequence.read(path)
-        kept = [number for number in range(len(sequence)) if sequence.has_pose(number, chosen.transform)]
-        require(kept, f"{path}: no image has {chosen.transform}; it has {', '.join(sequence.frames_of_reference())}")
-        return [check_rigid(chosen.transform, sequence.pose(number, chosen.transform)) for number in kept]
+        kept = [number for number in range(len(sequence)) if sequence.has_pose(number, transform)]
+        require(kept, f"{path}: no image has {transform}; it has {', '.join(sequence.frames_of_reference())}")
+        return [check_rigid(transform, sequence.pose(number, transform)) for number in kept]
 
 
 def scene(recipe: Recipe, out: Path, case: Case) -> Scene:
@@ -170,12 +161,6 @@ def _innermost(labels: Volume, names: tuple[str, ...], tissue: str) -> np.ndarra
     return innermost_ras(inside[boxes[0]], labels, [part.start for part in boxes[0]])
 
 
-def section_of(settings: Any, drawn: Mapping[str, Any], section: str) -> Any:
-    """Settings with the drawn values of a section."""
-    values = {key.partition(".")[2]: value for key, value in drawn.items() if key.startswith(f"{section}.")}
-    return replace(settings, **values)
-
-
 def with_lesion(labels: Volume, names: Sequence[str], drawn: Mapping[str, Any], random: np.random.Generator) -> Added:
     """Labels 1, 2, ... called `names` with a lesion at a random place of the drawn depth.
 
@@ -196,15 +181,12 @@ def with_lesion(labels: Volume, names: Sequence[str], drawn: Mapping[str, Any], 
         f"{depth.max():.0f}",
     )
     middle = step * np.array(np.unravel_index(int(places[random.integers(places.size)]), where.shape))
-    waves, phases = random.normal(0.0, _FINENESS, (_WAVES, 3)), random.uniform(0.0, 2.0 * np.pi, _WAVES)
     reach = np.ceil(drawn["radius_mm"] * 2.5 / spacing).astype(int)
     low, high = np.maximum(middle - reach, 0), np.minimum(middle + reach + 1, labels.array.shape)
     box = tuple(slice(a, b) for a, b in zip(low, high, strict=True))
-    offset = (np.moveaxis(np.mgrid[box], 0, -1) - middle) * spacing.astype(np.float32)
-    away = np.linalg.norm(offset, axis=-1)
-    ways = (offset / np.maximum(away, 1e-6)[..., None]).astype(np.float32)
-    rough = sum(np.cos(ways @ wave + phase) for wave, phase in zip(waves, phases, strict=True)) * np.sqrt(2.0 / _WAVES)
-    radius = drawn["radius_mm"] * np.clip(1.0 + drawn["roughness"] * rough, 0.3, 2.4)
+    away = np.linalg.norm((np.moveaxis(np.mgrid[box], 0, -1) - middle) * spacing, axis=-1)
+    rough = ndimage.gaussian_filter(random.normal(size=away.shape), 0.5 * drawn["radius_mm"] / spacing)
+    radius = drawn["radius_mm"] * np.clip(1.0 + drawn["roughness"] * rough / rough.std(), 0.3, 2.4)
     names = (*names, *({drawn["tissue"]} - set(names)))
     array = labels.array.copy()
     array[box][(away <= radius) & ~np.isin(array[box], outside)] = names.index(drawn["tissue"]) + 1

@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 from scipy import ndimage
 
-from SlicerUSSim.Logic.base.errors import SimulationError, require
+from SlicerUSSim.Logic.base.errors import SimulationError, about_other_file, require
 from SlicerUSSim.Logic.base.files import make_folder, written_whole
 from SlicerUSSim.Logic.base.volume import Volume
-from SlicerUSSim.Logic.datasets.recipe import BUNDLED, Recipe
+from SlicerUSSim.Logic.datasets.recipe import BUNDLED, PatientSettings, Recipe
 from SlicerUSSim.Logic.mri.masks import read_mask
 from SlicerUSSim.Logic.mri.modality import segment_image
 from SlicerUSSim.Logic.mri.pathology import add_tissues, texture_below
@@ -51,6 +51,8 @@ class PreparedPatient:
     mri: Volume | None
     #: {name: (4, 4) probe_to_ras} of the standard views of the recipe, which would take workers 1 GB
     views: dict[str, np.ndarray]
+    #: What a user should check
+    warnings: tuple[str, ...]
 
 
 def prepared_path(out: Path, patient: int) -> Path:
@@ -59,18 +61,16 @@ def prepared_path(out: Path, patient: int) -> Path:
 
 
 def prepare(recipe: Recipe, patient: int, out: Path) -> None:
-    """Write what images of a patient are made of, unless it is there.
+    """Write what images of a patient are made of.
 
     Raises PatientError, which names the file, if it cannot be read or segmented.
     """
-    path = prepared_path(out, patient)
-    if path.exists():
-        return
     try:
-        found = _prepared(recipe, patient)
+        with about_other_file(recipe.patients[patient].file):
+            found = _prepared(recipe, recipe.patients[patient])
     except SimulationError as error:
-        name = recipe.patients[patient].file
-        raise PatientError(str(error) if name in str(error) else f"{name}: {error}") from None
+        raise PatientError(str(error)) from None
+    path = prepared_path(out, patient)
     make_folder(path.parent)
     with written_whole(path) as partial, partial.open("wb") as file:
         pickle.dump(found, file, protocol=pickle.HIGHEST_PROTOCOL)
@@ -82,9 +82,8 @@ def load(out: Path, patient: int) -> PreparedPatient:
         return pickle.load(file)
 
 
-def _prepared(recipe: Recipe, number: int) -> PreparedPatient:
-    chosen, settings = recipe.patients[number], recipe.segmentations[number]
-    texture, mri, path = None, None, recipe.folder / chosen.file
+def _prepared(recipe: Recipe, chosen: PatientSettings) -> PreparedPatient:
+    texture, mri, path, warnings = None, None, recipe.folder / chosen.file, ()
     is_file = chosen.file not in BUNDLED
     image = Volume.read(path) if is_file else demo_mri()[0] if chosen.file == BUNDLED[0] else head_mri()
     if is_file and is_label_file(path, image):
@@ -92,24 +91,27 @@ def _prepared(recipe: Recipe, number: int) -> PreparedPatient:
         found = read_label_file(path, image)
         labels, names, tissues = found.labels, found.tissues.names_by_label(), found.tissues
     else:
-        segmentation = segment_image(image, settings)
-        labels, names, mri, texture = segmentation.labels, segmentation.tissue_names, image, segmentation.texture()
+        made = segment_image(image, chosen.segmentation)
+        labels, names, mri, texture, warnings = made.labels, made.tissue_names, image, made.texture(), made.warnings
         tissues = TissueTable.brain(names)
         if chosen.ventricles:
-            labels, names, tissues = with_ventricles(image, segmentation, settings.contrast, tissues)
-    masks = [_mask(text, recipe.folder) for text in chosen.add]
+            labels, names, tissues = with_ventricles(image, made, chosen.segmentation.contrast, tissues)
+    masks = [(tissue, read_mask(str(recipe.folder / file)), file) for tissue, file in chosen.add.items()]
     if masks:
         added = add_tissues(labels, names, masks, has_brain_mask=mri is not None)
         texture = None if texture is None else texture_below(texture, image, labels, added.labels)
         labels, names, tissues = added.labels, added.tissue_names, added.table(tissues)
+        warnings += added.warnings
     part = _cut(labels)
     texture = None if texture is None else texture.on_grid_of(part, labels)
     if mri is not None:
         is_shown = "mri" in recipe.settings.outputs
         mri = part.with_array(on_grid(mri.with_array(mri.array.astype(np.float32)), part)) if is_shown else None
-    wanted = set(recipe.draws["pose.view"].values if recipe.pose.on == "view" else ())
-    views: dict[str, np.ndarray] = {name: view_pose(part, names, name)[0] for name in wanted}
-    return PreparedPatient(part, tuple(names), tissues, texture, mri, views)
+    views: dict[str, np.ndarray] = {
+        name: view_pose(part, names, name)[0] for name in recipe.draws["pose"]["view"].values
+        if recipe.fixed("pose", "on") == "view"
+    }  # fmt: skip
+    return PreparedPatient(part, tuple(names), tissues, texture, mri, views, warnings)
 
 
 def with_ventricles(
@@ -129,12 +131,6 @@ def with_ventricles(
     labels = labels.with_array(np.where(inside, len(names), labels.array).astype(np.uint8))
     membrane = replace(tissues.membrane, fluids=(*tissues.membrane.fluids, VENTRICLE))
     return labels, names, TissueTable({**tissues, len(names): replace(TISSUES["csf"], name=VENTRICLE)}, membrane)
-
-
-def _mask(text: str, folder: Path) -> tuple[str, Volume, str]:
-    tissue, equals, name = text.partition("=")
-    require(bool(equals), f"add is {text!r}, expected TISSUE=FILE, such as tumour=mask.nii.gz")
-    return tissue.strip(), read_mask(str(folder / name)), name
 
 
 def _cut(labels: Volume) -> Volume:

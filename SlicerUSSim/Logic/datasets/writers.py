@@ -4,31 +4,21 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
 
-from SlicerUSSim.Logic.base.errors import SimulationError, require, require_package
+from SlicerUSSim.Logic.base.errors import SimulationError, require
 from SlicerUSSim.Logic.base.files import make_folder, write_json, written_whole
 from SlicerUSSim.Logic.datasets.recipe import Recipe
 from SlicerUSSim.Logic.imaging.figures import write_png
 from SlicerUSSim.Logic.tracked.sequence import SIMULATED, TrackedSequence
 
-EXTRA = "SlicerUSSim[datasets]"
-#: The recipe in the folder of its set
-RECIPE = "recipe.toml"
-#: {format: the module that it needs}
-_NEEDS = {"zarr": "zarr", "hdf5": "h5py"}
 #: Written with every image
 GEOMETRY = ("pose", "image_to_probe")
-
-
-def require_format(recipe: Recipe) -> None:
-    """Raise SimulationError that names the extra to install if the recipe's format needs a package that is missing."""
-    if recipe.settings.format in _NEEDS:
-        require_package(_NEEDS[recipe.settings.format], EXTRA, f"format {recipe.settings.format}")
+_ZARR = "images.zarr"
 
 
 def record_path(out: Path, shard: int) -> Path:
@@ -43,7 +33,7 @@ def write_shard(recipe: Recipe, out: Path, shard: int, arrays: Mapping[str, np.n
     """
     write = {"zarr": _zarr, "hdf5": _hdf5, "png": _png, "tracked": _tracked}[recipe.settings.format]
     try:
-        write(recipe, out, shard, arrays, record)
+        write(recipe, out, shard, arrays, record["parameters"])
         make_folder(record_path(out, shard).parent)
         write_json(record_path(out, shard), record | {"checksums": checksums(arrays)})
     except OSError as error:
@@ -55,24 +45,22 @@ def checksums(arrays: Mapping[str, np.ndarray]) -> dict[str, str]:
     return {name: hashlib.sha256(np.ascontiguousarray(values).data).hexdigest() for name, values in arrays.items()}
 
 
-def _zarr(recipe: Recipe, out: Path, shard: int, arrays: Mapping[str, np.ndarray], _: dict) -> None:
+def _zarr(recipe: Recipe, out: Path, shard: int, arrays: Mapping[str, np.ndarray], _: list[dict]) -> None:
     """Zarr v3: an array per output of all images, a chunk per image, a file per shard."""
     import zarr
     from zarr.errors import ContainsArrayError
 
-    numbers, path = recipe.images_of(shard), out / "images.zarr"
+    numbers, path = recipe.images_of(shard), out / _ZARR
     for name, values in arrays.items():
         if not (path / name / "zarr.json").exists():  # another worker may write the same at the same time
             zarr.open_group(path, mode="a", zarr_format=3)
-            shape, chunks, shards = (
-                (first, *values.shape[1:]) for first in (recipe.settings.images, 1, recipe.shard)
-            )  # fmt: skip
+            shape, chunks, shards = ((n, *values.shape[1:]) for n in (recipe.settings.images, 1, recipe.shard))
             with suppress(ContainsArrayError):
                 zarr.create_array(path, name=name, shape=shape, chunks=chunks, shards=shards, dtype=values.dtype)
         zarr.open_array(path, path=name, mode="r+")[numbers.start : numbers.stop] = values
 
 
-def _hdf5(recipe: Recipe, out: Path, shard: int, arrays: Mapping[str, np.ndarray], _: dict) -> None:
+def _hdf5(recipe: Recipe, out: Path, shard: int, arrays: Mapping[str, np.ndarray], _: list[dict]) -> None:
     """A file per shard with a dataset per output, compressed by image."""
     import h5py
 
@@ -86,38 +74,39 @@ def _h5(out: Path, shard: int) -> Path:
     return out / f"shard-{shard:06d}.h5"
 
 
-def _png(recipe: Recipe, out: Path, shard: int, arrays: Mapping[str, np.ndarray], record: dict) -> None:
+def _png(recipe: Recipe, out: Path, shard: int, arrays: Mapping[str, np.ndarray], parameters: list[dict]) -> None:
     """A picture per image and output, and its pose and parameters as JSON."""
     for place, number in enumerate(recipe.images_of(shard)):
         for name in set(arrays) - set(GEOMETRY):
             write_png(make_folder(out / name) / f"{number:08d}.png", arrays[name][place])
         geometry = {name: arrays[name][place].tolist() for name in GEOMETRY}
-        write_json(make_folder(out / "parameters") / f"{number:08d}.json", record["parameters"][place] | geometry)
+        write_json(make_folder(out / "parameters") / f"{number:08d}.json", parameters[place] | geometry)
 
 
-def _tracked(recipe: Recipe, out: Path, shard: int, arrays: Mapping[str, np.ndarray], record: dict) -> None:
+def _tracked(recipe: Recipe, out: Path, shard: int, arrays: Mapping[str, np.ndarray], parameters: list[dict]) -> None:
     """A tracked sequence per shard and output."""
     geometry = zip(*(arrays[name] for name in GEOMETRY), strict=True)
     transforms = tuple({"ProbeToReference": pose, "ImageToProbe": matrix} for pose, matrix in geometry)
-    texts = tuple({"Parameters": json.dumps(one, separators=(",", ":"))} for one in record["parameters"])
+    texts = tuple({"Parameters": json.dumps(one, separators=(",", ":"))} for one in parameters)
     times = np.array(recipe.images_of(shard), float)
     for name in set(arrays) - set(GEOMETRY):
         about = {"fields": {SIMULATED: "dataset"}, "frame_fields": texts}
         TrackedSequence(arrays[name], transforms, times, **about).write(out / f"{name}-{shard:06d}.igs.mha")
 
 
-def read_arrays(out: Path, form: str, shard: int, numbers: range, names: tuple[str, ...]) -> dict[str, np.ndarray]:
-    """{output: (images, ...)} of a shard as it was written, of Zarr only those with these numbers.
+def read_arrays(out: Path, form: str, numbers: range, size: int, names: Iterable[str]) -> dict[str, np.ndarray]:
+    """{output: (images, ...)} of images with these numbers, all in one shard of `size`, as they were written.
 
     Raises SimulationError for a format of pictures.
     """
-    require(form in _NEEDS, f"{out}: has the format {form}, which other programs read, expected {' or '.join(_NEEDS)}")
+    require(form in ("zarr", "hdf5"), f"{out}: has the format {form}, which other programs read, expected zarr or hdf5")
     if form == "zarr":
         import zarr
 
         part = slice(numbers.start, numbers.stop)
-        return {name: np.asarray(zarr.open_array(out / "images.zarr", path=name, mode="r")[part]) for name in names}
+        return {name: np.asarray(zarr.open_array(out / _ZARR, path=name, mode="r")[part]) for name in names}
     import h5py
 
+    shard, first = divmod(numbers.start, size)
     with h5py.File(_h5(out, shard), "r") as file:
-        return {name: np.array(file[name]) for name in names}
+        return {name: np.array(file[name][first : first + len(numbers)]) for name in names}
