@@ -19,8 +19,7 @@ import numpy as np
 
 from SlicerUSSim.Logic.datasets import Recipe, make_dataset
 from SlicerUSSim.Logic.datasets.making import render_task
-from SlicerUSSim.Logic.datasets.placed import scene
-from SlicerUSSim.Logic.datasets.prepared import prepare
+from SlicerUSSim.Logic.datasets.patients import prepare, scene
 from SlicerUSSim.Logic.datasets.rendering import Shot, render
 from SlicerUSSim.Logic.datasets.writers import record_path, write_shard
 

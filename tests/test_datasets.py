@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -28,8 +29,8 @@ from SlicerUSSim.Logic.datasets import (
     making as making_module,
 )
 from SlicerUSSim.Logic.datasets.draws import Draw, generator
-from SlicerUSSim.Logic.datasets.placed import Scene
-from SlicerUSSim.Logic.datasets.prepared import CLASSES
+from SlicerUSSim.Logic.datasets.patients import Scene
+from SlicerUSSim.Logic.datasets.recipe import CLASSES
 from SlicerUSSim.Logic.datasets.rendering import render
 from SlicerUSSim.Logic.datasets.writers import record_path
 from SlicerUSSim.Logic.imaging.preset import preset_parameters
@@ -129,7 +130,7 @@ def recipe(folder: Path, more: str = VARIED, *, outputs="image labels", format_=
             "P\n[tissues.all]\nmu0 = {uniform = [0, 200], relative = true}",
             "line 5: mu0 is 200, expected a number between 0 and 100",
         ),
-        ("P\n[display]\ngain_db = {uniform = [0, 1], relative = true}", "line 5: relative is True, expected true, for"),
+        ("P\n[display]\ngain_db = {uniform = [0, 1], relative = true}", "line 5: gain_db is .*expected a number"),
         ("P\nlicence = 3", "line 4: licence is 3, expected text"),
         ("P\n[patients.segmentation]\nclasses = 9", "line 5: classes is 9, expected a whole number between 3 and 4"),
         ("P\n[[patients]]\nfiles = 'b'", "line 5: 'files' is unknown, expected one of file"),
@@ -176,7 +177,7 @@ def test_ready_recipes_are_read_and_name_their_purpose():
     for name in READY:
         made = Recipe.read(name)
         assert made.settings.title and made.settings.images >= 500 and len(made.draws["display"]) > 2
-    with pytest.raises(SimulationError, match=r"none.toml: cannot be read .*or one of brain-tumour, denoising"):
+    with pytest.raises(SimulationError, match=r"none.toml: is no file, .*or one of brain-tumour, denoising"):
         Recipe.read("none.toml")
 
 
@@ -212,7 +213,7 @@ def test_images_of_a_set_are_those_that_its_parameters_say(plain, folder):
     np.testing.assert_allclose(images[7]["pose"], made.pose(7, drawn["pose"]))
     display = DisplaySettings(gain_db=drawn["display"]["gain_db"], image_size=(48, 64))
     with made.simulator.with_tissues(tissues):
-        made.simulator.settings = made.settings(drawn["settings"])
+        made.simulator.settings = replace(made.settings, **drawn["settings"])
         probe = recipe(folder).probes[values["probe"]["number"]]
         frame = made.simulator.simulate(probe, images[7]["pose"], display, noise_seed=7)
     np.testing.assert_array_equal(images[7]["image"], frame.image)

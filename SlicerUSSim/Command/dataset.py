@@ -37,7 +37,7 @@ def dataset(
     if a patient was left out.
     """
     from SlicerUSSim.Logic.datasets import Recipe, export_coco, export_nnunet, make_dataset
-    from SlicerUSSim.Logic.datasets.exports import labels_to_export
+    from SlicerUSSim.Logic.datasets.reader import labels_to_export
 
     if device is not None:
         os.environ["USSIM_DEVICE"] = device  # workers have it, too

@@ -53,17 +53,15 @@ class FindView(gymnasium.Env):
     (64, 80, 1)
     """
 
-    metadata = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012, as Gymnasium declares it
-
     def __init__(
         self, view: str = "craniotomy", *, simulator: UltrasoundSimulator | None = None,
         probe: Probe = PROBES["phased"], image_size: tuple[int, int] = (128, 160), within_mm: float = 4.0,
-        steps: int = 100, render_mode: str | None = None,
+        steps: int = 100,
     ) -> None:  # fmt: skip
         require_between("FindView", "within_mm", within_mm, 0.1, 100.0)
         self.simulator = simulator or _demo_simulator()
         self.surface, self.target = _scene(self.simulator, view)
-        self.probe, self.within_mm, self.steps, self.render_mode = probe, within_mm, steps, render_mode
+        self.probe, self.within_mm, self.steps = probe, within_mm, steps
         self._display = DisplaySettings(image_size=image_size)
         self.observation_space = gymnasium.spaces.Box(0, 255, (*image_size, 1), np.uint8)
         self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (len(STEP_DEG),), np.float32)
@@ -85,10 +83,6 @@ class FindView(gymnasium.Env):
         after = self.distance_mm()
         is_found = after <= self.within_mm
         return self._image(), before - after + _FOUND * is_found, is_found, self._step >= self.steps, self._about()
-
-    def render(self) -> np.ndarray | None:
-        """(rows, columns, 3) uint8 the image."""
-        return np.repeat(self._image(), 3, axis=2) if self.render_mode == "rgb_array" else None
 
     def distance_mm(self) -> float:
         """From the pose to the target: way and turn."""

@@ -42,16 +42,15 @@ class Draw:
             return cls.fixed(entry.checked(where, value), entry)
         kinds = KINDS if entry.type in (int, float) else {"choice": KINDS["choice"]}
         kind = next((name for name in value if name in kinds), "")
-        values, unit, relative = value.get(kind), value.get("unit", entry.unit), value.get("relative", False)
-        is_known = set(value) <= {kind, "unit", "relative"} and isinstance(values, list) and bool(values)
+        values, unit, relative = value.get(kind), value.get("unit", entry.unit), bool(value.get("relative", False))
+        known = {kind, "unit", "relative"} if may_be_relative else {kind, "unit"}
+        is_known = set(value) <= known and isinstance(values, list) and bool(values)
         wanted = " or ".join(f"{{{name} = {of}}}" for name, of in kinds.items())
         require(
             is_known and (kind == "choice" or len(values) == 2),
             f"{where}: {entry.name} is {short(dict(value))}, expected {entry.expected}, or {wanted}",
         )
         require(unit == entry.unit, f"{where}: {entry.name} is in {short(unit)}, expected its unit, {entry.unit!r}")
-        may = f"{where}: relative is {short(relative)}, expected true, for numbers of tissues alone"
-        require(relative is False or (relative is True and may_be_relative), may)
         each = [replace(entry, bounds=(0.0, 100.0)) if relative else entry] * len(values)
         if kind == "normal":
             each[1] = replace(entry, name="the deviation", type=float, bounds=(0.0, 1e9))

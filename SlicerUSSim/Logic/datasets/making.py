@@ -18,10 +18,9 @@ from uuid import uuid4
 from SlicerUSSim.Logic.base.errors import SimulationError, collected_warnings, require, require_package
 from SlicerUSSim.Logic.base.files import make_folder, require_folder, written_whole
 from SlicerUSSim.Logic.base.version import __version__
-from SlicerUSSim.Logic.datasets.datasheet import write_datasheet
-from SlicerUSSim.Logic.datasets.prepared import PatientError, prepare, prepared_path
+from SlicerUSSim.Logic.datasets.patients import PatientError, prepare, prepared_path
 from SlicerUSSim.Logic.datasets.recipe import FORMATS, Recipe
-from SlicerUSSim.Logic.datasets.writers import record_path, write_shard
+from SlicerUSSim.Logic.datasets.writers import record_path, write_datasheet, write_shard
 from SlicerUSSim.Logic.imaging.batch import bytes_of, free_memory
 from SlicerUSSim.Logic.opencl.devices import choose_device
 
@@ -33,10 +32,10 @@ WORKER_BYTES, _ANSWER_S, _ASKED_EVERY_S = 600e6, 4.0, 2.0
 #: In workers: a terminal sends Ctrl-C to all processes, but the one that has started them ends them
 _NO_INTERRUPTS = "import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)"
 
-#: Renders a shard; gives the largest memory so far of the process, MB
+#: Renders a shard of the set in the first folder by files in the second; the largest memory so far of the process, MB
 Task = Callable[[str, str, int], float]
-#: (shard, what its task gives or why its patient cannot be)
-Done = Iterator[tuple[int, float | PatientError]]
+#: The same of one set; or why its patient cannot be
+Attempt = Callable[[int], float | PatientError]
 
 
 @dataclass
@@ -71,10 +70,7 @@ class Made:
 
 
 def render_task(out: str, files: str, shard: int) -> float:
-    """Render and write a shard of the set in the folder `out`, unless its record is there: a Task.
-
-    `files` is the folder of the recipe's files. It does the same on every worker and however often it is done.
-    """
+    """A Task: renders and writes a shard unless its record is there; the same on every worker, however often."""
     from SlicerUSSim.Logic.datasets.rendering import render, scene  # which workers alone wait for
 
     recipe, folder = _recipe(out, files), Path(out)
@@ -129,10 +125,13 @@ def make_dataset(
     made, began = Made(folder, recipe.settings.images), perf_counter()
     there = {shard for shard in range(recipe.shards) if record_path(folder, shard).exists()}
     made.done = made.found = sum(len(recipe.images_of(shard)) for shard in there)
-    work = partial(task, str(folder), str(recipe.folder.absolute())), _prepared_shards(recipe, folder, there, made, say)
-    workers = best_workers() if workers is None else workers
-    done = _one_by_one(*work) if workers == 1 and scheduler is None else _on_dask(scheduler, workers, *work, say)
-    for shard, found in done if len(there) < recipe.shards else ():
+    attempt = partial(_attempted, task, str(folder), str(recipe.folder.absolute()))
+    shards, workers = _prepared_shards(recipe, folder, there, made, say), workers or best_workers()
+    if (workers == 1 and scheduler is None) or len(there) == recipe.shards:
+        done = ((shard, attempt(shard)) for shard in shards)
+    else:
+        done = _on_dask(scheduler, workers, attempt, shards, say)
+    for shard, found in done:
         if isinstance(found, PatientError):
             made.skipped.setdefault(recipe.patients[recipe.case_of(shard).patient].file, str(found))
             continue
@@ -180,22 +179,20 @@ def _prepared_shards(
             yield shard
 
 
-def _one_by_one(task: Callable[[int], float], shards: Iterator[int]) -> Done:
-    """By this process."""
-    for shard in shards:
-        try:
-            yield shard, task(shard)
-        except PatientError as error:
-            yield shard, error
+def _attempted(task: Task, out: str, files: str, shard: int) -> float | PatientError:
+    try:
+        return task(out, files, shard)
+    except PatientError as error:
+        return error
 
 
 # ---- Dask ------------------------------------------------------------------------------------------------------------
 
 
 def _on_dask(
-    scheduler: str | None, workers: int, task: Callable[[int], float], shards: Iterator[int], say: Callable[[str], None]
-) -> Done:
-    """On a cluster, in the order in which shards are done. Raises SimulationError if the scheduler is gone."""
+    scheduler: str | None, workers: int, attempt: Attempt, shards: Iterator[int], say: Callable[[str], None]
+) -> Iterator[tuple[int, float | PatientError]]:
+    """(shard, what its attempt gave) as they are done. Raises SimulationError if the scheduler is gone."""
     waiting: dict[Any, int] = {}
     asked, threads = -_ASKED_EVERY_S, -1
     with _client(scheduler, workers) as client:
@@ -208,7 +205,7 @@ def _on_dask(
                     if not threads and before:
                         say(f"{client.scheduler.address}: waiting for workers ...")
                 for shard in islice(shards, max(2 * threads - len(waiting), 4 - len(waiting), 0)):
-                    waiting[client.submit(task, shard, key=f"shard-{uuid4().hex}", pure=False)] = shard
+                    waiting[client.submit(attempt, shard, key=f"shard-{uuid4().hex}", pure=False)] = shard
                 if not waiting:
                     return
                 done = [future for future in waiting if future.done()]
@@ -218,9 +215,9 @@ def _on_dask(
                     shard, error = waiting.pop(future), future.exception()
                     if type(error).__name__ == "KilledWorker":
                         raise SimulationError(f"shard {shard}: {_line(error)}; is there memory for a worker?")
-                    if error is not None and not isinstance(error, PatientError):
+                    if error is not None:
                         raise error
-                    yield shard, error or future.result()
+                    yield shard, future.result()
                 if not done:
                     sleep(0.02)
         except (OSError, TimeoutError, CancelledError) as error:

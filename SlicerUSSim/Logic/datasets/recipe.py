@@ -10,9 +10,10 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from SlicerUSSim.Logic.base.declaration import Declared, Parameter, built, parameter, parameters_of, short
 from SlicerUSSim.Logic.base.errors import SimulationError, about_file, either, require, require_package
-from SlicerUSSim.Logic.base.files import read_text
 from SlicerUSSim.Logic.base.settings import DisplaySettings, SimulationSettings
 from SlicerUSSim.Logic.datasets.draws import Draw, generator
 from SlicerUSSim.Logic.imaging.batch import OUTPUTS as SIMULATED
@@ -43,6 +44,9 @@ READY = {path.stem: path for path in sorted((Path(__file__).parent / "recipes").
 #: Bundled patients, which are no files
 BUNDLED = ("mni152", "synthetic")
 ALL = "all"
+VENTRICLE = "ventricle"
+#: Names of the labels in all sets: the label is the place; and that of a tissue which is none of them
+CLASSES, OTHER = (*TISSUES, VENTRICLE), 255
 #: Probes that are drawn for a set: the record of a new one takes 20 ms
 PROBE_POOL = 16
 #: Images of a shard, and bytes of its arrays, of which an image has so many for each of its signals
@@ -125,11 +129,10 @@ _KNOWN = {
     "display": _entries(DisplaySettings), "settings": _entries(SimulationSettings), "lesions": _entries(LesionSettings),
 }  # fmt: skip
 _DEFAULTS = {
-    "pose": {name: Draw.fixed(entry.default, entry) for name, entry in _KNOWN["pose"].items()},
+    **{name: {key: Draw.fixed(one.default, one) for key, one in _KNOWN[name].items()} for name in ("pose", "lesions")},
     "probe": {"name": Draw.fixed(_PROBE.default, _PROBE)},
     "display": {"image_size": Draw.fixed((256, 256), _KNOWN["display"]["image_size"])},
     "settings": {"seed": Draw(_KNOWN["settings"]["seed"], "uniform", (0, 2**32 - 1))},
-    "lesions": {name: Draw.fixed(entry.default, entry) for name, entry in _KNOWN["lesions"].items()},
 }
 _TABLES = ("patients", "tissues", *_KNOWN)
 
@@ -168,12 +171,8 @@ class Recipe:
     def read(cls, path: str | Path) -> Recipe:
         """From a file, or one of READY by its name. Raises SimulationError that names file, line and key."""
         path = READY.get(str(path), Path(path))
-        try:
-            text = read_text(path)
-        except (OSError, UnicodeDecodeError) as error:
-            expected = f"expected a recipe in TOML, or one of {', '.join(READY)}"
-            raise SimulationError(f"{path}: cannot be read ({getattr(error, 'strerror', error)}), {expected}") from None
-        return cls.of_text(text, str(path), path.parent)
+        require(path.is_file(), f"{path}: is no file, expected a recipe in TOML, or one of {', '.join(READY)}")
+        return cls.of_text(path.read_text(encoding="utf-8", errors="replace"), str(path), path.parent)
 
     @classmethod
     def of_text(cls, text: str, source: str = "recipe", folder: Path | None = None) -> Recipe:
@@ -187,10 +186,10 @@ class Recipe:
     @cached_property
     def shard(self) -> int:
         """Images of a shard, but for the last."""
-        s = self.settings
-        rows, columns = self.fixed("display", "image_size")
-        image_bytes = 4 * rows * columns * (len(s.outputs) - len(self.signals)) + _SIGNAL_BYTES * len(self.signals)
-        return s.shard or max(min(_MOST_PER_SHARD, s.images // self.cases, int(_SHARD_BYTES / image_bytes)), 1)
+        pixels, signals = np.prod(self.fixed("display", "image_size")), len(self.signals)
+        image_bytes = 4 * pixels * (len(self.settings.outputs) - signals) + _SIGNAL_BYTES * signals
+        most = min(_MOST_PER_SHARD, self.settings.images // self.cases, int(_SHARD_BYTES / image_bytes))
+        return self.settings.shard or max(most, 1)
 
     @property
     def shards(self) -> int:

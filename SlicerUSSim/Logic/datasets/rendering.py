@@ -11,9 +11,8 @@ import numpy as np
 from SlicerUSSim.Logic.base.settings import DisplaySettings, SimulationSettings
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.datasets.draws import generator
-from SlicerUSSim.Logic.datasets.placed import Scene, scene
-from SlicerUSSim.Logic.datasets.prepared import CLASSES, OTHER
-from SlicerUSSim.Logic.datasets.recipe import Recipe
+from SlicerUSSim.Logic.datasets.patients import Scene, scene
+from SlicerUSSim.Logic.datasets.recipe import CLASSES, OTHER, Recipe
 from SlicerUSSim.Logic.imaging.batch import OUTPUTS as SIMULATED, lines_of_pixels
 from SlicerUSSim.Logic.probe.arrays import Probe
 from SlicerUSSim.Logic.probe.image_grid import ImageGrid
@@ -44,7 +43,7 @@ class Shot:
         drawn, (tissues, values) = made.recipe.drawn(number), made.tissues(number)
         return cls(
             number, made.recipe.probes[drawn["probe"]["number"]], made.pose(number, drawn["pose"]),
-            replace(DisplaySettings(), **drawn["display"]), made.settings(drawn["settings"]), tissues,
+            replace(DisplaySettings(), **drawn["display"]), replace(made.settings, **drawn["settings"]), tissues,
             {"image": number, **drawn, "tissues": values},
         )  # fmt: skip
 
