@@ -49,7 +49,10 @@ def test_the_way_to_the_target_is_the_reward_and_ends_there(patient):
 
 
 def test_a_seed_repeats_an_episode_and_steps_end_it(patient):
-    runs, made = [], environment(patient, steps=3)
+    import SlicerUSSim.gym  # noqa: F401, which registers it
+
+    made = gymnasium.make("SlicerUSSim/FindView-v0", simulator=patient, image_size=SIZE, max_episode_steps=3)
+    runs = []
     for _ in range(2):
         runs.append([made.reset(seed=8)[0], *(made.step(np.full(5, 0.5)) for _ in range(3))])
     np.testing.assert_array_equal(runs[0][0], runs[1][0])

@@ -31,7 +31,10 @@ def dataset(
     ctx: click.Context, recipe: str, out: Path, scheduler: str | None, workers: int | None, export: str | None,
     device: str | None,
 ) -> None:  # fmt: skip
-    """Make many labelled images from a recipe, a TOML file or the name of one that comes with the package.
+    """Make many labelled images from a recipe.
+
+    RECIPE is a file in TOML (docs/datasets.md), or the name of one that comes with the package: brain-tumour,
+    denoising, mri-registration, standard-views or ventricles.
 
     Image n is the same whoever makes it. The same command goes on with a set that was interrupted. The exit status is 1
     if a patient was left out.

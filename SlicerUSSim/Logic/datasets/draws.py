@@ -29,9 +29,9 @@ class Draw:
     """A distribution of the values of one parameter; a fixed value is a choice of one."""
 
     entry: Parameter
-    #: One of KINDS
-    kind: str
     values: tuple
+    #: One of KINDS
+    kind: str = "choice"
     #: Whether the values are factors of the preset's
     relative: bool = False
 
@@ -39,7 +39,7 @@ class Draw:
     def of(cls, value: Any, entry: Parameter, where: str, *, may_be_relative: bool = False) -> Draw:
         """From a recipe's value. Raises SimulationError that begins with `where` for what the parameter refuses."""
         if not isinstance(value, Mapping):
-            return cls.fixed(entry.checked(where, value), entry)
+            return cls(entry, (entry.checked(where, value),))
         kinds = KINDS if entry.type in (int, float) else {"choice": KINDS["choice"]}
         kind = next((name for name in value if name in kinds), "")
         values, unit, relative = value.get(kind), value.get("unit", entry.unit), bool(value.get("relative", False))
@@ -57,12 +57,7 @@ class Draw:
         values = tuple(one.checked(where, number) for one, number in zip(each, values, strict=True))
         is_ordered = "uniform" not in kind or (values[0] <= values[1] and (kind == "uniform" or values[0] > 0))
         require(is_ordered, f"{where}: {kind} is {short(list(values))}, expected {KINDS[kind]}")
-        return cls(entry, kind, values, relative)
-
-    @classmethod
-    def fixed(cls, value: Any, entry: Parameter) -> Draw:
-        """The same value for all images."""
-        return cls(entry, "choice", (value,))
+        return cls(entry, values, kind, relative)
 
     @property
     def is_fixed(self) -> bool:

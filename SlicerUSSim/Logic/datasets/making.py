@@ -34,8 +34,6 @@ _NO_INTERRUPTS = "import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)"
 
 #: Renders a shard of the set in the first folder by files in the second; the largest memory so far of the process, MB
 Task = Callable[[str, str, int], float]
-#: The same of one set; or why its patient cannot be
-Attempt = Callable[[int], float | PatientError]
 
 
 @dataclass
@@ -74,30 +72,25 @@ def render_task(out: str, files: str, shard: int) -> float:
     from SlicerUSSim.Logic.datasets.rendering import render, scene  # which workers alone wait for
 
     recipe, folder = _recipe(out, files), Path(out)
-    if not record_path(folder, shard).exists():
-        numbers, case, began = recipe.images_of(shard), recipe.case_of(shard), perf_counter()
-        with collected_warnings() as warned:
-            arrays, parameters = render(recipe, folder, shard)
-        made = scene(recipe, folder, case)
-        write_shard(recipe, folder, shard, arrays, {
-            "images": [numbers.start, numbers.stop], "patient": recipe.patients[case.patient].file,
-            "case": case.number, "tissues": made.names, "version": __version__,
-            "device": str(choose_device(None)[0]), "seconds": round(perf_counter() - began, 3),
-            "peak_mb": round(peak_mb(), 1), "warnings": sorted({*made.warnings, *map(str, warned)}),
-            "parameters": parameters,
-        })  # fmt: skip
-    return peak_mb()
+    if record_path(folder, shard).exists():
+        return 0.0
+    numbers, case = recipe.images_of(shard), recipe.case_of(shard)
+    with collected_warnings() as warned:
+        arrays, parameters = render(recipe, folder, shard)
+    made = scene(recipe, folder, case)
+    peak_mb = round(1e-6 * bytes_of("/proc/self/status", "VmHWM", 0.0), 1)  # getrusage has that of the parent, too
+    write_shard(recipe, folder, shard, arrays, {
+        "images": [numbers.start, numbers.stop], "patient": recipe.patients[case.patient].file, "case": case.number,
+        "tissues": made.names, "version": __version__, "device": str(choose_device(None)[0]), "peak_mb": peak_mb,
+        "warnings": sorted({*made.warnings, *map(str, warned)}), "parameters": parameters,
+    })  # fmt: skip
+    return peak_mb
 
 
 @lru_cache(maxsize=1)
 def _recipe(out: str, files: str) -> Recipe:
     path = Path(out) / RECIPE
     return Recipe.of_text(path.read_text(encoding="utf-8"), str(path), Path(files))
-
-
-def peak_mb() -> float:
-    """Largest resident memory of this process so far, MB, as Linux says; 0 elsewhere."""
-    return 1e-6 * bytes_of("/proc/self/status", "VmHWM", 0.0)  # getrusage has that of the process which started it
 
 
 def make_dataset(
@@ -144,21 +137,20 @@ def make_dataset(
 
 def best_workers() -> int:
     """As many processes as help on this computer: one for each core, two for a GPU, if there is memory for them."""
-    is_gpu = "gpu" in str(choose_device(None)[0]).lower()
-    return max(int(min(2 if is_gpu else os.cpu_count() or 1, free_memory() / WORKER_BYTES)), 1)
+    most = 2 if "gpu" in str(choose_device(None)[0]).lower() else os.cpu_count() or 1
+    return max(int(min(most, free_memory() / WORKER_BYTES)), 1)
 
 
 def _own_folder(recipe: Recipe, out: Path) -> Path:
     """The folder of a set, with the recipe in it. Raises SimulationError for one that has something else."""
     require_folder(out)
     known = out / RECIPE
-    if known.exists():
-        is_same = known.read_text(encoding="utf-8") == recipe.text
-        require(is_same, f"{out}: has the set of another recipe; give another folder, or delete it")
-        return out
-    require(not out.exists() or not any(out.iterdir()), f"{out}: has other files, expected a new or empty folder")
-    with written_whole(make_folder(out) / RECIPE) as partial_file:
-        partial_file.write_text(recipe.text, encoding="utf-8")
+    if not known.exists():
+        require(not out.exists() or not any(out.iterdir()), f"{out}: has other files, expected a new or empty folder")
+        with written_whole(make_folder(out) / RECIPE) as partial_file:
+            partial_file.write_text(recipe.text, encoding="utf-8")
+    is_same = known.read_text(encoding="utf-8") == recipe.text
+    require(is_same, f"{out}: has the set of another recipe; give another folder, or delete it")
     return out
 
 
@@ -166,7 +158,7 @@ def _prepared_shards(
     recipe: Recipe, out: Path, there: set[int], made: Made, say: Callable[[str], None]
 ) -> Iterator[int]:
     """The shards to be rendered, each after its patient was prepared. Patients that cannot be are left out."""
-    for shard in (shard for shard in range(recipe.shards) if shard not in there):
+    for shard in sorted({*range(recipe.shards)} - there):
         number = recipe.case_of(shard).patient
         file = recipe.patients[number].file
         if file not in made.skipped and not prepared_path(out, number).exists():
@@ -190,7 +182,7 @@ def _attempted(task: Task, out: str, files: str, shard: int) -> float | PatientE
 
 
 def _on_dask(
-    scheduler: str | None, workers: int, attempt: Attempt, shards: Iterator[int], say: Callable[[str], None]
+    scheduler: str | None, workers: int, attempt: Callable, shards: Iterator[int], say: Callable[[str], None]
 ) -> Iterator[tuple[int, float | PatientError]]:
     """(shard, what its attempt gave) as they are done. Raises SimulationError if the scheduler is gone."""
     waiting: dict[Any, int] = {}

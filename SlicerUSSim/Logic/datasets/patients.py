@@ -48,8 +48,6 @@ from SlicerUSSim.Logic.tracked.sequence import TrackedSequence
 _MARGIN_MM = 5.0
 #: Wider than the probe's face is an opening, in which poses differ, mm
 _WIDER_MM = 30.0
-#: Kinds of markups that are paths
-_PATHS = ("Curve", "ClosedCurve", "Line", "Fiducial")
 #: Where the middle of a lesion may lie, in which steps it is looked for, and how far from the wanted depth, mm
 _WITHIN, _COARSE_MM, _SHELL_MM = ("grey matter", "white matter", "brain"), 2.0, 1.5
 #: The scene of this process, by recipe, folder and case
@@ -110,7 +108,8 @@ def _prepared(recipe: Recipe, chosen: PatientSettings) -> PreparedPatient:
     is_file = chosen.file not in BUNDLED
     image = Volume.read(path) if is_file else demo_mri()[0] if chosen.file == BUNDLED[0] else head_mri()
     if is_file and is_label_file(path, image):
-        require(not chosen.ventricles, "is a label map; ventricles are looked for in an MRI")
+        has_labels = not chosen.ventricles and "mri" not in recipe.settings.outputs
+        require(has_labels, "is a label map; ventricles, and the output mri, are of an MRI")
         found = read_label_file(path, image)
         labels, names, tissues = found.labels, found.tissues.names_by_label(), found.tissues
     else:
@@ -167,9 +166,6 @@ def _cut(labels: Volume) -> Volume:
     return Volume(np.ascontiguousarray(labels.array[box]), matrix)
 
 
-# ---- scenes ----------------------------------------------------------------------------------------------------------
-
-
 class Scene:
     """The simulator of a case, and where probes stand on it. Raises SimulationError if they cannot."""
 
@@ -180,8 +176,6 @@ class Scene:
         self.recipe, self.case, self.mri, self.warnings = recipe, case, patient.mri, patient.warnings
         self._views, self._tissues = patient.views, patient.tissues
         del patient  # so that what is not needed goes
-        has_mri = self.mri is not None or "mri" not in recipe.settings.outputs
-        require(has_mri, "is a label map, and the output mri needs an MRI or CT")
         drawn = recipe.drawn(case.image)
         #: Those of an image are drawn over them
         self.settings = replace(SimulationSettings(), **drawn["settings"])
@@ -260,7 +254,8 @@ class Scene:
         file, transform = (self.recipe.fixed("pose", name) for name in ("file", "transform"))
         path = str(self.recipe.folder / file)
         if self._on == "path":
-            return self.surface.along(markup_points(path, _PATHS, "a curve")[1])
+            kinds = ("Curve", "ClosedCurve", "Line", "Fiducial")
+            return self.surface.along(markup_points(path, kinds, "a curve")[1])
         sequence = TrackedSequence.read(path)
         kept = [number for number in range(len(sequence)) if sequence.has_pose(number, transform)]
         require(kept, f"{path}: no image has {transform}; it has {', '.join(sequence.frames_of_reference())}")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +12,7 @@ from scipy import ndimage
 
 from SlicerUSSim.Logic.base.errors import require
 from SlicerUSSim.Logic.base.files import make_folder, read_json, write_json
-from SlicerUSSim.Logic.datasets.writers import GEOMETRY, MANIFEST, ZARR, checksums, hdf5_path, record_path
+from SlicerUSSim.Logic.datasets.writers import GEOMETRY, HDF5, MANIFEST, ZARR, record_path
 from SlicerUSSim.Logic.imaging.figures import write_png
 
 
@@ -25,26 +25,20 @@ class SimulatedImages:
     ----------
     folder : of `ussim dataset`.
     outputs : which of the set's (default: all).
-    patients : those of these files alone, to train and test on different ones.
 
-    Raises SimulationError for a folder without a finished set, and for outputs and patients that it has not.
+    Images of a patient follow each other: `manifest["shards"]` says which. Raises SimulationError for a folder without
+    a finished set, and for outputs that it has not.
     """
 
-    def __init__(
-        self, folder: str | os.PathLike, outputs: Sequence[str] | None = None, *, patients: Sequence[str] | None = None
-    ) -> None:
+    def __init__(self, folder: str | os.PathLike, outputs: Sequence[str] | None = None) -> None:
         self.folder = Path(folder)
         require((self.folder / MANIFEST).exists(), f"{folder}: has no {MANIFEST}, expected a set of `ussim dataset`")
         self.manifest = read_json(self.folder / MANIFEST, most_bytes=2**30)
-        shards, known = self.manifest["shards"], list(self.manifest["outputs"])
-        every = sorted({one["patient"] for one in shards.values()})
+        known = self.manifest["outputs"]
         self.outputs = tuple(known if outputs is None else outputs)
-        wanted = every if patients is None else patients
-        for kind, names, there in (("output", self.outputs, known), ("patient", wanted, every)):
-            for name in names:
-                require(name in there, f"{folder}: has no {kind} {name!r}, expected some of {', '.join(there)}")
-        self._shards = {int(shard): one for shard, one in shards.items() if one["patient"] in wanted}
-        numbers = [np.arange(*one["images"]) for one in self._shards.values()]
+        for name in self.outputs:
+            require(name in known, f"{folder}: has no output {name!r}, expected some of {', '.join(known)}")
+        numbers = [np.arange(*one["images"]) for one in self.manifest["shards"].values()]
         self._numbers = np.concatenate([np.zeros(0, int), *numbers])
         #: {label: tissue}
         self.labels: dict[int, str] = {int(label): name for label, name in self.manifest["labels"].items()}
@@ -53,40 +47,24 @@ class SimulatedImages:
         return len(self._numbers)
 
     def __getitem__(self, index: int) -> dict[str, Any]:
-        number = int(self._numbers[index])
-        arrays = self._read(range(number, number + 1), (*self.outputs, *GEOMETRY))
-        return {name: values[0] for name, values in arrays.items()} | {"number": number}
-
-    def _read(self, numbers: range, names: Iterable[str]) -> dict[str, np.ndarray]:
-        """{output: (images, ...)} of images of one shard, as they were written."""
-        form = self.manifest["format"]
-        readable = f"{self.folder}: has the format {form}, which other programs read, expected zarr or hdf5"
-        require(form in ("zarr", "hdf5"), readable)
+        number, names, form = int(self._numbers[index]), (*self.outputs, *GEOMETRY), self.manifest["format"]
+        require(form in ("zarr", "hdf5"), f"{self.folder}: has the format {form}, expected zarr or hdf5 to read it")
         if form == "zarr":
             import zarr
 
-            group, first = zarr.open_group(self.folder / ZARR, mode="r"), numbers.start
-            return {name: np.asarray(group[name][first : first + len(numbers)]) for name in names}
+            group = zarr.open_group(self.folder / ZARR, mode="r")
+            return {"number": number, **{name: np.asarray(group[name][number]) for name in names}}
         import h5py
 
-        shard, first = divmod(numbers.start, self.manifest["shard"])
-        with h5py.File(hdf5_path(self.folder, shard), "r") as file:
-            return {name: np.array(file[name][first : first + len(numbers)]) for name in names}
+        shard, within = divmod(number, self.manifest["shard"])
+        with h5py.File(self.folder / HDF5.format(shard), "r") as file:
+            return {"number": number, **{name: np.asarray(file[name][within]) for name in names}}
 
     def parameters(self) -> list[dict[str, Any]]:
         """What was drawn for each image, in their order."""
-        records = (read_json(record_path(self.folder, shard), most_bytes=2**30) for shard in self._shards)
+        shards = map(int, self.manifest["shards"])
+        records = (read_json(record_path(self.folder, shard), most_bytes=2**30) for shard in shards)
         return [one for record in records for one in record["parameters"]]
-
-    def damaged(self) -> list[int]:
-        """The shards whose arrays have not the checksums of the manifest."""
-        return [
-            shard for shard, one in self._shards.items()
-            if checksums(self._read(range(*one["images"]), one["checksums"])) != one["checksums"]
-        ]  # fmt: skip
-
-
-# ---- exports ---------------------------------------------------------------------------------------------------------
 
 
 def labels_to_export(outputs: Collection[str], format_: str, where: str) -> str:
@@ -100,18 +78,14 @@ def labels_to_export(outputs: Collection[str], format_: str, where: str) -> str:
     return labels
 
 
-def _opened(folder: str | os.PathLike) -> tuple[SimulatedImages, str]:
-    images = SimulatedImages(folder)
-    return images, labels_to_export(images.outputs, images.manifest["format"], str(folder))
-
-
 def export_coco(folder: str | os.PathLike) -> Path:
     """The file of annotations of a set in COCO's format, written into its folder `coco` with the images as PNG.
 
     Each connected region of a tissue is an object, with its box, area in pixels and mask (run lengths). Raises
     SimulationError as labels_to_export.
     """
-    (images, labels), out = _opened(folder), Path(folder) / "coco"
+    images, out = SimulatedImages(folder), Path(folder) / "coco"
+    labels = labels_to_export(images.outputs, images.manifest["format"], str(folder))
     entries, objects = [], []
     for item in images:
         name, (rows, columns) = f"{item['number']:08d}.png", item["image"].shape
@@ -144,7 +118,8 @@ def export_nnunet(folder: str | os.PathLike) -> Path:
 
     Labels are numbered anew, without gaps. Raises SimulationError as labels_to_export.
     """
-    (images, labels), out = _opened(folder), Path(folder) / "Dataset001_SlicerUSSim"
+    images, out = SimulatedImages(folder), Path(folder) / "Dataset001_SlicerUSSim"
+    labels = labels_to_export(images.outputs, images.manifest["format"], str(folder))
     known = {label: new for new, label in enumerate((label for label in images.labels if label), 1)}
     new_of = np.array([known.get(label, 0) for label in range(256)], np.uint8)
     for item in images:

@@ -18,7 +18,7 @@ from SlicerUSSim.Logic.base.settings import DisplaySettings, SimulationSettings
 from SlicerUSSim.Logic.datasets.draws import Draw, generator
 from SlicerUSSim.Logic.imaging.batch import OUTPUTS as SIMULATED
 from SlicerUSSim.Logic.imaging.preset import Preset
-from SlicerUSSim.Logic.imaging.quality import signal_shape, worked
+from SlicerUSSim.Logic.imaging.quality import line_shape, worked
 from SlicerUSSim.Logic.mri.pathology import LESIONS
 from SlicerUSSim.Logic.mri.segmentation_settings import SegmentationSettings
 from SlicerUSSim.Logic.placement.views import VIEWS
@@ -129,10 +129,10 @@ _KNOWN = {
     "display": _entries(DisplaySettings), "settings": _entries(SimulationSettings), "lesions": _entries(LesionSettings),
 }  # fmt: skip
 _DEFAULTS = {
-    **{name: {key: Draw.fixed(one.default, one) for key, one in _KNOWN[name].items()} for name in ("pose", "lesions")},
-    "probe": {"name": Draw.fixed(_PROBE.default, _PROBE)},
-    "display": {"image_size": Draw.fixed((256, 256), _KNOWN["display"]["image_size"])},
-    "settings": {"seed": Draw(_KNOWN["settings"]["seed"], "uniform", (0, 2**32 - 1))},
+    **{name: {key: Draw(one, (one.default,)) for key, one in _KNOWN[name].items()} for name in ("pose", "lesions")},
+    "probe": {"name": Draw(_PROBE, (_PROBE.default,))},
+    "display": {"image_size": Draw(_KNOWN["display"]["image_size"], ((256, 256),))},
+    "settings": {"seed": Draw(_KNOWN["settings"]["seed"], (0, 2**32 - 1), "uniform")},
 }
 _TABLES = ("patients", "tissues", *_KNOWN)
 
@@ -147,13 +147,7 @@ class Case(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Recipe:
-    """A checked recipe. Image i depends on (seed, i) alone; images of one patient follow each other.
-
-    >>> from SlicerUSSim.Logic.datasets import Recipe
-    >>> recipe = Recipe.of_text('images = 100\n[[patients]]\nfile = "mni152"\n[display]\ngain_db = 3')
-    >>> recipe.shards, recipe.drawn(7) == recipe.drawn(7)
-    (3, True)
-    """
+    """A checked recipe. Image i depends on (seed, i) alone; images of one patient follow each other."""
 
     settings: SetSettings
     patients: tuple[PatientSettings, ...]
@@ -226,12 +220,8 @@ class Recipe:
     def probes(self) -> tuple[Probe, ...]:
         """The probes of the set; one if none of their values is drawn."""
         is_fixed = all(draw.is_fixed for draw in self.draws["probe"].values())
-        found = []
-        for number in range(1 if is_fixed else PROBE_POOL):
-            values = self._of("probe", number)
-            preset = Preset(PROBES[values.pop("name")])
-            found.append(preset.changed("probe", **values).probe if values else preset.probe)
-        return tuple(found)
+        drawn = [self._of("probe", number) for number in range(1 if is_fixed else PROBE_POOL)]
+        return tuple(Preset(PROBES[one.pop("name")]).changed("probe", **one).probe for one in drawn)
 
     @property
     def signals(self) -> tuple[str, ...]:
@@ -247,7 +237,7 @@ class Recipe:
         fixed = {name: draw.values[0] for name, draw in self.draws["settings"].items() if draw.is_fixed}
         columns = self.fixed("display", "image_size")[1]
         found = [worked(probe, replace(SimulationSettings(), **fixed), columns) for probe in self.probes]
-        shapes = sorted({signal_shape(*each) for each in found})
+        shapes = sorted({line_shape(*each) for each in found})
         require(
             not self.signals or len(shapes) == 1,
             f"{', '.join(self.signals)} would have {shapes[0]} to {shapes[-1]} scan lines and samples, expected one "
@@ -260,8 +250,16 @@ class _Reader:
     """Checks the values of a TOML text."""
 
     def __init__(self, text: str, source: str) -> None:
-        self.text, self.source = text, source
-        self.values, self.lines = _parsed(text, source), dict(_lines(text))
+        self.text, self.source, self.lines = text, source, dict(_lines(text))
+        if sys.version_info >= (3, 11):
+            import tomllib
+        else:
+            require_package("tomli", "SlicerUSSim[datasets]", "a recipe")
+            import tomli as tomllib  # type: ignore[import-not-found]
+        try:
+            self.values: dict[str, Any] = tomllib.loads(text)
+        except tomllib.TOMLDecodeError as error:
+            raise SimulationError(f"{source}: is not TOML ({error})") from None
 
     def at(self, *path: object) -> str:
         """File and line of a key, or of the table around it."""
@@ -296,9 +294,10 @@ class _Reader:
 
     def recipe(self, folder: Path) -> Recipe:
         settings = self.plain(SetSettings, self.values, tables=_TABLES)
-        for name in settings.outputs:
-            is_known = name in OUTPUTS
-            require(is_known, f"{self.at('outputs')}: output {short(name)} is unknown, expected {', '.join(OUTPUTS)}")
+        outputs = (
+            f"{self.at('outputs')}: outputs are {', '.join(settings.outputs)}, expected some of {', '.join(OUTPUTS)}"
+        )
+        require(set(settings.outputs) <= set(OUTPUTS), outputs)
         other = ", ".join(name for name in settings.outputs if name not in _PICTURES)
         holds = f"format {settings.format} holds {either(_PICTURES)}, and outputs have {other}, expected zarr or hdf5"
         require(FORMATS[settings.format] or not other, f"{self.at('format')}: {holds}")
@@ -330,18 +329,6 @@ class _Reader:
             path = ("patients", number)
             segmentation = self.plain(SegmentationSettings, table.get("segmentation", {}), *path, "segmentation")
             yield replace(self.plain(PatientSettings, table, *path, tables=["segmentation"]), segmentation=segmentation)
-
-
-def _parsed(text: str, source: str) -> dict[str, Any]:
-    if sys.version_info >= (3, 11):
-        import tomllib
-    else:
-        require_package("tomli", "SlicerUSSim[datasets]", "a recipe")
-        import tomli as tomllib  # type: ignore[import-not-found]
-    try:
-        return tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise SimulationError(f"{source}: is not TOML ({error})") from None
 
 
 def _lines(text: str) -> Iterator[tuple[tuple, int]]:

@@ -29,7 +29,6 @@ _LOOKS = 16
 class Shot:
     """What one image is made of."""
 
-    number: int
     probe: Probe
     pose: np.ndarray
     display: DisplaySettings
@@ -42,7 +41,7 @@ class Shot:
         """Image `number` of the set."""
         drawn, (tissues, values) = made.recipe.drawn(number), made.tissues(number)
         return cls(
-            number, made.recipe.probes[drawn["probe"]["number"]], made.pose(number, drawn["pose"]),
+            made.recipe.probes[drawn["probe"]["number"]], made.pose(number, drawn["pose"]),
             replace(DisplaySettings(), **drawn["display"]), replace(made.settings, **drawn["settings"]), tissues,
             {"image": number, **drawn, "tissues": values},
         )  # fmt: skip
@@ -64,7 +63,8 @@ def render(recipe: Recipe, out: Path, shard: int) -> tuple[dict[str, np.ndarray]
     # Images of one probe follow each other, since its geometry is kept for a few probes alone
     shots.sort(key=lambda shot: shot.parameters["probe"]["number"])
     names = [name for name in SIMULATED if name in wanted or (name == "labels" and "walls" in wanted)]
-    arrays = _simulated(made, shots, names or ["image"], [shot.number % 2**32 for shot in shots])
+    numbers = [shot.parameters["image"] for shot in shots]
+    arrays = _simulated(made, shots, names or ["image"], numbers)
     labels = arrays.get("labels", [None] * len(shots))
     for name in wanted:
         if name not in SIMULATED:
@@ -73,7 +73,7 @@ def render(recipe: Recipe, out: Path, shard: int) -> tuple[dict[str, np.ndarray]
     arrays = {name: number_of[arrays[name]] if name.startswith("labels") else arrays[name] for name in wanted}
     arrays["pose"] = np.stack([shot.pose for shot in shots]).astype(np.float32)
     arrays["image_to_probe"] = np.stack([shot.grid.image_to_probe for shot in shots]).astype(np.float32)
-    back = np.argsort([shot.number for shot in shots])
+    back = np.argsort(numbers)
     return {name: values[back] for name, values in arrays.items()}, [shots[place].parameters for place in back]
 
 
@@ -93,7 +93,7 @@ def _computed(name: str, made: Scene, shot: Shot, labels: np.ndarray | None) -> 
     if name == "walls" and labels is not None:
         return walls(labels, shot)
     if name == "clean":
-        seeds = generator(made.recipe.settings.seed, shot.number, "looks").integers(0, 2**32, _LOOKS)
+        seeds = generator(made.recipe.settings.seed, shot.parameters["image"], "looks").integers(0, 2**32, _LOOKS)
         looks = [replace(shot, settings=replace(shot.settings, seed=int(seed))) for seed in seeds]
         images = _simulated(made, looks, ["image"], seeds.tolist())["image"]
         return np.rint(images.mean(axis=0)).astype(np.uint8)

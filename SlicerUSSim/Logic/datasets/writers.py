@@ -25,7 +25,7 @@ from SlicerUSSim.Logic.tracked.sequence import SIMULATED, TrackedSequence
 
 #: Written with every image
 GEOMETRY = ("pose", "image_to_probe")
-ZARR, MANIFEST = "images.zarr", "manifest.json"
+ZARR, HDF5, MANIFEST = "images.zarr", "shard-{:06d}.h5", "manifest.json"
 #: (licence, citation) of the bundled patients
 _SOURCES = {
     BUNDLED[0]: ("that of mni152.txt in the package", "MNI152 2009a (Fonov et al., NeuroImage 54, 2011), from nilearn"),
@@ -98,15 +98,10 @@ def _hdf5(recipe: Recipe, out: Path, shard: int, arrays: Mapping[str, np.ndarray
     """A file per shard with a dataset per output, compressed by image."""
     import h5py
 
-    with written_whole(hdf5_path(out, shard)) as partial, h5py.File(partial, "w") as file:
+    with written_whole(out / HDF5.format(shard)) as partial, h5py.File(partial, "w") as file:
         for name, values in arrays.items():
             chunks = (1, *values.shape[1:])
             file.create_dataset(name, data=values, chunks=chunks, compression="gzip", compression_opts=1)
-
-
-def hdf5_path(out: Path, shard: int) -> Path:
-    """The file of a shard."""
-    return out / f"shard-{shard:06d}.h5"
 
 
 def _png(recipe: Recipe, out: Path, shard: int, arrays: Mapping[str, np.ndarray], parameters: list[dict]) -> None:
@@ -127,9 +122,6 @@ def _tracked(recipe: Recipe, out: Path, shard: int, arrays: Mapping[str, np.ndar
     for name in set(arrays) - set(GEOMETRY):
         made = TrackedSequence(arrays[name], transforms, times, fields={SIMULATED: "dataset"}, frame_fields=texts)
         made.write(out / f"{name}-{shard:06d}.igs.mha")
-
-
-# ---- manifest and datasheet ------------------------------------------------------------------------------------------
 
 
 def write_datasheet(recipe: Recipe, out: Path, skipped: Mapping[str, str]) -> None:

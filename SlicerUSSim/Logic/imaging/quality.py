@@ -50,7 +50,7 @@ def worked(probe: Probe, settings: SimulationSettings, columns: int) -> tuple[Pr
     )
 
 
-def signal_shape(probe: Probe, settings: SimulationSettings) -> tuple[int, int]:
+def line_shape(probe: Probe, settings: SimulationSettings) -> tuple[int, int]:
     """(scan_lines, samples) of the signals along the lines, of what worked() gives."""
     return probe.scan_lines, int(np.ceil(probe.displayed_mm / sample_mm(probe, settings)))
 

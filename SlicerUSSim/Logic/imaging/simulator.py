@@ -30,14 +30,7 @@ from SlicerUSSim.Logic.imaging.contact import line_contact
 from SlicerUSSim.Logic.imaging.frame import Echoes, Frame
 from SlicerUSSim.Logic.imaging.medium import Medium, as_labels
 from SlicerUSSim.Logic.imaging.noise import stirred
-from SlicerUSSim.Logic.imaging.quality import (
-    coarser_fans,
-    cycles_per_mm,
-    sample_mm,
-    sigmas_between,
-    signal_shape,
-    worked,
-)
+from SlicerUSSim.Logic.imaging.quality import coarser_fans, cycles_per_mm, line_shape, sample_mm, sigmas_between, worked
 from SlicerUSSim.Logic.imaging.raytracing import RayTracer
 from SlicerUSSim.Logic.imaging.scattering import cells_in_view, sites_per_mm3
 from SlicerUSSim.Logic.imaging.signals import RayTree
@@ -214,7 +207,7 @@ class UltrasoundSimulator:
             with self._timed("download", timings):
                 image = self._persisted(frame.download("image"), probe, display, frame.grid)
                 self._warn_if_overflown()
-            samples = signal_shape(frame.probe, frame.settings)[1]
+            samples = line_shape(frame.probe, frame.settings)[1]
             iq, envelope, bmode = (frame.on_demand(name, samples) for name in ("iq", "envelope", "grey"))
             made = Frame(
                 iq=iq,
@@ -292,7 +285,7 @@ class UltrasoundSimulator:
             for probe, shown in zip(probes, displays, strict=True)
         ]
         pixels = same_shapes([(grid.rows, grid.columns) for grid in grids])
-        lines = [signal_shape(*worked(*both, pixels[1])) for both in zip(probes, each, strict=True)]
+        lines = [line_shape(*worked(*both, pixels[1])) for both in zip(probes, each, strict=True)]
         has_signals = not all(OUTPUTS[name][2] for name in outputs if name in OUTPUTS)
         arrays = arrays_for(outputs, len(poses), pixels, same_shapes(lines) if has_signals else lines[0], out)
         for probe in dict.fromkeys(probes):
@@ -638,7 +631,7 @@ class UltrasoundSimulator:
         # The last samples of the image have echoes from half a pulse behind it. Borders are found by labels, up to a
         # voxel behind where they are.
         behind = pulse_taps(axial_sigma / step_mm).size // 2
-        acquisition["samples"] = -(-(signal_shape(probe, settings)[1] + behind) // block) * block
+        acquisition["samples"] = -(-(line_shape(probe, settings)[1] + behind) // block) * block
         acquisition["traced_mm"] = probe.displayed_mm + behind * step_mm + medium.labels.spacing_mm.min()
         acquisition["wavefront_curvature"] = CURVED if settings.wavefront_curvature else 0.0
         for name, value in transmit_fields(probe).items():
