@@ -19,6 +19,7 @@ from PIL import Image
 
 from SlicerUSSim.Command.cli import main
 from SlicerUSSim.Logic import DisplaySettings, SimulationError, TrackedSequence
+from SlicerUSSim.Logic.base.errors import Cancelled
 from SlicerUSSim.Logic.datasets import (
     READY,
     Recipe,
@@ -105,7 +106,7 @@ def recipe(folder: Path, more: str = VARIED, *, outputs="image labels", format_=
         ("images = ", r"is not TOML \(Invalid value"),
         (
             "images = 5\noutputs = ['image', 'colour']",
-            "line 2: outputs are image, colour, expected some of image, labels",
+            "line 2: outputs are .*'colour'.*, expected some of image",
         ),
         (
             "P\n[display]\ngain_db = {uniform = [-600, 6]}",
@@ -138,6 +139,10 @@ def recipe(folder: Path, more: str = VARIED, *, outputs="image labels", format_=
         ("P\n[patients.segmentation]\nclasses = 9", "line 5: classes is 9, expected a whole number between 3 and 4"),
         ("P\n[[patients]]\nfiles = 'b'", "line 5: 'files' is unknown, expected one of file"),
         ("P\n[lesions]\neach = 9", "5 images are 5 shards for 9 patients with their lesions, expected one for each"),
+        (
+            "images = 5\noutputs = ['rf']\n[[patients]]\nfile = 'a'\n[probe]\ndepth_mm = {uniform = [60, 90]}",
+            "line 5: rf would have .196, 1569. to .196, 2243. scan lines and samples, expected one shape",
+        ),
         ("P\n[pose]\nrock_deg = 200", "line 5: rock_deg is 200, expected a number between -180 and 180"),
         (
             "images = 5\nformat = 'png'\noutputs = ['image', 'rf']",
@@ -252,6 +257,28 @@ def test_every_output_is_of_the_images_pixels_or_lines(folder, tmp_path):
     assert roughness[1] < 0.7 * roughness[0] and arrays["clean"].mean() == pytest.approx(
         arrays["image"].mean(), rel=0.1
     )
+
+
+def test_signals_can_be_converted_to_the_image_by_what_the_manifest_says(folder, tmp_path):
+    more = '[pose]\non = "surface"\n[probe]\nname = "convex"\n'
+    text = recipe(folder, more, outputs="image bmode").text.replace("[settings]", 'look = "even"\n[settings]')
+    text = text.replace("[48, 64]", "[256, 320]").replace("images = 12", "images = 1").replace("shard = 4", "")
+    made = make_dataset(Recipe.of_text(text, folder=folder), tmp_path / "s", workers=1)
+    images = SimulatedImages(made.folder)
+    item, (probe,) = images[0], images.manifest["probes"]
+    rows, columns = np.mgrid[:256:4, :320:4]
+    image = item["image"][::4, ::4]
+    places = np.stack([columns, rows, 0 * rows, 1 + 0 * rows], axis=-1) @ item["image_to_probe"].T
+    origins, directions = np.array(probe["origins_mm"]), np.array(probe["directions"])
+    offset = places[..., None, :3] - origins
+    along = (offset * directions).sum(axis=-1)
+    line = np.linalg.norm(offset - along[..., None] * directions, axis=-1).argmin(axis=-1)
+    sample = np.rint(np.take_along_axis(along, line[..., None], -1)[..., 0] / probe["sample_mm"]).astype(int)
+    inside = (image > 0) & (sample >= 0) & (sample < item["bmode"].shape[1])
+    found = item["bmode"][line[inside], sample[inside]].astype(float)
+    assert inside.mean() > 0.3 and np.corrcoef(found, image[inside])[0, 1] > 0.9
+    cycle_mm = probe["sample_mm"] * probe["samples_per_cycle"]
+    assert probe["sampling_mhz"] == pytest.approx(0.77 * probe["samples_per_cycle"] / cycle_mm)
 
 
 @pytest.mark.parametrize("on", ["craniotomy", "view", "path", "sequence", "lesion"])
@@ -389,6 +416,20 @@ def test_what_a_patient_has_not_is_said_and_no_image_is_made(folder, tmp_path, m
     assert made.done == 0 and re.search(says, made.skipped["second.nii.gz"])
 
 
+def test_warnings_about_a_patient_are_in_the_manifest_with_its_name(folder, tmp_path):
+    block(lambda x, y, z: (np.hypot(x - 45, y) + abs(z) < 12).astype(np.uint8), (54, 58, 54), 2.0).write(
+        folder / "mask.nii.gz"
+    )
+    lines: list[str] = []
+    text = recipe(folder, "").text.replace(
+        'file = "brain.nii.gz"', 'file = "brain.nii.gz"\nadd = {tumour = "mask.nii.gz"}'
+    )
+    made = make_dataset(Recipe.of_text(text, folder=folder), tmp_path / "s", workers=1, say=lines.append)
+    (warning,) = SimulatedImages(made.folder).manifest["warnings"]
+    assert warning.startswith("brain.nii.gz: ") and "mask.nii.gz" in warning
+    assert lines == ["brain.nii.gz: preparing it ..."]
+
+
 def test_a_full_disk_ends_the_run_in_one_line(folder, tmp_path, monkeypatch):
     def full(*_, **__):
         raise OSError(28, "No space left on device")
@@ -517,6 +558,19 @@ def test_a_scheduler_that_is_gone_is_reported_within_ten_seconds(plain, folder, 
             process.wait()
     assert make_dataset(recipe(folder), tmp_path / "s", workers=1).found >= 4
     assert checksum(tmp_path / "s") == checksum(plain)
+
+
+def test_workers_that_are_awaited_are_one_line(folder, tmp_path, distributed):
+    lines = []
+
+    def say(line: str) -> None:
+        lines.append(line)
+        if "waiting" in line:
+            raise Cancelled
+
+    with distributed.LocalCluster(n_workers=0, dashboard_address=None) as cluster, pytest.raises(Cancelled):
+        make_dataset(recipe(folder), tmp_path / "s", scheduler=cluster.scheduler_address, say=say)
+    assert re.fullmatch(r"tcp://.*: waiting for workers ...", lines[-1])
 
 
 def test_a_scheduler_that_does_not_answer_is_one_line(folder, tmp_path, distributed):

@@ -42,7 +42,8 @@ class Draw:
             return cls(entry, (entry.checked(where, value),))
         kinds = KINDS if entry.type in (int, float) else {"choice": KINDS["choice"]}
         kind = next((name for name in value if name in kinds), "")
-        values, unit, relative = value.get(kind), value.get("unit", entry.unit), bool(value.get("relative", False))
+        values: Any = value.get(kind)
+        unit, relative = value.get("unit", entry.unit), bool(value.get("relative", False))
         known = {kind, "unit", "relative"} if may_be_relative else {kind, "unit"}
         is_known = set(value) <= known and isinstance(values, list) and bool(values)
         wanted = " or ".join(f"{{{name} = {of}}}" for name, of in kinds.items())

@@ -52,8 +52,8 @@ class SimulatedImages:
         if form == "zarr":
             import zarr
 
-            group = zarr.open_group(self.folder / ZARR, mode="r")
-            return {"number": number, **{name: np.asarray(group[name][number]) for name in names}}
+            file: Any = zarr.open_group(self.folder / ZARR, mode="r")
+            return {"number": number, **{name: np.asarray(file[name][number]) for name in names}}
         import h5py
 
         shard, within = divmod(number, self.manifest["shard"])

@@ -294,10 +294,8 @@ class _Reader:
 
     def recipe(self, folder: Path) -> Recipe:
         settings = self.plain(SetSettings, self.values, tables=_TABLES)
-        outputs = (
-            f"{self.at('outputs')}: outputs are {', '.join(settings.outputs)}, expected some of {', '.join(OUTPUTS)}"
-        )
-        require(set(settings.outputs) <= set(OUTPUTS), outputs)
+        outputs = f"outputs are {short(settings.outputs)}, expected some of {', '.join(OUTPUTS)}"
+        require(set(settings.outputs) <= set(OUTPUTS), f"{self.at('outputs')}: {outputs}")
         other = ", ".join(name for name in settings.outputs if name not in _PICTURES)
         holds = f"format {settings.format} holds {either(_PICTURES)}, and outputs have {other}, expected zarr or hdf5"
         require(FORMATS[settings.format] or not other, f"{self.at('format')}: {holds}")
