@@ -292,7 +292,7 @@ def test_poses_stand_where_the_recipe_says(folder, tmp_path, on):
     if on == "sequence":
         poses = [pose_looking_at((x, 0, 50), (x, 0, 0)) for x in (0.0, 5.0)]
         transforms = tuple({"ProbeToReference": pose} for pose in poses)
-        TrackedSequence(np.zeros((2, 8, 8), np.uint8), transforms, [0.0, 1.0]).write(folder / "s.igs.mha")
+        TrackedSequence(np.zeros((2, 8, 8), np.uint8), transforms, np.array([0.0, 1.0])).write(folder / "s.igs.mha")
         more += 'file = "s.igs.mha"\n'
     if on == "lesion":
         more = '[pose]\naim = "tumour"\nright_deg = 20\n[lesions]\neach = 2\ndepth_mm = 20\nradius_mm = 7\n'
