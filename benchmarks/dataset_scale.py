@@ -17,12 +17,10 @@ from time import perf_counter
 
 import numpy as np
 
-from SlicerUSSim.Logic.base.settings import DisplaySettings
 from SlicerUSSim.Logic.datasets import Recipe, make_dataset
 from SlicerUSSim.Logic.datasets.making import render_task
-from SlicerUSSim.Logic.datasets.placed import scene, section_of
-from SlicerUSSim.Logic.datasets.prepared import prepare
-from SlicerUSSim.Logic.datasets.rendering import _Shot, render
+from SlicerUSSim.Logic.datasets.patients import prepare, scene
+from SlicerUSSim.Logic.datasets.rendering import Shot, render
 from SlicerUSSim.Logic.datasets.writers import record_path, write_shard
 
 #: Seconds that the slowed-down renderer takes for a shard, and its shards for each worker
@@ -31,13 +29,9 @@ SLOW_S, SHARDS_EACH = 2.0, 12
 
 def batch_rate(recipe: Recipe, out: Path, images: int) -> float:
     """Images per second of simulate_batch with the inputs of the recipe's images, in shards."""
-    made = scene(recipe, out, recipe.cases[0])
-    inputs = []
-    for number in range(images):
-        drawn = recipe.drawn(number)
-        display = section_of(DisplaySettings(), drawn, "display")
-        table = made.tissues(number)[0]
-        inputs.append((recipe.probes[drawn["probe"]], made.pose(number, drawn), display, table, made.settings(drawn)))
+    made = scene(recipe, out, recipe.case_of(0))
+    shots = [Shot.of(made, number) for number in range(images)]
+    inputs = [(shot.probe, shot.pose, shot.display, shot.tissues, shot.settings) for shot in shots]
     shards = [inputs[first : first + recipe.shard] for first in range(0, images, recipe.shard)]
     began = perf_counter()
     for shard in shards:
@@ -62,7 +56,7 @@ def set_rate(recipe: Recipe, patients: Path, workers: int) -> tuple[float, float
         return (after - before) / (last - first), made.peak_mb
 
 
-def slowed_task(out: str, files: str, shard: int) -> tuple[int, float]:
+def slowed_task(out: str, files: str, shard: int) -> float:
     """A shard of which nothing is computed: it takes SLOW_S, and has the arrays of the first one."""
     recipe = Recipe.read(Path(out) / "recipe.toml")
     time.sleep(SLOW_S)
@@ -71,7 +65,7 @@ def slowed_task(out: str, files: str, shard: int) -> tuple[int, float]:
     record = {"images": [numbers.start, numbers.stop], "patient": "mni152", "case": 0, "tissues": [], "version": "",
               "device": "none", "warnings": [], "parameters": []}  # fmt: skip
     write_shard(recipe, Path(out), shard, arrays, record)
-    return len(numbers), 0.0
+    return 0.0
 
 
 def eight_workers(recipe: Recipe) -> tuple[float, float]:
@@ -107,9 +101,9 @@ def main(images: int) -> None:
         began = perf_counter()
         write_shard(recipe, out, 0, arrays, {"parameters": parameters})
         write_ms = 1e3 * (perf_counter() - began) / recipe.shard
-        made, began = scene(recipe, out, recipe.cases[0]), perf_counter()
+        made, began = scene(recipe, out, recipe.case_of(0)), perf_counter()
         for number in range(recipe.shard):
-            _Shot.of(made, number, recipe.drawn(number))
+            Shot.of(made, number)
         draw_ms = 1e3 * (perf_counter() - began) / recipe.shard
         record_path(out, 0).unlink()
         began = perf_counter()

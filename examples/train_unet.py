@@ -17,6 +17,7 @@ from SlicerUSSim.Logic.datasets import SimulatedImages
 def train(folder: Path, tissue: str = "ventricle", epochs: int = 10) -> float:
     """The mean Dice coefficient of the last epoch on the test images."""
     import torch  # type: ignore[import-not-found]
+    from monai.data import Dataset  # type: ignore[import-not-found]
     from monai.losses import DiceCELoss  # type: ignore[import-not-found]
     from monai.metrics import DiceMetric  # type: ignore[import-not-found]
     from monai.networks.nets import UNet  # type: ignore[import-not-found]
@@ -29,7 +30,7 @@ def train(folder: Path, tissue: str = "ventricle", epochs: int = 10) -> float:
         Lambdad("labels", lambda labels: (labels == label).astype("float32")),
         ToTensord(["image", "labels"]),
     ])  # fmt: skip
-    images = SimulatedImages(folder, ["image", "labels"], transform=steps)
+    images = Dataset(SimulatedImages(folder, ["image", "labels"]), steps)
     first = len(images) - max(len(images) // 10, 1)
     train_part, test_part = (
         torch.utils.data.Subset(images, part) for part in (range(first), range(first, len(images)))

@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +19,7 @@ from PIL import Image
 
 from SlicerUSSim.Command.cli import main
 from SlicerUSSim.Logic import DisplaySettings, SimulationError, TrackedSequence
+from SlicerUSSim.Logic.base.errors import Cancelled
 from SlicerUSSim.Logic.datasets import (
     READY,
     Recipe,
@@ -28,10 +30,10 @@ from SlicerUSSim.Logic.datasets import (
     making as making_module,
 )
 from SlicerUSSim.Logic.datasets.draws import Draw, generator
-from SlicerUSSim.Logic.datasets.placed import Scene
-from SlicerUSSim.Logic.datasets.prepared import CLASSES
+from SlicerUSSim.Logic.datasets.patients import Scene
+from SlicerUSSim.Logic.datasets.recipe import CLASSES
 from SlicerUSSim.Logic.datasets.rendering import render
-from SlicerUSSim.Logic.datasets.writers import record_path
+from SlicerUSSim.Logic.datasets.writers import checksums, record_path
 from SlicerUSSim.Logic.imaging.preset import preset_parameters
 from SlicerUSSim.Logic.mri.samples import head_mri
 from SlicerUSSim.Logic.probe import pose_looking_at
@@ -102,24 +104,27 @@ def recipe(folder: Path, more: str = VARIED, *, outputs="image labels", format_=
         ("images = 5\nimage = 3", "line 2: 'image' is unknown, expected one of images, seed"),
         ("images = 5", r"patients is \[\], expected \[\[patients\]\] with file"),
         ("images = ", r"is not TOML \(Invalid value"),
-        ("images = 5\noutputs = ['image', 'colour']", "line 2: output 'colour' is unknown, expected image, labels"),
+        (
+            "images = 5\noutputs = ['image', 'colour']",
+            "line 2: outputs are .*'colour'.*, expected some of image",
+        ),
         (
             "P\n[display]\ngain_db = {uniform = [-600, 6]}",
             "line 5: gain_db is -600, expected a number between -200 and",
         ),
         (
             "P\n[display]\n\ngain_db = {uniform = [6, -6]}",
-            "line 6: uniform is .6.0, -6.0., expected the lower number first",
+            "line 6: uniform is .6.0, -6.0., expected .low, high.",
         ),
         (
             "P\n[display]\ngain_db = {uniform = [0, 6], unit = 'mm'}",
             "line 5: gain_db is in 'mm', expected its unit, 'dB'",
         ),
-        ("P\n[display]\ngain_db = {about = 3}", "line 5: gain_db is .*expected a number .*or one of {uniform = .low"),
-        ("P\n[display]\ngain_db = {log_uniform = [0, 3]}", "line 5: log_uniform is .*expected more than 0"),
-        ("P\n[display]\nlook = {uniform = ['even', 'even']}", "look has no uniform distribution, expected {choice"),
+        ("P\n[display]\ngain_db = {about = 3}", "line 5: gain_db is .*expected a number .*or {uniform = .low"),
+        ("P\n[display]\ngain_db = {log_uniform = [0, 3]}", "line 5: log_uniform is .*expected .low, high. above 0"),
+        ("P\n[display]\nlook = {uniform = ['even', 'even']}", "look is .*, expected one of scanner, even, or {choice"),
         ("P\n[display]\nimage_size = {choice = [[8, 8], [9, 9]]}", "line 5: image_size is .*one value for all images"),
-        ("P\n[pose]\nrock_deg = {normal = [0, -1]}", "line 5: the deviation is -1, expected a number from 0 on"),
+        ("P\n[pose]\nrock_deg = {normal = [0, -1]}", "line 5: the deviation is -1, expected a number between 0"),
         ("P\n[pose]\non = 'path'", "line 5: on is path, which needs a file"),
         ("P\n[pose]\nwithin_deg = {uniform = [0, 90]}", "line 5: within_deg is"),
         ("P\n[probe]\nname = 'convexx'", "line 5: name is 'convexx', expected one of phased, convex"),
@@ -129,11 +134,15 @@ def recipe(folder: Path, more: str = VARIED, *, outputs="image labels", format_=
             "P\n[tissues.all]\nmu0 = {uniform = [0, 200], relative = true}",
             "line 5: mu0 is 200, expected a number between 0 and 100",
         ),
-        ("P\n[display]\ngain_db = {uniform = [0, 1], relative = true}", "line 5: relative is True, expected true, for"),
+        ("P\n[display]\ngain_db = {uniform = [0, 1], relative = true}", "line 5: gain_db is .*expected a number"),
         ("P\nlicence = 3", "line 4: licence is 3, expected text"),
         ("P\n[patients.segmentation]\nclasses = 9", "line 5: classes is 9, expected a whole number between 3 and 4"),
         ("P\n[[patients]]\nfiles = 'b'", "line 5: 'files' is unknown, expected one of file"),
         ("P\n[lesions]\neach = 9", "5 images are 5 shards for 9 patients with their lesions, expected one for each"),
+        (
+            "images = 5\noutputs = ['rf']\n[[patients]]\nfile = 'a'\n[probe]\ndepth_mm = {uniform = [60, 90]}",
+            "line 5: rf would have .196, 1569. to .196, 2243. scan lines and samples, expected one shape",
+        ),
         ("P\n[pose]\nrock_deg = 200", "line 5: rock_deg is 200, expected a number between -180 and 180"),
         (
             "images = 5\nformat = 'png'\noutputs = ['image', 'rf']",
@@ -151,7 +160,7 @@ def test_a_recipe_names_the_line_and_the_key_of_what_is_wrong(text, says):
 def test_draws_stay_within_bounds_and_have_their_distribution():
     entry = preset_parameters()["display.gain_db"]
     drawn = {
-        kind: np.array([Draw.of({kind: values}, entry, "r")(generator(1, n)) for n in range(2000)])
+        kind: np.array([Draw.of({kind: values}, entry, "r")(generator(1, n, "")) for n in range(2000)])
         for kind, values in {"uniform": [-3, 5], "normal": [190, 20], "choice": [1, 4], "log_uniform": [1, 100]}.items()
     }
     assert drawn["uniform"].min() >= -3 and drawn["uniform"].max() <= 5
@@ -159,23 +168,24 @@ def test_draws_stay_within_bounds_and_have_their_distribution():
     assert drawn["normal"].max() == 200.0 and np.median(drawn["normal"]) == pytest.approx(190, abs=2)
     assert set(drawn["choice"]) == {1.0, 4.0} and np.median(drawn["log_uniform"]) == pytest.approx(10, rel=0.15)
     lines = Draw.of({"uniform": [10, 12]}, preset_parameters()["probe.scan_lines"], "r")
-    assert {lines(generator(1, n)) for n in range(50)} == {10, 11, 12}
+    assert {lines(generator(1, n, "")) for n in range(50)} == {10, 11, 12}
 
 
 def test_a_draw_depends_on_seed_image_and_key_alone(folder):
     plain, more = recipe(folder), recipe(folder, f"{VARIED}texture_db = 3.0\n")
     other = recipe(folder, VARIED.replace("rock_deg = {normal = [0, 8]}", "tilt_deg = {normal = [0, 8]}"))
     assert plain.drawn(7) == more.drawn(7) != plain.drawn(8)
-    same = set(plain.drawn(7)) & set(other.drawn(7)) - {"pose.rock_deg", "pose.tilt_deg"}
-    assert all(plain.drawn(7)[key] == other.drawn(7)[key] for key in same)
+    mine, its = plain.drawn(7), other.drawn(7)
+    assert mine["pose"].pop("rock_deg") != its["pose"].pop("rock_deg") == 0.0
+    assert its["pose"].pop("tilt_deg") != mine["pose"].pop("tilt_deg") == 0.0 and mine == its
 
 
 def test_ready_recipes_are_read_and_name_their_purpose():
     assert set(READY) == {"brain-tumour", "denoising", "mri-registration", "standard-views", "ventricles"}
     for name in READY:
         made = Recipe.read(name)
-        assert made.settings.title and made.settings.images >= 500 and len(made.draws) > 5
-    with pytest.raises(SimulationError, match=r"none.toml: cannot be read .*or one of brain-tumour, denoising"):
+        assert made.settings.title and made.settings.images >= 500 and len(made.draws["display"]) > 2
+    with pytest.raises(SimulationError, match=r"none.toml: is no file, .*or one of brain-tumour, denoising"):
         Recipe.read("none.toml")
 
 
@@ -201,18 +211,18 @@ def test_images_of_a_set_are_those_that_its_parameters_say(plain, folder):
     first, last = images[0], images[-1]
     assert first["image"].shape == first["labels"].shape == (48, 64) and last["number"] == 11
     assert (first["image"] > 0).mean() > 0.2 and set(np.unique(last["labels"])) <= {0, 1, 2, 3}
-    made, values = Scene(recipe(folder), plain, recipe(folder).cases[0]), images.parameters()[7]
-    assert values["image"] == 7 and 3 <= recipe(folder).probes[values["probe"]].frequency_mhz <= 6
+    made, values = Scene(recipe(folder), plain, recipe(folder).case_of(0)), images.parameters()[7]
+    assert values["image"] == 7 and 3 <= values["probe"]["frequency_mhz"] <= 6
     drawn = recipe(folder).drawn(7)
     tissues, changed = made.tissues(7)
-    assert changed.items() <= values.items() and tissues.tissue("grey matter").mu0 == values["grey matter.mu0"]
-    assert 0.7 <= values["grey matter.mu0"] / TISSUES["grey matter"].mu0 <= 1.4
-    assert 0.3 <= values["white matter.attenuation_db_cm_mhz"] <= 0.7
-    np.testing.assert_allclose(images[7]["pose"], made.pose(7, drawn))
-    display = DisplaySettings(gain_db=drawn["display.gain_db"], image_size=(48, 64))
+    assert changed == values["tissues"] and tissues.tissue("grey matter").mu0 == changed["grey matter"]["mu0"]
+    assert 0.7 <= changed["grey matter"]["mu0"] / TISSUES["grey matter"].mu0 <= 1.4
+    assert 0.3 <= changed["white matter"]["attenuation_db_cm_mhz"] <= 0.7
+    np.testing.assert_allclose(images[7]["pose"], made.pose(7, drawn["pose"]))
+    display = DisplaySettings(gain_db=drawn["display"]["gain_db"], image_size=(48, 64))
     with made.simulator.with_tissues(tissues):
-        made.simulator.settings = made.settings(drawn)
-        probe = recipe(folder).probes[values["probe"]]
+        made.simulator.settings = replace(made.settings, **drawn["settings"])
+        probe = recipe(folder).probes[values["probe"]["number"]]
         frame = made.simulator.simulate(probe, images[7]["pose"], display, noise_seed=7)
     np.testing.assert_array_equal(images[7]["image"], frame.image)
     np.testing.assert_array_equal(images[7]["labels"], frame.labels())
@@ -249,6 +259,28 @@ def test_every_output_is_of_the_images_pixels_or_lines(folder, tmp_path):
     )
 
 
+def test_signals_can_be_converted_to_the_image_by_what_the_manifest_says(folder, tmp_path):
+    more = '[pose]\non = "surface"\n[probe]\nname = "convex"\n'
+    text = recipe(folder, more, outputs="image bmode").text.replace("[settings]", 'look = "even"\n[settings]')
+    text = text.replace("[48, 64]", "[256, 320]").replace("images = 12", "images = 1").replace("shard = 4", "")
+    made = make_dataset(Recipe.of_text(text, folder=folder), tmp_path / "s", workers=1)
+    images = SimulatedImages(made.folder)
+    item, (probe,) = images[0], images.manifest["probes"]
+    rows, columns = np.mgrid[:256:4, :320:4]
+    image = item["image"][::4, ::4]
+    places = np.stack([columns, rows, 0 * rows, 1 + 0 * rows], axis=-1) @ item["image_to_probe"].T
+    origins, directions = np.array(probe["origins_mm"]), np.array(probe["directions"])
+    offset = places[..., None, :3] - origins
+    along = (offset * directions).sum(axis=-1)
+    line = np.linalg.norm(offset - along[..., None] * directions, axis=-1).argmin(axis=-1)
+    sample = np.rint(np.take_along_axis(along, line[..., None], -1)[..., 0] / probe["sample_mm"]).astype(int)
+    inside = (image > 0) & (sample >= 0) & (sample < item["bmode"].shape[1])
+    found = item["bmode"][line[inside], sample[inside]].astype(float)
+    assert inside.mean() > 0.3 and np.corrcoef(found, image[inside])[0, 1] > 0.9
+    cycle_mm = probe["sample_mm"] * probe["samples_per_cycle"]
+    assert probe["sampling_mhz"] == pytest.approx(0.77 * probe["samples_per_cycle"] / cycle_mm)
+
+
 @pytest.mark.parametrize("on", ["craniotomy", "view", "path", "sequence", "lesion"])
 def test_poses_stand_where_the_recipe_says(folder, tmp_path, on):
     more = f'[pose]\non = "{on}"\n'
@@ -260,14 +292,14 @@ def test_poses_stand_where_the_recipe_says(folder, tmp_path, on):
     if on == "sequence":
         poses = [pose_looking_at((x, 0, 50), (x, 0, 0)) for x in (0.0, 5.0)]
         transforms = tuple({"ProbeToReference": pose} for pose in poses)
-        TrackedSequence(np.zeros((2, 8, 8), np.uint8), transforms, [0.0, 1.0]).write(folder / "s.igs.mha")
+        TrackedSequence(np.zeros((2, 8, 8), np.uint8), transforms, np.array([0.0, 1.0])).write(folder / "s.igs.mha")
         more += 'file = "s.igs.mha"\n'
     if on == "lesion":
         more = '[pose]\naim = "tumour"\nright_deg = 20\n[lesions]\neach = 2\ndepth_mm = 20\nradius_mm = 7\n'
     made = recipe(folder, more, outputs="image")
     making_module.prepare(made, 0, tmp_path)
-    scene = Scene(made, tmp_path, made.cases[0])
-    poses = [scene.pose(n, made.drawn(n)) for n in range(3)]
+    scene = Scene(made, tmp_path, made.case_of(0))
+    poses = [scene.pose(n, made.drawn(n)["pose"]) for n in range(3)]
     faces = np.array([pose[:3, 3] for pose in poses])
     surface = PatientSurface(scene.simulator.medium.labels)
     away = [np.linalg.norm(face - surface.nearest(face)) for face in faces]
@@ -282,7 +314,7 @@ def test_poses_stand_where_the_recipe_says(folder, tmp_path, on):
         tumour = np.argwhere(labels.array == scene.names.index("tumour") + 1)[:, ::-1].mean(axis=0)
         across, depth, _ = (np.linalg.inv(poses[0]) @ labels.ijk_to_ras @ [*tumour, 1.0])[:3]
         assert abs(across) < 3.0 and 12.0 < depth < 45.0
-        other = Scene(made, tmp_path, made.cases[1])
+        other = Scene(made, tmp_path, made.case_of(2))
         assert (other.simulator.medium.labels.array != labels.array).any()
 
 
@@ -304,7 +336,10 @@ def test_all_formats_hold_the_same_images(plain, folder, tmp_path):
         make_dataset(recipe(folder, format_=format_), tmp_path / format_, workers=1)
         assert checksum(plain) == checksum(tmp_path / format_)
     before, hdf5 = SimulatedImages(plain), SimulatedImages(tmp_path / "hdf5")
-    assert hdf5.damaged() == [] == before.damaged()
+    for shard, about in before.manifest["shards"].items():
+        items = [before[number] for number in range(*about["images"])]
+        arrays = {name: np.stack([item[name] for item in items]) for name in about["checksums"]}
+        assert checksums(arrays) == about["checksums"], shard
     for number in (0, 5, 11):
         wanted = before[number]
         for name, values in hdf5[number].items():
@@ -318,7 +353,7 @@ def test_all_formats_hold_the_same_images(plain, folder, tmp_path):
             np.testing.assert_allclose(pose, wanted["pose"] @ wanted["image_to_probe"], atol=1e-4)
         values = json.loads((tmp_path / "png" / "parameters" / f"{number:08d}.json").read_text())
         assert values["image"] == number and np.allclose(values["pose"], wanted["pose"])
-    with pytest.raises(SimulationError, match="has the format png, which other programs read, expected zarr or hdf5"):
+    with pytest.raises(SimulationError, match="has the format png, expected zarr or hdf5"):
         SimulatedImages(tmp_path / "png")[0]
 
 
@@ -329,7 +364,7 @@ def test_a_zarr_set_has_a_file_per_shard_and_any_reader_opens_it(plain):
     assert (group["image"].chunks, group["image"].shards) == ((1, 48, 64), (4, 48, 64))
 
 
-def test_a_damaged_shard_is_found_and_only_missing_ones_are_made(plain, folder, tmp_path):
+def test_only_missing_shards_are_made_and_no_other_set_is_touched(plain, folder, tmp_path):
     out, calls = tmp_path / "set", []
 
     def counted(*arguments):
@@ -340,8 +375,6 @@ def test_a_damaged_shard_is_found_and_only_missing_ones_are_made(plain, folder, 
     record_path(out, 1).unlink()
     made = make_dataset(recipe(folder), out, workers=1, task=counted)
     assert calls == [1] and (made.found, made.done) == (8, 12) and checksum(out) == checksum(plain)
-    zarr.open_array(out / "images.zarr", path="image", mode="r+")[9, 3, 3] ^= 1
-    assert SimulatedImages(out).damaged() == [2]
     with pytest.raises(SimulationError, match="has the set of another recipe"):
         make_dataset(recipe(folder, ""), out, workers=1)
     with pytest.raises(SimulationError, match="has other files, expected a new or empty folder"):
@@ -359,9 +392,9 @@ def test_a_patient_that_cannot_be_read_is_left_out_and_listed(folder, tmp_path):
     images = SimulatedImages(tmp_path / "s")
     assert len(images) == 8 and "broken.nii.gz" in (tmp_path / "s" / "README.md").read_text()
     assert [images[n]["number"] for n in (3, 4)] == [3, 8]
-    assert len(SimulatedImages(tmp_path / "s", ["image"], patients=["second.nii.gz"])) == 4
-    with pytest.raises(SimulationError, match="has no patient 'third'"):
-        SimulatedImages(tmp_path / "s", patients=["third"])
+    assert images.manifest["shards"]["2"]["patient"] == "second.nii.gz"
+    with pytest.raises(SimulationError, match="has no output 'labels', expected some of image"):
+        SimulatedImages(tmp_path / "s", ["labels"])
 
 
 @pytest.mark.parametrize(
@@ -381,6 +414,20 @@ def test_a_patient_that_cannot_be_read_is_left_out_and_listed(folder, tmp_path):
 def test_what_a_patient_has_not_is_said_and_no_image_is_made(folder, tmp_path, more, says):
     made = make_dataset(recipe(folder, more, file="second.nii.gz"), tmp_path / "s", workers=1)
     assert made.done == 0 and re.search(says, made.skipped["second.nii.gz"])
+
+
+def test_warnings_about_a_patient_are_in_the_manifest_with_its_name(folder, tmp_path):
+    block(lambda x, y, z: (np.hypot(x - 45, y) + abs(z) < 12).astype(np.uint8), (54, 58, 54), 2.0).write(
+        folder / "mask.nii.gz"
+    )
+    lines: list[str] = []
+    text = recipe(folder, "").text.replace(
+        'file = "brain.nii.gz"', 'file = "brain.nii.gz"\nadd = {tumour = "mask.nii.gz"}'
+    )
+    made = make_dataset(Recipe.of_text(text, folder=folder), tmp_path / "s", workers=1, say=lines.append)
+    (warning,) = SimulatedImages(made.folder).manifest["warnings"]
+    assert warning.startswith("brain.nii.gz: ") and "mask.nii.gz" in warning
+    assert lines == ["brain.nii.gz: preparing it ..."]
 
 
 def test_a_full_disk_ends_the_run_in_one_line(folder, tmp_path, monkeypatch):
@@ -453,12 +500,12 @@ def distributed():
 @pytest.mark.slow
 def test_two_workers_make_the_bits_of_one_process(plain, folder, tmp_path, distributed):
     told = []
-    made = make_dataset(recipe(folder), tmp_path / "s", workers=2, progress=lambda done: told.append(str(done)))
+    made = make_dataset(recipe(folder), tmp_path / "s", workers=2, progress=lambda done: told.append(done.in_words()))
     assert made.done == 12 and checksum(tmp_path / "s") == checksum(plain)
     assert "12 of 12 images" in told[-1] and "images/s" in told[-1] and 50 < made.peak_mb < 600
 
 
-def killing_task(out: str, files: str, shard: int) -> tuple[int, float]:
+def killing_task(out: str, files: str, shard: int) -> float:
     """The worker that gets shard 7 first is killed in it."""
     marker = Path(out) / "patients" / "killed"
     if shard == 7 and not marker.exists():
@@ -479,7 +526,7 @@ def test_two_thousand_images_survive_a_killed_worker(folder, tmp_path, distribut
     )
 
 
-def slow_task(out: str, files: str, shard: int) -> tuple[int, float]:
+def slow_task(out: str, files: str, shard: int) -> float:
     time.sleep(1.0)
     return making_module.render_task(out, files, shard)
 
@@ -511,6 +558,19 @@ def test_a_scheduler_that_is_gone_is_reported_within_ten_seconds(plain, folder, 
             process.wait()
     assert make_dataset(recipe(folder), tmp_path / "s", workers=1).found >= 4
     assert checksum(tmp_path / "s") == checksum(plain)
+
+
+def test_workers_that_are_awaited_are_one_line(folder, tmp_path, distributed):
+    lines = []
+
+    def say(line: str) -> None:
+        lines.append(line)
+        if "waiting" in line:
+            raise Cancelled
+
+    with distributed.LocalCluster(n_workers=0, dashboard_address=None) as cluster, pytest.raises(Cancelled):
+        make_dataset(recipe(folder), tmp_path / "s", scheduler=cluster.scheduler_address, say=say)
+    assert re.fullmatch(r"tcp://.*: waiting for workers ...", lines[-1])
 
 
 def test_a_scheduler_that_does_not_answer_is_one_line(folder, tmp_path, distributed):

@@ -4,24 +4,11 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import click
 
 from SlicerUSSim.Command.options import device_option, out_option
-from SlicerUSSim.Command.progress import Share, note
-from SlicerUSSim.Logic.base.errors import require
-
-if TYPE_CHECKING:
-    from SlicerUSSim.Logic.datasets import Made
-
-
-class _Rate(Share):
-    """A progress bar with images per second and the time left."""
-
-    def __call__(self, made: Made) -> None:  # type: ignore[override]
-        self._show(str(made))
-        super().__call__(made.done / made.images)
+from SlicerUSSim.Command.progress import Curve, note
 
 
 @click.command()
@@ -44,24 +31,26 @@ def dataset(
     ctx: click.Context, recipe: str, out: Path, scheduler: str | None, workers: int | None, export: str | None,
     device: str | None,
 ) -> None:  # fmt: skip
-    """Make many labelled images from a recipe, a TOML file or the name of one that comes with the package.
+    """Make many labelled images from a recipe.
 
-    Image n is the same whoever makes it. The same command goes on with a set that was interrupted. The exit status is 1
-    if a patient was left out.
+    RECIPE is a file in TOML (docs/datasets.md), or the name of one that comes with the package: brain-tumour,
+    denoising, mri-registration, standard-views or ventricles.
+
+    Image n is the same whoever makes it. The same command goes on with a set that was interrupted: docs/scale.md.
+
+    The exit status is 1 if a patient was left out.
     """
     from SlicerUSSim.Logic.datasets import Recipe, export_coco, export_nnunet, make_dataset
-    from SlicerUSSim.Logic.datasets.exports import labels_to_export
+    from SlicerUSSim.Logic.datasets.reader import labels_to_export
 
     if device is not None:
         os.environ["USSIM_DEVICE"] = device  # workers have it, too
     read = Recipe.read(recipe)
     if export is not None:  # before hours of work
-        labels_to_export(read.settings.outputs, recipe)
-        kind = read.settings.format
-        require(kind in ("zarr", "hdf5"), f"{recipe}: the format is {kind}, expected zarr or hdf5 to export the set")
-    note(f"{recipe}: {read.settings.images} images of {len(read.cases)} cases in {read.shards} shards of {read.shard}")
-    with _Rate("dataset") as progress:
-        made = make_dataset(read, out, scheduler=scheduler, workers=workers, progress=progress)
+        labels_to_export(read.settings.outputs, read.settings.format, recipe)
+    note(f"{recipe}: {read.settings.images} images of {read.cases} cases in {read.shards} shards of {read.shard}")
+    with Curve("dataset") as progress:
+        made = make_dataset(read, out, scheduler=scheduler, workers=workers, progress=progress, say=note)
     for why in made.skipped.values():
         note(f"left out: {why}")
     if export is not None:

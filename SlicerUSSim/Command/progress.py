@@ -11,6 +11,7 @@ import click
 if TYPE_CHECKING:
     from typing_extensions import Self
 
+    from SlicerUSSim.Logic.datasets import Made
     from SlicerUSSim.Logic.fitting import Progress
 
 #: Seconds until the first line about something slow where there is no terminal
@@ -65,8 +66,8 @@ class Share:
 
 
 class Curve(Share):
-    """A progress bar of an optimisation, with its stage and the best cost so far."""
+    """A progress bar of an optimisation or of a data set, with what it says of itself."""
 
-    def __call__(self, progress: Progress) -> None:  # type: ignore[override]
+    def __call__(self, progress: Progress | Made) -> None:  # type: ignore[override]
         self._show(progress.in_words())
         super().__call__(progress.share)

@@ -13,4 +13,5 @@ lazy_exports(globals())
 with suppress(ImportError):  # which FindView reports, and says what to install
     import gymnasium
 
-    gymnasium.register("SlicerUSSim/FindView-v0", entry_point="SlicerUSSim.gym.find_view:FindView")
+    _PLACE = "SlicerUSSim.gym.find_view:FindView"
+    gymnasium.register("SlicerUSSim/FindView-v0", entry_point=_PLACE, max_episode_steps=100)

@@ -40,30 +40,19 @@ class FindView(gymnasium.Env):
     simulator : of any patient; default: the MNI152 brain, one for all environments of a process. Its quality is draft.
     image_size : (rows, columns).
     within_mm : distance at which the target is found.
-    steps : most steps of an episode.
 
-    Raises SimulationError for an unknown view and a distance out of range.
-
-    >>> import gymnasium
-    >>> import SlicerUSSim.gym  # registers SlicerUSSim/FindView-v0
-    >>> environment = SlicerUSSim.gym.FindView(image_size=(64, 80))
-    >>> image, about = environment.reset(seed=1)
-    >>> image, reward, found, ended, about = environment.step(environment.action_space.sample())
-    >>> image.shape
-    (64, 80, 1)
+    "SlicerUSSim/FindView-v0" ends episodes after 100 steps. Raises SimulationError for an unknown view and a distance
+    out of range.
     """
-
-    metadata = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012, as Gymnasium declares it
 
     def __init__(
         self, view: str = "craniotomy", *, simulator: UltrasoundSimulator | None = None,
         probe: Probe = PROBES["phased"], image_size: tuple[int, int] = (128, 160), within_mm: float = 4.0,
-        steps: int = 100, render_mode: str | None = None,
     ) -> None:  # fmt: skip
         require_between("FindView", "within_mm", within_mm, 0.1, 100.0)
         self.simulator = simulator or _demo_simulator()
         self.surface, self.target = _scene(self.simulator, view)
-        self.probe, self.within_mm, self.steps, self.render_mode = probe, within_mm, steps, render_mode
+        self.probe, self.within_mm = probe, within_mm
         self._display = DisplaySettings(image_size=image_size)
         self.observation_space = gymnasium.spaces.Box(0, 255, (*image_size, 1), np.uint8)
         self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (len(STEP_DEG),), np.float32)
@@ -78,17 +67,13 @@ class FindView(gymnasium.Env):
         return self._image(), self._about()
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        """(image after a motion, reward, whether the target is found, whether the steps are used up, info)."""
+        """(image after a motion, reward, whether the target is found, False, info)."""
         before = self.distance_mm()
         self._pose = self._moved(self._pose, np.clip(np.asarray(action, float), -1.0, 1.0))
         self._step += 1
         after = self.distance_mm()
         is_found = after <= self.within_mm
-        return self._image(), before - after + _FOUND * is_found, is_found, self._step >= self.steps, self._about()
-
-    def render(self) -> np.ndarray | None:
-        """(rows, columns, 3) uint8 the image."""
-        return np.repeat(self._image(), 3, axis=2) if self.render_mode == "rgb_array" else None
+        return self._image(), before - after + _FOUND * is_found, is_found, False, self._about()
 
     def distance_mm(self) -> float:
         """From the pose to the target: way and turn."""

@@ -8,9 +8,8 @@ from typing import TYPE_CHECKING
 from SlicerUSSim.Logic.base.lazy import lazy_exports
 
 if TYPE_CHECKING:
-    from .exports import export_coco as export_coco, export_nnunet as export_nnunet
     from .making import Made as Made, make_dataset as make_dataset
-    from .reader import SimulatedImages as SimulatedImages
+    from .reader import SimulatedImages as SimulatedImages, export_coco as export_coco, export_nnunet as export_nnunet
     from .recipe import READY as READY, Recipe as Recipe
 
 lazy_exports(globals())

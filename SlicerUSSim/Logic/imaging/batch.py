@@ -108,11 +108,16 @@ def arrays_for(
 
 def free_memory() -> float:
     """Bytes that new arrays may take, as Linux says; infinite elsewhere."""
+    return bytes_of("/proc/meminfo", "MemAvailable", np.inf)
+
+
+def bytes_of(file: str, name: str, otherwise: float) -> float:
+    """Bytes by a line of a file in which Linux tells kilobytes; `otherwise` elsewhere."""
     try:
-        with open("/proc/meminfo") as lines:
-            return 1024.0 * next(int(line.split()[1]) for line in lines if line.startswith("MemAvailable"))
+        with open(file) as lines:
+            return 1024.0 * next(int(line.split()[1]) for line in lines if line.startswith(name))
     except (OSError, StopIteration):
-        return np.inf
+        return otherwise
 
 
 def _filed(shape: tuple[int, ...], kind: type[np.generic]) -> np.ndarray:
@@ -161,6 +166,7 @@ def depth_of_pixels(probe: Probe, grid: ImageGrid) -> np.ndarray:
     return np.where(_field(probe, grid), along - probe.line_starts_mm(position), np.nan).astype(np.float32)
 
 
+@lru_cache(maxsize=4)
 def lines_of_pixels(probe: Probe, grid: ImageGrid) -> tuple[np.ndarray, np.ndarray]:
     """Probe.line_through of the centres of all pixels, (rows, columns) each."""
     (x, y), (dx, dy) = (grid.left_mm, grid.top_mm), grid.pixel_spacing_mm

@@ -23,6 +23,7 @@ import numpy as np
 from SlicerUSSim.Logic.base.settings import SimulationSettings
 from SlicerUSSim.Logic.imaging.scattering import sites_per_mm3
 from SlicerUSSim.Logic.probe.arrays import Probe
+from SlicerUSSim.Logic.probe.beam import NOMINAL_SPEED_M_S
 
 _LINES_PER_COLUMN, _APART_SIGMAS = 0.6, 1.75
 _SAMPLES_PER_BANDWIDTH, _LEAST_SAMPLES = 4.0, 2
@@ -47,6 +48,21 @@ def worked(probe: Probe, settings: SimulationSettings, columns: int) -> tuple[Pr
         beam_cutoff=min(settings.beam_cutoff, _CUTOFF),
         samples_per_cycle=int(min(settings.samples_per_cycle, samples)),
     )
+
+
+def line_shape(probe: Probe, settings: SimulationSettings) -> tuple[int, int]:
+    """(scan_lines, samples) of the signals along the lines, of what worked() gives."""
+    return probe.scan_lines, int(np.ceil(probe.displayed_mm / sample_mm(probe, settings)))
+
+
+def sample_mm(probe: Probe, settings: SimulationSettings) -> float:
+    """Millimetres between samples along the lines, with the scanner's speed of sound."""
+    return 1.0 / (settings.samples_per_cycle * cycles_per_mm(probe, settings))
+
+
+def cycles_per_mm(probe: Probe, settings: SimulationSettings) -> float:
+    """Cycles of the carrier for a millimetre along the lines, with the scanner's speed of sound."""
+    return probe.cycles_per_mm * NOMINAL_SPEED_M_S / settings.reference_speed_m_s
 
 
 @lru_cache(maxsize=64)

@@ -30,7 +30,7 @@ from SlicerUSSim.Logic.imaging.contact import line_contact
 from SlicerUSSim.Logic.imaging.frame import Echoes, Frame
 from SlicerUSSim.Logic.imaging.medium import Medium, as_labels
 from SlicerUSSim.Logic.imaging.noise import stirred
-from SlicerUSSim.Logic.imaging.quality import coarser_fans, sigmas_between, worked
+from SlicerUSSim.Logic.imaging.quality import coarser_fans, cycles_per_mm, line_shape, sample_mm, sigmas_between, worked
 from SlicerUSSim.Logic.imaging.raytracing import RayTracer
 from SlicerUSSim.Logic.imaging.scattering import cells_in_view, sites_per_mm3
 from SlicerUSSim.Logic.imaging.signals import RayTree
@@ -207,15 +207,15 @@ class UltrasoundSimulator:
             with self._timed("download", timings):
                 image = self._persisted(frame.download("image"), probe, display, frame.grid)
                 self._warn_if_overflown()
-            samples = self._sample_count(frame.probe, frame.settings)
+            samples = line_shape(frame.probe, frame.settings)[1]
             iq, envelope, bmode = (frame.on_demand(name, samples) for name in ("iq", "envelope", "grey"))
             made = Frame(
                 iq=iq,
                 envelope=envelope,
                 bmode=bmode,
                 image=image,
-                sample_interval_mm=self._sample_mm(frame.probe, frame.settings),
-                cycles_per_mm=self._cycles_per_mm(probe),
+                sample_interval_mm=sample_mm(frame.probe, frame.settings),
+                cycles_per_mm=cycles_per_mm(probe, self.settings),
                 grid=frame.grid,
                 probe_to_ras=pose,
                 timings_ms=timings,
@@ -285,7 +285,7 @@ class UltrasoundSimulator:
             for probe, shown in zip(probes, displays, strict=True)
         ]
         pixels = same_shapes([(grid.rows, grid.columns) for grid in grids])
-        lines = [self._signal_shape(*worked(*both, pixels[1])) for both in zip(probes, each, strict=True)]
+        lines = [line_shape(*worked(*both, pixels[1])) for both in zip(probes, each, strict=True)]
         has_signals = not all(OUTPUTS[name][2] for name in outputs if name in OUTPUTS)
         arrays = arrays_for(outputs, len(poses), pixels, same_shapes(lines) if has_signals else lines[0], out)
         for probe in dict.fromkeys(probes):
@@ -570,7 +570,7 @@ class UltrasoundSimulator:
 
     def _record_of(self, probe: Probe, settings: SimulationSettings) -> np.ndarray:
         """The part of the record that does not depend on the pose."""
-        medium, sample_mm = self.medium, self._sample_mm(probe, settings)
+        medium, step_mm = self.medium, sample_mm(probe, settings)
         block = CONSTANTS["BLOCK"]
         axial_sigma = self.axial_sigma_mm(probe)
         acquisition = np.zeros((), ACQUISITION)
@@ -597,7 +597,7 @@ class UltrasoundSimulator:
             acquisition["membrane_variation"] = membrane.roughness_octaves
             acquisition["membrane_octaves"] = membrane.patch_db / 6.0206
             # 2 k s of the range's deviation s: the carrier has 2 k / 2 pi cycles per millimetre of depth.
-            acquisition["membrane_phase"] = 2.0 * np.pi * self._cycles_per_mm(probe) * membrane.roughness_mm
+            acquisition["membrane_phase"] = 2.0 * np.pi * cycles_per_mm(probe, self.settings) * membrane.roughness_mm
         acquisition["linear"] = probe.is_linear
         acquisition["apex_radius_mm"] = 0.0 if probe.is_linear else probe.apex_radius_mm
         for name, value in steering_fields(probe).items():
@@ -609,13 +609,13 @@ class UltrasoundSimulator:
         acquisition["line_spacing"] = probe.line_spacing
         acquisition["frequency_mhz"] = probe.received_mhz
         acquisition["fractional_bandwidth"] = probe.received_bandwidth
-        acquisition["cycles_per_mm"] = self._cycles_per_mm(probe)
-        acquisition["sample_mm"] = sample_mm
+        acquisition["cycles_per_mm"] = cycles_per_mm(probe, self.settings)
+        acquisition["sample_mm"] = step_mm
         # The last samples of the image have echoes from half a pulse behind it. Borders are found by labels, up to a
         # voxel behind where they are.
-        behind = pulse_taps(axial_sigma / sample_mm).size // 2
-        acquisition["samples"] = -(-(self._sample_count(probe, settings) + behind) // block) * block
-        acquisition["traced_mm"] = probe.displayed_mm + behind * sample_mm + medium.labels.spacing_mm.min()
+        behind = pulse_taps(axial_sigma / step_mm).size // 2
+        acquisition["samples"] = -(-(line_shape(probe, settings)[1] + behind) // block) * block
+        acquisition["traced_mm"] = probe.displayed_mm + behind * step_mm + medium.labels.spacing_mm.min()
         acquisition["wavefront_curvature"] = CURVED if settings.wavefront_curvature else 0.0
         for name, value in transmit_fields(probe).items():
             acquisition[name] = value
@@ -641,22 +641,9 @@ class UltrasoundSimulator:
         acquisition["speckle_scale"] = (density * np.pi**1.5 * axial_sigma) ** -0.5
         return acquisition
 
-    def _cycles_per_mm(self, probe: Probe) -> float:
-        return probe.cycles_per_mm * NOMINAL_SPEED_M_S / self.settings.reference_speed_m_s
-
     def axial_sigma_mm(self, probe: Probe) -> float:
         """Standard deviation of the pulse in depth, millimetres, with the scanner's speed of sound."""
         return probe.axial_sigma_mm * self.settings.reference_speed_m_s / NOMINAL_SPEED_M_S
-
-    def _signal_shape(self, probe: Probe, settings: SimulationSettings) -> tuple[int, int]:
-        """(scan_lines, samples) of the signals along the lines."""
-        return probe.scan_lines, self._sample_count(probe, settings)
-
-    def _sample_mm(self, probe: Probe, settings: SimulationSettings) -> float:
-        return 1.0 / (settings.samples_per_cycle * self._cycles_per_mm(probe))
-
-    def _sample_count(self, probe: Probe, settings: SimulationSettings) -> int:
-        return int(np.ceil(probe.displayed_mm / self._sample_mm(probe, settings)))
 
     def warn_if_slow(self, probe: Probe) -> None:
         """Warn if an image has so many scatterers that it takes seconds.
@@ -668,7 +655,7 @@ class UltrasoundSimulator:
             return
         lateral, guard = _traced_lines_for(probe, self.settings)
         traced = (probe.scan_lines - 1) * lateral + 1 + 2 * guard
-        chunk_mm = CONSTANTS["BLOCK"] * self._sample_mm(probe, self.settings)
+        chunk_mm = CONSTANTS["BLOCK"] * sample_mm(probe, self.settings)
         cells = cells_in_view(self.settings, probe, traced, lateral, chunk_mm)
         if cells <= _MANY_CELLS:
             self._fast_for = asked_for
