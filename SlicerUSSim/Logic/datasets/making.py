@@ -28,7 +28,7 @@ EXTRA = "SlicerUSSim[datasets]"
 #: The recipe in the folder of its set
 RECIPE = "recipe.toml"
 #: A worker's memory, bytes; seconds in which a scheduler answers or is gone, and between questions
-WORKER_BYTES, _ANSWER_S, _ASKED_EVERY_S = 600e6, 4.0, 2.0
+WORKER_BYTES, _ANSWER_S, _ASKED_EVERY_S = 600e6, 6.0, 2.0
 #: In workers: a terminal sends Ctrl-C to all processes, but the one that has started them ends them
 _NO_INTERRUPTS = "import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)"
 
