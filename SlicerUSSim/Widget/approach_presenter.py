@@ -14,7 +14,7 @@ from SlicerUSSim.Logic.placement.approach import Approach
 from SlicerUSSim.Logic.placement.approach_weights import NO_ADVICE
 from SlicerUSSim.Widget.interface import PanelHost, tr as _
 from SlicerUSSim.Widget.placement_presenter import PlacementPresenter
-from SlicerUSSim.Widget.tracked_presenter import is_face
+from SlicerUSSim.Widget.tracked_presenter import FACE
 
 
 class ApproachPresenter:
@@ -112,7 +112,7 @@ class ApproachPresenter:
     def _keep(self) -> None:
         plan, parameters = self.found, self._panel.parameters
         probe: Any = parameters.probe_transform
-        if plan is None or probe is None or not parameters.panel.keep_in_opening or is_face(probe):
+        if plan is None or probe is None or not parameters.panel.keep_in_opening or probe.GetName() == FACE:
             return
         self.probe.watch(None)  # the next change is none of the user
         set_node_to_world(probe, plan.in_opening(self._panel.preset.probe, probe_pose(probe), self._rim()))

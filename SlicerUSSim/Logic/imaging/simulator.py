@@ -320,6 +320,23 @@ class UltrasoundSimulator:
         self._warn_if_overflown(len(poses))
         return arrays
 
+    def render(
+        self,
+        probe: Probe,
+        pose: np.ndarray,
+        display: DisplaySettings,
+        grid: ImageGrid,
+        timings: dict[str, float] | None = None,
+        *,
+        noise_seed: int = 0,
+    ) -> Buffer:
+        """Enqueue all stages of one frame; returns the device buffer of its image, which the next frame overwrites.
+
+        If only the display, the noise or the pixels have changed since the last frame, its echoes are reused.
+        """
+        with self._lock:
+            return self._rendered(probe, pose, display, grid, {} if timings is None else timings, noise_seed).image
+
     def redisplay(
         self, echoes: Echoes, probe: Probe, settings: SimulationSettings, display: DisplaySettings, noise_seed: int = 0
     ) -> np.ndarray:
