@@ -231,7 +231,7 @@ class USSimWidget(ScriptedLoadableModuleWidget, VTKObservationMixin):
         self.initializeParameterNode()
 
     def exit(self) -> None:
-        """Called each time the user opens another module; live update goes on, the user's layout comes back."""
+        """Called each time the user opens another module; live update continues, the user's layout comes back."""
         self.setParameterNode(None)
         if self.panel is not None:
             self.panel.restoreLayout()

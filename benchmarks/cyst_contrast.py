@@ -38,7 +38,7 @@ def contrast_db(probe: Probe, depth_mm: float, device: str | None) -> float:
     labels = Volume(np.where(x**2 + y**2 + z**2 < RADIUS_MM**2, 2, 1).astype(np.uint8), matrix)
     tissue = replace(BACKGROUND, attenuation_db_cm_mhz=0.0)
     cyst = replace(tissue, name="cyst", mu0=0.0, sigma0=0.0)
-    tissues = TissueTable({0: tissue, 1: tissue, 2: cyst})  # the tissue goes on around the volume
+    tissues = TissueTable({0: tissue, 1: tissue, 2: cyst})  # the tissue continues around the volume
     apart = float(probe.line_distance_mm(depth_mm))
     middle, near = probe.scan_lines // 2, max(round(1.0 / apart), 1)
     aside = min(round(9.0 / apart), middle - near - 1)

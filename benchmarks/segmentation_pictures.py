@@ -2,7 +2,7 @@
 
     python -m benchmarks.segmentation_pictures docs/images [mni152 colin27 remind022 plane]
 
-Colin27 needs Debian's mricron-data, and ReMIND-022 and the sweep need ../shared; what is not there is left out. Brain
+Colin27 needs Debian's mricron-data, and ReMIND-022 and the sweep need ../shared; missing data are left out. Brain
 extraction takes up to 90 s per head; its masks are kept in --keep.
 """
 

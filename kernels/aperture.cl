@@ -17,9 +17,9 @@
 // line][depth]: the nepers of them that strong tissue takes; those that it takes right behind its last end between the
 // depth before and this one; those that soft tissue has taken from what arrives, on the mean; and the distance from
 // that end in mm, NO_END if there is none, negative in strong tissue. spreads float2 [screen line][depth]: width of the
-// beam and a factor of its echoes, both re an undisturbed one; beams float4 [traced line][1 + depth] as screens,
-// followed by float4 [traced line][1 + depth] as shades, but that the last is 1, -1 where the beam is in strong tissue,
-// and -2 where that does not end between this depth and the one before.
+// beam and a factor of its echoes, both relative to an undisturbed one; beams float4 [traced line][1 + depth] as
+// screens, followed by float4 [traced line][1 + depth] as shades, but that the last is 1, -1 where the beam is in
+// strong tissue, and -2 where that does not end between this depth and the one before.
 
 #include "common.clh"
 
@@ -631,7 +631,7 @@ __kernel void screens(Frame frame, __global const float *sums, int with_level, i
     const float depth = all_soft ? path : depth_outside(frame, sums, path, axis);
     is_inside = depth < path;
     if (depth != path) find_lines(frame, sums, depth, axis, &lines);
-    if (is_inside) {  // and goes on as before it: within bone, the lines that are left say nothing of a direction
+    if (is_inside) {  // and continues as before it: within bone, the remaining lines do not show a direction
       const Means before = means_over(frame, &lines, depth);
       slope = before.slope;
       rise = before.rise * path / depth;

@@ -62,8 +62,8 @@ inline float part_carried(float least, float phase, float most, float flat) {
   return part + flat * (1.0f - part) * (1.0f - 1.0f / sqrt(1.0f + share * share));
 }
 
-// The echo of a plane of this tilt re a square one, as an exponent of two, along one `axis` of the aperture's table
-// (diffraction.py); nan where there is none.
+// The echo of a plane of this tilt relative to a square one, as an exponent of two, along one `axis` of the aperture's
+// table (diffraction.py); nan where there is none.
 inline float plane_of_aperture(Frame frame, __global const float *planes, float path, float tilt, int axis) {
   const float deep = clamp(path * ((PLANE_DEPTHS - 1) / frame->depth_mm), 0.0f, PLANE_DEPTHS - 1.001f);
   const float place = clamp(sqrt(fabs(tilt)) * (PLANE_TILTS - 1), 0.0f, PLANE_TILTS - 1.001f);

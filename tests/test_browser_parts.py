@@ -312,7 +312,7 @@ def test_only_the_image_that_shows_a_movement_tells_its_latency():
     stamps = LatencyStamps()
     stamps.receive("page", 1.0)
     stamps.image_begun()
-    assert stamps.computed is None  # of before the movement
+    assert stamps.computed is None  # from before the movement
     stamps.probe_moved()
     stamps.image_begun()
     assert stamps.computed == ("page", 1.0)

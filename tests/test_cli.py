@@ -155,7 +155,7 @@ def bad_inputs(folder):
         ([*simulate, "auto", "--probe", folder / "probe.json"], "width_mm is -4"),
         (
             [*simulate, "auto", "--probe", "neonatel"],
-            f"which is no file, expected a JSON file or one of {', '.join(PROBES)}",
+            f"which does not exist, expected a JSON file or one of {', '.join(PROBES)}",
         ),
         ([*simulate, "auto", "--device", "abacus"], "no OpenCL device fits 'abacus'"),
         ([*simulate, "auto", "--seed", -1], "seed is -1"),
@@ -201,7 +201,7 @@ def test_no_command_replaces_a_file_that_it_reads(command, labels, tmp_path):
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="pipes have no names here")
 def test_pipes_and_devices_are_no_outputs_and_endless_inputs_are_refused(labels, tmp_path):
-    """Both waited for ever, or filled the memory."""
+    """Both waited forever, or filled the memory."""
     for name in ("o.png", "o.nii.gz", "o.mha"):
         os.mkfifo(tmp_path / name)
         result = ussim("simulate", labels, "--pose", "auto", "-o", tmp_path / name)

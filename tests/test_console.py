@@ -189,7 +189,7 @@ def test_the_grey_maps_of_two_scanners_are_those_found_by_trial():
     found = np.array([phantom.at(grey) for grey in greys])
     np.testing.assert_allclose(found, (0.18, 0.36, 0.55, 0.71, 0.91, 0.95, 0.98, 0.87), atol=0.19)
     if not (SHARED / "brain_sweep").is_dir():
-        pytest.skip("the real sweep is not there")
+        pytest.skip("the real sweep is missing")
     from SlicerUSSim.Logic.base.files import read_json
 
     probe = probe_from_dict(read_json(SHARED / "brain_sweep" / "probe.json"), "probe")

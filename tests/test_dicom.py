@@ -188,7 +188,7 @@ def test_frames_of_two_stacks_are_refused(tmp_path):
 
 
 def test_what_is_in_a_folder_beside_a_series_does_not_change_it(tmp_path, caplog):
-    """Reports, a directory of the disk, and what cannot be read, which may be an image and is told."""
+    """Reports, a directory of the disk, and what cannot be read, which may be an image and triggers a warning."""
     save(tmp_path, images())
     state = images()[0]
     del state.Rows, state.PixelData

@@ -197,7 +197,7 @@ def test_a_narrow_gap_is_closed_and_a_wide_one_stays():
 
 
 def test_a_falx_does_not_hang_in_the_saline_of_an_opening():
-    """It goes on above the hull of the brain, into the sinus, which is not there without the head."""
+    """It continues above the hull of the brain into the sinus, which is absent without the head."""
     labels = block(lambda x, y, z: (y > 0.0) & (np.abs(x) > 0.6), half_mm=(20, 20, 20))  # a fissure below coupling
     y, z = (grid.ravel() for grid in np.meshgrid(np.arange(-12.0, 12.0, 0.8), np.arange(-12.0, 12.0, 0.8)))
     place = np.stack([np.zeros_like(y), y, z], axis=1)

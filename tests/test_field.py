@@ -300,14 +300,14 @@ def letters(shape: tuple[int, int], row: int, column: int, height: int) -> np.nd
 def test_images_that_cannot_tell_what_is_drawn_are_said(caplog):
     few = recording(CONVEX, 3)
     TrackedImages.of(few, probe=CONVEX)
-    assert "marks in the images could not be looked for: 3 different images, expected at least 4" in caplog.text
+    assert "marks in the images could not be detected: 3 different images, expected at least 4" in caplog.text
     caplog.clear()
     still = few.images[[0] * 6] + np.arange(6, dtype=np.uint8)[:, None, None] * (few.images[0] > 0)
     TrackedImages.of(few.with_images([0] * 6, still.astype(np.uint8)), probe=CONVEX)
     assert "changes by at most 5 grey levels, expected 20 or more" in caplog.text
     caplog.clear()
     TrackedImages.of(replace(few, fields={"SlicerUSSimSimulated": "twin 1"}), probe=CONVEX)
-    assert "could not be looked for" not in caplog.text
+    assert "could not be detected" not in caplog.text
 
 
 def test_pixels_of_another_size_are_named():
@@ -370,7 +370,7 @@ def test_colours_are_left_out_and_said(tmp_path, caplog):
     read = in_colours(tmp_path / "colour.mha", sequence, array)
     assert read.coloured is not None and read.coloured.sum() == 600
     found = TrackedImages.of(read, probe=CONVEX)
-    assert "have colours, as of Doppler or markers: left out" in caplog.text
+    assert "have colours, such as Doppler or markers: left out" in caplog.text
     assert not found.field.mask[flow].any()
     sequence.write(tmp_path / "grey.mha")
     assert TrackedSequence.read(tmp_path / "grey.mha").coloured is None
@@ -385,7 +385,7 @@ def test_a_mirroring_calibration_is_said(caplog):
 
 
 def test_an_image_of_one_grey_level_is_refused_with_its_number():
-    """White images were fitted, with costs and textures that were no numbers."""
+    """White images were fitted, with costs and textures that were NaN."""
     sequence = recording(CONVEX, 2)
     images = sequence.images.copy()
     images[1] = 255

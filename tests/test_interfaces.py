@@ -204,7 +204,7 @@ def test_a_plane_nearly_across_a_diagonal_of_the_voxels_keeps_its_level():
 
 @pytest.mark.parametrize(("rays", "angle_deg"), [(1, 4.0), (2, 9.0), (3, 20.0), (32, 9.0)])
 def test_few_elevational_rays_see_a_plane_as_many_do(rays, angle_deg):
-    """A plane oblique out of the image. With one or two rays it was too bright, or its lines were no numbers."""
+    """A plane oblique out of the image. With one or two rays it was too bright, or its lines were NaN."""
     slope = np.tan(np.radians(angle_deg))
     wall = block(lambda x, y, z: y > slope * z, half_mm=(16, 12, 16), spacing_mm=0.5)
     probe, hard = replace(PROBE, width_mm=16.0, depth_mm=35.0, scan_lines=65), Tissue("wall", 1540.0, 1.8, 0.0)

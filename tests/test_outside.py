@@ -115,7 +115,7 @@ def test_the_commands_label_what_is_outside_the_brain(tmp_path):
         ([out, "--outside"], "is a label map, and --outside is for an MRI"),
         (
             [image, "--skull-strip", "none", "--outside"],
-            "(--outside) is not known without it, and --skull-strip is none",
+            "--outside needs the brain, which --skull-strip none does not find",
         ),
         (
             [image, "--mask", mask, "--contrast", "t2", "--outside"],

@@ -42,7 +42,7 @@ def test_a_pose_is_read_as_it_was_written_in_every_format(suffix, tmp_path):
 @pytest.mark.parametrize("suffix", [".txt", ".mat"])
 @pytest.mark.parametrize("kind", ["double", "float"])
 def test_transforms_of_c3d_and_ants_are_read(suffix, kind, tmp_path):
-    """SimpleITK shows their class as a chain of itself, in which reading did not end."""
+    """SimpleITK shows their class as a chain with itself, in which reading did not end."""
     path, name = tmp_path / f"pose{suffix}", f"MatrixOffsetTransformBase_{kind}_3_3"
     pose = pose_of_angles([10.0, -20.0, 30.0], [11.0, 22.0, 33.0])
     to_probe = np.linalg.inv(LPS_TO_RAS @ pose @ LPS_TO_RAS)[:3]

@@ -102,7 +102,7 @@ def test_the_tissues_of_another_patient_in_the_scene_stay(presenter):
     presenter.segmenting.segment()
     assert not presenter.view.errors and parameters.labels is not first and parameters.lesions is None
     assert parameters.labels.GetName() == "Other tissues" and content_of(first) == content
-    assert "'Head tissues' is of another MRI, and is kept" in presenter.notes.text()
+    assert "'Head tissues' belongs to another MRI, and is kept" in presenter.notes.text()
     assert "'Lesions' was chosen for another MRI and was not used" in presenter.notes.text()
 
 
@@ -256,7 +256,7 @@ def test_every_probe_preset_is_offered_by_a_readable_name(presenter):
             assert presenter.values.probeName() == CUSTOM_PROBE
             presenter.values.chooseProbe(spelling)
             assert presenter.logic.preset.probe == probe and presenter.values.probeName() == shown
-            presenter.values.chooseProbe(CUSTOM_PROBE)  # back to that of before
+            presenter.values.chooseProbe(CUSTOM_PROBE)  # back to the previous one
             assert presenter.values.probeName() == CUSTOM_PROBE and presenter.logic.preset.probe.depth_mm == 77.0
     assert not presenter.view.errors
 

@@ -119,7 +119,7 @@ def test_a_folder_is_not_trusted_in_other_threads_too(sent):
         (crashes, r"cannot be read \(the library that reads it crashed: SIGSEGV\)"),
         (fills_the_memory, r"cannot be read \(it needs more memory than there is\)"),
         (raises, r"cannot be read \(KeyError: 'no such tag'\)"),
-        (returns_a_call, r"cannot be read \(its reader gave no answer: posix.mkdir is no value"),
+        (returns_a_call, r"cannot be read \(its reader gave no answer: posix.mkdir is not a value"),
     ],
 )
 def test_what_ends_or_deceives_a_reader_is_one_line(sent, read, words):

@@ -272,7 +272,7 @@ def test_real_images_keep_their_probe_and_registration():
     again = TrackedImages.of(record.sequence, reference_to_ras=record.to_ras, field=record.field)
     assert again.probe == tracked.probe and np.array_equal(again.mask, tracked.mask) and again.grid == tracked.grid
     np.testing.assert_allclose(again.poses, tracked.poses, atol=1e-9)
-    # A scene of before has neither, and is where it was all the same
+    # An older scene has neither, and is nevertheless where it was
     node.SetAttribute("SlicerUSSim.field", None)
     record = required(record_scene(logic.scene).sequence, "no sequence")
     assert record.field is None and record.to_ras is None

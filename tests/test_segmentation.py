@@ -346,7 +346,7 @@ def test_white_matter_of_a_part_of_a_brain_is_no_bias_field(part, bias, least):
     assert found.atlas is None
     names = dict(enumerate(found.tissue_names, start=1))
     assert scores(found.labels.array, names, case)["grey and white"] >= least
-    assert any(("left as it is" if not bias else "removed by a polynomial") in line for line in found.notes)
+    assert any(("not removed" if not bias else "removed by a polynomial") in line for line in found.notes)
     if bias:
         tissue = case.truth.array > 1
         true = np.log(case.bias[tissue])

@@ -316,7 +316,7 @@ def test_a_damaged_field_is_one_clear_error(tmp_path, change, message):
 @pytest.mark.parametrize("name", ["missing.mha", "empty.mha", "text.nrrd", "text.mha"])
 def test_a_file_that_is_none_is_one_clear_error(tmp_path, name):
     if "missing" not in name:
-        (tmp_path / name).write_text("" if "empty" in name else "this is no image\n")
+        (tmp_path / name).write_text("" if "empty" in name else "this is not an image\n")
     with pytest.raises(SimulationError, match=name) as caught:
         TrackedSequence.read(tmp_path / name)
     assert "\n" not in str(caught.value)

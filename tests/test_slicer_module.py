@@ -1133,7 +1133,7 @@ def test_selectors_offer_only_what_fits(session):
 
 @pytest.mark.slow
 def test_deleting_the_live_output_takes_no_other_volume(session):
-    """Slicer's selector goes on to the next node: live images were then written into the FLAIR of the patient."""
+    """Slicer's selector chooses the next node: live images were then written into the FLAIR of the patient."""
     session.segmented()
     session.ui.liveCheckBox.setChecked(True)
     own = session.add("ScalarVolume", "another image of this module")

@@ -39,11 +39,11 @@ SEQUENCE = TrackedSequence(np.full((2, 8, 9), 3, np.uint8), ({"ImageToReference"
 @pytest.mark.parametrize(
     ("name", "words"),
     [
-        ("../mri.nii.gz", "is no plain file name"),
-        ("/etc/cron.d/x", "is no plain file name"),
-        ("a\\b.nii", "is no plain file name"),
-        ("a\0.nii", "is no plain file name"),
-        ("", "is no plain file name"),
+        ("../mri.nii.gz", "is not a plain file name"),
+        ("/etc/cron.d/x", "is not a plain file name"),
+        ("a\\b.nii", "is not a plain file name"),
+        ("a\0.nii", "is not a plain file name"),
+        ("", "is not a plain file name"),
         ("x" * 300 + ".nii", "its name has 304 bytes, expected at most 200"),
     ],
 )
@@ -178,7 +178,7 @@ def test_a_table_of_nothing_is_one_line(patient, tmp_path, names):
 
 
 def test_a_label_map_and_a_preset_are_told_apart(patient, tmp_path):
-    """A preset is no table of the labels that are opened with it."""
+    """A preset is not a table of the labels that are opened with it."""
     Preset().write(tmp_path / "preset.json")
     patient.labels.write(tmp_path / "a.nii.gz")
     files, wrong = opener()[0].recognised(sorted(tmp_path.iterdir()))

@@ -191,7 +191,7 @@ def test_a_rotation_that_is_none_is_refused():
 )
 def test_phantoms_echo_from_where_they_say(make):
     phantom = make(ORIENTATIONS["oblique"])
-    # Only the bar echoes by its scatterers; a bright grain beside another object is no error.
+    # Only the bar echoes by its scatterers; a bright grain beside another object is not an error.
     is_bar = phantom.name == "thin rod"
     chosen = SimulationSettings(scatterers_per_mm3=300.0, reflections=False, scattering=is_bar)
     simulator = UltrasoundSimulator(phantom.labels, phantom.tissues, chosen)

@@ -353,7 +353,7 @@ def test_a_file_that_does_not_fit_on_the_disk_leaves_the_one_before(tmp_path):
     """Of a NIfTI file ITK did not say so: the file before was replaced by an empty one."""
     names = ["v.mha", "v.nii", "v.nii.gz", "v.nrrd", "v.vti"]
     done = subprocess.run([sys.executable, "-c", _FULL, *names], cwd=tmp_path, capture_output=True, text=True)
-    assert done.returncode == 0 and done.stderr == ""  # ITK and VTK told of it in words of their own
+    assert done.returncode == 0 and done.stderr == ""  # ITK and VTK reported it in their own words
     assert sorted(file.name for file in tmp_path.iterdir()) == names
     for name in names:
         assert done.stdout.count(f"{name}: cannot be written") == 2, done.stdout

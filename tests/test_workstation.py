@@ -43,7 +43,7 @@ FLAGS = [
 ]  # fmt: skip
 #: A state that has not come after so long never will, however busy the machine is.
 PATIENCE_S = 180
-#: Trame's own messages that a page could not send since it was left are no faults of the page.
+#: Trame's own messages that a page could not send since it was left are not faults of the page.
 LEAVING = """addEventListener("beforeunload", () =>
   addEventListener("unhandledrejection", rejection => rejection.preventDefault()));"""
 POSE = ("right_deg", "front_deg", "rotate_deg", "rock_deg", "tilt_deg", "lift_mm")
@@ -796,7 +796,7 @@ def test_a_click_grows_a_lesion_that_is_added_to_the_tissues(browser, tmp_path):
 
 def test_a_file_that_cannot_be_read_is_said_and_changes_nothing(page):
     before = state(page, NAMES.title), shown(page, "kindComboBox"), shown(page, "mriSelector")
-    broken = {"name": "broken.nii.gz", "mimeType": "application/octet-stream", "buffer": b"this is no image"}
+    broken = {"name": "broken.nii.gz", "mimeType": "application/octet-stream", "buffer": b"this is not an image"}
     page.set_input_files("#open-file", broken)
     text = shown_errors(page)
     assert "broken.nii.gz: " in text and "/tmp" not in text and "Traceback" not in text

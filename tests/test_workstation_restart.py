@@ -1,4 +1,4 @@
-"""A server that is started again offers pose and settings of before; what was made on the page is saved as a scene."""
+"""A server that is started again offers the last pose and settings; what the page made is saved as a scene."""
 
 from __future__ import annotations
 
@@ -79,11 +79,11 @@ def test_pose_and_settings_are_offered_after_a_crash_and_restored(start, browser
     server.kill()
     page.locator("#connection-lost").wait_for()
     page.close()
-    # Another patient is open: that of before is opened by his file, and nothing is restored unasked
+    # Another patient is open: the last one is opened from his file, and nothing is restored unasked
     page = opened(browser, served("--labels", files / "labels.nii.gz").url)
     page.locator("#offer").wait_for()
     text = page.locator("#offer-text").inner_text()
-    assert text.startswith("Go on with head.nii.gz as at ") and shown(page, "gainSlider") != 7
+    assert text.startswith("Continue with head.nii.gz as at ") and shown(page, "gainSlider") != 7
     assert json.loads(file.read_text()) == found  # until the offer is answered
     click(page, "#restore")
     answer_new_patient(page)

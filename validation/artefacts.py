@@ -161,7 +161,7 @@ def reverberation(rotation: np.ndarray, device) -> Outcome:
             for n in range(1, len(echoes)):
                 apart = echoes[n].shown_mm[1] - echoes[n - 1].shown_mm[1]
                 fall = echoes[n].level_db - echoes[n - 1].level_db
-                with np.errstate(divide="ignore"):  # an echo that is not there at all is a finding too
+                with np.errstate(divide="ignore"):  # a missing echo is a finding too
                     found_fall = 20.0 * np.log10(found[n][2] / found[n - 1][2])
                 where = f"{echoes[n].name}, {name}, {spacing:g} mm"
                 rows += [

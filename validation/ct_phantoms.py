@@ -62,7 +62,7 @@ class CtPhantom:
     ct: Volume
     #: uint8, labels of NAMES from 1; 0 outside the patient
     truth: Volume
-    #: int16, label map in TotalSegmentator's numbers of what it knows of this phantom
+    #: int16, label map in TotalSegmentator's numbers of what it labels in this phantom
     organs: Volume
 
 

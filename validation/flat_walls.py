@@ -286,7 +286,7 @@ def _cut(phantom: Phantom, from_end: int) -> tuple[Volume, TissueTable]:
     kept[2 - axis] = slice(first, None)
     matrix = labels.ijk_to_ras.copy()
     matrix[:3, 3] += first * matrix[:3, axis]
-    # The fluid goes on beyond the end.
+    # The fluid continues beyond the end.
     return Volume(np.ascontiguousarray(labels.array[tuple(kept)]), matrix), TissueTable({**phantom.tissues, 0: FLUID})
 
 

@@ -77,7 +77,7 @@ Table: TypeAlias = tuple[str, list[str], list[list[str]]]
 _MOST_IMAGES = 6
 #: Names of the sources that are always there
 REAL, BLURRED, LEVELLED = "real", "real, blurred", "uniform, real level"
-#: Between which the gain of the uniform control is looked for
+#: Bounds of the gain of the uniform control
 _GAINS_DB = -80.0, 80.0
 _CONTROLS = (REAL, NEIGHBOURS, BLURRED, UNIFORM, LEVELLED)
 #: Sigma of the blurred control, pixels

@@ -121,7 +121,7 @@ def coherent_part(rotation: np.ndarray, device) -> Outcome:
 def _diffuse_rows(phantom: Phantom, tissues: TissueTable, device) -> list[Row]:
     """Of a border with a membrane whose scatterers echo: what is the same for all seeds and lines is its coherent part.
 
-    The rest, whose mean is none, does not depend on the height of the surface.
+    The rest has mean 0 and does not depend on the height of the surface.
     """
     probe = replace(_FULL_WAVE_PROBE, frequency_mhz=5.0)
     rows, smooth = [], np.zeros(2)

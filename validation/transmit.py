@@ -165,7 +165,7 @@ def _level_of_elements_db(probe: Probe, sines: np.ndarray) -> float:
 
 
 def harmonic(rotation: np.ndarray, device) -> Outcome:
-    """Width of a wire re the fundamental, frequency, and level against depth in the quasi-linear solution."""
+    """Width of a wire relative to the fundamental, frequency, and level against depth in the quasi-linear solution."""
     simulator, phantom = _wires(rotation, device)
     tissue = uniform_speckle(SPECKLE, rotation)
     speckle = [

@@ -41,7 +41,7 @@ _FULL_WAVE_PROBE = LinearProbe(36.0, 40.0, scan_lines=145, focus_mm=_DEPTH_MM, a
 
 def _wall(rotation: np.ndarray, device, depth_mm: float = _DEPTH_MM) -> tuple[UltrasoundSimulator, Phantom]:
     phantom = layered([FLUID, BEHIND], [depth_mm], rotation, spacing_mm=0.15, half_width_mm=12.0)
-    # The fluid goes on around the phantom, which is narrower than some apertures.
+    # The fluid continues around the phantom, which is narrower than some apertures.
     tissues = TissueTable({**phantom.tissues, 0: FLUID})
     return UltrasoundSimulator(phantom.labels, tissues, _SETTINGS, device), phantom
 

@@ -44,9 +44,9 @@ def dataset(
     ctx: click.Context, recipe: str, out: Path, scheduler: str | None, workers: int | None, export: str | None,
     device: str | None,
 ) -> None:  # fmt: skip
-    """Make many labelled images from a recipe, a TOML file or the name of one that comes with the package.
+    """Make many labelled images from a recipe, a TOML file or the name of one in the package.
 
-    Image n is the same whoever makes it. The same command goes on with a set that was interrupted. The exit status is 1
+    Image n is the same whoever makes it. The same command resumes an interrupted set. The exit status is 1
     if a patient was left out.
     """
     from SlicerUSSim.Logic.datasets import Recipe, export_coco, export_nnunet, make_dataset

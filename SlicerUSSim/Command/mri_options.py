@@ -146,7 +146,7 @@ def require_no_map(path: str, maps: Iterable[str], organs: str | None) -> None:
 def segmented_file(
     path: str, mri: Volume, patient: MriOptions, *, tell_all: bool = False, is_file: bool = True
 ) -> Segmentation | CtSegmentation:
-    """Segment the MRI or CT of a file; the brain mask of an MRI is kept beside it, unless it is none (`is_file`).
+    """Segment the MRI or CT of a file; the brain mask of an MRI is kept beside it if the MRI is a file (`is_file`).
 
     Says how the brain was found, with `tell_all` also what else; what should be checked is logged as warnings.
     """

@@ -136,7 +136,7 @@ def named_probe(name_or_path: str) -> Probe:
     if name_or_path in PROBES:
         return PROBES[name_or_path]
     place = Path(name_or_path)
-    wrong = f"--probe is {name_or_path!r}, which is no file, expected a JSON file or one of {', '.join(PROBES)}"
+    wrong = f"--probe is {name_or_path!r}, which does not exist, expected a JSON file or one of {', '.join(PROBES)}"
     require(place.exists() or bool(place.suffix) or os.path.dirname(name_or_path) != "", wrong)
     return probe_from_dict(read_json(name_or_path), name_or_path)
 
@@ -352,7 +352,7 @@ def _labelled(
     found = read_label_file(
         Path(patient.mri_or_labels), volume, mapping, table=table, preset=given, default=preset
     )  # fmt: skip
-    if found.has_own_table:  # as `ussim segment` wrote it: nothing to be said
+    if found.has_own_table:  # as `ussim segment` wrote it: nothing to report
         log.info("%s: %s", patient.mri_or_labels, found.message)
     else:
         note(f"{patient.mri_or_labels}: {found.message}")

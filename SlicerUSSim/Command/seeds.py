@@ -30,7 +30,7 @@ def split_seeds(texts: Iterable[str]) -> list[tuple[tuple[float, ...], str | Non
     """[((R, A, S) mm, tissue)] of the values of --seed, one for each point; None for the tissue: by its look.
 
     Raises SimulationError for a value that is not R,A,S or a file of points, without or with =TISSUE, and for a tissue
-    that is no lesion.
+    that is not a lesion.
     """
     seeds = []
     for text in texts:
@@ -98,7 +98,7 @@ def require_none_refused(refused: Iterable[str], labels_path: Path) -> None:
 def write_lesions(lesions: Iterable[GrownLesion], labels_path: Path) -> None:
     """Write the masks of lesions beside the labels, and say what they are and how to apply them.
 
-    Those of an earlier run that stay beside the labels are named.
+    A warning lists files of an earlier run that stay beside the labels.
     """
     from SlicerUSSim.Logic.mri.lesions.grown_lesion import grown_beside
 

@@ -37,7 +37,7 @@ class FitPresenter:
         self.following: Callable[[Progress], None] = lambda step: None
 
     def forget(self) -> None:
-        """Forget the last fit, which is of another patient."""
+        """Forget the last fit, which belongs to another patient."""
         self._fit = self._before = None
         self.summary = ""
 

@@ -16,7 +16,7 @@ from SlicerUSSim.Widget.interface import PanelHost, tr as _
 from SlicerUSSim.Widget.notes import Notes
 from SlicerUSSim.Widget.placement_presenter import PlacementPresenter
 
-#: What is said of an image that does not follow the probe any more
+#: State of an image that no longer follows the probe
 FROZEN = "FROZEN"
 
 

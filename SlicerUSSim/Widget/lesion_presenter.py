@@ -20,7 +20,7 @@ class LesionPresenter:
         self.forget()
 
     def forget(self) -> None:
-        """Forget the lesion that was grown last, which is of another patient."""
+        """Forget the lesion that was grown last, which belongs to another patient."""
         self._grown: tuple[Any, list[str]] = (None, [])  # node and IDs of the segments
 
     def canAddTissues(self) -> tuple[bool, str]:

@@ -67,7 +67,7 @@ class SegmentPresenter:
         self.forget()
 
     def forget(self) -> None:
-        """Forget the last Segment, which is of another patient."""
+        """Forget the last Segment, which belongs to another patient."""
         self._last: _LastSegment | None = None
         self._mri: Any = None  # as it was chosen when followMri was called last
 
@@ -150,7 +150,7 @@ class SegmentPresenter:
         panel.parameters.labels = node
         self._notes.replaceByLogic(source, node)
         if kept is not None:
-            why = "is of another MRI" if is_of_other else "was not made by Segment, or edited since"
+            why = "belongs to another MRI" if is_of_other else "was not made by Segment, or edited since"
             self._notes.add(f"{kept!r} {why}, and is kept; the result is {node.GetName()!r}")
 
     # ---- undo --------------------------------------------------------------------------------------------------

@@ -38,7 +38,7 @@ def is_loopback(host: str) -> bool:
 
 
 def tls_context(certificate: str, key: str) -> ssl.SSLContext:
-    """The TLS of a server. Raises SimulationError for files that are no certificate with its key (both PEM)."""
+    """The TLS of a server. Raises SimulationError for files other than a certificate and its key (both PEM)."""
     for path in (certificate, key):
         require(Path(path).is_file(), f"{path}: no such file")
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)

@@ -48,7 +48,7 @@ class _Work:
     task: greenlet
     percent: int = 0
     began: float = field(default_factory=perf_counter)
-    #: Of this work alone: what is abandoned goes on to hear of it
+    #: Of this work alone: abandoned work still sees it
     is_cancelled: threading.Event = field(default_factory=threading.Event)
 
 

@@ -49,7 +49,7 @@ class Comparison:
         self._playing: asyncio.Task | None = None
         self._waiting: tuple[RealImages, int, np.ndarray, ImageGrid] | None = None  # to be compared
         self._comparing: asyncio.Task | None = None
-        self._era = 0  # changes when a similarity of before must not be shown any more
+        self._era = 0  # changes when the previous similarity must no longer be shown
         #: For display next to the simulated image, and over it; and the best image of a fit that runs
         self.streams = (ImageStream("real"), ImageStream("real-over"), ImageStream("best"))
         self._best = (inf, 0.0)  # its cost, and when it was sent
@@ -170,7 +170,7 @@ class Comparison:
             now.sequence.similarity = ""
 
     def drop(self) -> None:
-        """Forget the sequence, which is of another patient."""
+        """Forget the sequence, which belongs to another patient."""
         self.stop()
         self._real = self._browser = None
         self.sees_nothing(None)

@@ -100,12 +100,12 @@ class KeptState:
             saved = datetime.fromisoformat(kept.saved).astimezone()
             is_today = saved.date() == saved.now(saved.tzinfo).date()
             when = f"{saved:%H:%M}" if is_today else f"{saved:%d %B, %H:%M}"
-            text = f"Go on with {kept.patient} as at {when} (pose and settings)?"
+            text = f"Continue with {kept.patient} as at {when} (pose and settings)?"
         with self._panel.shared.changing() as now:
             now.offer = text
 
     def restore(self) -> None:
-        """Take pose and settings of before, on the patient of that name, whose files are opened if he is not."""
+        """Take the kept pose and settings, on the patient of that name, whose files are opened if he is not."""
         kept = self._offered
         if kept is None:
             return

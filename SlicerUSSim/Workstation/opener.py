@@ -142,7 +142,7 @@ class Opener:
     def recognised(self, paths: Sequence[Path]) -> tuple[list[_File], list[str]]:
         """(what files are, in the order in which they can be opened; lines about those that cannot).
 
-        Label maps come with the tables of their labels. Raises SimulationError if there is nothing to open.
+        Label maps include the tables of their labels. Raises SimulationError if there is nothing to open.
         """
         found: dict[Path, Content] = {}
         wrong: list[str] = []
@@ -351,7 +351,7 @@ class Opener:
         preset = self._tasks.doAside(lambda: Preset.read(file.path))
         self._presenter.values.takePreset(preset)
         moves = "" if preset.probe_to_ras is None else "; the probe is moved to its pose"
-        return f"in place of the settings of before{moves}"
+        return f"in place of the previous settings{moves}"
 
     def _pose(self, file: _File, together: list[_File]) -> str:
         self._poses.set(self._tasks.doAside(lambda: read_pose(file.path)))

@@ -94,7 +94,7 @@ class OpenPatient:
 
     @property
     def is_of_user(self) -> bool:
-        """Whether a patient is open, other than the demo brain as it is."""
+        """Whether a patient is open, other than the unchanged demo brain."""
         parameters: Any = self._logic.parameters
         is_demo = parameters.mri is not None and parameters.mri.GetAttribute(FILE) == ""
         mine = (parameters.lesions, parameters.mask, parameters.second_mri)
@@ -137,7 +137,7 @@ class OpenPatient:
         return not then_segment or self.segment()
 
     def show_image(self, node: Any) -> None:
-        """Take the MRI or CT of a patient of whom only labels are open."""
+        """Take the MRI or CT of a patient whose labels alone are open."""
         self._logic.parameters.mri = node
         self._views.show_volume(node)
 

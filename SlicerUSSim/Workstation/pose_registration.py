@@ -73,7 +73,7 @@ class Registration:
         self._tell()
 
     def forget(self) -> None:
-        """Forget the recording, which is of another patient; its nodes are removed with him."""
+        """Forget the recording, which belongs to another patient; its nodes are removed with him."""
         self.recording, self._calibration, self._to_ras = None, {}, np.eye(4)
         self.nodes, self._field = [], None
         self._from = {_CALIBRATION: "", _REGISTRATION: ""}
@@ -146,7 +146,7 @@ class Registration:
             if node.GetScene() is not None:
                 node.GetScene().RemoveNode(node)
         if made is not None and self._logic.scene.GetFirstNodeByName(recording.name) is None:
-            made[2].SetName(recording.name)  # which its nodes of before had, and scenes give back
+            made[2].SetName(recording.name)  # the name of its previous nodes, which scenes restore
 
     def _choose_poses(self, browser: Any, old: list[Any]) -> None:
         """Let Simulate sequence use the poses of the images, instead of those before, or of none."""

@@ -1,4 +1,4 @@
-"""Transfer: files from and to pages over HTTP, piece by piece: images, keys and Cancel go on meanwhile.
+"""Transfer: files from and to pages over HTTP, piece by piece: images, keys and Cancel continue meanwhile.
 
 On the web socket everything else would wait: it answers one request of a page after the other.
 """
@@ -22,8 +22,8 @@ class Transfer:
 
     Parameters
     ----------
-    opened : called in the event loop with {name: content} of files to open, and what they are meant to be ("": not
-        said).
+    opened : called in the event loop with {name: content} of files to open, and what they are meant to be ("":
+        unspecified).
     export : called in the event loop with what is wanted, and the images from which a page has composed it; returns
         (file name, content, MIME type), or None if there is nothing, which the page has been told.
     refused : called with a line about files that were not taken.

@@ -92,14 +92,14 @@ class Sent:
 
 
 def require_whole_files(files: Mapping[str, bytes]) -> None:
-    """Raise SimulationError for names that are no plain file names, and for headers that name another file.
+    """Raise SimulationError for names that are not plain file names, and for headers that name another file.
 
     `files` are {name: content} as a page sent them. Nothing has been written yet.
     """
     for name, content in files.items():
         require(
             bool(name) and name not in (".", "..") and not re.search(r"[/\\\0-\x1f\x7f]", name),
-            f"{plain(name)}: is no plain file name, expected one without slashes and control characters",
+            f"{plain(name)}: is not a plain file name, expected one without slashes and control characters",
         )
         length = len(name.encode("utf-8", "replace"))
         require(

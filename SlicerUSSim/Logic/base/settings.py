@@ -7,7 +7,7 @@ from typing import Any
 
 from SlicerUSSim.Logic.base.declaration import Declared, Fit, Shown, parameter
 
-#: Level of full white at 0 dB gain, in dB re the mean square echo of tissue with unit scatterer variance.
+#: Level of full white at 0 dB gain, in dB relative to the mean square echo of tissue with unit scatterer variance.
 FULL_SCALE_DB = 23.0
 
 
@@ -247,7 +247,7 @@ class DisplaySettings(Declared):
     )  # fmt: skip
     grey_map: str = parameter(
         "linear", "Grey map",
-        "From decibels to grey levels. linear: log compression alone. soft: flat near black, steep near white, as of a "
+        "From decibels to grey levels. linear: log compression alone. soft: flat near black, steep near white, as in a "
         "scanner of brains. contrast: very flat near black, then straight",
         choices=("linear", "soft", "contrast"), shown=True, option="grey-map",
     )  # fmt: skip

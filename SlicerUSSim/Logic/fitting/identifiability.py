@@ -58,7 +58,7 @@ class Spread:
 
     @property
     def is_determined(self) -> bool | None:
-        """Whether the equally good solutions agree within the tolerance; None if that cannot be said.
+        """Whether the equally good solutions agree within the tolerance; None if that is unknown.
 
         It cannot without another solution, nor of what was not fitted.
         """

@@ -57,7 +57,7 @@ class TriedDevice:
 
 
 class DeviceTrials:
-    """Runs the trials one after the other, the preferred device first, while the program goes on.
+    """Runs the trials one after the other, the preferred device first, in the background.
 
     Parameters
     ----------

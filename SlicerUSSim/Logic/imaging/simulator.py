@@ -52,7 +52,7 @@ if TYPE_CHECKING:
 _ON_DEVICE = 2
 #: Beyond all fields
 _FAR_MM = 1e6
-#: Part of an image beyond the volume, in tissue, of which the user is told
+#: Part of an image beyond the volume, in tissue, that triggers a warning
 _TOLD_SHARE = 0.01
 #: Cells of the scatterer lattice per image: about 5 s on two cores, what is not begun, and per second there (measured
 #: with tall beams; two to three times as many with low ones)
@@ -190,7 +190,7 @@ class UltrasoundSimulator:
         `grid` gives the pixels, for example those of a real image; by default they cover the bounding box of the imaged
         field, with display.image_size pixels. `noise_seed` selects the amplifier noise (noise.py): 0 depends only on
         the settings' seed, seed_of_pose(probe_to_ras) also on the pose.
-        Warns with EmptyViewWarning if the field is outside the volume, whose last tissue goes on there, and with
+        Warns with EmptyViewWarning if the field is outside the volume, whose last tissue continues there, and with
         SlowScatterersWarning if there are so many scatterers that it takes more than seconds on a CPU.
         Raises SimulationError if it would take minutes, for a pose that is not rigid and a noise_seed that is not a
         whole number of 32 bits.
@@ -704,7 +704,7 @@ class UltrasoundSimulator:
         size = np.array(self.medium.labels.array.shape[::-1])
         if (voxels.max(axis=1) < -0.5).any() or (voxels.min(axis=1) > size - 0.5).any():
             warnings.warn(
-                "the probe looks past the volume: the image has only what goes on beyond its end", EmptyViewWarning,
+                "the probe looks past the volume: the image shows only its last tissue, continued", EmptyViewWarning,
                 stacklevel=stacklevel,
             )  # fmt: skip
         elif self._told_share < 0.5 and ((voxels.min(axis=1) < -0.5) | (voxels.max(axis=1) > size - 0.5)).any():

@@ -116,7 +116,7 @@ def with_thin_slices(volume: Volume, interpolate: bool = True) -> Volume:
 
 
 def widened(values: np.ndarray, step: int, shape: tuple[int, ...]) -> np.ndarray:
-    """(k, j, i) float32 of `shape` from values at every `step`-th voxel, interpolated linearly; the last go on."""
+    """(k, j, i) float32 of `shape` from values at every `step`-th voxel, interpolated linearly and padded."""
     for axis, count in enumerate(shape):
         places = np.arange(count) / step
         low = np.minimum(places.astype(int), values.shape[axis] - 1)

@@ -34,10 +34,10 @@ _SHEET_HU, _STANDS_OUT, _SHEET_MM = 220, 90, 6.0
 _GAP_MM, _GAP_DEPTH_HU = 3.5, 150
 #: Marrow with trabeculae from this number on, where bone lies in such a share of 26 directions within so many mm
 _MARROW_HU, _ENCLOSED, _REACH_MM = 100, 0.84, 30.0
-#: A difference across a voxel from which on it is on a step: less than from fat to muscle, or so many deviations of the
+#: Least difference across a voxel that is on a step: less than from fat to muscle, or so many deviations of the
 #: noise; and those within which a number alone does not tell contrast agent
 _LEAST_STEP, _STEP_PER_NOISE, _MARGIN_PER_NOISE = 90, 5.0, 2.0
-#: Gas in a smaller space than this is no lung, ml
+#: Gas in a smaller space than this is not lung, ml
 _LEAST_LUNG_ML = 10.0
 #: Thickness of the skin (1.6 to 2.3 mm; Laurent et al., Vaccine 25(34), 2007)
 SKIN_MM = 1.8
@@ -77,7 +77,7 @@ def classified(
     _mark_gas(classes, ct)
     _mark_bone(classes, hu, filtered, ct)
     _settle_blood(classes, hu, noise)
-    if skin_mm > 0.0:  # the outermost layer; the ends of the image are no surface
+    if skin_mm > 0.0:  # the outermost layer; the ends of the image are not a surface
         import SimpleITK as sitk
 
         outside, radius = sitk.GetImageFromArray((~body).astype(np.uint8)), np.rint(skin_mm / ct.spacing_mm)
@@ -140,7 +140,7 @@ def _mark_bone(classes: np.ndarray, hu: np.ndarray, filtered: np.ndarray, ct: Vo
 
 
 def enclosed_share(wall: np.ndarray, spacing_mm: np.ndarray) -> np.ndarray:
-    """(k, j, i) share of 26 directions in which a wall is within reach; the image goes on beyond its ends as there.
+    """(k, j, i) share of 26 directions in which a wall is within reach; the image continues beyond its ends.
 
     `spacing_mm` is along k, j, i. Marrow has a wall all around; a vessel beside a vertebra has one on one side, a disc
     above and below, the spinal canal not along itself.

@@ -24,7 +24,7 @@ FIELD_HU = -1100.0
 def hounsfield_offset(ct: Volume) -> tuple[float, str | None]:
     """(what is to be subtracted from the numbers for Hounsfield units, a line about what should be checked or None).
 
-    Raises SimulationError for numbers without air that begin at 0 or are cut off, as of an MRI or a window of a CT.
+    Raises SimulationError for numbers without air that begin at 0 or are cut off (an MRI, a window of a CT).
     """
     values = _sample(ct.array)
     offset = _offset_of(values)

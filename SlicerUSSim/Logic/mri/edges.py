@@ -6,7 +6,7 @@ import numpy as np
 
 from SlicerUSSim.Logic.base.volume import SIDES, Volume
 
-#: Area of the brain at an edge of the image from which that is said, and at the bottom, where the stem leaves, cm2
+#: Least area of the brain at an edge of the image that is reported, and at the bottom, where the stem leaves, cm2
 _WORTH_CM2, _WORTH_AT_BASE_CM2 = 6.0, 20.0
 
 

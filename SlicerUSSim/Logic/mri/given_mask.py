@@ -99,7 +99,7 @@ def follows(mri: Volume, labels: Volume) -> bool:
     Parameters
     ----------
     mri : (k, j, i) intensities.
-    labels : (k, j, i) tissues, 0 is none; on any grid.
+    labels : (k, j, i) tissues, 0 without one; on any grid.
     """
     places = np.argwhere(labels.array > 0)
     if not len(places):

@@ -235,7 +235,7 @@ def resampled(masks: Masks, like: Volume) -> tuple[tuple[slice, ...], np.ndarray
 
 
 def _cut_at(shares: np.ndarray, count: int) -> float:
-    """The share, within _CUTS, from which on nearest to `count` voxels are inside."""
+    """The threshold of the share, within _CUTS, with the number of voxels inside nearest to `count`."""
     low, high = _CUTS
     cuts, of_each = np.unique(np.append(shares[(shares > low) & (shares < high)], high), return_counts=True)
     counts = np.count_nonzero(shares >= high) + np.cumsum(of_each[::-1])[::-1] - 1  # -1: the one appended

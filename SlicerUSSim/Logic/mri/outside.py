@@ -87,7 +87,7 @@ def require_findable(contrast: str, skull_strip: str, has_mask: bool) -> None:
     )
     require(
         has_mask or skull_strip != "none",
-        "what is outside the brain (--outside) is not known without it, and --skull-strip is none; choose another, or "
+        "--outside needs the brain, which --skull-strip none does not find; choose another method, or "
         "give a brain mask (--mask)",
     )
 
@@ -195,7 +195,7 @@ def _within(mask: np.ndarray, distance_mm: float, mm: np.ndarray) -> np.ndarray:
 
 
 def _depth(mask: np.ndarray, mm: np.ndarray) -> np.ndarray:
-    """(k, j, i) distance in mm to what is outside; beyond the image it goes on."""
+    """(k, j, i) distance in mm to what is outside; it keeps growing beyond the image."""
     return distance_to(~mask, mm)
 
 
@@ -221,7 +221,7 @@ LEAST_MM, LARGEST_MM = 2.5, 14.0
 #: Usual distance from the brain's surface to that of the skull with what is between, and its deviation over heads and
 #: places (skulls of adults: 3 mm at the temples to 9 mm at the back; Lillie et al., Journal of Anatomy 228, 2016)
 _USUAL_MM, _DEVIATION_MM = 5.5, 3.0
-#: A border is looked for across this
+#: Width of the search across a border
 _ACROSS_MM = 1.5
 #: What it costs that there is bone farther out, but below the skin
 _NOT_OUTERMOST = 1.0

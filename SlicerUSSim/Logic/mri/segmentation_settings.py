@@ -12,7 +12,7 @@ from SlicerUSSim.Logic.base.errors import require_kind
 #: Contrasts of MRIs, which segment_mri has; and the name of a CT, which is segment_ct's
 MRI_CONTRASTS, CT = ("t1", "t1gd", "t2", "flair"), "ct"
 
-#: What gel bridges between skin and probe where nothing else is said, mm
+#: Default width of the gap between skin and probe that gel fills, mm
 GEL_MM = 3.0
 
 

@@ -78,7 +78,7 @@ class BrainPart:
 
 
 def atlas_of(part: BrainPart, report: Callable[[float], None]) -> tuple[AtlasFit | None, str, float | None]:
-    """(the registered atlas, or None where it is of no use; a line that says why; the share that it explains)."""
+    """(the registered atlas, or None where it is useless; a line that says why; the share that it explains)."""
     reason = is_whole_brain(part.images[0], part.inside)
     if reason:
         return None, f"without an atlas, since {reason}", None

@@ -106,7 +106,7 @@ def tag_of(segment, tag: str) -> str:
 def with_lesions(
     labels: Volume, names: Sequence[str], lesions: list[Lesion], *, also: list[str], before: Told, has_brain_mask: bool
 ) -> tuple[Added, Told]:
-    """(labels with lesions, what is told about each); `before` is that about those which the labels have.
+    """(labels with lesions, a report about each); `before` is the report about those that the labels have.
 
     See pathology.add_tissues.
     """

@@ -163,8 +163,8 @@ def content_as_made(labels_node) -> str | None:
 def may_replace(labels_node) -> bool:
     """Whether a node is new, or has labels that this program made, and nobody has edited since.
 
-    A new one has neither segments nor voxels; segments without voxels are somebody's plan. A copy of labels is of whom
-    copied them, see claim.
+    A new one has neither segments nor voxels; segments without voxels are a user's plan. A copy of labels belongs to
+    the user who made it, see claim.
     """
     made = content_as_made(labels_node)
     return is_empty(labels_node) or (made is not None and content_of(labels_node) == made)
@@ -173,8 +173,8 @@ def may_replace(labels_node) -> bool:
 def content_of(labels_node) -> str:
     """A hash of voxels, position and names, the same after saving and loading; "" if no voxel has a label.
 
-    Where segments lie in several layers and may overlap, the voxels of each count, since those below others are as
-    much somebody's work. Segment writes one layer.
+    Where segments lie in several layers and may overlap, the voxels of each count, since those below others are work,
+    too. Segment writes one layer.
     """
     try:
         volume, names = node_labels(labels_node)

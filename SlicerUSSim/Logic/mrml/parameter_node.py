@@ -73,8 +73,8 @@ class PanelSettings(Declared):
         "numbers of ImageToProbe by rows", shown=True,
     )  # fmt: skip
     face_pixel: str = parameter(
-        "", "Face in the image", "Column and row of the middle of the probe's face, such as 320 12; empty: it is "
-        "looked for in the real images", shown=True,
+        "", "Face in the image", "Column and row of the middle of the probe's face, such as 320 12; empty: "
+        "found in the real images", shown=True,
     )  # fmt: skip
     preset_pose: bool = parameter(
         False, "Pose in presets", "Save preset saves the pose of the probe, too; a preset with a pose moves the probe "

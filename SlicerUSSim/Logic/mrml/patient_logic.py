@@ -127,7 +127,7 @@ class PatientLogic:
         self._texture: tuple[Hashable, Texture | None] | None = None  # with the version of its labels
 
     def renewSimulator(self) -> None:
-        """Make images with another simulator from now on: work that was abandoned may still use the one of before."""
+        """Make images with another simulator from now on: work that was abandoned may still use the previous one."""
         self._simulators = ReusedSimulator()
 
     def patient(self, labels_node) -> Patient:

@@ -45,7 +45,7 @@ from SlicerUSSim.Logic.tissue.texture import Texture
 
 #: Attribute of a mask node that was extracted
 _BRAIN_OF = "SlicerUSSim.brainOf"
-#: Share of the time in which tissues are segmented, if sheets are looked for after that
+#: Share of the time in which tissues are segmented, if a search for sheets follows
 _SEGMENTED = 0.4
 
 
@@ -58,7 +58,7 @@ class SegmentLogic:
 
     def forget(self) -> None:
         """Release what is kept in memory of the last patient."""
-        #: Version of the labels over which lesions were laid last, and what was told about each of them
+        #: Version of the labels over which lesions were laid last, and what was reported about each of them
         self._laid: tuple[Hashable, Told] = (None, {})
         #: Grows lesions on the MRI that was segmented last
         self.growth = LesionGrowth(self._work.do)
@@ -77,7 +77,7 @@ class SegmentLogic:
         See segmentation.segment_mri, and ct.segment_ct for the contrast "ct"; `values` change single ones of the
         settings. `mask_node` is a label map on the MRI's grid, or a segmentation; `others` are volume nodes of the same
         patient by their contrast. The segments of `lesions_node` are laid over the labels, as by addTissues, but are
-        not in the result. `organs_node` is a label map or segmentation of organs of a CT. `sheets` are looked for, too
+        not in the result. `organs_node` is a label map or segmentation of organs of a CT. `sheets` are found, too
         (sheets.find_sheets): those with a volume are laid over the labels, the others are written into the model
         `sheets_node`, which images show if it is the parameter `sheets`. `progress` may raise errors.Cancelled; the
         nodes are then as they were.

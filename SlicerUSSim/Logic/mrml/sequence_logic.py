@@ -1,4 +1,4 @@
-"""SequenceLogic: sequences of images, and images of before that are shown again."""
+"""SequenceLogic: sequences of images, and previous images that are shown again."""
 
 from __future__ import annotations
 
@@ -178,7 +178,7 @@ class SequenceLogic:
 
     @contextmanager
     def imageHeld(self) -> Iterator[None]:
-        """While a scene is saved: as if Live ended, so that the image is where it was taken; it goes on after that.
+        """While a scene is saved: as if Live ended, so that the image is where it was taken; Live then continues.
 
         The scene says that the image is live. Saving lays the segments of tissues together into one label map. The
         images are of them as before.

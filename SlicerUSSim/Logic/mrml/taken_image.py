@@ -99,7 +99,7 @@ def write_image(taken: TakenImage, transform_node=None) -> None:
 
 
 def about_image(volume_node) -> dict[str, Any]:
-    """What the image in a volume node is of, see TakenImage.about; {} of a volume that is no such image.
+    """What the image in a volume node shows, see TakenImage.about; {} for any other volume.
 
     With `is_empty`, and the `number` of an image of a sequence.
     """

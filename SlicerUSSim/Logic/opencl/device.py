@@ -271,7 +271,7 @@ class Device:
         return self._loans.setdefault(buffer, Loan(buffer))
 
     def is_lent(self, buffer: Buffer) -> bool:
-        """Whether somebody has its loan."""
+        """Whether its loan is in use."""
         return buffer in self._loans
 
     def take_profile(self) -> dict[str, float]:

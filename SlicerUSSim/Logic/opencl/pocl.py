@@ -91,7 +91,7 @@ def name_processor(handle) -> str | None:
 
 
 def _passes_self_test(what: str) -> bool:
-    """Whether a child process computes with PoCL as it is. The answer is kept beside PoCL's programs, for `what`."""
+    """Whether a child process computes with the present PoCL. The answer is kept beside PoCL's programs, for `what`."""
     kept, text = cache_folder() / "ussim-self-test", ""
     with suppress(OSError):
         text = kept.read_text()
@@ -171,7 +171,7 @@ def remove_damaged_kernels(folder: Path | None = None) -> int:
         except OSError:  # another process has removed it
             continue
         if is_damaged:
-            _log.warning("%s: has an incomplete file, as of a process that was killed; it is removed", program)
+            _log.warning("%s: has an incomplete file, as after a killed process; it is removed", program)
             shutil.rmtree(program, ignore_errors=True)
             removed += 1
     return removed

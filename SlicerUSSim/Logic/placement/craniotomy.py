@@ -29,7 +29,7 @@ REMOVED = tuple(name for name in OUTSIDE if name != "air")
 _BELOW = 1.0
 #: Where the brain may begin under the probe, or under a polygon, mm: a probe on the brain has the skull behind its face
 _BRAIN_MM = (-40.0, 60.0)
-#: What a head has, and what a body has that is no head's; fluid is in spines, too
+#: Tissues of a head, and of a body but not of a head; fluid is in spines, too
 _OF_BRAIN, _OF_BODY = ("grey matter", "white matter", "brain"), ("muscle", "bone", "liver", "kidney")
 #: Markups of 3D Slicer whose points are a polygon
 POLYGONS = ("ClosedCurve", "Curve", "Fiducial")
@@ -49,7 +49,7 @@ def without_outside(labels: Volume, names: Sequence[str]) -> Volume:
 
 
 def require_brain(names: Sequence[str]) -> None:
-    """Raise SimulationError if tissues are those of a body without a brain, as of a spine or an abdomen."""
+    """Raise SimulationError if tissues are those of a body without a brain, such as a spine or an abdomen."""
     require(
         not set(_OF_BRAIN).isdisjoint(names) or set(_OF_BODY).isdisjoint(names),
         f"the labels have no tissue of a brain (they have {', '.join(names)}), expected those of a head",
@@ -131,7 +131,7 @@ def file_opening(labels: Volume, names: Sequence[str], path: str) -> np.ndarray:
 def mask_opening(labels: Volume, mask: Volume, name: str) -> np.ndarray:
     """(k, j, i) bool of a mask on any grid (not 0 is open; above 1/2 of values from 0 to 1), called `name` in errors.
 
-    Raises SimulationError for what is no mask, and for one that is empty or lies elsewhere.
+    Raises SimulationError for a volume that is not a mask, and for a mask that is empty or elsewhere.
     """
     k, j, i = np.indices(labels.array.shape)
     ras = np.stack([i, j, k], axis=-1) @ labels.ijk_to_ras[:3, :3].T + labels.ijk_to_ras[:3, 3]
@@ -143,7 +143,7 @@ def mask_opening(labels: Volume, mask: Volume, name: str) -> np.ndarray:
 def is_open(mask: Volume, name: str) -> Volume:
     """A mask as uint8, 1 where it is open: not 0, or above 1/2 of values from 0 to 1; `name` as in errors.
 
-    Raises SimulationError for what is no mask.
+    Raises SimulationError for a volume that is not a mask.
     """
     segments = several_segments(mask)
     require(

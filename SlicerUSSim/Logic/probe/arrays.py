@@ -310,7 +310,7 @@ def _field_of_view_deg() -> Any:
 class LinearProbe(Probe):
     """A flat array with parallel scan lines over `width_mm`.
 
-    They can be steered, or fan out from the face as of a convex array behind it (trapezoid, "virtual convex").
+    They can be steered, or fan out from the face as from a convex array behind it (trapezoid, "virtual convex").
     """
 
     kind = "linear"

@@ -23,7 +23,7 @@ CURVED = 0.6
 #: Largest number of focal zones
 MOST_ZONES = 8
 #: Amplitude of twice the pulse's frequency that leaves the face itself, and of what is left of the pulse in the band,
-#: re the harmonic at the focus: typical of transmitters (docs/physics.md#harmonic-imaging)
+#: relative to the harmonic at the focus: typical of transmitters (docs/physics.md#harmonic-imaging)
 LEAKED = 0.1
 #: f-number of a beam that is wide compared with all others
 _NO_FOCUS = 1e4
@@ -55,8 +55,8 @@ class Beam(Declared):
         False, "Harmonic imaging",
         "Receive the second harmonic, which arises in tissue where the beam is strong: twice the frequency, narrower "
         "beams, weaker side lobes, dark near the face", shown=True,
-        note="frequency_mhz is that of the pulse. The level of the harmonic is that of the fundamental at the transmit "
-        "focus, as a scanner's gain makes it",
+        note="frequency_mhz belongs to the pulse. At the transmit focus the harmonic has the level of the fundamental, "
+        "as with a scanner's gain",
     )  # fmt: skip
     band_mhz: tuple[float, float] | None = parameter(
         None, "Band", "Lowest and highest frequency that the array receives, -6 dB; the second harmonic of the pulse "
@@ -66,7 +66,7 @@ class Beam(Declared):
     fractional_bandwidth: float = parameter(
         0.5, "Bandwidth", "-6 dB bandwidth of the two-way pulse, as a fraction of the frequency", bounds=(0.05, 1.5)
     )
-    focus_mm: MmOrNone = parameter(  # noqa: RUF009, which knows no descriptors
+    focus_mm: MmOrNone = parameter(  # noqa: RUF009, which ignores descriptors
         _BY_DEPTH, "Focus", "Depth of the transmit focus; none (panels: 0): 60 % of the image depth", unit="mm",
         bounds=(0.1, 1000), shown=Shown(0, 300, is_slider=True, none_at=0.0), can_be_none=True,
         note="It then moves with the depth",
@@ -223,7 +223,7 @@ class Beam(Declared):
         return lens_beam(self.wavelength_mm, spread, height, self.elevation_focus_mm, self.displayed_mm, self.harmonic)
 
     def harmonic_level(self, depth_mm) -> np.ndarray:
-        """Amplitude of the second harmonic at `depth_mm` re the fundamental, 1 at the transmit focus.
+        """Amplitude of the second harmonic at `depth_mm` relative to the fundamental, 1 at the transmit focus.
 
         In the quasi-linear approximation the square of a Gaussian beam feeds a Gaussian beam of twice the frequency and
         the same Rayleigh lengths, whose amplitude grows by 1 / sqrt((1 + i b)(1 + i c)) per millimetre, with b and c

@@ -61,7 +61,7 @@ def combined_probability_maps(path: Path, volume: Volume) -> CombinedMaps | None
     for other, read in zip(paths, volumes, strict=False):
         is_same = read.array.shape == volume.array.shape and np.allclose(read.ijk_to_ras, volume.ijk_to_ras, atol=1e-3)
         require(is_same, f"{other}: has another grid than {path.name}, expected maps of one segmentation")
-        require(_is_share(read.array), f"{other}: is no probability map, expected values from 0 to 1")
+        require(_is_share(read.array), f"{other}: is not a probability map, expected values from 0 to 1")
     shares = [read.array for read in volumes]
     inside = np.sum(shares, axis=0) > _INSIDE
     require(inside.any(), f"{path}: no tissue is probable anywhere, expected values up to 1")

@@ -22,8 +22,8 @@ from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.opencl.layout import CONSTANTS
 
 _FARTHEST_DEVIATION = 2.5
-#: Of volume shares: voxels whose second tissue is less probable are whole; standard deviations between the means of
-#: tissues from which on an intensity between them tells a share; the part of that range in which it does
+#: Of volume shares: voxels whose second tissue is less probable are whole; least standard deviations between
+#: the means of tissues for which an intensity between them shows a share; the part of that range in which it does
 _SURE, _CLEAR, _INNER_RANGE = 0.05, 5.0, 0.7
 
 

@@ -67,7 +67,7 @@ class Tissue(Declared):
         unit="mm", symbol="ℓₜ", bounds=(0.1, 20),
     )  # fmt: skip
     specks_per_mm3: float = parameter(
-        0.0, "Specks", "Bright specks per cubic millimetre, as of small vessels and calcifications", unit="1/mm³",
+        0.0, "Specks", "Bright specks per cubic millimetre, such as small vessels and calcifications", unit="1/mm³",
         symbol="nₛ", bounds=(0, 10), note="At most one in a cube of twice the texture length",
     )  # fmt: skip
     speck_db: float = parameter(
@@ -126,7 +126,7 @@ class Membrane(Declared):
         unit="dB", bounds=(-100, 40),
     )  # fmt: skip
     sheet_exponent: float | None = parameter(
-        None, "Diffuse exponent of sheets", "The same of sulci and other sheets, which hold vessels; none: as of walls",
+        None, "Diffuse exponent of sheets", "The same for sulci and other sheets, which hold vessels; none: as walls",
         bounds=(0, 20), can_be_none=True,
     )  # fmt: skip
     roughness_octaves: float = parameter(

@@ -233,7 +233,7 @@ def _sector(points: np.ndarray, left, right, scale) -> tuple[str, dict[str, floa
     away = points - apex
     radius, angle = np.hypot(*away.T), np.arctan2(away[:, 0], away[:, 1])
     in_sides = np.abs(angle) < half
-    require(bool(in_sides.any()), "the bright part of the images is no probe's field, it lies beside its own sides")
+    require(bool(in_sides.any()), "the bright part of the images is not a probe's field, it is outside its own sides")
     radius, angle = radius[in_sides], angle[in_sides]
     # The probe face is a circle about the apex. The first bright pixel of each direction, one pixel wide, lies on it;
     # the pixel's centre is on average half a pixel deeper.

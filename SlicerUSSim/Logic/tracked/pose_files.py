@@ -253,7 +253,7 @@ def read_coordinate_definitions(path: str | os.PathLike) -> dict[str, np.ndarray
 
 
 def read_registration(path: str | os.PathLike) -> tuple[np.ndarray, str]:
-    """((4, 4) map from the reference frame of ultrasound to the MRI, a line about it), as of --to-mri.
+    """((4, 4) map from the reference frame of ultrasound to the MRI, a line about it), as for --to-mri.
 
     A file is one of read_transform, or a .tag with landmarks in MRI and ultrasound, for which the rigid map with the
     least squared distances is computed. Raises SimulationError for others, and for landmarks of one volume.
@@ -384,7 +384,7 @@ def require_sound(path: Path, transform) -> None:
         parts = [chain.GetNthTransform(n) for n in range(chain.GetNumberOfTransforms())]
     for part in parts:
         kind, found = part.GetName(), part.GetParameters()
-        if kind == _COMPOSITE:  # SimpleITK has no class for ITK's base class, and shows it as a chain of itself
+        if kind == _COMPOSITE:  # SimpleITK has no class for ITK's base class, and shows it as a chain with itself
             kind = "MatrixOffsetTransformBase"
         _require_parameters(path, kind, found)
 

@@ -47,9 +47,9 @@ _NOT_OURS = (
     "ITK_", "Kinds", "Modality", "NRRD_", "ObjectType", "AnatomicalOrientation", "type", "dimension", "space", "sizes",
     "kinds", "endian", "encoding", "measurement frame", "centers", "spacings", "thicknesses", "axis", "labels", "units",
 )  # fmt: skip
-#: Difference of the components of a pixel, grey levels, from which on it has a colour; below are codecs
+#: Least difference of the components of a pixel that has a colour, grey levels; codecs make smaller ones
 _COLOURED = 24
-#: Grey levels from which on colours can be told; more of what is bright with a colour is a tint
+#: Least grey level at which colours show; if more of the bright pixels have a colour, it is a tint
 _BRIGHT, _MOST_COLOURED = 40, 0.5
 _OPPOSITE = {"M": "U", "U": "M", "F": "N", "N": "F"}
 
@@ -223,8 +223,8 @@ class TrackedSequence:
     def read(cls, path: str | os.PathLike) -> TrackedSequence:
         """Read a sequence metafile (.igs.mha, .seq.mha, .mhd, .nrrd), compressed or not, in any image orientation.
 
-        Transforms whose status is not OK were not tracked and are omitted, and so are those whose name or matrix is
-        none. Colours are converted to grey levels, those of a colour map with a warning. Transforms alone, as 3D Slicer
+        Transforms whose status is not OK were not tracked and are omitted, and so are those without a name or matrix.
+        Colours are converted to grey levels, those of a colour map with a warning. Transforms alone, as 3D Slicer
         saves a sequence of them, are poses without images.
         Raises SimulationError for a file that is missing, unreadable or of another format.
         """
@@ -346,7 +346,7 @@ def frame_numbers(text: str, count: int) -> list[int]:
 
 
 def checked_apart(text: str, fitted: Sequence[int] | None, count: int) -> list[int]:
-    """Numbers of images that are predicted, from a text as of frame_numbers; an empty one is none.
+    """Numbers of images that are predicted, from a text as for frame_numbers; an empty one selects none.
 
     Raises SimulationError for other text, and for images that are `fitted` (None: not known) as well.
     """
@@ -491,7 +491,7 @@ def _as_images(array: np.ndarray, components: int, source: str) -> _Pixels:
 
 
 def _are_coloured(colours: np.ndarray, grey: np.ndarray, source: str) -> np.ndarray:
-    """[...] bool, pixels of [..., 3] colours that are no grey; none where most are, as of a scanner's tint.
+    """[...] bool, pixels of [..., 3] colours other than grey; none where most are coloured, as by a scanner's tint.
 
     A tint is logged as a warning.
     """

@@ -200,7 +200,7 @@ import "./measure.js";
     input.value = ""; // so that the same file can be chosen again
   };
 
-  // `files` are [path, file]; the folders above a file become part of its name, since a name is no path.
+  // `files` are [path, file]; the folders above a file become part of its name, since a name is not a path.
   function sendFiles(files, purpose) {
     if (!files.length) return;
     const form = new FormData();

@@ -104,12 +104,12 @@ def lesion_tissue(name: str) -> str:
         tissue = tissue_to_add(name)
     except SimulationError:
         raise SimulationError(f"no tissue is called {name!r}, {expected}") from None
-    require(tissue in LESION_TISSUES, f"{name!r} is no lesion, {expected}")
+    require(tissue in LESION_TISSUES, f"{name!r} is not a lesion, {expected}")
     return tissue
 
 
 def require_in_image(grid: Volume, seed_ras_mm: Sequence[float]) -> np.ndarray:
-    """(3,) RAS mm of a seed. Raises SimulationError for one outside the grid of an MRI, and for what is no point."""
+    """(3,) RAS mm of a seed. Raises SimulationError for one outside the grid of an MRI and for other values."""
     seed = np.asarray(seed_ras_mm, float)
     require(
         seed.shape == (3,) and bool(np.isfinite(seed).all()),
@@ -180,7 +180,7 @@ def _enhancing(window: Window) -> _Grown | None:
 
 
 def _bright(evidence: Evidence, channel: int) -> float:
-    """Intensity from which on a channel is brighter than white matter and its noise."""
+    """Least intensity of a channel that is brighter than white matter and its noise."""
     return _white(evidence, channel) + _ABOVE_WHITE * float(evidence.deviations[channel])
 
 

@@ -1,6 +1,6 @@
 """The falx cerebri: a height field over the midsagittal plane, above the template's free edge.
 
-It ends at the line between the rims of the hemispheres, and with contrast agent goes on into the sinus that is seen.
+It ends at the line between the rims of the hemispheres, and with contrast agent continues into the visible sinus.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from SlicerUSSim.Logic.mri.sheets.head import Head
 from SlicerUSSim.Logic.mri.sheets.heights import centred, patches, settled
 from SlicerUSSim.Logic.tissue.surfels import Surfels
 
-#: y and z of MNI152 in which the falx is looked for, how far from the midsagittal plane, and steps; mm
+#: y and z of MNI152 of the search for the falx, its distance from the midsagittal plane, and steps; mm
 _Y_MM, _Z_MM, _X_MM, _STEP_MM = (-112.0, 78.0), (-30.0, 90.0), 16.0, 1.0
 #: The rims of the hemispheres, between which the hull of the brain may dip, are this near to the midsagittal plane
 _RIM_MM = 24.0
@@ -140,7 +140,7 @@ def _sampled_evidence(
 def _evidence(head: Head) -> np.ndarray:
     """(k, j, i) float32: share of fluid, or with contrast agent enhancement by that of white to grey matter, 0 to 2.
 
-    Where the dura enhances, the fluid beside it is no evidence: it is where the falx is not.
+    Where the dura enhances, the fluid beside it is not evidence, since the falx is elsewhere.
     """
     if head.is_enhanced:
         return np.clip((head.image.array - head.white) / (head.white - head.grey), 0.0, 2.0)
