@@ -98,8 +98,8 @@ inline int depths_needed(Frame frame, float along, float angle) {
 }
 
 // One work-item follows one ray of a fan. Global size (angles, points, rows). Look-ups are trilinear, so that sums over
-// steps of a voxel are smooth. Strong tissue counts as what lies in front of it, with what it takes more recorded: by
-// its borders, its attenuation, and by refraction. With `all_soft`, no tissues have a strong border.
+// steps of a voxel are smooth. Strong tissue counts as the tissue in front of it, and its additional losses are
+// recorded: by its borders, its attenuation, and by refraction. With `all_soft`, no tissues have a strong border.
 ONE_BY_ONE
 __kernel void fans(Frame frame, __global const ushort *voxels, __global const float4 *acoustics, int all_soft,
                    __global float *sums) {

@@ -23,8 +23,8 @@ inline float plane_echo(float phase2, float width) {
   return exp_fast(-0.5f * phase2 / spread) / sqrt(spread);
 }
 
-// Factor of the echo of a patch. Of the squared phase over the beam (`phase2`) the sum over the patches has what is not
-// `inside` them. Both parts are Gaussian, but for a pulse the product of their peaks is not the peak of their product,
+// Factor of the echo of a patch. Of the squared phase over the beam (`phase2`) the sum over the patches has the part
+// not `inside` them. Both parts are Gaussian. For a pulse the product of their peaks is not the peak of their product,
 // which matters as long as the echo of a plane can be seen: up to 4.5 radians, -40 dB.
 inline float patch_echo(float phase2, float inside2, float width) {
   const float seen = fmin(1.0f, 20.0f / fmax(phase2, 1e-6f)), seen2 = seen * phase2, seen_inside2 = seen * inside2;

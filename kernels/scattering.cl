@@ -295,7 +295,7 @@ inline int drawn_label(const Patient *patient, const Piece *piece, int here, flo
 }
 
 // A scatterer of the membrane is the brighter the more squarely the beam meets the sheet; one of falx and tentorium
-// that were found by Lambert's law, but for a part that is the same from all sides. Its normal is that of the
+// that were found by Lambert's law, except for a part that is the same from all sides. Its normal is that of the
 // fitted plane, or the gradient of the fluid distance: from lines of two voxels along i, first those of the near plane,
 // then of the far.
 inline float gain_on_membrane(const Patient *patient, const Piece *piece, int here, float3 at) {

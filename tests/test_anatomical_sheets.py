@@ -206,7 +206,7 @@ def test_files_that_are_no_sheets_are_named(tmp_path):
     with pytest.raises(SimulationError, match="no such file"):
         read_surfels(tmp_path / "none.vtp")
     (tmp_path / "text.vtp").write_text("no XML")
-    with pytest.raises(SimulationError, match="no VTK surface"):
+    with pytest.raises(SimulationError, match="not a VTK surface"):
         read_surfels(tmp_path / "text.vtp")
     # VTK ended the process for a damaged one
     write_surfels(tmp_path / "own.vtp", some_surfels())

@@ -140,7 +140,7 @@ def test_a_straight_map_is_log_compression(solid):
     np.testing.assert_allclose(grey_table(even_display()), np.linspace(0, 255, TABLE_SIZE), atol=1e-3)
     probe, pose = LinearProbe(30, 40, scan_lines=91), rigid(np.eye(3), [0, -30, 0])
     plain = solid.simulate(probe, pose, even_display()).image.astype(int)
-    # By way of the table: a map that is straight but for what is beyond any float
+    # By way of the table: a map that is straight except beyond any float
     nearly = solid.simulate(probe, pose, even_display(map_white=1.0 + 1e-6)).image
     assert np.abs(plain - nearly).max() <= 1
 

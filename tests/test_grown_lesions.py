@@ -129,7 +129,7 @@ def test_a_refused_seed_costs_neither_the_labels_nor_the_other_seeds(tmp_path):
     smaller, larger = (tmp_path / f"labels_grown_tumour{version}.nii.gz" for version in ("", "_larger"))
     result = segment("--seed", "-28,-22,28", "--seed", "28,-22,28")
     assert result.exit_code == 2 and "looks as its surroundings" in result.stderr, result.output
-    assert result.stderr.splitlines()[-1].endswith(f"{labels} is written, with all that was not refused")
+    assert result.stderr.splitlines()[-1].endswith(f"{labels} is written, with all lesions that were not refused")
     assert f"--add tumour={smaller}; larger: {larger}" in result.stderr
     assert labels.exists() and 0 < Volume.read(smaller).array.sum() < Volume.read(larger).array.sum()
     labels.unlink()

@@ -575,7 +575,7 @@ def test_tissue_probability_maps_are_combined_and_said(program, tmp_path):
         found = read_label_file(path, Volume.read(path))
         assert f"tissue probability maps: {names[0]} csf, {names[1]} grey matter" in found.message
         assert found.names == ("csf", "grey matter", "white matter")
-        assert np.mean(found.labels.array == labels.array) > 0.97  # but for voxels at the borders
+        assert np.mean(found.labels.array == labels.array) > 0.97  # except at the borders
     swapped = LabelMapping.of(["1=white", "3=csf"])  # as FAST counts in a T2
     assert read_label_file(path, Volume.read(path), swapped).names == ("white matter", "grey matter", "csf")
     Volume.read(path).write(tmp_path / names[0].replace("_0", "_3"))

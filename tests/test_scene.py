@@ -322,7 +322,7 @@ def test_segment_names_and_colours_tissues_where_the_mri_is(kind):
     if kind == "Segmentation":
         labels.GetSegmentation().GetNthSegment(0).SetName("Cerebrospinal fluid")
     else:
-        labels.GetImageData().Modified()  # painted on: the texture is not that of these labels any more
+        labels.GetImageData().Modified()  # painted on: the texture no longer fits these labels
     with pytest.raises(SimulationError, match="segment the MRI again"):
         logic.simulate(labels, probe, image)
 

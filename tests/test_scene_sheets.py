@@ -121,7 +121,7 @@ def test_segment_finds_sheets_and_images_show_them(monkeypatch):
     parameters.sheets = model
     presenter.values.setValue("scene.sheet_find", False)
     presenter.segmenting.segment()
-    assert parameters.sheets is None and "of an earlier Segment, are not shown any more" in presenter.notes.text()
+    assert parameters.sheets is None and "of an earlier Segment, are no longer shown" in presenter.notes.text()
 
 
 def test_sheets_of_a_user_are_kept_and_another_model_is_one_line():

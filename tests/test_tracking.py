@@ -177,11 +177,11 @@ def test_who_does_not_speak_openigtlink_is_dropped_and_the_next_one_heard(link):
     nonsense = struct.pack(">H12s20sQQQ", 1, b"TRANSFORM", b"x", 0, 1 << 60, 0) + b"x" * 100
     port = free_port()
     _, poses = link("127.0.0.1", port, listen=True)
-    with socket.create_connection(("127.0.0.1", port)) as stranger:
-        stranger.sendall(nonsense)
-        stranger.settimeout(120)
+    with socket.create_connection(("127.0.0.1", port)) as other:
+        other.sendall(nonsense)
+        other.settimeout(120)
         with contextlib.suppress(ConnectionResetError):  # with what was not read, closing is a reset
-            assert stranger.recv(1) == b""
+            assert other.recv(1) == b""
     client = pyigtl.OpenIGTLinkClient("127.0.0.1", port)
     until(lambda: client.is_connected())
     client.send_message(transform())

@@ -200,7 +200,7 @@ def test_a_caliper_across_the_fluid_reads_its_thickness(page):
     status(page, "LIVE")
     with new_image(page):
         page.keyboard.press("a")
-    assert words(page) == []  # they were of the image before
+    assert words(page) == []  # they belonged to the previous image
 
 
 @pytest.mark.slow

@@ -117,7 +117,7 @@ def test_an_uploaded_patient_goes_on_with_his_saved_scene(start, browser, files,
     page = opened(browser, served("--labels", files / "labels.nii.gz").url)
     click(page, "#restore")
     eventually(page, lambda: bool(errors(page)))
-    assert errors(page)[0].startswith("sent.nii.gz: its files are not on the computer of the server any more")
+    assert errors(page)[0].startswith("sent.nii.gz: its files are no longer on the computer of the server")
     assert page.locator("#offer").is_visible() and state(page, NAMES.title) == "labels.nii.gz"
     page.set_input_files("#open-file", tmp_path / "saved.mrb")
     answer_new_patient(page, "The patient of the scene")

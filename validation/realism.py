@@ -95,7 +95,7 @@ def control_named(name: str, reference: str) -> str:
 
 @dataclass(frozen=True, eq=False)
 class Looks:
-    """What the images of one source are like."""
+    """Statistics of the images of one source."""
 
     #: One per depth
     widths: list[SpeckleWidth]
@@ -232,7 +232,7 @@ def measure_realism(
     simulator : its labels say which pixels are of which tissue, and where sheets and walls are; it also simulates the
         uniform tissue.
     neighbours : per real image, other real images near it (neighbours_of); none: without that control.
-    display : of the uniform tissue, but for its gain.
+    display : of the uniform tissue, except for its gain.
 
     Raises SimulationError for numbers or shapes that differ, and for a name of a control.
     """

@@ -221,7 +221,7 @@ def open_examination(
     if table is not None:
         found = set(table.names()) & set(tissues.names())
         expected = f"expected tissues called {', '.join(added.tissue_names)}"
-        require(bool(found - {"coupling"}), f"{patient.tissues}: has none of the patient's tissues, {expected}")
+        require(bool(found - {"coupling"}), f"{patient.tissues}: lacks the patient's tissues, {expected}")
     tissues = with_their_tissue(tissues, surfels, known)
     texture = texture_below(segmentation.texture(), volume, segmentation.labels, added.labels)
     tissues = changes.to_tissues(tissues)

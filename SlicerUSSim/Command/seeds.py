@@ -92,7 +92,7 @@ def grown_at(segmentation: Segmentation, seeds: Iterable[str]) -> tuple[list[Gro
 def require_none_refused(refused: Iterable[str], labels_path: Path) -> None:
     """Raise SimulationError with the lines of refused seeds, when labels and the other lesions are written."""
     lines = "; ".join(refused)
-    require(not lines, f"{lines}; {labels_path} is written, with all that was not refused")
+    require(not lines, f"{lines}; {labels_path} is written, with all lesions that were not refused")
 
 
 def write_lesions(lesions: Iterable[GrownLesion], labels_path: Path) -> None:

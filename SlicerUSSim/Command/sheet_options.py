@@ -66,7 +66,7 @@ class DrawnSheets:
     def found(
         self, mri_path: str, mri: Volume, segmentation: Segmentation, contrast: str
     ) -> tuple[Surfels | None, Volume, tuple[str, ...]]:
-        """(Sheets of an MRI, its labels, their names with the structures on top). Looked for once, all are kept."""
+        """(Sheets of an MRI, its labels, their names with the structures on top). One search keeps all."""
         if self.source != AUTO or not self.kinds:
             return self.read, segmentation.labels, segmentation.tissue_names
         return _searched(mri_path, mri, segmentation, contrast, self.kinds)

@@ -56,7 +56,7 @@ class ImageFlow:
         return not self._show_in_views.is_waiting
 
     def image_changed(self) -> None:
-        """Distribute the new image, or the news that there is none any more."""
+        """Distribute the new image, or the news that there is no longer one."""
         taken = self._logic.taken
         if taken is None:
             self.clear()

@@ -384,13 +384,13 @@ class Opener:
         """What becomes of the patient who is open, and what of him is lost then."""
         unsaved = self._patient.unsaved
         lost = f"; not saved: {', '.join(unsaved)}" if unsaved else ""
-        return f"{self._patient.name} is closed, with all that belongs to it{lost}"
+        return f"{self._patient.name} is closed with everything that belongs to it{lost}"
 
     def _ask_what(self, file: _File, choices: list[Choice]) -> str:
         return self._ask(f"Open {file.name} as?", f"{file.name} is {file.content.what}.", choices)
 
     def _ask(self, title: str, text: str, choices: list[Choice]) -> str:
-        """The key of the answer. Raises SimulationError if the patient about whom was asked is not open any more."""
+        """The key of the answer. Raises SimulationError if the patient of the question is no longer open."""
         patient = self._patient.name
         key = self._questions.ask(title, as_known(text), choices)
         now = self._patient.name

@@ -277,7 +277,7 @@ class OpenPatient:
         self._logic.stopLiveUpdate()
         self._logic.clearImage(parameters.output)
         self._logic.clearOutline(parameters.outline)
-        # Ultrasound that was opened before any patient of the user's is of this one
+        # Ultrasound that was opened before any patient of the user belongs to this one
         kept = [] if self.is_of_user else list(self._registration.nodes)
         if self.is_of_user:
             self.forget_ultrasound()
@@ -318,7 +318,7 @@ class OpenPatient:
     def labels_ready(self, *, is_placed: bool = False, frozen: FrozenRecord | None = None) -> None:
         """Show the image of new labels, or a `frozen` one of them.
 
-        The probe `is_placed`, or is placed now if they are of a new patient.
+        The probe `is_placed`, or is placed now if the patient is new.
         """
         if self._logic.parameters.probe_transform is None or (self._is_new and not is_placed):
             self._presenter.placing.placeProbe()

@@ -64,7 +64,7 @@ class Registration:
         Its probe and poses are used once its calibration is known. Nothing changes if it cannot be used.
         """
         calibration, place, sources = self._calibration, self._to_ras, dict(self._from)
-        if self.recording is not None:  # they are of that
+        if self.recording is not None:  # they belong to that one
             calibration, place, sources = {}, np.eye(4), {_CALIBRATION: "", _REGISTRATION: ""}
         if recording.to_ras is not None and not np.allclose(recording.to_ras, np.eye(4)):
             place, sources[_REGISTRATION] = recording.to_ras, "as it was given or saved"

@@ -150,7 +150,7 @@ class SequenceState:
     mask: str = ""
     playing: bool = False
     comparison: ComparisonMode = ComparisonMode.BESIDE
-    #: Cost between simulated and real image, as text, and whether they are of different poses
+    #: Cost between simulated and real image, as text, and whether their poses differ
     similarity: str = ""
     is_elsewhere: bool = False
 

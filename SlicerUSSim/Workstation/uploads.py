@@ -51,7 +51,7 @@ class Sent:
     def __init__(self, folder: str, files: Mapping[str, bytes]) -> None:
         require_whole_files(files)
         self._folder = Path(folder)
-        #: Those that are no DICOM images
+        #: Those that are not DICOM images
         self.paths: list[Path] = []
         dicom = {name for name, content in files.items() if _is_dicom(name, content)}
         #: Whether there are DICOM files, which `series` and `take` make into a volume

@@ -251,14 +251,14 @@ def simulated(
 #: A tissue of less than this part of the imaged fields is too small to show its parameters.
 _LEAST_SHARE = 0.002
 #: Mean path through a tissue, mm, from which its attenuation shows: at 5 MHz a change by the parameter's tolerance,
-#: 0.1 dB/(cm MHz), then changes what lies behind by 0.3 dB.
+#: 0.1 dB/(cm MHz), then changes the tissue behind by 0.3 dB.
 _LEAST_PATH_MM = 3.0
 #: Surfels are 1 mm apart: a sheet that crosses an image has some this near to its plane.
 _BESIDE_MM = 1.0
 
 
 def shares(simulator: UltrasoundSimulator, tracked: TrackedImages) -> dict[str, float]:
-    """{tissue: its part of the imaged fields, 0 to 1}, without what lies outside the labels."""
+    """{tissue: its part of the imaged fields, 0 to 1}, without the part outside the labels."""
     medium = simulator.medium
     count = np.zeros(256, int)
     for pose in tracked.poses:

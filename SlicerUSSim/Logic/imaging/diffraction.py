@@ -165,7 +165,7 @@ def plane_echoes(probe: Probe) -> np.ndarray:
 
     Exponents of two of the peak of the pulse, by lateral and by elevational tilt: at depths evenly from the face to the
     image depth, and tangents of the tilt whose square roots are evenly from 0 to 1. What leaves the transmit aperture
-    at a is reflected to c - a, c = 2 s tan(tilt), but for diffraction:
+    at a is reflected to c - a, c = 2 s tan(tilt), except for diffraction:
 
         integral T(a) R(b) exp(-i k (a + b - c)^2 / 4 s) da db,    T(a) = exp(i k a^2 (1 / s - 1 / F) / 2)
 

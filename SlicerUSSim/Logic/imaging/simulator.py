@@ -136,7 +136,7 @@ class UltrasoundSimulator:
         self._acquisition_buffer = self.device.empty(ACQUISITION.itemsize)
         # The last probe and settings that were found fast enough
         self._fast_for: tuple | None = None
-        # The record of the last frame, and its inputs but for the pose
+        # The record of the last frame, and its inputs except the pose
         self._record: np.ndarray | None = None
         self._record_made_for: tuple | None = None
         # The baseband signal of the last frame, and its inputs

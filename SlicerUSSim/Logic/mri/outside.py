@@ -1,4 +1,4 @@
-"""What lies outside the brain in the MRI of a whole head: skin, scalp, skull with its marrow, and air.
+"""Tissues outside the brain in the MRI of a whole head: skin, scalp, skull with its marrow, and air.
 
 Bone, its tables at least, and air give no signal; fat, muscle and marrow do. As in Dogdas, Shattuck and Leahy,
 "Segmentation of skull and scalp in 3-D human MRI using mathematical morphology" (Human Brain Mapping 26, 2005), the
@@ -79,7 +79,7 @@ class Outside:
 
 
 def require_findable(contrast: str, skull_strip: str, has_mask: bool) -> None:
-    """Raise SimulationError where the image is no T1, or its brain is not to be found."""
+    """Raise SimulationError where the image is not a T1, or its brain cannot be found."""
     require(
         contrast in CONTRASTS,
         f"skin, skull and what else is outside the brain (--outside) are found in a whole head of contrast "
@@ -95,7 +95,7 @@ def require_findable(contrast: str, skull_strip: str, has_mask: bool) -> None:
 def find_outside(
     mri: Volume, brain: np.ndarray, progress: Callable[[float], None] = lambda share: None
 ) -> Outside:  # fmt: skip
-    """Label what lies outside the brain in the MRI of a whole head (T1, with or without contrast agent).
+    """Label the tissues outside the brain in the MRI of a whole head (T1, with or without contrast agent).
 
     Parameters
     ----------
@@ -103,7 +103,7 @@ def find_outside(
     brain : (k, j, i) bool, the brain.
     progress : called with the completed fraction, 0 to 1.
 
-    In a T1, CSF is as dark as bone: what lies between a shrunken brain and its skull counts as skull.
+    In a T1, CSF is as dark as bone: the gap between a shrunken brain and its skull counts as skull.
     Raises SimulationError if there is no brain, or nothing around it.
     """
     require(brain.any(), "the brain mask is empty, expected a brain")

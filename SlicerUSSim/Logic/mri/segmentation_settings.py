@@ -59,7 +59,7 @@ class SegmentationSettings(Declared):
     def of(cls, settings: SegmentationSettings | None, **values: Any) -> SegmentationSettings:
         """Settings, by default the defaults, with values changed by name.
 
-        Raises SimulationError for what is no SegmentationSettings, an unknown name and an invalid value.
+        Raises SimulationError for another type, an unknown name and an invalid value.
         """
         settings = cls() if settings is None else settings
         require_kind("settings", settings, cls, 'or single values by name, such as contrast="t2"')

@@ -81,7 +81,7 @@ def add_lesion(lesions_node, mask: Volume, tissue: str, name: str) -> list[str]:
         lesions_node.SetSourceRepresentationToBinaryLabelmap()
     ids = []
     for number, part in enumerate(masks.tissues):
-        # What lies within is laid over it: segments that only touch could leave gaps on another grid.
+        # Parts inside overlap it: segments that only touch could leave gaps on another grid.
         inside = masks.shares[number:].sum(axis=0) > 0.5
         image = slicer.vtkOrientedImageData()
         image.ShallowCopy(Volume(inside, np.eye(4)).to_vtk())

@@ -157,7 +157,7 @@ class SettingsParameter(Generic[S]):
 
 
 def preset_texts(texts: Mapping[str, str]) -> dict[str, str]:
-    """Those of a scene's {name: text} that are of its preset, see Preset.to_texts."""
+    """Those of a scene's {name: text} that belong to its preset, see Preset.to_texts."""
     sections = ("probe", "display", "settings", "tissues", "membrane")
     return {name: text for name, text in texts.items() if text and name.split(".")[0] in sections}
 

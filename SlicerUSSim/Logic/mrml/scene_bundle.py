@@ -76,7 +76,7 @@ def _check_names(path: Path, scene: Path, folder: Path) -> None:
     try:
         tree = ElementTree.parse(scene)
     except ElementTree.ParseError as error:
-        raise SimulationError(f"{path}: its scene is no XML ({error})") from None
+        raise SimulationError(f"{path}: its scene is not XML ({error})") from None
     for element in tree.iter():
         for attribute, text in element.attrib.items():
             if not text or not attribute.startswith(_FILES):

@@ -32,7 +32,7 @@ from SlicerUSSim.Logic.probe.surface import PatientSurface
 
 
 class SequenceLogic:
-    """Images of many poses, and whether they are of the patient as it is now."""
+    """Images of many poses, and whether they show the patient's current state."""
 
     def __init__(self, patient: PatientLogic, images: ImageLogic, live: LiveLogic) -> None:
         self._patient, self._images, self._live = patient, images, live
@@ -140,7 +140,7 @@ class SequenceLogic:
         mark_as_result(volume_node, COMPOUNDED)
 
     def sequenceImage(self, images_node, number: int) -> TakenImage:
-        """The image with a number, from 0, that simulateSequence made, with all that it is of.
+        """The image with a number, from 0, that simulateSequence made, with everything it shows.
 
         Raises SimulationError for a sequence of something else.
         """

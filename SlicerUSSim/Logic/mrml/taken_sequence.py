@@ -1,4 +1,4 @@
-"""Images of a simulated sequence with all that each is of, as nodes that are saved with the scene."""
+"""Images of a simulated sequence with their records, as nodes that are saved with the scene."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Craniotomy: an opening in what lies outside the brain, through which a beam reaches it.
+"""Craniotomy: an opening in the tissues outside the brain, through which a beam reaches it.
 
 Skin, scalp, skull and marrow in the opening become the coupling medium, as saline fills it in an operation. The brain,
 what was laid over it, and air stay.
@@ -44,7 +44,7 @@ ROOM_MM = 10.0
 
 
 def without_outside(labels: Volume, names: Sequence[str]) -> Volume:
-    """The labels, 1, 2, ... called `names`, without what lies outside the brain."""
+    """The labels, 1, 2, ... called `names`, without those outside the brain."""
     return labels.with_array(np.where(_is_any(labels, names, OUTSIDE), 0, labels.array))
 
 

@@ -54,7 +54,7 @@ class Findings:
     scheme: Scheme | None
     mapping: LabelMapping
     tissues: TissueTable
-    #: Whether it is of organs of a CT
+    #: Whether it labels organs of a CT
     of_ct: bool = False
 
     @property

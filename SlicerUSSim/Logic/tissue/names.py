@@ -114,8 +114,8 @@ def _synonyms() -> dict[str, str]:
 
 @cache
 def _by_words(name: str, kind: str) -> str | None:
-    """By the first row of words.csv with a word in the name, if it is of this kind, so that what is special comes
-    before what is general: neither a cyst nor a lesion of the kidney is kidney, nor is bone wax bone."""
+    """By the first row of words.csv with a word in the name, if it has this kind, so that special words come before
+    general ones: neither a cyst nor a lesion of the kidney is kidney, nor is bone wax bone."""
     key = plain_name(name)
     key = _synonyms().get(key, key)
     if key in TISSUES:

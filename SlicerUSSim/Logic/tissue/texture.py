@@ -91,7 +91,7 @@ class Texture:
         return Texture(self.second_label[part], self.second_share[part], self.deviation[part], share)
 
     def along(self, labels: Volume) -> Texture:
-        """Stored as `labels.along()`, of the label map that it is of. Raises SimulationError if the shapes differ."""
+        """Stored as `labels.along()`, of its label map. Raises SimulationError if the shapes differ."""
         require(
             self.deviation.shape == labels.array.shape,
             f"the texture has shape {self.deviation.shape}, expected that of the labels, {labels.array.shape}",

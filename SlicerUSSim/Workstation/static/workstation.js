@@ -33,7 +33,7 @@ import "./measure.js";
     if (name === "simulated") workstation.image = meta.blank ? null : meta;
     // One ruler: real images are on the pixels of the simulated one, unless their size is not known
     const ruler = meta.ruler?.x !== undefined ? meta.ruler : (workstation.image?.ruler ?? meta.ruler);
-    if (name === "simulated" && !isFrozen()) measure.unfrozen(); // they are of the image before
+    if (name === "simulated" && !isFrozen()) measure.unfrozen(); // they belong to the previous image
     screens.put(name, bitmap, { ...meta, ruler });
     if (name !== "simulated" || !bitmap) return;
     workstation.images += 1;

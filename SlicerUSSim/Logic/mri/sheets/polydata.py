@@ -100,7 +100,7 @@ def read_surfels(path: str | os.PathLike) -> Surfels:
     require(Path(path).suffix.lower() == ".vtp", f"{path}: expected a .vtp that `ussim segment --sheets` has written")
     file = vtkXMLPolyDataReader()
     with messages_withheld():
-        require(file.CanReadFile(str(path)) == 1, f"{path}: is no VTK surface")
+        require(file.CanReadFile(str(path)) == 1, f"{path}: is not a VTK surface")
         require(_has_end(Path(path)), f"{path}: is incomplete; copy or write it again")
         file.SetFileName(str(path))
         file.Update()
