@@ -1,4 +1,4 @@
-"""Level at the centre of a cyst re its surroundings, against its depth, for three probe presets as a figure.
+"""Level at the centre of a cyst relative to its surroundings, against depth, for three probe presets as a figure.
 
     python -m benchmarks.cyst_contrast PICTURE.png [--all]
 
@@ -29,7 +29,7 @@ RADIUS_MM, SEEDS = 5.0, 4
 
 
 def contrast_db(probe: Probe, depth_mm: float, device: str | None) -> float:
-    """Mean power within 1 mm of the centre of the cyst, re that beside it at the same depth."""
+    """Mean power within 1 mm of the centre of the cyst, relative to that beside it at the same depth."""
     spacing = 0.5
     axis = np.arange(-12, 13) * spacing
     x, y, z = np.meshgrid(axis, axis, axis)

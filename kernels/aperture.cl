@@ -38,7 +38,7 @@
 #define LEFT_FOR_MEANS 0.01f  // of the power of a line that strong tissue stops
 #define EDGE_OF_BONE 0.75f    // part of a cell from which lines are lost in it by their length
 #define LEAST_OPEN 0.05f      // amplitude that is left by the part that bone covers
-#define LEAST_POWER 1e-7f     // of a beam re an undisturbed one
+#define LEAST_POWER 1e-7f     // of a beam relative to an undisturbed one
 #define NO_END 1e3f
 #define LEAST_UNEVEN 0.02f  // nepers, both ways, by which soft tissue may take more from one line than from another
 #define MOST_UNEVEN 0.7f    // ... and up to which that belongs to the width of the beam
@@ -397,7 +397,7 @@ typedef struct {
   // Sums along the lines, per length of the axis: extra path, nepers, elevational deflection; and the amplitude that
   // passes strong tissue
   float delay[ROWS][MOST_POINTS], loss[ROWS][MOST_POINTS], lift[ROWS][MOST_POINTS], passed[ROWS][MOST_POINTS];
-  // The amplitude that soft tissue leaves, re that of the line of the least loss, and by how much losses differ
+  // The amplitude that soft tissue leaves, relative to the line of least loss, and by how much losses differ
   float kept[ROWS][MOST_POINTS], least_loss, uneven;
 } Lines;
 

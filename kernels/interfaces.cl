@@ -121,7 +121,7 @@ __kernel void find_walls(Frame frame, __global const Hit *hits, __global const i
       const float inside2 =
           bent_patch(per_mm, hit->lateral_slope, bend + fan, inside * sigma2, &wall.depth_mm) +
           bent_patch(per_mm, hit->elevational_slope, bend, inside_aside * sigma.y * sigma.y, &wall.depth_mm);
-      // Of a bent patch only the Fresnel zone contributes. The mean curvature says nothing of its direction; laterally,
+      // Of a bent patch only the Fresnel zone contributes. The mean curvature does not show its direction; laterally,
       // where patches are wide, this is within 2 dB of theory for spheres and for cylinders along and across the plane.
       const float zones = per_mm * bend * inside * sigma2;
       wall.echo /= sqrt(sqrt(1.0f + zones * zones));

@@ -363,7 +363,7 @@ inline floatn unevenness(uint seed, const floatn *words, int has_specks, floatn 
   return exp2_fast(clamp(level, (floatn)(-30.0f), (floatn)(30.0f)));
 }
 
-// Where scatterers are re a piece, for LANES of them at places u, v, w from the segment's start.
+// Positions of LANES scatterers relative to a piece, at places u, v, w from the segment's start.
 typedef struct {
   floatn t, along, aside;  // part of the piece, length along the segment, distance from its axis in the image plane
   floatn right, ends;      // distance from the strip's middle, at which it ends

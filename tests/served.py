@@ -66,7 +66,7 @@ class Served:
         return self.process.exitcode is None
 
     def kill(self) -> None:
-        """End it by a signal that it cannot hear."""
+        """End it by a signal that it cannot handle."""
         self.process.kill()
         self.process.join()
 

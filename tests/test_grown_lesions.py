@@ -53,7 +53,7 @@ def test_one_seed_grows_the_lesion_and_a_larger_version(kind, aside_mm):
     assert np.linalg.norm(lesion.centre_ras_mm - CENTRE) < 4.0
     assert (segmentation.labels.array == before).all()
     assert lesion.tissues == (("tumour", "necrosis") if kind == "ring" else ("tumour",))
-    assert any("say what it is" in line for line in lesion.warnings) == (kind == "low")
+    assert any("state which" in line for line in lesion.warnings) == (kind == "low")
 
 
 @pytest.mark.long

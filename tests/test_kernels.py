@@ -58,7 +58,7 @@ def scene(spacing_mm=1.0):
 
 
 def off(found: np.ndarray, expected: np.ndarray) -> float:
-    """The mean over depths, in steps of 64 samples, of the difference re what is expected there (60 dB at most)."""
+    """The mean over depths, in steps of 64 samples, of the difference relative to the expected (60 dB at most)."""
     error, power = ((np.abs(x) ** 2).reshape(len(x), -1, 64).sum(axis=(0, 2)) for x in (found - expected, expected))
     return float(np.sqrt(error / np.maximum(power, 1e-6 * power.max())).mean())
 

@@ -699,7 +699,7 @@ def test_an_image_of_a_sequence_is_shown_where_it_was_taken(bench, tmp_path):
     bench.logic.simulate(bench.labels, bench.probe, bench.image)  # into the same volume again
     assert not is_frozen(bench.image)
     images.SetAttribute("SlicerUSSim.images", None)
-    with pytest.raises(SimulationError, match="does not say what its images are of, expected those of Simulate"):
+    with pytest.raises(SimulationError, match="has no records of its images, expected those of Simulate"):
         bench.logic.showSequenceImage(images, 1, bench.image)
     with pytest.raises(SimulationError, match="has 2 images, expected one with the number 2"):
         bench.logic.showSequenceImage(images, 2, bench.image)

@@ -350,7 +350,7 @@ for size in (80, 64):  # of 64, only the header does not fit
 
 @pytest.mark.skipif(sys.platform == "win32", reason="no limit of the size of files")
 def test_a_file_that_does_not_fit_on_the_disk_leaves_the_one_before(tmp_path):
-    """Of a NIfTI file ITK did not say so: the file before was replaced by an empty one."""
+    """ITK did not report it for NIfTI: an empty file replaced the previous one."""
     names = ["v.mha", "v.nii", "v.nii.gz", "v.nrrd", "v.vti"]
     done = subprocess.run([sys.executable, "-c", _FULL, *names], cwd=tmp_path, capture_output=True, text=True)
     assert done.returncode == 0 and done.stderr == ""  # ITK and VTK reported it in their own words

@@ -26,7 +26,7 @@ PATTERNS = {
     r"of before": "previous, last",
     r"from which (on|that)": "least, above which",
     r"is not there": "is missing, does not exist",
-    r"(?<!db\s)re the": "relative to the",
+    r"(?<!db\s)re (the|its|that|those|an?|one|what)": "relative to",
     r"(?<!now\s)as of (a|an|the|another)": "such as, as in, as from",
     r"for ever": "forever",
     r"(it|that|they|which|these|those) (is|are|was|were) of (a|an|the|another|this|that)": "belongs to, shows",

@@ -449,7 +449,7 @@ def test_a_double_click_aims_the_probe_at_a_structure(page):
         settled(page)
         return pose(page) != before
 
-    eventually(page, aimed)  # the server takes two clicks for two where it is too busy to hear them in time
+    eventually(page, aimed)  # the server takes two clicks for two where it is too busy to handle them in time
     page.evaluate("window.trame.trigger('plane', ['Green', 'Axial'])")
     after = pose(page)
     assert abs(after["tilt_deg"] - before["tilt_deg"]) > 3 and after["right_deg"] == pytest.approx(before["right_deg"])

@@ -1,4 +1,4 @@
-"""The level of speckle along lines, of images and of wave propagation, re a medium of one speed of sound."""
+"""Levels of speckle along lines, of images and of wave propagation, relative to a medium of one speed of sound."""
 
 from __future__ import annotations
 

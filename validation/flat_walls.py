@@ -106,13 +106,13 @@ def turned_planes(rotation: np.ndarray, device) -> Outcome:
 
 
 def _lowest_facing(along: np.ndarray, straight: np.ndarray) -> float:
-    """The lowest of levels in dB by line, re those of a straight plane, of the lines that it faces."""
+    """The lowest of levels in dB by line, relative to a straight plane, of the lines that it faces."""
     facing = straight > np.nanmax(straight) - 0.7
     return float(np.min((along - straight)[facing], initial=np.inf))
 
 
 def planes_in_small_maps(rotation: np.ndarray, device) -> Outcome:
-    """Planes that face the beam in maps of 80 x 66 x 52 voxels, re those on a face of voxels that are not turned."""
+    """Planes that face the beam in maps of 80 x 66 x 52 voxels, relative to planes along the voxels."""
     probes = {name: replace(PROBES[name], frequency_mhz=5.0, band_mhz=None) for name in _SMALL_PROBES}
     normal = np.array([0.0, 1.0, 0.0])
     random = np.random.default_rng(round(1e6 * Rotation.from_matrix(rotation).magnitude()))

@@ -425,7 +425,7 @@ def round_cyst(rotation: np.ndarray | None = None, *, depth_mm: float = 40.0, ra
 
 
 def clutter_power(probe: Probe, depth_mm: float, radius_mm: float, within_mm: float = 0.0) -> float:
-    """Power received from outside a disc across the beam at a depth, re that of everything; without attenuation.
+    """Power received from outside a disc across the beam at a depth, relative to all power; without attenuation.
 
     It is that of lines through the centre of the disc, or the mean of those within `within_mm` of it laterally.
 

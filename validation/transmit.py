@@ -45,7 +45,7 @@ def focal_zones(rotation: np.ndarray, device) -> Outcome:
             theory = MAIN_LOBE * probe.wavelength_mm * f_number / np.sqrt(2.0)
             rows.append(Row(f"lateral FWHM at {depth} mm, {name}", "mm", theory, width, 0.15 * theory))
             if depth == 10:
-                rows.append(Row(f"re one focus, {name}", "", 0.85, width / wide[depth], 0.0, "at most"))
+                rows.append(Row(f"relative to one focus, {name}", "", 0.85, width / wide[depth], 0.0, "at most"))
     return Outcome(tuple(rows))
 
 

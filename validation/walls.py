@@ -19,7 +19,7 @@ from validation.phantoms import FLUID, Phantom, layered, reflection_coefficient,
 from validation.pictures import Curve, Plot, draw_plots
 
 _DEPTH_MM = 25.0
-#: Levels re a perpendicular wall in dB: predictions hold down to the first; what is predicted below it stays below the
+#: Levels in dB relative to a perpendicular wall: predictions hold down to the first; below it, levels stay below the
 #: second
 _FLOOR_DB, _CEILING_DB = -30.0, -28.0
 _SETTINGS = SimulationSettings(scattering=False, specular_exponent=0.0)
@@ -137,7 +137,7 @@ def sheets(rotation: np.ndarray, device) -> Outcome:
         back = (1 - r * r) * np.exp(-2j * np.pi * probe.cycles_per_mm * thickness)
         echo = np.exp(-0.5 * (depth / sigma) ** 2) - back * np.exp(-0.5 * ((depth - thickness) / sigma) ** 2)
         predicted = float(20 * np.log10(np.abs(echo).max()))
-        rows.append(Row(f"sheet of {thickness:g} mm re one border", "dB", predicted, float(measured), 2.0))
+        rows.append(Row(f"sheet of {thickness:g} mm relative to one border", "dB", predicted, float(measured), 2.0))
     return Outcome(tuple(rows))
 
 

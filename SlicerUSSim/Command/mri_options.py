@@ -117,8 +117,8 @@ class ImageOptions(MriOptions):
     #: Kinds that are not drawn
     no_sheets: tuple[str, ...] = declared(
         "--no-sheet", multiple=True, metavar="KIND",
-        help="What --sheets leaves as the labels have it: sulcus, falx, tentorium, ependyma, corpus callosum, choroid "
-        "plexus or vessels; may be repeated.",
+        help="Kind that --sheets omits: sulcus, falx, tentorium, ependyma, corpus callosum, choroid plexus, "
+        "vessels; may be repeated.",
     )  # fmt: skip
 
 

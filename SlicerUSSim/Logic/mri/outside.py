@@ -162,7 +162,7 @@ def _cut(labels: np.ndarray, mri: Volume) -> tuple[str, ...]:
 
 
 def _at_faces(box: list[slice], mri: Volume) -> np.ndarray:
-    """(k, j, i) bool of the box: near the faces of the image, where coils hear little and fat is as dark as air."""
+    """(k, j, i) bool of the box: near the faces of the image, where coils receive little and fat is as dark as air."""
     inside = np.ones(mri.array.shape, bool)
     for axis, step in enumerate(mri.spacing_mm[::-1]):
         n = min(int(np.ceil(_FACES_MM / step)), mri.array.shape[axis] // 2)

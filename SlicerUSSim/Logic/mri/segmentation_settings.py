@@ -74,9 +74,9 @@ class SheetSettings(Declared):
     """What a scene looks for with sheets.find_sheets, and what its images show of it."""
 
     find: bool = parameter(
-        False, "Find sheets and vessels", "Segment also looks for sulci, falx, tentorium, walls of the ventricles, "
+        False, "Find sheets and vessels", "Segment also finds sulci, falx, tentorium, walls of the ventricles, "
         "corpus callosum, choroid plexus and vessels, in a T1 or T2 (about a minute); off: images have the lines of "
-        "the labels, as the paper's model", shown=True,
+        "the labels, as in the paper", shown=True,
     )  # fmt: skip
     sulcus: bool = parameter(True, "Sulci", "Sulci as thin sheets, also closed ones")
     falx: bool = parameter(True, "Falx", "Falx as a thin sheet")

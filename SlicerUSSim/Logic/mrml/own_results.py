@@ -59,7 +59,7 @@ def mark_as_result(node, kind: str) -> None:
         marks[_DATA] = _hash_of(node)
         claim(node)
     for name, text in marks.items():
-        if node.GetAttribute(name) != text:  # an attribute that is set is a change, which observers hear of
+        if node.GetAttribute(name) != text:  # an attribute that is set is a change, which observers are notified of
             node.SetAttribute(name, text)
 
 

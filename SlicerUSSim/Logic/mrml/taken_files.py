@@ -51,7 +51,7 @@ def written(suffix: str, write: Callable[[Path], object]) -> bytes:
 def sequence_file(images: Sequence[tuple[float, TakenImage]]) -> bytes:
     """Images with their times in s as a sequence metafile (.igs.mha), with their places in the MRI (RAS, mm).
 
-    The file says what the last one is of (TakenImage.about).
+    The file has the record of the last one (TakenImage.about).
     """
     seconds, taken = zip(*images, strict=True)
     transforms = tuple(

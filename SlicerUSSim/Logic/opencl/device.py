@@ -170,7 +170,7 @@ class Device:
             except Exception as error:  # pyopencl raises whatever pickle does
                 why = f"{type(error).__name__}: {error}"
             else:
-                # The runtime of a damaged file has a program without them, and says nothing
+                # For a damaged file the runtime returns a program without them, without an error
                 missing = set(re.findall(r"^(?:__)?kernel\s+void\s+(\w+)", source, re.MULTILINE)) - kernels.keys()
                 if not missing:
                     return program, kernels

@@ -61,13 +61,12 @@ class Probe(Beam):
         bounds=(0, 10),
     )  # fmt: skip
     ring_down_db: float = parameter(
-        0.0, "Ring-down level", "Of the reverberation at the face, re tissue of unit scatterer variance", unit="dB",
+        0.0, "Ring-down level", "Reverberation at the face, relative to tissue of unit scatterer variance", unit="dB",
         bounds=(-100, 100),
     )  # fmt: skip
     face_reflection: float = parameter(
         0.25, "Face reflection",
-        "Amplitude that the face reflects of what bone or gas send back to it, which shows them again at twice their "
-        "depth; 0: none",
+        "Amplitude reflected at the face, so that echoes of bone and gas appear again at twice their depth; 0: none",
         bounds=(0, 1),
     )  # fmt: skip
 

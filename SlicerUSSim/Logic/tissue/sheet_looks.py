@@ -20,7 +20,7 @@ class SheetLook:
     #: Of the layer of scatterers, mm
     least_thickness_mm: float
     most_thickness_mm: float
-    #: Their level re those of that tissue, dB
+    #: Their level relative to that tissue, dB
     level_db: float
     #: Whether it is the border of a ventricle, whose scatterers fade with the angle as those of any wall
     is_wall: bool

@@ -284,6 +284,6 @@ def _doubts(grown: _Grown, named: str | None) -> Iterator[str]:
     if named is None and grown.look == "fluid":
         yield "fluid looks alike in ventricles, sulci and cysts: look which it is"
     elif named is None and grown.look != "enhancing":
-        yield "what does not enhance may be tumour or oedema: look, and say what it is (TISSUE)"
+        yield "a lesion that does not enhance may be tumour or oedema: look, and state which (TISSUE)"
     if grown.region.radius_mm < _THIN_MM:
         yield "it is thin, as vessels and the cortex are: look whether it is one"

@@ -134,7 +134,7 @@ def _sampled_evidence(
         return np.where(beyond <= _SINUS_MM, found, 0.0)  # marrow and scalp are bright as well
     # In wide fluid the falx is a brighter line, and the fluid on either side of it would draw it there.
     found = np.asarray(ndimage.grey_closing(found, (1, 1, round(_LINE_MM / _STEP_MM))))
-    return np.where(beyond > 0.0, 1.0, found)  # bone and marrow say nothing of the falx
+    return np.where(beyond > 0.0, 1.0, found)  # bone and marrow do not show the falx
 
 
 def _evidence(head: Head) -> np.ndarray:
