@@ -77,7 +77,7 @@ def simulator(
 
 @cache
 def coarse_chest() -> CtPhantom:
-    """A CT of the lower chest in voxels of 4 mm, which nobody changes."""
+    """A CT of the lower chest in voxels of 4 mm, which no test changes."""
     return lower_chest((4.0, 4.0, 4.0))
 
 

@@ -27,7 +27,7 @@ from validation.ct_phantoms import BY_NUMBER, NAMES, CtPhantom, lower_chest, lum
 
 @cache
 def coarse() -> CtPhantom:
-    """The spine in voxels of 3 mm, where the place of tissues is not what is asked; nobody changes it."""
+    """The spine in voxels of 3 mm, where the place of tissues is not tested; no test changes it."""
     return lumbar_spine((3.0, 3.0, 3.0))
 
 

@@ -85,7 +85,7 @@ def file(tmp_path) -> Path:
 
 @pytest.fixture
 def sent():
-    """A file from somebody else."""
+    """An untrusted file."""
     with untrusted_folder(ReadingLimits(seconds=60)) as folder:
         path = Path(folder) / "file.txt"
         path.write_text("text")

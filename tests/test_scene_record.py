@@ -195,7 +195,7 @@ def test_images_of_a_sequence_and_lesions_there_and_back():
         assert np.array_equal(old.image, new.image) and old.about() == new.about() and new.grid == old.grid
         assert np.array_equal(old.probe_to_world, new.probe_to_world)
         assert sequence.GetNthIndexValue(number) == images.GetNthIndexValue(number)
-        assert new.anatomy is None  # of which nobody knows whether it is the same still
+        assert new.anatomy is None  # which may have changed
     # What does not go together is refused, and nothing of it stays.
     count = other.scene.GetNumberOfNodesByClass("vtkMRMLSequenceNode")
     with pytest.raises(SimulationError, match=r"of a sequence is|images of"):

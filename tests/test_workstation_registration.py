@@ -92,7 +92,7 @@ def test_ultrasound_without_a_calibration_asks_for_it(page, recording):
     said = state(page, NAMES.opened)[0]
     assert said.endswith(
         "tracked ultrasound: 6 images of 624x512, transforms ProbeToTracker, ReferenceToTracker, StylusToTracker: its "
-        "calibration is asked for in Tracked ultrasound"
+        "enter its calibration in Tracked ultrasound"
     )
     assert state(page, NAMES.sequence.length) == 6 and not state(page, NAMES.sequence.is_placed)
     assert "no path from Image to Reference" in page.locator("#calibration-from").inner_text()

@@ -38,7 +38,7 @@ _SMALL_PROBES = ("convex", "phased", "linear")
 #: Voxels of 1 mm beside the axis at which planes end, out of the image plane, by the turn of the voxels in degrees
 _ENDS = {0.0: (14.0, 18.0, 22.0, 26.0, 30.0, 36.0, 42.0), 2.0: (26.0, 30.0, 36.0, 42.0)}
 
-#: Planes tilted by so much to the beam: the level along them does not vary by more dB
+#: Tilt of planes to the beam, and the largest variation of the level along them in dB
 _TILT_DEG, _VARIATION_DB = 5.0, 3.0
 
 #: Layers of voxels at right angles to diagonals, and degrees by which planes are turned from them. The steps of one

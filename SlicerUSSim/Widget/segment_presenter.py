@@ -136,7 +136,7 @@ class SegmentPresenter:
 
     @contextmanager
     def replaceable(self, name: str, source: Any) -> Iterator[Any]:
-        """The chosen labels if Segment made them and nobody has edited them; otherwise a new node, which is selected.
+        """The chosen labels if Segment made them and no user edited them; otherwise a new node, which is selected.
 
         Afterwards the notes are those of the logic, about the node `source`.
         """

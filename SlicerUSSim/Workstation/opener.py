@@ -130,7 +130,7 @@ class Opener:
             self._take_all(files, meant)
         finally:
             self._nodes.volumes.clear()
-        for line in wrong:  # after a new patient, with whom the messages about the one before are gone
+        for line in wrong:  # after a new patient, who clears the messages about the previous one
             self._panel.showError(line)
 
     def _take_all(self, files: list[_File], meant: str) -> None:
@@ -318,7 +318,7 @@ class Opener:
         recording = self._registration.read(file.path)
         self._registration.take(recording)
         if not recording.is_calibrated:
-            return f"{recording.what}: its calibration is asked for in Tracked ultrasound"
+            return f"{recording.what}: enter its calibration in Tracked ultrasound"
         return f"{recording.what}: compared with {self._patient.name or 'the patient who is opened next'}"
 
     def _transform(self, file: _File, together: list[_File]) -> str:
@@ -381,7 +381,7 @@ class Opener:
         return Choice(_NEW, "New patient", self._closed())
 
     def _closed(self) -> str:
-        """What becomes of the patient who is open, and what of him is lost then."""
+        """A line about closing the open patient, and about unsaved data that are lost."""
         unsaved = self._patient.unsaved
         lost = f"; not saved: {', '.join(unsaved)}" if unsaved else ""
         return f"{self._patient.name} is closed with everything that belongs to it{lost}"

@@ -44,7 +44,7 @@ class OpenPatient:
         self._panel, self._presenter, self._nodes = panel, panel.presenter, nodes
         self._views, self._probe, self._comparison = views, probe, comparison
         self._registration = registration
-        self._is_new = False  # a patient was opened, on whom the probe is not yet
+        self._is_new = False  # a patient was opened, and the probe is not placed yet
         #: {what was made here: its version in the last scene that was saved or opened}
         self._saved: dict[str, Hashable] = {}
 

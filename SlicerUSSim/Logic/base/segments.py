@@ -105,5 +105,5 @@ def ranked_codes(category: str, kind: str, modifier: str, region: str) -> tuple[
 
 
 def is_meaningful(name: str | None) -> bool:
-    """Whether somebody gave this name, and no program ("Label 3", "Segment_1")."""
+    """Whether a user gave this name, rather than a program ("Label 3", "Segment_1")."""
     return bool(name) and not _MEANINGLESS.fullmatch(str(name).strip())

@@ -13,7 +13,7 @@ from SlicerUSSim.Logic.base.transforms import LPS_TO_RAS
 from SlicerUSSim.Logic.base.volume import Volume
 
 _SPACING_MM = 4.0
-#: Slices thicker than this, and than twice the pixels, are divided into ones of at most so many mm
+#: Slices thicker than this, and than twice the pixels, are divided into ones of at most the second number, mm
 _THICK_MM, _THIN_MM = 3.0, 1.5
 
 

@@ -28,14 +28,14 @@ _AIR_LUNG, _LUNG_FAT, _FAT_SOFT, _SOFT_BRIGHT, _METAL = -930, -250, -25, 135, 29
 #: Only bone is as dense as the first number, or as the second in a sheet; around it cortex goes down to the third,
 #: and has the last where it is thicker than the blur
 _DENSE_HU, _CORE_HU, _CORTEX_HU, _WHOLE_CORTEX_HU = 700, 450, 300, 1600.0
-#: Thin cortex has less: from this number on, if it stands out so much from what is wider than this, mm
+#: Thin cortex has less: at least this number, if it exceeds wider structures than the third, mm, by the second
 _SHEET_HU, _STANDS_OUT, _SHEET_MM = 220, 90, 6.0
-#: A gap between bones that is narrower than the first number, mm, and so much darker than both
+#: A gap between bones that is narrower than the first number, mm, and by the second darker than both
 _GAP_MM, _GAP_DEPTH_HU = 3.5, 150
-#: Marrow with trabeculae from this number on, where bone lies in such a share of 26 directions within so many mm
+#: Marrow with trabeculae has at least this number, where bone is in this share of 26 directions within this many mm
 _MARROW_HU, _ENCLOSED, _REACH_MM = 100, 0.84, 30.0
-#: Least difference across a voxel that is on a step: less than from fat to muscle, or so many deviations of the
-#: noise; and those within which a number alone does not tell contrast agent
+#: Least difference across a voxel that is on a step: less than from fat to muscle, or this many deviations of
+#: the noise; and those within which a number alone does not tell contrast agent
 _LEAST_STEP, _STEP_PER_NOISE, _MARGIN_PER_NOISE = 90, 5.0, 2.0
 #: Gas in a smaller space than this is not lung, ml
 _LEAST_LUNG_ML = 10.0

@@ -79,7 +79,7 @@ def volume_doubts(millilitres: float) -> tuple[str, ...]:
 
 #: Labelled voxels that are looked at; the share of them that has to lie in the MRI
 _SAMPLES, _LEAST_INSIDE = 40_000, 0.5
-#: The labels are moved by so much along either direction of the three axes, for comparison; by the first of these with
+#: The labels are moved this far along either direction of the three axes, for comparison; by the first of these with
 #: which they no longer explain more than this share of intensities that are exactly theirs. A direction in which they
 #: do so still, such as a cylinder's axis, is ignored.
 _MOVED_MM, _MOST_ALIKE = (6.0, 12.0, 24.0), 0.35

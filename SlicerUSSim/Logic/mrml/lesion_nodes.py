@@ -121,7 +121,7 @@ def with_lesions(
 
 
 def place_of(mask: Volume) -> tuple[float, ...]:
-    """Volume in ml, centre and box in RAS mm of a mask that is not empty: equal for a lesion that nobody has edited."""
+    """Volume in ml, centre and box in RAS mm of a mask that is not empty: equal for an unedited lesion."""
     inside = mask.array > 0
     centre = mask.ijk_to_ras[:3] @ np.append(np.argwhere(inside).mean(axis=0)[::-1], 1.0)
     numbers = (inside.sum() * mask.voxel_ml, *centre, *np.ravel(box_ras(inside, mask)))

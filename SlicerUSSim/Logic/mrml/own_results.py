@@ -161,7 +161,7 @@ def content_as_made(labels_node) -> str | None:
 
 
 def may_replace(labels_node) -> bool:
-    """Whether a node is new, or has labels that this program made, and nobody has edited since.
+    """Whether a node is new, or has unedited labels that this program made.
 
     A new one has neither segments nor voxels; segments without voxels are a user's plan. A copy of labels belongs to
     the user who made it, see claim.

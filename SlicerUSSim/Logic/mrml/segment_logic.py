@@ -50,7 +50,7 @@ _SEGMENTED = 0.4
 
 
 class SegmentLogic:
-    """Labels of a patient, written into nodes that this module made and nobody edited since."""
+    """Labels of a patient, written into unedited nodes of this module."""
 
     def __init__(self, patient: PatientLogic, live: LiveLogic) -> None:
         self._patient, self._live, self._work = patient, live, patient.work
@@ -153,7 +153,7 @@ class SegmentLogic:
     def writeBrain(self, result: Segmentation, mri_node):
         """The label map node "NAME brain" with the mask that segment() extracted from a whole head.
 
-        It is used again as long as nobody has edited it; otherwise another node is made.
+        It is used again until a user edits it; then another node is made.
         """
         scene, name = self._patient.scene, f"{mri_node.GetName()} brain"
         known = nodes_of_class(scene, "vtkMRMLLabelMapVolumeNode")
@@ -167,7 +167,7 @@ class SegmentLogic:
         return node
 
     def isOwnBrain(self, mask_node) -> bool:
-        """Whether a mask is one that writeBrain wrote, and nobody has edited it."""
+        """Whether writeBrain wrote a mask, and no user has edited it."""
         return self.isBrainOf(mask_node, None) is not None and may_replace(mask_node)
 
     def isBrainOf(self, mask_node, mri_node) -> bool | None:
@@ -177,7 +177,7 @@ class SegmentLogic:
         return mri_of(mask_node) is mri_node
 
     def mayReplace(self, labels_node) -> bool:
-        """Whether segment() may write into a node: if it is empty, or has what segment() wrote and nobody edited."""
+        """Whether segment() may write into a node: if it is empty, or has unedited labels by segment()."""
         require_node(labels_node, *LABEL_CLASSES, use="output of Segment")
         return may_replace(labels_node)
 

@@ -39,7 +39,7 @@ DIAMETERS_MM, _MOST_ML = (5.0, 150.0), 500.0
 _NEAR_BRAIN_MM = 30.0
 #: A polygon that was drawn on the skin or the brain is so near to them, mm: half of its points
 _NEAR_POLYGON_MM = 15.0
-#: A face needs so much more room than it is wide, mm
+#: A face needs this much more room than it is wide, mm
 ROOM_MM = 10.0
 
 

@@ -174,7 +174,7 @@ _OTHERS = 0.6
 #: Least correlation of that brightness with the atlas that confirms an orientation: 0.46 to 0.51 for correct ones in
 #: heads of any orientation, 0.15 to 0.33 for wrong ones, although their masks overlap (Dice 0.88 to 0.91)
 _LEAST_CORRELATION = 0.38
-#: Orientations that are tried where the registration, which starts upright, finds none, and so many points for each
+#: Orientations to try if the registration, which starts upright, finds none, and points for each
 _MOST_TRIED, _POINTS = 4, 4000
 #: A head that lies less obliquely than this needs no word, degrees
 _TOLD_DEG = 8.0

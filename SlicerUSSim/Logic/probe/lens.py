@@ -18,8 +18,8 @@ _DEPTHS, _DISTANCES = CONSTANTS["LOBE_DEPTHS"], CONSTANTS["LENS_DISTANCES"]
 _OPEN, _LEAST_PLANE, _MOST_PLANE = 256, 2048, 16384
 #: Frequencies of the band, by a Gauss-Hermite rule; the lowest relative to the centre
 _FREQUENCIES, _LEAST_FREQUENCY = 7, 0.2
-#: The main beam begins to fade where it has this part of the deviation of all of the power, and ends at so many times
-#: that distance
+#: The main beam begins to fade where it has this part of the deviation of all of the power, and ends at this multiple
+#: of that distance
 _KEPT, _ENDS = 0.9, 1.06
 #: Lobes are computed up to the larger of these: in wavelengths x f-number, and in wavelengths
 _REACH_LOBES, _REACH_WAVELENGTHS = 5.0, 26.0

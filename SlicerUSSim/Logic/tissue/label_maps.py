@@ -150,7 +150,7 @@ class _Reading:
         self._names = {label: everything[label] for label in self._present if label in everything}
 
     def unchanged(self) -> LabelledTissues | None:
-        """The labels as they are, if the table by number has all of them and nobody says anything else about them."""
+        """The labels as they are, if the table by number has all of them and nothing else maps them."""
         table = self._by_number
         if table is None or self._mapping or self._names or any(label not in table for label in self._present):
             return None

@@ -26,13 +26,13 @@ FREE_EDGE = (
     (-60, 5), (-78, -3), (-96, -7),
 )  # fmt: skip
 _WINDOWS_MM, _SMOOTHINGS_MM = (6.0, 4.0, 3.0, 2.0), (8.0, 6.0, 5.0, 4.0)
-#: Distance to white matter counts up to this; fluid and enhancement count so many mm of it
+#: Distance to white matter counts up to this; fluid and enhancement count as this many mm of it
 _FARTHEST_MM, _EVIDENCE_MM = 6.0, 1.5
 #: Half the thickness of the thinnest white matter that counts, and what is added when it is grown back, for the grid
 _THIN_MM, _ROUNDING_MM = 1.5, 0.3
 #: Distance to white matter in the fissure, after smoothing
 _FISSURE_MM, _FISSURE_SIGMA = 1.8, 2.0
-#: With contrast agent the falx is followed so far beyond the rims, into the sinus, where it enhances by so much
+#: With contrast agent the falx is followed this far beyond the rims, into the sinus, where it enhances by this much
 _SINUS_MM, _ENHANCED = 8.0, 0.5
 #: Bright lines between fluids that are narrower than this may be the falx itself, mm
 _LINE_MM = 5.0
