@@ -148,7 +148,7 @@ def test_what_cannot_be_opened_changes_nothing(head):  # noqa: F811
     with pytest.raises(SimulationError, match="was not made by this module, or edited since, and is not replaced"):
         bench.logic.openCraniotomy(bench.whole, mine, probe_transform_node=bench.probe)
     bench.presenter.placing.closeCraniotomy()
-    assert "has no opening, or the labels before it are gone" in bench.view.errors[-1]
+    assert "has no opening, or the previous labels were removed" in bench.view.errors[-1]
 
 
 @pytest.mark.slow
@@ -298,7 +298,7 @@ def test_a_view_is_placed_in_an_opening_or_said_to_be_elsewhere(head):  # noqa: 
     bench.presenter.values.setValue("scene.view", "temporal")
     bench.presenter.placing.placeAtView()
     assert radius() == pytest.approx(78.0, abs=2.0) and bench.presenter.notes.aboutProbe().count("view: ") == 1
-    assert "the opening is not where the view temporal is seen from: the probe stands on the skin" in (
+    assert "the view temporal does not pass through the opening: the probe stands on the skin" in (
         bench.presenter.notes.aboutProbe()
     )
 

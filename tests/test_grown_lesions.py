@@ -72,7 +72,7 @@ def test_a_tumour_in_thick_slices_grows_from_its_ends_too():
 @pytest.mark.parametrize(
     ("seed", "words"),
     [
-        ((28.0, -22.0, 28.0), "in what looks as its surroundings, .* expected a point in a lesion that stands out"),
+        ((28.0, -22.0, 28.0), "looks like its surroundings, .* expected a point in a lesion that stands out"),
         ((0.0, 0.0, -70.0), "mm outside the brain"),
         ((float("nan"), 0.0, 0.0), "three finite numbers"),
     ],
@@ -128,7 +128,7 @@ def test_a_refused_seed_costs_neither_the_labels_nor_the_other_seeds(tmp_path):
 
     smaller, larger = (tmp_path / f"labels_grown_tumour{version}.nii.gz" for version in ("", "_larger"))
     result = segment("--seed", "-28,-22,28", "--seed", "28,-22,28")
-    assert result.exit_code == 2 and "looks as its surroundings" in result.stderr, result.output
+    assert result.exit_code == 2 and "looks like its surroundings" in result.stderr, result.output
     assert result.stderr.splitlines()[-1].endswith(f"{labels} is written, with all lesions that were not refused")
     assert f"--add tumour={smaller}; larger: {larger}" in result.stderr
     assert labels.exists() and 0 < Volume.read(smaller).array.sum() < Volume.read(larger).array.sum()

@@ -179,7 +179,7 @@ def test_totalsegmentators_whole_bodies_are_recognised_and_said(key):
 def test_numbers_of_several_programs_are_refused_with_choices_that_work(labels, choices):
     volume = made(dict.fromkeys(labels, ""))
     message = str(refusal_of(volume))
-    assert "have no names; say whose numbers they are: --map" in message and f"--map {labels[0]}=TISSUE" in message
+    assert "have no names; state their program: --map" in message and f"--map {labels[0]}=TISSUE" in message
     offered = [part.split()[0] for part in message.split("--map ")[1:-1]]
     assert set(offered) == set(choices), message
     for key in choices:
@@ -279,7 +279,7 @@ def test_a_command_for_an_mri_says_what_a_label_map_is_for(tmp_path, monkeypatch
             "add it to a segmentation with --add tumour=glioma.nii.gz, or simulate it alone with --map 255=tumour",
         ),
         ("brats", "--add brats=brats.nii.gz, or simulate it alone"),
-        ("unknown", "unknown.nii.gz: is a label map (8 labels), expected an MRI; use it as it is (ussim simulate unkn"),
+        ("unknown", "unknown.nii.gz: is a label map (8 labels), expected an MRI; use it directly (ussim simulate unkn"),
     ):
         assert message in refused("segment", "-o", "out.nii.gz", f"{name}.nii.gz")
     assert not Path("out.nii.gz").exists()
@@ -325,7 +325,7 @@ def test_few_unknown_labels_are_taken_as_what_is_around_them():
 
 def test_a_numbering_that_is_said_has_to_have_most_labels():
     message = str(refusal_of(numbered(ASEG), mapping=LabelMapping.of("brats")))
-    assert message.endswith("are not of --map brats; expected --map freesurfer")
+    assert message.endswith("do not belong to --map brats; expected --map freesurfer")
     found = read_label_map(tumour((1, 2, 3)), mapping=LabelMapping.of("brats"))
     assert found.names == ("necrosis", "oedema", "enhancing") and "has a tumour alone" in found.warnings[0]
     found = read_label_map(tumour((1, 2, 4)), mapping=LabelMapping.of("brats"))

@@ -176,7 +176,7 @@ def test_an_output_of_others_is_kept_and_a_new_one_selected(presenter):
     logic.parameters.output = scan
     presenter.images.simulate()
     assert not presenter.view.errors and logic.parameters.output.GetName() == "Ultrasound"
-    assert "'CT' has data of others and is kept; the result is 'Ultrasound'" in presenter.notes.text()
+    assert "'CT' has other data and is kept; the result is 'Ultrasound'" in presenter.notes.text()
     np.testing.assert_array_equal(slicer.util.arrayFromVolume(scan), head_mri(3.5).array)
     chosen = logic.parameters.output
     presenter.images.simulate()
@@ -266,7 +266,7 @@ def test_custom_without_a_custom_probe_says_how_to_make_one(presenter):
     presenter.values._custom_probe = None
     presenter.values.chooseProbe(CUSTOM_PROBE)
     assert presenter.values.probeName() == "linear"
-    assert presenter.view.errors == ["there is no custom probe yet: change a value of this probe, and it is one"]
+    assert presenter.view.errors == ["there is no custom probe yet: change a value of this probe to make one"]
 
 
 @pytest.mark.parametrize(

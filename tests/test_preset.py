@@ -41,7 +41,7 @@ def test_a_preset_may_carry_a_pose_and_one_without_is_as_before(tmp_path):
     np.testing.assert_allclose(read_pose(tmp_path / "preset.json"), pose)  # --pose takes it from there
     with pytest.raises(SimulationError, match="probe_to_ras is not rigid"):
         Preset.from_dict({**preset.to_dict(), "probe_to_ras": (2 * np.diag([1, 1, 1, 0.5])).tolist()})
-    with pytest.raises(SimulationError, match="is a pose and no preset; open it as a pose"):
+    with pytest.raises(SimulationError, match="is a pose, not a preset; open it as a pose"):
         Preset.from_dict({"probe_to_ras": pose.tolist()})  # which would reset probe and tissues
 
 

@@ -246,7 +246,7 @@ def test_the_end_of_a_label_map_is_not_a_border_and_is_reported_once(caplog):
     images = [made.simulate(seen_by, rigid(np.eye(3), [0, -10, 0])).iq for made, seen_by in views]
     np.testing.assert_allclose(images[4], images[0], atol=1e-3 * np.abs(images[0]).max())
     told = [record.getMessage() for record in caplog.records if "beyond the volume" in record.getMessage()]
-    end = "% of the image is beyond the volume: it continues what is at the volume's end, not the patient"
+    end = "% of the image is beyond the volume: it shows the tissue at the volume's end, not the patient"
     assert told == [f"27 {end}", f"57 {end}"]  # again once the share has doubled
 
 

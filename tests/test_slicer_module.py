@@ -701,7 +701,7 @@ def test_a_cancelled_fit_changes_nothing_and_errors_are_one_line(session):
     assert session.ui.fitLabel.text() == "" and session.ui.fitButton.isEnabled()
     session.panel.presenter.fits.setFree("gain_db", False)
     session.ui.fitButton.click()
-    assert session.app.errors == ["nothing is free, tick at least one parameter"]
+    assert session.app.errors == ["no parameter is free; tick at least one"]
     session.panel.presenter.fits.setFree("noise_db", True)
     assert session.parameters.fit_free == "noise_db"
     images = session.add("Sequence", "images")

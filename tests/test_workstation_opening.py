@@ -181,7 +181,7 @@ def test_several_files_at_once_are_opened_in_their_order(page, files, tmp_path):
             tmp_path / "broken.nii.gz"]  # fmt: skip
     said = answered(page, sent, "New patient").splitlines()
     assert [line.partition(":")[0] for line in said] == ["a.json", "z.nii.gz", "labels.nii.gz", "sweep.igs.mha"]
-    assert "its labels came with it; head.nii.gz is closed" in said[1] and said[2].endswith("tissues of z.nii.gz")
+    assert "with its own labels; head.nii.gz is closed" in said[1] and said[2].endswith("tissues of z.nii.gz")
     assert state(page, NAMES.title) == "labels.nii.gz" and state(page, NAMES.sequence.length) == 6
     assert page.locator("#mriSelector option:checked").inner_text().strip() == "z.nii.gz"
     assert len(errors(page)) == 1 and errors(page)[0].startswith("broken.nii.gz: ") and "/tmp" not in errors(page)[0]

@@ -228,8 +228,8 @@ def read_mri(path: str, patient: MriOptions, *, is_served: bool = False) -> Volu
         except SimulationError:  # simulate says what its labels need
             what = f"{np.unique(volume.array[volume.array != 0]).size} labels"
         raise SimulationError(
-            f"{path}: is a label map ({what}), expected an MRI; use it as it is ({used_by}), or segment it all the "
-            "same with --skull-strip none"
+            f"{path}: is a label map ({what}), expected an MRI; use it directly ({used_by}), or segment it "
+            "nevertheless with --skull-strip none"
         )
     return volume
 

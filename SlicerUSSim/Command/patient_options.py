@@ -279,7 +279,7 @@ def _placed(
             at = middle_of(added.labels, labels)
         target = added.centre_ras(before)
         if pose == AUTO and not set(names) & {*BRAIN_TISSUES, "brain"}:
-            note("--pose is auto, and no tissue of a brain is labelled: the probe stands on top of what is")
+            note("--pose is auto, and no tissue of a brain is labelled: the probe is placed on top of the others")
         if at is not None and pose == AUTO:
             from SlicerUSSim.Logic.placement.aiming import opening_pose
 

@@ -231,7 +231,7 @@ class SegmentPresenter:
             parameters.sheets = found
             lines = [f"images show the sheets in {found.GetName()!r}"]
             if before not in (None, found):
-                lines.append(f"{before.GetName()!r} was loaded by others and is kept, but no longer shown")
+                lines.append(f"{before.GetName()!r} was loaded separately and is kept, but no longer shown")
             return lines
         if before is None:
             return []

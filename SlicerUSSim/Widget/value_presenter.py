@@ -92,7 +92,7 @@ class ValuePresenter:
                 self._custom_probe = before
             if name == CUSTOM_PROBE:
                 probe = required(
-                    self._custom_probe, "there is no custom probe yet: change a value of this probe, and it is one"
+                    self._custom_probe, "there is no custom probe yet: change a value of this probe to make one"
                 )
             else:
                 key = SHOWN_PROBES.get(name, name)

@@ -113,7 +113,7 @@ class KeptState:
             is_there = self._patient.name == kept.patient
             require(
                 is_there or (kept.files and all(map(os.path.exists, kept.files))),
-                f"{kept.patient}: its files are no longer on the computer of the server, or a page had sent them; "
+                f"{kept.patient}: its files are no longer on the computer of the server, or were uploaded; "
                 "open them or the saved scene (.mrb), and press Restore again",
             )
             parameters = self._logic.parameters

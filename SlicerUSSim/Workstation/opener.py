@@ -235,7 +235,7 @@ class Opener:
             return f"shown as the image of {patient}"
         if not self._patient.take_mri(node, contrast, then_segment=not labels):
             return "a new patient, whose tissues were not found"
-        then = "its labels came with it" if labels else f"segmented as {contrast}"
+        then = "with its own labels" if labels else f"segmented as {contrast}"
         changed = f" (before: {before})" if contrast != before else ""
         return f"a new patient, {then}{changed}{f'; {patient} is closed' if patient else ''}"
 
@@ -326,7 +326,7 @@ class Opener:
         known = {".xml": _CALIBRATION, ".tag": _REGISTRATION}
         key = known.get(Path(file.name).suffix.lower())
         if key is None:
-            later = "" if self._registration.recording is not None else "; of the one that is opened next"
+            later = "" if self._registration.recording is not None else "; for the next one that is opened"
             choices = [
                 Choice(_CALIBRATION, "Calibration", f"Of tracked ultrasound: from pixels to its probe{later}"),
                 Choice(_REGISTRATION, "Registration", f"Of tracked ultrasound: from its frame to the patient{later}"),
@@ -415,7 +415,7 @@ def _tables_of(found: Mapping[Path, Content]) -> tuple[set[Path], dict[Path, Pat
         require(
             len(own) == 1 and own[0] not in pairs,
             f"{table.name} is a table of labels and was opened with {len(maps)} label maps, expected one for each "
-            "table: open a label map and its table together, both of one name if there are several",
+            "table: open a label map and its table together, with the same name if there are several",
         )
         pairs[own[0]] = table
     return set(tables), pairs

@@ -63,7 +63,7 @@ def offer() -> None:
     html.Div(
         f"""<span id="offer-text">{{{{ {NAMES.offer} }}}}</span>
         <button class="ussim-button" id="restore" :disabled="{is_busy}" @click="trigger('restore')"
-        title="Pose and settings; the patient's files are opened if another patient is">Restore</button>
+        title="Restore pose and settings; opens the patient's files if needed">Restore</button>
         <button class="ussim-button" id="discard" :disabled="{is_busy}" @click="trigger('discard')"
         title="Continue with what is open">Discard</button>""",
         v_if=NAMES.offer, classes="ussim-bar ussim-offer", id="offer", raw_attrs=['role="status"'],

@@ -23,7 +23,7 @@ from SlicerUSSim.Workstation.file_nodes import FileNodes
 SECTION = "Tracked ultrasound"
 _IMAGE, _REFERENCE = "Image", "Reference"
 _CALIBRATION, _REGISTRATION = "Calibration", "Registration"
-_NOT_REGISTERED = "none: the frame of the ultrasound is taken for the patient's"
+_NOT_REGISTERED = "none: the frame of the ultrasound is assumed to be the patient's"
 
 
 class Registration:
@@ -56,7 +56,7 @@ class Registration:
         if self.recording is not None and self._logic.parameters.real is None:
             return "The real ultrasound is not calibrated: its place in the patient is not known"
         is_assumed = self.recording is not None and not self._from[_REGISTRATION]
-        return "The real ultrasound is not registered: its frame is taken for the patient's" if is_assumed else ""
+        return "The real ultrasound is not registered: its frame is assumed to be the patient's" if is_assumed else ""
 
     def take(self, recording: SequenceRecord) -> None:
         """Use a recording from now on, in its place in the patient, if it is known.
@@ -91,7 +91,7 @@ class Registration:
     def calibrate(self, path: str) -> None:
         """Use the calibration of a file: of the name that is chosen, or those of a Plus configuration.
 
-        It is that of the ultrasound that is open, or else of the one that is opened next.
+        It belongs to the open ultrasound, or else to the next one that is opened.
         """
         name = self._shared.now.registration.name.strip()
         asked_ends(name, ())

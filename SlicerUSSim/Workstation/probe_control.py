@@ -25,7 +25,7 @@ _log = logging.getLogger(__name__)
 #: Seconds between two updates of the slice views, and of the sliders: both delay the image.
 _TURN_EVERY_S, _TELL_EVERY_S = 0.12, 0.4
 #: Message after a surface was cancelled
-_NO_SURFACE = "no surface of the patient, along which the probe slides: the camera over the 3D view makes it"
+_NO_SURFACE = "no surface of the patient for the probe to slide on: the camera over the 3D view makes it"
 _POSE_FIELDS = tuple(entry.name for entry in fields(SurfacePose))
 
 

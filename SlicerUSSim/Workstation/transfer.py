@@ -59,7 +59,7 @@ class Transfer:
             parts.append((part.filename or "", bytes(content)))
             if size > uploads.MOST_BYTES or len(parts) > uploads.MOST_FILES:
                 most = f"{uploads.MOST_FILES} files or {uploads.MOST_BYTES} bytes"
-                self._refused(f"more than {most} are sent at once, of which none are taken")
+                self._refused(f"more than {most} are sent at once; none is opened")
                 return web.Response(status=413, text="too much")
         files = uploads.plain_names(parts)
         if request.query.get("for") == DICOM:

@@ -366,7 +366,7 @@ def _as_slices(path: Path, dataset: Any) -> tuple[list[Any], str]:
     from pydicom.uid import ExplicitVRLittleEndian
 
     step = abs(float(dataset.get("SpacingBetweenSlices") or dataset.get("SliceThickness") or 0.0))
-    require(step > 0, f"{path}: its frames have neither places nor SpacingBetweenSlices; without there is no volume")
+    require(step > 0, f"{path}: its frames have neither places nor SpacingBetweenSlices; a volume needs one")
     first = _numbers(dataset, "ImagePositionPatient", 3, str(path))
     cosines = _numbers(dataset, "ImageOrientationPatient", 6, str(path))
     pixels = dataset.pixel_array
@@ -438,7 +438,7 @@ def _numbers(dataset: Any, keyword: str, count: int, name: str) -> np.ndarray:
         found = np.array([np.nan])
     require(
         len(found) == count and np.isfinite(found).all(),
-        f"{name} has no {keyword} of {count} numbers; without it there is no volume",
+        f"{name} has no {keyword} of {count} numbers, which a volume needs",
     )
     return found
 

@@ -108,7 +108,7 @@ def fit(
         if reference.is_dark:
             _log.warning(
                 "image %d is dark in all that is left of the probe's field (%.0f %% of it): its texture cannot be "
-                "compared, and the fit says little; expected an image of the patient",
+                "compared, and the fit is unreliable; expected an image of the patient",
                 number, 100.0 * tracked.mask.sum() / max(tracked.grid.field(tracked.probe).sum(), 1),
             )  # fmt: skip
 

@@ -721,7 +721,7 @@ class UltrasoundSimulator:
         share = float(is_beyond.mean())
         if share > max(_TOLD_SHARE, 2.0 * self._told_share):
             self._told_share = share
-            end = "%.0f %% of the image is beyond the volume: it continues what is at the volume's end, not the patient"
+            end = "%.0f %% of the image is beyond the volume: it shows the tissue at the volume's end, not the patient"
             _log.warning(end, 100.0 * share)
 
     def _warn_if_overflown(self, frames: int = 1) -> None:

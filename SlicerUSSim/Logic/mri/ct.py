@@ -153,7 +153,7 @@ def segment_ct(
     labels, names = classified(sharp, hu, left, body, ct, skin_mm), NAMES
     report(0.85)
     if not np.any(labels == BONE):
-        warnings.append(f"no bone was found; the densest is {sharp[body].max()} HU, expected from 700 on in a whole CT")
+        warnings.append(f"no bone was found; the densest is {sharp[body].max()} HU, expected 700 or more in a whole CT")
     if noise > _NOISY_HU:
         warnings.append(f"noise is {noise:.0f} HU, expected less than {_NOISY_HU:.0f} to tell fat and muscle apart")
     if organs is None:

@@ -50,7 +50,7 @@ def unpacked(path: Path, folder: Path, depth: int = 0) -> Path:
                 with archive.open(entry) as source, target.open("wb") as file:
                     while piece := source.read(2**20):
                         left -= len(piece)
-                        require(left >= 0, f"{path}: unpacks to more than it says, expected {size} bytes")
+                        require(left >= 0, f"{path}: unpacks to more than it states, expected {size} bytes")
                         file.write(piece)
             except (zipfile.BadZipFile, NotImplementedError, RuntimeError, EOFError, OSError) as error:
                 raise SimulationError(f"{path}: is damaged at {name.name!r} ({error})") from None

@@ -107,7 +107,7 @@ class Device:
             opened = _opened[info] = Device(info)
             if not opened.rounds_divisions:
                 _log.warning(
-                    "%s does not round divisions as IEEE 754 says: its images may differ from those of other devices: "
+                    "%s does not round divisions as IEEE 754 requires: its images may differ from other devices: "
                     "by a grey level, and by more where a ray grazes a voxel",
                     info,
                 )

@@ -68,7 +68,7 @@ def name_processor(handle) -> str | None:
         return None
     name = next((name for name, needed in _KNOWN_PROCESSORS if needed <= flags), None)
     if name is None:
-        _log.warning("PoCL's compiler does not know this processor, and no older one is like it: kernels may not build")
+        _log.warning("PoCL's compiler does not know this processor, and no similar older one: kernels may not build")
         return None
     try:
         # Reading a wrong pointer through /proc/self/mem is an error; dereferencing it would end the process.

@@ -113,7 +113,7 @@ def polygon_opening(labels: Volume, names: Sequence[str], points_ras: np.ndarray
     if away > _NEAR_POLYGON_MM:
         _log.warning(
             "the points of the polygon lie %.0f mm from the patient, %.0f or less of one that was drawn there; what is "
-            "below them is opened: look whether it belongs to this patient", away, _NEAR_POLYGON_MM,
+            "below them is opened: check that it belongs to this patient", away, _NEAR_POLYGON_MM,
         )  # fmt: skip
     return inside & (places[..., 1] < deepest)
 

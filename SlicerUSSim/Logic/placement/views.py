@@ -79,7 +79,7 @@ def opened_view_pose(labels: Volume, names: Sequence[str], view: str) -> tuple[n
     pose, line = view_pose(labels, names, view)
     return pose, _joined(
         line,
-        f"the opening is not where the view {view} is seen from: the probe stands on the skin over the closed skull; "
+        f"the view {view} does not pass through the opening: the probe stands on the skin over the closed skull; "
         "without a view it stands in the opening",
     )
 

@@ -79,7 +79,7 @@ class Findings:
             return
         found, choices = recognised(self.names, of_ct=self.of_ct)
         fits = " or ".join(f"--map {one.key}" for one in ([found] if found else choices) or schemes().values())
-        raise SimulationError(f"{self.source}: labels {listed(other, 4)} are not of --map {key}; expected {fits}")
+        raise SimulationError(f"{self.source}: labels {listed(other, 4)} do not belong to --map {key}; expected {fits}")
 
     def require_patient(self) -> None:
         """Raise NoPatientError for a mask or lesion, which is not a patient, unless the user gave it a tissue."""

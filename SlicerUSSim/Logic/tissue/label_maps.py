@@ -229,7 +229,7 @@ class _Reading:
         scheme, choices = recognised(unknown, of_ct=self._of_ct)
         if scheme is None and choices:
             raise SimulationError(
-                f"{self._source}: labels {listed(unknown)} have no names; say whose numbers they are: "
+                f"{self._source}: labels {listed(unknown)} have no names; state their program: "
                 f"{', '.join(self._offered(choice, unknown) for choice in choices)}; or give each its tissue: --map "
                 f"{unknown[0]}=TISSUE"
             )

@@ -115,7 +115,7 @@ class TrackedImages:
                     _require_size(field, every, spacing, path)
             finds_marks = finds_marks and sequence.is_recorded
             seen = visible_part(every, field.mask, sequence.coloured, finds_marks=finds_marks)
-            require(bool(seen.any()), "nothing of the probe's field is seen in the images")
+            require(bool(seen.any()), "the images show nothing of the probe's field")
             for number, image in zip(kept, images, strict=True):
                 low, high = int(image[seen].min()), int(image[seen].max())
                 require(
@@ -308,7 +308,7 @@ def face_of_calibration(
     require(
         low <= min(spacing) and max(spacing) <= high,
         f"ImageToProbe has pixels of {spacing[0]:.3g} x {spacing[1]:.3g} mm, expected {low:g} to {high:g} mm; is it in "
-        "metres, or is it no calibration of an image?",
+        "metres, or not a calibration of an image?",
     )
     if face_pixel is not None:
         place, how = face_pixel, "as given"
