@@ -156,7 +156,7 @@ def _predicted(prediction: Prediction, reference: str) -> str:
     return f"""<h2>Images that were not fitted</h2>
 {html_table(heads, rows, own=FITTED)}
 <p class="dim">The cost of the predicted images is {prediction.of_uniform:.2f} times the cost of one uniform tissue
-without anatomy, fitted in the same way; {html.escape(reference)} neighbours are the images before and after in the recording. With
+without anatomy, fitted in the same way; {html.escape(reference)} neighbours are the images before and after. With
 texture: + T1 + T2 / 2.</p>"""
 
 
