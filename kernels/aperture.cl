@@ -15,7 +15,7 @@
 // elevational deflection in mm; screens float4 [screen line][depth], depths from screen_step on: nepers lost both ways,
 // extra path in mm, deflection in the lateral and in the elevational direction in mm; shades float4 [screen
 // line][depth]: the nepers of them that strong tissue takes; those that it takes right behind its last end between the
-// depth before and this one; those that soft tissue has taken from what arrives, on the mean; and the distance from
+// depth before and this one; those that soft tissue has taken from what arrives, on average; and the distance from
 // that end in mm, NO_END if there is none, negative in strong tissue. spreads float2 [screen line][depth]: width of the
 // beam and a factor of its echoes, both relative to an undisturbed one; beams float4 [traced line][1 + depth] as
 // screens, followed by float4 [traced line][1 + depth] as shades, but that the last is 1, -1 where the beam is in

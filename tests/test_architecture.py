@@ -50,7 +50,7 @@ BUDGETS = {
     "base": 3360, "opencl": 1325, "probe": 1755, "tissue": 2065, "tracked": 2230, "mri": 7470, "placement": 1310,
     "imaging": 5690, "device": 595, "datasets": 1650, "fitting": 3675, "vtk": 510, "mrml": 4920, "Widget": 3420,
     "Workstation": 5855, "Command": 3125, "gym": 140, "module": 430, "validation": 6625, "benchmarks": 4055,
-    "tests": 31015, "tests/reference": 505,
+    "tests": 31020, "tests/reference": 505,
 }  # fmt: skip
 #: Lines of all of SlicerUSSim/, and of kernels/
 LARGEST_PRODUCT, LARGEST_KERNELS = 49_500, 5_860

@@ -45,7 +45,7 @@ def test_draws_have_the_variance_of_the_best_and_otherwise_differ(seed):
     assert [variance_db(tissue) for tissue in tissues] == pytest.approx([variance_db(best)] * 12, abs=0.06)
     assert np.std([tissue.mu1 for tissue in tissues]) > 0.2
     assert np.std([tissue.mu0 / tissue.sigma0 for tissue in tissues]) > 0.2
-    # What does not scatter stays as it was.
+    # What does not scatter does not change.
     for name in ("gain_db", "white matter.attenuation_db_cm_mhz"):
         place = parameters.names.index(name)
         assert len({units[place] for units in draws}) == 1

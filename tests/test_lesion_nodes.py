@@ -1,4 +1,4 @@
-"""Lesions in a scene, and labels that are not Segment's own and stay as they are."""
+"""Lesions in a scene, and labels of others, which do not change."""
 
 from __future__ import annotations
 
@@ -183,7 +183,7 @@ def test_doubts_about_a_file_of_lesions_are_told_every_time():
         add_lesion(bench.lesions, whole.with_array((whole.array == 1).astype(np.uint8)), "brats", "core")
 
 
-# ---- labels that stay as they are ------------------------------------------------------------------------------------
+# ---- labels that do not change ---------------------------------------------------------------------------------------
 
 
 def edit(node) -> None:

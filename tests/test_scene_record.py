@@ -257,7 +257,7 @@ def recorded_images(scene):
 
 
 def test_real_images_keep_their_probe_and_registration():
-    """A depth that a user had set since was taken for a wrong calibration, and the registration for none."""
+    """A depth that a user had set since was mistaken for a wrong calibration, and the registration for none."""
     logic = UltrasoundSceneLogic(slicer.vtkMRMLScene())
     sequences = slicer.vtkSlicerSequencesLogic()  # which also registers the browser's class
     sequences.SetMRMLScene(logic.scene)

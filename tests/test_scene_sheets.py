@@ -179,7 +179,7 @@ def test_organs_of_a_ct_are_laid_over_its_tissues_wherever_their_node_lies():
 
 @pytest.mark.slow
 def test_organs_without_names_are_read_by_totalsegmentators_numbers():
-    """After Segment of a CT, they were taken for the tissues that it had found: a kidney for fat."""
+    """After Segment of a CT, they were mistaken for the tissues that it had found: a kidney for fat."""
     bench, phantom = Scene(), coarse_chest()
     organs = bench.add("LabelMapVolume", "organs")
     write_volume(organs, phantom.organs)

@@ -70,7 +70,7 @@ def test_any_path_and_its_reverse_are_inverses(a, c):
 
 @pytest.mark.parametrize("lost", ["nowhere", "in one image", "everywhere"])
 def test_measured_transforms_win_over_constants_of_a_configuration(tmp_path, caplog, lost):
-    """Where they were lost, too: an identity in a Plus configuration was taken for the pose."""
+    """Where they were lost, too: an identity in a Plus configuration was mistaken for the pose."""
     plus_file(tmp_path / "plus.mha", "MF", MARKED_FAR)  # whose image 1 was not tracked
     content = (tmp_path / "plus.mha").read_bytes()
     status = {"nowhere": (b"= INVALID", b"= OK"), "everywhere": (b"TransformStatus = OK", b"TransformStatus = INVALID")}
@@ -349,7 +349,7 @@ def test_values_that_slicers_igsio_writes_are_read_with_a_warning(tmp_path, capl
     plus_file(tmp_path / "plus.mha", "??", MARKED_FAR, "BRIGHTNESSBRIGHTNESS")
     found = TrackedSequence.read(tmp_path / "plus.mha")
     assert np.array_equal(found.images, MARKED_FAR) and found.image_type == "BRIGHTNESS"
-    assert "UltrasoundImageOrientation is '??', which is unknown, taken for MF" in caplog.text
+    assert "UltrasoundImageOrientation is '??', which is unknown, read as MF" in caplog.text
 
 
 # ---- the MNI's files -------------------------------------------------------------------------------------------------

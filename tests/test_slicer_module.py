@@ -483,7 +483,7 @@ def test_tissues_are_edited_taken_from_presets_and_reset(session):
     assert "Szabo" in table.item(line, 1).toolTip()
     table.item(line, 4).setText("0,5")  # a comma is a point
     assert session.logic.preset.tissues.for_names(["grey matter"])[1].mu0 == 0.5
-    assert table.item(line, 4).toolTip() == "set by hand"
+    assert table.item(line, 4).toolTip() == "set manually"
     ui.resetTissuesButton.click()
     assert table.item(line, 1).text() == "1541"
     # One that the preset does not have

@@ -28,10 +28,11 @@ PATTERNS = {
     r"is not there": "is missing, does not exist",
     r"(?<!db\s)re (the|its|that|those|an?|one|what)": "relative to",
     r"(?<!now\s)as of (a|an|the|another)": "such as, as in, as from",
-    r"for ever": "forever",
+    r"for ever|on the mean": "forever, on average",
     r"(it|that|they|which|these|those) (is|are|was|were) of (a|an|the|another|this|that)": "belongs to, shows",
-    r"any more": "no longer",
-    r"but for": "except for",
+    r"any more|but for": "no longer; except for",
+    r"(stays?|left) as (it|they) (is|are|was|were)": "does not change",
+    r"(?<!\.)taken for": "assumed to be, read as, counts as, mistaken for",
     r"what lies": "name the thing: the tissue behind, the part outside",
 }
 _ANY = "|".join(rf"\b(?P<n{n}>{pattern})\b" for n, pattern in enumerate(PATTERNS)).replace(" ", r"\s+")

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 seed_option = click.option(
     "--seed", "seeds", multiple=True, metavar="R,A,S|FILE[=TISSUE]",
     help="Grow the lesion around a point, RAS mm in the frame of the MRI, or around each point of a file of 3D "
-    "Slicer (.mrk.json): masks beside the labels, which stay as they are, each in a smaller and a larger "
+    "Slicer (.mrk.json): masks beside the unchanged labels, each in a smaller and a larger "
     "version; --add lays them over. With a tissue (tumour, oedema, necrosis, cyst, haematoma, cavity, enhancing) it "
     "is called that. May be repeated.",
 )  # fmt: skip

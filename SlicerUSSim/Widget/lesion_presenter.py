@@ -72,7 +72,7 @@ class LesionPresenter:
             self._panel.view.pickPoint(parameters.seed, self.growAtPoint)
 
     def growAtPoint(self) -> None:
-        """Add the lesion around the last point of the chosen markups to the lesions; the tissues stay as they are."""
+        """Add the lesion around the last point of the chosen markups to the lesions; the tissues do not change."""
         parameters, growth = self._panel.parameters, self._panel.logic.growth
         with self._panel.acting(), self._panel.working(_("Grow lesion")):
             chosen = parameters.panel

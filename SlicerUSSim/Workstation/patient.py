@@ -199,7 +199,7 @@ class OpenPatient:
         return self.then_show(self._presenter.segmenting.segment)
 
     def undo_segment(self) -> None:
-        """Go back to the tissues from before the last Segment; others that were chosen since stay as they are."""
+        """Go back to the tissues from before the last Segment; tissues that were chosen since do not change."""
         chosen = self._logic.parameters.labels
         self.then_show(self._presenter.segmenting.undoSegment)
         if chosen is not None and self._logic.parameters.labels is None:

@@ -325,7 +325,7 @@ def _read_nifti(path: Path) -> ImageFile:
 
 
 def add_label_table(path: Path, names: Mapping[int, str]) -> None:
-    """Add the names of labels to a NIfTI file, as _label_table reads them; without nibabel it stays as it is."""
+    """Add the names of labels to a NIfTI file, as _label_table reads them; without nibabel it is not changed."""
     if importlib.util.find_spec("nibabel") is None:
         return
     import nibabel

@@ -289,8 +289,8 @@ def parameters_seen(
     """The free parameters with "tissues" replaced by those that the images can show.
 
     These are the echogenicity of every tissue in the imaged fields, of the membrane, and of the dura where sheets of it
-    were found there, and the attenuation of tissues through which the beams pass for some millimetres. Other names stay
-    as they are.
+    were found there, and the attenuation of tissues through which the beams pass for some millimetres. Other names do
+    not change.
     """
     entries = dict(free) if isinstance(free, Mapping) else dict.fromkeys([free] if isinstance(free, str) else free)
     if TISSUES not in entries or entries[TISSUES] is not None:

@@ -37,7 +37,7 @@ def hounsfield_offset(ct: Volume) -> tuple[float, str | None]:
         f"values are from {low:g} to {high:g}, expected Hounsfield units (air -1000, water 0, bone 1000) that are not "
         "cut off; for an MRI give its contrast, for a CT apply slope and intercept of its header",
     )
-    return 0.0, f"values are from {low:g} to {high:g} without air at -1000; they are taken for Hounsfield units"
+    return 0.0, f"values are from {low:g} to {high:g} without air at -1000; they are assumed to be Hounsfield units"
 
 
 def why_ct(image: Volume) -> str | None:

@@ -20,7 +20,7 @@ from SlicerUSSim.Logic.mri.classification import Classes
 from SlicerUSSim.Logic.mri.plausibility import is_whole_brain
 from SlicerUSSim.Logic.mri.recognition import check_finite
 
-#: Percentile of the brain that is taken for 0 where it has more than this share of negative values
+#: Percentile of the brain that counts as 0 where it has more than this share of negative values
 _DARKEST, _FEW_NEGATIVE = 0.1, 0.01
 
 

@@ -77,7 +77,7 @@ class ImageLogic:
                 self._check_output(labels_node, output_node)
             require_node(probe_transform_node, "vtkMRMLTransformNode", use="probe transform")
         except BaseException:
-            self.clearImage(output_node)  # the previous image would be taken for the image of this pose
+            self.clearImage(output_node)  # the previous image would be mistaken for the image of this pose
             raise
         self.taken = taken
         write_image(taken, probe_transform_node)

@@ -9,7 +9,7 @@ user's.
 Attributes are copied with a node, and the number in a node's ID may change when a scene is imported into another one.
 A reference to the node itself does right in both: a copy (clone) refers to the node that it was copied from, and scenes
 put references right when they give nodes other IDs, on import as on loading. Nodes of scenes that were saved by
-versions without this reference are taken for their users', and kept.
+versions without this reference count as the user's, and are kept.
 """
 
 from __future__ import annotations

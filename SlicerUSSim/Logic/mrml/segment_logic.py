@@ -228,7 +228,7 @@ class SegmentLogic:
         The opening is a disc under the probe of `diameter_mm` (default: as wide as its face needs), or what
         `opening_node` says: the polygon of a markups node, such as a closed curve, or a label map or segmentation. The
         labels (a label map or segmentation with skin and skull, as Segment makes with `outside`) with the opening,
-        filled with the coupling medium, are written into `output_node`; the labels stay as they are. Opened labels are
+        filled with the coupling medium, are written into `output_node`; the labels do not change. Opened labels are
         opened anew from those before (closedLabels). A model shows the piece that was removed.
         Raises SimulationError, and changes nothing, if that removes nothing or there is no brain under it, and for an
         output with labels that this module did not make, or edited since.
@@ -261,7 +261,7 @@ class SegmentLogic:
         show_flap(output_node, labels.with_array(result.array != labels.array))
         self.notes = (
             f"craniotomy: {what}; {millilitres:.1f} ml of skin, scalp and skull are replaced by the coupling medium in "
-            f"{named(output_node)}, and {named(closed)} stays as it is",
+            f"{named(output_node)}, and {named(closed)} is not changed",
         )
         self.warnings = left_out
         if was_edited:

@@ -1,6 +1,6 @@
 """TakenImage: a simulated image with a record of everything it shows, also as attributes of its volume node.
 
-An image without the name of its patient, its pose and its settings can be taken for one of another patient or place.
+An image without the name of its patient, its pose and its settings can be mistaken for one of another patient or place.
 """
 
 from __future__ import annotations

@@ -79,7 +79,7 @@ def name_processor(handle) -> str | None:
     try:
         address = _find_string(memory, handle.int_ptr, called.encode() + b"\0")
         if address is None and _find_string(memory, handle.int_ptr, name.encode() + b"\0") is not None:
-            return None  # since the device was opened before; its version stays as it was
+            return None  # since the device was opened before; its version does not change
     finally:
         os.close(memory)
     if address is None or _usable_bytes(address) <= len(name):

@@ -129,7 +129,7 @@ def volume_shares(
     """(k, j, i) float32 part of every voxel that its second tissue fills, 0 to 1/2, from a denoised image.
 
     A voxel of both tissues lies between their means by the parts that they fill; its class is more certain than that
-    (`second_share`). Only voxels next to the second tissue are taken for such, and pairs of tissues whose means differ
+    (`second_share`). Only voxels next to the second tissue count as mixed, and pairs of tissues whose means differ
     by _CLEAR standard deviations; of the others the share is that of the class. The outer parts of the range count as
     whole, since noise there would have one sign.
     """

@@ -61,7 +61,7 @@ def _matrix(path: Path):
         if isinstance(values, dict):
             require("probe_to_ras" in values, f'{path}: has no "probe_to_ras", expected a 4x4 matrix under that name')
             return values["probe_to_ras"]
-        _log.info("%s: a bare matrix, taken for probe_to_ras", path)
+        _log.info("%s: a bare matrix, read as probe_to_ras", path)
         return values
     if suffix in _ITK_SUFFIXES or _starts_like_itk(path):
         require(
@@ -70,9 +70,9 @@ def _matrix(path: Path):
             f"in millimetres: c3d_affine_tool -ref REFERENCE -src IMAGE {path.name} -fsl2ras -oitk pose.tfm converts "
             "it; if it is one in RAS, name it .txt",
         )
-        _log.info("%s: ITK transform, taken for the map from world to probe in LPS, as 3D Slicer saves it", path)
+        _log.info("%s: ITK transform, read as the map from world to probe in LPS, as 3D Slicer saves it", path)
         return _itk_to_world(path)
-    _log.info("%s: 16 numbers, taken for probe_to_ras by rows", path)
+    _log.info("%s: 16 numbers, read as probe_to_ras by rows", path)
     return matrix_of_text(f"{path}:", read_text(path))
 
 

@@ -444,9 +444,9 @@ def _value(header: Mapping[str, str], key: str, default: str, source: str) -> st
         return text
     meaning = f"{default}, rows away from the probe and columns towards its mark" if default == "MF" else default
     if key in header:
-        _log.warning("%s: its %s is %r, which is unknown, taken for %s", source, key, header[key], meaning)
+        _log.warning("%s: its %s is %r, which is unknown, read as %s", source, key, header[key], meaning)
     else:
-        _log.info("%s: has no %s, taken for %s", source, key, meaning)
+        _log.info("%s: has no %s, read as %s", source, key, meaning)
     return default
 
 
@@ -500,7 +500,7 @@ def _are_coloured(colours: np.ndarray, grey: np.ndarray, source: str) -> np.ndar
     if not is_coloured.any() or is_coloured[is_bright].mean() <= _MOST_COLOURED:
         return is_coloured
     _log.warning(
-        "%s: the images are tinted: %.0f %% of what is bright has colours; their luminance is taken for the grey level",
+        "%s: the images are tinted: %.0f %% of the bright pixels have colours; their luminance is the grey level",
         source, 100.0 * is_coloured[is_bright].mean(),
     )  # fmt: skip
     return np.zeros_like(is_coloured)
@@ -529,7 +529,7 @@ def _read_poses(path: Path, count: int) -> tuple[_Pixels, dict[str, str]]:
     )
     names = {found[1] for key in fields if (found := re.fullmatch(r"Seq_Frame\d+_(.+)Transform", key))}
     if len(names) == 1 and not _FROM_TO.fullmatch(only := names.pop()):
-        _log.warning("%s: its only transform is %s, taken for ProbeToReference", path, only)
+        _log.warning("%s: its only transform is %s, read as ProbeToReference", path, only)
         fields = {key.replace(f"_{only}Transform", "_ProbeToReferenceTransform"): fields[key] for key in fields}
     return (np.zeros((count, 0, 0), np.uint8), None), fields
 

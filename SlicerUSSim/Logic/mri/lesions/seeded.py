@@ -60,7 +60,7 @@ class _Grown:
 
 
 def grow_lesion(segmentation: Segmentation, seed_ras_mm: Sequence[float], tissue: str | None = None) -> GrownLesion:
-    """The lesion around one point, and a larger version of it; the segmentation stays as it is.
+    """The lesion around one point, and a larger version of it; the segmentation does not change.
 
     Parameters
     ----------
