@@ -24,7 +24,7 @@ _log = logging.getLogger(__name__)
 _DARK = 4
 #: Sides with a smaller angle to the vertical are those of a linear array, degrees.
 _PARALLEL_DEG = 1.5
-#: A phased array has an apex radius below this fraction of the outer radius: 4.5 of 78 mm belong to a small convex array,
+#: A phased array has an apex radius below this fraction of the outer radius: 4.5 of 78 mm are a small convex array,
 #: whose image would begin 4.5 mm early as a phased array.
 _POINT_SHARE = 0.03
 #: Least overlap of the estimated field with the bright region (intersection over union).
