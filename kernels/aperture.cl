@@ -19,7 +19,7 @@
 // that end in mm, NO_END if there is none, negative in strong tissue. spreads float2 [screen line][depth]: width of the
 // beam and a factor of its echoes, both relative to an undisturbed one; beams float4 [traced line][1 + depth] as
 // screens, followed by float4 [traced line][1 + depth] as shades, but that the last is 1, -1 where the beam is in
-// strong tissue, and -2 where that does not end between this depth and the one before.
+// strong tissue, and -2 where that does not end between this depth and the previous one.
 
 #include "common.clh"
 
@@ -87,7 +87,7 @@ inline float border_nepers(float impedance, float other_impedance) {
 }
 
 // Stored depths that lines need of the ray at an angle from a point of a flat face whose lines begin in its middle: no
-// traced line goes where the ray, or the one before it, has left the sector of them. All of other faces.
+// traced line goes where the ray, or the previous one, has left the sector of them. All of other faces.
 inline int depths_needed(Frame frame, float along, float angle) {
   const int depths = frame->fan_depths;
   if (frame->linear || frame->apex_radius_mm > 0.0f) return depths;
@@ -737,8 +737,8 @@ inline Between between_lines(Frame frame, float place) {
 
 // The amplitude that strong tissue lets through at the depth `node`, at a place among the screen lines: of one of the
 // two `kinds` of shades. In shadows it is the mean over a deviation `sigma` in screen lines, by a Gauss-Hermite rule of
-// three points; from where the beam passes beside, nothing is taken. In strong tissue shades are those before it, and
-// light from there does not reach what is behind: its lines count as the line itself.
+// three points; from where the beam passes beside, nothing is taken. In strong tissue shades are those in front of it,
+// and light from there does not reach what is behind: its lines count as the line itself.
 inline float mean_lit(Frame frame, __global const float *shades, int kind, int node, float place, float sigma) {
   const int nodes = frame->screen_depths;
   const Between middle = between_lines(frame, place);

@@ -209,7 +209,7 @@ def test_a_head_whose_skull_is_not_labelled_is_told_of(head):  # noqa: F811
     )
     brain = without_outside(head, NAMES)
     (line,) = about_missing_skull(brain, NAMES[:2], mri)
-    assert "tick Label what is outside the brain and press Segment" in in_panel(line)
+    assert "tick Label tissues outside the brain and press Segment" in in_panel(line)
     assert about_missing_skull(head, NAMES, mri) == about_missing_skull(brain, ["liver"], mri) == ()
     stripped = mri.with_array(np.where(brain.array > 0, mri.array, 0.0))
     assert about_missing_skull(brain, NAMES[:2], stripped) == ()

@@ -504,7 +504,7 @@ def test_totalsegmentators_header_names_the_labels(tmp_path):
 
 
 def layered(path, values: tuple[int, ...]) -> Volume:
-    """Segments of 3D Slicer of which the last, a tumour in a layer of its own, overlaps the others."""
+    """Segments of 3D Slicer of which the last, a tumour in a separate layer, overlaps the others."""
     import SimpleITK as sitk
 
     base = brain({"csf": values[0], "grey matter": values[1], "white matter": values[2]})
@@ -529,7 +529,7 @@ def test_overlapping_segments_of_slicer_are_read_with_the_last_on_top(values, tm
     assert np.array_equal(tumour, truth.array == 4) and np.array_equal(found.labels.array > 0, truth.array > 0)
     result = ussim("simulate", path, "--pose", "auto", "-o", tmp_path / "o.png")
     covered = np.count_nonzero(truth.array == 4) * truth.voxel_ml
-    assert f"segments overlap, the last is taken: 'Tumor' covers {covered:.3g} ml of those before it" in result.stderr
+    assert f"segments overlap, the last is taken: 'Tumor' covers {covered:.3g} ml of earlier ones" in result.stderr
     assert result.exit_code == 0 and "labels with names: 4 labels to 4 tissues, named in its header" in result.stderr
 
 

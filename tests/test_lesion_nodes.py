@@ -30,7 +30,7 @@ KINDS = ["LabelMapVolume", "Segmentation"]
 
 
 def lesion(radius: float, centre=PLACE) -> Volume:
-    """A ball on a grid of its own, finer than the head's and turned."""
+    """A ball on a separate grid, finer than the head's and turned."""
     return ball(moved(empty((1.3, 1.3, 2.0), np.diag([-1.0, -1.0, 1.0]), 22), *PLACE), radius, centre)
 
 

@@ -234,7 +234,7 @@ def test_a_mask_outside_the_volume_is_reported():
 
 @pytest.fixture(scope="module")
 def files(tmp_path_factory):
-    """A head, and masks on a finer grid of their own."""
+    """A head, and masks on their own finer grid."""
     folder = tmp_path_factory.mktemp("lesions")
     head = head_mri(4.0)
     head.write(folder / "head.nii.gz")

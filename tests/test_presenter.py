@@ -469,7 +469,7 @@ def test_lesions_that_were_laid_over_the_tissues_after_segment_end_undo(presente
     ("message", "shown"),
     [
         ("give a brain mask (--mask)", "give a brain mask"),
-        ("or label the whole head (--outside)", "or tick Label what is outside the brain and press Segment"),
+        ("or label the whole head (--outside)", "or tick Label tissues outside the brain and press Segment"),
         ("choose another, --skull-strip none or --mask", "choose another, Brain extraction none or Brain mask"),
         ("map them with --map 9=TISSUE", "map them with the name of a tissue for 9 in its colour table"),
         ("add it with --add brats=FILE, or alone with --map 1=csf --map 2='grey matter' (ussim simulate)",

@@ -1,6 +1,6 @@
 """3D Slicer finds and loads the module from all locations: the sources, a renamed folder, a wheel, both at once.
 
-Each time in a Python of its own, where sys.path has nothing of this package but what Slicer puts there
+Each time in a separate Python, where sys.path has nothing of this package but what Slicer puts there
 (slicer_factory.py says which sources of Slicer are imitated). test_cmake.py does the same with the build and the
 installed tree.
 """

@@ -637,7 +637,7 @@ def test_choosing_other_nodes_while_live_goes_on_with_those(session):
 
 
 def with_real_image(session, gain_db: float = 9.0):
-    """A "real" image of the segmented head: brighter than simulated, other speckle, in a volume of its own."""
+    """A "real" image of the segmented head: brighter than simulated, other speckle, in a separate volume."""
     session.segmented()
     session.ui.simulateButton.click()
     preset = session.logic.preset
@@ -758,7 +758,7 @@ def test_closing_a_scene_does_not_redraw_the_panel_for_each_node(session, monkey
 
 
 def test_closing_the_scene_forgets_the_patient(session):
-    """Nodes of the next scene have the IDs of those before: a fit to patient A set the gain of patient B."""
+    """Nodes of the next scene have the IDs of earlier ones: a fit to patient A set the gain of patient B."""
     with_real_image(session)
     ui = session.ui
     ui.fitButton.click()

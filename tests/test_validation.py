@@ -21,7 +21,7 @@ from validation.measurement import echo_near, fit_rayleigh, full_width
 from validation.phantoms import Echo
 from validation.run import all_checks, validate
 
-#: A cheap check of each phenomenon; side lobes and aberration have tests of their own (test_side_lobes, test_aperture)
+#: A cheap check of each phenomenon; side lobes and aberration have separate tests (test_side_lobes, test_aperture)
 _QUICK = (
     "attenuation and time", "echo level", "mirroring", "refraction and reflectance", "resolution", "speckle coherence",
 )  # fmt: skip

@@ -240,7 +240,7 @@ def test_missing_and_unreadable_files_are_named(tmp_path):
     (tmp_path / "bad.nii").write_text("not an image")
     with pytest.raises(SimulationError, match=r"bad\.nii: cannot be read"):
         Volume.read(tmp_path / "bad.nii")
-    with pytest.raises(SimulationError, match=r"has no DICOM series.*images of their own \(bad\.nii\): give"):
+    with pytest.raises(SimulationError, match=r"has no DICOM series.*separate images \(bad\.nii\): give"):
         Volume.read(tmp_path)
     (tmp_path / "bad.nii").unlink()
     with pytest.raises(SimulationError, match=r"has no DICOM series, nor have the folders in it$"):

@@ -192,7 +192,7 @@ def test_several_files_at_once_are_opened_in_their_order(page, files, tmp_path):
 
 @pytest.fixture(scope="module")
 def dicom(files, tmp_path_factory) -> Path:
-    """A folder as on a CD: two volumes and a localiser in folders of their own, with a viewer."""
+    """A folder as on a CD: two volumes and a localiser in separate folders, with a viewer."""
     folder = tmp_path_factory.mktemp("cd")
     mri = Volume.read(files / "head.nii.gz")
     scaled = mri.with_array((mri.array * (1000.0 / mri.array.max())).astype(np.int16))

@@ -185,7 +185,7 @@ def wires_cysts_and_contrast(rotation: np.ndarray, device) -> Outcome:
             if isinstance(change, LevelChange):
                 rows.append(_level_row(f"{change.name} target, {name}", change, probe, frames[name], plain[name]))
         # In the main lobes there are only echoes from a cyst's surroundings at the edges of the beam; side lobes and
-        # clutter have a check of their own.
+        # clutter have a separate check.
         black = region_level_db(dark[name], probe, (-13.5, -10.5, 18.5, 21.5))
         around = region_level_db(dark[name], probe, (-10.0, -8.0, 24.0, 34.0))
         rows.append(Row(f"cyst in the main lobes, {name}", "dB", -40.0, black - around, 0.0, "at most"))

@@ -84,9 +84,9 @@ class PlacementPresenter:
         return self._panel.ready((is_open, _("These labels have no opening, or the previous labels were removed")))
 
     def openCraniotomy(self) -> None:
-        """Open skin and skull under the probe, or where the chosen node says, in labels of their own.
+        """Open skin and skull under the probe, or where the chosen node says, in separate labels.
 
-        Labels that were opened are opened anew, from those before: an opening follows the probe when it is moved.
+        Opened labels are opened again from the closed ones: an opening follows the probe when it is moved.
         """
         panel, logic, parameters = self._panel, self._panel.logic, self._panel.parameters
         with panel.acting(), panel.working(_("Open skull")):

@@ -105,7 +105,7 @@ class Comparison:
             return
         if isinstance(real, np.ndarray):
             image = np.clip(real[sequence.number], 0, 255).astype(np.uint8)
-            rows, columns = image.shape  # of a size that is not known: a ruler of its own, without marks
+            rows, columns = image.shape  # of a size that is not known: a separate ruler, without marks
             about = {"x": 0, "y": 0, "w": columns, "h": rows, "ticks": [], "size": rows / 36, "focus": 0, "range": ""}
             self.streams[0].send(image, ruler=about)
         elif real is not None and grid is not None:

@@ -34,7 +34,7 @@ MODULE = {
     "styles": ["ussim/workstation.css", "ussim/views.css"],
 }
 #: Controls of the panel that are not on the page: its views follow the probe and show it, it compares the fit in the
-#: ultrasound view, it has a button of its own to place the probe, and no editor of segments or curves.
+#: ultrasound view, it has a separate button to place the probe, and no editor of segments or curves.
 NOT_SHOWN = {
     "sliceViewComboBox", "showInSliceCheckBox", "showIn3dCheckBox", "showProbeCheckBox", "layoutButton",
     "compareComboBox", "compareNumberComboBox", "blinkCheckBox", "statusLabel", "placeButton", "editTissuesButton",

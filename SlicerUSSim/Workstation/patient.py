@@ -283,7 +283,7 @@ class OpenPatient:
             self.forget_ultrasound()
         self._probe.forget_patient()
         if parameters.probe_transform is not None and self._registration.recording is None:
-            self._probe.move(np.eye(4))  # it is placed on the next one; a saved scene has no pose of the one before
+            self._probe.move(np.eye(4))  # placed on the next patient; a saved scene has no pose of the previous one
         self._presenter.forgetPatient()
         self._saved = {}
         kept += [parameters.output, parameters.outline, parameters.probe_transform, *new]

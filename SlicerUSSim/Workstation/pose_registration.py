@@ -149,7 +149,7 @@ class Registration:
             made[2].SetName(recording.name)  # the name of its previous nodes, which scenes restore
 
     def _choose_poses(self, browser: Any, old: list[Any]) -> None:
-        """Let Simulate sequence use the poses of the images, instead of those before, or of none."""
+        """Let Simulate sequence use the poses of the images, instead of previous ones, or of none."""
         parameters: Any = self._logic.parameters
         if parameters.transform_sequence is None or parameters.transform_sequence in old:
             parameters.transform_sequence = browser.GetNodeReference(POSES)

@@ -147,7 +147,7 @@ class Tasks(AtOnce):
     ) -> None:  # fmt: skip
         """Let a cancelled task continue with Cancelled, even if its work does not notice in time.
 
-        The work then ends in its own time, in a thread of its own, and its result is dropped; what waited behind it
+        The work then ends in its own time, in a separate thread, and its result is dropped; what waited behind it
         is computed by a new thread. `abandoned` is called then.
         """
 

@@ -1,4 +1,4 @@
-"""What a page may send: files that are whole by themselves, under plain names, in a folder of their own.
+"""What a page may send: files that are whole by themselves, under plain names, in a separate folder.
 
 The name is a text from a browser, or from whoever has the token, and becomes a path; a header may name any other file
 of the server's user as its voxels, which would then be shown and saved with the scene.

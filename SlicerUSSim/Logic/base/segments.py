@@ -79,7 +79,7 @@ def flattened(layers: np.ndarray, segments: list[Segment], voxel_ml: float, name
         inside = layers[..., segment.layer] == segment.value
         covered = float(np.count_nonzero(labels[inside]) * voxel_ml)
         if covered:
-            overlaps.append(f"{segment.name!r} covers {covered:.3g} ml of those before it")
+            overlaps.append(f"{segment.name!r} covers {covered:.3g} ml of earlier ones")
         labels[inside] = segment.label
     if overlaps:
         _log.warning("%s: segments overlap, the last is taken: %s", name, "; ".join(overlaps))

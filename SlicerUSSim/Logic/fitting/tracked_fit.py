@@ -173,7 +173,7 @@ def _speckle_of(
 
 
 def _at_the_levels_of(found: DisplaySettings, given: DisplaySettings) -> DisplaySettings:
-    """What was found of the speckle, with the rest as given: the user's values are those before the fit."""
+    """What was found of the speckle, with the rest as given: the user's values are from before the fit."""
     names = ("smoothing_axial_mm", "smoothing_lateral_deg", "grey_map", "map_black", "map_dark", "map_white")
     return replace(given, **{name: getattr(found, name) for name in names})
 

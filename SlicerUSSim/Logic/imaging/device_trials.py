@@ -30,7 +30,7 @@ from SlicerUSSim.Logic.tissue.table import TissueTable
 
 #: Of a trial, for its progress, and between two looks at it
 _USUAL_SECONDS, _POLL_SECONDS = 40.0, 0.1
-#: Voxels of the patient, in which thin sulci have a label of their own
+#: Voxels of the patient, in which thin sulci have a separate label
 _PATIENT_MM = 1.5
 #: Before the line of a child that is its answer
 _ANSWER = "ussim: "

@@ -47,7 +47,7 @@ class FoundSheets:
 
     @property
     def reflects(self) -> bool:
-        """Whether any sheet has a coherent echo of its own."""
+        """Whether any sheet has its own coherent echo."""
         return bool((self.words[:, 1] >> np.uint32(28)).any())
 
 

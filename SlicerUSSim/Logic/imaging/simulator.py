@@ -48,7 +48,7 @@ from SlicerUSSim.Logic.tissue.texture import Texture
 if TYPE_CHECKING:
     from pyopencl import Buffer
 
-#: Frames whose signals stay on the device: one, and the one before, which goes when its name gets the next
+#: Frames whose signals stay on the device: one, and the previous one, which is freed with the next assignment
 _ON_DEVICE = 2
 #: Beyond all fields
 _FAR_MM = 1e6
@@ -242,7 +242,7 @@ class UltrasoundSimulator:
     ) -> dict[str, np.ndarray]:
         """{output: array} of images at `poses` (n, 4, 4); image i has the noise_seed + i, or its own.
 
-        One image is prepared while the device computes the one before, and nothing else than the outputs is downloaded.
+        One image is prepared while the device computes the previous one, and only the outputs are downloaded.
 
         Parameters
         ----------
@@ -323,7 +323,7 @@ class UltrasoundSimulator:
     def redisplay(
         self, echoes: Echoes, probe: Probe, settings: SimulationSettings, display: DisplaySettings, noise_seed: int = 0
     ) -> np.ndarray:
-        """(rows, columns) uint8 image of echoes that were kept, without those before (display.persistence).
+        """(rows, columns) uint8 image of echoes that were kept, without earlier images (display.persistence).
 
         `probe`, `settings` and `noise_seed` are those of the echoes; the patient of this simulator does not matter.
         """
@@ -492,7 +492,7 @@ class UltrasoundSimulator:
     ) -> None:
         """Enqueue images (probe, pose, display, grid, noise_seed), and call what `start` gives to complete each.
 
-        While the device computes an image, the host completes the one before and prepares the next, no more than one.
+        While the device computes an image, the host completes the previous one and prepares the next, no more than one.
         """
         before: Callable[[], object] | None = None
         for number, (probe, pose, display, grid, noise_seed) in enumerate(jobs):

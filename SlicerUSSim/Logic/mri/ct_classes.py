@@ -3,7 +3,7 @@
 A voxel on a border has the numbers of neither side: between air and skin lie those of lung and fat, between bone and
 muscle those of contrast agent. So borders are sharpened first: a voxel on a step belongs to the side on which half of
 the step puts it, as edges in CT are measured, and takes the number of that side beyond the step (after toggle mapping;
-Kramer and Bruckner, Pattern Recognition 7, 1975). What is in between afterwards is a tissue of its own.
+Kramer and Bruckner, Pattern Recognition 7, 1975). What is in between afterwards is a separate tissue.
 """
 
 from __future__ import annotations

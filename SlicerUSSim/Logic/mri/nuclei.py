@@ -1,7 +1,7 @@
 """Deep nuclei: thalamus, putamen and pallidum are grey matter that an MRI shows nearly as bright as white matter.
 
 Myelin and iron make them so, and a mixture with one mean per tissue splits them. What tells them from white matter is
-their place: the atlas says where a nucleus may be, and a mixture of its own, in those voxels alone, says which of them
+their place: the atlas says where a nucleus may be, and a separate mixture, in those voxels alone, says which of them
 it is. Only white matter becomes grey by it; CSF, vessels and lesions stay.
 """
 

@@ -279,7 +279,7 @@ def segment_mri(
     labels[part.inside] = found.posteriors.argmax(axis=0) + 1
     tissue_names = names
     if settings.thin_sulci and thickest_mm > _THICK_SLICE_MM:
-        notes.append(f"thin sulci get no label of their own: voxels of {thickest_mm:.3g} mm are thicker than they are")
+        notes.append(f"thin sulci get no separate label: voxels of {thickest_mm:.3g} mm are thicker than they are")
     elif settings.thin_sulci:
         middles = narrow_sulci(labels, found, filtered[0][0], filtered[0][1])
         labels[middles] = len(names) + 1

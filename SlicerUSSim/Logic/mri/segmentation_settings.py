@@ -39,7 +39,7 @@ class SegmentationSettings(Declared):
         option="thin-sulci/no-thin-sulci",
     )  # fmt: skip
     outside: bool = parameter(
-        False, "Label what is outside the brain",
+        False, "Label tissues outside the brain",
         "Also label skin, scalp, skull, its marrow and air in the T1 of a whole head, so that a probe stands on the "
         "skin", shown=True, option="outside/no-outside",
     )  # fmt: skip
@@ -83,7 +83,7 @@ class SheetSettings(Declared):
     tentorium: bool = parameter(True, "Tentorium", "Tentorium as a thin sheet")
     ependyma: bool = parameter(True, "Ependyma", "Walls of the ventricles as thin sheets")
     corpus_callosum: bool = parameter(
-        True, "Corpus callosum", "Corpus callosum as a tissue of its own, from the next Segment on"
+        True, "Corpus callosum", "Corpus callosum as a separate tissue, from the next Segment on"
     )
     choroid_plexus: bool = parameter(
         True, "Choroid plexus", "Choroid plexus as enhancing tissue, in a T1 with contrast agent alone; from the next "

@@ -229,7 +229,7 @@ class SegmentLogic:
         `opening_node` says: the polygon of a markups node, such as a closed curve, or a label map or segmentation. The
         labels (a label map or segmentation with skin and skull, as Segment makes with `outside`) with the opening,
         filled with the coupling medium, are written into `output_node`; the labels do not change. Opened labels are
-        opened anew from those before (closedLabels). A model shows the piece that was removed.
+        opened again from the closed ones (closedLabels). A model shows the piece that was removed.
         Raises SimulationError, and changes nothing, if that removes nothing or there is no brain under it, and for an
         output with labels that this module did not make, or edited since.
         """

@@ -352,7 +352,7 @@ def pocl_group(global_size: tuple[int, ...]) -> tuple[int, ...]:
 
 
 def _was_cached(program: Program) -> bool:
-    """Whether pyopencl had the binary on disk. PoCL has a cache of its own, which only the time shows."""
+    """Whether pyopencl had the binary on disk. PoCL has a separate cache, which only the time shows."""
     # pyopencl's own, for its messages: (what, whether it was cached, seconds)
     info = getattr(program, "_build_duration_info", None)
     return bool(info and info[1])

@@ -1,4 +1,4 @@
-"""Probability maps of grey matter, white matter and CSF, each a file of its own, combined into a label map.
+"""Probability maps of grey matter, white matter and CSF, each a separate file, combined into a label map.
 
 SPM and CAT12 write c1, p1 (grey matter), c2, p2 (white matter) and c3, p3 (CSF) before the name of the MRI (SPM12
 manual, chapter "Segment"); FSL's FAST *_pve_0, _1 and _2, by increasing brightness, of a T1 CSF, grey and white matter

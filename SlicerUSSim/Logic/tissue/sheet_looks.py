@@ -72,7 +72,7 @@ def dura_label(tissues: TissueTable) -> int:
 def with_dura(tissues: TissueTable, kinds: Iterable[str], known: TissueTable | None = None) -> TissueTable:
     """The table with the tissue of falx and tentorium, under a label without voxels, where sheets are of these `kinds`.
 
-    With it, their level is that of a tissue of their own, which a fit changes, and not tied to the membrane's. Its
+    With it, their level belongs to a separate tissue, which a fit changes, and is not tied to the membrane's. Its
     parameters are those in the table `known`, or else the preset's. Unchanged if the table has it, or no label is left.
     """
     # The last free label: the next one may be another tissue's in label maps for which a preset is used

@@ -33,7 +33,7 @@ _SMOOTHING_MM = 1.0
 
 @dataclass(frozen=True, eq=False)
 class Window:
-    """A cube around a place in the box of the brain, on a grid of its own with cubic voxels."""
+    """A cube around a place in the box of the brain, on a separate grid with cubic voxels."""
 
     evidence: Evidence
     #: (3,) k, j, i in the box of its centre
