@@ -396,7 +396,7 @@ def test_what_cannot_be_found_is_reported_before_the_search():
         find_sheets(mri, found, contrast="t1", kinds=["dura"])
     with pytest.raises(SimulationError, match="contrast 'flair'"):
         find_sheets(mri, found, contrast="flair")
-    with pytest.raises(SimulationError, match="nothing is to be found"):
+    with pytest.raises(SimulationError, match="no kind was chosen"):
         find_sheets(mri, found, contrast="t1", kinds=[])
     with pytest.raises(SimulationError, match="expected one grid"):
         find_sheets(Volume(mri.array[1:], mri.ijk_to_ras), found, contrast="t1")
