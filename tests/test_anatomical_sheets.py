@@ -200,7 +200,7 @@ def test_a_file_shows_squares_of_the_surfels_where_slicer_expects_them(tmp_path)
 
 
 @pytest.mark.slow
-def test_files_that_are_no_sheets_are_named(tmp_path):
+def test_files_without_sheets_are_listed(tmp_path):
     with pytest.raises(SimulationError, match="expected a name with"):
         write_surfels(tmp_path / "sheets.stl", some_surfels())
     with pytest.raises(SimulationError, match="no such file"):
@@ -322,7 +322,7 @@ def test_a_grid_too_coarse_for_the_reach_and_no_surfels():
 
 
 @pytest.mark.slow
-def test_a_falx_that_enhances_as_white_matter_does_is_no_white_matter():
+def test_a_falx_that_enhances_as_white_matter_does_is_not_white_matter():
     """Between hemispheres 10 mm apart, off the middle between them."""
     x, y, z = np.mgrid[-30:31, -110:76, -30:89].astype(float).transpose(0, 3, 2, 1)
     csf, grey, white = 20.0, 100.0, 140.0

@@ -117,7 +117,7 @@ def test_a_stripped_brain_is_recognised_and_taken_whole():
         (lambda a: np.where(a == 0, -1000.0, 40.0 + 0.1 * a), "is a CT (its values are Hounsfield units)"),
     ],
 )
-def test_what_is_no_mri_is_reported(change, message):
+def test_what_is_not_an_mri_is_reported(change, message):
     mri = head_mri(4.0)
     with pytest.raises(SimulationError) as caught:
         find_brain(mri.with_array(change(mri.array)))

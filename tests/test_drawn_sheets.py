@@ -103,7 +103,7 @@ def test_dura_has_a_coherent_echo_that_is_seen_square_only():
     assert square == pytest.approx(border, abs=1.5)
 
 
-def test_dura_is_a_tissue_of_its_own_whose_level_a_fit_can_change():
+def test_dura_is_a_separate_tissue_whose_level_a_fit_can_change():
     phantom, tissues = grey()
     surfels = Surfels.joined([plane(kind, phantom.probe_to_ras, at) for kind, at in (("falx", 15.0), ("sulcus", 8.0))])
     simulator = UltrasoundSimulator(phantom.labels, tissues, sulci._SETTINGS, sheets=surfels)

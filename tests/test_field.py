@@ -264,7 +264,7 @@ def test_darkness_is_not_a_cut():
     np.testing.assert_array_equal(found.field.mask, whole)
 
 
-def test_text_and_boxes_in_the_field_are_left_out_and_said(caplog):
+def test_text_and_boxes_in_the_field_are_left_out_and_reported(caplog):
     """Letters have smooth edges."""
     sequence = recording(CONVEX)
     part = letters(sequence.images.shape[1:], 60, sequence.images.shape[2] // 2 - 80, 20)
@@ -297,7 +297,7 @@ def letters(shape: tuple[int, int], row: int, column: int, height: int) -> np.nd
     return np.asarray(drawing, float).reshape(shape[0], fine, shape[1], fine).mean(axis=(1, 3)) / 255
 
 
-def test_images_that_cannot_tell_what_is_drawn_are_said(caplog):
+def test_images_that_cannot_tell_what_is_drawn_are_reported(caplog):
     few = recording(CONVEX, 3)
     TrackedImages.of(few, probe=CONVEX)
     assert "marks in the images could not be detected: 3 different images, expected at least 4" in caplog.text
@@ -349,7 +349,7 @@ def in_colours(path, sequence: TrackedSequence, colours: np.ndarray) -> TrackedS
     [np.outer(np.arange(256), [1, 0.85, 0.6]), np.clip(np.arange(256)[:, None] * 3 - np.array([0, 255, 510]), 0, 255)],
     ids=["sepia", "hot iron"],
 )
-def test_tinted_images_are_grey_levels_and_that_is_said(tint, tmp_path, caplog):
+def test_tinted_images_are_grey_levels_with_a_warning(tint, tmp_path, caplog):
     """Sepia was Doppler's: what was left of the field was black, and fitted."""
     sequence = recording(CONVEX)
     read = in_colours(tmp_path / "tinted.mha", sequence, tint.astype(np.uint8)[sequence.images])
@@ -361,7 +361,7 @@ def test_tinted_images_are_grey_levels_and_that_is_said(tint, tmp_path, caplog):
     assert found.field.mask.sum() == ImagedField.of(CONVEX, found.field.image_to_probe, levels.shape[1:]).mask.sum()
 
 
-def test_colours_are_left_out_and_said(tmp_path, caplog):
+def test_colours_are_left_out_and_reported(tmp_path, caplog):
     sequence = recording(CONVEX, 2)
     array = np.repeat(sequence.images[..., None], 3, axis=-1)
     middle = np.array(array.shape[1:3]) // 2
@@ -376,7 +376,7 @@ def test_colours_are_left_out_and_said(tmp_path, caplog):
     assert TrackedSequence.read(tmp_path / "grey.mha").coloured is None
 
 
-def test_a_mirroring_calibration_is_said(caplog):
+def test_a_mirroring_calibration_is_reported(caplog):
     sequence = recording(CONVEX, 2)
     mirror = np.diag([-1.0, 1.0, 1.0, 1.0])
     transforms = tuple({**entry, "ProbeToReference": mirror} for entry in sequence.transforms)

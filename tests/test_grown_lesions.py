@@ -141,7 +141,7 @@ def test_a_refused_seed_costs_neither_the_labels_nor_the_other_seeds(tmp_path):
 
 
 @pytest.mark.parametrize("text", ["1,2", "1,2,x", "1,2,3="])
-def test_a_seed_that_is_no_point_is_refused_with_an_example(text):
+def test_a_seed_that_is_not_a_point_is_refused_with_an_example(text):
     with pytest.raises(SimulationError, match=r"--seed is .*expected R,A,S in mm"):
         split_seeds([text])
     assert split_seeds(["1,-2.5,3=Edema"]) == [((1.0, -2.5, 3.0), "oedema")]

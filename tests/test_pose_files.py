@@ -55,7 +55,7 @@ def test_transforms_of_c3d_and_ants_are_read(suffix, kind, tmp_path):
     np.testing.assert_allclose(read_pose(path), pose, atol=1e-4)
 
 
-def test_a_matrix_of_flirt_is_no_pose(tmp_path):
+def test_a_matrix_of_flirt_is_not_a_pose(tmp_path):
     for name in ("flirt.mat", "flirt.txt"):
         np.savetxt(tmp_path / name, np.eye(4), "%.8f ")
     with pytest.raises(SimulationError, match=r"FLIRT .* -src IMAGE flirt\.mat -fsl2ras -oitk pose\.tfm converts"):
@@ -92,7 +92,7 @@ def test_other_texts_are_refused_in_one_line(text):
     assert "pose" in str(error.value) and "\n" not in str(error.value)
 
 
-def test_a_matrix_that_is_no_pose_is_not_written(tmp_path):
+def test_a_matrix_that_is_not_a_pose_is_not_written(tmp_path):
     with pytest.raises(SimulationError, match="is not rigid"):
         write_pose(tmp_path / "pose.json", np.diag([2.0, 2.0, 2.0, 1.0]))
     assert not list(tmp_path.iterdir())

@@ -347,7 +347,7 @@ def test_lesions_leave_the_checks_of_the_tissues_under_them_in_the_notes(present
     assert "tumour: " in presenter.notes.text() and checks[0] not in presenter.notes.text()
 
 
-def test_an_image_that_does_not_follow_the_probe_is_said_to_be_frozen(presenter):
+def test_an_image_that_does_not_follow_the_probe_is_called_frozen(presenter):
     presenter.segmenting.segment()
     presenter.values.setValue("probe.scan_lines", 48)
     presenter.images.setLive(True)

@@ -45,7 +45,7 @@ def test_a_preset_may_carry_a_pose_and_one_without_is_as_before(tmp_path):
         Preset.from_dict({"probe_to_ras": pose.tolist()})  # which would reset probe and tissues
 
 
-def test_the_result_of_a_fit_is_no_preset():
+def test_the_result_of_a_fit_is_not_a_preset():
     with pytest.raises(SimulationError, match="result of a fit, expected a preset, as ussim optimize --save-preset"):
         Preset.from_dict({"at_bounds": [], "parameters": [], "cost_before": 0.9, "cost_after": 0.4, "display": {}})
     with pytest.raises(SimulationError, match="has 'b', expected probe, display"):

@@ -187,7 +187,7 @@ def test_what_is_read_in_a_child_is_what_is_read_here(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("arguments", [["--untrusted", "segment"], ["segment", "--untrusted"], ["segment"]])
-def test_a_command_reads_in_children_when_it_is_told_so(tmp_path, arguments, monkeypatch):
+def test_a_command_reads_in_children_when_asked_to(tmp_path, arguments, monkeypatch):
     monkeypatch.delenv(UNTRUSTED, raising=False)
     (tmp_path / "head.nii.gz").write_bytes(b"no image")
     children: list[object] = []

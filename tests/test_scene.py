@@ -352,7 +352,7 @@ def test_cancelling_a_segmentation_leaves_the_node_as_it_was():
     assert labels.GetImageData() is None
 
 
-def test_segment_names_choose_tissues_and_those_nobody_knows_are_listed(bench):
+def test_segment_names_choose_tissues_and_unknown_ones_are_listed(bench):
     segmentation = add(bench.scene, "Segmentation", "painted")
     write_labels(segmentation, cyst(), ("Left-White-Matter", "Tumor_1"), bench.grid())
     table = bench.logic.tissues(segmentation)

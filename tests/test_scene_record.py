@@ -152,7 +152,7 @@ def test_a_scene_without_choices_has_its_first_volume_as_mri():
         record_scene(slicer.vtkMRMLScene())
 
 
-def test_values_of_other_versions_are_told_and_have_their_default():
+def test_values_of_other_versions_are_reported_and_have_their_default():
     logic = segmented()
     values = {**recorded_values(logic.parameters), "contrast": "t9", "what_is_that": "1"}
     again = UltrasoundSceneLogic(slicer.vtkMRMLScene())

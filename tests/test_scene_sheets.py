@@ -142,7 +142,7 @@ def test_sheets_of_a_user_are_kept_and_another_model_is_one_line():
     assert line.startswith("sheets Model 'Ultrasound outline': has no array 'place' of its cells, expected a file of")
 
 
-def test_what_has_no_sheets_is_said_before_anything_is_computed():
+def test_what_has_no_sheets_is_reported_before_anything_is_computed():
     bench, presenter = bench_with_probe()
     presenter.values.setValue("scene.sheet_find", True)
     for contrast, words in (("flair", "sheets are not found in contrast 'flair'"), ("ct", "in contrast 'ct'")):

@@ -93,7 +93,7 @@ def test_a_missing_transform_is_named_with_what_there_is():
 
 
 @pytest.mark.parametrize("name", ["Image", "ToReference"])
-def test_a_name_that_is_no_transform_is_refused(name):
+def test_a_name_that_is_not_a_transform_is_refused(name):
     with pytest.raises(SimulationError, match="expected two frames joined by To"):
         chain().pose(0, name)
 
@@ -488,7 +488,7 @@ def test_a_calibration_is_read_from_a_transform_as_slicer_saves_it(tmp_path):
         np.testing.assert_allclose(found[1], matrix, atol=1e-9)
 
 
-def test_what_is_left_at_each_landmark_is_told():
+def test_what_is_left_at_each_landmark_is_reported():
     points = np.array([[0.0, 0, 0], [50, 0, 0], [0, 40, 0], [0, 0, 30], [30, 30, 30]])
     shift = np.array([5.0, 4.0, -2.0])
     matrix, line, left = fit_landmarks(points, points + shift + np.eye(5, 3, k=-2) * [0.0, 0.0, 1.0])

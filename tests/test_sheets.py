@@ -66,7 +66,7 @@ def test_a_plane_is_fitted_to_a_flat_sheet(spacing_mm, across):
     assert set(np.unique(beside[at])) <= {1, 3}
 
 
-def test_what_is_no_sheet_has_no_plane():
+def test_what_is_not_a_sheet_has_no_plane():
     labels = np.ones((40, 40, 40), np.uint8)
     labels[5, 5, 5] = SHEET
     labels[10, 10, 5:35] = SHEET

@@ -224,7 +224,7 @@ def test_changed_tissues_give_what_a_new_simulator_would(solid):
 
 
 @pytest.mark.parametrize("spacing_mm", [0.3, 1.0])
-def test_a_membrane_goes_on_beyond_the_end_of_a_label_map(spacing_mm):
+def test_a_membrane_continues_beyond_the_end_of_a_label_map(spacing_mm):
     half = block(lambda x, y, z: np.where(y > 0, 1, 0), (8, 12, 6), spacing_mm)
     bright = Tissue("bright", 1540.0, 1.54, 0.0, mu0=1.0, sigma0=0.5)
     silent = Tissue("silent", 1540.0, 1.54, 0.0)

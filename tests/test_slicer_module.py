@@ -619,7 +619,7 @@ def test_a_sequence_is_simulated_and_its_browser_plays_it(session):
     assert session.scene.GetNumberOfNodesByClass("vtkMRMLSequenceNode") == count
 
 
-def test_choosing_other_nodes_while_live_goes_on_with_those(session):
+def test_choosing_other_nodes_while_live_continues_with_those(session):
     session.segmented()
     session.ui.liveCheckBox.setChecked(True)
     first = session.parameters.output

@@ -242,7 +242,7 @@ def test_of_several_series_one_is_taken_and_called_as_it_is_described(tmp_path, 
     assert "Miller" not in caplog.text and "4711" not in caplog.text and "T1 MPRAGE" in caplog.text
 
 
-def test_a_damaged_image_beside_the_chosen_series_is_said(tmp_path):
+def test_a_damaged_image_beside_the_chosen_series_is_reported(tmp_path):
     """The volume would end before it."""
     mri = head_mri(6.0)
     write_series(tmp_path, mri, 3, "T1")
@@ -260,7 +260,7 @@ def test_a_damaged_image_beside_the_chosen_series_is_said(tmp_path):
 # ---- questions -------------------------------------------------------------------------------------------------------
 
 
-def test_a_question_waits_for_its_own_answer_and_all_else_goes_on():
+def test_a_question_waits_for_its_own_answer_and_all_else_continues():
     import asyncio
 
     from trame_server.state import State

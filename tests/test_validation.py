@@ -46,7 +46,7 @@ def test_theory_and_simulation_agree(name):
     assert not off, "; ".join(off)
 
 
-def test_every_check_has_a_name_of_its_own_and_three_orientations():
+def test_every_check_has_its_own_name_and_three_orientations():
     for check in all_checks():
         # Views of heads have random orientations.
         assert set(check.orientations) == set(ORIENTATIONS) or check.name == "beams in heads"
@@ -212,7 +212,7 @@ def test_refraction_between_equal_speeds_displaces_nothing(probe):
         assert np.linalg.norm(away) == pytest.approx(0.6, abs=1e-6)  # the wire's radius: its front is what echoes
 
 
-def test_the_rayleigh_fit_finds_sigma_and_refuses_what_is_no_rayleigh():
+def test_the_rayleigh_fit_finds_sigma_and_refuses_other_distributions():
     rng = np.random.default_rng(0)
     fit = fit_rayleigh(rng.rayleigh(3.0, 400_000))
     top = 255.0 / 3.0  # grey levels per unit, times the largest of that many samples

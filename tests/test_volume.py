@@ -188,7 +188,7 @@ CODES = {"sform_code": 0, "qform_code": 0}
         ({"scl_slope": 0, "scl_inter": 5}, (2, 2, 2), "scl_slope is 0 and scl_inter 5, read without both"),
     ],
 )
-def test_a_nifti_header_that_contradicts_itself_is_told_with_both_values(fields, diagonal, words, tmp_path, caplog):
+def test_a_contradicting_nifti_header_is_reported_with_both_values(fields, diagonal, words, tmp_path, caplog):
     if fields.get("xyzt_units"):
         with pytest.raises(SimulationError, match=r"has voxels of 0\.002 x 0\.002 x 0\.002 mm"):
             nifti(tmp_path / "i.nii", **fields)
@@ -309,7 +309,7 @@ def test_only_rotations_with_translation_pass_as_poses(matrix):
 
 
 @pytest.mark.parametrize("name", ["mri.nii.gz", "mri.nrrd", "mri.mha"])
-def test_voxels_that_are_no_numbers_are_read_as_zero_and_told(name, tmp_path, caplog):
+def test_voxels_that_are_not_finite_are_read_as_zero_and_reported(name, tmp_path, caplog):
     """SPM and others write NaN outside the head."""
     values = np.ones((6, 7, 8), np.float32)
     values[4:] = np.nan

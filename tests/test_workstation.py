@@ -794,7 +794,7 @@ def test_a_click_grows_a_lesion_that_is_added_to_the_tissues(browser, tmp_path):
         page.close()
 
 
-def test_a_file_that_cannot_be_read_is_said_and_changes_nothing(page):
+def test_a_file_that_cannot_be_read_is_reported_and_changes_nothing(page):
     before = state(page, NAMES.title), shown(page, "kindComboBox"), shown(page, "mriSelector")
     broken = {"name": "broken.nii.gz", "mimeType": "application/octet-stream", "buffer": b"this is not an image"}
     page.set_input_files("#open-file", broken)
@@ -821,12 +821,12 @@ def test_a_file_that_cannot_be_read_is_said_and_changes_nothing(page):
         (["{head}", "--set", "patient.no_sheets=falx"], "no_sheets leaves out some of --sheets; give --sheets, too"),
     ],
 )
-def test_what_cannot_be_served_is_said_in_one_line(files, arguments, message):
+def test_what_cannot_be_served_is_reported_in_one_line(files, arguments, message):
     names = {name: files / f"{name}.nii.gz" for name in ("broken", "head", "far")}
     assert message in refused(*(text.format(**names) for text in arguments))
 
 
-def test_a_port_that_is_taken_is_said():
+def test_a_port_that_is_taken_is_reported():
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
         assert f"127.0.0.1:{port}" in refused("--port", port)

@@ -149,7 +149,7 @@ def test_with_a_certificate_page_and_images_come_over_tls(browser, files, certif
 
 @pytest.mark.slow
 @needs_openssl
-def test_what_is_no_certificate_is_said_in_one_line(files, certificate):
+def test_what_is_not_a_certificate_is_reported_in_one_line(files, certificate):
     labels = files / "labels.nii.gz"
     cert, _ = certificate
     for arguments, words in (

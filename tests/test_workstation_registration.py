@@ -110,7 +110,7 @@ def test_ultrasound_without_a_calibration_asks_for_it(page, recording):
 
 
 @pytest.mark.long
-def test_wrong_calibrations_and_registrations_are_said_and_change_nothing(page, recording, tmp_path):
+def test_wrong_calibrations_and_registrations_are_reported_without_effect(page, recording, tmp_path):
     def sent(name: str, matrix: np.ndarray) -> None:
         np.savetxt(tmp_path / "matrix.txt", matrix)
         page.set_input_files(f"#{name}-file", tmp_path / "matrix.txt")

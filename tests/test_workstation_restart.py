@@ -99,7 +99,7 @@ def test_pose_and_settings_are_offered_after_a_crash_and_restored(start, browser
 
 
 @pytest.mark.slow
-def test_an_uploaded_patient_goes_on_with_his_saved_scene(start, browser, files, tmp_path):
+def test_an_uploaded_patient_continues_with_his_saved_scene(start, browser, files, tmp_path):
     served, file = start
     server = served("--labels", files / "labels.nii.gz")
     page = opened(browser, server.url)
