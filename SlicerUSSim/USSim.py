@@ -231,7 +231,7 @@ class USSimWidget(ScriptedLoadableModuleWidget, VTKObservationMixin):
         self.initializeParameterNode()
 
     def exit(self) -> None:
-        """Called each time the user opens another module; live update goes on, the user's layout comes back."""
+        """Called each time the user opens another module; live update continues, the user's layout comes back."""
         self.setParameterNode(None)
         if self.panel is not None:
             self.panel.restoreLayout()
@@ -259,7 +259,7 @@ class USSimWidget(ScriptedLoadableModuleWidget, VTKObservationMixin):
 
     @vtk.calldata_type(vtk.VTK_OBJECT)
     def onNodeAboutToBeRemoved(self, caller, event, node) -> None:
-        """Called before node selectors hear of a removal; these then choose the next node."""
+        """Called before node selectors see a removal; these then choose the next node."""
         if self.panel is not None:
             self.panel.nodeGoes(node)
 

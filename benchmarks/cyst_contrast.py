@@ -1,4 +1,4 @@
-"""Level at the centre of a cyst re its surroundings, against its depth, for three probe presets as a figure.
+"""Level at the centre of a cyst relative to its surroundings, against depth, for three probe presets as a figure.
 
     python -m benchmarks.cyst_contrast PICTURE.png [--all]
 
@@ -29,7 +29,7 @@ RADIUS_MM, SEEDS = 5.0, 4
 
 
 def contrast_db(probe: Probe, depth_mm: float, device: str | None) -> float:
-    """Mean power within 1 mm of the centre of the cyst, re that beside it at the same depth."""
+    """Mean power within 1 mm of the centre of the cyst, relative to that beside it at the same depth."""
     spacing = 0.5
     axis = np.arange(-12, 13) * spacing
     x, y, z = np.meshgrid(axis, axis, axis)
@@ -38,7 +38,7 @@ def contrast_db(probe: Probe, depth_mm: float, device: str | None) -> float:
     labels = Volume(np.where(x**2 + y**2 + z**2 < RADIUS_MM**2, 2, 1).astype(np.uint8), matrix)
     tissue = replace(BACKGROUND, attenuation_db_cm_mhz=0.0)
     cyst = replace(tissue, name="cyst", mu0=0.0, sigma0=0.0)
-    tissues = TissueTable({0: tissue, 1: tissue, 2: cyst})  # the tissue goes on around the volume
+    tissues = TissueTable({0: tissue, 1: tissue, 2: cyst})  # the tissue continues around the volume
     apart = float(probe.line_distance_mm(depth_mm))
     middle, near = probe.scan_lines // 2, max(round(1.0 / apart), 1)
     aside = min(round(9.0 / apart), middle - near - 1)

@@ -37,7 +37,7 @@ WARM_UP_FRAMES = 300
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=str(__doc__).splitlines()[0])
-    parser.add_argument("--device", action="append", help="as of `ussim devices`; may be repeated (default: each once)")
+    parser.add_argument("--device", action="append", help="see `ussim devices`; may be repeated (default: each once)")
     parser.add_argument("--seconds", type=float, default=10.0, help="of dragging, in each view")
     parser.add_argument("--frames", type=int, default=2000, help="over which memory is measured; 0: not measured")
     parser.add_argument("--json", type=output_file, help="write the results to this file")

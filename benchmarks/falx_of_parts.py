@@ -1,4 +1,4 @@
-"""The falx without an atlas, in parts of heads: against that of the whole head by the atlas, and where there is none.
+"""The falx in parts of heads without an atlas, compared with the falx of the whole head by the atlas.
 
     python -m benchmarks.falx_of_parts [remind022] [colin27] [FILE=CONTRAST ...]
 

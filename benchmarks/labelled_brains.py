@@ -70,7 +70,7 @@ def _blurred(shares: np.ndarray, mask: np.ndarray) -> np.ndarray:
 def labelled_scan(mri: Volume, labels: Volume, name: str) -> BrainPhantom:
     """A real scan with another program's labels (FreeSurfer's values) as the truth; the mask is what is labelled.
 
-    Agreement with such labels is no measure of accuracy beyond about 0.9: programs differ from each other, and
+    Agreement with such labels does not measure accuracy beyond about 0.9: programs differ from each other, and
     FreeSurfer's cortex is cut out by surfaces rather than by intensity.
 
     Raises SimulationError if the grids differ or the labels contain no white matter.

@@ -33,7 +33,7 @@ def image_of(probe: Probe, device: str | None) -> np.ndarray:
     matrix = np.diag([spacing, spacing, spacing, 1.0])
     matrix[:3, 3] = axis[0] + np.array([0.0, probe.focus_mm, 0.0])
     cyst = replace(BACKGROUND, name="cyst", mu0=0.0, sigma0=0.0)
-    tissues = TissueTable({0: BACKGROUND, 1: BACKGROUND, 2: cyst})  # the tissue goes on around the volume
+    tissues = TissueTable({0: BACKGROUND, 1: BACKGROUND, 2: cyst})  # the tissue continues around the volume
     return UltrasoundSimulator(Volume(labels, matrix), tissues, device=device).simulate(probe, np.eye(4)).image
 
 

@@ -2,7 +2,7 @@
 
 One column for the real image, one for every source, and one for a picture of another program (--other NAME=FILE), in
 equal millimetres: the whole field, a part of it at its own pixels, and the same magnified. LABELS is a label map; the
-PRESET has probe, display and tissues, as of `ussim optimize --save-preset`; a third file has sheets, as of `ussim
+PRESET has probe, display and tissues, as from `ussim optimize --save-preset`; a third file has sheets, as from `ussim
 segment --sheets`. --credit is written below.
 """
 

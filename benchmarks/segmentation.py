@@ -9,7 +9,7 @@
     python -m benchmarks.segmentation patients            # ReMIND-022: T1, T2, both; shares and hemispheres
 
 Every table is markdown; --json FILE keeps the numbers, and --pictures FOLDER writes a picture of every case.
-Methods that are not installed (antspyx, brainextractor) are left out, and it is said.
+Methods that are not installed (antspyx, brainextractor) are left out with a message.
 Names of data: mni152, colin27, ring; a part of a case's name selects too, as "7% noise" or "tight".
 """
 
@@ -133,7 +133,7 @@ def measure_tissues(arguments: argparse.Namespace) -> list[dict]:
             if method == "Atropos" and " 0% bias" not in name:
                 continue  # with a bias field it is only worse
             if "true thresholds" in method and np.isnan(case.noise):
-                continue  # nobody knows them in a scan
+                continue  # they are unknown in a scan
             known = [row for row in arguments.reuse if (row["data"], row["method"]) == (name, method)]
             if known and not method.startswith("segment_mri"):
                 rows += known

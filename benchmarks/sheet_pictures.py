@@ -3,7 +3,7 @@
     python -m benchmarks.sheet_pictures docs/images [colin27 remind022 mni152] [FILE=CONTRAST ...] [--keep FOLDER]
 
 With --views PICTURE also a view of every head through a craniotomy, by its labels alone and, below, with the sheets.
-Colin27 needs Debian's mricron-data, and ReMIND-022 ../shared; what is not there is left out.
+Colin27 needs Debian's mricron-data, and ReMIND-022 ../shared; missing data are left out.
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 
     python -m benchmarks.sheets [remind022 turned shifted colin27 mni152] [FILE=CONTRAST ...] [--keep FOLDER]
 
-ReMIND-022 needs ../shared, Colin27 Debian's mricron-data; what is not there is left out. About four minutes in all.
+ReMIND-022 needs ../shared, Colin27 Debian's mricron-data; missing data are left out. About four minutes in all.
 """
 
 from __future__ import annotations

@@ -5,8 +5,8 @@
 
 Each seed draws a probe (array, transmission, steering, harmonic, apodisation), settings, tissues (fluid, brain, bone,
 a lossy plate, one that is strong but does not bend, a membrane with a thin sulcus), sheets, a texture, and the grid of
-the voxels. The signal goes to OUT/SEED.npy. Where there is one already, of another device, the largest difference re
-the largest value is told: the first command interprets (a minute per seed or two), the second compares.
+the voxels. The signal goes to OUT/SEED.npy. If another device has written one already, the second command reports the
+largest difference relative to the largest value. The first command interprets: a minute or two per seed.
 """
 
 from __future__ import annotations

@@ -45,7 +45,7 @@ def main() -> None:
 
 
 def change_db(simulators: list[UltrasoundSimulator], probe: Probe, pose: np.ndarray, beam: str) -> np.ndarray:
-    """(lines,) level in the deeper half of the image, re that of the last simulator."""
+    """(lines,) level in the deeper half of the image, relative to the last simulator."""
     levels = []
     for simulator in simulators:
         simulator.settings = replace(SimulationSettings(interfaces=False), beam=beam)

@@ -15,11 +15,11 @@
 // elevational deflection in mm; screens float4 [screen line][depth], depths from screen_step on: nepers lost both ways,
 // extra path in mm, deflection in the lateral and in the elevational direction in mm; shades float4 [screen
 // line][depth]: the nepers of them that strong tissue takes; those that it takes right behind its last end between the
-// depth before and this one; those that soft tissue has taken from what arrives, on the mean; and the distance from
+// depth before and this one; those that soft tissue has taken from what arrives, on average; and the distance from
 // that end in mm, NO_END if there is none, negative in strong tissue. spreads float2 [screen line][depth]: width of the
-// beam and a factor of its echoes, both re an undisturbed one; beams float4 [traced line][1 + depth] as screens,
-// followed by float4 [traced line][1 + depth] as shades, but that the last is 1, -1 where the beam is in strong tissue,
-// and -2 where that does not end between this depth and the one before.
+// beam and a factor of its echoes, both relative to an undisturbed one; beams float4 [traced line][1 + depth] as
+// screens, followed by float4 [traced line][1 + depth] as shades, but that the last is 1, -1 where the beam is in
+// strong tissue, and -2 where that does not end between this depth and the previous one.
 
 #include "common.clh"
 
@@ -38,7 +38,7 @@
 #define LEFT_FOR_MEANS 0.01f  // of the power of a line that strong tissue stops
 #define EDGE_OF_BONE 0.75f    // part of a cell from which lines are lost in it by their length
 #define LEAST_OPEN 0.05f      // amplitude that is left by the part that bone covers
-#define LEAST_POWER 1e-7f     // of a beam re an undisturbed one
+#define LEAST_POWER 1e-7f     // of a beam relative to an undisturbed one
 #define NO_END 1e3f
 #define LEAST_UNEVEN 0.02f  // nepers, both ways, by which soft tissue may take more from one line than from another
 #define MOST_UNEVEN 0.7f    // ... and up to which that belongs to the width of the beam
@@ -87,7 +87,7 @@ inline float border_nepers(float impedance, float other_impedance) {
 }
 
 // Stored depths that lines need of the ray at an angle from a point of a flat face whose lines begin in its middle: no
-// traced line goes where the ray, or the one before it, has left the sector of them. All of other faces.
+// traced line goes where the ray, or the previous one, has left the sector of them. All of other faces.
 inline int depths_needed(Frame frame, float along, float angle) {
   const int depths = frame->fan_depths;
   if (frame->linear || frame->apex_radius_mm > 0.0f) return depths;
@@ -98,8 +98,8 @@ inline int depths_needed(Frame frame, float along, float angle) {
 }
 
 // One work-item follows one ray of a fan. Global size (angles, points, rows). Look-ups are trilinear, so that sums over
-// steps of a voxel are smooth. Strong tissue counts as what lies in front of it, with what it takes more recorded: by
-// its borders, its attenuation, and by refraction. With `all_soft`, no tissues have a strong border.
+// steps of a voxel are smooth. Strong tissue counts as the tissue in front of it, and its additional losses are
+// recorded: by its borders, its attenuation, and by refraction. With `all_soft`, no tissues have a strong border.
 ONE_BY_ONE
 __kernel void fans(Frame frame, __global const ushort *voxels, __global const float4 *acoustics, int all_soft,
                    __global float *sums) {
@@ -397,7 +397,7 @@ typedef struct {
   // Sums along the lines, per length of the axis: extra path, nepers, elevational deflection; and the amplitude that
   // passes strong tissue
   float delay[ROWS][MOST_POINTS], loss[ROWS][MOST_POINTS], lift[ROWS][MOST_POINTS], passed[ROWS][MOST_POINTS];
-  // The amplitude that soft tissue leaves, re that of the line of the least loss, and by how much losses differ
+  // The amplitude that soft tissue leaves, relative to the line of least loss, and by how much losses differ
   float kept[ROWS][MOST_POINTS], least_loss, uneven;
 } Lines;
 
@@ -631,7 +631,7 @@ __kernel void screens(Frame frame, __global const float *sums, int with_level, i
     const float depth = all_soft ? path : depth_outside(frame, sums, path, axis);
     is_inside = depth < path;
     if (depth != path) find_lines(frame, sums, depth, axis, &lines);
-    if (is_inside) {  // and goes on as before it: within bone, the lines that are left say nothing of a direction
+    if (is_inside) {  // and continues as before it: within bone, the remaining lines do not show a direction
       const Means before = means_over(frame, &lines, depth);
       slope = before.slope;
       rise = before.rise * path / depth;
@@ -737,8 +737,8 @@ inline Between between_lines(Frame frame, float place) {
 
 // The amplitude that strong tissue lets through at the depth `node`, at a place among the screen lines: of one of the
 // two `kinds` of shades. In shadows it is the mean over a deviation `sigma` in screen lines, by a Gauss-Hermite rule of
-// three points; from where the beam passes beside, nothing is taken. In strong tissue shades are those before it, and
-// light from there does not reach what is behind: its lines count as the line itself.
+// three points; from where the beam passes beside, nothing is taken. In strong tissue shades are those in front of it,
+// and light from there does not reach what is behind: its lines count as the line itself.
 inline float mean_lit(Frame frame, __global const float *shades, int kind, int node, float place, float sigma) {
   const int nodes = frame->screen_depths;
   const Between middle = between_lines(frame, place);

@@ -23,8 +23,8 @@
 
 #include "common.clh"
 
-// Writes the width of the beam of a traced line at path lengths `s` and the factor of its echoes, both re an
-// undisturbed one, linear between the screens.
+// Writes the width of the beam of a traced line at path lengths `s` and the factor of its echoes, both relative
+// to an undisturbed one, linear between the screens.
 inline void find_spread(Frame frame, __global const float *spreads, int traced, floatn s, floatn *width,
                         floatn *factor) {
   *width = *factor = (floatn)(1.0f);

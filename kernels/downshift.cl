@@ -3,7 +3,7 @@
 //
 // A Gaussian spectrum exp(-(f - f0)^2 / 2 sf^2) times exp(-A f), the two-way loss, is the same Gaussian about f0 - A
 // sf^2 times exp(-A f0 + (A sf)^2 / 2), of which the part above zero is there. Every echo has its own amplitude
-// (gain_of_band). Its frequency is that of the strongest path to its depth on the scan line: behind bone, that of a
+// (gain_of_band). Its frequency comes from the strongest path to its depth on the scan line: behind bone, from a
 // mirror image in front of it.
 //
 // Buffers: segments with their counts as in raytracing.cl; losses float [scan line][1 + samples / LOSS_STEP]
@@ -33,7 +33,7 @@ __kernel void losses(Frame frame, __global const Segment *segments, __global con
   }
   float loss = 0.0f, lower = 0.0f, turns = 0.0f;
   for (int node = 0; node < nodes; node++) {
-    if (to[LOSS_WORDS * node + 1] >= 0.0f) loss = to[LOSS_WORDS * node];  // otherwise nothing is there: it goes on
+    if (to[LOSS_WORDS * node + 1] >= 0.0f) loss = to[LOSS_WORDS * node];  // without an echo here, the loss stays
     const float frequency = frequency_after(frame, loss), missing = 1.0f - frequency;
     if (node > 0) turns += 0.5f * (lower + missing) * step * frame->cycles_per_mm;
     lower = missing;

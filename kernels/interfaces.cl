@@ -23,8 +23,8 @@ inline float plane_echo(float phase2, float width) {
   return exp_fast(-0.5f * phase2 / spread) / sqrt(spread);
 }
 
-// Factor of the echo of a patch. Of the squared phase over the beam (`phase2`) the sum over the patches has what is not
-// `inside` them. Both parts are Gaussian, but for a pulse the product of their peaks is not the peak of their product,
+// Factor of the echo of a patch. Of the squared phase over the beam (`phase2`) the sum over the patches has the part
+// not `inside` them. Both parts are Gaussian. For a pulse the product of their peaks is not the peak of their product,
 // which matters as long as the echo of a plane can be seen: up to 4.5 radians, -40 dB.
 inline float patch_echo(float phase2, float inside2, float width) {
   const float seen = fmin(1.0f, 20.0f / fmax(phase2, 1e-6f)), seen2 = seen * phase2, seen_inside2 = seen * inside2;
@@ -62,8 +62,8 @@ inline float part_carried(float least, float phase, float most, float flat) {
   return part + flat * (1.0f - part) * (1.0f - 1.0f / sqrt(1.0f + share * share));
 }
 
-// The echo of a plane of this tilt re a square one, as an exponent of two, along one `axis` of the aperture's table
-// (diffraction.py); nan where there is none.
+// The echo of a plane of this tilt relative to a square one, as an exponent of two, along one `axis` of the aperture's
+// table (diffraction.py); nan where there is none.
 inline float plane_of_aperture(Frame frame, __global const float *planes, float path, float tilt, int axis) {
   const float deep = clamp(path * ((PLANE_DEPTHS - 1) / frame->depth_mm), 0.0f, PLANE_DEPTHS - 1.001f);
   const float place = clamp(sqrt(fabs(tilt)) * (PLANE_TILTS - 1), 0.0f, PLANE_TILTS - 1.001f);
@@ -121,7 +121,7 @@ __kernel void find_walls(Frame frame, __global const Hit *hits, __global const i
       const float inside2 =
           bent_patch(per_mm, hit->lateral_slope, bend + fan, inside * sigma2, &wall.depth_mm) +
           bent_patch(per_mm, hit->elevational_slope, bend, inside_aside * sigma.y * sigma.y, &wall.depth_mm);
-      // Of a bent patch only the Fresnel zone contributes. The mean curvature says nothing of its direction; laterally,
+      // Of a bent patch only the Fresnel zone contributes. The mean curvature does not show its direction; laterally,
       // where patches are wide, this is within 2 dB of theory for spheres and for cylinders along and across the plane.
       const float zones = per_mm * bend * inside * sigma2;
       wall.echo /= sqrt(sqrt(1.0f + zones * zones));

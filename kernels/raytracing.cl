@@ -87,7 +87,7 @@ __kernel void trace(Frame frame, __global const ushort *voxels, __global const u
   }
   if (is_in_bone || !is_beam) stack[line.waiting++] = ray;
 
-  // Depth first: the refracted ray and all its children, before the beam goes on beside it; all others at the end.
+  // Depth first: the refracted ray and all its children, before the beam continues beside it; all others at the end.
   int below = 0;
   while (1) {
     while (line.waiting > below) trace_ray(&line, stack[--line.waiting]);

@@ -245,7 +245,7 @@ inline int is_in_sheet(Frame frame, const Piece *piece, Sheet sheet, float3 offs
   const float distance = LOOK(sheet) ? distance_of_look(LOOK(sheet)) : distance_of_sheet(sheet.plane);
   const float reach = LOOK(sheet) ? half_of_look(LOOK(sheet)) : frame->sheet_reach_mm;
   const float away = fabs(dot3(gradient, offset) - length3(gradient) * distance);
-  // A gradient's length in millimetres is at most 1 / voxel_mm of that in voxels; this is seldom true.
+  // A gradient's length in millimetres is at most 1 / voxel_mm of its length in voxels; this is rarely true.
   if (away * frame->voxel_mm >= reach) return 0;
   *normal = gradient.x * piece->row_i + gradient.y * piece->row_j + gradient.z * piece->row_k;
   return away < reach * length3(*normal);
@@ -295,7 +295,7 @@ inline int drawn_label(const Patient *patient, const Piece *piece, int here, flo
 }
 
 // A scatterer of the membrane is the brighter the more squarely the beam meets the sheet; one of falx and tentorium
-// that were found by Lambert's law, but for a part that is the same from all sides. Its normal is that of the
+// that were found by Lambert's law, except for a part that is the same from all sides. Its normal is that of the
 // fitted plane, or the gradient of the fluid distance: from lines of two voxels along i, first those of the near plane,
 // then of the far.
 inline float gain_on_membrane(const Patient *patient, const Piece *piece, int here, float3 at) {
@@ -363,7 +363,7 @@ inline floatn unevenness(uint seed, const floatn *words, int has_specks, floatn 
   return exp2_fast(clamp(level, (floatn)(-30.0f), (floatn)(30.0f)));
 }
 
-// Where scatterers are re a piece, for LANES of them at places u, v, w from the segment's start.
+// Positions of LANES scatterers relative to a piece, at places u, v, w from the segment's start.
 typedef struct {
   floatn t, along, aside;  // part of the piece, length along the segment, distance from its axis in the image plane
   floatn right, ends;      // distance from the strip's middle, at which it ends
@@ -784,7 +784,7 @@ inline float depth_moved(__global const Segment *segment) {
 }
 
 // The factor by which curved mirrors lower the power of speckle at a path length: the integral of what is transmitted
-// times what is received, re the same behind plane ones.
+// times what is received, relative to that behind plane ones.
 inline float mirrored_power(Frame frame, float path, float4 tube, float cosine) {
   if (tube.x == 1.0f && tube.z == 1.0f) return 1.0f;
   const float per_mm2 = 0.5f * TWO_PI * frame->cycles_per_mm;

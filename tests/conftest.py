@@ -77,7 +77,7 @@ def simulator(
 
 @cache
 def coarse_chest() -> CtPhantom:
-    """A CT of the lower chest in voxels of 4 mm, which nobody changes."""
+    """A CT of the lower chest in voxels of 4 mm, which no test changes."""
     return lower_chest((4.0, 4.0, 4.0))
 
 
@@ -156,5 +156,5 @@ def files(tmp_path_factory) -> Path:
     transforms = tuple({"ImageToProbe": to_probe, "ProbeToReference": pose} for pose in poses)
     TrackedSequence(np.stack(images), transforms, 0.1 * np.arange(6)).write(folder / "sweep.igs.mha")
     Volume(np.ones((4, 4, 4), np.uint8), np.diag([5.0, 5, 5, 1]) + 300 * np.eye(4, k=3)).write(folder / "far.nii.gz")
-    (folder / "broken.nii.gz").write_bytes(b"this is no image")
+    (folder / "broken.nii.gz").write_bytes(b"this is not an image")
     return folder

@@ -63,7 +63,7 @@ class Received:
 
 
 class StrictClient:
-    """One connection. `receive_buffer` limits what the system keeps for it, as of a client that is slow."""
+    """One connection. `receive_buffer` limits what the system keeps for it, as for a slow client."""
 
     def __init__(self, port: int, receive_buffer: int | None = None) -> None:
         self.socket = socket.socket()

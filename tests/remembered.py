@@ -35,7 +35,7 @@ class _Records(logging.Handler):
 def once(segment: Callable[..., Segmentation]) -> Callable[..., Segmentation]:
     """`segment`, which is segment_mri: the second time with a copy of its result, the same progress and the same log.
 
-    One that was cancelled or refused, reads or writes a kept mask, or is for a certain device is none to remember.
+    One that was cancelled or refused, reads or writes a kept mask, or is for a certain device is not remembered.
     """
     results: OrderedDict[bytes, tuple[Segmentation, list[float], list[logging.LogRecord]]] = OrderedDict()
 

@@ -66,7 +66,7 @@ class Served:
         return self.process.exitcode is None
 
     def kill(self) -> None:
-        """End it by a signal that it cannot hear."""
+        """End it by a signal that it cannot handle."""
         self.process.kill()
         self.process.join()
 
@@ -98,7 +98,7 @@ def _write_errors_to(path: str) -> None:
 
 
 def _serve(arguments: list[str], state: str, out: Any, errors: str, segmented: str) -> None:
-    """As `python -m SlicerUSSim.Command.cli serve`, in a process of its own."""
+    """As `python -m SlicerUSSim.Command.cli serve`, in a separate process."""
     os.environ["XDG_STATE_HOME"] = state
     _write_errors_to(errors)
     os.dup2(out.fileno(), 1)

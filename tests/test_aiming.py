@@ -59,7 +59,7 @@ def test_a_probe_in_an_opening_looks_at_the_tumour_below_it(head):  # noqa: F811
 
 
 @pytest.mark.slow
-def test_veins_are_no_lesion(head):  # noqa: F811
+def test_veins_are_not_a_lesion(head):  # noqa: F811
     """With contrast agent a class of the T1 is what enhances, and a probe was aimed at the sinus as "the enhancing"."""
     vein, tumour, names = np.array([10.0, 8.0, 35.0]), np.array([-12.0, 0.0, 30.0]), (*ILL, "enhancing")
     labels, middle = with_disc(with_ball(head, vein, 7.0, len(names)), 40.0)
@@ -95,7 +95,7 @@ def test_the_edge_of_a_turned_face_lies_on_the_surface(head):  # noqa: F811
     assert off_axis_mm(pose, [14.0, 0.0, 35.0]) < 1.5
 
 
-def test_a_lesion_too_far_aside_is_told_and_not_aimed_at(head):  # noqa: F811
+def test_a_lesion_too_far_aside_is_reported_and_not_aimed_at(head):  # noqa: F811
     labels, middle = with_disc(with_ball(head, [45.0, 0.0, 15.0], 7.0), 40.0)
     pose, line = opening_pose(labels, ILL, PROBES["phased"], middle)
     np.testing.assert_allclose(pose[:3, 1], [0.0, 0.0, -1.0], atol=0.03)
@@ -120,7 +120,7 @@ def test_the_largest_lesion_in_reach_is_aimed_at_and_oedema_last(head):  # noqa:
 
 
 @pytest.mark.slow
-def test_specks_are_no_lesion_and_one_right_before_the_face_needs_no_turn(head):  # noqa: F811
+def test_specks_are_not_lesions_and_one_before_the_face_needs_no_turn(head):  # noqa: F811
     labels, middle = with_disc(with_ball(head, [10.5, 0.0, 34.5], 2.0), 40.0)
     assert 0 < (labels.array == TUMOUR).sum() * labels.voxel_ml < 0.05
     assert opening_pose(labels, ILL, PROBES["phased"], middle)[1] == ""
@@ -139,7 +139,7 @@ def test_the_target_of_a_caller_comes_before_lesions_of_the_labels(head):  # noq
 # ---- bone before the probe ------------------------------------------------------------------------------------------
 
 
-def test_a_face_that_does_not_fit_an_opening_is_said_with_both_sizes(head):  # noqa: F811
+def test_a_face_that_does_not_fit_an_opening_is_reported_with_both_sizes(head):  # noqa: F811
     wide = ConvexProbe(radius_mm=60.0, field_of_view_deg=60.0, depth_mm=120.0, frequency_mhz=3.5)
     labels, middle = with_disc(head, 30.0)
     for pose in (ON_SKIN, opening_pose(labels, ILL, wide, middle)[0]):  # over the opening, and on the brain in it
@@ -161,7 +161,7 @@ def test_an_aimed_face_fits_the_opening_that_was_made_for_it(head):  # noqa: F81
     assert line.startswith("aimed at the tumour") and notes_of(labels, probe, pose, is_open=True) == ()
 
 
-def test_a_closed_skull_that_leaves_no_signal_is_told(head):  # noqa: F811
+def test_a_closed_skull_that_leaves_no_signal_is_reported(head):  # noqa: F811
     probe = PROBES["phased"]
     pose = default_pose(head, NAMES, probe)
     (line,) = notes_of(head, probe, pose, is_open=False, names=NAMES)
@@ -176,7 +176,7 @@ def test_a_closed_skull_that_leaves_no_signal_is_told(head):  # noqa: F811
 
 
 @pytest.mark.slow
-def test_a_skull_is_not_said_to_be_closed_where_the_brain_is_seen(head):  # noqa: F811
+def test_a_skull_is_not_called_closed_where_the_brain_is_seen(head):  # noqa: F811
     pose, _ = view_pose(head, NAMES, "temporal")
     lower = replace(PROBES["transcranial"], frequency_mhz=1.2)
     assert notes_of(head, lower, pose, is_open=False) == ()
@@ -193,7 +193,7 @@ def test_a_skull_is_not_said_to_be_closed_where_the_brain_is_seen(head):  # noqa
     assert not any("closed" in line for line in notes_of(labels, LinearProbe(38, 60), ON_SKIN, is_open=True))
 
 
-def test_a_probe_below_a_closed_skull_is_told_of(head):  # noqa: F811
+def test_a_probe_below_a_closed_skull_triggers_a_warning(head):  # noqa: F811
     below = TOP.copy()
     below[:3, 3] += 25.0 * TOP[:3, 1]
     (line,) = notes_of(head, PROBES["phased"], below, is_open=False, names=NAMES)
@@ -202,14 +202,14 @@ def test_a_probe_below_a_closed_skull_is_told_of(head):  # noqa: F811
     assert notes_of(opened_there, PROBES["phased"], below, is_open=True) == ()
 
 
-def test_a_head_whose_skull_is_not_labelled_is_told_of(head):  # noqa: F811
+def test_a_head_whose_skull_is_not_labelled_triggers_a_warning(head):  # noqa: F811
     """It was imaged straight through the skull without a word."""
     mri = Volume(
         np.array([5.0, *(90.0 if "skull" not in name else 10.0 for name in NAMES)])[head.array], head.ijk_to_ras
     )
     brain = without_outside(head, NAMES)
     (line,) = about_missing_skull(brain, NAMES[:2], mri)
-    assert "tick Label what is outside the brain and press Segment" in in_panel(line)
+    assert "tick Label tissues outside the brain and press Segment" in in_panel(line)
     assert about_missing_skull(head, NAMES, mri) == about_missing_skull(brain, ["liver"], mri) == ()
     stripped = mri.with_array(np.where(brain.array > 0, mri.array, 0.0))
     assert about_missing_skull(brain, NAMES[:2], stripped) == ()

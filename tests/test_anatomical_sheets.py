@@ -200,13 +200,13 @@ def test_a_file_shows_squares_of_the_surfels_where_slicer_expects_them(tmp_path)
 
 
 @pytest.mark.slow
-def test_files_that_are_no_sheets_are_named(tmp_path):
+def test_files_without_sheets_are_listed(tmp_path):
     with pytest.raises(SimulationError, match="expected a name with"):
         write_surfels(tmp_path / "sheets.stl", some_surfels())
     with pytest.raises(SimulationError, match="no such file"):
         read_surfels(tmp_path / "none.vtp")
     (tmp_path / "text.vtp").write_text("no XML")
-    with pytest.raises(SimulationError, match="no VTK surface"):
+    with pytest.raises(SimulationError, match="not a VTK surface"):
         read_surfels(tmp_path / "text.vtp")
     # VTK ended the process for a damaged one
     write_surfels(tmp_path / "own.vtp", some_surfels())
@@ -322,7 +322,7 @@ def test_a_grid_too_coarse_for_the_reach_and_no_surfels():
 
 
 @pytest.mark.slow
-def test_a_falx_that_enhances_as_white_matter_does_is_no_white_matter():
+def test_a_falx_that_enhances_as_white_matter_does_is_not_white_matter():
     """Between hemispheres 10 mm apart, off the middle between them."""
     x, y, z = np.mgrid[-30:31, -110:76, -30:89].astype(float).transpose(0, 3, 2, 1)
     csf, grey, white = 20.0, 100.0, 140.0
@@ -396,7 +396,7 @@ def test_what_cannot_be_found_is_reported_before_the_search():
         find_sheets(mri, found, contrast="t1", kinds=["dura"])
     with pytest.raises(SimulationError, match="contrast 'flair'"):
         find_sheets(mri, found, contrast="flair")
-    with pytest.raises(SimulationError, match="nothing is to be found"):
+    with pytest.raises(SimulationError, match="no kind was chosen"):
         find_sheets(mri, found, contrast="t1", kinds=[])
     with pytest.raises(SimulationError, match="expected one grid"):
         find_sheets(Volume(mri.array[1:], mri.ijk_to_ras), found, contrast="t1")

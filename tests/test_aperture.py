@@ -244,7 +244,7 @@ def test_the_penumbra_of_bone_is_that_of_its_aperture_and_has_no_steps(kind):
 def test_behind_a_lossy_plate_beams_have_the_mean_of_their_aperture(loss_db, thick_mm):
     """Against wave propagation, 28 to 40 mm deep; the mean of the decibels of the lines is far off.
 
-    The plate of 8.5 mm is of less than 2 dB/(cm MHz), so that labels have no border there: rays go on in one node.
+    The plate of 8.5 mm is of less than 2 dB/(cm MHz), so that labels have no border there: rays continue in one node.
     """
     labels, tissue = lossy_plate(loss_db, thick_mm)
     probe = replace(PROBES["linear"], depth_mm=48.0, frequency_mhz=5.0)
@@ -600,7 +600,7 @@ def test_what_leaves_bone_before_its_neighbours_is_as_dark_as_they_are(slope):
 
 
 def changes_of(phantom: Phantom, probe: Probe, edges_mm: tuple[float, float], lines: slice, **settings) -> tuple:
-    """(lines,) levels in dB and lengths of speckle re the phantom's baseline."""
+    """(lines,) levels in dB and lengths of speckle relative to the phantom's baseline."""
     assert phantom.baseline is not None
     return levels_and_widths(
         phantom.labels, phantom.tissues, phantom.baseline, probe, phantom.probe_to_ras, None,

@@ -117,7 +117,7 @@ def test_moving_the_anchor_makes_the_model_exact_there(layers):
     assert found.medium.tissues is before
 
 
-def test_display_needs_no_bases_of_its_own(layers):
+def test_display_needs_no_separate_bases(layers):
     found, poses = layers
     model = AppearanceModel(found, PROBE, poses[:1], {})
     for display in (DISPLAY, DisplaySettings(gain_db=6, dynamic_range_db=40, tgc_db_cm_mhz=0.9, noise_db=-50)):

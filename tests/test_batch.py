@@ -122,7 +122,7 @@ def test_labels_as_imaged_are_displaced_by_travel_time():
         ({"poses": [2.0 * np.eye(4)]}, "pose 0"),
     ],
 )  # fmt: skip
-def test_what_makes_no_batch_is_said_before_anything_is_computed(made, monkeypatch, change, says):
+def test_what_makes_no_batch_is_reported_before_anything_is_computed(made, monkeypatch, change, says):
     monkeypatch.setattr(made, "_rendered", lambda *_: pytest.fail("computed"))
     values = {"probes": PROBE, "poses": POSES, "display": SMALL, **change}
     with pytest.raises(SimulationError, match=says) as error:

@@ -117,7 +117,7 @@ def test_a_stripped_brain_is_recognised_and_taken_whole():
         (lambda a: np.where(a == 0, -1000.0, 40.0 + 0.1 * a), "is a CT (its values are Hounsfield units)"),
     ],
 )
-def test_what_is_no_mri_is_reported(change, message):
+def test_what_is_not_an_mri_is_reported(change, message):
     mri = head_mri(4.0)
     with pytest.raises(SimulationError) as caught:
         find_brain(mri.with_array(change(mri.array)))
@@ -198,7 +198,7 @@ def test_a_kept_mask_is_read_and_never_replaced(head, found, tmp_path):
     place.write_bytes(found.place.read_bytes())
     other = mri.with_array(mri.array + 1.0)
     assert kept_mask.read_kept(place, other) is None
-    assert kept_mask.keep(place, other, found.result.mask).endswith(f"not kept: {place} exists and is of another image")
+    assert kept_mask.keep(place, other, found.result.mask).endswith(f"{place} exists and belongs to another image")
     assert place.read_bytes() == found.place.read_bytes()
     assert "is not kept: " in kept_mask.keep(tmp_path / "absent" / "mask.nrrd", mri, found.result.mask)
 

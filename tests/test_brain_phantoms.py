@@ -135,5 +135,5 @@ def test_segmentation_at_1_mm_is_as_good_as_the_documentation_says(name, noise, 
     names = dict(enumerate(found.tissue_names, start=1))
     assert scores(found.labels.array, names, case)["grey and white"] >= LEAST[name, noise, bias]
     for stated, right, voxels in calibration(found.posteriors, names, case):
-        # Three standard errors of a share: a single voxel is right or wrong, and says nothing.
+        # Three standard errors of a share: a single voxel is right or wrong, and shows nothing.
         assert right == pytest.approx(stated, abs=0.07 + 1.5 / voxels**0.5)

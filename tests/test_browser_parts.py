@@ -91,7 +91,7 @@ def _run_in(loop: asyncio.AbstractEventLoop, coroutine_function):
         loop.close()
 
 
-def test_the_event_loop_goes_on_and_results_come_back_to_their_tasks():
+def test_the_event_loop_continues_and_results_come_back_to_their_tasks():
     async def scenario():
         tasks, seen, ticks = Tasks(seen_errors.append), [], 0
         goes_on = threading.Event()
@@ -121,7 +121,7 @@ def test_the_event_loop_goes_on_and_results_come_back_to_their_tasks():
     assert seen == [("first", True, True), ("second", True, True)] and are_done and not seen_errors
 
 
-def test_errors_of_work_reach_the_task_and_those_of_tasks_are_told():
+def test_errors_of_work_reach_the_task_and_those_of_tasks_are_reported():
     async def scenario():
         errors, caught = [], []
         tasks = Tasks(errors.append)
@@ -312,7 +312,7 @@ def test_only_the_image_that_shows_a_movement_tells_its_latency():
     stamps = LatencyStamps()
     stamps.receive("page", 1.0)
     stamps.image_begun()
-    assert stamps.computed is None  # of before the movement
+    assert stamps.computed is None  # from before the movement
     stamps.probe_moved()
     stamps.image_begun()
     assert stamps.computed == ("page", 1.0)

@@ -52,7 +52,7 @@ def test_a_device_that_computes_correctly_passes(info):
     assert "ms per frame" in findings[-1]
 
 
-def test_wrong_pixels_are_told_per_image_and_exit_with_one(info, distort):
+def test_wrong_pixels_are_reported_per_image_and_exit_with_one(info, distort):
     distort(lambda frame: replace(frame, image=np.roll(frame.image, 2, axis=0)))
     result = ussim_check("--device", info.index)
     assert result.exit_code == 1 and "correctly" not in result.stdout

@@ -107,7 +107,7 @@ def on_bench(head, scenario):
 
 
 def test_an_image_is_live_only_while_its_record_is_that_of_now(head, clock):
-    """After Segment the image of before stood unmarked for 9 s."""
+    """After Segment the previous image stood unmarked for 9 s."""
 
     async def scenario(bench) -> None:
         assert bench.tell() == ("", "")

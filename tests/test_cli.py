@@ -155,7 +155,7 @@ def bad_inputs(folder):
         ([*simulate, "auto", "--probe", folder / "probe.json"], "width_mm is -4"),
         (
             [*simulate, "auto", "--probe", "neonatel"],
-            f"which is no file, expected a JSON file or one of {', '.join(PROBES)}",
+            f"which does not exist, expected a JSON file or one of {', '.join(PROBES)}",
         ),
         ([*simulate, "auto", "--device", "abacus"], "no OpenCL device fits 'abacus'"),
         ([*simulate, "auto", "--seed", -1], "seed is -1"),
@@ -200,8 +200,8 @@ def test_no_command_replaces_a_file_that_it_reads(command, labels, tmp_path):
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="pipes have no names here")
-def test_pipes_and_devices_are_no_outputs_and_endless_inputs_are_refused(labels, tmp_path):
-    """Both waited for ever, or filled the memory."""
+def test_pipes_and_devices_are_not_outputs_and_endless_inputs_are_refused(labels, tmp_path):
+    """Both waited forever, or filled the memory."""
     for name in ("o.png", "o.nii.gz", "o.mha"):
         os.mkfifo(tmp_path / name)
         result = ussim("simulate", labels, "--pose", "auto", "-o", tmp_path / name)
@@ -210,7 +210,7 @@ def test_pipes_and_devices_are_no_outputs_and_endless_inputs_are_refused(labels,
     assert result.exit_code == 2 and "/dev/zero: has more than" in result.stderr
 
 
-def test_values_that_are_no_text_and_sweeps_without_end_are_refused(labels, tmp_path):
+def test_values_that_are_not_text_and_sweeps_without_end_are_refused(labels, tmp_path):
     out = tmp_path / "o.nrrd"
     result = ussim("simulate", labels, "--pose", "auto", "-o", out, "--set", "probe.depth_mm=\udced\udca0")
     assert result.exit_code == 2 and "expected NAME=VALUE as text" in result.stderr

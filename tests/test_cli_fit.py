@@ -82,7 +82,7 @@ def test_optimize_writes_result_report_and_preset(folder):
         assert words in report
 
 
-def test_a_probe_off_the_patient_is_said(folder, tmp_path, monkeypatch):
+def test_a_probe_off_the_patient_is_reported(folder, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     write_json(tmp_path / "off.json", rigid_from([300.0, 0.0, 0.0, 0.0, 0.0, 0.0]).tolist())
     done = ussim(
@@ -109,7 +109,7 @@ def test_a_sweep_simulates_poses_of_slicer_without_images(folder, tmp_path):
 
 
 @pytest.mark.parametrize("name", ["o.igs.mha", pytest.param("o.nrrd", marks=pytest.mark.slow)])
-def test_a_sweep_is_never_taken_for_a_recording(name, folder, tmp_path):
+def test_a_sweep_is_never_mistaken_for_a_recording(name, folder, tmp_path):
     sweep = ("sweep", folder / "labels.nii.gz", "--sequence", folder / "tracked.igs.mha", "-o", tmp_path / name)
     for more in ((), ("--overwrite",)):
         result = ussim(*sweep, "--frames", "0:2", *more)

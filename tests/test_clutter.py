@@ -90,7 +90,7 @@ def test_an_image_along_the_axes_of_the_patient_ignores_rounding():
     assert np.linalg.norm(here - beside) < 1e-3 * np.linalg.norm(here)
 
 
-def test_lobes_leave_the_speckle_of_bright_tissue_as_it_is():
+def test_lobes_leave_the_speckle_of_bright_tissue_unchanged():
     """At the focus 0.3 % of the power is in them."""
     solid = block(lambda x, y, z: np.ones_like(x), half_mm=(24, 30, 12))
     both = [depth_window(frame(solid, LINEAR, 0, side_lobes=on), DEPTH_MM, 6.0) for on in (True, False)]

@@ -140,7 +140,7 @@ def test_a_straight_map_is_log_compression(solid):
     np.testing.assert_allclose(grey_table(even_display()), np.linspace(0, 255, TABLE_SIZE), atol=1e-3)
     probe, pose = LinearProbe(30, 40, scan_lines=91), rigid(np.eye(3), [0, -30, 0])
     plain = solid.simulate(probe, pose, even_display()).image.astype(int)
-    # By way of the table: a map that is straight but for what is beyond any float
+    # By way of the table: a map that is straight except beyond any float
     nearly = solid.simulate(probe, pose, even_display(map_white=1.0 + 1e-6)).image
     assert np.abs(plain - nearly).max() <= 1
 
@@ -189,7 +189,7 @@ def test_the_grey_maps_of_two_scanners_are_those_found_by_trial():
     found = np.array([phantom.at(grey) for grey in greys])
     np.testing.assert_allclose(found, (0.18, 0.36, 0.55, 0.71, 0.91, 0.95, 0.98, 0.87), atol=0.19)
     if not (SHARED / "brain_sweep").is_dir():
-        pytest.skip("the real sweep is not there")
+        pytest.skip("the real sweep is missing")
     from SlicerUSSim.Logic.base.files import read_json
 
     probe = probe_from_dict(read_json(SHARED / "brain_sweep" / "probe.json"), "probe")

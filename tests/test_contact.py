@@ -76,7 +76,7 @@ def test_a_curved_face_touches_a_plane_as_far_as_the_gel_reaches():
     assert np.rad2deg(-touching.min()) == pytest.approx(np.rad2deg(touching.max()), abs=0.6)
 
 
-def test_a_face_off_the_patient_is_said_with_the_share_that_touches():
+def test_a_face_off_the_patient_is_reported_with_the_share_that_touches():
     """The image was black, without a word."""
     deep = slab(from_mm=-17.0)  # 3 mm below the face
     (line,) = about_contact(deep, LINEAR, [AT_TOP], 2.0)
@@ -91,7 +91,7 @@ def test_a_face_off_the_patient_is_said_with_the_share_that_touches():
     assert about_contact(corner, PHASED, [AT_TOP], 2.0) == ()
 
 
-def test_a_face_far_from_a_patient_in_the_coupling_medium_is_said():
+def test_a_face_far_from_a_patient_in_the_coupling_medium_is_reported():
     """A probe 45 mm off an opened head gave the image of a water bath, without a word."""
     near, far = slab(from_mm=5.0), slab(from_mm=15.0)  # 25 and 35 mm below the face
     assert about_contact(near, LINEAR, [AT_TOP], None) == ()

@@ -73,7 +73,7 @@ def write_markup(path, *, count: int = 1, **change) -> str:
     return str(path)
 
 
-def test_a_polygon_of_slicer_opens_what_lies_under_it(head, tmp_path, caplog):
+def test_a_polygon_of_slicer_opens_the_tissue_under_it(head, tmp_path, caplog):
     direct, _ = opened(head, NAMES, polygon_opening(head, NAMES, SQUARE))
     gone = places(head, direct.array != head.array)
     assert np.abs(gone[:, 0]).max() == pytest.approx(19.5, abs=1.5) and np.abs(gone[:, 1]).max() <= 10.0
@@ -200,7 +200,7 @@ def refused_craniotomy(path, *arguments) -> str:
     return done.stderr
 
 
-def test_a_file_with_two_segments_is_no_opening_and_both_are_named(head, tmp_path):
+def test_a_file_with_two_segments_is_not_an_opening_and_both_are_listed(head, tmp_path):
     """It was "has 3 different values"."""
     sides = (head.array == 3) * np.where(np.arange(head.array.shape[2]) < 42, 1, 2)
     stored = head.with_array(sides.astype(np.uint8)).to_sitk()

@@ -72,7 +72,7 @@ def expected(labels: Volume, pose: np.ndarray, diameter_mm: float) -> float:
     return opened(labels, NAMES, disc_opening(labels, NAMES, pose, diameter_mm))[1]
 
 
-def test_a_disc_is_opened_in_labels_of_its_own_and_closed_again(head):  # noqa: F811
+def test_a_disc_is_opened_in_separate_labels_and_closed_again(head):  # noqa: F811
     bench = Bench(head)
     before = bench.tissues(bench.whole)
     assert bench.presenter.placing.canOpenCraniotomy()[0] and not bench.presenter.placing.canCloseCraniotomy()[0]
@@ -148,7 +148,7 @@ def test_what_cannot_be_opened_changes_nothing(head):  # noqa: F811
     with pytest.raises(SimulationError, match="was not made by this module, or edited since, and is not replaced"):
         bench.logic.openCraniotomy(bench.whole, mine, probe_transform_node=bench.probe)
     bench.presenter.placing.closeCraniotomy()
-    assert "has no opening, or the labels before it are gone" in bench.view.errors[-1]
+    assert "has no opening, or the previous labels were removed" in bench.view.errors[-1]
 
 
 @pytest.mark.slow
@@ -174,7 +174,7 @@ def test_place_follows_the_labels_and_takes_the_largest_piece(head):  # noqa: F8
     assert model.GetParentTransformNode() is moved
 
 
-def test_the_labels_are_no_opening_and_edits_are_not_lost_unsaid(head):  # noqa: F811
+def test_the_labels_are_not_an_opening_and_edits_are_not_lost_silently(head):  # noqa: F811
     bench = Bench(head)
     bench.logic.parameters.opening = bench.whole
     bench.presenter.placing.openCraniotomy()
@@ -282,7 +282,7 @@ def test_the_notes_follow_the_probe_over_bone_and_openings(head):  # noqa: F811
 
 
 @pytest.mark.slow
-def test_a_view_is_placed_in_an_opening_or_said_to_be_elsewhere(head):  # noqa: F811
+def test_a_view_is_placed_in_an_opening_or_reported_elsewhere(head):  # noqa: F811
     bench = Bench(head)
 
     def radius() -> float:
@@ -298,12 +298,12 @@ def test_a_view_is_placed_in_an_opening_or_said_to_be_elsewhere(head):  # noqa: 
     bench.presenter.values.setValue("scene.view", "temporal")
     bench.presenter.placing.placeAtView()
     assert radius() == pytest.approx(78.0, abs=2.0) and bench.presenter.notes.aboutProbe().count("view: ") == 1
-    assert "the opening is not where the view temporal is seen from: the probe stands on the skin" in (
+    assert "the view temporal does not pass through the opening: the probe stands on the skin" in (
         bench.presenter.notes.aboutProbe()
     )
 
 
-def test_hidden_segments_of_an_opening_stay_closed_and_are_said_to(head):  # noqa: F811
+def test_hidden_segments_of_an_opening_stay_closed_and_are_reported(head):  # noqa: F811
     bench = Bench(head)
     z, _, x = np.indices(head.array.shape)
     above = (head.array > 2) & (z > 75)

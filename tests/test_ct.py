@@ -27,7 +27,7 @@ from validation.ct_phantoms import BY_NUMBER, NAMES, CtPhantom, lower_chest, lum
 
 @cache
 def coarse() -> CtPhantom:
-    """The spine in voxels of 3 mm, where the place of tissues is not what is asked; nobody changes it."""
+    """The spine in voxels of 3 mm, where the place of tissues is not tested; no test changes it."""
     return lumbar_spine((3.0, 3.0, 3.0))
 
 
@@ -141,7 +141,7 @@ def test_an_offset_is_removed_and_reported():
         (lambda a: np.where(np.indices(a.shape).sum(axis=0) % 40 < 2, a, -1000.0 - a % 7), "in the CT has 0 ml"),
     ],
 )  # fmt: skip
-def test_what_is_no_ct_is_refused_with_what_it_is(change, message):
+def test_what_is_not_a_ct_is_refused_with_what_it_is(change, message):
     ct = coarse().ct
     with pytest.raises(SimulationError, match=message):
         segment_ct(ct.with_array(change(ct.array.astype(np.float32))))
@@ -157,7 +157,7 @@ def test_what_may_be_hounsfield_units_is_used_with_a_warning():
 
 
 @pytest.mark.slow
-def test_padding_around_a_round_field_of_view_is_no_unit():
+def test_padding_around_a_round_field_of_view_is_not_an_unit():
     ct, without = chest()[0].ct, chest()[1]
     height, width = ct.array.shape[1:]
     j, i = np.indices((height, width))

@@ -94,7 +94,7 @@ def test_a_name_that_is_not_utf8_is_refused(tmp_path):
     [
         ("0.1 0.2", "inf 0.2", "Parameters of Euler3DTransform has 'inf', expected numbers"),  # ended the process
         ("0.1 0.2", "\u0663 0.2", "Parameters of Euler3DTransform has '\u0663', expected numbers"),  # ITK saw five
-        ("0.1 0.2 ", "", "Euler3DTransform has 4 parameters, expected 6"),  # was made of what lies behind in memory
+        ("0.1 0.2 ", "", "Euler3DTransform has 4 parameters, expected 6"),  # was made of the next bytes in memory
         ("Parameters: 0.1", "P: 0.1", "expected Transform, Parameters and FixedParameters"),  # was the identity
         ("\nFixedParameters: 0 0 0 0", "", "expected Transform, Parameters and FixedParameters"),  # was the identity
         ("Euler3DTransform_double_3_3", "BSplineTransform_double_3_3", "expected a linear one"),

@@ -279,7 +279,7 @@ def test_a_bad_preset_is_one_line_that_names_file_and_place(tmp_path, content, m
     assert "\n" not in str(caught.value) and len(str(caught.value)) < len(str(path)) + 500
 
 
-def test_a_file_that_is_no_text_is_refused(tmp_path):
+def test_a_file_that_is_not_text_is_refused(tmp_path):
     path = tmp_path / "bad.json"
     for content in (b"\xff\xfe{}", b"\x00", b"\xef\xbb\xbf"):
         path.write_bytes(content)

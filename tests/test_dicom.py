@@ -116,7 +116,7 @@ CLASSIC = {
 
 
 @pytest.mark.parametrize("case", list(CLASSIC))
-def test_images_that_are_no_volume_together_are_refused(case, tmp_path):
+def test_images_that_are_not_a_volume_together_are_refused(case, tmp_path):
     change, words = CLASSIC[case]
     save(tmp_path, images(change=change))
     with pytest.raises(SimulationError, match=words) as error:
@@ -126,7 +126,7 @@ def test_images_that_are_no_volume_together_are_refused(case, tmp_path):
 
 @pytest.mark.parametrize("is_enhanced", [False, True])
 @pytest.mark.parametrize("case", ["gap", "echoes", "tilt", "steps"])
-def test_stacks_that_are_no_volume_are_refused(case, is_enhanced, tmp_path):
+def test_stacks_that_are_not_a_volume_are_refused(case, is_enhanced, tmp_path):
     """ITK read all of them without a word, with many frames."""
     series = images(change=tilted if case == "tilt" else None)
     words = "tilted by 9.5 degrees"
@@ -188,7 +188,7 @@ def test_frames_of_two_stacks_are_refused(tmp_path):
 
 
 def test_what_is_in_a_folder_beside_a_series_does_not_change_it(tmp_path, caplog):
-    """Reports, a directory of the disk, and what cannot be read, which may be an image and is told."""
+    """Reports, a directory of the disk, and what cannot be read, which may be an image and triggers a warning."""
     save(tmp_path, images())
     state = images()[0]
     del state.Rows, state.PixelData

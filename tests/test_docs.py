@@ -25,7 +25,7 @@ SOURCES = {
     for path in sorted((ROOT / folder).rglob(suffix))
 }
 EACH_PAGE = pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
-#: Options in the text that are none of `ussim`.
+#: Options in the text of other programs than `ussim`.
 NOT_OURS = {"--no-deps", "--sheet"}
 #: Files in the text that are written, not kept.
 WRITTEN = {"report.html", "build/docs/README.html"}

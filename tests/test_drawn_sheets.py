@@ -103,7 +103,7 @@ def test_dura_has_a_coherent_echo_that_is_seen_square_only():
     assert square == pytest.approx(border, abs=1.5)
 
 
-def test_dura_is_a_tissue_of_its_own_whose_level_a_fit_can_change():
+def test_dura_is_a_separate_tissue_whose_level_a_fit_can_change():
     phantom, tissues = grey()
     surfels = Surfels.joined([plane(kind, phantom.probe_to_ras, at) for kind, at in (("falx", 15.0), ("sulcus", 8.0))])
     simulator = UltrasoundSimulator(phantom.labels, tissues, sulci._SETTINGS, sheets=surfels)
@@ -197,7 +197,7 @@ def test_a_narrow_gap_is_closed_and_a_wide_one_stays():
 
 
 def test_a_falx_does_not_hang_in_the_saline_of_an_opening():
-    """It goes on above the hull of the brain, into the sinus, which is not there without the head."""
+    """It continues above the hull of the brain into the sinus, which is absent without the head."""
     labels = block(lambda x, y, z: (y > 0.0) & (np.abs(x) > 0.6), half_mm=(20, 20, 20))  # a fissure below coupling
     y, z = (grid.ravel() for grid in np.meshgrid(np.arange(-12.0, 12.0, 0.8), np.arange(-12.0, 12.0, 0.8)))
     place = np.stack([np.zeros_like(y), y, z], axis=1)

@@ -63,7 +63,7 @@ def test_the_falx_is_the_deepest_straight_sulcus_down_to_its_free_edge():
     assert found.kinds() == ("falx",)
 
 
-def test_sulci_of_one_hemisphere_are_no_falx():
+def test_sulci_of_one_hemisphere_are_not_a_falx():
     assert len(falx_in(*slab(has_fissure=False))) == 0
     empty = Volume(np.full((20, 20, 20), WHITE, np.float32), np.eye(4))
     assert len(falx_in(empty, np.ones((20, 20, 20), bool))) == 0
@@ -74,7 +74,7 @@ def test_sulci_of_one_hemisphere_are_no_falx():
     [("y", 10.0, True), ("z", 90.0, False), ("y", 40.0, False), ("y", 180.0, False)],
     ids=["rolled", "across front and back", "as steep as the tentorium", "from below, as cisterns"],
 )
-def test_a_plane_that_does_not_divide_left_from_right_is_no_falx(axis, degrees, is_falx):
+def test_a_plane_that_does_not_divide_left_from_right_is_not_a_falx(axis, degrees, is_falx):
     image, brain = slab()
     turn = np.eye(4)
     turn[:3, :3] = Rotation.from_euler(axis, degrees, degrees=True).as_matrix()

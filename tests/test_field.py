@@ -264,7 +264,7 @@ def test_darkness_is_not_a_cut():
     np.testing.assert_array_equal(found.field.mask, whole)
 
 
-def test_text_and_boxes_in_the_field_are_left_out_and_said(caplog):
+def test_text_and_boxes_in_the_field_are_left_out_and_reported(caplog):
     """Letters have smooth edges."""
     sequence = recording(CONVEX)
     part = letters(sequence.images.shape[1:], 60, sequence.images.shape[2] // 2 - 80, 20)
@@ -297,17 +297,17 @@ def letters(shape: tuple[int, int], row: int, column: int, height: int) -> np.nd
     return np.asarray(drawing, float).reshape(shape[0], fine, shape[1], fine).mean(axis=(1, 3)) / 255
 
 
-def test_images_that_cannot_tell_what_is_drawn_are_said(caplog):
+def test_images_that_cannot_tell_what_is_drawn_are_reported(caplog):
     few = recording(CONVEX, 3)
     TrackedImages.of(few, probe=CONVEX)
-    assert "marks in the images could not be looked for: 3 different images, expected at least 4" in caplog.text
+    assert "marks in the images could not be detected: 3 different images, expected at least 4" in caplog.text
     caplog.clear()
     still = few.images[[0] * 6] + np.arange(6, dtype=np.uint8)[:, None, None] * (few.images[0] > 0)
     TrackedImages.of(few.with_images([0] * 6, still.astype(np.uint8)), probe=CONVEX)
     assert "changes by at most 5 grey levels, expected 20 or more" in caplog.text
     caplog.clear()
     TrackedImages.of(replace(few, fields={"SlicerUSSimSimulated": "twin 1"}), probe=CONVEX)
-    assert "could not be looked for" not in caplog.text
+    assert "could not be detected" not in caplog.text
 
 
 def test_pixels_of_another_size_are_named():
@@ -349,7 +349,7 @@ def in_colours(path, sequence: TrackedSequence, colours: np.ndarray) -> TrackedS
     [np.outer(np.arange(256), [1, 0.85, 0.6]), np.clip(np.arange(256)[:, None] * 3 - np.array([0, 255, 510]), 0, 255)],
     ids=["sepia", "hot iron"],
 )
-def test_tinted_images_are_grey_levels_and_that_is_said(tint, tmp_path, caplog):
+def test_tinted_images_are_grey_levels_with_a_warning(tint, tmp_path, caplog):
     """Sepia was Doppler's: what was left of the field was black, and fitted."""
     sequence = recording(CONVEX)
     read = in_colours(tmp_path / "tinted.mha", sequence, tint.astype(np.uint8)[sequence.images])
@@ -361,7 +361,7 @@ def test_tinted_images_are_grey_levels_and_that_is_said(tint, tmp_path, caplog):
     assert found.field.mask.sum() == ImagedField.of(CONVEX, found.field.image_to_probe, levels.shape[1:]).mask.sum()
 
 
-def test_colours_are_left_out_and_said(tmp_path, caplog):
+def test_colours_are_left_out_and_reported(tmp_path, caplog):
     sequence = recording(CONVEX, 2)
     array = np.repeat(sequence.images[..., None], 3, axis=-1)
     middle = np.array(array.shape[1:3]) // 2
@@ -370,13 +370,13 @@ def test_colours_are_left_out_and_said(tmp_path, caplog):
     read = in_colours(tmp_path / "colour.mha", sequence, array)
     assert read.coloured is not None and read.coloured.sum() == 600
     found = TrackedImages.of(read, probe=CONVEX)
-    assert "have colours, as of Doppler or markers: left out" in caplog.text
+    assert "have colours, such as Doppler or markers: left out" in caplog.text
     assert not found.field.mask[flow].any()
     sequence.write(tmp_path / "grey.mha")
     assert TrackedSequence.read(tmp_path / "grey.mha").coloured is None
 
 
-def test_a_mirroring_calibration_is_said(caplog):
+def test_a_mirroring_calibration_is_reported(caplog):
     sequence = recording(CONVEX, 2)
     mirror = np.diag([-1.0, 1.0, 1.0, 1.0])
     transforms = tuple({**entry, "ProbeToReference": mirror} for entry in sequence.transforms)
@@ -385,7 +385,7 @@ def test_a_mirroring_calibration_is_said(caplog):
 
 
 def test_an_image_of_one_grey_level_is_refused_with_its_number():
-    """White images were fitted, with costs and textures that were no numbers."""
+    """White images were fitted, with costs and textures that were NaN."""
     sequence = recording(CONVEX, 2)
     images = sequence.images.copy()
     images[1] = 255

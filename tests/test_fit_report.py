@@ -90,7 +90,7 @@ def test_the_report_says_what_the_fit_of_the_speckle_found(folder):
     assert "x " in said["texture of the tissues"]
 
 
-def test_what_the_fit_of_the_speckle_found_is_said():
+def test_what_the_fit_of_the_speckle_found_is_reported():
     shown = replace(SHOWN, smoothing_axial_mm=0.044, smoothing_lateral_deg=0.31, map_black=0.5)
     found = SpeckleFit(shown, TISSUES, 1.4, TextureMisfit(0.2, 0.4), TextureMisfit(0.12, 0.5), True)
     rows = dict(found.rows())

@@ -53,7 +53,7 @@ def test_one_seed_grows_the_lesion_and_a_larger_version(kind, aside_mm):
     assert np.linalg.norm(lesion.centre_ras_mm - CENTRE) < 4.0
     assert (segmentation.labels.array == before).all()
     assert lesion.tissues == (("tumour", "necrosis") if kind == "ring" else ("tumour",))
-    assert any("say what it is" in line for line in lesion.warnings) == (kind == "low")
+    assert any("state which" in line for line in lesion.warnings) == (kind == "low")
 
 
 @pytest.mark.long
@@ -72,7 +72,7 @@ def test_a_tumour_in_thick_slices_grows_from_its_ends_too():
 @pytest.mark.parametrize(
     ("seed", "words"),
     [
-        ((28.0, -22.0, 28.0), "in what looks as its surroundings, .* expected a point in a lesion that stands out"),
+        ((28.0, -22.0, 28.0), "looks like its surroundings, .* expected a point in a lesion that stands out"),
         ((0.0, 0.0, -70.0), "mm outside the brain"),
         ((float("nan"), 0.0, 0.0), "three finite numbers"),
     ],
@@ -128,8 +128,8 @@ def test_a_refused_seed_costs_neither_the_labels_nor_the_other_seeds(tmp_path):
 
     smaller, larger = (tmp_path / f"labels_grown_tumour{version}.nii.gz" for version in ("", "_larger"))
     result = segment("--seed", "-28,-22,28", "--seed", "28,-22,28")
-    assert result.exit_code == 2 and "looks as its surroundings" in result.stderr, result.output
-    assert result.stderr.splitlines()[-1].endswith(f"{labels} is written, with all that was not refused")
+    assert result.exit_code == 2 and "looks like its surroundings" in result.stderr, result.output
+    assert result.stderr.splitlines()[-1].endswith(f"{labels} is written, with all lesions that were not refused")
     assert f"--add tumour={smaller}; larger: {larger}" in result.stderr
     assert labels.exists() and 0 < Volume.read(smaller).array.sum() < Volume.read(larger).array.sum()
     labels.unlink()
@@ -141,7 +141,7 @@ def test_a_refused_seed_costs_neither_the_labels_nor_the_other_seeds(tmp_path):
 
 
 @pytest.mark.parametrize("text", ["1,2", "1,2,x", "1,2,3="])
-def test_a_seed_that_is_no_point_is_refused_with_an_example(text):
+def test_a_seed_that_is_not_a_point_is_refused_with_an_example(text):
     with pytest.raises(SimulationError, match=r"--seed is .*expected R,A,S in mm"):
         split_seeds([text])
     assert split_seeds(["1,-2.5,3=Edema"]) == [((1.0, -2.5, 3.0), "oedema")]

@@ -45,7 +45,7 @@ def test_draws_have_the_variance_of_the_best_and_otherwise_differ(seed):
     assert [variance_db(tissue) for tissue in tissues] == pytest.approx([variance_db(best)] * 12, abs=0.06)
     assert np.std([tissue.mu1 for tissue in tissues]) > 0.2
     assert np.std([tissue.mu0 / tissue.sigma0 for tissue in tissues]) > 0.2
-    # What does not scatter stays as it was.
+    # What does not scatter does not change.
     for name in ("gain_db", "white matter.attenuation_db_cm_mhz"):
         place = parameters.names.index(name)
         assert len({units[place] for units in draws}) == 1
@@ -183,7 +183,7 @@ def test_combinations_are_of_what_scatters_and_is_free():
     assert [name for name in with_tgc if "net attenuation" in name] == ["net attenuation in white matter"]
 
 
-def test_what_was_not_free_of_a_tissue_is_not_said_to_be_determined():
+def test_what_was_not_free_of_a_tissue_is_not_called_determined():
     """Net attenuation changes with TGC alone where the tissue's attenuation is as given."""
     for free, is_fitted in (("white matter.mu0", False), ("white matter.attenuation_db_cm_mhz", True)):
         found, _ = spreads_of([], [{}], free=(free, "tgc_db_cm_mhz"))

@@ -43,7 +43,7 @@ def test_an_interface_echo_does_not_depend_on_line_density():
 
 @pytest.mark.parametrize(("radius_mm", "is_ball", "least_db"), [(8.0, False, -1.5), (15.0, True, -2.5)])
 def test_bent_walls_in_coarse_voxels_are_as_bright_as_theory_says(radius_mm, is_ball, least_db):
-    """A rod of 8 voxels and a ball of 15 in oblique grids, re a plane; expected are -0.2 to -0.4 dB."""
+    """A rod of 8 voxels and a ball of 15 in oblique grids, relative to a plane; expected are -0.2 to -0.4 dB."""
     focus = LinearProbe(
         20.0, 40.0, scan_lines=161, focus_mm=25.0, aperture_mm=12.5, receive_f_number=2.0, elevation_focus_mm=25.0
     )
@@ -124,7 +124,7 @@ def test_a_steep_wall_returns_nothing():
     ids=["matrix", "linear_15"],
 )
 def test_a_steep_wall_does_not_depend_on_the_lines_of_shipped_probes(probe, depth_mm, angle_deg, turn_deg):
-    """Levels re a square wall on the middle line, those below -28 dB as equal; in a grid oblique to the probe."""
+    """Levels relative to a square wall on the centre line, equal below -28 dB; in a grid oblique to the probe."""
     grid = Rotation.from_euler("xyz", [25.0, -35.0, 15.0], degrees=True)
     normal = grid.apply([0.0, 1.0, 0.0])
     wall = block(
@@ -204,7 +204,7 @@ def test_a_plane_nearly_across_a_diagonal_of_the_voxels_keeps_its_level():
 
 @pytest.mark.parametrize(("rays", "angle_deg"), [(1, 4.0), (2, 9.0), (3, 20.0), (32, 9.0)])
 def test_few_elevational_rays_see_a_plane_as_many_do(rays, angle_deg):
-    """A plane oblique out of the image. With one or two rays it was too bright, or its lines were no numbers."""
+    """A plane oblique out of the image. With one or two rays it was too bright, or its lines were NaN."""
     slope = np.tan(np.radians(angle_deg))
     wall = block(lambda x, y, z: y > slope * z, half_mm=(16, 12, 16), spacing_mm=0.5)
     probe, hard = replace(PROBE, width_mm=16.0, depth_mm=35.0, scan_lines=65), Tissue("wall", 1540.0, 1.8, 0.0)

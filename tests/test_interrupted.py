@@ -59,7 +59,7 @@ from SlicerUSSim.Command import cli
 
 @cli.main.command()
 def compute():
-    print("begun", flush=True)  # then a library, which knows no signals, computes for ever, as a kernel may
+    print("begun", flush=True)  # then a library, which ignores signals, computes forever, as a kernel may
     sqlite3.connect(":memory:").execute(
         "WITH RECURSIVE c(x) AS (SELECT 1 UNION ALL SELECT x + 1 FROM c) SELECT count(*) FROM c"
     ).fetchall()

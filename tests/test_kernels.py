@@ -58,7 +58,7 @@ def scene(spacing_mm=1.0):
 
 
 def off(found: np.ndarray, expected: np.ndarray) -> float:
-    """The mean over depths, in steps of 64 samples, of the difference re what is expected there (60 dB at most)."""
+    """The mean over depths, in steps of 64 samples, of the difference relative to the expected (60 dB at most)."""
     error, power = ((np.abs(x) ** 2).reshape(len(x), -1, 64).sum(axis=(0, 2)) for x in (found - expected, expected))
     return float(np.sqrt(error / np.maximum(power, 1e-6 * power.max())).mean())
 
@@ -150,7 +150,7 @@ def test_the_record_of_a_frame_follows_from_the_equations():
 
 @pytest.mark.parametrize("has_shares", [False, True])
 def test_the_medium_has_groups_smoothed_shares_and_the_fluid_distance(has_shares):
-    """In voxels that are no cubes, where no border of fluid is flattened."""
+    """In voxels that are not cubes, where no border of fluid is flattened."""
     labels, tissues = scene()
     labels = Volume(labels.array, labels.ijk_to_ras @ np.diag([1.0, 1.0, 1.3, 1.0]))
     tissues = TissueTable(tissues, membrane=Membrane(BRAIN, 0.8, ("fluid",)))

@@ -54,7 +54,7 @@ def test_labels_of_one_tissue_or_none_tell_nothing(brain, labels):
 
 @pytest.mark.parametrize("shell_mm", [20.0, 60.0])
 def test_an_mri_follows_labels_that_are_the_same_beside_themselves(shell_mm):
-    """That of a symmetric phantom was taken for another patient's: labels of a cylinder are the same along its axis."""
+    """A symmetric phantom was mistaken for another patient: labels of a cylinder are the same along its axis."""
     k, j, i = np.ogrid[:40, :80, :80]
     radius = 2.5 * np.hypot(j - 40, i - 40) + 0.0 * k
     labels = np.where(radius < 95.0, 1 + radius // shell_mm, 0).astype(np.uint8)

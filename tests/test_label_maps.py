@@ -152,7 +152,7 @@ def test_freesurfers_numbers_are_recognised_in_every_file(labels, title, tissues
 
 
 @pytest.mark.parametrize("key", ["totalsegmentator", "totalsegmentator-v1", "totalsegmentator-mr"])
-def test_totalsegmentators_whole_bodies_are_recognised_and_said(key):
+def test_totalsegmentators_whole_bodies_are_recognised_and_reported(key):
     names = schemes()[key].names
     found = read_label_map(made(names))
     assert found.message.startswith(f"{schemes()[key].title}: {len(names)} labels to ")
@@ -179,7 +179,7 @@ def test_totalsegmentators_whole_bodies_are_recognised_and_said(key):
 def test_numbers_of_several_programs_are_refused_with_choices_that_work(labels, choices):
     volume = made(dict.fromkeys(labels, ""))
     message = str(refusal_of(volume))
-    assert "have no names; say whose numbers they are: --map" in message and f"--map {labels[0]}=TISSUE" in message
+    assert "have no names; state their program: --map" in message and f"--map {labels[0]}=TISSUE" in message
     offered = [part.split()[0] for part in message.split("--map ")[1:-1]]
     assert set(offered) == set(choices), message
     for key in choices:
@@ -236,7 +236,7 @@ def tumour(labels: tuple[int, int, int]) -> Volume:
 
 
 @pytest.mark.parametrize("stored", [np.uint8, np.float32])
-def test_a_tumour_of_brats_is_no_patient(stored, tmp_path):
+def test_a_tumour_of_brats_is_not_a_patient(stored, tmp_path):
     path = tmp_path / "BraTS-GLI-00001-000-seg.nii.gz"
     found = tumour((1, 2, 4))
     found.with_array(found.array.astype(stored)).write(path)
@@ -248,7 +248,7 @@ def test_a_tumour_of_brats_is_no_patient(stored, tmp_path):
     assert "--map brats (BraTS since 2023: 1 necrotic core, 2 oedema, 3 enhancing tumour)" in message
 
 
-def test_a_binary_mask_is_no_patient_unless_the_user_says_what_it_is(tmp_path):
+def test_a_binary_mask_is_not_a_patient_unless_the_user_says_what_it_is(tmp_path):
     path = tmp_path / "glioma.nii.gz"
     mask = tumour((255, 255, 255))
     mask.write(path)
@@ -279,7 +279,7 @@ def test_a_command_for_an_mri_says_what_a_label_map_is_for(tmp_path, monkeypatch
             "add it to a segmentation with --add tumour=glioma.nii.gz, or simulate it alone with --map 255=tumour",
         ),
         ("brats", "--add brats=brats.nii.gz, or simulate it alone"),
-        ("unknown", "unknown.nii.gz: is a label map (8 labels), expected an MRI; use it as it is (ussim simulate unkn"),
+        ("unknown", "unknown.nii.gz: is a label map (8 labels), expected an MRI; use it directly (ussim simulate unkn"),
     ):
         assert message in refused("segment", "-o", "out.nii.gz", f"{name}.nii.gz")
     assert not Path("out.nii.gz").exists()
@@ -323,9 +323,9 @@ def test_few_unknown_labels_are_taken_as_what_is_around_them():
         assert "label 9999 (0.73 ml) is unknown and taken as white matter, which is around" in found.warnings[0]
 
 
-def test_a_numbering_that_is_said_has_to_have_most_labels():
+def test_a_numbering_that_is_given_has_to_have_most_labels():
     message = str(refusal_of(numbered(ASEG), mapping=LabelMapping.of("brats")))
-    assert message.endswith("are not of --map brats; expected --map freesurfer")
+    assert message.endswith("do not belong to --map brats; expected --map freesurfer")
     found = read_label_map(tumour((1, 2, 3)), mapping=LabelMapping.of("brats"))
     assert found.names == ("necrosis", "oedema", "enhancing") and "has a tumour alone" in found.warnings[0]
     found = read_label_map(tumour((1, 2, 4)), mapping=LabelMapping.of("brats"))
@@ -378,7 +378,7 @@ def test_a_bad_mapping_is_one_line(text, message, tmp_path, monkeypatch):
     assert message in str(caught.value) and "\n" not in str(caught.value)
 
 
-def test_labels_are_no_mri_also_with_fractions_and_noise():
+def test_labels_are_not_an_mri_also_with_fractions_and_noise():
     labels = numbered(ASEG).array.astype(np.float32)
     noise = np.random.default_rng(0).normal(0, 1e-3, labels.shape)
     for array, message in (
@@ -504,7 +504,7 @@ def test_totalsegmentators_header_names_the_labels(tmp_path):
 
 
 def layered(path, values: tuple[int, ...]) -> Volume:
-    """Segments of 3D Slicer of which the last, a tumour in a layer of its own, overlaps the others."""
+    """Segments of 3D Slicer of which the last, a tumour in a separate layer, overlaps the others."""
     import SimpleITK as sitk
 
     base = brain({"csf": values[0], "grey matter": values[1], "white matter": values[2]})
@@ -529,7 +529,7 @@ def test_overlapping_segments_of_slicer_are_read_with_the_last_on_top(values, tm
     assert np.array_equal(tumour, truth.array == 4) and np.array_equal(found.labels.array > 0, truth.array > 0)
     result = ussim("simulate", path, "--pose", "auto", "-o", tmp_path / "o.png")
     covered = np.count_nonzero(truth.array == 4) * truth.voxel_ml
-    assert f"segments overlap, the last is taken: 'Tumor' covers {covered:.3g} ml of those before it" in result.stderr
+    assert f"segments overlap, the last is taken: 'Tumor' covers {covered:.3g} ml of earlier ones" in result.stderr
     assert result.exit_code == 0 and "labels with names: 4 labels to 4 tissues, named in its header" in result.stderr
 
 
@@ -564,7 +564,7 @@ NAMES = {"SPM": ("c3T1.nii", "c1T1.nii", "c2T1.nii"), "CAT12": ("p3T1.nii", "p1T
 
 
 @pytest.mark.parametrize("program", list(NAMES))
-def test_tissue_probability_maps_are_combined_and_said(program, tmp_path):
+def test_tissue_probability_maps_are_combined_and_reported(program, tmp_path):
     labels, names = brain({"csf": 1, "grey matter": 2, "white matter": 3}), NAMES[program]
     for number, name in enumerate(names, 1):
         smooth = ndimage.gaussian_filter((labels.array == number).astype(np.float32), 0.7)
@@ -575,7 +575,7 @@ def test_tissue_probability_maps_are_combined_and_said(program, tmp_path):
         found = read_label_file(path, Volume.read(path))
         assert f"tissue probability maps: {names[0]} csf, {names[1]} grey matter" in found.message
         assert found.names == ("csf", "grey matter", "white matter")
-        assert np.mean(found.labels.array == labels.array) > 0.97  # but for voxels at the borders
+        assert np.mean(found.labels.array == labels.array) > 0.97  # except at the borders
     swapped = LabelMapping.of(["1=white", "3=csf"])  # as FAST counts in a T2
     assert read_label_file(path, Volume.read(path), swapped).names == ("white matter", "grey matter", "csf")
     Volume.read(path).write(tmp_path / names[0].replace("_0", "_3"))
@@ -632,7 +632,7 @@ def test_an_mri_in_any_numbers_is_an_mri(mni, parcels):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("mm", [3, 8])
-def test_a_parcellation_is_no_mri_in_coarse_voxels(mm, mni):
+def test_a_parcellation_is_not_an_mri_in_coarse_voxels(mm, mni):
     """Cortex and white matter in random parcels, with wmparc's numbers; at 8 mm less than half of neighbours agree."""
     coarse = (slice(mm // 2, None, mm),) * 3
     assert Volume(parcellation(mni)[coarse], np.eye(4)).looks_like_labels()
@@ -641,7 +641,7 @@ def test_a_parcellation_is_no_mri_in_coarse_voxels(mm, mni):
         assert not Volume(np.rint(t1 / t1.max() * levels).astype(np.int16), np.eye(4)).looks_like_labels()
 
 
-def test_labels_stored_as_bytes_with_a_scale_are_rounded_and_said(tmp_path):
+def test_labels_stored_as_bytes_with_a_scale_are_rounded_and_reported(tmp_path):
     path = tmp_path / "aseg.nii.gz"
     exact, scale = numbered(SYNTHSEG), 60 / 255  # as nibabel stores floats of 0 to 60 in bytes
     stored = np.rint(exact.array / scale).astype(np.float32) * np.float32(scale)

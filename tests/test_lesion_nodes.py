@@ -1,4 +1,4 @@
-"""Lesions in a scene, and labels that are not Segment's own and stay as they are."""
+"""Lesions in a scene, and labels of others, which do not change."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ KINDS = ["LabelMapVolume", "Segmentation"]
 
 
 def lesion(radius: float, centre=PLACE) -> Volume:
-    """A ball on a grid of its own, finer than the head's and turned."""
+    """A ball on a separate grid, finer than the head's and turned."""
     return ball(moved(empty((1.3, 1.3, 2.0), np.diag([-1.0, -1.0, 1.0]), 22), *PLACE), radius, centre)
 
 
@@ -78,7 +78,7 @@ def millilitres(radius: float) -> float:
 # ---- lesions over labels ---------------------------------------------------------------------------------------------
 
 
-def test_segments_called_as_tissues_are_laid_over_them_others_are_told():
+def test_segments_called_as_tissues_are_laid_over_them_others_are_reported():
     bench = Scene("LabelMapVolume", Peritumoral_Edema=16.0, my_tumor=10.0, Segment_1=3.0)
     bench.logic.segment(bench.mri, bench.labels)
     added = bench.logic.addTissues(bench.labels, bench.lesions)
@@ -164,7 +164,7 @@ def test_a_lesion_of_another_place_leaves_the_segmentation_and_a_warning():
     assert bench.labels.GetImageData().GetMTime() == before
 
 
-def test_doubts_about_a_file_of_lesions_are_told_every_time():
+def test_doubts_about_a_file_of_lesions_are_reported_every_time():
     """Of a BraTS map that was added as one tissue, and not only when it was opened."""
     bench = Scene()
     whole = replace(brats((1, 3, 2)), doubts=("brats3.nii.gz: 7 voxels are NaN",))
@@ -183,7 +183,7 @@ def test_doubts_about_a_file_of_lesions_are_told_every_time():
         add_lesion(bench.lesions, whole.with_array((whole.array == 1).astype(np.uint8)), "brats", "core")
 
 
-# ---- labels that stay as they are ------------------------------------------------------------------------------------
+# ---- labels that do not change ---------------------------------------------------------------------------------------
 
 
 def edit(node) -> None:

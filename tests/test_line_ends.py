@@ -36,7 +36,7 @@ def test_the_last_samples_of_a_line_are_as_bright_as_those_before(name):
 
 
 @pytest.mark.parametrize("probe", [LINEAR, replace(LINEAR, steering_deg=15.0), replace(LINEAR, trapezoid_deg=20.0)])
-def test_an_image_ends_as_a_deeper_one_goes_on(probe):
+def test_an_image_ends_as_a_deeper_one_continues(probe):
     """Tissue and an oblique wall that lies partly within the image, partly behind its end."""
     medium = block(lambda x, y, z: 1 + (y > -45.0 + 0.03 * x), half_mm=(50, 90, 20), spacing_mm=1.0)
     sim = simulator(medium, SPECKLE, replace(TISSUES["fat"], attenuation_db_cm_mhz=0.0), **PLAIN)

@@ -158,7 +158,7 @@ def test_a_size_that_no_patient_has_is_a_warning(log, tmp_path):
     assert "its size is 2x2x2 mm" in messages(log, logging.WARNING)[0]
 
 
-def test_what_a_sequence_is_taken_for_is_logged(log, files):
+def test_what_a_sequence_is_read_as_is_logged(log, files):
     sequence = TrackedSequence.read(files / "sweep.igs.mha")
     assert sequence.composition(0, "ReferenceToImage") == ["inverse of ProbeToReference", "inverse of ImageToProbe"]
     TrackedImages.of(sequence, most=2)

@@ -94,7 +94,7 @@ def test_sulci_and_walls_are_bright(view):
     assert np.percentile(mean[rim], 75) > np.median(brain) + 15
 
 
-def test_poses_look_where_they_are_told():
+def test_poses_look_where_they_are_aimed():
     pose = pose_looking_at([0, 0, 100], [0, 0, 0], lateral_ras=[1, 0.2, 0])
     np.testing.assert_allclose(pose[:3, 1], [0, 0, -1], atol=1e-12)
     np.testing.assert_allclose(pose[:3, :3].T @ pose[:3, :3], np.eye(3), atol=1e-12)

@@ -122,6 +122,6 @@ def test_poses_of_a_sweep_have_seeds_of_their_own():
     assert len({seed_of_pose(pose) for pose in turned}) == len(turned)
 
 
-def test_what_is_no_pose_has_no_seed():
+def test_without_a_pose_there_is_no_seed():
     with pytest.raises(SimulationError, match=r"probe_to_ras has shape \(3, 3\), expected \(4, 4\)"):
         seed_of_pose(np.eye(3))

@@ -183,7 +183,7 @@ def restarted_in_a_curved_valley(budget):
     return found.restarts_as_good, stages
 
 
-def test_a_restart_that_stopped_above_the_fit_goes_on_along_its_axes():
+def test_a_restart_that_stopped_above_the_fit_continues_along_its_axes():
     as_good, stages = restarted_in_a_curved_valley(300)
     assert as_good == 4
     assert all(len(stage) <= 300 for stage in stages)

@@ -115,7 +115,7 @@ def test_the_commands_label_what_is_outside_the_brain(tmp_path):
         ([out, "--outside"], "is a label map, and --outside is for an MRI"),
         (
             [image, "--skull-strip", "none", "--outside"],
-            "(--outside) is not known without it, and --skull-strip is none",
+            "--outside needs the brain, which --skull-strip none does not find",
         ),
         (
             [image, "--mask", mask, "--contrast", "t2", "--outside"],
@@ -158,7 +158,7 @@ def test_the_segmentation_has_what_is_outside_after_its_own_labels():
 @pytest.mark.slow
 def test_a_table_of_other_tissues_is_refused(tmp_path):
     names = ("liver", "kidney")
-    message = "has none of the patient's tissues, expected tissues called csf, grey"
+    message = "lacks the patient's tissues, expected tissues called csf, grey"
     mri, brain, _ = round_head(COARSE_MM)
     mri.write(tmp_path / "head.nii.gz")
     mri.with_array(brain.astype(np.uint8)).write(tmp_path / "brain.nii.gz")

@@ -163,7 +163,7 @@ def test_every_declared_class_is_on_the_page():
     def below(kind: type) -> set[type]:
         return {kind}.union(*map(below, kind.__subclasses__()))
 
-    # A Beam is the part of a Probe that has a file of its own.
+    # A Beam is the part of a Probe that has a separate file.
     ours = {kind for kind in below(Declared) - {Declared, Beam} if kind.__module__.startswith("SlicerUSSim.Logic")}
     assert ours == {kind for _, kind, _ in SECTIONS}
 

@@ -104,7 +104,7 @@ def test_no_noise_starts_at_the_lowest_level():
         ({"dynamic_range_db": (-5, 60)}, "dynamic_range_db is -5.0"),
     ],
 )
-def test_what_is_no_parameter_or_no_range_is_refused_in_one_line(free, message):
+def test_what_is_not_a_parameter_or_no_range_is_refused_in_one_line(free, message):
     with pytest.raises(SimulationError) as caught:
         of(free)
     assert message in str(caught.value) and "\n" not in str(caught.value)

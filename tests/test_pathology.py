@@ -202,7 +202,7 @@ def moved(volume: Volume, *mm) -> Volume:
         (ball(empty((0.1, 0.1, 0.1), half_mm=1), 0.3, [0, 0, 0]), "tumour", "mm³ are too small for the voxels"),
     ],
 )
-def test_what_is_no_lesion_of_this_patient_is_refused_in_one_line(mask, tissue, message):
+def test_what_is_not_a_lesion_of_this_patient_is_refused_in_one_line(mask, tissue, message):
     with pytest.raises(SimulationError, match=message) as caught:
         added(mask, tissue)
     assert "\n" not in str(caught.value)
@@ -234,7 +234,7 @@ def test_a_mask_outside_the_volume_is_reported():
 
 @pytest.fixture(scope="module")
 def files(tmp_path_factory):
-    """A head, and masks on a finer grid of their own."""
+    """A head, and masks on their own finer grid."""
     folder = tmp_path_factory.mktemp("lesions")
     head = head_mri(4.0)
     head.write(folder / "head.nii.gz")
@@ -283,7 +283,7 @@ def test_a_mistake_in_an_addition_is_one_line_and_writes_nothing(files, tmp_path
 
 
 @pytest.mark.parametrize("name", ["l.nii.gz", "l.json"])
-def test_labels_and_their_table_are_replaced_only_when_told(name, files, tmp_path):
+def test_labels_and_their_table_are_replaced_only_when_asked(name, files, tmp_path):
     call = ("segment", files / "head.nii.gz", "-o", tmp_path / "l.nii.gz")
     (tmp_path / name).write_text("mine")  # as the table of l.nrrd, which has the same name
     assert ussim(*call).exit_code == 2 and [path.read_text() for path in tmp_path.iterdir()] == ["mine"]

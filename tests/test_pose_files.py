@@ -42,7 +42,7 @@ def test_a_pose_is_read_as_it_was_written_in_every_format(suffix, tmp_path):
 @pytest.mark.parametrize("suffix", [".txt", ".mat"])
 @pytest.mark.parametrize("kind", ["double", "float"])
 def test_transforms_of_c3d_and_ants_are_read(suffix, kind, tmp_path):
-    """SimpleITK shows their class as a chain of itself, in which reading did not end."""
+    """SimpleITK shows their class as a chain with itself, in which reading did not end."""
     path, name = tmp_path / f"pose{suffix}", f"MatrixOffsetTransformBase_{kind}_3_3"
     pose = pose_of_angles([10.0, -20.0, 30.0], [11.0, 22.0, 33.0])
     to_probe = np.linalg.inv(LPS_TO_RAS @ pose @ LPS_TO_RAS)[:3]
@@ -55,7 +55,7 @@ def test_transforms_of_c3d_and_ants_are_read(suffix, kind, tmp_path):
     np.testing.assert_allclose(read_pose(path), pose, atol=1e-4)
 
 
-def test_a_matrix_of_flirt_is_no_pose(tmp_path):
+def test_a_matrix_of_flirt_is_not_a_pose(tmp_path):
     for name in ("flirt.mat", "flirt.txt"):
         np.savetxt(tmp_path / name, np.eye(4), "%.8f ")
     with pytest.raises(SimulationError, match=r"FLIRT .* -src IMAGE flirt\.mat -fsl2ras -oitk pose\.tfm converts"):
@@ -92,7 +92,7 @@ def test_other_texts_are_refused_in_one_line(text):
     assert "pose" in str(error.value) and "\n" not in str(error.value)
 
 
-def test_a_matrix_that_is_no_pose_is_not_written(tmp_path):
+def test_a_matrix_that_is_not_a_pose_is_not_written(tmp_path):
     with pytest.raises(SimulationError, match="is not rigid"):
         write_pose(tmp_path / "pose.json", np.diag([2.0, 2.0, 2.0, 1.0]))
     assert not list(tmp_path.iterdir())

@@ -102,7 +102,7 @@ def test_the_tissues_of_another_patient_in_the_scene_stay(presenter):
     presenter.segmenting.segment()
     assert not presenter.view.errors and parameters.labels is not first and parameters.lesions is None
     assert parameters.labels.GetName() == "Other tissues" and content_of(first) == content
-    assert "'Head tissues' is of another MRI, and is kept" in presenter.notes.text()
+    assert "'Head tissues' belongs to another MRI, and is kept" in presenter.notes.text()
     assert "'Lesions' was chosen for another MRI and was not used" in presenter.notes.text()
 
 
@@ -176,7 +176,7 @@ def test_an_output_of_others_is_kept_and_a_new_one_selected(presenter):
     logic.parameters.output = scan
     presenter.images.simulate()
     assert not presenter.view.errors and logic.parameters.output.GetName() == "Ultrasound"
-    assert "'CT' has data of others and is kept; the result is 'Ultrasound'" in presenter.notes.text()
+    assert "'CT' has other data and is kept; the result is 'Ultrasound'" in presenter.notes.text()
     np.testing.assert_array_equal(slicer.util.arrayFromVolume(scan), head_mri(3.5).array)
     chosen = logic.parameters.output
     presenter.images.simulate()
@@ -256,7 +256,7 @@ def test_every_probe_preset_is_offered_by_a_readable_name(presenter):
             assert presenter.values.probeName() == CUSTOM_PROBE
             presenter.values.chooseProbe(spelling)
             assert presenter.logic.preset.probe == probe and presenter.values.probeName() == shown
-            presenter.values.chooseProbe(CUSTOM_PROBE)  # back to that of before
+            presenter.values.chooseProbe(CUSTOM_PROBE)  # back to the previous one
             assert presenter.values.probeName() == CUSTOM_PROBE and presenter.logic.preset.probe.depth_mm == 77.0
     assert not presenter.view.errors
 
@@ -266,7 +266,7 @@ def test_custom_without_a_custom_probe_says_how_to_make_one(presenter):
     presenter.values._custom_probe = None
     presenter.values.chooseProbe(CUSTOM_PROBE)
     assert presenter.values.probeName() == "linear"
-    assert presenter.view.errors == ["there is no custom probe yet: change a value of this probe, and it is one"]
+    assert presenter.view.errors == ["there is no custom probe yet: change a value of this probe to make one"]
 
 
 @pytest.mark.parametrize(
@@ -347,7 +347,7 @@ def test_lesions_leave_the_checks_of_the_tissues_under_them_in_the_notes(present
     assert "tumour: " in presenter.notes.text() and checks[0] not in presenter.notes.text()
 
 
-def test_an_image_that_does_not_follow_the_probe_is_said_to_be_frozen(presenter):
+def test_an_image_that_does_not_follow_the_probe_is_called_frozen(presenter):
     presenter.segmenting.segment()
     presenter.values.setValue("probe.scan_lines", 48)
     presenter.images.setLive(True)
@@ -469,7 +469,7 @@ def test_lesions_that_were_laid_over_the_tissues_after_segment_end_undo(presente
     ("message", "shown"),
     [
         ("give a brain mask (--mask)", "give a brain mask"),
-        ("or label the whole head (--outside)", "or tick Label what is outside the brain and press Segment"),
+        ("or label the whole head (--outside)", "or tick Label tissues outside the brain and press Segment"),
         ("choose another, --skull-strip none or --mask", "choose another, Brain extraction none or Brain mask"),
         ("map them with --map 9=TISSUE", "map them with the name of a tissue for 9 in its colour table"),
         ("add it with --add brats=FILE, or alone with --map 1=csf --map 2='grey matter' (ussim simulate)",

@@ -41,11 +41,11 @@ def test_a_preset_may_carry_a_pose_and_one_without_is_as_before(tmp_path):
     np.testing.assert_allclose(read_pose(tmp_path / "preset.json"), pose)  # --pose takes it from there
     with pytest.raises(SimulationError, match="probe_to_ras is not rigid"):
         Preset.from_dict({**preset.to_dict(), "probe_to_ras": (2 * np.diag([1, 1, 1, 0.5])).tolist()})
-    with pytest.raises(SimulationError, match="is a pose and no preset; open it as a pose"):
+    with pytest.raises(SimulationError, match="is a pose, not a preset; open it as a pose"):
         Preset.from_dict({"probe_to_ras": pose.tolist()})  # which would reset probe and tissues
 
 
-def test_the_result_of_a_fit_is_no_preset():
+def test_the_result_of_a_fit_is_not_a_preset():
     with pytest.raises(SimulationError, match="result of a fit, expected a preset, as ussim optimize --save-preset"):
         Preset.from_dict({"at_bounds": [], "parameters": [], "cost_before": 0.9, "cost_after": 0.4, "display": {}})
     with pytest.raises(SimulationError, match="has 'b', expected probe, display"):

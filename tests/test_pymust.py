@@ -4,8 +4,8 @@ PyMUST computes every element's pressure by far-field diffraction in the frequen
 user; here its channels are beamformed by its own delay-and-sum matrix. Differences that remain, and why:
 - Its transducer's spectrum is flat-topped, ours Gaussian. Ours gets the bandwidth of the Gaussian that fits best,
   and its pulse is then 8 % shorter, while speckle correlates over a length 6 % longer.
-- Away from the transmit focus its beam is no Gaussian, or has a curved phase: speckle correlates over a shorter length
-  than the echo of a point is wide. Our beam has a phase that does the same (docs/physics.md#wavefront-curvature).
+- Away from the transmit focus its beam is not a Gaussian, or has a curved phase: speckle correlates over less than the
+  width of a point's echo. Our beam has a phase that does the same (docs/physics.md#wavefront-curvature).
 - The mean frequency of its echoes is 4.76 MHz for 5 MHz and 60 %, and its elements' directivity tapers the aperture.
   Its compounded beams are 4 to 7 % wider than two sinc functions, and speckle correlates over a length 12 % longer.
 - Its beams are sinc functions, ours Gaussian with side lobes as clutter beside; the main lobes' widths are compared.
@@ -77,7 +77,7 @@ def probe() -> LinearProbe:
 def channels(param, lateral_mm, depth_mm, strength, delays) -> np.ndarray:
     """(samples, elements) analytic signals of point scatterers."""
     options = pymust.utils.Options()
-    options.dBThresh = -60  # of frequencies: the signals are those of its default, -100, but for 1e-6 of them
+    options.dBThresh = -60  # of frequencies: the signals are those of its default, -100, except for 1e-6 of them
     rf, _ = pymust.simus(
         np.asarray(lateral_mm) * 1e-3, np.asarray(depth_mm) * 1e-3, np.asarray(strength), delays, param, options
     )

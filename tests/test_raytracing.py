@@ -138,7 +138,7 @@ def test_more_segments_than_there_is_room_for_are_a_warning():
         sim.simulate(LinearProbe(4, 60, scan_lines=5), rigid(np.eye(3), [0, -30, 0]))
 
 
-def test_a_line_that_leaves_the_volume_goes_on_in_the_coupling_medium():
+def test_a_line_that_leaves_the_volume_continues_in_the_coupling_medium():
     small = block(lambda x, y, z: np.ones_like(x), half_mm=(10, 10, 10))
     tree = simulator(small, FLUID).trace(PROBES["linear"], rigid(np.eye(3), [0, -40, 0]))
     path = tree.segments[tree.segment_line == 24]

@@ -85,7 +85,7 @@ def file(tmp_path) -> Path:
 
 @pytest.fixture
 def sent():
-    """A file from somebody else."""
+    """An untrusted file."""
     with untrusted_folder(ReadingLimits(seconds=60)) as folder:
         path = Path(folder) / "file.txt"
         path.write_text("text")
@@ -119,7 +119,7 @@ def test_a_folder_is_not_trusted_in_other_threads_too(sent):
         (crashes, r"cannot be read \(the library that reads it crashed: SIGSEGV\)"),
         (fills_the_memory, r"cannot be read \(it needs more memory than there is\)"),
         (raises, r"cannot be read \(KeyError: 'no such tag'\)"),
-        (returns_a_call, r"cannot be read \(its reader gave no answer: posix.mkdir is no value"),
+        (returns_a_call, r"cannot be read \(its reader gave no answer: posix.mkdir is not a value"),
     ],
 )
 def test_what_ends_or_deceives_a_reader_is_one_line(sent, read, words):
@@ -187,7 +187,7 @@ def test_what_is_read_in_a_child_is_what_is_read_here(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("arguments", [["--untrusted", "segment"], ["segment", "--untrusted"], ["segment"]])
-def test_a_command_reads_in_children_when_it_is_told_so(tmp_path, arguments, monkeypatch):
+def test_a_command_reads_in_children_when_asked_to(tmp_path, arguments, monkeypatch):
     monkeypatch.delenv(UNTRUSTED, raising=False)
     (tmp_path / "head.nii.gz").write_bytes(b"no image")
     children: list[object] = []

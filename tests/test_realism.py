@@ -111,7 +111,7 @@ def test_width_of_known_speckle(sigma):
 
 @pytest.mark.slow
 def test_width_of_speckle_is_not_widened_by_structure_larger_than_it():
-    """Slow bright bands, as of tissue, in both directions; without the means that are subtracted it were +40 %."""
+    """Slow bright bands, as in tissue, in both directions; without the means that are subtracted it were +40 %."""
     rows, columns = np.indices((300, 240)) * 0.2
     images = [
         np.clip(0.7 * speckle((0.3, 0.8), seed) + 12.0 * np.sin(rows / 2.5) + 12.0 * np.sin(columns / 4.0), 0, 255)

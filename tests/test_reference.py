@@ -95,7 +95,7 @@ def test_names_and_pages_in_a_docstring(text, expected):
     assert reference.docstring_as_rest([text], known) == [expected]
 
 
-def test_an_example_is_left_as_it_is():
+def test_an_example_is_left_unchanged():
     lines = [">>> values[`0`] | 1", "'`TissueTable`'", "", "`depth`"]
     assert reference.docstring_as_rest(lines, {"TissueTable": "x"}) == [*lines[:3], "``depth``"]
 

@@ -322,7 +322,7 @@ def test_segment_names_and_colours_tissues_where_the_mri_is(kind):
     if kind == "Segmentation":
         labels.GetSegmentation().GetNthSegment(0).SetName("Cerebrospinal fluid")
     else:
-        labels.GetImageData().Modified()  # painted on: the texture is not that of these labels any more
+        labels.GetImageData().Modified()  # painted on: the texture no longer fits these labels
     with pytest.raises(SimulationError, match="segment the MRI again"):
         logic.simulate(labels, probe, image)
 
@@ -352,7 +352,7 @@ def test_cancelling_a_segmentation_leaves_the_node_as_it_was():
     assert labels.GetImageData() is None
 
 
-def test_segment_names_choose_tissues_and_those_nobody_knows_are_listed(bench):
+def test_segment_names_choose_tissues_and_unknown_ones_are_listed(bench):
     segmentation = add(bench.scene, "Segmentation", "painted")
     write_labels(segmentation, cyst(), ("Left-White-Matter", "Tumor_1"), bench.grid())
     table = bench.logic.tissues(segmentation)
@@ -699,7 +699,7 @@ def test_an_image_of_a_sequence_is_shown_where_it_was_taken(bench, tmp_path):
     bench.logic.simulate(bench.labels, bench.probe, bench.image)  # into the same volume again
     assert not is_frozen(bench.image)
     images.SetAttribute("SlicerUSSim.images", None)
-    with pytest.raises(SimulationError, match="does not say what its images are of, expected those of Simulate"):
+    with pytest.raises(SimulationError, match="has no records of its images, expected those of Simulate"):
         bench.logic.showSequenceImage(images, 1, bench.image)
     with pytest.raises(SimulationError, match="has 2 images, expected one with the number 2"):
         bench.logic.showSequenceImage(images, 2, bench.image)

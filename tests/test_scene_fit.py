@@ -129,7 +129,7 @@ def test_images_that_are_not_fitted_are_predicted(scene):
     assert found.tracked.numbers == [0, 2] and found.prediction is not None
     assert found.prediction.numbers == [1]
     assert len(found.prediction.predicted["real neighbours"]) == 2
-    with pytest.raises(SimulationError, match="is no sequence, expected one to predict other images"):
+    with pytest.raises(SimulationError, match="is not a sequence, expected one to predict other images"):
         scene.optimize(scene.volume("none"), validate=[1])
 
 

@@ -152,7 +152,7 @@ def test_a_scene_without_choices_has_its_first_volume_as_mri():
         record_scene(slicer.vtkMRMLScene())
 
 
-def test_values_of_other_versions_are_told_and_have_their_default():
+def test_values_of_other_versions_are_reported_and_have_their_default():
     logic = segmented()
     values = {**recorded_values(logic.parameters), "contrast": "t9", "what_is_that": "1"}
     again = UltrasoundSceneLogic(slicer.vtkMRMLScene())
@@ -195,7 +195,7 @@ def test_images_of_a_sequence_and_lesions_there_and_back():
         assert np.array_equal(old.image, new.image) and old.about() == new.about() and new.grid == old.grid
         assert np.array_equal(old.probe_to_world, new.probe_to_world)
         assert sequence.GetNthIndexValue(number) == images.GetNthIndexValue(number)
-        assert new.anatomy is None  # of which nobody knows whether it is the same still
+        assert new.anatomy is None  # which may have changed
     # What does not go together is refused, and nothing of it stays.
     count = other.scene.GetNumberOfNodesByClass("vtkMRMLSequenceNode")
     with pytest.raises(SimulationError, match=r"of a sequence is|images of"):
@@ -257,7 +257,7 @@ def recorded_images(scene):
 
 
 def test_real_images_keep_their_probe_and_registration():
-    """A depth that a user had set since was taken for a wrong calibration, and the registration for none."""
+    """A depth that a user had set since was mistaken for a wrong calibration, and the registration for none."""
     logic = UltrasoundSceneLogic(slicer.vtkMRMLScene())
     sequences = slicer.vtkSlicerSequencesLogic()  # which also registers the browser's class
     sequences.SetMRMLScene(logic.scene)
@@ -272,7 +272,7 @@ def test_real_images_keep_their_probe_and_registration():
     again = TrackedImages.of(record.sequence, reference_to_ras=record.to_ras, field=record.field)
     assert again.probe == tracked.probe and np.array_equal(again.mask, tracked.mask) and again.grid == tracked.grid
     np.testing.assert_allclose(again.poses, tracked.poses, atol=1e-9)
-    # A scene of before has neither, and is where it was all the same
+    # An older scene has neither, and is nevertheless where it was
     node.SetAttribute("SlicerUSSim.field", None)
     record = required(record_scene(logic.scene).sequence, "no sequence")
     assert record.field is None and record.to_ras is None

@@ -121,7 +121,7 @@ def test_segment_finds_sheets_and_images_show_them(monkeypatch):
     parameters.sheets = model
     presenter.values.setValue("scene.sheet_find", False)
     presenter.segmenting.segment()
-    assert parameters.sheets is None and "of an earlier Segment, are not shown any more" in presenter.notes.text()
+    assert parameters.sheets is None and "of an earlier Segment, are no longer shown" in presenter.notes.text()
 
 
 def test_sheets_of_a_user_are_kept_and_another_model_is_one_line():
@@ -142,7 +142,7 @@ def test_sheets_of_a_user_are_kept_and_another_model_is_one_line():
     assert line.startswith("sheets Model 'Ultrasound outline': has no array 'place' of its cells, expected a file of")
 
 
-def test_what_has_no_sheets_is_said_before_anything_is_computed():
+def test_what_has_no_sheets_is_reported_before_anything_is_computed():
     bench, presenter = bench_with_probe()
     presenter.values.setValue("scene.sheet_find", True)
     for contrast, words in (("flair", "sheets are not found in contrast 'flair'"), ("ct", "in contrast 'ct'")):
@@ -179,7 +179,7 @@ def test_organs_of_a_ct_are_laid_over_its_tissues_wherever_their_node_lies():
 
 @pytest.mark.slow
 def test_organs_without_names_are_read_by_totalsegmentators_numbers():
-    """After Segment of a CT, they were taken for the tissues that it had found: a kidney for fat."""
+    """After Segment of a CT, they were mistaken for the tissues that it had found: a kidney for fat."""
     bench, phantom = Scene(), coarse_chest()
     organs = bench.add("LabelMapVolume", "organs")
     write_volume(organs, phantom.organs)

@@ -337,7 +337,7 @@ def test_a_fifth_of_the_field_of_one_persons_phantom_is_left_at_most():
     ("part", "bias", "least"),
     [("quarter", 0.0, 0.95), ("part of a coronal slab", 0.2, 0.94)],
 )
-def test_white_matter_of_a_part_of_a_brain_is_no_bias_field(part, bias, least):
+def test_white_matter_of_a_part_of_a_brain_is_not_a_bias_field(part, bias, least):
     maps = tissue_maps("colin27")
     if maps is None:
         pytest.skip("needs Colin27")
@@ -346,7 +346,7 @@ def test_white_matter_of_a_part_of_a_brain_is_no_bias_field(part, bias, least):
     assert found.atlas is None
     names = dict(enumerate(found.tissue_names, start=1))
     assert scores(found.labels.array, names, case)["grey and white"] >= least
-    assert any(("left as it is" if not bias else "removed by a polynomial") in line for line in found.notes)
+    assert any(("not removed" if not bias else "removed by a polynomial") in line for line in found.notes)
     if bias:
         tissue = case.truth.array > 1
         true = np.log(case.bias[tissue])
@@ -354,7 +354,7 @@ def test_white_matter_of_a_part_of_a_brain_is_no_bias_field(part, bias, least):
         assert left.std() < 0.4 * true.std()
 
 
-def test_contrast_agent_that_was_not_told_is_a_warning():
+def test_contrast_agent_that_was_not_given_is_a_warning():
     image = np.random.default_rng(0).normal(100.0, 3.0, (60, 60, 60)).astype(np.float32)
     found, inside = SimpleNamespace(grey_and_white=(70.0, 100.0)), np.ones(image.shape, bool)
     assert enhancing(image, inside, found, 0.001) == []

@@ -70,7 +70,7 @@ def test_any_path_and_its_reverse_are_inverses(a, c):
 
 @pytest.mark.parametrize("lost", ["nowhere", "in one image", "everywhere"])
 def test_measured_transforms_win_over_constants_of_a_configuration(tmp_path, caplog, lost):
-    """Where they were lost, too: an identity in a Plus configuration was taken for the pose."""
+    """Where they were lost, too: an identity in a Plus configuration was mistaken for the pose."""
     plus_file(tmp_path / "plus.mha", "MF", MARKED_FAR)  # whose image 1 was not tracked
     content = (tmp_path / "plus.mha").read_bytes()
     status = {"nowhere": (b"= INVALID", b"= OK"), "everywhere": (b"TransformStatus = OK", b"TransformStatus = INVALID")}
@@ -93,7 +93,7 @@ def test_a_missing_transform_is_named_with_what_there_is():
 
 
 @pytest.mark.parametrize("name", ["Image", "ToReference"])
-def test_a_name_that_is_no_transform_is_refused(name):
+def test_a_name_that_is_not_a_transform_is_refused(name):
     with pytest.raises(SimulationError, match="expected two frames joined by To"):
         chain().pose(0, name)
 
@@ -316,7 +316,7 @@ def test_a_damaged_field_is_one_clear_error(tmp_path, change, message):
 @pytest.mark.parametrize("name", ["missing.mha", "empty.mha", "text.nrrd", "text.mha"])
 def test_a_file_that_is_none_is_one_clear_error(tmp_path, name):
     if "missing" not in name:
-        (tmp_path / name).write_text("" if "empty" in name else "this is no image\n")
+        (tmp_path / name).write_text("" if "empty" in name else "this is not an image\n")
     with pytest.raises(SimulationError, match=name) as caught:
         TrackedSequence.read(tmp_path / name)
     assert "\n" not in str(caught.value)
@@ -349,7 +349,7 @@ def test_values_that_slicers_igsio_writes_are_read_with_a_warning(tmp_path, capl
     plus_file(tmp_path / "plus.mha", "??", MARKED_FAR, "BRIGHTNESSBRIGHTNESS")
     found = TrackedSequence.read(tmp_path / "plus.mha")
     assert np.array_equal(found.images, MARKED_FAR) and found.image_type == "BRIGHTNESS"
-    assert "UltrasoundImageOrientation is '??', which is unknown, taken for MF" in caplog.text
+    assert "UltrasoundImageOrientation is '??', which is unknown, read as MF" in caplog.text
 
 
 # ---- the MNI's files -------------------------------------------------------------------------------------------------
@@ -488,7 +488,7 @@ def test_a_calibration_is_read_from_a_transform_as_slicer_saves_it(tmp_path):
         np.testing.assert_allclose(found[1], matrix, atol=1e-9)
 
 
-def test_what_is_left_at_each_landmark_is_told():
+def test_what_is_left_at_each_landmark_is_reported():
     points = np.array([[0.0, 0, 0], [50, 0, 0], [0, 40, 0], [0, 0, 30], [30, 30, 30]])
     shift = np.array([5.0, 4.0, -2.0])
     matrix, line, left = fit_landmarks(points, points + shift + np.eye(5, 3, k=-2) * [0.0, 0.0, 1.0])

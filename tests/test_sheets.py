@@ -49,7 +49,7 @@ def slab(normal, spacing_mm, thickness_mm: float, half: int = 16) -> np.ndarray:
 @pytest.mark.parametrize("spacing_mm", [(0.5, 0.5, 0.5), (0.8, 1.0, 1.3)])
 @pytest.mark.parametrize("across", [(0, 0, 1), (1, 2, 4), (-3, 1, 2)])
 def test_a_plane_is_fitted_to_a_flat_sheet(spacing_mm, across):
-    """Of gradients in voxels, which are not the normals in millimetres where voxels are no cubes."""
+    """Of gradients in voxels, which are not the normals in millimetres where voxels are not cubes."""
     normal = np.array(across) / np.linalg.norm(across)
     labels = slab(normal, spacing_mm, 1.5 * np.mean(spacing_mm))
     gradient, distance, beside, points = planes_of(labels, spacing_mm)
@@ -66,7 +66,7 @@ def test_a_plane_is_fitted_to_a_flat_sheet(spacing_mm, across):
     assert set(np.unique(beside[at])) <= {1, 3}
 
 
-def test_what_is_no_sheet_has_no_plane():
+def test_what_is_not_a_sheet_has_no_plane():
     labels = np.ones((40, 40, 40), np.uint8)
     labels[5, 5, 5] = SHEET
     labels[10, 10, 5:35] = SHEET
@@ -113,7 +113,7 @@ def test_a_thin_sulcus_along_the_beam_is_not_brighter_than_the_brain(spacing_mm,
 
 
 def test_a_sheet_at_the_ends_of_the_volume_and_an_isolated_voxel():
-    """No plane is read or written beyond the volume; a voxel that is no sheet keeps its tissue."""
+    """No plane is read or written beyond the volume; a voxel outside sheets keeps its tissue."""
     silent = Tissue("silent", 1540.0, 1.54, 0.0)
     bright = Tissue("pia", 1540.0, 1.54, 0.0, mu0=1.0, sigma0=0.5)
     labels = block(lambda x, y, z: np.where((abs(y) > 9.5) | (abs(x) + abs(y) + abs(z) < 0.5), 2, 1), (10, 10, 10))

@@ -224,7 +224,7 @@ def test_changed_tissues_give_what_a_new_simulator_would(solid):
 
 
 @pytest.mark.parametrize("spacing_mm", [0.3, 1.0])
-def test_a_membrane_goes_on_beyond_the_end_of_a_label_map(spacing_mm):
+def test_a_membrane_continues_beyond_the_end_of_a_label_map(spacing_mm):
     half = block(lambda x, y, z: np.where(y > 0, 1, 0), (8, 12, 6), spacing_mm)
     bright = Tissue("bright", 1540.0, 1.54, 0.0, mu0=1.0, sigma0=0.5)
     silent = Tissue("silent", 1540.0, 1.54, 0.0)
@@ -246,7 +246,7 @@ def test_the_end_of_a_label_map_is_not_a_border_and_is_reported_once(caplog):
     images = [made.simulate(seen_by, rigid(np.eye(3), [0, -10, 0])).iq for made, seen_by in views]
     np.testing.assert_allclose(images[4], images[0], atol=1e-3 * np.abs(images[0]).max())
     told = [record.getMessage() for record in caplog.records if "beyond the volume" in record.getMessage()]
-    end = "% of the image is beyond the volume: it continues what is at the volume's end, not the patient"
+    end = "% of the image is beyond the volume: it shows the tissue at the volume's end, not the patient"
     assert told == [f"27 {end}", f"57 {end}"]  # again once the share has doubled
 
 

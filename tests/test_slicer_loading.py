@@ -1,6 +1,6 @@
 """3D Slicer finds and loads the module from all locations: the sources, a renamed folder, a wheel, both at once.
 
-Each time in a Python of its own, where sys.path has nothing of this package but what Slicer puts there
+Each time in a separate Python, where sys.path has nothing of this package but what Slicer puts there
 (slicer_factory.py says which sources of Slicer are imitated). test_cmake.py does the same with the build and the
 installed tree.
 """
@@ -173,7 +173,7 @@ def test_the_wheels_module_is_found_as_the_documentation_says(wheel):
     assert done.stdout.strip() == str(wheel / "SlicerUSSim" / "USSim.py"), done.stderr
 
 
-def test_nothing_beside_the_module_is_taken_for_another():
+def test_nothing_beside_the_module_is_mistaken_for_another():
     """Slicer runs every .py file beside a module, and asks every file without a dot what it can do."""
     files = [path for path in (ROOT / "SlicerUSSim").iterdir() if path.is_file()]
     assert [path.name for path in files if is_scripted_module(path)] == ["USSim.py"]

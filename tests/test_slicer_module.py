@@ -483,7 +483,7 @@ def test_tissues_are_edited_taken_from_presets_and_reset(session):
     assert "Szabo" in table.item(line, 1).toolTip()
     table.item(line, 4).setText("0,5")  # a comma is a point
     assert session.logic.preset.tissues.for_names(["grey matter"])[1].mu0 == 0.5
-    assert table.item(line, 4).toolTip() == "set by hand"
+    assert table.item(line, 4).toolTip() == "set manually"
     ui.resetTissuesButton.click()
     assert table.item(line, 1).text() == "1541"
     # One that the preset does not have
@@ -619,7 +619,7 @@ def test_a_sequence_is_simulated_and_its_browser_plays_it(session):
     assert session.scene.GetNumberOfNodesByClass("vtkMRMLSequenceNode") == count
 
 
-def test_choosing_other_nodes_while_live_goes_on_with_those(session):
+def test_choosing_other_nodes_while_live_continues_with_those(session):
     session.segmented()
     session.ui.liveCheckBox.setChecked(True)
     first = session.parameters.output
@@ -637,7 +637,7 @@ def test_choosing_other_nodes_while_live_goes_on_with_those(session):
 
 
 def with_real_image(session, gain_db: float = 9.0):
-    """A "real" image of the segmented head: brighter than simulated, other speckle, in a volume of its own."""
+    """A "real" image of the segmented head: brighter than simulated, other speckle, in a separate volume."""
     session.segmented()
     session.ui.simulateButton.click()
     preset = session.logic.preset
@@ -701,7 +701,7 @@ def test_a_cancelled_fit_changes_nothing_and_errors_are_one_line(session):
     assert session.ui.fitLabel.text() == "" and session.ui.fitButton.isEnabled()
     session.panel.presenter.fits.setFree("gain_db", False)
     session.ui.fitButton.click()
-    assert session.app.errors == ["nothing is free, tick at least one parameter"]
+    assert session.app.errors == ["no parameter is free; tick at least one"]
     session.panel.presenter.fits.setFree("noise_db", True)
     assert session.parameters.fit_free == "noise_db"
     images = session.add("Sequence", "images")
@@ -758,7 +758,7 @@ def test_closing_a_scene_does_not_redraw_the_panel_for_each_node(session, monkey
 
 
 def test_closing_the_scene_forgets_the_patient(session):
-    """Nodes of the next scene have the IDs of those before: a fit to patient A set the gain of patient B."""
+    """Nodes of the next scene have the IDs of earlier ones: a fit to patient A set the gain of patient B."""
     with_real_image(session)
     ui = session.ui
     ui.fitButton.click()
@@ -1133,7 +1133,7 @@ def test_selectors_offer_only_what_fits(session):
 
 @pytest.mark.slow
 def test_deleting_the_live_output_takes_no_other_volume(session):
-    """Slicer's selector goes on to the next node: live images were then written into the FLAIR of the patient."""
+    """Slicer's selector chooses the next node: live images were then written into the FLAIR of the patient."""
     session.segmented()
     session.ui.liveCheckBox.setChecked(True)
     own = session.add("ScalarVolume", "another image of this module")

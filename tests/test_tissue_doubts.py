@@ -45,7 +45,7 @@ def test_cortex_is_not_csf_where_the_mask_leaves_only_the_ventricles():
     assert scores(found.labels.array, dict(enumerate(found.tissue_names, 1)), case)["grey and white"] > 0.9
 
 
-def test_a_brain_that_lies_unlike_its_header_is_said():
+def test_a_brain_that_lies_unlike_its_header_is_reported():
     case = phantom(brain(), "t1", noise=0.03, bias=0.0)
     for axis in (None, 0, 1):
         mri, mask = (one if axis is None else one.with_array(np.flip(one.array, axis)) for one in (case.mri, case.mask))

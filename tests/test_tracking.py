@@ -155,7 +155,7 @@ def test_damaged_and_invalid_poses_are_not_used_and_counted(link):
             assert "following ProbeToReference" in ours.status
 
 
-def test_a_tracker_that_sends_only_tracking_data_is_told_so_with_a_remedy(link):
+def test_a_tracker_that_sends_only_tracking_data_is_reported_with_a_remedy(link):
     class TrackingData(pyigtl.messages.MessageBase):
         def _pack_content(self):
             return struct.pack(">20sBB12f", b"Probe", 1, 0, *POSE[:3].T.ravel())
@@ -177,11 +177,11 @@ def test_who_does_not_speak_openigtlink_is_dropped_and_the_next_one_heard(link):
     nonsense = struct.pack(">H12s20sQQQ", 1, b"TRANSFORM", b"x", 0, 1 << 60, 0) + b"x" * 100
     port = free_port()
     _, poses = link("127.0.0.1", port, listen=True)
-    with socket.create_connection(("127.0.0.1", port)) as stranger:
-        stranger.sendall(nonsense)
-        stranger.settimeout(120)
+    with socket.create_connection(("127.0.0.1", port)) as other:
+        other.sendall(nonsense)
+        other.settimeout(120)
         with contextlib.suppress(ConnectionResetError):  # with what was not read, closing is a reset
-            assert stranger.recv(1) == b""
+            assert other.recv(1) == b""
     client = pyigtl.OpenIGTLinkClient("127.0.0.1", port)
     until(lambda: client.is_connected())
     client.send_message(transform())
@@ -220,7 +220,7 @@ def test_an_address_says_where_and_who_connects(text, address):
 
 
 @pytest.mark.parametrize("text", ["tracker", "tracker:99999", "tracker:x", "::1:18944", "listen:18944", ""])
-def test_what_is_no_address_is_said(text):
+def test_what_is_not_an_address_is_reported(text):
     with pytest.raises(SimulationError, match="expected HOST:PORT") as caught:
         parse_address(text)
     assert repr(text) in str(caught.value) and "listen:HOST:PORT" in str(caught.value)
@@ -230,7 +230,7 @@ def test_what_is_no_address_is_said(text):
     ("ours", "theirs"),
     [("0.0.0.0", "127.0.0.2"), ("[::1]", "[::1]")],  # the first is this computer too, but not where :PORT waits
 )
-def test_it_listens_where_it_is_told_and_connects_there(link, ours, theirs):
+def test_it_listens_where_it_is_asked_to_and_connects_there(link, ours, theirs):
     port = free_port()
     try:
         family = socket.AF_INET6 if "[" in theirs else socket.AF_INET
@@ -248,6 +248,6 @@ def test_it_listens_where_it_is_told_and_connects_there(link, ours, theirs):
         until(lambda: poses)
 
 
-def test_a_port_that_is_taken_is_said():
+def test_a_port_that_is_taken_is_reported():
     with socket.create_server(("127.0.0.1", 0)) as listener, pytest.raises(SimulationError, match="choose another"):
         TrackerLink("127.0.0.1", listener.getsockname()[1], print, listen=True)

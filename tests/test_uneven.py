@@ -123,7 +123,7 @@ def test_it_is_fixed_in_the_patient_and_depends_on_the_seed():
     moved = [made.simulate(probe, pose) for pose in (POSE, POSE @ one_line_on(probe))]
     assert correlation(moved[0].iq[1:], moved[1].iq[:-1]) > 0.95
     assert not np.array_equal(here.iq, simulator(UNEVEN, seed=1).simulate(PROBE, POSE).iq)
-    # Another part of the patient, in an image of its own, is not the same
+    # Another part of the patient, in a separate image, is not the same
     ratio = [np.abs(made.simulate(PROBE, POSE).iq) / np.abs(simulator(EVEN).simulate(PROBE, POSE).iq) for _ in range(2)]
     np.testing.assert_array_equal(*ratio)
 

@@ -39,11 +39,11 @@ SEQUENCE = TrackedSequence(np.full((2, 8, 9), 3, np.uint8), ({"ImageToReference"
 @pytest.mark.parametrize(
     ("name", "words"),
     [
-        ("../mri.nii.gz", "is no plain file name"),
-        ("/etc/cron.d/x", "is no plain file name"),
-        ("a\\b.nii", "is no plain file name"),
-        ("a\0.nii", "is no plain file name"),
-        ("", "is no plain file name"),
+        ("../mri.nii.gz", "is not a plain file name"),
+        ("/etc/cron.d/x", "is not a plain file name"),
+        ("a\\b.nii", "is not a plain file name"),
+        ("a\0.nii", "is not a plain file name"),
+        ("", "is not a plain file name"),
         ("x" * 300 + ".nii", "its name has 304 bytes, expected at most 200"),
     ],
 )
@@ -178,7 +178,7 @@ def test_a_table_of_nothing_is_one_line(patient, tmp_path, names):
 
 
 def test_a_label_map_and_a_preset_are_told_apart(patient, tmp_path):
-    """A preset is no table of the labels that are opened with it."""
+    """A preset is not a table of the labels that are opened with it."""
     Preset().write(tmp_path / "preset.json")
     patient.labels.write(tmp_path / "a.nii.gz")
     files, wrong = opener()[0].recognised(sorted(tmp_path.iterdir()))
@@ -242,7 +242,7 @@ def test_of_several_series_one_is_taken_and_called_as_it_is_described(tmp_path, 
     assert "Miller" not in caplog.text and "4711" not in caplog.text and "T1 MPRAGE" in caplog.text
 
 
-def test_a_damaged_image_beside_the_chosen_series_is_said(tmp_path):
+def test_a_damaged_image_beside_the_chosen_series_is_reported(tmp_path):
     """The volume would end before it."""
     mri = head_mri(6.0)
     write_series(tmp_path, mri, 3, "T1")
@@ -260,7 +260,7 @@ def test_a_damaged_image_beside_the_chosen_series_is_said(tmp_path):
 # ---- questions -------------------------------------------------------------------------------------------------------
 
 
-def test_a_question_waits_for_its_own_answer_and_all_else_goes_on():
+def test_a_question_waits_for_its_own_answer_and_all_else_continues():
     import asyncio
 
     from trame_server.state import State

@@ -21,7 +21,7 @@ from validation.measurement import echo_near, fit_rayleigh, full_width
 from validation.phantoms import Echo
 from validation.run import all_checks, validate
 
-#: A cheap check of each phenomenon; side lobes and aberration have tests of their own (test_side_lobes, test_aperture)
+#: A cheap check of each phenomenon; side lobes and aberration have separate tests (test_side_lobes, test_aperture)
 _QUICK = (
     "attenuation and time", "echo level", "mirroring", "refraction and reflectance", "resolution", "speckle coherence",
 )  # fmt: skip
@@ -46,7 +46,7 @@ def test_theory_and_simulation_agree(name):
     assert not off, "; ".join(off)
 
 
-def test_every_check_has_a_name_of_its_own_and_three_orientations():
+def test_every_check_has_its_own_name_and_three_orientations():
     for check in all_checks():
         # Views of heads have random orientations.
         assert set(check.orientations) == set(ORIENTATIONS) or check.name == "beams in heads"
@@ -191,7 +191,7 @@ def test_a_rotation_that_is_none_is_refused():
 )
 def test_phantoms_echo_from_where_they_say(make):
     phantom = make(ORIENTATIONS["oblique"])
-    # Only the bar echoes by its scatterers; a bright grain beside another object is no error.
+    # Only the bar echoes by its scatterers; a bright grain beside another object is not an error.
     is_bar = phantom.name == "thin rod"
     chosen = SimulationSettings(scatterers_per_mm3=300.0, reflections=False, scattering=is_bar)
     simulator = UltrasoundSimulator(phantom.labels, phantom.tissues, chosen)
@@ -212,7 +212,7 @@ def test_refraction_between_equal_speeds_displaces_nothing(probe):
         assert np.linalg.norm(away) == pytest.approx(0.6, abs=1e-6)  # the wire's radius: its front is what echoes
 
 
-def test_the_rayleigh_fit_finds_sigma_and_refuses_what_is_no_rayleigh():
+def test_the_rayleigh_fit_finds_sigma_and_refuses_other_distributions():
     rng = np.random.default_rng(0)
     fit = fit_rayleigh(rng.rayleigh(3.0, 400_000))
     top = 255.0 / 3.0  # grey levels per unit, times the largest of that many samples

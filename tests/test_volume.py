@@ -188,7 +188,7 @@ CODES = {"sform_code": 0, "qform_code": 0}
         ({"scl_slope": 0, "scl_inter": 5}, (2, 2, 2), "scl_slope is 0 and scl_inter 5, read without both"),
     ],
 )
-def test_a_nifti_header_that_contradicts_itself_is_told_with_both_values(fields, diagonal, words, tmp_path, caplog):
+def test_a_contradicting_nifti_header_is_reported_with_both_values(fields, diagonal, words, tmp_path, caplog):
     if fields.get("xyzt_units"):
         with pytest.raises(SimulationError, match=r"has voxels of 0\.002 x 0\.002 x 0\.002 mm"):
             nifti(tmp_path / "i.nii", **fields)
@@ -240,7 +240,7 @@ def test_missing_and_unreadable_files_are_named(tmp_path):
     (tmp_path / "bad.nii").write_text("not an image")
     with pytest.raises(SimulationError, match=r"bad\.nii: cannot be read"):
         Volume.read(tmp_path / "bad.nii")
-    with pytest.raises(SimulationError, match=r"has no DICOM series.*images of their own \(bad\.nii\): give"):
+    with pytest.raises(SimulationError, match=r"has no DICOM series.*separate images \(bad\.nii\): give"):
         Volume.read(tmp_path)
     (tmp_path / "bad.nii").unlink()
     with pytest.raises(SimulationError, match=r"has no DICOM series, nor have the folders in it$"):
@@ -309,7 +309,7 @@ def test_only_rotations_with_translation_pass_as_poses(matrix):
 
 
 @pytest.mark.parametrize("name", ["mri.nii.gz", "mri.nrrd", "mri.mha"])
-def test_voxels_that_are_no_numbers_are_read_as_zero_and_told(name, tmp_path, caplog):
+def test_voxels_that_are_not_finite_are_read_as_zero_and_reported(name, tmp_path, caplog):
     """SPM and others write NaN outside the head."""
     values = np.ones((6, 7, 8), np.float32)
     values[4:] = np.nan
@@ -350,10 +350,10 @@ for size in (80, 64):  # of 64, only the header does not fit
 
 @pytest.mark.skipif(sys.platform == "win32", reason="no limit of the size of files")
 def test_a_file_that_does_not_fit_on_the_disk_leaves_the_one_before(tmp_path):
-    """Of a NIfTI file ITK did not say so: the file before was replaced by an empty one."""
+    """ITK did not report it for NIfTI: an empty file replaced the previous one."""
     names = ["v.mha", "v.nii", "v.nii.gz", "v.nrrd", "v.vti"]
     done = subprocess.run([sys.executable, "-c", _FULL, *names], cwd=tmp_path, capture_output=True, text=True)
-    assert done.returncode == 0 and done.stderr == ""  # ITK and VTK told of it in words of their own
+    assert done.returncode == 0 and done.stderr == ""  # ITK and VTK reported it in their own words
     assert sorted(file.name for file in tmp_path.iterdir()) == names
     for name in names:
         assert done.stdout.count(f"{name}: cannot be written") == 2, done.stdout

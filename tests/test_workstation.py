@@ -43,7 +43,7 @@ FLAGS = [
 ]  # fmt: skip
 #: A state that has not come after so long never will, however busy the machine is.
 PATIENCE_S = 180
-#: Trame's own messages that a page could not send since it was left are no faults of the page.
+#: Trame's own messages that a page could not send since it was left are not faults of the page.
 LEAVING = """addEventListener("beforeunload", () =>
   addEventListener("unhandledrejection", rejection => rejection.preventDefault()));"""
 POSE = ("right_deg", "front_deg", "rotate_deg", "rock_deg", "tilt_deg", "lift_mm")
@@ -449,7 +449,7 @@ def test_a_double_click_aims_the_probe_at_a_structure(page):
         settled(page)
         return pose(page) != before
 
-    eventually(page, aimed)  # the server takes two clicks for two where it is too busy to hear them in time
+    eventually(page, aimed)  # the server takes two clicks for two where it is too busy to handle them in time
     page.evaluate("window.trame.trigger('plane', ['Green', 'Axial'])")
     after = pose(page)
     assert abs(after["tilt_deg"] - before["tilt_deg"]) > 3 and after["right_deg"] == pytest.approx(before["right_deg"])
@@ -792,9 +792,9 @@ def test_a_click_grows_a_lesion_that_is_added_to_the_tissues(browser, tmp_path):
         page.close()
 
 
-def test_a_file_that_cannot_be_read_is_said_and_changes_nothing(page):
+def test_a_file_that_cannot_be_read_is_reported_and_changes_nothing(page):
     before = state(page, NAMES.title), shown(page, "kindComboBox"), shown(page, "mriSelector")
-    broken = {"name": "broken.nii.gz", "mimeType": "application/octet-stream", "buffer": b"this is no image"}
+    broken = {"name": "broken.nii.gz", "mimeType": "application/octet-stream", "buffer": b"this is not an image"}
     page.set_input_files("#open-file", broken)
     text = shown_errors(page)
     assert "broken.nii.gz: " in text and "/tmp" not in text and "Traceback" not in text
@@ -819,12 +819,12 @@ def test_a_file_that_cannot_be_read_is_said_and_changes_nothing(page):
         (["{head}", "--set", "patient.no_sheets=falx"], "no_sheets leaves out some of --sheets; give --sheets, too"),
     ],
 )
-def test_what_cannot_be_served_is_said_in_one_line(files, arguments, message):
+def test_what_cannot_be_served_is_reported_in_one_line(files, arguments, message):
     names = {name: files / f"{name}.nii.gz" for name in ("broken", "head", "far")}
     assert message in refused(*(text.format(**names) for text in arguments))
 
 
-def test_a_port_that_is_taken_is_said():
+def test_a_port_that_is_taken_is_reported():
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
         assert f"127.0.0.1:{port}" in refused("--port", port)

@@ -98,10 +98,10 @@ def test_only_the_token_opens_the_door_on_loopback_too(server, browser):
         assert answer.split()[1] == "403"
     refused = server.page("GET / HTTP/1.1\nHost: <script>alert(1)</script>\nConnection: close\n\n")
     assert " 403 " in refused and "&lt;script&gt;" in refused and "<script>" not in refused
-    stranger = browser.new_page()
-    stranger.goto(f"{base}?token=wrong")
-    assert "token is missing or wrong" in stranger.locator("#reason").inner_text()
-    stranger.close()
+    intruder = browser.new_page()
+    intruder.goto(f"{base}?token=wrong")
+    assert "token is missing or wrong" in intruder.locator("#reason").inner_text()
+    intruder.close()
 
 
 @pytest.mark.slow
@@ -121,7 +121,7 @@ def test_requests_that_no_browser_sends_leave_no_traceback(server):
             assert answer.split()[1] == "403" and "The request was not understood" in answer
     for line in (f"GET /{'a' * 9000} HTTP/1.1\nHost: {host}", f"GET / HTTP/1.1\nHost: {host}\nX: {'a' * 9000}"):
         assert server.answer(f"{line}\n\n").split()[1] == "400"
-    assert server.answer(f"GET /?token={token} HTTP/1.1\nHost: {host}\n\n").split()[1] == "303"  # it goes on
+    assert server.answer(f"GET /?token={token} HTTP/1.1\nHost: {host}\n\n").split()[1] == "303"  # it still answers
 
 
 @needs_openssl
@@ -149,7 +149,7 @@ def test_with_a_certificate_page_and_images_come_over_tls(browser, files, certif
 
 @pytest.mark.slow
 @needs_openssl
-def test_what_is_no_certificate_is_said_in_one_line(files, certificate):
+def test_what_is_not_a_certificate_is_reported_in_one_line(files, certificate):
     labels = files / "labels.nii.gz"
     cert, _ = certificate
     for arguments, words in (

@@ -144,7 +144,7 @@ def test_views_fold_fill_the_window_and_change_places_with_the_image(page):
     assert {name: area(page, name) for name in before} == pytest.approx(before)
 
 
-def test_the_point_under_the_mouse_is_told_and_marked_in_all_views(page):
+def test_the_point_under_the_mouse_is_shown_and_marked_in_all_views(page):
     page.mouse.move(*at(page, 5.0, 20.0))  # in the fluid
     eventually(page, lambda: state(page, NAMES.views.under_mouse) != "")
     page.mouse.move(*at(page, 6.0, 20.0))
@@ -200,7 +200,7 @@ def test_a_caliper_across_the_fluid_reads_its_thickness(page):
     status(page, "LIVE")
     with new_image(page):
         page.keyboard.press("a")
-    assert words(page) == []  # they were of the image before
+    assert words(page) == []  # they belonged to the previous image
 
 
 @pytest.mark.slow

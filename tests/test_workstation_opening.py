@@ -67,7 +67,7 @@ def answer(page, title: str) -> None:
 
 
 def answered(page, sent, *titles: str) -> str:
-    """Open files, answer the questions, and return what is said about them."""
+    """Open files, answer the questions, and return the notes about them."""
     page.set_input_files("#open-file", sent)
     for title in titles:
         question(page)
@@ -176,12 +176,12 @@ def test_several_files_at_once_are_opened_in_their_order(page, files, tmp_path):
     preset.write(tmp_path / "a.json")
     shutil.copy(files / "labels.nii.gz", tmp_path / "labels.nii.gz")
     shutil.copy(files / "head.nii.gz", tmp_path / "z.nii.gz")
-    (tmp_path / "broken.nii.gz").write_bytes(b"this is no image")
+    (tmp_path / "broken.nii.gz").write_bytes(b"this is not an image")
     sent = [tmp_path / "labels.nii.gz", files / "sweep.igs.mha", tmp_path / "z.nii.gz", tmp_path / "a.json",
             tmp_path / "broken.nii.gz"]  # fmt: skip
     said = answered(page, sent, "New patient").splitlines()
     assert [line.partition(":")[0] for line in said] == ["a.json", "z.nii.gz", "labels.nii.gz", "sweep.igs.mha"]
-    assert "its labels came with it; head.nii.gz is closed" in said[1] and said[2].endswith("tissues of z.nii.gz")
+    assert "with its own labels; head.nii.gz is closed" in said[1] and said[2].endswith("tissues of z.nii.gz")
     assert state(page, NAMES.title) == "labels.nii.gz" and state(page, NAMES.sequence.length) == 6
     assert page.locator("#mriSelector option:checked").inner_text().strip() == "z.nii.gz"
     assert len(errors(page)) == 1 and errors(page)[0].startswith("broken.nii.gz: ") and "/tmp" not in errors(page)[0]
@@ -192,7 +192,7 @@ def test_several_files_at_once_are_opened_in_their_order(page, files, tmp_path):
 
 @pytest.fixture(scope="module")
 def dicom(files, tmp_path_factory) -> Path:
-    """A folder as of a CD: two volumes and a localiser in folders of their own, with a viewer."""
+    """A folder as on a CD: two volumes and a localiser in separate folders, with a viewer."""
     folder = tmp_path_factory.mktemp("cd")
     mri = Volume.read(files / "head.nii.gz")
     scaled = mri.with_array((mri.array * (1000.0 / mri.array.max())).astype(np.int16))

@@ -91,8 +91,8 @@ def shown_pose(page, number: int) -> np.ndarray:
 def test_ultrasound_without_a_calibration_asks_for_it(page, recording):
     said = state(page, NAMES.opened)[0]
     assert said.endswith(
-        "tracked ultrasound: 6 images of 624x512, transforms ProbeToTracker, ReferenceToTracker, StylusToTracker: its "
-        "calibration is asked for in Tracked ultrasound"
+        "tracked ultrasound: 6 images of 624x512, transforms ProbeToTracker, ReferenceToTracker, StylusToTracker: "
+        "enter its calibration in Tracked ultrasound"
     )
     assert state(page, NAMES.sequence.length) == 6 and not state(page, NAMES.sequence.is_placed)
     assert "no path from Image to Reference" in page.locator("#calibration-from").inner_text()
@@ -100,7 +100,7 @@ def test_ultrasound_without_a_calibration_asks_for_it(page, recording):
     settled(page)
     assert page.locator("#calibration-from").inner_text() == "Calibration ImageToProbe of plus.xml"
     assert state(page, NAMES.sequence.length) == 6 and not errors(page)
-    assert "none: the frame of the ultrasound is taken" in page.locator("#registration-from").inner_text()
+    assert "none: the frame of the ultrasound is assumed" in page.locator("#registration-from").inner_text()
     page.set_input_files("#registration-file", recording["folder"] / "registration.txt")
     settled(page)
     assert page.locator("#registration-from").inner_text() == "Registration registration.txt"
@@ -110,7 +110,7 @@ def test_ultrasound_without_a_calibration_asks_for_it(page, recording):
 
 
 @pytest.mark.long
-def test_wrong_calibrations_and_registrations_are_said_and_change_nothing(page, recording, tmp_path):
+def test_wrong_calibrations_and_registrations_are_reported_without_effect(page, recording, tmp_path):
     def sent(name: str, matrix: np.ndarray) -> None:
         np.savetxt(tmp_path / "matrix.txt", matrix)
         page.set_input_files(f"#{name}-file", tmp_path / "matrix.txt")

@@ -1,4 +1,4 @@
-"""A server that is started again offers pose and settings of before; what was made on the page is saved as a scene."""
+"""A server that is started again offers the last pose and settings; what the page made is saved as a scene."""
 
 from __future__ import annotations
 
@@ -79,11 +79,11 @@ def test_pose_and_settings_are_offered_after_a_crash_and_restored(start, browser
     server.kill()
     page.locator("#connection-lost").wait_for()
     page.close()
-    # Another patient is open: that of before is opened by his file, and nothing is restored unasked
+    # Another patient is open: the last one is opened from his file, and nothing is restored unasked
     page = opened(browser, served("--labels", files / "labels.nii.gz").url)
     page.locator("#offer").wait_for()
     text = page.locator("#offer-text").inner_text()
-    assert text.startswith("Go on with head.nii.gz as at ") and shown(page, "gainSlider") != 7
+    assert text.startswith("Continue with head.nii.gz as at ") and shown(page, "gainSlider") != 7
     assert json.loads(file.read_text()) == found  # until the offer is answered
     click(page, "#restore")
     answer_new_patient(page)
@@ -99,7 +99,7 @@ def test_pose_and_settings_are_offered_after_a_crash_and_restored(start, browser
 
 
 @pytest.mark.slow
-def test_an_uploaded_patient_goes_on_with_his_saved_scene(start, browser, files, tmp_path):
+def test_an_uploaded_patient_continues_with_his_saved_scene(start, browser, files, tmp_path):
     served, file = start
     server = served("--labels", files / "labels.nii.gz")
     page = opened(browser, server.url)
@@ -117,7 +117,7 @@ def test_an_uploaded_patient_goes_on_with_his_saved_scene(start, browser, files,
     page = opened(browser, served("--labels", files / "labels.nii.gz").url)
     click(page, "#restore")
     eventually(page, lambda: bool(errors(page)))
-    assert errors(page)[0].startswith("sent.nii.gz: its files are not on the computer of the server any more")
+    assert errors(page)[0].startswith("sent.nii.gz: its files are no longer on the computer of the server")
     assert page.locator("#offer").is_visible() and state(page, NAMES.title) == "labels.nii.gz"
     page.set_input_files("#open-file", tmp_path / "saved.mrb")
     answer_new_patient(page, "The patient of the scene")

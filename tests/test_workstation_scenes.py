@@ -116,7 +116,7 @@ def open_scene(page, path: Path) -> None:
 def test_the_workstation_opens_the_scene_that_it_saved(page, files, tmp_path):
     """With tissues, probe, settings, images of a sequence, and the place of the probe.
 
-    Another depth than that of the images was taken for a wrong calibration, and the page was empty; the registration
+    Another depth than that of the images was mistaken for a wrong calibration, and the page was empty; the registration
     was "none".
     """
     open_head(page, files)

@@ -240,7 +240,7 @@ def test_a_saved_scene_holds_this_patient_only_and_a_patient_can_be_closed(page,
 
 
 @pytest.mark.long
-def test_an_upload_shows_how_far_it_is_can_be_cancelled_and_images_go_on(page, files):
+def test_an_upload_shows_progress_can_be_cancelled_and_images_continue(page, files):
     """Of 216 MB nothing was shown for 49 s, and no image came meanwhile."""
     session = page.context.new_cdp_session(page)
     session.send("Network.enable")
@@ -268,7 +268,7 @@ def test_an_upload_shows_how_far_it_is_can_be_cancelled_and_images_go_on(page, f
 
 
 @pytest.mark.slow
-def test_exports_are_for_whom_has_the_token(page, browser, url):
+def test_exports_need_the_token(page, browser, url):
     other = browser.new_context()
     address = f"{url.split('?')[0]}exported?kind="
     assert other.request.get(f"{address}json").status == 403

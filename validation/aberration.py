@@ -123,7 +123,7 @@ def beams_behind_cysts(rotation: np.ndarray, device) -> Outcome:
 
 
 def _levels_db(scene: str, probe_name: str, beam: str, rotation: np.ndarray, device) -> np.ndarray:
-    """(lines,) power of speckle in the deeper part, re the same with the reference speed of sound everywhere."""
+    """(lines,) power of speckle in the deeper part, relative to the reference speed of sound everywhere."""
     phantom, probe = _SCENES[scene](rotation=rotation), PROBES[probe_name]
     assert phantom.baseline is not None
     return levels_db(
@@ -257,7 +257,7 @@ def shadows_of_rods(rotation: np.ndarray, device) -> Outcome:
         middle = float(np.interp(0.0, place[lines], powers)) + reflected * mirrored
         where = f"{depth - centre - radius:.0f} mm behind, {name}"
         # Right behind it, where waves leave -34 dB and mirror -27, images have -30 and -22: 2 dB by the Gaussian beam
-        # before a mirror as small as it is, and 2 dB by curvature from voxels.
+        # before so small a mirror, and 2 dB by curvature from voxels.
         limit = 6.0 if middle < 0.003 else 3.0
         rows += [
             Row(f"middle, {where}", "dB", 10.0 * np.log10(middle),

@@ -123,7 +123,7 @@ def _echoes_of_mirror(
 
 
 def mirror_echo_db(probe: Probe, tilt_deg, depth_mm: float, turn_deg: float = 0.0) -> np.ndarray:
-    """(tilts,) peaks of the pulse from planes re a square one: sums over the ways, laterally times those across.
+    """(tilts,) peaks of the pulse from planes relative to a square one: sums over paths, laterally times those across.
 
     The tilt is in the image plane, or in a plane turned about the axis of the probe.
     """

@@ -161,7 +161,7 @@ def reverberation(rotation: np.ndarray, device) -> Outcome:
             for n in range(1, len(echoes)):
                 apart = echoes[n].shown_mm[1] - echoes[n - 1].shown_mm[1]
                 fall = echoes[n].level_db - echoes[n - 1].level_db
-                with np.errstate(divide="ignore"):  # an echo that is not there at all is a finding too
+                with np.errstate(divide="ignore"):  # a missing echo is a finding too
                     found_fall = 20.0 * np.log10(found[n][2] / found[n - 1][2])
                 where = f"{echoes[n].name}, {name}, {spacing:g} mm"
                 rows += [
@@ -185,7 +185,7 @@ def wires_cysts_and_contrast(rotation: np.ndarray, device) -> Outcome:
             if isinstance(change, LevelChange):
                 rows.append(_level_row(f"{change.name} target, {name}", change, probe, frames[name], plain[name]))
         # In the main lobes there are only echoes from a cyst's surroundings at the edges of the beam; side lobes and
-        # clutter have a check of their own.
+        # clutter have a separate check.
         black = region_level_db(dark[name], probe, (-13.5, -10.5, 18.5, 21.5))
         around = region_level_db(dark[name], probe, (-10.0, -8.0, 24.0, 34.0))
         rows.append(Row(f"cyst in the main lobes, {name}", "dB", -40.0, black - around, 0.0, "at most"))

@@ -98,7 +98,7 @@ def _loss_db(probe: Probe, depth_mm) -> np.ndarray:
 
 
 def _mean_frequency(probe: Probe, depth_mm: float) -> float:
-    """Mean over the power spectrum, re the centre: the logarithmic derivative of its power by the loss."""
+    """Mean over the power spectrum, relative to the centre: the logarithmic derivative of its power by the loss."""
     loss, step = float(_loss_db(probe, depth_mm)), 0.01
     before, behind = (float(band_power(probe, loss + side * step)) for side in (-1, 1))
     return -10.0 * np.log10(behind / before) / (2.0 * step)

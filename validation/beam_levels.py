@@ -1,4 +1,4 @@
-"""The level of speckle along lines, of images and of wave propagation, re a medium of one speed of sound."""
+"""Levels of speckle along lines, of images and of wave propagation, relative to a medium of one speed of sound."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def levels_db(
     labels: Volume, tissues: TissueTable, baseline: TissueTable, probe: Probe, pose: np.ndarray, device,
     *, beam: str, edges_mm: np.ndarray, lines: slice, seeds: int, reflections: bool = True,
 ) -> np.ndarray:  # fmt: skip
-    """(lines,) power of speckle between the edges of blocks of depth, re the same with the tissues of `baseline`.
+    """(lines,) power of speckle between the edges of blocks of depth, relative to the tissues of `baseline`.
 
     Parameters as in levels_and_widths.
     """
@@ -48,7 +48,7 @@ def levels_and_widths(
     *, beam: str, edges_mm: np.ndarray, lines: slice, seeds: int, reflections: bool = True,
     wavefront_curvature: bool = True,
 ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
-    """Speckle between the edges of blocks of depth re the same with the tissues of `baseline`: levels and widths.
+    """Speckle between the edges of blocks of depth relative to the tissues of `baseline`: levels and widths.
 
     (lines,) power in dB, the mean over blocks of their changes, whatever the gain of depths is; and (lines, blocks) the
     width of the beam, from the correlation between a line and the next one, exp(-d^2 / 4 sigma^2) for Gaussian beams a

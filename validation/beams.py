@@ -229,7 +229,7 @@ def _band_power(frame, probe, depth_mm: float) -> float:
 
 
 def compounding(rotation: np.ndarray, device) -> Outcome:
-    """The thin bar in volumes compounded from a slide, a tilt (as of a matrix array) and a freehand sweep."""
+    """The thin bar in volumes compounded from a slide, a tilt (as by a matrix array) and a freehand sweep."""
     depth, width = 30.0, 1.2
     phantom = thin_rod(rotation, depth_mm=depth, width_mm=width)
     settings = SimulationSettings(scatterers_per_mm3=300.0)

@@ -107,8 +107,8 @@ def tissue_maps(name: str) -> TissueMaps | None:
     colin27: an average of 27 scans of one person (Holmes et al., J. Comput. Assist. Tomogr. 22(2), 1998), from Debian's
     mricron-data. No share maps are published with it, so that they come from its intensity, which has little noise:
     linear between the means of CSF, grey and white matter, pure beyond the outer two. A phantom of it has the anatomy
-    of one person, and its truth depends on none of the methods that are judged by it. It is no truth about that
-    person: what is between grey and white in intensity, such as deep nuclei, is partly white here.
+    of one person, and its truth depends on none of the methods that are judged by it. It is not the truth about
+    that person: what is between grey and white in intensity, such as deep nuclei, is partly white here.
 
     Raises SimulationError for another name.
     """
@@ -191,7 +191,7 @@ class BrainPhantom:
     name: str
     #: float32, 0 outside the brain
     mri: Volume
-    #: uint8, 1 where tissues are looked for
+    #: uint8, 1 in the region to segment
     mask: Volume
     #: uint8, the label in TISSUES with the largest share, within the mask; 0 outside and where it is not known
     truth: Volume

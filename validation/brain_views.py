@@ -33,7 +33,7 @@ class EvenBrain:
 def even_brains(device=None, **acoustics: float) -> list[EvenBrain]:
     """The MNI152 template and, if Debian's mricron-data is installed, Colin27.
 
-    There is no membrane. `acoustics` are further values for all tissues, such as attenuation_db_cm_mhz=0.0.
+    The table has no membrane. `acoustics` are further values for all tissues, such as attenuation_db_cm_mhz=0.0.
     """
     mris = {"MNI152": demo_mri()[0]}
     colin27 = COLIN27 / "ch2bet.nii.gz"

@@ -54,7 +54,7 @@ def motion(kind: str, distance_mm: float, depth_mm: float) -> np.ndarray:
 
 
 def changes(simulator: UltrasoundSimulator, probe: Probe, pose: np.ndarray, kind: str) -> np.ndarray:
-    """(3,) RMS change of the signal over the steps, re its RMS."""
+    """(3,) RMS change of the signal over the steps, relative to its RMS."""
     frames = [simulator.simulate(probe, pose @ motion(kind, mm, probe.depth_mm), EVEN) for mm in (0.0, *STEPS_MM)]
     here, *there = (frame.iq[:, int(_AT_FACE_MM / frame.sample_interval_mm) :] for frame in frames)
     return np.sqrt([(np.abs(moved - here) ** 2).mean() / (np.abs(here) ** 2).mean() for moved in there])

@@ -62,7 +62,7 @@ class CtPhantom:
     ct: Volume
     #: uint8, labels of NAMES from 1; 0 outside the patient
     truth: Volume
-    #: int16, label map in TotalSegmentator's numbers of what it knows of this phantom
+    #: int16, label map in TotalSegmentator's numbers of what it labels in this phantom
     organs: Volume
 
 
@@ -169,7 +169,7 @@ def _both(a: Shape, b: Shape) -> Shape:
 
 
 def _facing(normal_xy: tuple[float, float], point_xy: tuple[float, float], sign: float) -> Shape:
-    """What lies half a joint's width beyond a plane along z."""
+    """Everything from half a joint's width beyond a plane along z."""
     n = np.array(normal_xy) / np.hypot(*normal_xy)
     return Shape(
         lambda x, y, z: _JOINT_MM / 2.0 - sign * ((x - point_xy[0]) * n[0] + (y - point_xy[1]) * n[1]) + 0.0 * z

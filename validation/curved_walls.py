@@ -31,7 +31,7 @@ _GRIDS, _MEAN_DB = 6, 2.5
 
 
 def _expected_db(shape: str, radius_mm: float) -> float:
-    """Echo re a plane: of either axis in which it is bent, (1 + q^2 s^4)^(-1/4), q the phase per squared millimetre."""
+    """Echo relative to a plane: per bent axis (1 + q^2 s^4)^(-1/4), q the phase per squared millimetre."""
     q = 2.0 * np.pi * _PROBE.cycles_per_mm / radius_mm
     lateral, elevational = _PROBE.beam_sigma_mm(_DEPTH_MM)
     bent = {"ball": (lateral, elevational), "rod across the image": (lateral,), "rod in the image": (elevational,)}
@@ -66,7 +66,7 @@ def curved_walls(rotation: np.ndarray, device) -> Outcome:
             rows.append(Row(f"lowest, {what}", "dB", expected, float(np.min(levels)), loss, "at least"))
         at = np.array(list(radii), float)
         curves.append(Curve(f"{shape}, {spacing:g} mm", at, np.array(means), at, np.array(predictions)))
-    plot = Plot("bent walls", "radius [voxels]", "echo re a plane [dB]", curves)
+    plot = Plot("bent walls", "radius [voxels]", "echo relative to a plane [dB]", curves)
     return Outcome(tuple(rows), partial(draw_plots, plots=[plot]))
 
 

@@ -38,7 +38,7 @@ _SMALL_PROBES = ("convex", "phased", "linear")
 #: Voxels of 1 mm beside the axis at which planes end, out of the image plane, by the turn of the voxels in degrees
 _ENDS = {0.0: (14.0, 18.0, 22.0, 26.0, 30.0, 36.0, 42.0), 2.0: (26.0, 30.0, 36.0, 42.0)}
 
-#: Planes tilted by so much to the beam: the level along them does not vary by more dB
+#: Tilt of planes to the beam, and the largest variation of the level along them in dB
 _TILT_DEG, _VARIATION_DB = 5.0, 3.0
 
 #: Layers of voxels at right angles to diagonals, and degrees by which planes are turned from them. The steps of one
@@ -106,13 +106,13 @@ def turned_planes(rotation: np.ndarray, device) -> Outcome:
 
 
 def _lowest_facing(along: np.ndarray, straight: np.ndarray) -> float:
-    """The lowest of levels in dB by line, re those of a straight plane, of the lines that it faces."""
+    """The lowest of levels in dB by line, relative to a straight plane, of the lines that it faces."""
     facing = straight > np.nanmax(straight) - 0.7
     return float(np.min((along - straight)[facing], initial=np.inf))
 
 
 def planes_in_small_maps(rotation: np.ndarray, device) -> Outcome:
-    """Planes that face the beam in maps of 80 x 66 x 52 voxels, re those on a face of voxels that are not turned."""
+    """Planes that face the beam in maps of 80 x 66 x 52 voxels, relative to planes along the voxels."""
     probes = {name: replace(PROBES[name], frequency_mhz=5.0, band_mhz=None) for name in _SMALL_PROBES}
     normal = np.array([0.0, 1.0, 0.0])
     random = np.random.default_rng(round(1e6 * Rotation.from_matrix(rotation).magnitude()))
@@ -286,7 +286,7 @@ def _cut(phantom: Phantom, from_end: int) -> tuple[Volume, TissueTable]:
     kept[2 - axis] = slice(first, None)
     matrix = labels.ijk_to_ras.copy()
     matrix[:3, 3] += first * matrix[:3, axis]
-    # The fluid goes on beyond the end.
+    # The fluid continues beyond the end.
     return Volume(np.ascontiguousarray(labels.array[tuple(kept)]), matrix), TissueTable({**phantom.tissues, 0: FLUID})
 
 

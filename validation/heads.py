@@ -93,7 +93,7 @@ def _width_rows(kind: str, image: np.ndarray, ray: np.ndarray, wave: np.ndarray)
 def _waves(brain: EvenBrain, probe: Probe, pose: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """From wave propagation in the image plane: level, twice the one-way power near the line, and width of the beam.
 
-    (lines,) in dB twice, and (lines, blocks) re an undisturbed beam.
+    (lines,) in dB twice, and (lines, blocks) relative to an undisturbed beam.
     """
     extra = np.zeros(256, np.float32)  # of the path, per length
     for label, tissue in brain.tissues.items():

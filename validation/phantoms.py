@@ -57,7 +57,7 @@ class Echo:
 class EchoLevel(Echo):
     """Prediction: an echo at this position of the image, with its level."""
 
-    #: In dB re the first echo of the phantom
+    #: In dB relative to the first echo of the phantom
     level_db: float
 
 
@@ -123,7 +123,7 @@ def band_power(probe: Probe, loss_db) -> np.ndarray:
 
     A sum over 800 positive frequencies of the Gaussian band that is received, each attenuated by itself.
     """
-    sigma = probe.received_bandwidth / FWHM_PER_SIGMA  # re the centre
+    sigma = probe.received_bandwidth / FWHM_PER_SIGMA  # relative to the centre
     lowest, highest = max(1.0 - 8.0 * sigma, 0.0), 1.0 + 4.0 * sigma
     frequency = lowest + (np.arange(800) + 0.5) / 800 * (highest - lowest)
     power = np.exp(-(((frequency - 1.0) / sigma) ** 2))
@@ -259,7 +259,7 @@ def parallel_plates(
         rotation,
         spacing_mm,
         expected,
-        # Plates go on beyond the widest Gaussian that places them.
+        # Plates extend beyond the widest Gaussian that places them.
         box=_Box(half_width=20.0, half_thickness=max(6.0, 20.0 * spacing_mm)),
     )
 
@@ -425,7 +425,7 @@ def round_cyst(rotation: np.ndarray | None = None, *, depth_mm: float = 40.0, ra
 
 
 def clutter_power(probe: Probe, depth_mm: float, radius_mm: float, within_mm: float = 0.0) -> float:
-    """Power received from outside a disc across the beam at a depth, re that of everything; without attenuation.
+    """Power received from outside a disc across the beam at a depth, relative to all power; without attenuation.
 
     It is that of lines through the centre of the disc, or the mean of those within `within_mm` of it laterally.
 

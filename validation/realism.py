@@ -77,7 +77,7 @@ Table: TypeAlias = tuple[str, list[str], list[list[str]]]
 _MOST_IMAGES = 6
 #: Names of the sources that are always there
 REAL, BLURRED, LEVELLED = "real", "real, blurred", "uniform, real level"
-#: Between which the gain of the uniform control is looked for
+#: Bounds of the gain of the uniform control
 _GAINS_DB = -80.0, 80.0
 _CONTROLS = (REAL, NEIGHBOURS, BLURRED, UNIFORM, LEVELLED)
 #: Sigma of the blurred control, pixels
@@ -95,7 +95,7 @@ def control_named(name: str, reference: str) -> str:
 
 @dataclass(frozen=True, eq=False)
 class Looks:
-    """What the images of one source are like."""
+    """Statistics of the images of one source."""
 
     #: One per depth
     widths: list[SpeckleWidth]
@@ -232,7 +232,7 @@ def measure_realism(
     simulator : its labels say which pixels are of which tissue, and where sheets and walls are; it also simulates the
         uniform tissue.
     neighbours : per real image, other real images near it (neighbours_of); none: without that control.
-    display : of the uniform tissue, but for its gain.
+    display : of the uniform tissue, except for its gain.
 
     Raises SimulationError for numbers or shapes that differ, and for a name of a control.
     """

@@ -34,7 +34,7 @@ _MEMBRANE = Membrane(replace(_PIA, speed_of_sound_m_s=FLUID.speed_of_sound_m_s),
 _TILTS_DEG = (0.0, 4.0, 8.0)
 #: Roughness in units of 1 / 2k, so that every frequency loses as much: exp(-x^2) of the power at normal incidence
 _PHASES = (0.5, 1.0, 1.5)
-#: Full-wave simulation of rough planes, 2.5 MHz, f/2: lowest and highest level re a smooth one in dB, by rms height
+#: Full-wave simulation, 2.5 MHz, f/2: {rms height of a rough plane: lowest, highest level relative to a smooth one}
 _FULL_WAVE = {0.1: (-7.0, -4.0), 0.2: (-14.0, -10.0)}
 _FULL_WAVE_PROBE = LinearProbe(12.0, 32.0, scan_lines=97, frequency_mhz=2.5, focus_mm=_DEPTH_MM, aperture_mm=12.5,
                                receive_f_number=2.0, elevation_focus_mm=_DEPTH_MM)  # fmt: skip
@@ -114,14 +114,14 @@ def coherent_part(rotation: np.ndarray, device) -> Outcome:
                 phases = np.array(_PHASES)
                 curves.append(Curve(f"{what}, {where}", phases, lost[:, 0], phases, predicted[:, 0]))
     rows += _diffuse_rows(*objects["border"][1:], device)
-    plot = Plot("coherent part", "2 k s", "re a smooth sheet [dB]", curves)
+    plot = Plot("coherent part", "2 k s", "relative to a smooth sheet [dB]", curves)
     return Outcome(tuple(rows), partial(draw_plots, plots=[plot]))
 
 
 def _diffuse_rows(phantom: Phantom, tissues: TissueTable, device) -> list[Row]:
     """Of a border with a membrane whose scatterers echo: what is the same for all seeds and lines is its coherent part.
 
-    The rest, whose mean is none, does not depend on the height of the surface.
+    The rest has mean 0 and does not depend on the height of the surface.
     """
     probe = replace(_FULL_WAVE_PROBE, frequency_mhz=5.0)
     rows, smooth = [], np.zeros(2)
@@ -161,7 +161,7 @@ def _surface(seed: int, rms_mm: float, step_mm: float = 0.01) -> np.ndarray:
 
 
 def _kirchhoff_db(heights: np.ndarray, step_mm: float, probe: LinearProbe, lateral_mm: np.ndarray) -> np.ndarray:
-    """(lines,) peak re a smooth plane: every element of the surface echoes from its own depth, weighted by the beam."""
+    """(lines,) peak relative to a smooth plane: each surface element echoes from its depth, weighted by the beam."""
     at = step_mm * (np.arange(len(heights)) - 0.5 * (len(heights) - 1))
     sigma, _ = probe.beam_sigma_mm(_DEPTH_MM)
     depth = np.arange(-1.5, 1.5, 0.02)[:, None]

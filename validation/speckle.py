@@ -271,7 +271,7 @@ def one_line_on(probe: Probe) -> np.ndarray:
 
 
 def uneven(rotation: np.ndarray, device) -> Outcome:
-    """The level of a tissue whose echogenicity varies, re the same scatterers without."""
+    """The level of a tissue whose echogenicity varies, relative to the same scatterers without variation."""
     rows = []
     for name, changes in {
         "texture 3.5 dB, 0.8 mm": {"texture_db": 3.5, "texture_mm": 0.8},

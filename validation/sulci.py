@@ -116,7 +116,7 @@ CHECKS = (
     Check(
         "thin sulci",
         "A sulcus of one to two voxels is one rough sheet: it fades with the angle of incidence as a wall does, in any "
-        "grid; a falx by Lambert's law, but for a tenth of its power.",
+        "grid; a falx by Lambert's law, except for a tenth of its power.",
         thin_sulci,
     ),
 )

@@ -45,7 +45,7 @@ def focal_zones(rotation: np.ndarray, device) -> Outcome:
             theory = MAIN_LOBE * probe.wavelength_mm * f_number / np.sqrt(2.0)
             rows.append(Row(f"lateral FWHM at {depth} mm, {name}", "mm", theory, width, 0.15 * theory))
             if depth == 10:
-                rows.append(Row(f"re one focus, {name}", "", 0.85, width / wide[depth], 0.0, "at most"))
+                rows.append(Row(f"relative to one focus, {name}", "", 0.85, width / wide[depth], 0.0, "at most"))
     return Outcome(tuple(rows))
 
 
@@ -165,7 +165,7 @@ def _level_of_elements_db(probe: Probe, sines: np.ndarray) -> float:
 
 
 def harmonic(rotation: np.ndarray, device) -> Outcome:
-    """Width of a wire re the fundamental, frequency, and level against depth in the quasi-linear solution."""
+    """Width of a wire relative to the fundamental, frequency, and level against depth in the quasi-linear solution."""
     simulator, phantom = _wires(rotation, device)
     tissue = uniform_speckle(SPECKLE, rotation)
     speckle = [
@@ -178,18 +178,18 @@ def harmonic(rotation: np.ndarray, device) -> Outcome:
         widths = [_wire_widths(simulator, phantom, replace(p, scan_lines=_FINE))[30] for p in (fundamental, second)]
         # At equal f-numbers: transmitted twice at half the frequency, received once at the whole.
         ratio = np.sqrt(2.0 / 6.0)
-        rows.append(Row(f"width of a wire re the fundamental, {name}", "", ratio, widths[1] / widths[0], 0.1 * ratio))
+        rows.append(Row(f"width of a wire over that at f0, {name}", "", ratio, widths[1] / widths[0], 0.1 * ratio))
         frames = [s.simulate(second, tissue.probe_to_ras, DisplaySettings(look="even", noise_db=None)) for s in speckle]
         windows = [depth_window(frame, 30.0, 8.0) for frame in frames]
         turn = sum((w[:, 1:] * w[:, :-1].conj()).sum() for w in windows)
         carrier = frames[0].cycles_per_mm + float(np.angle(turn)) / (2 * np.pi * frames[0].sample_interval_mm)
-        rows.append(Row(f"frequency re the pulse's, {name}", "", 2.0, carrier / fundamental.cycles_per_mm, 0.02))
+        rows.append(Row(f"frequency over the pulse's, {name}", "", 2.0, carrier / fundamental.cycles_per_mm, 0.02))
         depths = np.array([4.0, 8.0, 15.0, 30.0, 45.0])
         found = np.array([level_db(np.stack([depth_window(f, d, 1.0) for f in frames])) for d in depths])
         theory = _level_of_equal_foci(second, depths)
         found, theory = found - found[3], theory - theory[3]
         rows += [
-            Row(f"level at {depth:.0f} mm re the focus, {name}", "dB", t, f, 1.2)
+            Row(f"level at {depth:.0f} mm relative to the focus, {name}", "dB", t, f, 1.2)
             for depth, t, f in zip(depths, theory, found, strict=True)
             if depth != 30.0
         ]

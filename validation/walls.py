@@ -19,7 +19,7 @@ from validation.phantoms import FLUID, Phantom, layered, reflection_coefficient,
 from validation.pictures import Curve, Plot, draw_plots
 
 _DEPTH_MM = 25.0
-#: Levels re a perpendicular wall in dB: predictions hold down to the first; what is predicted below it stays below the
+#: Levels in dB relative to a perpendicular wall: predictions hold down to the first; below it, levels stay below the
 #: second
 _FLOOR_DB, _CEILING_DB = -30.0, -28.0
 _SETTINGS = SimulationSettings(scattering=False, specular_exponent=0.0)
@@ -41,7 +41,7 @@ _FULL_WAVE_PROBE = LinearProbe(36.0, 40.0, scan_lines=145, focus_mm=_DEPTH_MM, a
 
 def _wall(rotation: np.ndarray, device, depth_mm: float = _DEPTH_MM) -> tuple[UltrasoundSimulator, Phantom]:
     phantom = layered([FLUID, BEHIND], [depth_mm], rotation, spacing_mm=0.15, half_width_mm=12.0)
-    # The fluid goes on around the phantom, which is narrower than some apertures.
+    # The fluid continues around the phantom, which is narrower than some apertures.
     tissues = TissueTable({**phantom.tissues, 0: FLUID})
     return UltrasoundSimulator(phantom.labels, tissues, _SETTINGS, device), phantom
 
@@ -137,7 +137,7 @@ def sheets(rotation: np.ndarray, device) -> Outcome:
         back = (1 - r * r) * np.exp(-2j * np.pi * probe.cycles_per_mm * thickness)
         echo = np.exp(-0.5 * (depth / sigma) ** 2) - back * np.exp(-0.5 * ((depth - thickness) / sigma) ** 2)
         predicted = float(20 * np.log10(np.abs(echo).max()))
-        rows.append(Row(f"sheet of {thickness:g} mm re one border", "dB", predicted, float(measured), 2.0))
+        rows.append(Row(f"sheet of {thickness:g} mm relative to one border", "dB", predicted, float(measured), 2.0))
     return Outcome(tuple(rows))
 
 

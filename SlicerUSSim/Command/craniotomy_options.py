@@ -31,7 +31,7 @@ class Craniotomy:
 
     @classmethod
     def of(cls, text: str) -> Craniotomy:
-        """Raises SimulationError for a value that is none of those, or a file that is not there."""
+        """Raises SimulationError for an unknown value and for a file that does not exist."""
         if text in (NONE, AUTO):
             return cls(text)
         if text.startswith(DISC):

@@ -31,14 +31,10 @@ def dataset(
     ctx: click.Context, recipe: str, out: Path, scheduler: str | None, workers: int | None, export: str | None,
     device: str | None,
 ) -> None:  # fmt: skip
-    """Make many labelled images from a recipe.
+    """Make many labelled images from a recipe, a TOML file or the name of one in the package.
 
-    RECIPE is a file in TOML (docs/datasets.md), or the name of one that comes with the package: brain-tumour,
-    denoising, mri-registration, standard-views or ventricles.
-
-    Image n is the same whoever makes it. The same command goes on with a set that was interrupted: docs/scale.md.
-
-    The exit status is 1 if a patient was left out.
+    Image n is the same whoever makes it. The same command resumes an interrupted set. The exit status is 1
+    if a patient was left out.
     """
     from SlicerUSSim.Logic.datasets import Recipe, export_coco, export_nnunet, make_dataset
     from SlicerUSSim.Logic.datasets.reader import labels_to_export

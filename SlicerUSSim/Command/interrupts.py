@@ -81,7 +81,7 @@ def _send_to_main(number: int) -> None:
 def _end_even_in_kernels() -> None:
     """End the process at a signal also while it waits for a kernel, where Python's handlers do not run.
 
-    A thread is told of every signal. If the handler has not run some seconds later, the main thread is in a library,
+    A thread sees every signal. If the handler has not run some seconds later, the main thread is in a library,
     and the process ends at once: files are replaced whole or not at all, and the next run removes what is left beside
     them.
     """

@@ -117,8 +117,8 @@ class ImageOptions(MriOptions):
     #: Kinds that are not drawn
     no_sheets: tuple[str, ...] = declared(
         "--no-sheet", multiple=True, metavar="KIND",
-        help="What --sheets leaves as the labels have it: sulcus, falx, tentorium, ependyma, corpus callosum, choroid "
-        "plexus or vessels; may be repeated.",
+        help="Kind that --sheets omits: sulcus, falx, tentorium, ependyma, corpus callosum, choroid plexus, "
+        "vessels; may be repeated.",
     )  # fmt: skip
 
 
@@ -146,7 +146,7 @@ def require_no_map(path: str, maps: Iterable[str], organs: str | None) -> None:
 def segmented_file(
     path: str, mri: Volume, patient: MriOptions, *, tell_all: bool = False, is_file: bool = True
 ) -> Segmentation | CtSegmentation:
-    """Segment the MRI or CT of a file; the brain mask of an MRI is kept beside it, unless it is none (`is_file`).
+    """Segment the MRI or CT of a file; the brain mask of an MRI is kept beside it if the MRI is a file (`is_file`).
 
     Says how the brain was found, with `tell_all` also what else; what should be checked is logged as warnings.
     """
@@ -228,8 +228,8 @@ def read_mri(path: str, patient: MriOptions, *, is_served: bool = False) -> Volu
         except SimulationError:  # simulate says what its labels need
             what = f"{np.unique(volume.array[volume.array != 0]).size} labels"
         raise SimulationError(
-            f"{path}: is a label map ({what}), expected an MRI; use it as it is ({used_by}), or segment it all the "
-            "same with --skull-strip none"
+            f"{path}: is a label map ({what}), expected an MRI; use it directly ({used_by}), or segment it "
+            "nevertheless with --skull-strip none"
         )
     return volume
 

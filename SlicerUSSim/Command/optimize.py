@@ -35,7 +35,7 @@ class Results:
     )
     save_transform: Path | None = declared(  # noqa: RUF009
         "--save-transform", type=click.Path(path_type=Path), help="With --register: the refined map from the "
-        "ultrasound's reference frame to the MRI, whole, as --to-mri takes it: .json",
+        "ultrasound's reference frame to the MRI, in the format of --to-mri: .json",
     )  # fmt: skip
 
 

@@ -68,7 +68,7 @@ def untrusted_option(command: click.Command, *, hidden: bool = False) -> click.C
     command.params.append(
         click.Option(
             ["--untrusted"], is_flag=True, expose_value=False, callback=_trust_nothing, hidden=hidden,
-            help="Read every file in a process of its own, with limits on time and memory: for files of strangers."
+            help="Read every file in a separate process, with limits on time and memory: for untrusted files."
         )
     )  # fmt: skip
     return command

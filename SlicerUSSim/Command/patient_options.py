@@ -131,7 +131,7 @@ def named_probe(name_or_path: str) -> Probe:
     if name_or_path in PROBES:
         return PROBES[name_or_path]
     place = Path(name_or_path)
-    wrong = f"--probe is {name_or_path!r}, which is no file, expected a JSON file or one of {', '.join(PROBES)}"
+    wrong = f"--probe is {name_or_path!r}, which does not exist, expected a JSON file or one of {', '.join(PROBES)}"
     require(place.exists() or bool(place.suffix) or os.path.dirname(name_or_path) != "", wrong)
     return probe_from_dict(read_json(name_or_path), name_or_path)
 
@@ -216,7 +216,7 @@ def open_examination(
     if table is not None:
         found = set(table.names()) & set(tissues.names())
         expected = f"expected tissues called {', '.join(added.tissue_names)}"
-        require(bool(found - {"coupling"}), f"{patient.tissues}: has none of the patient's tissues, {expected}")
+        require(bool(found - {"coupling"}), f"{patient.tissues}: lacks the patient's tissues, {expected}")
     tissues = with_their_tissue(tissues, surfels, known)
     texture = texture_below(segmentation.texture(), volume, segmentation.labels, added.labels)
     tissues = changes.to_tissues(tissues)
@@ -274,7 +274,7 @@ def _placed(
             at = middle_of(added.labels, labels)
         target = added.centre_ras(before)
         if pose == AUTO and not set(names) & {*BRAIN_TISSUES, "brain"}:
-            note("--pose is auto, and no tissue of a brain is labelled: the probe stands on top of what is")
+            note("--pose is auto, and no tissue of a brain is labelled: the probe is placed on top of the others")
         if at is not None and pose == AUTO:
             from SlicerUSSim.Logic.placement.aiming import opening_pose
 
@@ -347,7 +347,7 @@ def _labelled(
     found = read_label_file(
         Path(patient.mri_or_labels), volume, mapping, table=table, preset=given, default=preset
     )  # fmt: skip
-    if found.has_own_table:  # as `ussim segment` wrote it: nothing to be said
+    if found.has_own_table:  # as `ussim segment` wrote it: nothing to report
         log.info("%s: %s", patient.mri_or_labels, found.message)
     else:
         note(f"{patient.mri_or_labels}: {found.message}")

@@ -30,7 +30,7 @@ def note(text: str) -> None:
 class Share:
     """A progress bar during its `with` block, if stderr is a terminal. It is called with the fraction done, 0 to 1.
 
-    In a file or a pipe, what takes long is told in a line after 2 s, 4 s, 8 s and so on: eight lines in ten minutes.
+    In a file or a pipe, long work writes a line after 2 s, 4 s, 8 s and so on: eight lines in ten minutes.
     """
 
     def __init__(self, name: str) -> None:

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 seed_option = click.option(
     "--seed", "seeds", multiple=True, metavar="R,A,S|FILE[=TISSUE]",
     help="Grow the lesion around a point, RAS mm in the frame of the MRI, or around each point of a file of 3D "
-    "Slicer (.mrk.json): masks beside the labels, which stay as they are, each in a smaller and a larger "
+    "Slicer (.mrk.json): masks beside the unchanged labels, each in a smaller and a larger "
     "version; --add lays them over. With a tissue (tumour, oedema, necrosis, cyst, haematoma, cavity, enhancing) it "
     "is called that. May be repeated.",
 )  # fmt: skip
@@ -30,7 +30,7 @@ def split_seeds(texts: Iterable[str]) -> list[tuple[tuple[float, ...], str | Non
     """[((R, A, S) mm, tissue)] of the values of --seed, one for each point; None for the tissue: by its look.
 
     Raises SimulationError for a value that is not R,A,S or a file of points, without or with =TISSUE, and for a tissue
-    that is no lesion.
+    that is not a lesion.
     """
     seeds = []
     for text in texts:
@@ -92,13 +92,13 @@ def grown_at(segmentation: Segmentation, seeds: Iterable[str]) -> tuple[list[Gro
 def require_none_refused(refused: Iterable[str], labels_path: Path) -> None:
     """Raise SimulationError with the lines of refused seeds, when labels and the other lesions are written."""
     lines = "; ".join(refused)
-    require(not lines, f"{lines}; {labels_path} is written, with all that was not refused")
+    require(not lines, f"{lines}; {labels_path} is written, with all lesions that were not refused")
 
 
 def write_lesions(lesions: Iterable[GrownLesion], labels_path: Path) -> None:
     """Write the masks of lesions beside the labels, and say what they are and how to apply them.
 
-    Those of an earlier run that stay beside the labels are named.
+    A warning lists files of an earlier run that stay beside the labels.
     """
     from SlicerUSSim.Logic.mri.lesions.grown_lesion import grown_beside
 

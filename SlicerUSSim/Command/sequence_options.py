@@ -26,7 +26,7 @@ class TrackingOptions:
 
     transform: str = declared(
         "--transform", default="ImageToReference", show_default=True,
-        help="Transform from pixels to the patient's frame; composed of the transforms in the sequence.",
+        help="Transform from pixels to the patient's frame, composed from the transforms in the sequence.",
     )  # fmt: skip
     calibration: str | None = declared(
         "--calibration", type=click.Path(),
@@ -60,11 +60,9 @@ class SequenceOptions(TrackingOptions):
         "--cut", type=click.Path(), help="For a volume: file with the pose at which the image plane of a probe is "
         "extracted, and neighbouring planes",
     )  # fmt: skip
-    cut_tilt: float | None = declared(
-        "--cut-tilt", type=float, help="These are tilted over this total angle in degrees"
-    )
+    cut_tilt: float | None = declared("--cut-tilt", type=float, help="Total tilt of these planes in degrees")
     cut_slide: float | None = declared(
-        "--cut-slide", type=float, help="They are slid over this total distance in millimetres"
+        "--cut-slide", type=float, help="Total distance between these planes in millimetres"
     )
     cuts: int = declared("--cuts", type=click.IntRange(1), default=3, help="Number of these planes (default: 3)")
     field: Path | None = declared(  # noqa: RUF009, a dataclasses.field like the others

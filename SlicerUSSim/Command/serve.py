@@ -34,7 +34,7 @@ _OF_PATIENT = (
     "labels", "maps", "sequence", "calibration", "to_mri", "preset", "outside", "mask", "also", "additions", "organs",
     "craniotomy",
 )  # fmt: skip
-#: Suffixes of files that are no images, and that the page opens
+#: Suffixes of files other than images that the page opens
 _TEXTS = (".json", ".vtp", ".tfm", ".h5", ".hdf5", ".mat", ".xfm", ".xml", ".tag", ".txt")
 
 
@@ -68,7 +68,7 @@ class ServeOptions(ImageOptions):
     )
     autosave: bool = declared(
         "--autosave/--no-autosave", default=True, show_default=True, envvar="USSIM_AUTOSAVE", show_envvar=True,
-        help="Keep pose, settings and the names of files in a file of yours, to go on with after a restart; see "
+        help="Keep pose, settings and the names of files in a private file, to resume after a restart; see "
         "docs/security.md.",
     )  # fmt: skip
     igtl_device: str | None = declared(

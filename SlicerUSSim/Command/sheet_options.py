@@ -23,7 +23,7 @@ sheets_option = click.option(
     help="Also find sulci, falx, tentorium and walls of ventricles as surfaces and write them to FILE, a .vtp "
     "for Slicer; corpus callosum, choroid plexus and vessels are laid over the labels. T1, T1 with contrast, or T2.",
 )  # fmt: skip
-#: Value of --sheets that is no file, as NONE
+#: Value of --sheets that is not a file, like NONE
 AUTO = "auto"
 
 
@@ -56,7 +56,7 @@ class DrawnSheets:
                 Path(source).is_file(), f"--sheets is {source!r} (no such file), expected a .vtp file, {AUTO} or {NONE}"
             )
             for kind in dict.fromkeys(kind for kind in without if kind not in KINDS):
-                note(f"no_sheets {kind} leaves nothing out: it is no sheet of {source} but a label, where there is one")
+                note(f"no_sheets {kind} has no effect: sheets of {source} do not include it; the labels may")
             whole = read_surfels(source)
             return cls(source, kinds, whole.of_kind(*(set(KINDS) & set(kinds))))
         require(not is_labels, "--sheets is auto, and a label map has no sheets, expected a .vtp or an MRI")
@@ -66,7 +66,7 @@ class DrawnSheets:
     def found(
         self, mri_path: str, mri: Volume, segmentation: Segmentation, contrast: str
     ) -> tuple[Surfels | None, Volume, tuple[str, ...]]:
-        """(Sheets of an MRI, its labels, their names with the structures on top). Looked for once, all are kept."""
+        """(Sheets of an MRI, its labels, their names with the structures on top). One search keeps all."""
         if self.source != AUTO or not self.kinds:
             return self.read, segmentation.labels, segmentation.tissue_names
         return _searched(mri_path, mri, segmentation, contrast, self.kinds)

@@ -1,6 +1,6 @@
 """The public interface: `from SlicerUSSim.Logic import UltrasoundSimulator`.
 
-One room per subject, each with a face of its own: base, opencl, probe, tissue, tracked, mri, placement, imaging,
+One room per subject, each with its own face: base, opencl, probe, tissue, tracked, mri, placement, imaging,
 datasets, fitting, vtk, mrml. Names are imported when they are first used, so that importing this package costs nothing.
 """
 

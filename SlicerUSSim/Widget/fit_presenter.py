@@ -37,7 +37,7 @@ class FitPresenter:
         self.following: Callable[[Progress], None] = lambda step: None
 
     def forget(self) -> None:
-        """Forget the last fit, which is of another patient."""
+        """Forget the last fit, which belongs to another patient."""
         self._fit = self._before = None
         self.summary = ""
 
@@ -83,7 +83,7 @@ class FitPresenter:
         with panel.acting(), panel.working(_("Fit")) as progress:
             require(parameters.real is not None, "no real images chosen, expected a sequence or a volume")
             free = list(self._groups())  # "tissues" as such: the fit looks which the images show
-            require(bool(free), "nothing is free, tick at least one parameter")
+            require(bool(free), "no parameter is free; tick at least one")
             plot = CostPlot(panel.logic.scene)
             panel.view.showChart(plot.chart)
 
@@ -130,7 +130,7 @@ class FitPresenter:
     def _canChange(self, met: bool, why_not: str) -> tuple[bool, str]:
         labels: Any = None if self._fit is None else self._fit[1]
         is_chosen = labels is not None and labels is self._panel.parameters.labels
-        text = _("The fit is of {name!r}; choose these tissues")
+        text = _("The fit belongs to {name!r}; choose these tissues")
         other = "" if labels is None else text.format(name=labels.GetName())
         return self._panel.ready((self._fit, _("Fit to real images first")), (is_chosen, other), (met, why_not))
 

@@ -16,7 +16,7 @@ from SlicerUSSim.Widget.interface import PanelHost, tr as _
 from SlicerUSSim.Widget.notes import Notes
 from SlicerUSSim.Widget.placement_presenter import PlacementPresenter
 
-#: What is said of an image that does not follow the probe any more
+#: State of an image that no longer follows the probe
 FROZEN = "FROZEN"
 
 
@@ -206,11 +206,11 @@ class ImagePresenter:
         return parameters
 
     def _own(self, chosen: Any, kind: str, name: str) -> Any:
-        """The chosen node, or a new one if none is chosen or it has data of others, which the notes say."""
+        """The chosen node, or a new one if none is chosen or it has other data, which the notes report."""
         if chosen is not None and self._panel.logic.mayReplaceResult(chosen):
             return chosen
         node = self._panel.add(kind, name)
         put_beside(node, self._panel.parameters.labels)
         if chosen is not None:
-            self._notes.add(f"{chosen.GetName()!r} has data of others and is kept; the result is {node.GetName()!r}")
+            self._notes.add(f"{chosen.GetName()!r} has other data and is kept; the result is {node.GetName()!r}")
         return node

@@ -61,7 +61,7 @@ class Control:
     #: Source of the displayed value or text, unless it is a declared value; and what takes the one that a user enters
     shows: Callable[[], Any] | None = None
     sets: Callable[[Any], object] | None = None
-    #: Called when a button is pressed, unless the view has an action of its own in place of it
+    #: Called when a button is pressed, unless the view has its own action instead
     action: Callable[[], object] | None = None
     #: Whether it can be used; None: always, and without additional packages
     enabled: Can | None = None
@@ -178,13 +178,13 @@ class PanelView(Protocol):
 
 #: Options of the command in messages, and what a panel has for them
 _IN_PANEL = (
-    (r"label the whole head \(--outside\)", "tick Label what is outside the brain and press Segment"),
+    (r"label the whole head \(--outside\)", "tick Label tissues outside the brain and press Segment"),
     (r" ?\((?:--|ussim )[^()]*\)", ""),
     (r"--map (\d+)=TISSUE", r"the name of a tissue for \1 in its colour table"),
     (r"--map [^\s=]+=(?:'[^']*'|\S+)(?: --map [^\s=]+=(?:'[^']*'|\S+))*", "names of its tissues"),
     (r"--map (\S+)", r"names of \1"), (r"--add [^\s,;]+", "Add to tissues"), (r"--skull-strip", "Brain extraction"),
     (r"--contrast", "Contrast"), (r"--mask", "Brain mask"), (r"--organs", "Organs of a CT"),
-    (r"--outside", "Label what is outside the brain"), (r"--craniotomy", "Open skull"),
+    (r"--outside", "Label tissues outside the brain"), (r"--craniotomy", "Open skull"),
 )  # fmt: skip
 
 

@@ -20,7 +20,7 @@ class LesionPresenter:
         self.forget()
 
     def forget(self) -> None:
-        """Forget the lesion that was grown last, which is of another patient."""
+        """Forget the lesion that was grown last, which belongs to another patient."""
         self._grown: tuple[Any, list[str]] = (None, [])  # node and IDs of the segments
 
     def canAddTissues(self) -> tuple[bool, str]:
@@ -72,7 +72,7 @@ class LesionPresenter:
             self._panel.view.pickPoint(parameters.seed, self.growAtPoint)
 
     def growAtPoint(self) -> None:
-        """Add the lesion around the last point of the chosen markups to the lesions; the tissues stay as they are."""
+        """Add the lesion around the last point of the chosen markups to the lesions; the tissues do not change."""
         parameters, growth = self._panel.parameters, self._panel.logic.growth
         with self._panel.acting(), self._panel.working(_("Grow lesion")):
             chosen = parameters.panel

@@ -227,7 +227,7 @@ class Panel:
             setattr(self.logic.parameters, control.node, chosen)
 
     def nodeGoes(self, node: Any) -> None:
-        """Called before a node is removed from the scene, and before its selectors hear of it."""
+        """Called before a node is removed from the scene, and before its selectors see the removal."""
         self._removed = node
 
     def nodeGone(self) -> None:

@@ -80,12 +80,12 @@ class PlacementPresenter:
         """(whether there are labels before the opening, the reason if not)"""
         labels: Any = self._panel.parameters.labels
         is_open = labels is not None and self._panel.logic.closedLabels(labels) is not labels
-        return self._panel.ready((is_open, _("These labels have no opening, or those before it are gone")))
+        return self._panel.ready((is_open, _("These labels have no opening, or the previous labels were removed")))
 
     def openCraniotomy(self) -> None:
-        """Open skin and skull under the probe, or where the chosen node says, in labels of their own.
+        """Open skin and skull under the probe, or where the chosen node says, in separate labels.
 
-        Labels that were opened are opened anew, from those before: an opening follows the probe when it is moved.
+        Opened labels are opened again from the closed ones: an opening follows the probe when it is moved.
         """
         panel, logic, parameters = self._panel, self._panel.logic, self._panel.parameters
         with panel.acting(), panel.working(_("Open skull")):
@@ -107,7 +107,7 @@ class PlacementPresenter:
         with self._panel.acting():
             chosen: Any = required(self._panel.parameters.labels, "no label map chosen; segment the MRI first")
             closed = logic.closedLabels(chosen)
-            require(closed is not chosen, f"{chosen.GetName()!r} has no opening, or the labels before it are gone")
+            require(closed is not chosen, f"{chosen.GetName()!r} has no opening, or the previous labels were removed")
             logic.hideOpening(chosen)
             self._choose(closed)
 

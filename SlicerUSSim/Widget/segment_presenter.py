@@ -21,7 +21,7 @@ from SlicerUSSim.Logic.tissue.texture import Texture
 from SlicerUSSim.Widget.interface import PanelHost, tr as _
 from SlicerUSSim.Widget.notes import Notes, checks
 
-#: Roles of nodes that Segment chooses, and of those beside them that are of the patient whose tissues are chosen
+#: Roles of nodes that Segment chooses, and of those beside them that belong to the patient whose tissues are chosen
 _OF_SEGMENT = ("labels", "mask", "sheets")
 _BESIDE = ("lesions", "second_mri", "organs", "opening")
 
@@ -67,7 +67,7 @@ class SegmentPresenter:
         self.forget()
 
     def forget(self) -> None:
-        """Forget the last Segment, which is of another patient."""
+        """Forget the last Segment, which belongs to another patient."""
         self._last: _LastSegment | None = None
         self._mri: Any = None  # as it was chosen when followMri was called last
 
@@ -136,7 +136,7 @@ class SegmentPresenter:
 
     @contextmanager
     def replaceable(self, name: str, source: Any) -> Iterator[Any]:
-        """The chosen labels if Segment made them and nobody has edited them; otherwise a new node, which is selected.
+        """The chosen labels if Segment made them and no user edited them; otherwise a new node, which is selected.
 
         Afterwards the notes are those of the logic, about the node `source`.
         """
@@ -150,7 +150,7 @@ class SegmentPresenter:
         panel.parameters.labels = node
         self._notes.replaceByLogic(source, node)
         if kept is not None:
-            why = "is of another MRI" if is_of_other else "was not made by Segment, or edited since"
+            why = "belongs to another MRI" if is_of_other else "was not made by Segment, or edited since"
             self._notes.add(f"{kept!r} {why}, and is kept; the result is {node.GetName()!r}")
 
     # ---- undo --------------------------------------------------------------------------------------------------
@@ -231,13 +231,13 @@ class SegmentPresenter:
             parameters.sheets = found
             lines = [f"images show the sheets in {found.GetName()!r}"]
             if before not in (None, found):
-                lines.append(f"{before.GetName()!r} was loaded by others and is kept, but not shown any more")
+                lines.append(f"{before.GetName()!r} was loaded separately and is kept, but no longer shown")
             return lines
         if before is None:
             return []
         if self._are_own_sheets():
             parameters.sheets = None
-            return [f"the sheets in {before.GetName()!r}, of an earlier Segment, are not shown any more"]
+            return [f"the sheets in {before.GetName()!r}, of an earlier Segment, are no longer shown"]
         return [f"images show the sheets in {before.GetName()!r}"]
 
     def _forget_other_brain(self, mri: Any) -> list[str]:
@@ -271,7 +271,7 @@ class SegmentPresenter:
             if node is not None:
                 setattr(parameters, role, None)
                 lines.append(
-                    f"{node.GetName()!r} was chosen for another MRI and was not used; choose it if it is of this"
+                    f"{node.GetName()!r} was chosen for another MRI and was not used; choose it if it fits this one"
                 )
         return lines
 

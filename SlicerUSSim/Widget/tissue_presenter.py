@@ -45,7 +45,7 @@ class TissuePresenter:
         rows: dict[str, TissueRow] = {}
         for tissue in self.table().all_tissues():
             values = tuple(getattr(tissue, column[0]) for column in TISSUE_COLUMNS)
-            sources = tuple(tissue.sources.get(column[0], _("set by hand")) for column in TISSUE_COLUMNS)
+            sources = tuple(tissue.sources.get(column[0], _("set manually")) for column in TISSUE_COLUMNS)
             rows.setdefault(tissue.name, TissueRow(tissue.name, values, sources))
         return list(rows.values())
 

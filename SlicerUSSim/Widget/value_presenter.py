@@ -1,6 +1,6 @@
 """ValuePresenter: declared values of the preset and the scene as a panel displays them, and presets, without Qt.
 
-A value is named "section.name" in the preset ("display.gain_db") and "scene.name" in the parameters of the scene
+A value is called "section.name" in the preset ("display.gain_db") and "scene.name" in the parameters of the scene
 ("scene.contrast").
 """
 
@@ -36,7 +36,7 @@ class ValuePresenter:
 
     def __init__(self, panel: PanelHost, placing: PlacementPresenter) -> None:
         self._panel, self._placing = panel, placing
-        self._custom_probe: Probe | None = None  # the last one that was none of PROBES
+        self._custom_probe: Probe | None = None  # the last one that was not one of PROBES
         self._known: dict[str, Any] = {}
 
     def value(self, name: str) -> Any:
@@ -84,7 +84,7 @@ class ValuePresenter:
     def chooseProbe(self, name: str) -> None:
         """Select a probe of probe.PROBES by its name there or in the panel.
 
-        CUSTOM_PROBE is the last one that was none of them; before there is one, it is said how to make it.
+        CUSTOM_PROBE is the last one that was not one of them; before there is one, the error tells how to make it.
         """
         with self._panel.acting():
             before = self._panel.preset.probe
@@ -92,7 +92,7 @@ class ValuePresenter:
                 self._custom_probe = before
             if name == CUSTOM_PROBE:
                 probe = required(
-                    self._custom_probe, "there is no custom probe yet: change a value of this probe, and it is one"
+                    self._custom_probe, "there is no custom probe yet: change a value of this probe to make one"
                 )
             else:
                 key = SHOWN_PROBES.get(name, name)

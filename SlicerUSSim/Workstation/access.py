@@ -38,7 +38,7 @@ def is_loopback(host: str) -> bool:
 
 
 def tls_context(certificate: str, key: str) -> ssl.SSLContext:
-    """The TLS of a server. Raises SimulationError for files that are no certificate with its key (both PEM)."""
+    """The TLS of a server. Raises SimulationError for files other than a certificate and its key (both PEM)."""
     for path in (certificate, key):
         require(Path(path).is_file(), f"{path}: no such file")
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
@@ -56,7 +56,7 @@ def guard(app: web.Application, token: str, host: str) -> None:
 
     The token is first part of the URL and then a cookie, so that requests for the page's files and its web socket carry
     it too, and the address without it is shown. It is asked on loopback, too, where other users of the computer can
-    connect. There, requests by another host name are refused as well, since another site can make a name of its own
+    connect. There, requests by another host name are refused as well, since another site can make its own name
     resolve to this computer (DNS rebinding).
 
     Parameters

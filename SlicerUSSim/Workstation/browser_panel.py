@@ -37,7 +37,7 @@ _RATE, _STATUS_EVERY_S = "images per second", 1.0
 _MARKUPS = "vtkMRMLMarkupsNode"
 #: Maximum number of points of the cost curve on the page.
 _CURVE_POINTS = 150
-_CLICK = "click in the lesion, in a slice view (Escape: not)"
+_CLICK = "click in the lesion, in a slice view (Escape cancels)"
 
 
 @dataclass(eq=False)
@@ -48,7 +48,7 @@ class _Work:
     task: greenlet
     percent: int = 0
     began: float = field(default_factory=perf_counter)
-    #: Of this work alone: what is abandoned goes on to hear of it
+    #: Of this work alone: abandoned work still sees it
     is_cancelled: threading.Event = field(default_factory=threading.Event)
 
 

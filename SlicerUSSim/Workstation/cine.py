@@ -28,7 +28,7 @@ KEPT_S, _MOST_BYTES = 10.0, 320 * 2**20
 _EVERY_S, _SHORTEST_S, _LONGEST_S = 0.1, 0.04, 0.5
 #: Least seconds between two messages to pages about a cine that grows, and columns of an M-mode image
 _TELL_EVERY_S, _COLUMNS = 0.25, 480
-#: Sources, and what is said without images
+#: Sources, and the message without images
 LIVE, SEQUENCE = "live", "sequence"
 _NONE = "the cine has no images, expected live images or those of Simulate sequence"
 
@@ -104,7 +104,7 @@ class Cine:
     # ---- requests of pages -------------------------------------------------------------------------------------
 
     def freeze(self) -> None:
-        """End live images, or go on with them."""
+        """End live images, or continue them."""
         self._images.setLive(not self._logic.isLive)
 
     def show(self, index: int) -> None:

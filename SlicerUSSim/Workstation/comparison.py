@@ -49,7 +49,7 @@ class Comparison:
         self._playing: asyncio.Task | None = None
         self._waiting: tuple[RealImages, int, np.ndarray, ImageGrid] | None = None  # to be compared
         self._comparing: asyncio.Task | None = None
-        self._era = 0  # changes when a similarity of before must not be shown any more
+        self._era = 0  # changes when the previous similarity must no longer be shown
         #: For display next to the simulated image, and over it; and the best image of a fit that runs
         self.streams = (ImageStream("real"), ImageStream("real-over"), ImageStream("best"))
         self._best = (inf, 0.0)  # its cost, and when it was sent
@@ -105,7 +105,7 @@ class Comparison:
             return
         if isinstance(real, np.ndarray):
             image = np.clip(real[sequence.number], 0, 255).astype(np.uint8)
-            rows, columns = image.shape  # of a size that is not known: a ruler of its own, without marks
+            rows, columns = image.shape  # of a size that is not known: a separate ruler, without marks
             about = {"x": 0, "y": 0, "w": columns, "h": rows, "ticks": [], "size": rows / 36, "focus": 0, "range": ""}
             self.streams[0].send(image, ruler=about)
         elif real is not None and grid is not None:
@@ -170,7 +170,7 @@ class Comparison:
             now.sequence.similarity = ""
 
     def drop(self) -> None:
-        """Forget the sequence, which is of another patient."""
+        """Forget the sequence, which belongs to another patient."""
         self.stop()
         self._real = self._browser = None
         self.sees_nothing(None)

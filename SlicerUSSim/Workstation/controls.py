@@ -41,7 +41,7 @@ def control_html(control: Control) -> str:
         return f"""<label class="ussim-tick" title="{tip}"><input type="checkbox" id="{name}" :checked="{key}"
             :disabled="{disabled}" @change="{tick}"> {label}</label>"""
     if control.kind in ("choice", "node"):
-        if control.kind == "node":  # an HTML option cannot be null: "" is no node
+        if control.kind == "node":  # an HTML option cannot be null: "" stands for None
             options = f"""<option v-for="item in ({NAMES.panel.nodes}.{name} ?? [])" :value="item.value ?? ''">
                 {{{{ item.title }}}}</option>"""
         else:

@@ -46,7 +46,7 @@ class Exports:
         self._preset, self._progress = panel.presenter.values.presetToSave, panel.progress
 
     def export(self, kind: str, sent: Mapping[str, bytes]) -> tuple[str, bytes, str]:
-        """Export one kind, in a task: what takes time can be cancelled, and images go on meanwhile.
+        """Export one kind, in a task: long work can be cancelled, and images continue meanwhile.
 
         `sent` are the files of which a page has composed it, see ultrasound_file.
         """

@@ -56,7 +56,7 @@ class ImageFlow:
         return not self._show_in_views.is_waiting
 
     def image_changed(self) -> None:
-        """Distribute the new image, or that there is none any more."""
+        """Distribute the new image, or the news that there is no longer one."""
         taken = self._logic.taken
         if taken is None:
             self.clear()
@@ -73,7 +73,7 @@ class ImageFlow:
         self.tell()
 
     def clear(self) -> None:
-        """Show no image anywhere, since that of before is not of this patient or pose."""
+        """Show no image anywhere, since the previous one shows another patient or pose."""
         self._simulated.clear()
         self._cine.clear()
         self._views.hide_image()
@@ -81,7 +81,7 @@ class ImageFlow:
         self.tell()
 
     def watch(self) -> None:
-        """Compare the image with the scene from now on; whatever has changed, pages are told if it is not as it is."""
+        """Compare the image with the scene from now on; pages learn whether they differ, whatever has changed."""
         self.tell()
         get_event_loop().call_later(_COMPARE_EVERY_S, self.watch)
 

@@ -100,12 +100,12 @@ class KeptState:
             saved = datetime.fromisoformat(kept.saved).astimezone()
             is_today = saved.date() == saved.now(saved.tzinfo).date()
             when = f"{saved:%H:%M}" if is_today else f"{saved:%d %B, %H:%M}"
-            text = f"Go on with {kept.patient} as at {when} (pose and settings)?"
+            text = f"Continue with {kept.patient} as at {when} (pose and settings)?"
         with self._panel.shared.changing() as now:
             now.offer = text
 
     def restore(self) -> None:
-        """Take pose and settings of before, on the patient of that name, whose files are opened if he is not."""
+        """Take the kept pose and settings, on the patient of that name, whose files are opened if he is not."""
         kept = self._offered
         if kept is None:
             return
@@ -113,7 +113,7 @@ class KeptState:
             is_there = self._patient.name == kept.patient
             require(
                 is_there or (kept.files and all(map(os.path.exists, kept.files))),
-                f"{kept.patient}: its files are not on the computer of the server any more, or a page had sent them; "
+                f"{kept.patient}: its files are no longer on the computer of the server, or were uploaded; "
                 "open them or the saved scene (.mrb), and press Restore again",
             )
             parameters = self._logic.parameters

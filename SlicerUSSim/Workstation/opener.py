@@ -130,7 +130,7 @@ class Opener:
             self._take_all(files, meant)
         finally:
             self._nodes.volumes.clear()
-        for line in wrong:  # after a new patient, with whom the messages about the one before are gone
+        for line in wrong:  # after a new patient, who clears the messages about the previous one
             self._panel.showError(line)
 
     def _take_all(self, files: list[_File], meant: str) -> None:
@@ -142,7 +142,7 @@ class Opener:
     def recognised(self, paths: Sequence[Path]) -> tuple[list[_File], list[str]]:
         """(what files are, in the order in which they can be opened; lines about those that cannot).
 
-        Label maps come with the tables of their labels. Raises SimulationError if there is nothing to open.
+        Label maps include the tables of their labels. Raises SimulationError if there is nothing to open.
         """
         found: dict[Path, Content] = {}
         wrong: list[str] = []
@@ -235,7 +235,7 @@ class Opener:
             return f"shown as the image of {patient}"
         if not self._patient.take_mri(node, contrast, then_segment=not labels):
             return "a new patient, whose tissues were not found"
-        then = "its labels came with it" if labels else f"segmented as {contrast}"
+        then = "with its own labels" if labels else f"segmented as {contrast}"
         changed = f" (before: {before})" if contrast != before else ""
         return f"a new patient, {then}{changed}{f'; {patient} is closed' if patient else ''}"
 
@@ -318,7 +318,7 @@ class Opener:
         recording = self._registration.read(file.path)
         self._registration.take(recording)
         if not recording.is_calibrated:
-            return f"{recording.what}: its calibration is asked for in Tracked ultrasound"
+            return f"{recording.what}: enter its calibration in Tracked ultrasound"
         return f"{recording.what}: compared with {self._patient.name or 'the patient who is opened next'}"
 
     def _transform(self, file: _File, together: list[_File]) -> str:
@@ -326,7 +326,7 @@ class Opener:
         known = {".xml": _CALIBRATION, ".tag": _REGISTRATION}
         key = known.get(Path(file.name).suffix.lower())
         if key is None:
-            later = "" if self._registration.recording is not None else "; of the one that is opened next"
+            later = "" if self._registration.recording is not None else "; for the next one that is opened"
             choices = [
                 Choice(_CALIBRATION, "Calibration", f"Of tracked ultrasound: from pixels to its probe{later}"),
                 Choice(_REGISTRATION, "Registration", f"Of tracked ultrasound: from its frame to the patient{later}"),
@@ -351,7 +351,7 @@ class Opener:
         preset = self._tasks.doAside(lambda: Preset.read(file.path))
         self._presenter.values.takePreset(preset)
         moves = "" if preset.probe_to_ras is None else "; the probe is moved to its pose"
-        return f"in place of the settings of before{moves}"
+        return f"in place of the previous settings{moves}"
 
     def _pose(self, file: _File, together: list[_File]) -> str:
         self._poses.set(self._tasks.doAside(lambda: read_pose(file.path)))
@@ -381,16 +381,16 @@ class Opener:
         return Choice(_NEW, "New patient", self._closed())
 
     def _closed(self) -> str:
-        """What becomes of the patient who is open, and what of him is lost then."""
+        """A line about closing the open patient, and about unsaved data that are lost."""
         unsaved = self._patient.unsaved
         lost = f"; not saved: {', '.join(unsaved)}" if unsaved else ""
-        return f"{self._patient.name} is closed, with all that belongs to it{lost}"
+        return f"{self._patient.name} is closed with everything that belongs to it{lost}"
 
     def _ask_what(self, file: _File, choices: list[Choice]) -> str:
         return self._ask(f"Open {file.name} as?", f"{file.name} is {file.content.what}.", choices)
 
     def _ask(self, title: str, text: str, choices: list[Choice]) -> str:
-        """The key of the answer. Raises SimulationError if the patient about whom was asked is not open any more."""
+        """The key of the answer. Raises SimulationError if the patient of the question is no longer open."""
         patient = self._patient.name
         key = self._questions.ask(title, as_known(text), choices)
         now = self._patient.name
@@ -415,7 +415,7 @@ def _tables_of(found: Mapping[Path, Content]) -> tuple[set[Path], dict[Path, Pat
         require(
             len(own) == 1 and own[0] not in pairs,
             f"{table.name} is a table of labels and was opened with {len(maps)} label maps, expected one for each "
-            "table: open a label map and its table together, both of one name if there are several",
+            "table: open a label map and its table together, with the same name if there are several",
         )
         pairs[own[0]] = table
     return set(tables), pairs

@@ -34,7 +34,7 @@ MODULE = {
     "styles": ["ussim/workstation.css", "ussim/views.css"],
 }
 #: Controls of the panel that are not on the page: its views follow the probe and show it, it compares the fit in the
-#: ultrasound view, it has a button of its own to place the probe, and no editor of segments.
+#: ultrasound view, it has a separate button to place the probe, and no editor of segments.
 NOT_SHOWN = {
     "sliceViewComboBox", "showInSliceCheckBox", "showIn3dCheckBox", "showProbeCheckBox", "layoutButton",
     "compareComboBox", "compareNumberComboBox", "blinkCheckBox", "statusLabel", "placeButton", "editTissuesButton",
@@ -354,12 +354,12 @@ def _drawer(panel: BrowserPanel) -> None:
 def _open_file() -> str:
     tip = (
         "Also dropped on the page: MRI, CT, label map (with its table), mask, DICOM, tracked ultrasound, calibration, "
-        "registration, sheets (.vtp), scene (.mrb), preset, pose. What they are is recognised by their content"
+        "registration, sheets (.vtp), scene (.mrb), preset, pose. The page recognises them by their content"
     )
     sent = "window.ussim.send($event.target, {for: 'open'})"
     return f"""<div class="ussim-line" title="{tip}"><label for="open-file">Open files</label>
       <input type="file" multiple id="open-file" @change="{sent}"></div>
-      <div class="ussim-line" title="Of DICOM images; of several series the one is asked"><label for="open-folder">
+      <div class="ussim-line" title="DICOM images; the page asks which of several series"><label for="open-folder">
       Open a folder</label><input type="file" webkitdirectory id="open-folder" @change="{sent}"></div>
       <div id="opened" class="ussim-opened" aria-live="polite">
       <div v-for="line in {NAMES.opened}">{{{{ line }}}}</div></div>

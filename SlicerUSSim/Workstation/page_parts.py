@@ -58,14 +58,14 @@ def question_dialog() -> None:
 
 
 def offer() -> None:
-    """A bar with the question whether pose and settings of before are to be restored."""
+    """A bar with the question whether to restore the last pose and settings."""
     is_busy = f"{NAMES.messages.progress_title} !== ''"
     html.Div(
         f"""<span id="offer-text">{{{{ {NAMES.offer} }}}}</span>
         <button class="ussim-button" id="restore" :disabled="{is_busy}" @click="trigger('restore')"
-        title="Pose and settings; the patient's files are opened if another patient is">Restore</button>
+        title="Restore pose and settings; opens the patient's files if needed">Restore</button>
         <button class="ussim-button" id="discard" :disabled="{is_busy}" @click="trigger('discard')"
-        title="Go on with what is open">Discard</button>""",
+        title="Continue with what is open">Discard</button>""",
         v_if=NAMES.offer, classes="ussim-bar ussim-offer", id="offer", raw_attrs=['role="status"'],
     )  # fmt: skip
 

@@ -44,7 +44,7 @@ class OpenPatient:
         self._panel, self._presenter, self._nodes = panel, panel.presenter, nodes
         self._views, self._probe, self._comparison = views, probe, comparison
         self._registration = registration
-        self._is_new = False  # a patient was opened, on whom the probe is not yet
+        self._is_new = False  # a patient was opened, and the probe is not placed yet
         #: {what was made here: its version in the last scene that was saved or opened}
         self._saved: dict[str, Hashable] = {}
 
@@ -94,7 +94,7 @@ class OpenPatient:
 
     @property
     def is_of_user(self) -> bool:
-        """Whether a patient is open, other than the demo brain as it is."""
+        """Whether a patient is open, other than the unchanged demo brain."""
         parameters: Any = self._logic.parameters
         is_demo = parameters.mri is not None and parameters.mri.GetAttribute(FILE) == ""
         mine = (parameters.lesions, parameters.mask, parameters.second_mri)
@@ -137,7 +137,7 @@ class OpenPatient:
         return not then_segment or self.segment()
 
     def show_image(self, node: Any) -> None:
-        """Take the MRI or CT of a patient of whom only labels are open."""
+        """Take the MRI or CT of a patient whose labels alone are open."""
         self._logic.parameters.mri = node
         self._views.show_volume(node)
 
@@ -199,7 +199,7 @@ class OpenPatient:
         return self.then_show(self._presenter.segmenting.segment)
 
     def undo_segment(self) -> None:
-        """Go back to the tissues from before the last Segment; others that were chosen since stay as they are."""
+        """Go back to the tissues from before the last Segment; tissues that were chosen since do not change."""
         chosen = self._logic.parameters.labels
         self.then_show(self._presenter.segmenting.undoSegment)
         if chosen is not None and self._logic.parameters.labels is None:
@@ -277,13 +277,13 @@ class OpenPatient:
         self._logic.stopLiveUpdate()
         self._logic.clearImage(parameters.output)
         self._logic.clearOutline(parameters.outline)
-        # Ultrasound that was opened before any patient of the user's is of this one
+        # Ultrasound that was opened before any patient of the user belongs to this one
         kept = [] if self.is_of_user else list(self._registration.nodes)
         if self.is_of_user:
             self.forget_ultrasound()
         self._probe.forget_patient()
         if parameters.probe_transform is not None and self._registration.recording is None:
-            self._probe.move(np.eye(4))  # it is placed on the next one; a saved scene has no pose of the one before
+            self._probe.move(np.eye(4))  # placed on the next patient; a saved scene has no pose of the previous one
         self._presenter.forgetPatient()
         self._saved = {}
         kept += [parameters.output, parameters.outline, parameters.probe_transform, *new]
@@ -318,7 +318,7 @@ class OpenPatient:
     def labels_ready(self, *, is_placed: bool = False, frozen: FrozenRecord | None = None) -> None:
         """Show the image of new labels, or a `frozen` one of them.
 
-        The probe `is_placed`, or is placed now if they are of a new patient.
+        The probe `is_placed`, or is placed now if the patient is new.
         """
         if self._logic.parameters.probe_transform is None or (self._is_new and not is_placed):
             self._presenter.placing.placeProbe()

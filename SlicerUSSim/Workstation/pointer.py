@@ -1,4 +1,4 @@
-"""Pointer: the point under the mouse in all views, and what is there."""
+"""Pointer: the point under the mouse in all views, its tissue and its values."""
 
 from __future__ import annotations
 

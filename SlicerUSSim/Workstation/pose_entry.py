@@ -60,5 +60,5 @@ class PoseEntry:
 
 
 def _text(numbers: np.ndarray, decimals: int) -> str:
-    """Numbers with so many decimals, without -0."""
+    """Numbers with this many decimals, without -0."""
     return " ".join(f"{value:.{decimals}f}" for value in numbers.round(decimals) + 0.0)

@@ -23,7 +23,7 @@ from SlicerUSSim.Workstation.file_nodes import FileNodes
 SECTION = "Tracked ultrasound"
 _IMAGE, _REFERENCE = "Image", "Reference"
 _CALIBRATION, _REGISTRATION = "Calibration", "Registration"
-_NOT_REGISTERED = "none: the frame of the ultrasound is taken for the patient's"
+_NOT_REGISTERED = "none: the frame of the ultrasound is assumed to be the patient's"
 
 
 class Registration:
@@ -56,7 +56,7 @@ class Registration:
         if self.recording is not None and self._logic.parameters.real is None:
             return "The real ultrasound is not calibrated: its place in the patient is not known"
         is_assumed = self.recording is not None and not self._from[_REGISTRATION]
-        return "The real ultrasound is not registered: its frame is taken for the patient's" if is_assumed else ""
+        return "The real ultrasound is not registered: its frame is assumed to be the patient's" if is_assumed else ""
 
     def take(self, recording: SequenceRecord) -> None:
         """Use a recording from now on, in its place in the patient, if it is known.
@@ -64,7 +64,7 @@ class Registration:
         Its probe and poses are used once its calibration is known. Nothing changes if it cannot be used.
         """
         calibration, place, sources = self._calibration, self._to_ras, dict(self._from)
-        if self.recording is not None:  # they are of that
+        if self.recording is not None:  # they belong to that one
             calibration, place, sources = {}, np.eye(4), {_CALIBRATION: "", _REGISTRATION: ""}
         if recording.to_ras is not None and not np.allclose(recording.to_ras, np.eye(4)):
             place, sources[_REGISTRATION] = recording.to_ras, "as it was given or saved"
@@ -73,7 +73,7 @@ class Registration:
         self._tell()
 
     def forget(self) -> None:
-        """Forget the recording, which is of another patient; its nodes are removed with him."""
+        """Forget the recording, which belongs to another patient; its nodes are removed with him."""
         self.recording, self._calibration, self._to_ras = None, {}, np.eye(4)
         self.nodes, self._field = [], None
         self._from = {_CALIBRATION: "", _REGISTRATION: ""}
@@ -91,7 +91,7 @@ class Registration:
     def calibrate(self, path: str) -> None:
         """Use the calibration of a file: of the name that is chosen, or those of a Plus configuration.
 
-        It is that of the ultrasound that is open, or else of the one that is opened next.
+        It belongs to the open ultrasound, or else to the next one that is opened.
         """
         name = self._shared.now.registration.name.strip()
         asked_ends(name, ())
@@ -146,10 +146,10 @@ class Registration:
             if node.GetScene() is not None:
                 node.GetScene().RemoveNode(node)
         if made is not None and self._logic.scene.GetFirstNodeByName(recording.name) is None:
-            made[2].SetName(recording.name)  # which its nodes of before had, and scenes give back
+            made[2].SetName(recording.name)  # the name of its previous nodes, which scenes restore
 
     def _choose_poses(self, browser: Any, old: list[Any]) -> None:
-        """Let Simulate sequence use the poses of the images, instead of those before, or of none."""
+        """Let Simulate sequence use the poses of the images, instead of previous ones, or of none."""
         parameters: Any = self._logic.parameters
         if parameters.transform_sequence is None or parameters.transform_sequence in old:
             parameters.transform_sequence = browser.GetNodeReference(POSES)

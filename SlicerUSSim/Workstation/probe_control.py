@@ -24,8 +24,8 @@ _log = logging.getLogger(__name__)
 
 #: Seconds between two updates of the slice views, and of the sliders: both delay the image.
 _TURN_EVERY_S, _TELL_EVERY_S = 0.12, 0.4
-#: What is said when a surface was cancelled
-_NO_SURFACE = "no surface of the patient, along which the probe slides: the camera over the 3D view makes it"
+#: Message after a surface was cancelled
+_NO_SURFACE = "no surface of the patient for the probe to slide on: the camera over the 3D view makes it"
 _POSE_FIELDS = tuple(entry.name for entry in fields(SurfacePose))
 
 
@@ -141,7 +141,7 @@ class ProbeControl:
     def update_surface(self) -> None:
         """Recompute the surface if the labels have changed; called in a task.
 
-        Images go on meanwhile. One that is cancelled is not made again before the labels change, or look_again.
+        Images continue meanwhile. A cancelled surface is made again after the labels change, or after look_again.
         """
         labels: Any = self._logic.parameters.labels
         if labels is None or (labels.IsA("vtkMRMLVolumeNode") and labels.GetImageData() is None):
@@ -158,8 +158,8 @@ class ProbeControl:
                 made = surface = self._tasks.doAside(lambda: PatientSurface(placed, progress))
                 self._tasks.doAside(lambda: surface.coarse_polydata)  # made here, not where views wait for it
         except Cancelled:
-            made = None  # that of the labels before is not of these
-        if self._surface_version != version:  # of a patient who was closed meanwhile, or of labels of before
+            made = None  # a surface of the previous labels does not fit these
+        if self._surface_version != version:  # of a patient who was closed meanwhile, or of previous labels
             return
         self.surface = made
         self._views.show_surface(made)

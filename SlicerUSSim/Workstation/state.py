@@ -150,7 +150,7 @@ class SequenceState:
     mask: str = ""
     playing: bool = False
     comparison: ComparisonMode = ComparisonMode.BESIDE
-    #: Cost between simulated and real image, as text, and whether they are of different poses
+    #: Cost between simulated and real image, as text, and whether their poses differ
     similarity: str = ""
     is_elsewhere: bool = False
 
@@ -161,7 +161,7 @@ class ImageState:
 
     #: "LIVE", "OUTDATED" or "FROZEN"; "" without an image
     status: str = ""
-    #: What of the record is not as it is now, as "pose, tissues"; "" if nothing
+    #: What of the record differs from the scene, such as "pose, tissues"; "" if nothing
     differs: str = ""
     #: Texts for a banner, with units
     patient: str = ""
@@ -235,7 +235,7 @@ class PageState:
 
     #: Name of the patient: the file with the labels, or with the MRI from which they are
     title: str = ""
-    #: The question whether pose and settings of before are to be restored; "": there is none
+    #: The question whether to restore the last pose and settings; "": there is none
     offer: str = ""
     #: Pose of the probe on the patient; None without a probe or a patient
     pose: SurfacePose | None = None

@@ -47,7 +47,7 @@ class ImageStream:
         """Send the last image once more, to pages that have just opened."""
         if self._last is not None:
             content, about = self._last
-            self._push(content, {**about, "stamp": None})  # which is not shown to an event of before
+            self._push(content, {**about, "stamp": None})  # which no previous event waits for
 
     def _push(self, content: bytes, about: dict) -> None:
         if self._streamer is not None:

@@ -98,7 +98,7 @@ class Tasks(AtOnce):
     def ask(self, asked: Callable[[Callable[[T], None]], None]) -> T:
         """What a user answers; `asked` is called with a function that takes the answer, in the event loop.
 
-        Until then the task counts as done: nothing is computed, and everything else goes on.
+        Until then the task counts as done: nothing is computed, and everything else continues.
         """
         waiting, answers = getcurrent(), []
         event_loop = waiting.parent
@@ -145,9 +145,9 @@ class Tasks(AtOnce):
     def abandonSoon(
         self, waiting: greenlet, is_under_way: Callable[[], bool], abandoned: Callable[[], None]
     ) -> None:  # fmt: skip
-        """Let a task that was cancelled go on with Cancelled, even if its work does not hear of it in time.
+        """Let a cancelled task continue with Cancelled, even if its work does not notice in time.
 
-        The work then ends in its own time, in a thread of its own, and nobody takes its result; what waited behind it
+        The work then ends in its own time, in a separate thread, and its result is dropped; what waited behind it
         is computed by a new thread. `abandoned` is called then.
         """
 

@@ -1,4 +1,4 @@
-"""Transfer: files from and to pages over HTTP, piece by piece: images, keys and Cancel go on meanwhile.
+"""Transfer: files from and to pages over HTTP, piece by piece: images, keys and Cancel continue meanwhile.
 
 On the web socket everything else would wait: it answers one request of a page after the other.
 """
@@ -22,8 +22,8 @@ class Transfer:
 
     Parameters
     ----------
-    opened : called in the event loop with {name: content} of files to open, and what they are meant to be ("": not
-        said).
+    opened : called in the event loop with {name: content} of files to open, and what they are meant to be ("":
+        unspecified).
     export : called in the event loop with what is wanted, and the images from which a page has composed it; returns
         (file name, content, MIME type), or None if there is nothing, which the page has been told.
     refused : called with a line about files that were not taken.
@@ -59,7 +59,7 @@ class Transfer:
             parts.append((part.filename or "", bytes(content)))
             if size > uploads.MOST_BYTES or len(parts) > uploads.MOST_FILES:
                 most = f"{uploads.MOST_FILES} files or {uploads.MOST_BYTES} bytes"
-                self._refused(f"more than {most} are sent at once, of which none are taken")
+                self._refused(f"more than {most} are sent at once; none is opened")
                 return web.Response(status=413, text="too much")
         files = uploads.plain_names(parts)
         if request.query.get("for") == DICOM:

@@ -1,4 +1,4 @@
-"""What a page may send: files that are whole by themselves, under plain names, in a folder of their own.
+"""What a page may send: files that are whole by themselves, under plain names, in a separate folder.
 
 The name is a text from a browser, or from whoever has the token, and becomes a path; a header may name any other file
 of the server's user as its voxels, which would then be shown and saved with the scene.
@@ -51,7 +51,7 @@ class Sent:
     def __init__(self, folder: str, files: Mapping[str, bytes]) -> None:
         require_whole_files(files)
         self._folder = Path(folder)
-        #: Those that are no DICOM images
+        #: Those that are not DICOM images
         self.paths: list[Path] = []
         dicom = {name for name, content in files.items() if _is_dicom(name, content)}
         #: Whether there are DICOM files, which `series` and `take` make into a volume
@@ -92,14 +92,14 @@ class Sent:
 
 
 def require_whole_files(files: Mapping[str, bytes]) -> None:
-    """Raise SimulationError for names that are no plain file names, and for headers that name another file.
+    """Raise SimulationError for names that are not plain file names, and for headers that name another file.
 
     `files` are {name: content} as a page sent them. Nothing has been written yet.
     """
     for name, content in files.items():
         require(
             bool(name) and name not in (".", "..") and not re.search(r"[/\\\0-\x1f\x7f]", name),
-            f"{plain(name)}: is no plain file name, expected one without slashes and control characters",
+            f"{plain(name)}: is not a plain file name, expected one without slashes and control characters",
         )
         length = len(name.encode("utf-8", "replace"))
         require(

@@ -244,7 +244,7 @@ class Workstation:
             self._patient.begin(files)
         if files.also_open is not None:
             self._opener.open_paths([files.also_open])
-        self._kept.offer()  # not before: it is about the patient who is open
+        self._kept.offer()  # not before: it concerns the open patient
         self._panel.refresh()
 
     def _probe_moved(self) -> None:

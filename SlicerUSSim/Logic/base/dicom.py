@@ -64,7 +64,7 @@ class Series:
     #: Whether it has enough images for a volume, or frames with places
     is_volume: bool
     modality: str
-    #: Whether its frames say where they are, and every file is a volume of its own
+    #: Whether its frames say where they are, and every file is a separate volume
     has_frames: bool
     is_compressed: bool
 
@@ -192,7 +192,7 @@ def _only_volume(folder: Path) -> Series:
     Raises SimulationError if there is none, or if several are volumes: the message lists them.
     """
     found, damaged = _series_of(folder)
-    if not found:  # as on a CD, whose images are in folders of their own
+    if not found:  # as on a CD, whose images are in separate folders
         found, damaged = _series_of(folder, recursive=True)
         places = sorted({str(Path(file).parent) for series in found for file in series.files})
         require(bool(found), f"{folder}: has no DICOM series, nor have the folders in it{_other_images(folder)}")
@@ -225,7 +225,7 @@ def _other_images(folder: Path) -> str:
     if not files:
         return ""
     some = ", ".join(files[:3]) + (", ..." if len(files) > 3 else "")
-    return f"; files there are images of their own ({some}): give one, or one label map of several masks"
+    return f"; files there are separate images ({some}): give one, or one label map of several masks"
 
 
 # ---- images ----------------------------------------------------------------------------------------------------------
@@ -293,7 +293,7 @@ def _stack(path: Path, files: Sequence[str], datasets: Sequence[Any]) -> ImageFi
             require(
                 np.abs(value - values[0]).max() <= tolerance,
                 f"{name} has the {what} {value.tolist()}, and {Path(files[0]).name} {values[0].tolist()}, expected one "
-                "in all images of a volume; put one volume into a folder of its own",
+                "in all images of a volume; put one volume into a separate folder",
             )
     require_spacing(names[0], spacings[0].tolist())
     _require_even(path, np.array(positions), cosines[0])
@@ -366,7 +366,7 @@ def _as_slices(path: Path, dataset: Any) -> tuple[list[Any], str]:
     from pydicom.uid import ExplicitVRLittleEndian
 
     step = abs(float(dataset.get("SpacingBetweenSlices") or dataset.get("SliceThickness") or 0.0))
-    require(step > 0, f"{path}: its frames have neither places nor SpacingBetweenSlices; without there is no volume")
+    require(step > 0, f"{path}: its frames have neither places nor SpacingBetweenSlices; a volume needs one")
     first = _numbers(dataset, "ImagePositionPatient", 3, str(path))
     cosines = _numbers(dataset, "ImageOrientationPatient", 6, str(path))
     pixels = dataset.pixel_array
@@ -438,7 +438,7 @@ def _numbers(dataset: Any, keyword: str, count: int, name: str) -> np.ndarray:
         found = np.array([np.nan])
     require(
         len(found) == count and np.isfinite(found).all(),
-        f"{name} has no {keyword} of {count} numbers; without it there is no volume",
+        f"{name} has no {keyword} of {count} numbers, which a volume needs",
     )
     return found
 
@@ -460,7 +460,7 @@ def _require_even(path: Path, positions: np.ndarray, cosines: np.ndarray) -> Non
     require(
         repeated == 0,
         f"{path}: {repeated} of {len(along)} images lie at the place of another one (several times, echoes or "
-        "coils); put one volume into a folder of its own",
+        "coils); put one volume into a separate folder",
     )
     wide = np.flatnonzero(np.abs(steps - usual) > _UNEVEN * usual)
     off = np.abs(along - np.linspace(along[0], along[-1], len(along)))  # errors below this share may add up

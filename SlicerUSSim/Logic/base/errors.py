@@ -33,7 +33,7 @@ def either(names: Sequence[str]) -> str:
     return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} or {names[-1]}"
 
 
-class Cancelled(SimulationError):  # noqa: N818, what the user wanted is no error
+class Cancelled(SimulationError):  # noqa: N818, not an error: the user wanted it
     """Raised by a progress function to cancel the computation; nothing is changed or written."""
 
     def __init__(self) -> None:
@@ -115,7 +115,7 @@ def about_file(path: str) -> Iterator[None]:
 
 
 def shown_path(path: object) -> str:
-    """A path as text for messages, in which bytes that are no text are escaped."""
+    """A path as text for messages, with bytes escaped that are not text."""
     return str(path).encode("utf-8", "backslashreplace").decode()
 
 

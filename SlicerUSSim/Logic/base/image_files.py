@@ -208,7 +208,7 @@ def require_voxels(path: str | os.PathLike, size: Sequence[int]) -> None:
 
 
 def require_spacing(name: str, spacing_mm: Sequence[float]) -> None:
-    """Raise SimulationError for voxels smaller than .01 mm or larger than 50 mm, as of lengths in another unit."""
+    """Raise SimulationError for voxels smaller than .01 mm or larger than 50 mm, such as lengths in another unit."""
     low, high = _SPACING_MM
     if all(low <= mm <= high for mm in spacing_mm):
         return
@@ -325,7 +325,7 @@ def _read_nifti(path: Path) -> ImageFile:
 
 
 def add_label_table(path: Path, names: Mapping[int, str]) -> None:
-    """Add the names of labels to a NIfTI file, as _label_table reads them; without nibabel it stays as it is."""
+    """Add the names of labels to a NIfTI file, as _label_table reads them; without nibabel it is not changed."""
     if importlib.util.find_spec("nibabel") is None:
         return
     import nibabel

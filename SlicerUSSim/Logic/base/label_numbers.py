@@ -53,7 +53,7 @@ def _counted(array: np.ndarray) -> np.ndarray:
 
 
 def whole_numbers(array: np.ndarray) -> np.ndarray | None:
-    """The array, rounded where it is of floats; None if it contains fractions, or nothing but fractions of 1.
+    """The array, rounded where it has floats; None if it contains fractions, or nothing but fractions of 1.
 
     Fractions of labels that were stored as bytes with a scale (0.2118 n for label n of an aseg) are rounded.
     """

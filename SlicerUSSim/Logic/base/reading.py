@@ -1,6 +1,6 @@
 """Reading files: what readers raise becomes one line, and files that are not trusted are read in a child process.
 
-Libraries that read images end the whole process for some damaged files (ITK at HDF5, VTK at XML), run for ever or fill
+Libraries that read images end the whole process for some damaged files (ITK at HDF5, VTK at XML), run forever or fill
 the memory for others, and files may be made to do worse. A child process with limits on time and memory loses only
 itself; what it has read comes back as numbers, texts and this package's values, and as nothing else.
 """
@@ -96,7 +96,7 @@ _is_child = False
 
 @contextmanager
 def untrusted_folder(limits: ReadingLimits | None = None) -> Iterator[str]:
-    """A temporary folder for files from somebody else, as uploads, which readers read in a child process."""
+    """A temporary folder for untrusted files such as uploads, which readers read in a child process."""
     with TemporaryDirectory(prefix="ussim-untrusted-") as name:
         folder = Path(name).resolve()
         _folders[folder] = limits or ReadingLimits()
@@ -256,7 +256,7 @@ class _Safe(pickle.Unpickler):
             is_value = isinstance(found, type) and issubclass(found, PlainValue | Enum | Warning | SimulationError)
             if is_value or (isinstance(found, type) and is_dataclass(found)):
                 return found
-        raise pickle.UnpicklingError(f"{module}.{name} is no value that is read from files")
+        raise pickle.UnpicklingError(f"{module}.{name} is not a value that readers return")
 
 
 def _size(path: Path) -> int:

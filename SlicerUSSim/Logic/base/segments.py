@@ -43,7 +43,7 @@ def segments_of(header: Mapping[str, object], name: str = "segments") -> list[Se
     """The segments of a header, in their order; empty without.
 
     Labels are the numbers in the file, and count from 1 where segments in different layers have the same.
-    Raises SimulationError for a layer or number that is none.
+    Raises SimulationError for a layer or number that is not an integer.
     """
     numbers = sorted(int(found[1]) for key in header if (found := re.fullmatch(r"Segment(\d+)_Name", key)))
 
@@ -67,7 +67,7 @@ def segments_of(header: Mapping[str, object], name: str = "segments") -> list[Se
 def flattened(layers: np.ndarray, segments: list[Segment], voxel_ml: float, name: str) -> np.ndarray:
     """(k, j, i) labels of segments in layers (k, j, i, layer); where they overlap, the last is taken, with a warning.
 
-    Raises SimulationError for a segment in a layer that is not there.
+    Raises SimulationError for a segment in a layer that does not exist.
     """
     labels = np.zeros(layers.shape[:3], np.int32)
     overlaps = []
@@ -79,7 +79,7 @@ def flattened(layers: np.ndarray, segments: list[Segment], voxel_ml: float, name
         inside = layers[..., segment.layer] == segment.value
         covered = float(np.count_nonzero(labels[inside]) * voxel_ml)
         if covered:
-            overlaps.append(f"{segment.name!r} covers {covered:.3g} ml of those before it")
+            overlaps.append(f"{segment.name!r} covers {covered:.3g} ml of earlier ones")
         labels[inside] = segment.label
     if overlaps:
         _log.warning("%s: segments overlap, the last is taken: %s", name, "; ".join(overlaps))
@@ -99,11 +99,11 @@ def codes_of_entry(entry: str) -> tuple[str, ...]:
 def ranked_codes(category: str, kind: str, modifier: str, region: str) -> tuple[str, ...]:
     """Codes of a segment, the most special first: of the type's modifier, of the type, and of the anatomic region.
 
-    The region counts for healthy tissue alone, as "white matter" of the type "brain": a mass in the liver is no liver.
+    The region counts for healthy tissue alone, as "white matter" of the type "brain": a mass in the liver is not liver.
     """
     return tuple(code for code in (modifier, kind, region if category in _HEALTHY else "") if code)
 
 
 def is_meaningful(name: str | None) -> bool:
-    """Whether somebody gave this name, and no program ("Label 3", "Segment_1")."""
+    """Whether a user gave this name, rather than a program ("Label 3", "Segment_1")."""
     return bool(name) and not _MEANINGLESS.fullmatch(str(name).strip())

@@ -7,7 +7,7 @@ from typing import Any
 
 from SlicerUSSim.Logic.base.declaration import Declared, Fit, Shown, parameter
 
-#: Level of full white at 0 dB gain, in dB re the mean square echo of tissue with unit scatterer variance.
+#: Level of full white at 0 dB gain, in dB relative to the mean square echo of tissue with unit scatterer variance.
 FULL_SCALE_DB = 23.0
 
 
@@ -45,11 +45,11 @@ class SimulationSettings(Declared):
     )  # fmt: skip
     beam: str = parameter(
         "aperture", "Beam",
-        "What soft tissue does to the beam: aperture averages over the aperture, ray refracts its axis",
+        "Effect of soft tissue. aperture: averaged over the aperture; ray: refraction of the beam's axis",
         choices=("aperture", "ray"),
-        note="Bone, air and metal reflect and refract rays with both. A single ray meets borders that a real beam, as "
-        "wide as its aperture, hardly notices: black radial streaks",
-        source="ray is the paper's",
+        note="Bone, air and metal reflect and refract rays in both cases. Borders that hardly affect a beam as wide as "
+        "its aperture deflect a single ray: black radial streaks",
+        source="ray in the paper",
     )  # fmt: skip
     frequency_downshift: bool = parameter(
         True, "Frequency downshift",
@@ -59,7 +59,7 @@ class SimulationSettings(Declared):
     wavefront_curvature: bool = parameter(
         True, "Wavefront curvature",
         "The phase of the beam is curved across it: away from the transmit focus speckle has finer grains",
-        note="The echo of a point is as wide with it as without", source="Off in the paper",
+        note="It does not change the width of a point's echo", source="Off in the paper",
     )  # fmt: skip
     reflections: bool = parameter(
         True, "Reflected rays", "Simulate mirror images and reverberation by following reflected rays", shown=True
@@ -71,12 +71,12 @@ class SimulationSettings(Declared):
         note="Their level and width follow from the probe's apertures and apodisation",
     )  # fmt: skip
     ring_down: bool = parameter(
-        True, "Ring-down", "Reverberation between the probe's face and the skin, as the probe has it"
+        True, "Ring-down", "Reverberation between face and skin, with the ring-down values of the probe"
     )
     contact_gap_mm: float | None = parameter(
         None, "Contact gap",
-        "Widest gap between probe and patient that gel fills; elements over a wider one see nothing, and their lines "
-        "are dark; none: the patient lies in the coupling medium, as in a water bath or under saline",
+        "Widest gap between probe and patient that gel fills; elements over a wider one have no contact, and their "
+        "lines are dark; none: the patient lies in the coupling medium, as in a water bath or under saline",
         unit="mm", bounds=(0.0, 50.0), shown=Shown(-0.5, 20.0, 0.5, none_at=-0.5), can_be_none=True,
         option="contact-gap",
         source="Not in the paper",
@@ -86,16 +86,16 @@ class SimulationSettings(Declared):
         "Sites of the scatterer lattice per cubic millimetre; none: eight in the probe's smallest resolution cell",
         unit="1/mm³", bounds=(0.1, 200_000), can_be_none=True,
         note="Eight are enough for developed speckle, and there are at least 4 per mm³; the lattice is fixed in the "
-        "patient for a given probe. So many that an image takes more than about 5 s on two cores are a warning",
+        "patient for a given probe. More than about 5 s per image on two cores trigger a warning",
         source="The paper's Rayleigh test uses cells of 20 µm (125000/mm³), of which mu1 keeps 1 %",
     )  # fmt: skip
     partial_volume: bool | None = parameter(
         None, "Partial volume",
         "Mix the scatterers of tissues by the probabilities of the segmentation, which requires segmenting the MRI "
-        "first; none: where they are at hand",
+        "first; none: if they are available",
         option="partial-volume/hard-labels",
-        note="A scene of 3D Slicer or the page keeps them beside labels that Segment wrote, until somebody edits these",
-        source="Off in the paper; images are more like real ones with it, see optimization.md",
+        note="A scene of 3D Slicer or the page keeps them with labels by Segment until a user edits the labels",
+        source="Off in the paper; more realistic, see optimization.md",
     )  # fmt: skip
     mri_modulation_db: float = parameter(
         0.0, "MRI modulation",
@@ -121,7 +121,7 @@ class SimulationSettings(Declared):
         44.0, "Interface gain",
         "Level of a flat perpendicular perfect reflector, relative to tissue of unit scatterer variance", unit="dB",
         bounds=(-100, 100),
-        note="The default was chosen by how far walls stand out from speckle in images of brains",
+        note="The default matches the contrast of walls to speckle in images of brains",
     )  # fmt: skip
     interface_reflection: str = parameter(
         "pressure", "Interface reflection", "Echo amplitude: r with pressure, r² with energy",
@@ -136,10 +136,10 @@ class SimulationSettings(Declared):
     samples_per_cycle: int = parameter(4, "Samples per cycle", "RF samples per cycle of the carrier", bounds=(2, 16))
     quality: str = parameter(
         "full", "Quality",
-        "full: as probe and settings say. draft: fewer scan lines, the fewer columns the image has, fewer scatterers, "
-        "samples and rays; a quarter of the time for 160 columns",
+        "full: as probe and settings define. draft: fewer scatterers, samples and rays, and fewer scan lines in "
+        "images of fewer columns; a quarter of the time for 160 columns",
         choices=("full", "draft"),
-        note="The rule is in performance.md. Fits are of full quality",
+        note="See performance.md. Fits use full quality",
     )  # fmt: skip
 
     @property
@@ -168,9 +168,9 @@ def _line_gain(number: int) -> Any:
 
 def _map_slope(where: str) -> Any:
     return parameter(
-        1.0, f"Map at {where}", f"Slope of the grey map at {where}, relative to that at half of white",
+        1.0, f"Map at {where}", f"Slope of the grey map at {where}, relative to the slope at half of white",
         bounds=(0.02, 8), fit=Fit(0.1, 3, tolerance=0.15, is_logarithmic=True, on_request=True),
-        note="Multiplies that of grey_map",
+        note="Multiplies the slope of grey_map",
     )  # fmt: skip
 
 
@@ -200,13 +200,13 @@ class DisplaySettings(Declared):
     )  # fmt: skip
     tgc_reach: float = parameter(
         1.0, "TGC reach",
-        "Part of the image depth over which TGC rises; from there on it stays, as an amplifier has a largest gain",
+        "Part of the image depth over which TGC rises; below it is constant, since an amplifier has a largest gain",
         bounds=(0, 1), option="tgc-reach",
         fit=Fit(0.1, 1.0, tolerance=0.1, on_request=True),
     )  # fmt: skip
     near_gain_db: float = parameter(
         0.0, "Near gain",
-        "Gain at the face; 6 mm deeper 1 / e of it is left: near the face a scanner listens with fewer elements, and "
+        "Gain at the face, which falls to 1 / e over 6 mm: near the face a scanner receives with fewer elements, and "
         "consoles have a control for it",
         unit="dB", bounds=(-60, 60), shown=Shown(-40, 20, 0.5, is_slider=True), option="near-gain",
         fit=Fit(-40, 10, tolerance=3.0),
@@ -230,14 +230,14 @@ class DisplaySettings(Declared):
         unit="°", bounds=(0, 5), fit=Fit(0.0, 0.8, tolerance=0.06, on_request=True),
     )  # fmt: skip
     edge_enhancement: float = parameter(
-        0.0, "Edge enhancement", "Part of the difference of grey levels to their mean within half a millimetre, added",
+        0.0, "Edge enhancement", "Weight of the added difference between grey levels and their mean within 0.5 mm",
         bounds=(0, 4), fit=Fit(0.0, 1.5, tolerance=0.1, on_request=True),
     )  # fmt: skip
     persistence: float = parameter(
         0.0, "Persistence",
-        "Part of the last image that stays in the next one of the same probe: with 0.5 half of what is old goes",
+        "Weight of the last image in the next one of the same probe; 0: none",
         bounds=(0, 0.98), shown=Shown(0, 0.95, 0.05, is_slider=True),
-        note="Of images that follow each other, live and in sweeps; fits and comparisons have none",
+        note="For consecutive images, live and in sweeps; fits and comparisons do not use it",
     )  # fmt: skip
     look: str = parameter(
         "scanner", "Look",
@@ -247,7 +247,7 @@ class DisplaySettings(Declared):
     )  # fmt: skip
     grey_map: str = parameter(
         "linear", "Grey map",
-        "From decibels to grey levels. linear: log compression alone. soft: flat near black, steep near white, as of a "
+        "From decibels to grey levels. linear: log compression alone. soft: flat near black, steep near white, as in a "
         "scanner of brains. contrast: very flat near black, then straight",
         choices=("linear", "soft", "contrast"), shown=True, option="grey-map",
     )  # fmt: skip

@@ -69,7 +69,7 @@ class Volume:
 
     array: np.ndarray
     ijk_to_ras: np.ndarray
-    name: str = field(default="", compare=False)  # of no meaning for the image
+    name: str = field(default="", compare=False)  # does not affect the image
     label_names: Mapping[int, str] = field(default_factory=dict, compare=False)
     doubts: tuple[str, ...] = field(default=(), compare=False)
     label_codes: Mapping[int, tuple[str, ...]] = field(default_factory=dict, compare=False)

@@ -46,13 +46,13 @@ class FitSettings(Declared):
     speckle: bool = parameter(
         False, "Also fit the speckle",
         "Also take the grey map from the real images, and fit the smoothing of the envelope and the tissues' texture "
-        "to the size and number of speckle's grains",
+        "to the size and number of speckle grains",
         shown=True, option="speckle/no-speckle",
     )  # fmt: skip
     validate: str = parameter(
         "", "Predict",
-        "Images of the sequence that are not fitted but predicted, such as 2,6: the cost on them, beside one uniform "
-        "tissue fitted in the same way and the images' real neighbours; empty: none",
+        "Images of the sequence to predict instead of fit, such as 2,6: reports their cost, that of a uniform tissue "
+        "fitted in the same way, and that of neighbouring real images; empty: none",
         option="validate",
     )  # fmt: skip
 

@@ -66,7 +66,7 @@ def predict(
     both = sorted(set(found.tracked.numbers) & set(others.numbers))
     require(
         not both,
-        f"images {', '.join(map(str, both))} are fitted and predicted, expected others: what was fitted says little",
+        f"images {', '.join(map(str, both))} are fitted and predicted, expected others: fitted images test nothing",
     )
     others = as_fitted(found, others)
     result = found.appearance

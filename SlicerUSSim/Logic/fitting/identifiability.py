@@ -32,7 +32,7 @@ class Quantity:
     #: It counts as determined if the values spread by at most twice this
     tolerance: float
     of: Callable[[TissueTable, DisplaySettings], float]
-    #: False: what it is of the tissue was not free, only what that is combined with
+    #: False: its tissue parameter was not free, only what that is combined with
     is_fitted: bool = True
 
 
@@ -53,12 +53,12 @@ class Spread:
     tolerance: float
     #: Whether a search from another starting point reached the same cost; otherwise agreement has no meaning
     was_tested: bool
-    #: Whether what it is of the tissue was free; otherwise it is as good as the tissue table
+    #: Whether its tissue parameter was free; otherwise it is as good as the tissue table
     is_fitted: bool = True
 
     @property
     def is_determined(self) -> bool | None:
-        """Whether the equally good solutions agree within the tolerance; None if that cannot be said.
+        """Whether the equally good solutions agree within the tolerance; None if that is unknown.
 
         It cannot without another solution, nor of what was not fitted.
         """

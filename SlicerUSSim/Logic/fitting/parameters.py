@@ -41,7 +41,7 @@ TISSUES = "tissues"
 #: Groups of parameters of the display that are free on request, and how their names begin
 GROUPS = {"smoothing": "smoothing_", "map": "map_", "sliders": "depth_gain_", "line gains": "line_gain_"}
 #: Var of a tissue, by a common factor of mu0 and sigma0. The bounds are relative to the table's value: gain changes an
-#: image as all levels together do, but for interfaces, and with wide bounds sulci, the brightest, can end up black.
+#: image as all levels together do, except at interfaces, and with wide bounds sulci, the brightest, can end up black.
 ECHOGENICITY = Declaration(
     name="echogenicity_db", type=float, label="Echogenicity", symbol="Var", unit="dB",
     tip="Level of a tissue's speckle, 10 log10 Var, by a common factor of its mu0 and sigma0",

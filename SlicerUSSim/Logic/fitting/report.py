@@ -156,8 +156,8 @@ def _predicted(prediction: Prediction, reference: str) -> str:
     ]
     return f"""<h2>Images that were not fitted</h2>
 {_table(heads, rows)}
-<p class="dim">The predicted images cost {prediction.of_uniform:.2f} of what one uniform tissue without anatomy, fitted
-in the same way, costs there; {html.escape(reference)} neighbours are the images before and after in the recording. With
+<p class="dim">The cost of the predicted images is {prediction.of_uniform:.2f} times the cost of one uniform tissue
+without anatomy, fitted in the same way; {html.escape(reference)} neighbours are the images before and after. With
 texture: + T1 + T2 / 2.</p>"""
 
 
@@ -174,7 +174,7 @@ def _speckle(speckle: SpeckleFit) -> str:
     """What the fit of the speckle found, step by step."""
     return f"""<h2>Fit of the speckle</h2>
 <p class="dim">The grey map is that of the images alone. Smoothing and texture are found by T1 + T2 / 2, and smoothing
-once more with the width of the speckle. The fit by the paper's cost began with what is below.</p>
+once more with the width of the speckle. The fit by the paper's cost started from the values below.</p>
 {_table(["step", "found"], speckle.rows(), "words")}"""
 
 

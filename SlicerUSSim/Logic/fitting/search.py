@@ -68,7 +68,7 @@ class Progress:
 
     @staticmethod
     def named(name: str, progress: Callable[[Progress], None] | None) -> Callable[[Progress], None] | None:
-        """A progress function for a step of this name, which is said before its stages."""
+        """A progress function that puts the name of a step before its stages."""
         if progress is None:
             return None
         told = progress

@@ -241,7 +241,7 @@ def _triangle() -> tuple[np.ndarray, np.ndarray]:
 
 
 def _typical(values: np.ndarray) -> float:
-    """Mean of what lies between the 25th and the 50th percentile: texture and sheets widen speckle, never narrow it."""
+    """Mean between the 25th and the 50th percentile: texture and sheets widen speckle, never narrow it."""
     values = np.sort(values[np.isfinite(values)])
     if values.size < _LEAST_WINDOWS:
         return float("nan")

@@ -152,11 +152,11 @@ def _maxima(image: np.ndarray, counted: np.ndarray) -> np.ndarray:
     """(rows, columns) bool: one pixel of each maximum among those that are counted."""
     highest = ndimage.maximum_filter(image, 3)
     found = (image == highest) & counted
-    # Two of one level beside each other, seldom
+    # Two neighbours of one level, which is rare
     if not any((found & np.roll(found, step, (0, 1))).any() for step in ((0, 1), (1, 0), (1, 1), (1, -1))):
         return found
     regions, _ = ndimage.label(found, np.ones((3, 3)))  # type: ignore[misc]
-    # Beside pixels of the same level that have a brighter neighbour, a region is no maximum.
+    # A region with a brighter neighbour at any of its pixels is not a maximum.
     goes_on = found & (ndimage.maximum_filter(np.where(found, -np.inf, image), 3) == highest)
     places = np.flatnonzero(found)
     numbers, first = np.unique(regions.flat[places], return_index=True)

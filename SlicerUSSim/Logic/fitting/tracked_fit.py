@@ -108,7 +108,7 @@ def fit(
         if reference.is_dark:
             _log.warning(
                 "image %d is dark in all that is left of the probe's field (%.0f %% of it): its texture cannot be "
-                "compared, and the fit says little; expected an image of the patient",
+                "compared, and the fit is unreliable; expected an image of the patient",
                 number, 100.0 * tracked.mask.sum() / max(tracked.grid.field(tracked.probe).sum(), 1),
             )  # fmt: skip
 
@@ -173,7 +173,7 @@ def _speckle_of(
 
 
 def _at_the_levels_of(found: DisplaySettings, given: DisplaySettings) -> DisplaySettings:
-    """What was found of the speckle, with the rest as given: the user's values are those before the fit."""
+    """What was found of the speckle, with the rest as given: the user's values are from before the fit."""
     names = ("smoothing_axial_mm", "smoothing_lateral_deg", "grey_map", "map_black", "map_dark", "map_white")
     return replace(given, **{name: getattr(found, name) for name in names})
 
@@ -251,14 +251,14 @@ def simulated(
 #: A tissue of less than this part of the imaged fields is too small to show its parameters.
 _LEAST_SHARE = 0.002
 #: Mean path through a tissue, mm, from which its attenuation shows: at 5 MHz a change by the parameter's tolerance,
-#: 0.1 dB/(cm MHz), then changes what lies behind by 0.3 dB.
+#: 0.1 dB/(cm MHz), then changes the tissue behind by 0.3 dB.
 _LEAST_PATH_MM = 3.0
 #: Surfels are 1 mm apart: a sheet that crosses an image has some this near to its plane.
 _BESIDE_MM = 1.0
 
 
 def shares(simulator: UltrasoundSimulator, tracked: TrackedImages) -> dict[str, float]:
-    """{tissue: its part of the imaged fields, 0 to 1}, without what lies outside the labels."""
+    """{tissue: its part of the imaged fields, 0 to 1}, without the part outside the labels."""
     medium = simulator.medium
     count = np.zeros(256, int)
     for pose in tracked.poses:
@@ -289,8 +289,8 @@ def parameters_seen(
     """The free parameters with "tissues" replaced by those that the images can show.
 
     These are the echogenicity of every tissue in the imaged fields, of the membrane, and of the dura where sheets of it
-    were found there, and the attenuation of tissues through which the beams pass for some millimetres. Other names stay
-    as they are.
+    were found there, and the attenuation of tissues through which the beams pass for some millimetres. Other names do
+    not change.
     """
     entries = dict(free) if isinstance(free, Mapping) else dict.fromkeys([free] if isinstance(free, str) else free)
     if TISSUES not in entries or entries[TISSUES] is not None:

@@ -17,7 +17,7 @@ from SlicerUSSim.Logic.probe.poses import sample
 
 #: Places along the face per aperture, and across it; steps through the gap in voxels
 _ALONG, _ACROSS, _STEP = 25, 5, 0.5
-#: Without a gap a user is told of a face that is further from the patient than a bath or a cavity needs, mm
+#: Without a gap, a face further from the patient than a bath or a cavity needs triggers a warning, mm
 _BATH_MM = 30.0
 
 
@@ -49,7 +49,7 @@ def touching_share(labels: Volume, probe: Probe, probe_to_ras: np.ndarray, gap_m
 def about_contact(labels: Volume, probe: Probe, poses: Sequence[np.ndarray], gap_mm: float | None) -> tuple[str, ...]:
     """A line about a face no part of which touches the patient, at one pose (4, 4) or more; nothing if all do.
 
-    Without a gap (None) the patient lies in the coupling medium, and a face that is far from it is told of. The others
+    Without a gap (None) the patient lies in the coupling medium, and a face far from it triggers a warning. The others
     are as in line_contact.
     """
     reach = _BATH_MM if gap_mm is None else gap_mm

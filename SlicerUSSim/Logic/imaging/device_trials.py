@@ -30,7 +30,7 @@ from SlicerUSSim.Logic.tissue.table import TissueTable
 
 #: Of a trial, for its progress, and between two looks at it
 _USUAL_SECONDS, _POLL_SECONDS = 40.0, 0.1
-#: Voxels of the patient, in which thin sulci have a label of their own
+#: Voxels of the patient, in which thin sulci have a separate label
 _PATIENT_MM = 1.5
 #: Before the line of a child that is its answer
 _ANSWER = "ussim: "
@@ -57,7 +57,7 @@ class TriedDevice:
 
 
 class DeviceTrials:
-    """Runs the trials one after the other, the preferred device first, while the program goes on.
+    """Runs the trials one after the other, the preferred device first, in the background.
 
     Parameters
     ----------

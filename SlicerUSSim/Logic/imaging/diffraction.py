@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 _DEPTHS, _DISTANCES, _STEP = (CONSTANTS[f"LOBE_{name}"] for name in ("DEPTHS", "DISTANCES", "STEP"))
 _POINTS, _PADDED = 512, 4096  # of an aperture, and of its Fourier transform
 _PLANE_POINTS, _PLANE_FREQUENCIES, _PLANE_TIMES = 256, 9, 31  # of both apertures, and of the pulse, for planes
-_LEAST_PLANE = 1e-4  # of these, re a square plane
+_LEAST_PLANE = 1e-4  # of these, relative to a square plane
 _BEYOND_SIGMAS = 2.0  # what is closer to the axis belongs to the main beam
 _GAUSSIAN_SIGMAS = 6.0  # that has nothing beyond these
 #: Variance by which side_lobes.cl widens lobes: of a node's lines and of the interpolation between nodes, in squared
@@ -39,7 +39,7 @@ def lobes_of(probe: Probe) -> np.ndarray:
 
     At LOBE_DEPTHS depths evenly from the face to the image depth, and distances LOBE_STEP wavelengths times receive
     f-number at that depth apart: square roots of the power per such distance, averaged over one lobe, since it is
-    sampled at intervals, on either side, re that of the main beam.
+    sampled at intervals, on either side, relative to the main beam.
 
     The transmit aperture is uniform and focused once (with zones: once for each), the receive
     aperture has the weights 1 - a + a cos(pi x)^2 and is focused at every depth. The second harmonic is fed by the
@@ -165,7 +165,7 @@ def plane_echoes(probe: Probe) -> np.ndarray:
 
     Exponents of two of the peak of the pulse, by lateral and by elevational tilt: at depths evenly from the face to the
     image depth, and tangents of the tilt whose square roots are evenly from 0 to 1. What leaves the transmit aperture
-    at a is reflected to c - a, c = 2 s tan(tilt), but for diffraction:
+    at a is reflected to c - a, c = 2 s tan(tilt), except for diffraction:
 
         integral T(a) R(b) exp(-i k (a + b - c)^2 / 4 s) da db,    T(a) = exp(i k a^2 (1 / s - 1 / F) / 2)
 

@@ -47,7 +47,7 @@ class FoundSheets:
 
     @property
     def reflects(self) -> bool:
-        """Whether any sheet has a coherent echo of its own."""
+        """Whether any sheet has its own coherent echo."""
         return bool((self.words[:, 1] >> np.uint32(28)).any())
 
 
@@ -87,7 +87,7 @@ def found_sheets(
 def _hangs(surfels: Surfels, padded: np.ndarray, grid: Volume) -> np.ndarray:
     """(n,) bool: falx and tentorium in the coupling medium, without tissue on both sides.
 
-    Above the hull of a brain without its head, or in the saline of an opening, what holds the dura is not there.
+    Above the hull of a brain without its head, or in the saline of an opening, nothing holds the dura.
     """
     labels = padded.ravel()
     found = np.isin(surfels.kind, [KINDS.index("falx"), KINDS.index("tentorium")])
@@ -136,7 +136,7 @@ def _with_margin(grid: Volume) -> Volume:
 
 
 def _fluid_beside(surfels: Surfels, padded: np.ndarray, grid: Volume, fluids: tuple[int, ...]) -> np.ndarray:
-    """(n, 2) mm along and against the normals, up to _WIDE_MM, to which fluid goes on; -1 where there is none."""
+    """(n, 2) mm along and against the normals, up to _WIDE_MM, to which fluid continues; -1 without fluid."""
     extent = np.full((len(surfels), 2), -1.0)
     steps = np.arange(0.0, _WIDE_MM + 1e-6, _STEP_MM)
     index = _along(surfels, grid, padded.shape)
@@ -168,7 +168,7 @@ def _closed(
     for side, sign in enumerate((1.0, -1.0)):
         for step in np.arange(0.0, _WIDE_MM + 1e-6, _STEP_MM):
             gap.ravel()[index(sign * step)[extent[:, side] >= step - 1e-6]] = True
-    for axis in range(3):  # all corners of these cells; what is clipped is in the margin, which is no fluid
+    for axis in range(3):  # all corners of these cells; what is clipped is in the margin, which is not fluid
         wide = np.moveaxis(gap, axis, 0)
         wide[1:] |= wide[:-1].copy()
     gap &= np.isin(padded, fluids)

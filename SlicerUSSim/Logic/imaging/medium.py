@@ -4,9 +4,9 @@ A voxel has two bytes. The low byte has the label and flags for cells (the cube 
 corners agree, so that most look-ups need one load. The high byte has the *fluid distance* of the voxel from the border
 of the membrane's fluids, positive inside. It is computed from their indicator, smoothed by a Gaussian: for a planar
 border at distance d this is Phi(d / sigma), so d = sigma Phi^-1 of it. With linear interpolation between voxels, a
-layer thinner than a voxel is located without steps. Thin layers of the membrane's own tissue, as of a sulcus whose two
-borders meet, are sheets instead: planes fitted to their voxels (sheets.py). Sheets that were found in the MRI are such
-planes, too (found_sheets.py).
+layer thinner than a voxel is located without steps. Thin layers of the membrane's own tissue, such as a sulcus whose
+two borders meet, are sheets instead: planes fitted to their voxels (sheets.py), like sheets that were found in the MRI
+(found_sheets.py).
 """
 
 from __future__ import annotations
@@ -185,8 +185,8 @@ class Medium:
         return rows
 
     def _laid_over(self, tissues: TissueTable) -> np.ndarray:
-        """(k, j, i) uint8 labels, which go on in a margin: the volume's ends are no borders. Narrow gaps are closed
-        where a sheet that was found stands for them."""
+        """(k, j, i) uint8 labels, padded by edge values: the volume's ends are not borders. Narrow gaps are closed
+        where a sheet that was found represents them."""
         padded = np.pad(as_labels(self.labels.array), _PAD, mode="edge")
         membrane, self.found = tissues.membrane, None
         if self.sheets is None or membrane is None or membrane.thickness_mm == 0:
@@ -261,7 +261,7 @@ class Medium:
             groups |= {int(group) for group in np.unique(membership[0][share > 0])}
         buffer = self.device.upload(np.pad(group.ravel(), (0, 16)))
         self.smooth_buffer = smoothed_indicators(self.device, buffer, self.dims, groups, self.smooth_groups, membership)
-        self.device.mark()  # the device begins, and the host goes on
+        self.device.mark()  # the device begins while the host continues
         words = group | np.uint8(CONSTANTS["SAME_GROUP"]) * _are_same(group)
         # Rows are read eight voxels at a time, including the last one.
         self.group_buffer = self.device.upload(np.pad(words.ravel(), (0, 8)))

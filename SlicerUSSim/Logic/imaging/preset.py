@@ -114,7 +114,7 @@ class Preset:
         if "tissues" in values or "membrane" in values:
             sections["tissues"] = TissueTable.from_dict(values, source)
         if values.get(_POSE) is not None:
-            require(values.keys() != {_POSE}, f"{source}: is a pose and no preset; open it as a pose")
+            require(values.keys() != {_POSE}, f"{source}: is a pose, not a preset; open it as a pose")
             sections[_POSE] = check_rigid(f"{source}: {_POSE}", values[_POSE])
         missing = [name for name in known[:-2] if name not in values]
         if missing:

@@ -33,7 +33,7 @@ _FAN_STEP_MM = 2.0
 
 @lru_cache(maxsize=64)
 def worked(probe: Probe, settings: SimulationSettings, columns: int) -> tuple[Probe, SimulationSettings]:
-    """The probe and settings that an image of so many columns is computed with."""
+    """The probe and settings that compute an image of this many columns."""
     if settings.quality == "full":
         return probe, settings
     needed = int(np.ceil((probe.scan_lines - 1) * sigmas_between(probe)[1].max() / _APART_SIGMAS)) + 1

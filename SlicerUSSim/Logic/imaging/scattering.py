@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 PAPER_SITES_PER_MM3 = 0.02**-3
 # In the probe's smallest resolution cell, for developed speckle; thin structures need some too, whatever the probe
 _SITES_PER_CELL, _LEAST_PER_MM3 = 5.0, 4.0
-_LOBE_CHUNKS = 4  # samples of a work-item for elevational side lobes re those for the main beam
+_LOBE_CHUNKS = 4  # samples of a work-item for elevational side lobes, per sample for the main beam
 _SLICES = 16  # of a scan line for the interfaces on GPUs, which have more work-items than scan lines
 
 #: Extent of a cell of the lattice along a line of any direction, in its edges: between 1 and the root of 3
@@ -295,7 +295,7 @@ def is_uneven(table: np.ndarray) -> bool:
 
 @cache
 def speck_power(speck_db: float) -> float:
-    """Mean power in a cell of the lattice of specks that has one, re tissue: 10^(db max(0, 1 - r^2) / 10), r from 0 in
+    """Mean power, relative to tissue, in a lattice cell with a speck: 10^(db max(0, 1 - r^2) / 10), r from 0 in
     the middle to 1 at the faces."""
     axis = (np.arange(64) + 0.5) / 32.0 - 1.0
     squared = axis[:, None, None] ** 2 + axis[None, :, None] ** 2 + axis[None, None, :] ** 2

@@ -202,7 +202,7 @@ def _physics(device: Device) -> Iterator[Finding]:
     Attenuation is that of the centre frequency: without the downshift of the band the level falls by 2 a f d.
     """
     probe, settings = PROBES["linear"], SimulationSettings(frequency_downshift=False)
-    labels = np.zeros((46, 21, 61), np.uint8)  # label 0 goes on beyond the volume
+    labels = np.zeros((46, 21, 61), np.uint8)  # label 0 continues beyond the volume
     labels[:10] = 1
     ijk_to_ras = np.eye(4)
     ijk_to_ras[:3, 3] = -30.0, -10.0, -9.5  # the plate's surface is at z = 0

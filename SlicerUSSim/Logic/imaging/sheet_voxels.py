@@ -15,7 +15,7 @@ from SlicerUSSim.Logic.tissue.surfels import Surfels
 _NEIGHBOURS, _SIGMA_MM = 8, 0.7
 #: Neighbours whose normals differ by more belong to another sheet
 _SAME_COSINE = 0.7
-#: A sheet goes on beyond a surfel's place by this much of its radius, and this far at least: of ridges in voxels of
+#: A sheet extends beyond a surfel's place by this much of its radius, and this far at least: of ridges in voxels of
 #: 1 mm, no place is farther from a surfel, however the sheet is tilted
 _RIM, _RIM_MM = 1.5, 0.9
 #: Voxels at a time

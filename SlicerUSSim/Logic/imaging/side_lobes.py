@@ -25,7 +25,7 @@ COARSER = 4.0
 #: Elevational lobes are computed where tissue scatters less than this part of the typical power: elsewhere its own
 #: echoes hide them
 DARK = 0.25
-#: Elevational lobes follow one path for as many traced lines as are within so many sigmas of the beam
+#: Elevational lobes follow one path for all traced lines within this many sigmas of the beam
 _TOGETHER_SIGMAS, _MOST_TOGETHER = 3.0, 9
 _SEED = 0x51DE10BE
 

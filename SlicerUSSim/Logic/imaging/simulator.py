@@ -48,11 +48,11 @@ from SlicerUSSim.Logic.tissue.texture import Texture
 if TYPE_CHECKING:
     from pyopencl import Buffer
 
-#: Frames whose signals stay on the device: one, and the one before, which goes when its name gets the next
+#: Frames whose signals stay on the device: one, and the previous one, which is freed with the next assignment
 _ON_DEVICE = 2
 #: Beyond all fields
 _FAR_MM = 1e6
-#: Part of an image beyond the volume, in tissue, of which the user is told
+#: Part of an image beyond the volume, in tissue, that triggers a warning
 _TOLD_SHARE = 0.01
 #: Cells of the scatterer lattice per image: about 5 s on two cores, what is not begun, and per second there (measured
 #: with tall beams; two to three times as many with low ones)
@@ -136,7 +136,7 @@ class UltrasoundSimulator:
         self._acquisition_buffer = self.device.empty(ACQUISITION.itemsize)
         # The last probe and settings that were found fast enough
         self._fast_for: tuple | None = None
-        # The record of the last frame, and its inputs but for the pose
+        # The record of the last frame, and its inputs except the pose
         self._record: np.ndarray | None = None
         self._record_made_for: tuple | None = None
         # The baseband signal of the last frame, and its inputs
@@ -190,7 +190,7 @@ class UltrasoundSimulator:
         `grid` gives the pixels, for example those of a real image; by default they cover the bounding box of the imaged
         field, with display.image_size pixels. `noise_seed` selects the amplifier noise (noise.py): 0 depends only on
         the settings' seed, seed_of_pose(probe_to_ras) also on the pose.
-        Warns with EmptyViewWarning if the field is outside the volume, whose last tissue goes on there, and with
+        Warns with EmptyViewWarning if the field is outside the volume, whose last tissue continues there, and with
         SlowScatterersWarning if there are so many scatterers that it takes more than seconds on a CPU.
         Raises SimulationError if it would take minutes, for a pose that is not rigid and a noise_seed that is not a
         whole number of 32 bits.
@@ -242,7 +242,7 @@ class UltrasoundSimulator:
     ) -> dict[str, np.ndarray]:
         """{output: array} of images at `poses` (n, 4, 4); image i has the noise_seed + i, or its own.
 
-        One image is prepared while the device computes the one before, and nothing else than the outputs is downloaded.
+        One image is prepared while the device computes the previous one, and only the outputs are downloaded.
 
         Parameters
         ----------
@@ -340,7 +340,7 @@ class UltrasoundSimulator:
     def redisplay(
         self, echoes: Echoes, probe: Probe, settings: SimulationSettings, display: DisplaySettings, noise_seed: int = 0
     ) -> np.ndarray:
-        """(rows, columns) uint8 image of echoes that were kept, without those before (display.persistence).
+        """(rows, columns) uint8 image of echoes that were kept, without earlier images (display.persistence).
 
         `probe`, `settings` and `noise_seed` are those of the echoes; the patient of this simulator does not matter.
         """
@@ -509,7 +509,7 @@ class UltrasoundSimulator:
     ) -> None:
         """Enqueue images (probe, pose, display, grid, noise_seed), and call what `start` gives to complete each.
 
-        While the device computes an image, the host completes the one before and prepares the next, no more than one.
+        While the device computes an image, the host completes the previous one and prepares the next, no more than one.
         """
         before: Callable[[], object] | None = None
         for number, (probe, pose, display, grid, noise_seed) in enumerate(jobs):
@@ -708,7 +708,7 @@ class UltrasoundSimulator:
         size = np.array(self.medium.labels.array.shape[::-1])
         if (voxels.max(axis=1) < -0.5).any() or (voxels.min(axis=1) > size - 0.5).any():
             warnings.warn(
-                "the probe looks past the volume: the image has only what goes on beyond its end", EmptyViewWarning,
+                "the probe looks past the volume: the image shows only its last tissue, continued", EmptyViewWarning,
                 stacklevel=stacklevel,
             )  # fmt: skip
         elif self._told_share < 0.5 and ((voxels.min(axis=1) < -0.5) | (voxels.max(axis=1) > size - 0.5)).any():
@@ -725,7 +725,7 @@ class UltrasoundSimulator:
         share = float(is_beyond.mean())
         if share > max(_TOLD_SHARE, 2.0 * self._told_share):
             self._told_share = share
-            end = "%.0f %% of the image is beyond the volume: it continues what is at the volume's end, not the patient"
+            end = "%.0f %% of the image is beyond the volume: it shows the tissue at the volume's end, not the patient"
             _log.warning(end, 100.0 * share)
 
     def _warn_if_overflown(self, frames: int = 1) -> None:

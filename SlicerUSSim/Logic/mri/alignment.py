@@ -26,8 +26,8 @@ _PITCHES, _SIZES = (-30.0, -15.0, 0.0, 15.0, 30.0), (-10.0, 4.0)
 _EXPECTED_SIZE, _SIZE_SPREAD = -5.0, 12.0
 #: A fit that explains less of the image is repeated without fat. Plain T1s have 0.5 to 0.97
 _DOUBTFUL = 0.45
-#: Brighter than so many times the inner brain is fat, which drags the fit outwards; depth of that brain, mm; and its
-#: least brightness as a share of the image's range, below which (CT, half a head) it is no measure of fat
+#: Brighter than this many times the inner brain is fat, which drags the fit outwards; depth of that brain, mm; and its
+#: least brightness as a share of the image's range, below which (CT, half a head) it does not measure fat
 _FAT, _INNER_MM, _LEAST_INNER = 1.5, 15.0, 0.05
 
 

@@ -114,7 +114,7 @@ def register_atlas(
     affine.SetMatrix(linear.ravel().tolist())
     affine.SetTranslation((linear @ centres[0] + shift - centres[0]).tolist())
     found = optimised(_method(50, (2, 1)), fixed, moving, affine)[1]
-    # An array of its own: a view of an image that nothing else holds is of memory that is used again
+    # A separate array: a view of an image that nothing else holds is of memory that is used again
     warped = sitk.GetArrayFromImage(sitk.Resample(moving_mask, fixed_mask, found)) > 0.5
     mask = sitk.GetArrayViewFromImage(fixed_mask) > 0.5
     report(1.0)

@@ -24,7 +24,7 @@ _COARSE_MM = 4.0
 #: Length of an adult's brain: the field of a part of a brain is as smooth as that of the whole, which a coil makes
 _BRAIN_MM = 170.0
 #: Ratio of the 95th to the 5th percentile of the field in the brain, less 1: below the first its estimate is no better
-#: than none; from the second, as of surface coils, it is too strong for the polynomial and N4 goes first
+#: than none; from the second, as with surface coils, it is too strong for the polynomial and N4 goes first
 LEAST_FIELD, STRONG_FIELD = 0.1, 0.6
 #: The first for a part of a brain, which shows a part of what a field varies. On parts of phantoms with fields of 0 to
 #: 20 %, anything from 0 to 0.13 gives the same mean Dice to 0.0005
@@ -94,7 +94,7 @@ def _about(contrast: str, strength: float, wanted: bool | None, how: str, least:
     amount = f"{strength:.1%}" if strength < 10.0 else "more than a factor of ten"
     found = f"{contrast}: intensity varies by {amount} across the brain"
     if not how:
-        return f"{found}, below {least:.0%}: left as it is"
+        return f"{found}, below {least:.0%}: not removed"
     return f"{found}: {how}{', as asked for' if wanted else ''}"
 
 
@@ -269,7 +269,7 @@ def estimate_field(
 
 
 def anatomy(fit: AtlasFit, grid: Volume, shape: tuple[int, ...]) -> np.ndarray:
-    """(k, j, i) float32 part of a T1's estimated field that is no field but anatomy, as the atlas's own T1 shows it."""
+    """(k, j, i) float32 part of a T1's estimated field that is anatomy rather than field, as the atlas's T1 shows."""
     matrix = fit.atlas.t1.ras_to_ijk @ fit.patient_to_atlas @ grid.ijk_to_ras
     linear, offset = matrix[:3, :3][::-1, ::-1], matrix[:3, 3][::-1]
     stride = 4

@@ -15,7 +15,7 @@ from SlicerUSSim.Logic.mri.segmentation_settings import CT, SegmentationSettings
 
 #: Tissues (indices in mixture.TISSUES) from dark to bright
 ORDERS = {"t1": (0, 1, 2), "t1gd": (0, 1, 2), "t2": (2, 1, 0), "flair": (0, 2, 1)}
-#: Name of what is brighter than all tissues, where it is a class of its own
+#: Name of what is brighter than all tissues, where it is a separate class
 _BRIGHT_NAMES = {"t1gd": "enhancing", "flair": "tumour"}
 #: Contrasts from the one that tells grey from white matter best
 _PREFERENCE = ("t1", "t1gd", "flair", "t2")

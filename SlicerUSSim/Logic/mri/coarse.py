@@ -13,7 +13,7 @@ from SlicerUSSim.Logic.base.transforms import LPS_TO_RAS
 from SlicerUSSim.Logic.base.volume import Volume
 
 _SPACING_MM = 4.0
-#: Slices thicker than this, and than twice the pixels, are divided into ones of at most so many mm
+#: Slices thicker than this, and than twice the pixels, are divided into ones of at most the second number, mm
 _THICK_MM, _THIN_MM = 3.0, 1.5
 
 
@@ -116,7 +116,7 @@ def with_thin_slices(volume: Volume, interpolate: bool = True) -> Volume:
 
 
 def widened(values: np.ndarray, step: int, shape: tuple[int, ...]) -> np.ndarray:
-    """(k, j, i) float32 of `shape` from values at every `step`-th voxel, interpolated linearly; the last go on."""
+    """(k, j, i) float32 of `shape` from values at every `step`-th voxel, interpolated linearly and padded."""
     for axis, count in enumerate(shape):
         places = np.arange(count) / step
         low = np.minimum(places.astype(int), values.shape[axis] - 1)

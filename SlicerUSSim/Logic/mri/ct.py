@@ -30,14 +30,14 @@ _log = logging.getLogger(__name__)
 LOWEST_HU, HIGHEST_HU = -1024, 3500
 #: Strength of the guided filter per deviation of the noise, the part of the noise that it leaves, and voxels at once
 _EPSILON_PER_NOISE, _NOISE_LEFT, _AT_ONCE = 2.0, 0.5, 8_000_000
-#: Noise from which on fat and muscle cannot be told apart; the least patient
+#: Noise above which fat and muscle cannot be told apart; the least patient
 _NOISY_HU, _LEAST_ML = 60.0, 10.0
 #: Tissues of a label map of organs that the numbers know better, and those of bone
 _BY_NUMBER = {"lung", "air", "fat", "skin", "scalp", "metal", "muscle", "coupling"}
 _BONES = {"bone", "skull", "cancellous bone"}
-#: Vessels stay blood in an organ from this far above its median on, HU
+#: Vessels stay blood in an organ above its median by at least this much, HU
 _ABOVE_ORGAN_HU = 45.0
-#: What organs are made of, whose contents do not vary; the share from which on they are taken for this patient's
+#: What organs are made of, whose contents do not vary; the least share to take them for this patient's
 _MADE_OF = {"lung": ("lung or gas", (LUNG, AIR))} | dict.fromkeys(
     ("liver", "spleen", "kidney", "heart"), ("soft tissue", (SOFT, BLOOD))
 )
@@ -153,7 +153,7 @@ def segment_ct(
     labels, names = classified(sharp, hu, left, body, ct, skin_mm), NAMES
     report(0.85)
     if not np.any(labels == BONE):
-        warnings.append(f"no bone was found; the densest is {sharp[body].max()} HU, expected from 700 on in a whole CT")
+        warnings.append(f"no bone was found; the densest is {sharp[body].max()} HU, expected 700 or more in a whole CT")
     if noise > _NOISY_HU:
         warnings.append(f"noise is {noise:.0f} HU, expected less than {_NOISY_HU:.0f} to tell fat and muscle apart")
     if organs is None:

@@ -9,13 +9,13 @@ from scipy import ndimage
 
 from SlicerUSSim.Logic.base.volume import Volume
 
-#: Size of the cells in which the patient is looked for; what is thinner than four of them is not: couch, tubes, clothes
+#: Size of the cells in which the search for the patient works; it ignores parts thinner than four cells: couch, tubes
 CELL_MM = 2.5
 #: Above: tissue, and not foam; below: air, and not lung
 _TISSUE_HU, _AIR_HU = -250.0, -930.0
-#: A part smaller than this share of the largest is no part of the patient
+#: A part smaller than this share of the largest is not part of the patient
 _LEAST_PART = 0.02
-#: Share of air, from which on a space at the side of the image is outside; of lung that is cut by it 0.0
+#: Least share of air of a space at the side of the image that is outside; of lung that is cut by it 0.0
 _OUTSIDE_AIR = 0.3
 #: Share of slices in which a couch is at the same place; how much of it is seen at least on either side of the patient,
 #: and how far from a parabola
@@ -76,7 +76,7 @@ def _eroded(mask: np.ndarray, times: int) -> np.ndarray:
 def _cut_couch(inside: np.ndarray, hu: np.ndarray, ct: Volume) -> None:
     """Take out what is beyond the surface of a couch that touches the patient at the first rows.
 
-    A couch is the same in all slices. On both sides of the patient its surface is seen; a parabola through it goes on
+    A couch is the same in all slices. On both sides of the patient its surface is seen; a parabola through it continues
     below.
     """
     couch = ((hu > _TISSUE_HU) & ~inside).mean(axis=0) > _SAME_IN_SLICES

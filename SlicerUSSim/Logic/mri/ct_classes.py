@@ -3,7 +3,7 @@
 A voxel on a border has the numbers of neither side: between air and skin lie those of lung and fat, between bone and
 muscle those of contrast agent. So borders are sharpened first: a voxel on a step belongs to the side on which half of
 the step puts it, as edges in CT are measured, and takes the number of that side beyond the step (after toggle mapping;
-Kramer and Bruckner, Pattern Recognition 7, 1975). What is in between afterwards is a tissue of its own.
+Kramer and Bruckner, Pattern Recognition 7, 1975). What is in between afterwards is a separate tissue.
 """
 
 from __future__ import annotations
@@ -28,16 +28,16 @@ _AIR_LUNG, _LUNG_FAT, _FAT_SOFT, _SOFT_BRIGHT, _METAL = -930, -250, -25, 135, 29
 #: Only bone is as dense as the first number, or as the second in a sheet; around it cortex goes down to the third,
 #: and has the last where it is thicker than the blur
 _DENSE_HU, _CORE_HU, _CORTEX_HU, _WHOLE_CORTEX_HU = 700, 450, 300, 1600.0
-#: Thin cortex has less: from this number on, if it stands out so much from what is wider than this, mm
+#: Thin cortex has less: at least this number, if it exceeds wider structures than the third, mm, by the second
 _SHEET_HU, _STANDS_OUT, _SHEET_MM = 220, 90, 6.0
-#: A gap between bones that is narrower than the first number, mm, and so much darker than both
+#: A gap between bones that is narrower than the first number, mm, and by the second darker than both
 _GAP_MM, _GAP_DEPTH_HU = 3.5, 150
-#: Marrow with trabeculae from this number on, where bone lies in such a share of 26 directions within so many mm
+#: Marrow with trabeculae has at least this number, where bone is in this share of 26 directions within this many mm
 _MARROW_HU, _ENCLOSED, _REACH_MM = 100, 0.84, 30.0
-#: A difference across a voxel from which on it is on a step: less than from fat to muscle, or so many deviations of the
-#: noise; and those within which a number alone does not tell contrast agent
+#: Least difference across a voxel that is on a step: less than from fat to muscle, or this many deviations of
+#: the noise; and those within which a number alone does not tell contrast agent
 _LEAST_STEP, _STEP_PER_NOISE, _MARGIN_PER_NOISE = 90, 5.0, 2.0
-#: Gas in a smaller space than this is no lung, ml
+#: Gas in a smaller space than this is not lung, ml
 _LEAST_LUNG_ML = 10.0
 #: Thickness of the skin (1.6 to 2.3 mm; Laurent et al., Vaccine 25(34), 2007)
 SKIN_MM = 1.8
@@ -77,7 +77,7 @@ def classified(
     _mark_gas(classes, ct)
     _mark_bone(classes, hu, filtered, ct)
     _settle_blood(classes, hu, noise)
-    if skin_mm > 0.0:  # the outermost layer; the ends of the image are no surface
+    if skin_mm > 0.0:  # the outermost layer; the ends of the image are not a surface
         import SimpleITK as sitk
 
         outside, radius = sitk.GetImageFromArray((~body).astype(np.uint8)), np.rint(skin_mm / ct.spacing_mm)
@@ -140,7 +140,7 @@ def _mark_bone(classes: np.ndarray, hu: np.ndarray, filtered: np.ndarray, ct: Vo
 
 
 def enclosed_share(wall: np.ndarray, spacing_mm: np.ndarray) -> np.ndarray:
-    """(k, j, i) share of 26 directions in which a wall is within reach; the image goes on beyond its ends as there.
+    """(k, j, i) share of 26 directions in which a wall is within reach; the image continues beyond its ends.
 
     `spacing_mm` is along k, j, i. Marrow has a wall all around; a vessel beside a vertebra has one on one side, a disc
     above and below, the spinal canal not along itself.

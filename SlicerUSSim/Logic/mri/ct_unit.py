@@ -24,7 +24,7 @@ FIELD_HU = -1100.0
 def hounsfield_offset(ct: Volume) -> tuple[float, str | None]:
     """(what is to be subtracted from the numbers for Hounsfield units, a line about what should be checked or None).
 
-    Raises SimulationError for numbers without air that begin at 0 or are cut off, as of an MRI or a window of a CT.
+    Raises SimulationError for numbers without air that begin at 0 or are cut off (an MRI, a window of a CT).
     """
     values = _sample(ct.array)
     offset = _offset_of(values)
@@ -37,7 +37,7 @@ def hounsfield_offset(ct: Volume) -> tuple[float, str | None]:
         f"values are from {low:g} to {high:g}, expected Hounsfield units (air -1000, water 0, bone 1000) that are not "
         "cut off; for an MRI give its contrast, for a CT apply slope and intercept of its header",
     )
-    return 0.0, f"values are from {low:g} to {high:g} without air at -1000; they are taken for Hounsfield units"
+    return 0.0, f"values are from {low:g} to {high:g} without air at -1000; they are assumed to be Hounsfield units"
 
 
 def why_ct(image: Volume) -> str | None:

@@ -6,7 +6,7 @@ import numpy as np
 
 from SlicerUSSim.Logic.base.volume import SIDES, Volume
 
-#: Area of the brain at an edge of the image from which that is said, and at the bottom, where the stem leaves, cm2
+#: Least area of the brain at an edge of the image that is reported, and at the bottom, where the stem leaves, cm2
 _WORTH_CM2, _WORTH_AT_BASE_CM2 = 6.0, 20.0
 
 
@@ -20,7 +20,7 @@ def edge_value(values: np.ndarray) -> tuple[float, float]:
 def ends_at_edge(mri: Volume, inside: np.ndarray) -> tuple[str, ...]:
     """One line for each edge of the image that cuts the brain (k, j, i) off; at the bottom only over a larger area.
 
-    A whole brain does not reach the edge but for the stem, however little of scalp and skull is shown.
+    A whole brain does not reach the edge except at the stem, however little of scalp and skull is shown.
     """
     return tuple(
         f"the brain reaches the {name} edge of the image over {area:.0f} cm2: it is cut off there"

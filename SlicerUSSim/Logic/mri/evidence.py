@@ -1,4 +1,4 @@
-"""What a segmentation knows about every voxel beyond its label: on this, lesions are looked for and grown."""
+"""What a segmentation knows about every voxel beyond its label: lesions are found and grown from this."""
 
 from __future__ import annotations
 

@@ -79,9 +79,9 @@ def volume_doubts(millilitres: float) -> tuple[str, ...]:
 
 #: Labelled voxels that are looked at; the share of them that has to lie in the MRI
 _SAMPLES, _LEAST_INSIDE = 40_000, 0.5
-#: The labels are moved by so much along either direction of the three axes, for comparison; by the first of these with
+#: The labels are moved this far along either direction of the three axes, for comparison; by the first of these with
 #: which they no longer explain more than this share of intensities that are exactly theirs. A direction in which they
-#: do so still, as that of a cylinder's axis, says nothing.
+#: do so still, such as a cylinder's axis, is ignored.
 _MOVED_MM, _MOST_ALIKE = (6.0, 12.0, 24.0), 0.35
 #: How many times as much of the variance of the intensities they explain in their place as in the best other place:
 #: 3.5 to 28 of a patient's own (also those of another contrast: 4.3 and 10.6), at most 1.4 of another head's that was
@@ -99,7 +99,7 @@ def follows(mri: Volume, labels: Volume) -> bool:
     Parameters
     ----------
     mri : (k, j, i) intensities.
-    labels : (k, j, i) tissues, 0 is none; on any grid.
+    labels : (k, j, i) tissues, 0 without one; on any grid.
     """
     places = np.argwhere(labels.array > 0)
     if not len(places):

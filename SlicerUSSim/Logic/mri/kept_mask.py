@@ -22,7 +22,7 @@ _MRI = "ussim_mri"
 
 
 def read_kept(path: Path, mri: Volume) -> Volume | None:
-    """The mask kept for this MRI, also where somebody edited it; None if there is none, or it is of another image."""
+    """The mask kept for this MRI, also where a user edited it; None without one, or if it belongs to another image."""
     if not path.is_file():
         return None
     try:
@@ -56,7 +56,7 @@ def keep(path: Path, mri: Volume, mask: Volume) -> str:
 def keep_file(path: Path, what: str, write: Callable[[Path], None], *, replaces: bool = False) -> str:
     """Write a file to `path`, where there is none unless it `replaces` one; a line that says so, or why not."""
     try:
-        require(replaces or not path.exists(), f"{path} exists and is of another image")
+        require(replaces or not path.exists(), f"{path} exists and belongs to another image")
         write(path)
     except SimulationError as error:
         return f"{what} is not kept: {error}"

@@ -123,7 +123,7 @@ def several_segments(volume: Volume) -> str:
 
 
 def _alternative(labels: np.ndarray, names: Mapping[int, str]) -> str:
-    """How several labels could be added as tissues of their own, in brackets; empty if it is not known."""
+    """How several labels could be added as separate tissues, in brackets; empty if it is not known."""
     if not names:
         return " (brats=FILE adds the tissues of a BraTS map)" if set(labels.tolist()) <= {1, 2, 3, 4} else ""
     try:
@@ -149,9 +149,9 @@ def _by_name(labelled: Volume, labels: np.ndarray, names: Mapping[int, str], sou
             tissue = None
         require(
             tissue is not None,
-            f"{source}: holds the labels {called(labels, names)}, and {name or f'label {label}'!r} is called like no "
-            "tissue; rename it (tumour, oedema, necrosis, enhancing, cyst, cavity), or add every label from a file of "
-            "its own with its tissue",
+            f"{source}: holds the labels {called(labels, names)}, and {name or f'label {label}'!r} matches no "
+            "tissue; rename it (tumour, oedema, necrosis, enhancing, cyst, cavity), or add every label from a "
+            "separate file with its tissue",
         )
         found.setdefault(str(tissue), []).append(label)
     masks = {tissue: np.isin(labelled.array, of_it) for tissue, of_it in found.items()}
@@ -235,7 +235,7 @@ def resampled(masks: Masks, like: Volume) -> tuple[tuple[slice, ...], np.ndarray
 
 
 def _cut_at(shares: np.ndarray, count: int) -> float:
-    """The share, within _CUTS, from which on nearest to `count` voxels are inside."""
+    """The threshold of the share, within _CUTS, with the number of voxels inside nearest to `count`."""
     low, high = _CUTS
     cuts, of_each = np.unique(np.append(shares[(shares > low) & (shares < high)], high), return_counts=True)
     counts = np.count_nonzero(shares >= high) + np.cumsum(of_each[::-1])[::-1] - 1  # -1: the one appended

@@ -47,5 +47,5 @@ def segment_image(
 
 
 def has_brain_mask(contrast: str) -> bool:
-    """Whether a segmentation is of a brain alone, as of an MRI; see pathology.add_tissue."""
+    """Whether a segmentation covers a brain alone, as from an MRI; see pathology.add_tissue."""
     return contrast != CT

@@ -1,7 +1,7 @@
 """Deep nuclei: thalamus, putamen and pallidum are grey matter that an MRI shows nearly as bright as white matter.
 
 Myelin and iron make them so, and a mixture with one mean per tissue splits them. What tells them from white matter is
-their place: the atlas says where a nucleus may be, and a mixture of its own, in those voxels alone, says which of them
+their place: the atlas says where a nucleus may be, and a separate mixture, in those voxels alone, says which of them
 it is. Only white matter becomes grey by it; CSF, vessels and lesions stay.
 """
 
@@ -45,7 +45,7 @@ _DARKEST = 140.0
 _TEMPLATE_SIGMA_MM, _SIGMA_MM = 0.7, 1.5
 #: Around the ellipsoids, for these
 _MARGIN_MM = 8.0
-#: Probability of a nucleus where its place leaves no doubt, and below which it is not looked for
+#: Probability of a nucleus where its place leaves no doubt, and below which the search ignores it
 _MOST, _LEAST = 0.95, 0.02
 #: Shares of white matter, grey matter and voxels that are part of both in what surrounds a nucleus
 _AROUND = (0.7, 0.1, 0.2)

@@ -1,4 +1,4 @@
-"""What lies outside the brain in the MRI of a whole head: skin, scalp, skull with its marrow, and air.
+"""Tissues outside the brain in the MRI of a whole head: skin, scalp, skull with its marrow, and air.
 
 Bone, its tables at least, and air give no signal; fat, muscle and marrow do. As in Dogdas, Shattuck and Leahy,
 "Segmentation of skull and scalp in 3-D human MRI using mathematical morphology" (Human Brain Mapping 26, 2005), the
@@ -79,7 +79,7 @@ class Outside:
 
 
 def require_findable(contrast: str, skull_strip: str, has_mask: bool) -> None:
-    """Raise SimulationError where the image is no T1, or its brain is not to be found."""
+    """Raise SimulationError where the image is not a T1, or its brain cannot be found."""
     require(
         contrast in CONTRASTS,
         f"skin, skull and what else is outside the brain (--outside) are found in a whole head of contrast "
@@ -87,7 +87,7 @@ def require_findable(contrast: str, skull_strip: str, has_mask: bool) -> None:
     )
     require(
         has_mask or skull_strip != "none",
-        "what is outside the brain (--outside) is not known without it, and --skull-strip is none; choose another, or "
+        "--outside needs the brain, which --skull-strip none does not find; choose another method, or "
         "give a brain mask (--mask)",
     )
 
@@ -95,7 +95,7 @@ def require_findable(contrast: str, skull_strip: str, has_mask: bool) -> None:
 def find_outside(
     mri: Volume, brain: np.ndarray, progress: Callable[[float], None] = lambda share: None
 ) -> Outside:  # fmt: skip
-    """Label what lies outside the brain in the MRI of a whole head (T1, with or without contrast agent).
+    """Label the tissues outside the brain in the MRI of a whole head (T1, with or without contrast agent).
 
     Parameters
     ----------
@@ -103,7 +103,7 @@ def find_outside(
     brain : (k, j, i) bool, the brain.
     progress : called with the completed fraction, 0 to 1.
 
-    In a T1, CSF is as dark as bone: what lies between a shrunken brain and its skull counts as skull.
+    In a T1, CSF is as dark as bone: the gap between a shrunken brain and its skull counts as skull.
     Raises SimulationError if there is no brain, or nothing around it.
     """
     require(brain.any(), "the brain mask is empty, expected a brain")
@@ -162,7 +162,7 @@ def _cut(labels: np.ndarray, mri: Volume) -> tuple[str, ...]:
 
 
 def _at_faces(box: list[slice], mri: Volume) -> np.ndarray:
-    """(k, j, i) bool of the box: near the faces of the image, where coils hear little and fat is as dark as air."""
+    """(k, j, i) bool of the box: near the faces of the image, where coils receive little and fat is as dark as air."""
     inside = np.ones(mri.array.shape, bool)
     for axis, step in enumerate(mri.spacing_mm[::-1]):
         n = min(int(np.ceil(_FACES_MM / step)), mri.array.shape[axis] // 2)
@@ -195,7 +195,7 @@ def _within(mask: np.ndarray, distance_mm: float, mm: np.ndarray) -> np.ndarray:
 
 
 def _depth(mask: np.ndarray, mm: np.ndarray) -> np.ndarray:
-    """(k, j, i) distance in mm to what is outside; beyond the image it goes on."""
+    """(k, j, i) distance in mm to what is outside; it keeps growing beyond the image."""
     return distance_to(~mask, mm)
 
 
@@ -221,7 +221,7 @@ LEAST_MM, LARGEST_MM = 2.5, 14.0
 #: Usual distance from the brain's surface to that of the skull with what is between, and its deviation over heads and
 #: places (skulls of adults: 3 mm at the temples to 9 mm at the back; Lillie et al., Journal of Anatomy 228, 2016)
 _USUAL_MM, _DEVIATION_MM = 5.5, 3.0
-#: A border is looked for across this
+#: Width of the search across a border
 _ACROSS_MM = 1.5
 #: What it costs that there is bone farther out, but below the skin
 _NOT_OUTERMOST = 1.0

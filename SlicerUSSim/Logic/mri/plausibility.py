@@ -17,8 +17,8 @@ _LEAST_EXTENT_MM = 90.0
 _LEAST_PART_ML = 400.0
 #: Prior share from which a voxel shows the atlas's tissue, and the least number of such voxels
 _SURE_SHARE, _LEAST_VOXELS = 0.7, 200
-#: Distance of grey and white matter's medians in the wrong order from which that is said, and from which it is refused,
-#: in units of the width of both together
+#: Least distance of grey and white matter's medians in the wrong order that triggers a warning, and an error, in units
+#: of the width of both together
 _APART, _FAR_APART = 0.25, 0.5
 #: Share of an image that the atlas explains, below which a user should look: heads and brains had 0.24 (T2) to 0.95,
 #: a clinical scan in 6.5 mm slices 0.19, brains that lie the wrong way round 0.11

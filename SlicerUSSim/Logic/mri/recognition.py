@@ -15,7 +15,7 @@ from SlicerUSSim.Logic.mri.coarse import largest_component
 from SlicerUSSim.Logic.mri.ct_unit import why_ct
 from SlicerUSSim.Logic.mri.edges import edge_value
 
-#: Volumes of a brain, millilitres: outside the first range a user should look, outside the second it is no brain.
+#: Volumes of a brain, millilitres: outside the first a user should check it, outside the second it is not a brain.
 USUAL_ML, POSSIBLE_ML = (1000.0, 1900.0), (500.0, 2600.0)
 #: Share of an image that the atlas's tissues have to explain (alignment.explained). Heads had 0.10 (6.5 mm slices) to
 #: 0.60; phantoms, bodies, noise, ultrasound and heads upside down 0.01 to 0.07

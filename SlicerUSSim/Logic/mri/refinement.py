@@ -30,7 +30,7 @@ def refined(
     `core_mm` is brain, what is further out than `reach_mm` is not. Between them a watershed on the brightness, after
     division by that of the brain nearby (bias field), puts the border into the darkest valley (Hahn and Peitgen, MICCAI
     2000); darker tissue than grey matter is then taken off outside, and sulci are closed. Where much CSF is outside the
-    cortex (the vertex of an older patient), gyri that a bias field makes dark are told from it by its own brightness.
+    cortex (the vertex of an older patient), its brightness separates it from gyri that a bias field makes dark.
     What is deeper in the first mask than `keep_mm` stays if it is on this side of the valley. `progress` is called with
     the completed fraction, 0 to 1.
     """

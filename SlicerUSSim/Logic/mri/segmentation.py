@@ -40,11 +40,11 @@ _log = logging.getLogger(__name__)
 
 #: Least volume of a mask in which several images are compared
 _LEAST_TO_REGISTER_ML = 100.0
-#: Share of the time in which the brain is looked for in a whole head, and until what is outside of it is looked for
+#: Share of the time that finding the brain in a whole head takes, and share before the search outside it begins
 _SHARE_OF_BRAIN, _SHARE_OF_TISSUES = 0.6, 0.75
-#: Size of voxels in which thin sulci, which are narrower, cannot be told, and beyond which tissues mix across them
+#: Size of voxels above which thin sulci, which are narrower, cannot be found: tissues mix across them
 _THICK_SLICE_MM = 3.5
-#: Means from which on the table has two decimals, and three digits below
+#: Least mean for which the table has two decimals; it has three digits below
 _LARGE = 10.0
 
 
@@ -66,7 +66,7 @@ class Segmentation:
     #: Standard deviation of the estimated noise, and the filter's epsilon
     noise: float
     filter_epsilon: float
-    #: Where tissues were looked for, and how it was found
+    #: Region that was segmented, and how it was found
     brain: BrainMask
     #: Lines for the user: what was recognised and decided, and what should be checked
     notes: tuple[str, ...]
@@ -162,7 +162,7 @@ def segment_mri(
         where it is strong or there is no atlas; see bias.corrected.
     thin_sulci : also label the middle of sulci that are too narrow to reach CSF intensity, one voxel thick, as an extra
         tissue "leptomeninges" within the grey matter. Ultrasound shows these sulci, but intensity classes miss them.
-        In voxels of more than 3.5 mm they are not looked for, which the notes say.
+        Voxels of more than 3.5 mm do not show them, which the notes state.
     outside : also label what is outside the brain of a whole head (t1, t1gd), after all others: see
         outside.find_outside. Probabilities are those of the brain.
     skull_strip : how the brain is found without a `mask`; see brain.find_brain.
@@ -279,7 +279,7 @@ def segment_mri(
     labels[part.inside] = found.posteriors.argmax(axis=0) + 1
     tissue_names = names
     if settings.thin_sulci and thickest_mm > _THICK_SLICE_MM:
-        notes.append(f"thin sulci get no label of their own: voxels of {thickest_mm:.3g} mm are thicker than they are")
+        notes.append(f"thin sulci get no separate label: voxels of {thickest_mm:.3g} mm are thicker than they are")
     elif settings.thin_sulci:
         middles = narrow_sulci(labels, found, filtered[0][0], filtered[0][1])
         labels[middles] = len(names) + 1

@@ -12,7 +12,7 @@ from SlicerUSSim.Logic.base.errors import require_kind
 #: Contrasts of MRIs, which segment_mri has; and the name of a CT, which is segment_ct's
 MRI_CONTRASTS, CT = ("t1", "t1gd", "t2", "flair"), "ct"
 
-#: What gel bridges between skin and probe where nothing else is said, mm
+#: Default width of the gap between skin and probe that gel fills, mm
 GEL_MM = 3.0
 
 
@@ -39,7 +39,7 @@ class SegmentationSettings(Declared):
         option="thin-sulci/no-thin-sulci",
     )  # fmt: skip
     outside: bool = parameter(
-        False, "Label what is outside the brain",
+        False, "Label tissues outside the brain",
         "Also label skin, scalp, skull, its marrow and air in the T1 of a whole head, so that a probe stands on the "
         "skin", shown=True, option="outside/no-outside",
     )  # fmt: skip
@@ -59,7 +59,7 @@ class SegmentationSettings(Declared):
     def of(cls, settings: SegmentationSettings | None, **values: Any) -> SegmentationSettings:
         """Settings, by default the defaults, with values changed by name.
 
-        Raises SimulationError for what is no SegmentationSettings, an unknown name and an invalid value.
+        Raises SimulationError for another type, an unknown name and an invalid value.
         """
         settings = cls() if settings is None else settings
         require_kind("settings", settings, cls, 'or single values by name, such as contrast="t2"')
@@ -74,16 +74,16 @@ class SheetSettings(Declared):
     """What a scene looks for with sheets.find_sheets, and what its images show of it."""
 
     find: bool = parameter(
-        False, "Find sheets and vessels", "Segment also looks for sulci, falx, tentorium, walls of the ventricles, "
+        False, "Find sheets and vessels", "Segment also finds sulci, falx, tentorium, walls of the ventricles, "
         "corpus callosum, choroid plexus and vessels, in a T1 or T2 (about a minute); off: images have the lines of "
-        "the labels, as the paper's model", shown=True,
+        "the labels, as in the paper", shown=True,
     )  # fmt: skip
     sulcus: bool = parameter(True, "Sulci", "Sulci as thin sheets, also closed ones")
     falx: bool = parameter(True, "Falx", "Falx as a thin sheet")
     tentorium: bool = parameter(True, "Tentorium", "Tentorium as a thin sheet")
     ependyma: bool = parameter(True, "Ependyma", "Walls of the ventricles as thin sheets")
     corpus_callosum: bool = parameter(
-        True, "Corpus callosum", "Corpus callosum as a tissue of its own, from the next Segment on"
+        True, "Corpus callosum", "Corpus callosum as a separate tissue, from the next Segment on"
     )
     choroid_plexus: bool = parameter(
         True, "Choroid plexus", "Choroid plexus as enhancing tissue, in a T1 with contrast agent alone; from the next "

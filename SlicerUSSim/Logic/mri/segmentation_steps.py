@@ -20,7 +20,7 @@ from SlicerUSSim.Logic.mri.classification import Classes
 from SlicerUSSim.Logic.mri.plausibility import is_whole_brain
 from SlicerUSSim.Logic.mri.recognition import check_finite
 
-#: Percentile of the brain that is taken for 0 where it has more than this share of negative values
+#: Percentile of the brain that counts as 0 where it has more than this share of negative values
 _DARKEST, _FEW_NEGATIVE = 0.1, 0.01
 
 
@@ -78,7 +78,7 @@ class BrainPart:
 
 
 def atlas_of(part: BrainPart, report: Callable[[float], None]) -> tuple[AtlasFit | None, str, float | None]:
-    """(the registered atlas, or None where it is of no use; a line that says why; the share that it explains)."""
+    """(the registered atlas, or None where it is useless; a line that says why; the share that it explains)."""
     reason = is_whole_brain(part.images[0], part.inside)
     if reason:
         return None, f"without an atlas, since {reason}", None

@@ -151,8 +151,8 @@ def with_fit(preset: Preset, found: Fit) -> Preset:
 def taken_back(before: Preset, adopted: Preset, now: Preset) -> tuple[Preset, list[str]]:
     """(`now` with the values that came from `before` to `adopted` as they were before, names of the others).
 
-    Values that were changed since `adopted` stay, and are named, as "csf mu0". Raises SimulationError if values of
-    before do not go together with those that stay.
+    Values that were changed since `adopted` stay, and are listed, such as "csf mu0". Raises SimulationError if previous
+    values do not fit together with those that stay.
     """
     if now == adopted:
         return before, []

@@ -56,7 +56,7 @@ def tracked_images(
     """
     require_node(images_node, "vtkMRMLSequenceNode", "vtkMRMLScalarVolumeNode", use="real images")
     is_sequence = images_node.IsA("vtkMRMLSequenceNode")
-    require(is_sequence or not apart, f"{named(images_node)} is no sequence, expected one to predict other images")
+    require(is_sequence or not apart, f"{named(images_node)} is not a sequence, expected one to predict other images")
     if is_sequence:
         sequence = sequence_of(images_node)
     else:
@@ -81,7 +81,7 @@ def neighbours_in(images_node, tracked: TrackedImages) -> list[list[np.ndarray]]
 def sequence_of(sequence_node) -> TrackedSequence:
     """The images of a sequence node, each with its ImageToReference, which leads to the world.
 
-    Raises SimulationError for an empty sequence, and for items that are no images.
+    Raises SimulationError for an empty sequence, and for items other than images.
     """
     count = sequence_node.GetNumberOfDataNodes()
     require(count > 0, f"sequence {named(sequence_node)} is empty, expected images")

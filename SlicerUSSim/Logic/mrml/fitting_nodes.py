@@ -13,7 +13,7 @@ from SlicerUSSim.Logic.mrml.sheet_nodes import holds_sheets
 _OF_SLICE_VIEWS = ("Volume Slice", "Slice Transform", "Volume Slice Transform")
 #: {role: roles of which a node cannot have one at the same time}
 _OTHERS = {"second_mri": ("mri",), "real": ("mri", "second_mri")}
-#: Attribute of nodes that only views show, which are nobody's data
+#: Attribute of nodes for display alone, which hold no user's data
 _DRAWN = "SlicerUSSim.drawn"
 
 

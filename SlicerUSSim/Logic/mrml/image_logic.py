@@ -53,7 +53,7 @@ class ImageLogic:
 
     def __init__(self, patient: PatientLogic) -> None:
         self._patient, self._parameters = patient, patient.parameters
-        #: The last image with all that it is of; None if there is none, or the last one failed
+        #: The last image with everything it shows; None if there is none, or the last one failed
         self.taken: TakenImage | None = None
         #: What about_missing_skull says, and of what
         self._missing: tuple[Hashable, tuple[str, ...]] = None, ()
@@ -77,7 +77,7 @@ class ImageLogic:
                 self._check_output(labels_node, output_node)
             require_node(probe_transform_node, "vtkMRMLTransformNode", use="probe transform")
         except BaseException:
-            self.clearImage(output_node)  # an image of before would be taken for that of this pose
+            self.clearImage(output_node)  # the previous image would be mistaken for the image of this pose
             raise
         self.taken = taken
         write_image(taken, probe_transform_node)
@@ -113,7 +113,7 @@ class ImageLogic:
         )  # fmt: skip
 
     def redisplay(self, taken: TakenImage, echoes: Echoes, display: DisplaySettings) -> TakenImage:
-        """An image of before with another display, from its echoes; nothing is written.
+        """A previous image with another display, from its echoes; nothing is written.
 
         Raises SimulationError without labels.
         """
@@ -235,7 +235,7 @@ class ImageLogic:
         return line
 
     def _laid_lesion(self, labels_node) -> np.ndarray | None:
-        """(3,) RAS mm of the largest lesion that was laid over these labels at last, as of --add; or None."""
+        """(3,) RAS mm of the largest lesion that was laid over these labels last, such as by --add; or None."""
         version, place = self._patient.lesion_place
         if place is None or version != labels_version(labels_node):
             return None

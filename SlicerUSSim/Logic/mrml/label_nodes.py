@@ -37,7 +37,7 @@ LABEL_CLASSES = ("vtkMRMLLabelMapVolumeNode", "vtkMRMLSegmentationNode")
 
 #: Slicer's table for every label map
 _DEFAULT_COLOURS = "GenericAnatomyColors"
-#: Tissues of label 0, 1, 2, ... of every preset that nobody has changed
+#: Tissues of label 0, 1, 2, ... in an unchanged preset
 _OF_EVERY_BRAIN = tuple(Preset().tissues.names())
 
 
@@ -98,7 +98,7 @@ def read_labels(labels_node, tissues: TissueTable, *, of_ct: bool = False) -> La
     else:
         volume = read_volume(labels_node, "label map")
         names = _colour_names(labels_node, volume)
-        if not of_ct and tuple(tissues.names()) != _OF_EVERY_BRAIN:  # somebody chose which tissue has which number
+        if not of_ct and tuple(tissues.names()) != _OF_EVERY_BRAIN:  # the user chose which tissue has which number
             by_number = tissues
     found = read_label_map(
         volume, names, source=named(labels_node), tissues=tissues, by_number=by_number, renumber=True, of_ct=of_ct,

@@ -81,7 +81,7 @@ def add_lesion(lesions_node, mask: Volume, tissue: str, name: str) -> list[str]:
         lesions_node.SetSourceRepresentationToBinaryLabelmap()
     ids = []
     for number, part in enumerate(masks.tissues):
-        # What lies within is laid over it: segments that only touch could leave gaps on another grid.
+        # Parts inside overlap it: segments that only touch could leave gaps on another grid.
         inside = masks.shares[number:].sum(axis=0) > 0.5
         image = slicer.vtkOrientedImageData()
         image.ShallowCopy(Volume(inside, np.eye(4)).to_vtk())
@@ -106,7 +106,7 @@ def tag_of(segment, tag: str) -> str:
 def with_lesions(
     labels: Volume, names: Sequence[str], lesions: list[Lesion], *, also: list[str], before: Told, has_brain_mask: bool
 ) -> tuple[Added, Told]:
-    """(labels with lesions, what is told about each); `before` is that about those which the labels have.
+    """(labels with lesions, a report about each); `before` is the report about those that the labels have.
 
     See pathology.add_tissues.
     """
@@ -121,7 +121,7 @@ def with_lesions(
 
 
 def place_of(mask: Volume) -> tuple[float, ...]:
-    """Volume in ml, centre and box in RAS mm of a mask that is not empty: equal for a lesion that nobody has edited."""
+    """Volume in ml, centre and box in RAS mm of a mask that is not empty: equal for an unedited lesion."""
     inside = mask.array > 0
     centre = mask.ijk_to_ras[:3] @ np.append(np.argwhere(inside).mean(axis=0)[::-1], 1.0)
     numbers = (inside.sum() * mask.voxel_ml, *centre, *np.ravel(box_ras(inside, mask)))

@@ -64,7 +64,7 @@ class LiveUpdate:
         output_node.InvokeEvent(_CLAIMED)  # stops a live update that wrote to it before
         self._observe(output_node, _CLAIMED, self._claimed)
         self._observe(scene, scene.StartCloseEvent, self.stop)
-        # Before Slicer's node selectors, which choose the next node instead: live images would go on into that
+        # Before Slicer's node selectors, which choose the next node instead: live images would continue in that
         self._observe(scene, scene.NodeAboutToBeRemovedEvent, self._node_goes, call_data=VTK_OBJECT, priority=_FIRST)
         self._observe(scene, scene.EndBatchProcessEvent, self._batch_ended)
         self._observe(transform_node, transform_node.TransformModifiedEvent, self.request)

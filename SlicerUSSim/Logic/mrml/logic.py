@@ -136,7 +136,7 @@ class UltrasoundSceneLogic:
 
     @property
     def taken(self) -> TakenImage | None:
-        """The last result of simulate(), with all that it is of; None if there is none, or the last one failed."""
+        """The last result of simulate(), with everything it shows; None if there is none, or the last one failed."""
         return self.images.taken
 
     @property

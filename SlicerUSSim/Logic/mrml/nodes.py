@@ -19,7 +19,7 @@ from SlicerUSSim.Logic.base.vtk_data import matrix_array, vtk_matrix
 from SlicerUSSim.Logic.probe.arrays import Probe
 from SlicerUSSim.Logic.probe.shape import outline_polydata, probe_polydata
 
-#: What is of a patient: images, labels, surfaces, points, recordings, the costs of a fit
+#: What belongs to a patient: images, labels, surfaces, points, recordings, the costs of a fit
 _PATIENT_CLASSES = (
     "vtkMRMLSequenceBrowserNode", "vtkMRMLSequenceNode", "vtkMRMLVolumeNode", "vtkMRMLSegmentationNode",
     "vtkMRMLModelNode", "vtkMRMLMarkupsNode", "vtkMRMLTransformNode", "vtkMRMLPlotChartNode", "vtkMRMLPlotSeriesNode",
@@ -313,8 +313,8 @@ def composite_of(slice_node):
 def remove_patient_nodes(scene, kept: Iterable[Any]) -> None:
     """Remove all nodes of these classes, with what displays and stores them, except those that are kept.
 
-    Nodes that are not saved with the scene belong to the views and stay. The scene is the workstation's own: nobody
-    else puts nodes into it.
+    Nodes that are not saved with the scene belong to the views and stay. The scene belongs to the workstation:
+    nothing else puts nodes into it.
     """
     ids = {node.GetID() for node in kept if node is not None}
     for name in _PATIENT_CLASSES:

@@ -9,7 +9,7 @@ user's.
 Attributes are copied with a node, and the number in a node's ID may change when a scene is imported into another one.
 A reference to the node itself does right in both: a copy (clone) refers to the node that it was copied from, and scenes
 put references right when they give nodes other IDs, on import as on loading. Nodes of scenes that were saved by
-versions without this reference are taken for their users', and kept.
+versions without this reference count as the user's, and are kept.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ def mark_as_result(node, kind: str) -> None:
         marks[_DATA] = _hash_of(node)
         claim(node)
     for name, text in marks.items():
-        if node.GetAttribute(name) != text:  # an attribute that is set is a change, which observers hear of
+        if node.GetAttribute(name) != text:  # an attribute that is set is a change, which observers are notified of
             node.SetAttribute(name, text)
 
 
@@ -161,10 +161,10 @@ def content_as_made(labels_node) -> str | None:
 
 
 def may_replace(labels_node) -> bool:
-    """Whether a node is new, or has labels that this program made, and nobody has edited since.
+    """Whether a node is new, or has unedited labels that this program made.
 
-    A new one has neither segments nor voxels; segments without voxels are somebody's plan. A copy of labels is of whom
-    copied them, see claim.
+    A new one has neither segments nor voxels; segments without voxels are a user's plan. A copy of labels belongs to
+    the user who made it, see claim.
     """
     made = content_as_made(labels_node)
     return is_empty(labels_node) or (made is not None and content_of(labels_node) == made)
@@ -173,8 +173,8 @@ def may_replace(labels_node) -> bool:
 def content_of(labels_node) -> str:
     """A hash of voxels, position and names, the same after saving and loading; "" if no voxel has a label.
 
-    Where segments lie in several layers and may overlap, the voxels of each count, since those below others are as
-    much somebody's work. Segment writes one layer.
+    Where segments lie in several layers and may overlap, the voxels of each count, since those below others are work,
+    too. Segment writes one layer.
     """
     try:
         volume, names = node_labels(labels_node)

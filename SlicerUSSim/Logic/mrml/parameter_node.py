@@ -49,11 +49,11 @@ class PanelSettings(Declared):
         shown=True,
     )  # fmt: skip
     craniotomy_mm: float | None = parameter(
-        None, "Craniotomy", "Diameter of the disc under the probe that is opened; none: as wide as its face needs",
+        None, "Craniotomy", "Diameter of the opening under the probe; none: as wide as its face needs",
         unit="mm", bounds=(5.0, 150.0), shown=Shown(4.0, 150.0, 1.0, none_at=4.0), can_be_none=True,
     )  # fmt: skip
     lesion_as: str = parameter(
-        BY_LOOK, "Lesion is", "What the lesion at the point is; by its look: what the MRI shows there",
+        BY_LOOK, "Lesion is", "Tissue of the lesion at the point; by its look: as the MRI shows it",
         choices=(BY_LOOK, *LESION_TISSUES), shown=True,
     )  # fmt: skip
     lesion_size: str = parameter(
@@ -61,7 +61,7 @@ class PanelSettings(Declared):
         "farther out", choices=(SMALLER, LARGER), shown=True,
     )  # fmt: skip
     target: str = parameter(
-        LARGEST, "Target", "What Plan looks for a way to: the largest lesion, that of a tissue, or a point that is "
+        LARGEST, "Target", "Target of Plan: the largest lesion, the largest of a tissue, or a point that is "
         "clicked in a slice view", choices=(LARGEST, *LESION_TISSUES, POINT), shown=True,
     )  # fmt: skip
     keep_in_opening: bool = parameter(
@@ -76,7 +76,8 @@ class PanelSettings(Declared):
         "", "Or file, or numbers", "A Plus configuration (.xml), or 16 numbers of ImageToProbe by rows", shown=True
     )  # fmt: skip
     face_pixel: str = parameter(
-        "", "Face in the image", "Column and row of its middle, as 320 12; empty: looked for in real images", shown=True
+        "", "Face in the image", "Column and row of the middle of the probe's face, such as 320 12; empty: "
+        "found in the real images", shown=True,
     )  # fmt: skip
     preset_pose: bool = parameter(
         False, "Pose in presets", "Save preset saves the pose of the probe, too; a preset with a pose moves the probe "
@@ -159,7 +160,7 @@ class SettingsParameter(Generic[S]):
 
 
 def preset_texts(texts: Mapping[str, str]) -> dict[str, str]:
-    """Those of a scene's {name: text} that are of its preset, see Preset.to_texts."""
+    """Those of a scene's {name: text} that belong to its preset, see Preset.to_texts."""
     sections = ("probe", "display", "settings", "tissues", "membrane")
     return {name: text for name, text in texts.items() if text and name.split(".")[0] in sections}
 

@@ -127,7 +127,7 @@ class PatientLogic:
         self._texture: tuple[Hashable, Texture | None] | None = None  # with the version of its labels
 
     def renewSimulator(self) -> None:
-        """Make images with another simulator from now on: work that was abandoned may still use the one of before."""
+        """Make images with another simulator from now on: work that was abandoned may still use the previous one."""
         self._simulators = ReusedSimulator()
 
     def patient(self, labels_node) -> Patient:
@@ -161,7 +161,7 @@ class PatientLogic:
         return _tissues_of(self.parameters.preset, self.patient(labels_node).names, sheets)
 
     def settings(self, labels_node, patient: Patient | None = None) -> SimulationSettings:
-        """The preset's settings, with gel between skin and probe (GEL_MM) where labels have skin and nobody says more.
+        """The preset's settings, with gel between skin and probe (GEL_MM) where labels have skin, by default.
 
         That is: no contact gap, the parameter `gel`, and no opening, which is filled with the coupling medium.
         """

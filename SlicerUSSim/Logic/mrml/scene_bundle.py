@@ -24,7 +24,7 @@ _DEEPEST = 1
 _FILES = ("fileName", "fileListMember", "uri")
 #: Suffixes of files that may name another one
 _HEADERS = (".mhd", ".mha", ".nhdr", ".nrrd", ".hdr", ".img")
-#: Folders of archives that are no part of them
+#: Folders in archives that do not belong to the bundle
 _NOT_OURS = ("__MACOSX/",)
 
 
@@ -33,7 +33,7 @@ def unpacked(path: Path, folder: Path, depth: int = 0) -> Path:
     try:
         archive = zipfile.ZipFile(path)
     except (zipfile.BadZipFile, OSError) as error:
-        raise SimulationError(f"{path}: is no bundle of a scene, expected a .mrb ({error})") from None
+        raise SimulationError(f"{path}: is not a bundle of a scene, expected a .mrb ({error})") from None
     with archive:
         entries = [entry for entry in archive.infolist() if not entry.is_dir() and not _is_extra(entry.filename)]
         require(len(entries) <= _MOST_FILES, f"{path}: has {len(entries)} files, expected at most {_MOST_FILES}")
@@ -50,7 +50,7 @@ def unpacked(path: Path, folder: Path, depth: int = 0) -> Path:
                 with archive.open(entry) as source, target.open("wb") as file:
                     while piece := source.read(2**20):
                         left -= len(piece)
-                        require(left >= 0, f"{path}: unpacks to more than it says, expected {size} bytes")
+                        require(left >= 0, f"{path}: unpacks to more than it states, expected {size} bytes")
                         file.write(piece)
             except (zipfile.BadZipFile, NotImplementedError, RuntimeError, EOFError, OSError) as error:
                 raise SimulationError(f"{path}: is damaged at {name.name!r} ({error})") from None
@@ -76,7 +76,7 @@ def _check_names(path: Path, scene: Path, folder: Path) -> None:
     try:
         tree = ElementTree.parse(scene)
     except ElementTree.ParseError as error:
-        raise SimulationError(f"{path}: its scene is no XML ({error})") from None
+        raise SimulationError(f"{path}: its scene is not XML ({error})") from None
     for element in tree.iter():
         for attribute, text in element.attrib.items():
             if not text or not attribute.startswith(_FILES):

@@ -222,7 +222,7 @@ def _choose_missing(scene, parameters: SceneParameters) -> None:
 
 
 def _others(scene, parameters: SceneParameters) -> Iterable[str]:
-    """Names of the volumes, labels, models and markups of a scene that have no role and are no result."""
+    """Names of the volumes, labels, models and markups of a scene that have no role and are not results."""
     chosen = {node.GetID() for role in ROLES if (node := getattr(parameters, role)) is not None}
     labels = parameters.labels
     if labels is not None:
@@ -248,7 +248,7 @@ def _recorded(node) -> NodeRecord:
         surfels = surfels_of(data, f"sheets {named(node)}")
         corners = np.array(vtk_to_numpy(data.GetPoints().GetData()), np.float32)
         return NodeRecord(_MODEL, name, attributes, to_world, surfels=surfels, corners=corners)
-    require(node.IsA(_POINTS), f"{named(node)} is of a class that is not kept")
+    require(node.IsA(_POINTS), f"{named(node)} has a class that is not kept")
     return NodeRecord(node.GetClassName(), name, attributes, np.eye(4), points=control_points(node))
 
 
@@ -326,7 +326,7 @@ def put_nodes(scene, record: SceneRecord) -> dict[str, Any]:
 def put_values(parameters: SceneParameters, values: Mapping[str, str]) -> list[str]:
     """Set the scene's values and preset from their texts; returns lines about values that this version does not take.
 
-    A preset is taken as it is, and checked when it is used.
+    A preset is taken unchecked, and checked when it is used.
     """
     node, refused = parameters.node, []
     was_modifying = node.StartModify()

@@ -45,12 +45,12 @@ from SlicerUSSim.Logic.tissue.texture import Texture
 
 #: Attribute of a mask node that was extracted
 _BRAIN_OF = "SlicerUSSim.brainOf"
-#: Share of the time in which tissues are segmented, if sheets are looked for after that
+#: Share of the time in which tissues are segmented, if a search for sheets follows
 _SEGMENTED = 0.4
 
 
 class SegmentLogic:
-    """Labels of a patient, written into nodes that this module made and nobody edited since."""
+    """Labels of a patient, written into unedited nodes of this module."""
 
     def __init__(self, patient: PatientLogic, live: LiveLogic) -> None:
         self._patient, self._live, self._work = patient, live, patient.work
@@ -58,7 +58,7 @@ class SegmentLogic:
 
     def forget(self) -> None:
         """Release what is kept in memory of the last patient."""
-        #: Version of the labels over which lesions were laid last, and what was told about each of them
+        #: Version of the labels over which lesions were laid last, and what was reported about each of them
         self._laid: tuple[Hashable, Told] = (None, {})
         #: Grows lesions on the MRI that was segmented last
         self.growth = LesionGrowth(self._work.do)
@@ -77,7 +77,7 @@ class SegmentLogic:
         See segmentation.segment_mri, and ct.segment_ct for the contrast "ct"; `values` change single ones of the
         settings. `mask_node` is a label map on the MRI's grid, or a segmentation; `others` are volume nodes of the same
         patient by their contrast. The segments of `lesions_node` are laid over the labels, as by addTissues, but are
-        not in the result. `organs_node` is a label map or segmentation of organs of a CT. `sheets` are looked for, too
+        not in the result. `organs_node` is a label map or segmentation of organs of a CT. `sheets` are found, too
         (sheets.find_sheets): those with a volume are laid over the labels, the others are written into the model
         `sheets_node`, which images show if it is the parameter `sheets`. `progress` may raise errors.Cancelled; the
         nodes are then as they were.
@@ -153,7 +153,7 @@ class SegmentLogic:
     def writeBrain(self, result: Segmentation, mri_node):
         """The label map node "NAME brain" with the mask that segment() extracted from a whole head.
 
-        It is used again as long as nobody has edited it; otherwise another node is made.
+        It is used again until a user edits it; then another node is made.
         """
         scene, name = self._patient.scene, f"{mri_node.GetName()} brain"
         known = nodes_of_class(scene, "vtkMRMLLabelMapVolumeNode")
@@ -167,7 +167,7 @@ class SegmentLogic:
         return node
 
     def isOwnBrain(self, mask_node) -> bool:
-        """Whether a mask is one that writeBrain wrote, and nobody has edited it."""
+        """Whether writeBrain wrote a mask, and no user has edited it."""
         return self.isBrainOf(mask_node, None) is not None and may_replace(mask_node)
 
     def isBrainOf(self, mask_node, mri_node) -> bool | None:
@@ -177,7 +177,7 @@ class SegmentLogic:
         return mri_of(mask_node) is mri_node
 
     def mayReplace(self, labels_node) -> bool:
-        """Whether segment() may write into a node: if it is empty, or has what segment() wrote and nobody edited."""
+        """Whether segment() may write into a node: if it is empty, or has unedited labels by segment()."""
         require_node(labels_node, *LABEL_CLASSES, use="output of Segment")
         return may_replace(labels_node)
 
@@ -228,8 +228,8 @@ class SegmentLogic:
         The opening is a disc under the probe of `diameter_mm` (default: as wide as its face needs), or what
         `opening_node` says: the polygon of a markups node, such as a closed curve, or a label map or segmentation. The
         labels (a label map or segmentation with skin and skull, as Segment makes with `outside`) with the opening,
-        filled with the coupling medium, are written into `output_node`; the labels stay as they are. Opened labels are
-        opened anew from those before (closedLabels). A model shows the piece that was removed.
+        filled with the coupling medium, are written into `output_node`; the labels do not change. Opened labels are
+        opened again from the closed ones (closedLabels). A model shows the piece that was removed.
         Raises SimulationError, and changes nothing, if that removes nothing or there is no brain under it, and for an
         output with labels that this module did not make, or edited since.
         """
@@ -261,7 +261,7 @@ class SegmentLogic:
         show_flap(output_node, labels.with_array(result.array != labels.array))
         self.notes = (
             f"craniotomy: {what}; {millilitres:.1f} ml of skin, scalp and skull are replaced by the coupling medium in "
-            f"{named(output_node)}, and {named(closed)} stays as it is",
+            f"{named(output_node)}, and {named(closed)} is not changed",
         )
         self.warnings = left_out
         if was_edited:

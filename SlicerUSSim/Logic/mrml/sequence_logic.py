@@ -1,4 +1,4 @@
-"""SequenceLogic: sequences of images, and images of before that are shown again."""
+"""SequenceLogic: sequences of images, and previous images that are shown again."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from SlicerUSSim.Logic.probe.surface import PatientSurface
 
 
 class SequenceLogic:
-    """Images of many poses, and whether they are of the patient as it is now."""
+    """Images of many poses, and whether they show the patient's current state."""
 
     def __init__(self, patient: PatientLogic, images: ImageLogic, live: LiveLogic) -> None:
         self._patient, self._images, self._live = patient, images, live
@@ -140,7 +140,7 @@ class SequenceLogic:
         mark_as_result(volume_node, COMPOUNDED)
 
     def sequenceImage(self, images_node, number: int) -> TakenImage:
-        """The image with a number, from 0, that simulateSequence made, with all that it is of.
+        """The image with a number, from 0, that simulateSequence made, with everything it shows.
 
         Raises SimulationError for a sequence of something else.
         """
@@ -178,7 +178,7 @@ class SequenceLogic:
 
     @contextmanager
     def imageHeld(self) -> Iterator[None]:
-        """While a scene is saved: as if Live ended, so that the image is where it was taken; it goes on after that.
+        """While a scene is saved: as if Live ended, so that the image is where it was taken; Live then continues.
 
         The scene says that the image is live. Saving lays the segments of tissues together into one label map. The
         images are of them as before.

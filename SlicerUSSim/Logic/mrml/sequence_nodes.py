@@ -224,7 +224,7 @@ def known_field(images_node: Any, shape: tuple[int, int]) -> KnownField | None:
         to_ras = check_rigid("to_ras", np.array(values["to_ras"], float))
     except (SimulationError, ValueError, LookupError, TypeError, AttributeError) as error:
         raise SimulationError(
-            f"{named(images_node)}: its attribute {_KNOWN} is damaged ({error}); without it the probe is looked for in "
+            f"{named(images_node)}: its attribute {_KNOWN} is damaged ({error}); without it the probe must be found in "
             "the images"
         ) from None
     return KnownField(ImagedField.of(probe, image_to_probe, shape), to_ras)

@@ -1,8 +1,8 @@
 """Shares of tissues in the voxels of labels that Segment wrote, kept in the scene with the node of these labels.
 
 Labels alone say only which tissue a voxel has most of. What the segmentation knows besides, the second tissue of every
-voxel and its share (Texture), is in a hidden volume to which the node of the labels refers. It counts as long as nobody
-edits the labels, and is saved with the scene, so that a scene has the same images after it is opened again.
+voxel and its share (Texture), is in a hidden volume to which the node of the labels refers. It is used until
+a user edits the labels, and is saved with the scene, so that a scene has the same images after it is opened again.
 """
 
 from __future__ import annotations

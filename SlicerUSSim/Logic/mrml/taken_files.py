@@ -1,4 +1,4 @@
-"""Files of simulated images, with what they are of (TakenImage.about): pictures, images in the MRI, sequences."""
+"""Files of simulated images, with their records (TakenImage.about): pictures, images in the MRI, sequences."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ ABOUT = "SlicerUSSim"
 
 
 def png(taken: TakenImage) -> bytes:
-    """An image as a PNG file, without scaling, with what it is of as a text."""
+    """An image as a PNG file, without scaling, with its record as a text."""
     from PIL import Image
     from PIL.PngImagePlugin import PngInfo
 
@@ -32,7 +32,7 @@ def png(taken: TakenImage) -> bytes:
 
 
 def frame_file(taken: TakenImage, suffix: str) -> bytes:
-    """An image with its position in the patient, and what it is of, as a file.
+    """An image with its position in the patient, and its record, as a file.
 
     Raises SimulationError if `suffix` is not one of FRAME_SUFFIXES.
     """
@@ -51,7 +51,7 @@ def written(suffix: str, write: Callable[[Path], object]) -> bytes:
 def sequence_file(images: Sequence[tuple[float, TakenImage]]) -> bytes:
     """Images with their times in s as a sequence metafile (.igs.mha), with their places in the MRI (RAS, mm).
 
-    The file says what the last one is of (TakenImage.about).
+    The file has the record of the last one (TakenImage.about).
     """
     seconds, taken = zip(*images, strict=True)
     transforms = tuple(

@@ -1,6 +1,6 @@
-"""TakenImage: a simulated image together with all that it is of, and the same as attributes of its volume node.
+"""TakenImage: a simulated image with a record of everything it shows, also as attributes of its volume node.
 
-An image without the name of its patient, its pose and its settings can be taken for one of another patient or place.
+An image without the name of its patient, its pose and its settings can be mistaken for one of another patient or place.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from SlicerUSSim.Logic.probe.image_grid import ImageGrid
 PATIENT = "SlicerUSSim.patient"
 #: Reference of labels to the volume of which they were made
 MRI = "SlicerUSSim.mri"
-#: Attributes of the image's volume node: what it is of, as JSON, and whether it stays where it was taken
+#: Attributes of the image's volume node: its record, as JSON, and whether it stays where it was taken
 _ABOUT, _FROZEN = "SlicerUSSim.image", "SlicerUSSim.frozen"
 #: Texts of _FROZEN: of an image that stays, and of a live one while its scene is saved
 _STAYS, _WHILE_SAVED = "stays", "while saved"
@@ -83,7 +83,7 @@ def patient_of(node) -> str:
 
 
 def write_image(taken: TakenImage, transform_node=None) -> None:
-    """Write an image and what it is of into its node: fixed geometry in the probe frame, under the probe's transform.
+    """Write an image and its record into its node: fixed geometry in the probe frame, under the probe's transform.
 
     The slice therefore moves with the transform immediately, before its pixels are updated.
     """
@@ -99,7 +99,7 @@ def write_image(taken: TakenImage, transform_node=None) -> None:
 
 
 def about_image(volume_node) -> dict[str, Any]:
-    """What the image in a volume node is of, see TakenImage.about; {} of a volume that is no such image.
+    """What the image in a volume node shows, see TakenImage.about; {} for any other volume.
 
     With `is_empty`, and the `number` of an image of a sequence.
     """
@@ -121,7 +121,7 @@ def was_live(volume_node) -> bool:
 
 
 def freeze(taken: TakenImage, *, while_saved: bool = False) -> None:
-    """Leave the image of a volume node where it was taken, not under the probe's transform any more.
+    """Leave the image of a volume node where it was taken, no longer under the probe's transform.
 
     `while_saved`: it is live, and follows the probe again once its scene is saved.
     """

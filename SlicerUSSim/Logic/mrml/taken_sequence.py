@@ -1,4 +1,4 @@
-"""Images of a simulated sequence with all that each is of, as nodes that are saved with the scene."""
+"""Images of a simulated sequence with their records, as nodes that are saved with the scene."""
 
 from __future__ import annotations
 
@@ -55,8 +55,7 @@ def read_taken(images_node, number: int, anatomy: Hashable = None) -> TakenImage
         return _taken(images_node.GetAttribute(_ABOUT) or "{}", number, image, anatomy, node)
     except (ValueError, LookupError, TypeError, AttributeError):
         raise SimulationError(
-            f"{named(images_node)} does not say what its images are of, expected those of Simulate sequence; make them "
-            "again"
+            f"{named(images_node)} has no records of its images, expected those of Simulate sequence; make them again"
         ) from None
 
 

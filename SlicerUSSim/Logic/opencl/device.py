@@ -107,7 +107,7 @@ class Device:
             opened = _opened[info] = Device(info)
             if not opened.rounds_divisions:
                 _log.warning(
-                    "%s does not round divisions as IEEE 754 says: its images may differ from those of other devices: "
+                    "%s does not round divisions as IEEE 754 requires: its images may differ from other devices: "
                     "by a grey level, and by more where a ray grazes a voxel",
                     info,
                 )
@@ -170,7 +170,7 @@ class Device:
             except Exception as error:  # pyopencl raises whatever pickle does
                 why = f"{type(error).__name__}: {error}"
             else:
-                # The runtime of a damaged file has a program without them, and says nothing
+                # For a damaged file the runtime returns a program without them, without an error
                 missing = set(re.findall(r"^(?:__)?kernel\s+void\s+(\w+)", source, re.MULTILINE)) - kernels.keys()
                 if not missing:
                     return program, kernels
@@ -271,7 +271,7 @@ class Device:
         return self._loans.setdefault(buffer, Loan(buffer))
 
     def is_lent(self, buffer: Buffer) -> bool:
-        """Whether somebody has its loan."""
+        """Whether its loan is in use."""
         return buffer in self._loans
 
     def take_profile(self) -> dict[str, float]:
@@ -352,7 +352,7 @@ def pocl_group(global_size: tuple[int, ...]) -> tuple[int, ...]:
 
 
 def _was_cached(program: Program) -> bool:
-    """Whether pyopencl had the binary on disk. PoCL has a cache of its own, which only the time shows."""
+    """Whether pyopencl had the binary on disk. PoCL has a separate cache, which only the time shows."""
     # pyopencl's own, for its messages: (what, whether it was cached, seconds)
     info = getattr(program, "_build_duration_info", None)
     return bool(info and info[1])

@@ -219,7 +219,7 @@ HIT = np.dtype(
         ("depth_mm", _FLOAT),
         ("weight", _FLOAT),
         ("attenuation", _FLOAT),
-        ("loss", _FLOAT),  # as of a segment
+        ("loss", _FLOAT),  # as in a segment
         ("cos_incidence", _FLOAT),
         ("reflectance", _FLOAT),  # R = r^2
         # depth (displayed) per mm of lateral offset along the interface, in the unfolded beam

@@ -68,7 +68,7 @@ def name_processor(handle) -> str | None:
         return None
     name = next((name for name, needed in _KNOWN_PROCESSORS if needed <= flags), None)
     if name is None:
-        _log.warning("PoCL's compiler does not know this processor, and no older one is like it: kernels may not build")
+        _log.warning("PoCL's compiler does not know this processor, and no similar older one: kernels may not build")
         return None
     try:
         # Reading a wrong pointer through /proc/self/mem is an error; dereferencing it would end the process.
@@ -79,7 +79,7 @@ def name_processor(handle) -> str | None:
     try:
         address = _find_string(memory, handle.int_ptr, called.encode() + b"\0")
         if address is None and _find_string(memory, handle.int_ptr, name.encode() + b"\0") is not None:
-            return None  # since the device was opened before; its version stays as it was
+            return None  # since the device was opened before; its version does not change
     finally:
         os.close(memory)
     if address is None or _usable_bytes(address) <= len(name):
@@ -91,7 +91,7 @@ def name_processor(handle) -> str | None:
 
 
 def _passes_self_test(what: str) -> bool:
-    """Whether a child process computes with PoCL as it is. The answer is kept beside PoCL's programs, for `what`."""
+    """Whether a child process computes with the present PoCL. The answer is kept beside PoCL's programs, for `what`."""
     kept, text = cache_folder() / "ussim-self-test", ""
     with suppress(OSError):
         text = kept.read_text()
@@ -171,7 +171,7 @@ def remove_damaged_kernels(folder: Path | None = None) -> int:
         except OSError:  # another process has removed it
             continue
         if is_damaged:
-            _log.warning("%s: has an incomplete file, as of a process that was killed; it is removed", program)
+            _log.warning("%s: has an incomplete file, as after a killed process; it is removed", program)
             shutil.rmtree(program, ignore_errors=True)
             removed += 1
     return removed

@@ -38,7 +38,7 @@ def load_pyopencl():
 
 
 def _remove_damaged_calls() -> None:
-    """Remove pyopencl's store of generated calls if it is damaged: pyopencl fails on it for ever."""
+    """Remove pyopencl's store of generated calls if it is damaged: pyopencl would fail on it every time."""
     import sqlite3
 
     import platformdirs

@@ -22,11 +22,11 @@ _DARK_DB = 22.0
 _OPEN_SHARE = 0.1
 #: A face does not fit where bone is before, or so near behind, that much of it, mm
 _BEHIND_MM, _COVERED_MM = 10.0, 1.0
-#: Brain is looked for so far from a face, mm
+#: Depth of the search for brain in front of a face, mm
 _BRAIN_MM = 60.0
 _STEP_MM, _COVER_STEP_MM = 0.5, 1.0
 _LINES = 33
-#: An MRI shows a head where so much, by what is labelled, is unlabelled and bright, by the brain; every so many voxels
+#: An MRI shows a head if this share of the labels is unlabelled and bright, relative to the brain; voxels per sample
 _HEAD, _BRIGHT, _SOME = 0.25, 0.35, 4
 _BONE, _BRAIN = 1, 2
 

@@ -1,4 +1,4 @@
-"""Craniotomy: an opening in what lies outside the brain, through which a beam reaches it.
+"""Craniotomy: an opening in the tissues outside the brain, through which a beam reaches it.
 
 Skin, scalp, skull and marrow in the opening become the coupling medium, as saline fills it in an operation. The brain,
 what was laid over it, and air stay.
@@ -29,7 +29,7 @@ REMOVED = tuple(name for name in OUTSIDE if name != "air")
 _BELOW = 1.0
 #: Where the brain may begin under the probe, or under a polygon, mm: a probe on the brain has the skull behind its face
 _BRAIN_MM = (-40.0, 60.0)
-#: What a head has, and what a body has that is no head's; fluid is in spines, too
+#: Tissues of a head, and of a body but not of a head; fluid is in spines, too
 _OF_BRAIN, _OF_BODY = ("grey matter", "white matter", "brain"), ("muscle", "bone", "liver", "kidney")
 #: Markups of 3D Slicer whose points are a polygon
 POLYGONS = ("ClosedCurve", "Curve", "Fiducial")
@@ -39,17 +39,17 @@ DIAMETERS_MM, _MOST_ML = (5.0, 150.0), 500.0
 _NEAR_BRAIN_MM = 30.0
 #: A polygon that was drawn on the skin or the brain is so near to them, mm: half of its points
 _NEAR_POLYGON_MM = 15.0
-#: A face needs so much more room than it is wide, mm
+#: A face needs this much more room than it is wide, mm
 ROOM_MM = 10.0
 
 
 def without_outside(labels: Volume, names: Sequence[str]) -> Volume:
-    """The labels, 1, 2, ... called `names`, without what lies outside the brain."""
+    """The labels, 1, 2, ... called `names`, without those outside the brain."""
     return labels.with_array(np.where(_is_any(labels, names, OUTSIDE), 0, labels.array))
 
 
 def require_brain(names: Sequence[str]) -> None:
-    """Raise SimulationError if tissues are those of a body without a brain, as of a spine or an abdomen."""
+    """Raise SimulationError if tissues are those of a body without a brain, such as a spine or an abdomen."""
     require(
         not set(_OF_BRAIN).isdisjoint(names) or set(_OF_BODY).isdisjoint(names),
         f"the labels have no tissue of a brain (they have {', '.join(names)}), expected those of a head",
@@ -113,7 +113,7 @@ def polygon_opening(labels: Volume, names: Sequence[str], points_ras: np.ndarray
     if away > _NEAR_POLYGON_MM:
         _log.warning(
             "the points of the polygon lie %.0f mm from the patient, %.0f or less of one that was drawn there; what is "
-            "below them is opened: look whether it belongs to this patient", away, _NEAR_POLYGON_MM,
+            "below them is opened: check that it belongs to this patient", away, _NEAR_POLYGON_MM,
         )  # fmt: skip
     return inside & (places[..., 1] < deepest)
 
@@ -131,7 +131,7 @@ def file_opening(labels: Volume, names: Sequence[str], path: str) -> np.ndarray:
 def mask_opening(labels: Volume, mask: Volume, name: str) -> np.ndarray:
     """(k, j, i) bool of a mask on any grid (not 0 is open; above 1/2 of values from 0 to 1), called `name` in errors.
 
-    Raises SimulationError for what is no mask, and for one that is empty or lies elsewhere.
+    Raises SimulationError for a volume that is not a mask, and for a mask that is empty or elsewhere.
     """
     k, j, i = np.indices(labels.array.shape)
     ras = np.stack([i, j, k], axis=-1) @ labels.ijk_to_ras[:3, :3].T + labels.ijk_to_ras[:3, 3]
@@ -143,7 +143,7 @@ def mask_opening(labels: Volume, mask: Volume, name: str) -> np.ndarray:
 def is_open(mask: Volume, name: str) -> Volume:
     """A mask as uint8, 1 where it is open: not 0, or above 1/2 of values from 0 to 1; `name` as in errors.
 
-    Raises SimulationError for what is no mask.
+    Raises SimulationError for a volume that is not a mask.
     """
     segments = several_segments(mask)
     require(

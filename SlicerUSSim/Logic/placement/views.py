@@ -59,11 +59,11 @@ VIEWS = {
 }  # fmt: skip
 
 
-#: Bone is looked for so far behind a face in an opening, and so much of it is a closed skull, mm
+#: Depth of the search for bone behind a face in an opening, and the amount of it that is a closed skull, mm
 _BEHIND_MM, _CLOSED_MM = 40.0, 2
 #: Cosine of the angle between a surface's normal and the plane of a view, within which the probe stands in that plane
 _FLAT_COS = 0.87
-#: Depths at which bone is looked for below a place on the skin
+#: Depths of the search for bone below a place on the skin
 _DEEP_MM = np.arange(0.5, 40.0)
 
 
@@ -79,7 +79,7 @@ def opened_view_pose(labels: Volume, names: Sequence[str], view: str) -> tuple[n
     pose, line = view_pose(labels, names, view)
     return pose, _joined(
         line,
-        f"the opening is not where the view {view} is seen from: the probe stands on the skin over the closed skull; "
+        f"the view {view} does not pass through the opening: the probe stands on the skin over the closed skull; "
         "without a view it stands in the opening",
     )
 
@@ -171,10 +171,10 @@ def _joined(*lines: str) -> str:
 #: Brightness in a T1, by which the atlas is registered to labels; what is not named here is as grey matter
 _BRIGHTNESS = {"csf": 0.2, "ventricle": 0.2, "resection cavity": 0.2, "white matter": 1.0, "corpus callosum": 1.0}
 _OTHERS = 0.6
-#: Correlation of that brightness with the atlas from which an orientation is believed: 0.46 to 0.51 in heads that lie
-#: anyhow, found as they lie, and 0.15 to 0.33 otherwise, where the masks overlap as well (Dice 0.88 to 0.91)
+#: Least correlation of that brightness with the atlas that confirms an orientation: 0.46 to 0.51 for correct ones in
+#: heads of any orientation, 0.15 to 0.33 for wrong ones, although their masks overlap (Dice 0.88 to 0.91)
 _LEAST_CORRELATION = 0.38
-#: Orientations that are tried where the registration, which starts upright, finds none, and so many points for each
+#: Orientations to try if the registration, which starts upright, finds none, and points for each
 _MOST_TRIED, _POINTS = 4, 4000
 #: A head that lies less obliquely than this needs no word, degrees
 _TOLD_DEG = 8.0

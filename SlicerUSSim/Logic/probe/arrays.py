@@ -61,13 +61,12 @@ class Probe(Beam):
         bounds=(0, 10),
     )  # fmt: skip
     ring_down_db: float = parameter(
-        0.0, "Ring-down level", "Of the reverberation at the face, re tissue of unit scatterer variance", unit="dB",
+        0.0, "Ring-down level", "Reverberation at the face, relative to tissue of unit scatterer variance", unit="dB",
         bounds=(-100, 100),
     )  # fmt: skip
     face_reflection: float = parameter(
         0.25, "Face reflection",
-        "Amplitude that the face reflects of what bone or gas send back to it, which shows them again at twice their "
-        "depth; 0: none",
+        "Amplitude reflected at the face, so that echoes of bone and gas appear again at twice their depth; 0: none",
         bounds=(0, 1),
     )  # fmt: skip
 
@@ -310,7 +309,7 @@ def _field_of_view_deg() -> Any:
 class LinearProbe(Probe):
     """A flat array with parallel scan lines over `width_mm`.
 
-    They can be steered, or fan out from the face as of a convex array behind it (trapezoid, "virtual convex").
+    They can be steered, or fan out from the face as from a convex array behind it (trapezoid, "virtual convex").
     """
 
     kind = "linear"

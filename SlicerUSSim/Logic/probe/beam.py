@@ -23,7 +23,7 @@ CURVED = 0.6
 #: Largest number of focal zones
 MOST_ZONES = 8
 #: Amplitude of twice the pulse's frequency that leaves the face itself, and of what is left of the pulse in the band,
-#: re the harmonic at the focus: typical of transmitters (docs/physics.md#harmonic-imaging)
+#: relative to the harmonic at the focus: typical of transmitters (docs/physics.md#harmonic-imaging)
 LEAKED = 0.1
 #: f-number of a beam that is wide compared with all others
 _NO_FOCUS = 1e4
@@ -55,26 +55,26 @@ class Beam(Declared):
         False, "Harmonic imaging",
         "Receive the second harmonic, which arises in tissue where the beam is strong: twice the frequency, narrower "
         "beams, weaker side lobes, dark near the face", shown=True,
-        note="frequency_mhz is that of the pulse. The level of the harmonic is that of the fundamental at the transmit "
-        "focus, as a scanner's gain makes it",
+        note="frequency_mhz belongs to the pulse. At the transmit focus the harmonic has the level of the fundamental, "
+        "as with a scanner's gain",
     )  # fmt: skip
     band_mhz: tuple[float, float] | None = parameter(
         None, "Band", "Lowest and highest frequency that the array receives, -6 dB; the second harmonic of the pulse "
         "must lie within; none: any", unit="MHz", bounds=(0.1, 100),
-        note="Without harmonic, frequency_mhz is not held to it: a preset can be tried at any frequency",
+        note="Without harmonic, frequency_mhz may be outside of it: a preset can be tried at any frequency",
     )  # fmt: skip
     fractional_bandwidth: float = parameter(
         0.5, "Bandwidth", "-6 dB bandwidth of the two-way pulse, as a fraction of the frequency", bounds=(0.05, 1.5)
     )
-    focus_mm: MmOrNone = parameter(  # noqa: RUF009, which knows no descriptors
+    focus_mm: MmOrNone = parameter(  # noqa: RUF009, which ignores descriptors
         _BY_DEPTH, "Focus", "Depth of the transmit focus; none (panels: 0): 60 % of the image depth", unit="mm",
         bounds=(0.1, 1000), shown=Shown(0, 300, is_slider=True, none_at=0.0), can_be_none=True,
         note="It then moves with the depth",
     )  # fmt: skip
     transmit: str = parameter(
         "focus", "Transmit",
-        "focus: one focus. zones: several foci, each depth from the narrowest. angles: plane or diverging waves under "
-        "several angles, compounded coherently, which are in focus at every depth",
+        "focus: one focus. zones: several foci; each depth uses the narrowest beam. angles: plane or diverging waves "
+        "at several angles, compounded coherently, in focus at every depth",
         choices=("focus", "zones", "angles"), shown=True,
     )  # fmt: skip
     focal_zones: int = parameter(
@@ -82,10 +82,10 @@ class Beam(Declared):
         note="Their f-number is at least that of reception",
     )  # fmt: skip
     transmit_angles: int = parameter(
-        5, "Angles", "Number of waves that are compounded with angles; 1: one wave, without focus", bounds=(1, 255),
+        5, "Angles", "Number of waves to compound for transmit angles; 1: one wave, without focus", bounds=(1, 255),
     )  # fmt: skip
     largest_angle_deg: float = parameter(
-        10.0, "Largest angle", "Of these waves to the axis; as large as the aperture they replace is seen from a depth",
+        10.0, "Largest angle", "Angle of the outermost waves to the axis: half that of the aperture they replace",
         unit="°", bounds=(0.1, 60),
     )  # fmt: skip
     aperture_mm: float = parameter(
@@ -100,18 +100,18 @@ class Beam(Declared):
         bounds=(0, 1),
     )  # fmt: skip
     clutter_db: float | None = parameter(
-        -36.0, "Clutter", "Diffuse echoes from beside the beam, by multiple scattering and aberration, re its own; "
-        "none: only side lobes", unit="dB", bounds=(-100, 0),
-        note="They and the side lobes fill cysts; they fall off smoothly over 48 wavelengths x f-number to either side",
+        -36.0, "Clutter", "Diffuse echoes from beside the beam, by multiple scattering and aberration, relative to "
+        "echoes of the beam; none: only side lobes", unit="dB", bounds=(-100, 0),
+        note="Clutter and side lobes fill cysts. Clutter falls off over 48 wavelengths x f-number to each side",
     )  # fmt: skip
     element_mm: float | None = parameter(
         None, "Element", "Lateral size of the elements: larger ones send and receive less along steered lines; none: "
         "half a wavelength", unit="mm", bounds=(0.01, 10),
     )  # fmt: skip
     directivity: str = parameter(
-        "soft", "Directivity", "What steered lines lose. soft: their elements are in a soft baffle, which takes the "
-        "cosine of the angle both ways besides, as measured on arrays; rigid: what elements of their size lose; "
-        "none: nothing, as if a gain made up for it", choices=("soft", "rigid", "none"),
+        "soft", "Directivity", "Loss of steered lines. rigid: directivity of elements of this size; soft: also the "
+        "cosine of the angle, both ways, of a soft baffle, as measured on arrays; none: no loss, as if a gain "
+        "compensated it", choices=("soft", "rigid", "none"),
     )  # fmt: skip
     elevation_aperture_mm: float = parameter(
         7.0, "Elevational aperture", "Height of the elements, in the elevation direction", unit="mm", bounds=(0.5, 100)
@@ -123,7 +123,7 @@ class Beam(Declared):
 
     @property
     def wavelength_mm(self) -> float:
-        """Wavelength of what is received, at the nominal speed of sound of 1540 m/s, for which arrays are designed."""
+        """Wavelength of the echoes at the nominal speed of sound of 1540 m/s, for which arrays are designed."""
         return NOMINAL_SPEED_M_S / self.received_mhz * 1e-3
 
     @property
@@ -138,7 +138,7 @@ class Beam(Declared):
 
     @property
     def clutter_power(self) -> float:
-        """Power of the clutter re that of the beam; 0 without."""
+        """Power of the clutter relative to the beam; 0 without."""
         return 0.0 if self.clutter_db is None else 10.0 ** (self.clutter_db / 10.0)
 
     @property
@@ -178,7 +178,7 @@ class Beam(Declared):
         return transmit, self._focused_everywhere(depth, *self.receive_beam()) / cosine
 
     def steered_level(self, angle_rad) -> np.ndarray:
-        """Amplitude of echoes along lines at these angles to the normal of the face, re a line along it.
+        """Amplitude of echoes along lines at these angles to the normal of the face, relative to a line along it.
 
         Elements w wide send and receive sinc(w sin a / wavelength), in a soft baffle cos a of that (A. R. Selfridge, G.
         S. Kino, B. T. Khuri-Yakub, Appl. Phys. Lett. 37(1), 1980). The beam, wider by 1 / cos a, keeps its power of
@@ -223,7 +223,7 @@ class Beam(Declared):
         return lens_beam(self.wavelength_mm, spread, height, self.elevation_focus_mm, self.displayed_mm, self.harmonic)
 
     def harmonic_level(self, depth_mm) -> np.ndarray:
-        """Amplitude of the second harmonic at `depth_mm` re the fundamental, 1 at the transmit focus.
+        """Amplitude of the second harmonic at `depth_mm` relative to the fundamental, 1 at the transmit focus.
 
         In the quasi-linear approximation the square of a Gaussian beam feeds a Gaussian beam of twice the frequency and
         the same Rayleigh lengths, whose amplitude grows by 1 / sqrt((1 + i b)(1 + i c)) per millimetre, with b and c
@@ -338,7 +338,7 @@ def apodized_pattern(u: np.ndarray, apodization: float) -> np.ndarray:
 
 @cache
 def widening(apodization: float) -> float:
-    """The -6 dB width of the main lobe of an aperture with weights (apodized_pattern) re that of a uniform one."""
+    """The -6 dB width of the main lobe of an aperture with weights (apodized_pattern) relative to a uniform one."""
     u = np.linspace(0.5, 1.1, 1201)  # half widths: 0.603 with 0, 1 with 1
     uniform, weighted = (float(np.interp(-0.5, -apodized_pattern(u, a), u)) for a in (0.0, apodization))
     return weighted / uniform

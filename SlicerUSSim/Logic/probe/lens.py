@@ -16,10 +16,10 @@ from SlicerUSSim.Logic.opencl.layout import CONSTANTS
 _DEPTHS, _DISTANCES = CONSTANTS["LOBE_DEPTHS"], CONSTANTS["LENS_DISTANCES"]
 #: Points of the open aperture, and the fewest and most of the plane that waves run over
 _OPEN, _LEAST_PLANE, _MOST_PLANE = 256, 2048, 16384
-#: Frequencies of the band, by a Gauss-Hermite rule; the lowest re the centre
+#: Frequencies of the band, by a Gauss-Hermite rule; the lowest relative to the centre
 _FREQUENCIES, _LEAST_FREQUENCY = 7, 0.2
-#: The main beam begins to fade where it has this part of the deviation of all of the power, and ends at so many times
-#: that distance
+#: The main beam begins to fade where it has this part of the deviation of all of the power, and ends at this multiple
+#: of that distance
 _KEPT, _ENDS = 0.9, 1.06
 #: Lobes are computed up to the larger of these: in wavelengths x f-number, and in wavelengths
 _REACH_LOBES, _REACH_WAVELENGTHS = 5.0, 26.0
@@ -52,7 +52,7 @@ def lens_beam(
     Parameters
     ----------
     wavelength_mm : of what is received; of its second harmonic the square of a field of half the frequency is sent.
-    spread : standard deviation of the amplitude's spectrum re the centre frequency.
+    spread : standard deviation of the amplitude's spectrum relative to the centre frequency.
     depth_mm : of the last row.
     """
     point = aperture_mm / _OPEN

@@ -2,7 +2,7 @@
 
 Headers: segments of DICOM SEG and 3D Slicer's .seg.nrrd, and the label table that TotalSegmentator writes into NIfTI.
 Tables: ITK-SNAP's label descriptions, 3D Slicer's colour tables (.ctbl, .csv), FreeSurfer's look-up tables, and those
-of BIDS (.tsv with columns index and name). A name that is of no tissue gives way to the label's SNOMED CT code.
+of BIDS (.tsv with columns index and name). The label's SNOMED CT code replaces a name that matches no tissue.
 """
 
 from __future__ import annotations

@@ -30,12 +30,12 @@ _NO_PATIENT = (
 )
 #: A label map without a name, in messages
 UNNAMED = "label map"
-#: Tissues of a lesion, which alone are no patient
+#: Tissues of a lesion, which alone are not a patient
 _LESIONS = ("tumour", "oedema", "necrosis", "cyst", "cavity", "enhancing")
 
 
 class NoPatientError(SimulationError):
-    """A label map is a mask or a lesion, and no patient."""
+    """A label map is a mask or a lesion, not a patient."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,7 +54,7 @@ class Findings:
     scheme: Scheme | None
     mapping: LabelMapping
     tissues: TissueTable
-    #: Whether it is of organs of a CT
+    #: Whether it labels organs of a CT
     of_ct: bool = False
 
     @property
@@ -64,7 +64,7 @@ class Findings:
 
     @property
     def _file(self) -> str:
-        """The label map in options; FILE for one that is no file."""
+        """The label map in options; FILE for one without a file."""
         return "FILE" if self.source == UNNAMED or "'" in self.source else self.source
 
     def number(self) -> str:
@@ -79,10 +79,10 @@ class Findings:
             return
         found, choices = recognised(self.names, of_ct=self.of_ct)
         fits = " or ".join(f"--map {one.key}" for one in ([found] if found else choices) or schemes().values())
-        raise SimulationError(f"{self.source}: labels {listed(other, 4)} are not of --map {key}; expected {fits}")
+        raise SimulationError(f"{self.source}: labels {listed(other, 4)} do not belong to --map {key}; expected {fits}")
 
     def require_patient(self) -> None:
-        """Raise NoPatientError for a mask or lesion, which is no patient, unless the user gave it a tissue."""
+        """Raise NoPatientError for a mask or lesion, which is not a patient, unless the user gave it a tissue."""
         if self.is_mapped or self.mapping.scheme:
             return
         size = f"{self.number()}, {self._size(self.names)}"

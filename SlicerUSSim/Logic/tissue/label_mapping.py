@@ -48,7 +48,7 @@ class LabelMapping:
         """From texts "24=csf", "Left-Lesion=tumour", files and keys of schemes, or from a mapping {24: "csf"}.
 
         One text alone may be given without a list. `tissues` are known by their names in addition to the presets.
-        Raises SimulationError for texts that are none of these, for unknown tissues, and for two tissues of one label.
+        Raises SimulationError for other texts, for unknown tissues, and for two tissues of one label.
         """
         if isinstance(texts, Mapping):
             texts = [f"{label}={tissue}" for label, tissue in texts.items()]

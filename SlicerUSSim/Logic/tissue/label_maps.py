@@ -1,7 +1,7 @@
 """read_label_map: label maps of other programs as labels of tissues, by the user's words, names or known numbers.
 
-Every door (command, Slicer, workstation) uses it. What was recognised and done is said in `message`, what is doubtful
-in `warnings`; what cannot be known is an error with its remedy, and never a guess.
+Command, Slicer and workstation use it. `message` reports what was recognised and done, `warnings` what is doubtful.
+What cannot be known is an error with its remedy, and never a guess.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from SlicerUSSim.Logic.tissue.tissue import Tissue
 _log = logging.getLogger(__name__)
 
 LARGEST_LABEL = 99_999
-#: Smallest distance of a label from a whole number that is said
+#: Smallest distance of a label from a whole number that is reported
 _WORTH_ROUNDING = 0.01
 #: Share of the labels that may be unknown to a program, and are taken as what is around them
 _MOST_UNKNOWN = 0.25
@@ -84,7 +84,7 @@ def read_label_map(
     renumber : renumber them also then, from 1.
     of_ct : it has organs of a CT: only programs that label these are thought of.
 
-    Raises SimulationError for numbers that are no labels, labels without a tissue, which it lists, numbers that fit
+    Raises SimulationError for numbers that are not labels, labels without a tissue, which it lists, numbers that fit
     several programs, and for a mask or lesion without a patient.
 
     >>> import numpy as np
@@ -150,7 +150,7 @@ class _Reading:
         self._names = {label: everything[label] for label in self._present if label in everything}
 
     def unchanged(self) -> LabelledTissues | None:
-        """The labels as they are, if the table by number has all of them and nobody says anything else about them."""
+        """The labels as they are, if the table by number has all of them and nothing else maps them."""
         table = self._by_number
         if table is None or self._mapping or self._names or any(label not in table for label in self._present):
             return None
@@ -229,7 +229,7 @@ class _Reading:
         scheme, choices = recognised(unknown, of_ct=self._of_ct)
         if scheme is None and choices:
             raise SimulationError(
-                f"{self._source}: labels {listed(unknown)} have no names; say whose numbers they are: "
+                f"{self._source}: labels {listed(unknown)} have no names; state their program: "
                 f"{', '.join(self._offered(choice, unknown) for choice in choices)}; or give each its tissue: --map "
                 f"{unknown[0]}=TISSUE"
             )

@@ -67,7 +67,7 @@ def read_label_file(
     table : given for this label map (--tissues).
     preset : of a preset that the user gave; then the table beside the file is not used.
     default : tissues by their names, and the membrane, if neither of them is given.
-    of_ct : as of read_label_map.
+    of_ct : as for read_label_map.
 
     Raises SimulationError as read_label_map does.
     """

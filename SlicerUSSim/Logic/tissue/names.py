@@ -20,7 +20,7 @@ BRAIN_TISSUES = ("csf", "grey matter", "white matter")
 OUTSIDE = ("skin", "scalp", "skull", "cancellous bone", "air")
 #: A word after one of these is not what the name means: "non-tumor tissue", "brain without lesion"
 _NOT = "".join(rf"(?<!\b{word} )" for word in ("non", "no", "not", "without"))
-#: A name with one of these says what is not there
+#: A name with one of these states what is absent
 _ABSENT = re.compile(r"\b(free|absen(t|ce)|resected|removed)\b")
 #: Context of codes in 3D Slicer's terminologies, and a coded entry with a category and a type
 _ENTRY = (
@@ -76,7 +76,7 @@ def similar_tissues(name: str, tissue_names: Iterable[str] = ()) -> list[str]:
 
 
 def name_or_term(name: str | None, codes: Iterable[str]) -> str:
-    """A label's name; the tissue of its SNOMED CT codes instead, the first known, if the name is of no tissue."""
+    """A label's name; the tissue of its SNOMED CT codes instead, the first known, if the name matches no tissue."""
     text = str(name or "")
     if is_meaningful(name) and _by_words(text, "word"):
         return text
@@ -114,8 +114,8 @@ def _synonyms() -> dict[str, str]:
 
 @cache
 def _by_words(name: str, kind: str) -> str | None:
-    """By the first row of words.csv with a word in the name, if it is of this kind, so that what is special comes
-    before what is general: neither a cyst nor a lesion of the kidney is kidney, nor is bone wax bone."""
+    """By the first row of words.csv with a word in the name, if it has this kind, so that special words come before
+    general ones: neither a cyst nor a lesion of the kidney is kidney, nor is bone wax bone."""
     key = plain_name(name)
     key = _synonyms().get(key, key)
     if key in TISSUES:

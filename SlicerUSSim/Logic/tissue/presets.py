@@ -65,7 +65,7 @@ _LIQUID = _level("estimate: CSF with protein, a quarter to a third of its way to
 # angles, since its surface is rough; scatterers in its first millimetre stand for that.
 _ROUGH_BONE = _level(
     "some 20 dB above soft tissue, for its rough surface, which is bright also where it is oblique to the beam: by eye "
-    "as in real ultrasound of bone; what lies deeper than a millimetre or two is lost by attenuation"
+    "as in real ultrasound of bone; attenuation hides what is deeper than a millimetre or two"
 )
 
 # Grey and white matter share Szabo's speed of sound for brain and one impedance: published differences between them are

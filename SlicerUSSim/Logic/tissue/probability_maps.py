@@ -1,4 +1,4 @@
-"""Probability maps of grey matter, white matter and CSF, each a file of its own, combined into a label map.
+"""Probability maps of grey matter, white matter and CSF, each a separate file, combined into a label map.
 
 SPM and CAT12 write c1, p1 (grey matter), c2, p2 (white matter) and c3, p3 (CSF) before the name of the MRI (SPM12
 manual, chapter "Segment"); FSL's FAST *_pve_0, _1 and _2, by increasing brightness, of a T1 CSF, grey and white matter
@@ -61,7 +61,7 @@ def combined_probability_maps(path: Path, volume: Volume) -> CombinedMaps | None
     for other, read in zip(paths, volumes, strict=False):
         is_same = read.array.shape == volume.array.shape and np.allclose(read.ijk_to_ras, volume.ijk_to_ras, atol=1e-3)
         require(is_same, f"{other}: has another grid than {path.name}, expected maps of one segmentation")
-        require(_is_share(read.array), f"{other}: is no probability map, expected values from 0 to 1")
+        require(_is_share(read.array), f"{other}: is not a probability map, expected values from 0 to 1")
     shares = [read.array for read in volumes]
     inside = np.sum(shares, axis=0) > _INSIDE
     require(inside.any(), f"{path}: no tissue is probable anywhere, expected values up to 1")

@@ -20,11 +20,11 @@ class SheetLook:
     #: Of the layer of scatterers, mm
     least_thickness_mm: float
     most_thickness_mm: float
-    #: Their level re those of that tissue, dB
+    #: Their level relative to that tissue, dB
     level_db: float
     #: Whether it is the border of a ventricle, whose scatterers fade with the angle as those of any wall
     is_wall: bool
-    #: Whether these are of the tissue DURA of the table, and otherwise of the membrane's
+    #: Whether these have the table's tissue DURA, and otherwise the membrane's
     is_dura: bool
     #: Amplitude reflection coefficient of the layer where the beam meets it squarely and it is smooth
     reflection: float
@@ -55,7 +55,7 @@ def looks_of(tissues: TissueTable) -> dict[str, SheetLook]:
         tissue = membrane.tissue if name is None else _tissue(tissues, name)
         is_dura, level_db = name == DURA and has_dura, 0.0
         if name is not None and not is_dura:
-            # Re the membrane's by the presets: where a fit changes the membrane's level, that of the dura follows.
+            # Relative to the membrane's in the presets: where a fit changes the membrane's level, the dura's follows.
             level_db = 10.0 * np.log10(TISSUES[name].scatterer_variance / _OWN_VARIANCE)
         most = max(_MOST_MM[kind], membrane.thickness_mm)
         result[kind] = SheetLook(
@@ -72,8 +72,8 @@ def dura_label(tissues: TissueTable) -> int:
 def with_dura(tissues: TissueTable, kinds: Iterable[str], known: TissueTable | None = None) -> TissueTable:
     """The table with the tissue of falx and tentorium, under a label without voxels, where sheets are of these `kinds`.
 
-    With it, their level is that of a tissue of their own, which a fit changes, and not tied to the membrane's. Its
-    parameters are those in the table `known`, or else the preset's. Unchanged if it is there, or no label is left.
+    With it, their level belongs to a separate tissue, which a fit changes, and is not tied to the membrane's. Its
+    parameters are those in the table `known`, or else the preset's. Unchanged if the table has it, or no label is left.
     """
     # The last free label: the next one may be another tissue's in label maps for which a preset is used
     label = next((label for label in range(MAX_LABEL, 0, -1) if label not in tissues), None)

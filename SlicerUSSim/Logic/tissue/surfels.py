@@ -80,5 +80,5 @@ class Surfels:
     def of_kind(self, *kinds: str) -> Surfels:
         """The surfels of some kinds only. Raises SimulationError for a name that is not in KINDS."""
         for name in kinds:
-            require(name in KINDS, f"sheets are of no kind {name!r}, expected some of: {', '.join(KINDS)}")
+            require(name in KINDS, f"sheets have no kind {name!r}, expected some of: {', '.join(KINDS)}")
         return self.chosen(np.isin(self.kind, [KINDS.index(name) for name in kinds]))

@@ -149,7 +149,7 @@ class TissueTable(PlainValue, Mapping[int, Tissue]):
     def for_names(self, names: Iterable[str]) -> TissueTable:
         """A table for labels 1, 2, ... named `names`, with the coupling medium and membrane of this table.
 
-        With skin among the names the coupling medium lies on it and is no fluid of the membrane. A tissue is taken from
+        With skin among the names the coupling medium lies on it, outside the membrane's fluids. A tissue is taken from
         this table, including its membrane, if the name occurs there, or else if it occurs with
         other case, hyphens or underscores, or else from the presets. Of several tissues with one name, the first is
         taken, as in `label_of` and `tissue`.
@@ -172,7 +172,7 @@ class TissueTable(PlainValue, Mapping[int, Tissue]):
         return self.with_labels(table)
 
     def with_labels(self, tissues: Mapping[int, Tissue]) -> TissueTable:
-        """A table of these tissues by label, with this table's membrane; coupling is none of its fluids on skin.
+        """A table of these tissues by label, with this table's membrane; coupling is not one of its fluids on skin.
 
         Raises SimulationError for a label out of range.
         """

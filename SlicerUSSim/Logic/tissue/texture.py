@@ -22,8 +22,8 @@ from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.opencl.layout import CONSTANTS
 
 _FARTHEST_DEVIATION = 2.5
-#: Of volume shares: voxels whose second tissue is less probable are whole; standard deviations between the means of
-#: tissues from which on an intensity between them tells a share; the part of that range in which it does
+#: Of volume shares: voxels whose second tissue is less probable are whole; least standard deviations between
+#: the means of tissues for which an intensity between them shows a share; the part of that range in which it does
 _SURE, _CLEAR, _INNER_RANGE = 0.05, 5.0, 0.7
 
 
@@ -91,7 +91,7 @@ class Texture:
         return Texture(self.second_label[part], self.second_share[part], self.deviation[part], share)
 
     def along(self, labels: Volume) -> Texture:
-        """Stored as `labels.along()`, of the label map that it is of. Raises SimulationError if the shapes differ."""
+        """Stored as `labels.along()`, of its label map. Raises SimulationError if the shapes differ."""
         require(
             self.deviation.shape == labels.array.shape,
             f"the texture has shape {self.deviation.shape}, expected that of the labels, {labels.array.shape}",
@@ -129,7 +129,7 @@ def volume_shares(
     """(k, j, i) float32 part of every voxel that its second tissue fills, 0 to 1/2, from a denoised image.
 
     A voxel of both tissues lies between their means by the parts that they fill; its class is more certain than that
-    (`second_share`). Only voxels next to the second tissue are taken for such, and pairs of tissues whose means differ
+    (`second_share`). Only voxels next to the second tissue count as mixed, and pairs of tissues whose means differ
     by _CLEAR standard deviations; of the others the share is that of the class. The outer parts of the range count as
     whole, since noise there would have one sign.
     """

@@ -67,11 +67,11 @@ class Tissue(Declared):
         unit="mm", symbol="ℓₜ", bounds=(0.1, 20),
     )  # fmt: skip
     specks_per_mm3: float = parameter(
-        0.0, "Specks", "Bright specks per cubic millimetre, as of small vessels and calcifications", unit="1/mm³",
+        0.0, "Specks", "Bright specks per cubic millimetre, such as small vessels and calcifications", unit="1/mm³",
         symbol="nₛ", bounds=(0, 10), note="At most one in a cube of twice the texture length",
     )  # fmt: skip
     speck_db: float = parameter(
-        0.0, "Speck level", "How much brighter a speck is in its middle", unit="dB", symbol="Δₛ", bounds=(0, 30)
+        0.0, "Speck level", "Level of a speck's centre above its tissue", unit="dB", symbol="Δₛ", bounds=(0, 30)
     )
     sources: Mapping[str, str] = parameter(
         default_factory=dict, label="Sources", tip="Source of each value, by parameter", compare=False
@@ -119,14 +119,14 @@ class Membrane(Declared):
     )  # fmt: skip
     roughness_mm: float = parameter(
         0.03, "Roughness", "RMS height of the sheet: the border's own echo falls by exp(-(2 k s cos i)²/2)", unit="mm",
-        bounds=(0, 1), note="0 is a mirror; at 5 MHz 0.03 mm costs 6 dB at normal incidence",
+        bounds=(0, 1), note="0 is a mirror; at 5 MHz 0.03 mm lowers the echo by 6 dB at normal incidence",
     )  # fmt: skip
     diffuse_db: float = parameter(
-        12.0, "Diffuse echo", "Level of its scatterers where the beam meets the sheet squarely, re those of its tissue",
+        12.0, "Diffuse echo", "Level of its scatterers at normal incidence, relative to those of its tissue",
         unit="dB", bounds=(-100, 40),
     )  # fmt: skip
     sheet_exponent: float | None = parameter(
-        None, "Diffuse exponent of sheets", "The same of sulci and other sheets, which hold vessels; none: as of walls",
+        None, "Diffuse exponent of sheets", "The same for sulci and other sheets, which hold vessels; none: as walls",
         bounds=(0, 20), can_be_none=True,
     )  # fmt: skip
     roughness_octaves: float = parameter(
@@ -134,13 +134,13 @@ class Membrane(Declared):
         unit="octaves", bounds=(0, 4),
     )  # fmt: skip
     patch_db: float = parameter(
-        0.0, "Variation of the diffuse echo", "Standard deviation of its level from patch to patch; its mean stays",
+        0.0, "Variation of the diffuse echo", "Standard deviation of its level from patch to patch, at constant mean",
         unit="dB", bounds=(0, 20),
     )  # fmt: skip
     patch_mm: float = parameter(5.0, "Patches", "Size of the patches along a sheet", unit="mm", bounds=(0.5, 50))
     diffuse_exponent: float = parameter(
-        1.5, "Diffuse exponent", "Exponent n of cosⁿ of the angle of incidence, for the scatterers of the sheet",
-        bounds=(0, 20), note="1 is Lambert's law; 0 a sheet that is equally bright on all sides",
+        1.5, "Diffuse exponent", "Exponent n of cosⁿ of the angle of incidence, for scatterers of the sheet",
+        bounds=(0, 20), note="1 is Lambert's law; with 0 a sheet is equally bright at all angles",
     )  # fmt: skip
 
     def __post_init__(self) -> None:

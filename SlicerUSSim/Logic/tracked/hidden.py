@@ -45,7 +45,7 @@ def visible_part(
     images : (n, rows, columns) uint8, of a recording.
     field : (rows, columns) bool, the probe's imaged field.
     coloured : (rows, columns) bool, pixels that have a colour in any image, such as Doppler's.
-    finds_marks : whether what a scanner draws over the field is looked for; nothing is drawn over simulated images.
+    finds_marks : whether to find what a scanner draws over the field; nothing is drawn over simulated images.
 
     What is left out is logged as a warning.
     """
@@ -53,7 +53,7 @@ def visible_part(
     seen = _without(field, ~_shown(images.max(axis=0) > _DARK, field), "are beyond what the file shows")
     if coloured is not None:
         around = np.asarray(ndimage.binary_dilation(coloured, iterations=_AROUND), bool)
-        seen = _without(seen, around, "have colours, as of Doppler or markers")
+        seen = _without(seen, around, "have colours, such as Doppler or markers")
     if finds_marks:
         seen = _without(seen, _drawn_over(images, seen), "are the same in all images, as text, rulers and boxes are")
     return seen
@@ -97,7 +97,7 @@ def _drawn_over(images: np.ndarray, field: np.ndarray) -> np.ndarray:
     different = {image[field].tobytes(): number for number, image in enumerate(images)}  # a scanner may be frozen
     if len(different) < _LEAST_IMAGES:
         _log.warning(
-            "text, rulers and other marks in the images could not be looked for: %d different images, expected at "
+            "text, rulers and other marks in the images could not be detected: %d different images, expected at "
             "least %d", len(different), _LEAST_IMAGES,
         )  # fmt: skip
         return nothing
@@ -108,8 +108,8 @@ def _drawn_over(images: np.ndarray, field: np.ndarray) -> np.ndarray:
     same = shows & (low >= _DRAWN) & (high - low <= max(_SAME, _SAME_SHARE * change))
     if change < _LEAST_CHANGE or same.sum() > _MOST_DRAWN * field.sum():
         _log.warning(
-            "text, rulers and other marks in the images could not be looked for: half of what the field shows changes "
-            "by at most %.0f grey levels, expected %d or more, as of a moving probe", change, _LEAST_CHANGE,
+            "text, rulers and other marks in the images could not be detected: half of what the field shows changes "
+            "by at most %.0f grey levels, expected %d or more, as with a moving probe", change, _LEAST_CHANGE,
         )  # fmt: skip
         return nothing
     regions = np.zeros(same.shape, np.int32)

@@ -24,8 +24,8 @@ _log = logging.getLogger(__name__)
 _DARK = 4
 #: Sides with a smaller angle to the vertical are those of a linear array, degrees.
 _PARALLEL_DEG = 1.5
-#: A phased array has an apex radius below this fraction of the outer radius: 4.5 mm under 78 mm are a small convex
-#: array's, and taken for none the image would begin 4.5 mm early.
+#: A phased array has an apex radius below this fraction of the outer radius: 4.5 of 78 mm are a small convex array,
+#: whose image would begin 4.5 mm early as a phased array.
 _POINT_SHARE = 0.03
 #: Least overlap of the estimated field with the bright region (intersection over union).
 _LEAST_OVERLAP = 0.85
@@ -233,7 +233,7 @@ def _sector(points: np.ndarray, left, right, scale) -> tuple[str, dict[str, floa
     away = points - apex
     radius, angle = np.hypot(*away.T), np.arctan2(away[:, 0], away[:, 1])
     in_sides = np.abs(angle) < half
-    require(bool(in_sides.any()), "the bright part of the images is no probe's field, it lies beside its own sides")
+    require(bool(in_sides.any()), "the bright part of the images is not a probe's field, it is outside its own sides")
     radius, angle = radius[in_sides], angle[in_sides]
     # The probe face is a circle about the apex. The first bright pixel of each direction, one pixel wide, lies on it;
     # the pixel's centre is on average half a pixel deeper.

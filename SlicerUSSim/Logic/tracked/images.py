@@ -73,9 +73,9 @@ class TrackedImages:
             Without `probe` the probe is estimated too.
         apart : images that are prepared as well, but are not among those of the default choice; see `split`.
         beam : probe whose parameters other than the geometry are used for an estimated probe.
-        field : the probe and its place in the images, if both are known, as of images that were prepared before; what a
-            scanner draws over it is looked for again.
-        finds_marks : whether what a scanner draws over the field is looked for, as for a comparison.
+        field : the probe and its place in the images, if both are known, as for images prepared before; what a scanner
+            draws over it is detected again.
+        finds_marks : whether to detect what a scanner draws over the field, as for a comparison.
 
         Raises SimulationError for images that do not exist or were not tracked, a skewed calibration, a field that
         cannot be estimated or whose size is not that of what images show, and images that are black or of one grey
@@ -115,7 +115,7 @@ class TrackedImages:
                     _require_size(field, every, spacing, path)
             finds_marks = finds_marks and sequence.is_recorded
             seen = visible_part(every, field.mask, sequence.coloured, finds_marks=finds_marks)
-            require(bool(seen.any()), "nothing of the probe's field is seen in the images")
+            require(bool(seen.any()), "the images show nothing of the probe's field")
             for number, image in zip(kept, images, strict=True):
                 low, high = int(image[seen].min()), int(image[seen].max())
                 require(
@@ -237,7 +237,7 @@ def _located_field(
     if probe is None:
         shared = {field.name for field in fields(Probe)}
         known = {} if beam is None else {name: v for name, v in beam.to_dict().items() if name in shared}
-        _log.info("no probe is given: its geometry is looked for in the images, the rest is the preset's")
+        _log.info("no probe is given: its geometry is estimated from the images, the rest comes from the preset")
         return estimate_field(images, spacing, **known)
     if all("ImageToProbe" in entry for entry in sequence.transforms):
         image_to_probe = np.array(sequence.transforms[0]["ImageToProbe"])
@@ -245,7 +245,7 @@ def _located_field(
             image_to_probe[2, 2] = 1.0
             _log.info("the probe's place in the images is that of ImageToProbe, which is in the probe's own frame")
             return ImagedField.of(probe, image_to_probe, images.shape[1:])
-    _log.info("the probe's place is looked for in the images: no ImageToProbe in the probe's own frame")
+    _log.info("the probe's place is estimated from the images: no ImageToProbe in the probe's own frame")
     try:
         found = estimate_field(images, spacing)
     except SimulationError as error:
@@ -298,9 +298,9 @@ def face_of_calibration(
     """((4, 4) rigid, from the probe frame, at the face, to the tracked sensor, which Plus calls Probe; what was taken).
 
     `image_to_probe` is a calibration (4, 4), from pixels (column, row, 0, 1) to the sensor, mm. The face is at
-    `face_pixel`, or else looked for in `images` (n, rows, columns), or else in the middle of their first row.
-    Raises SimulationError for a skewed calibration, for pixels of another size than scanners have, as of a calibration
-    in metres, and if nothing says where the face is.
+    `face_pixel`, or else found in `images` (n, rows, columns), or else in the middle of their first row.
+    Raises SimulationError for a skewed calibration, for pixels of another size than scanners have, such as those of a
+    calibration in metres, and if the place of the face is unknown.
     """
     spacing = pixel_spacing(image_to_probe, "ImageToProbe")
     size = f"pixels of {spacing[0]:.3g} x {spacing[1]:.3g} mm"

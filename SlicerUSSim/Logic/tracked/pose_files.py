@@ -61,7 +61,7 @@ def _matrix(path: Path):
         if isinstance(values, dict):
             require("probe_to_ras" in values, f'{path}: has no "probe_to_ras", expected a 4x4 matrix under that name')
             return values["probe_to_ras"]
-        _log.info("%s: a bare matrix, taken for probe_to_ras", path)
+        _log.info("%s: a bare matrix, read as probe_to_ras", path)
         return values
     if suffix in _ITK_SUFFIXES or _starts_like_itk(path):
         require(
@@ -70,9 +70,9 @@ def _matrix(path: Path):
             f"in millimetres: c3d_affine_tool -ref REFERENCE -src IMAGE {path.name} -fsl2ras -oitk pose.tfm converts "
             "it; if it is one in RAS, name it .txt",
         )
-        _log.info("%s: ITK transform, taken for the map from world to probe in LPS, as 3D Slicer saves it", path)
+        _log.info("%s: ITK transform, read as the map from world to probe in LPS, as 3D Slicer saves it", path)
         return _itk_to_world(path)
-    _log.info("%s: 16 numbers, taken for probe_to_ras by rows", path)
+    _log.info("%s: 16 numbers, read as probe_to_ras by rows", path)
     return matrix_of_text(f"{path}:", read_text(path))
 
 
@@ -253,7 +253,7 @@ def read_coordinate_definitions(path: str | os.PathLike) -> dict[str, np.ndarray
 
 
 def read_registration(path: str | os.PathLike) -> tuple[np.ndarray, str]:
-    """((4, 4) map from the reference frame of ultrasound to the MRI, a line about it), as of --to-mri.
+    """((4, 4) map from the reference frame of ultrasound to the MRI, a line about it), as for --to-mri.
 
     A file is one of read_transform, or a .tag with landmarks in MRI and ultrasound, for which the rigid map with the
     least squared distances is computed. Raises SimulationError for others, and for landmarks of one volume.
@@ -384,7 +384,7 @@ def require_sound(path: Path, transform) -> None:
         parts = [chain.GetNthTransform(n) for n in range(chain.GetNumberOfTransforms())]
     for part in parts:
         kind, found = part.GetName(), part.GetParameters()
-        if kind == _COMPOSITE:  # SimpleITK has no class for ITK's base class, and shows it as a chain of itself
+        if kind == _COMPOSITE:  # SimpleITK has no class for ITK's base class, and shows it as a chain with itself
             kind = "MatrixOffsetTransformBase"
         _require_parameters(path, kind, found)
 

@@ -47,9 +47,9 @@ _NOT_OURS = (
     "ITK_", "Kinds", "Modality", "NRRD_", "ObjectType", "AnatomicalOrientation", "type", "dimension", "space", "sizes",
     "kinds", "endian", "encoding", "measurement frame", "centers", "spacings", "thicknesses", "axis", "labels", "units",
 )  # fmt: skip
-#: Difference of the components of a pixel, grey levels, from which on it has a colour; below are codecs
+#: Least difference of the components of a pixel that has a colour, grey levels; codecs make smaller ones
 _COLOURED = 24
-#: Grey levels from which on colours can be told; more of what is bright with a colour is a tint
+#: Least grey level at which colours show; if more of the bright pixels have a colour, it is a tint
 _BRIGHT, _MOST_COLOURED = 40, 0.5
 _OPPOSITE = {"M": "U", "U": "M", "F": "N", "N": "F"}
 
@@ -223,8 +223,8 @@ class TrackedSequence:
     def read(cls, path: str | os.PathLike) -> TrackedSequence:
         """Read a sequence metafile (.igs.mha, .seq.mha, .mhd, .nrrd), compressed or not, in any image orientation.
 
-        Transforms whose status is not OK were not tracked and are omitted, and so are those whose name or matrix is
-        none. Colours are converted to grey levels, those of a colour map with a warning. Transforms alone, as 3D Slicer
+        Transforms whose status is not OK were not tracked and are omitted, and so are those without a name or matrix.
+        Colours are converted to grey levels, those of a colour map with a warning. Transforms alone, as 3D Slicer
         saves a sequence of them, are poses without images.
         Raises SimulationError for a file that is missing, unreadable or of another format.
         """
@@ -346,7 +346,7 @@ def frame_numbers(text: str, count: int) -> list[int]:
 
 
 def checked_apart(text: str, fitted: Sequence[int] | None, count: int) -> list[int]:
-    """Numbers of images that are predicted, from a text as of frame_numbers; an empty one is none.
+    """Numbers of images that are predicted, from a text as for frame_numbers; an empty one selects none.
 
     Raises SimulationError for other text, and for images that are `fitted` (None: not known) as well.
     """
@@ -444,9 +444,9 @@ def _value(header: Mapping[str, str], key: str, default: str, source: str) -> st
         return text
     meaning = f"{default}, rows away from the probe and columns towards its mark" if default == "MF" else default
     if key in header:
-        _log.warning("%s: its %s is %r, which is unknown, taken for %s", source, key, header[key], meaning)
+        _log.warning("%s: its %s is %r, which is unknown, read as %s", source, key, header[key], meaning)
     else:
-        _log.info("%s: has no %s, taken for %s", source, key, meaning)
+        _log.info("%s: has no %s, read as %s", source, key, meaning)
     return default
 
 
@@ -491,7 +491,7 @@ def _as_images(array: np.ndarray, components: int, source: str) -> _Pixels:
 
 
 def _are_coloured(colours: np.ndarray, grey: np.ndarray, source: str) -> np.ndarray:
-    """[...] bool, pixels of [..., 3] colours that are no grey; none where most are, as of a scanner's tint.
+    """[...] bool, pixels of [..., 3] colours other than grey; none where most are coloured, as by a scanner's tint.
 
     A tint is logged as a warning.
     """
@@ -500,7 +500,7 @@ def _are_coloured(colours: np.ndarray, grey: np.ndarray, source: str) -> np.ndar
     if not is_coloured.any() or is_coloured[is_bright].mean() <= _MOST_COLOURED:
         return is_coloured
     _log.warning(
-        "%s: the images are tinted: %.0f %% of what is bright has colours; their luminance is taken for the grey level",
+        "%s: the images are tinted: %.0f %% of the bright pixels have colours; their luminance is the grey level",
         source, 100.0 * is_coloured[is_bright].mean(),
     )  # fmt: skip
     return np.zeros_like(is_coloured)
@@ -529,7 +529,7 @@ def _read_poses(path: Path, count: int) -> tuple[_Pixels, dict[str, str]]:
     )
     names = {found[1] for key in fields if (found := re.fullmatch(r"Seq_Frame\d+_(.+)Transform", key))}
     if len(names) == 1 and not _FROM_TO.fullmatch(only := names.pop()):
-        _log.warning("%s: its only transform is %s, taken for ProbeToReference", path, only)
+        _log.warning("%s: its only transform is %s, read as ProbeToReference", path, only)
         fields = {key.replace(f"_{only}Transform", "_ProbeToReferenceTransform"): fields[key] for key in fields}
     return (np.zeros((count, 0, 0), np.uint8), None), fields
 

@@ -374,9 +374,9 @@ class UltrasoundSimulationFilter(_ImageFilter):
     def SetSheetsData(self, surface: vtkPolyData | None) -> None:
         """Thin sheets (falx, tentorium, sulci, walls of ventricles) as `ussim segment --sheets` writes them to a .vtp.
 
-        They replace the lines that labels have in their place; None: the lines of the labels. What they are made of is
-        said by the table's membrane, without which none are drawn. The surface is not observed: call Modified() of the
-        filter after changing it. A surface of something else is an error of the update.
+        They replace the lines of the labels where they are; None: the lines of the labels. They consist of the table's
+        membrane; without a membrane none are drawn. The surface is not observed: call Modified() of the filter after
+        changing it. An update raises an error for any other surface.
         """
         self._change("_sheets_data", surface)
 

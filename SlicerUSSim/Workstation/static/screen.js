@@ -4,7 +4,7 @@
   const INK = "#b9c2c9";
   const MARGIN = { left: 44, right: 44, top: 12, bottom: 12 };
   const LETTERS = 12;
-  const DRAWN_ON = { "real-over": "simulated" }; // streams without a screen of their own
+  const DRAWN_ON = { "real-over": "simulated" }; // streams without a separate screen
   const view = { zoom: 1, x: 0, y: 0, flipX: false, flipY: false }; // x, y: pixels by which images are moved
   const images = {}; // by stream: { bitmap, meta }
   const screens = { view, images, drawMarks: () => {} };

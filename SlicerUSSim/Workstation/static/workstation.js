@@ -33,7 +33,7 @@ import "./measure.js";
     if (name === "simulated") workstation.image = meta.blank ? null : meta;
     // One ruler: real images are on the pixels of the simulated one, unless their size is not known
     const ruler = meta.ruler?.x !== undefined ? meta.ruler : (workstation.image?.ruler ?? meta.ruler);
-    if (name === "simulated" && !isFrozen()) measure.unfrozen(); // they are of the image before
+    if (name === "simulated" && !isFrozen()) measure.unfrozen(); // they belong to the previous image
     screens.put(name, bitmap, { ...meta, ruler });
     if (name !== "simulated" || !bitmap) return;
     workstation.images += 1;
@@ -200,7 +200,7 @@ import "./measure.js";
     input.value = ""; // so that the same file can be chosen again
   };
 
-  // `files` are [path, file]; the folders above a file become part of its name, since a name is no path.
+  // `files` are [path, file]; the folders above a file become part of its name, since a name is not a path.
   function sendFiles(files, purpose) {
     if (!files.length) return;
     const form = new FormData();

@@ -18,7 +18,7 @@ from SlicerUSSim.Logic.tissue.table import write_named_labels
 class GrownLesion:
     """A lesion on the grid of its MRI, and a larger version of it. Nothing is laid over labels by it."""
 
-    #: uint8 on the grid of the MRI; label n + 1 is part n, 0 is none of them
+    #: uint8 on the grid of the MRI; label n + 1 is part n, 0 is outside
     labels: Volume
     #: Tissue of each part, from outside to inside: "tumour", "necrosis"; "cyst"; as the user said
     tissues: tuple[str, ...]

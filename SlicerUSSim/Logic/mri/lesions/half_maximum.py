@@ -1,6 +1,6 @@
 """The region around a point that is brighter than half-way from its surroundings to its own intensity.
 
-The full width at half maximum is the border of a blurred object (as of hot spots in PET: Erdi et al., Cancer 80(12),
+The full width at half maximum is the border of a blurred object (such as hot spots in PET: Erdi et al., Cancer 80(12),
 1997). Both intensities are medians and are taken anew from each region until it stays. Regions end at thin bridges
 (opening by reconstruction: Serra, Image Analysis and Mathematical Morphology, 1982).
 """
@@ -33,7 +33,7 @@ _SMOOTHING_MM = 1.0
 
 @dataclass(frozen=True, eq=False)
 class Window:
-    """A cube around a place in the box of the brain, on a grid of its own with cubic voxels."""
+    """A cube around a place in the box of the brain, on a separate grid with cubic voxels."""
 
     evidence: Evidence
     #: (3,) k, j, i in the box of its centre
@@ -147,7 +147,7 @@ def _connected(above: np.ndarray, distance: np.ndarray, mm: float) -> np.ndarray
             return None
     parts, _ = ndimage.label(above)  # type: ignore[misc]
     number = int(np.bincount(parts[near])[1:].argmax()) + 1
-    # With a voxel around it, or the depth would go on beyond the box as it does beyond the window
+    # With a voxel around it, or the depth would continue beyond the box as it does beyond the window
     box = tuple(slice(max(part.start - 1, 0), part.stop + 1) for part in ndimage.find_objects(parts)[number - 1])
     part, away = parts[box] == number, distance[box]
     depth = _depth(part, mm)

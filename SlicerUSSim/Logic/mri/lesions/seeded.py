@@ -60,7 +60,7 @@ class _Grown:
 
 
 def grow_lesion(segmentation: Segmentation, seed_ras_mm: Sequence[float], tissue: str | None = None) -> GrownLesion:
-    """The lesion around one point, and a larger version of it; the segmentation stays as it is.
+    """The lesion around one point, and a larger version of it; the segmentation does not change.
 
     Parameters
     ----------
@@ -72,7 +72,7 @@ def grow_lesion(segmentation: Segmentation, seed_ras_mm: Sequence[float], tissue
     The lesion ends half-way between its own intensity and that of its surroundings; the larger version at the foot of
     that border, up to 3 mm outside. Whatever a user should look at is among its warnings.
 
-    Raises SimulationError for a point outside the image or the brain, in what looks as its surroundings, and in what
+    Raises SimulationError for a point outside the image or the brain, in what looks like its surroundings, and in what
     has no border within 70 mm.
 
     Takes 1 to 5 seconds.
@@ -84,7 +84,7 @@ def grow_lesion(segmentation: Segmentation, seed_ras_mm: Sequence[float], tissue
     grown = next(_regions_at(evidence, index, named), None)
     if grown is None:
         raise SimulationError(
-            f"the seed {place(seed)} is in what looks as its surroundings, or has no border within "
+            f"the seed {place(seed)} is in tissue that looks like its surroundings, or has no border within "
             f"{_WINDOWS_MM[-1][0]:.0f} mm: expected a point in a lesion that stands out; draw a mask for --add"
         )
     warnings = tuple(_doubts(grown, named))
@@ -104,12 +104,12 @@ def lesion_tissue(name: str) -> str:
         tissue = tissue_to_add(name)
     except SimulationError:
         raise SimulationError(f"no tissue is called {name!r}, {expected}") from None
-    require(tissue in LESION_TISSUES, f"{name!r} is no lesion, {expected}")
+    require(tissue in LESION_TISSUES, f"{name!r} is not a lesion, {expected}")
     return tissue
 
 
 def require_in_image(grid: Volume, seed_ras_mm: Sequence[float]) -> np.ndarray:
-    """(3,) RAS mm of a seed. Raises SimulationError for one outside the grid of an MRI, and for what is no point."""
+    """(3,) RAS mm of a seed. Raises SimulationError for one outside the grid of an MRI and for other values."""
     seed = np.asarray(seed_ras_mm, float)
     require(
         seed.shape == (3,) and bool(np.isfinite(seed).all()),
@@ -180,7 +180,7 @@ def _enhancing(window: Window) -> _Grown | None:
 
 
 def _bright(evidence: Evidence, channel: int) -> float:
-    """Intensity from which on a channel is brighter than white matter and its noise."""
+    """Least intensity of a channel that is brighter than white matter and its noise."""
     return _white(evidence, channel) + _ABOVE_WHITE * float(evidence.deviations[channel])
 
 
@@ -282,8 +282,8 @@ def _lesion(
 def _doubts(grown: _Grown, named: str | None) -> Iterator[str]:
     """What a user should look at, a line each."""
     if named is None and grown.look == "fluid":
-        yield "fluid looks alike in ventricles, sulci and cysts: look which it is"
+        yield "fluid looks alike in ventricles, sulci and cysts: check which it is"
     elif named is None and grown.look != "enhancing":
-        yield "what does not enhance may be tumour or oedema: look, and say what it is (TISSUE)"
+        yield "a lesion that does not enhance may be tumour or oedema: look, and state which (TISSUE)"
     if grown.region.radius_mm < _THIN_MM:
-        yield "it is thin, as vessels and the cortex are: look whether it is one"
+        yield "it is thin like vessels and cortex: check whether it is one of them"

@@ -1,6 +1,6 @@
 """The falx cerebri: a height field over the midsagittal plane, above the template's free edge.
 
-It ends at the line between the rims of the hemispheres, and with contrast agent goes on into the sinus that is seen.
+It ends at the line between the rims of the hemispheres, and with contrast agent continues into the visible sinus.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from SlicerUSSim.Logic.mri.sheets.head import Head
 from SlicerUSSim.Logic.mri.sheets.heights import centred, patches, settled
 from SlicerUSSim.Logic.tissue.surfels import Surfels
 
-#: y and z of MNI152 in which the falx is looked for, how far from the midsagittal plane, and steps; mm
+#: y and z of MNI152 of the search for the falx, its distance from the midsagittal plane, and steps; mm
 _Y_MM, _Z_MM, _X_MM, _STEP_MM = (-112.0, 78.0), (-30.0, 90.0), 16.0, 1.0
 #: The rims of the hemispheres, between which the hull of the brain may dip, are this near to the midsagittal plane
 _RIM_MM = 24.0
@@ -26,13 +26,13 @@ FREE_EDGE = (
     (-60, 5), (-78, -3), (-96, -7),
 )  # fmt: skip
 _WINDOWS_MM, _SMOOTHINGS_MM = (6.0, 4.0, 3.0, 2.0), (8.0, 6.0, 5.0, 4.0)
-#: Distance to white matter counts up to this; fluid and enhancement count so many mm of it
+#: Distance to white matter counts up to this; fluid and enhancement count as this many mm of it
 _FARTHEST_MM, _EVIDENCE_MM = 6.0, 1.5
 #: Half the thickness of the thinnest white matter that counts, and what is added when it is grown back, for the grid
 _THIN_MM, _ROUNDING_MM = 1.5, 0.3
 #: Distance to white matter in the fissure, after smoothing
 _FISSURE_MM, _FISSURE_SIGMA = 1.8, 2.0
-#: With contrast agent the falx is followed so far beyond the rims, into the sinus, where it enhances by so much
+#: With contrast agent the falx is followed this far beyond the rims, into the sinus, where it enhances by this much
 _SINUS_MM, _ENHANCED = 8.0, 0.5
 #: Bright lines between fluids that are narrower than this may be the falx itself, mm
 _LINE_MM = 5.0
@@ -134,13 +134,13 @@ def _sampled_evidence(
         return np.where(beyond <= _SINUS_MM, found, 0.0)  # marrow and scalp are bright as well
     # In wide fluid the falx is a brighter line, and the fluid on either side of it would draw it there.
     found = np.asarray(ndimage.grey_closing(found, (1, 1, round(_LINE_MM / _STEP_MM))))
-    return np.where(beyond > 0.0, 1.0, found)  # bone and marrow say nothing of the falx
+    return np.where(beyond > 0.0, 1.0, found)  # bone and marrow do not show the falx
 
 
 def _evidence(head: Head) -> np.ndarray:
     """(k, j, i) float32: share of fluid, or with contrast agent enhancement by that of white to grey matter, 0 to 2.
 
-    Where the dura enhances, the fluid beside it is no evidence: it is where the falx is not.
+    Where the dura enhances, the fluid beside it is not evidence, since the falx is elsewhere.
     """
     if head.is_enhanced:
         return np.clip((head.image.array - head.white) / (head.white - head.grey), 0.0, 2.0)

@@ -35,7 +35,7 @@ _log = logging.getLogger(__name__)
 
 #: Structures with a volume and the tissue that stands for each; label n + 1 of Sheets.structures is number n
 STRUCTURES = {"corpus callosum": "corpus callosum", "choroid plexus": "enhancing", "vessels": "enhancing"}
-#: What can be looked for
+#: Everything that can be found
 ALL_KINDS = (*KINDS, *STRUCTURES)
 #: Those that only contrast agent shows
 _ENHANCING = ("choroid plexus", "vessels")
@@ -57,7 +57,7 @@ class Sheets:
     surfels: Surfels
     #: uint8 on the MRI's grid: label n + 1 is number n of STRUCTURES, 0 elsewhere
     structures: Volume
-    #: Lines for the user: what was found, and what was not looked for
+    #: Lines for the user: what was found, and what the search omitted
     notes: tuple[str, ...]
 
     def masks(self) -> list[tuple[str, Volume, str]]:
@@ -84,10 +84,10 @@ def find_sheets(
     Parameters
     ----------
     mri : the image from which `segmentation` was made.
-    segmentation : led by the atlas. Without, as of a part of a brain, only sulci and walls of wide deep fluid are
+    segmentation : led by the atlas. Without it, as in a part of a brain, only sulci and walls of wide deep fluid are
         found, and a falx that stands out of the sulci (falx_of_part.py).
     contrast : of the MRI: "t1", "t1gd" or "t2".
-    kinds : what is looked for, of ALL_KINDS. Without contrast agent no vessels and no choroid plexus are found.
+    kinds : what to find, of ALL_KINDS. Without contrast agent no vessels and no choroid plexus are found.
     keep_at : file in which they are kept and from which they are read again; see kept.sheets_beside.
     progress : called with the completed fraction, 0 to 1; may raise errors.Cancelled, which ends the search.
 
@@ -96,14 +96,14 @@ def find_sheets(
     """
     wanted = tuple(kinds)
     require_findable(wanted, contrast)
-    require(wanted, f"nothing is to be found, expected some of: {', '.join(ALL_KINDS)}")
+    require(wanted, f"no kind was chosen, expected some of: {', '.join(ALL_KINDS)}")
     notes, asked = [], wanted
     if segmentation.atlas is None:
         wanted = tuple(kind for kind in wanted if kind in _WITHOUT_ATLAS)
         lacking = "without an atlas, which needs a whole brain"
         require(wanted, f"{', '.join(asked)} cannot be found {lacking}")
         if len(wanted) < len(asked):
-            notes.append(f"only {' and '.join(wanted)} are looked for {lacking}")
+            notes.append(f"only {' and '.join(wanted)} can be found {lacking}")
     report = progress or (lambda share: None)
     report(0.0)
     key = key_of(mri, segmentation, contrast) if keep_at is not None else ""
@@ -118,7 +118,7 @@ def find_sheets(
         first = keep_sheets(keep_at, key, wanted, surfels, structures.array) if keep_at is not None else ""
     notes += [first] if first else []
     if contrast != "t1gd" and set(_ENHANCING) & set(wanted):
-        notes.append("no vessels and no choroid plexus are looked for: only a T1 with contrast agent shows them")
+        notes.append("vessels and choroid plexus are omitted: only a T1 with contrast agent shows them")
     notes += _lines(surfels, structures, wanted)
     if segmentation.atlas is None and "falx" in wanted:
         notes.append("the falx is the straight sulcus, if there is one, that is as deep as the fissure: look at it")
@@ -234,7 +234,7 @@ _THICKNESS_MM = 0.1
 def ependyma(head: Head, ventricles: np.ndarray) -> Surfels:
     """Surfels where the intensity is midway between CSF and the tissue around the `ventricles` (k, j, i).
 
-    Without those at foramina, where fluid goes on outside, and at the choroid plexus, which enhances.
+    Without those at foramina, where fluid continues outside, and at the choroid plexus, which enhances.
     """
     from skimage.measure import marching_cubes
 

@@ -1,4 +1,4 @@
-"""The head in which sheets are looked for: its MRI around the brain, without bias field, and its place in the atlas."""
+"""The head in which sheets are found: its MRI around the brain, without bias field, and its place in the atlas."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from SlicerUSSim.Logic.mri.coarse import largest_component, widened, with_thin_s
 from SlicerUSSim.Logic.mri.refinement import closed, on_grid
 from SlicerUSSim.Logic.mri.segmentation import Segmentation
 
-#: Voxels of the grid on which sheets are looked for; an image whose voxels differ by less than the share from the
-#: nearest of these stays as it is
+#: Voxels of the grid on which sheets are found; an image whose voxels differ by less than the share from the nearest of
+#: these is not resampled
 _FINEST_MM, _COARSEST_MM, _NEAR = 0.8, 1.0, 0.15
 #: Along each axis of that grid
 LEAST_VOXELS = 3
@@ -55,7 +55,7 @@ class Head:
     noise: float
     #: Whether vessels and dura enhance
     is_enhanced: bool
-    #: None of a part of a brain: what the atlas does not lead is looked for without it
+    #: None for a part of a brain: the search then works without the atlas
     registered: AtlasFit | None
 
     @classmethod
@@ -134,7 +134,7 @@ class Head:
     def depth(self) -> np.ndarray:
         """(k, j, i) float32 mm inside the hull of the brain; 0 or less outside.
 
-        Where the image cuts the brain, it goes on as at the cut.
+        Where the image cuts the brain, the brain continues as at the cut.
         """
         radius = _HULL_MM / float(self.spacing.mean())
         n = 2 * int(radius) + 2

@@ -1,4 +1,4 @@
-"""Sheets kept beside their MRI, so that they are looked for once."""
+"""Sheets kept beside their MRI, so that the search runs once."""
 
 from __future__ import annotations
 

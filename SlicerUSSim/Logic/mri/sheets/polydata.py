@@ -47,7 +47,7 @@ def write_surfels(path: str | os.PathLike, surfels: Surfels) -> None:
 
 
 def _has_end(path: Path) -> bool:
-    """Whether a .vtp goes on to its end."""
+    """Whether a .vtp is complete."""
     with path.open("rb") as file:
         file.seek(max(path.stat().st_size - 64, 0))
         return b"</VTKFile>" in file.read()
@@ -93,14 +93,14 @@ def as_polydata(surfels: Surfels) -> vtkPolyData:
 
 @in_child  # VTK ends the process for some damaged files
 def read_surfels(path: str | os.PathLike) -> Surfels:
-    """The surfels of a .vtp by write_surfels, where its squares are. Raises SimulationError for a file that is none."""
+    """The surfels of a .vtp by write_surfels, where its squares are. Raises SimulationError for other files."""
     from vtkmodules.vtkIOXML import vtkXMLPolyDataReader
 
     require(Path(path).is_file(), f"{path}: no such file")
     require(Path(path).suffix.lower() == ".vtp", f"{path}: expected a .vtp that `ussim segment --sheets` has written")
     file = vtkXMLPolyDataReader()
     with messages_withheld():
-        require(file.CanReadFile(str(path)) == 1, f"{path}: is no VTK surface")
+        require(file.CanReadFile(str(path)) == 1, f"{path}: is not a VTK surface")
         require(_has_end(Path(path)), f"{path}: is incomplete; copy or write it again")
         file.SetFileName(str(path))
         file.Update()
@@ -131,8 +131,8 @@ def placed_surfels(data: vtkPolyData, source: str, to_ras: np.ndarray | None = N
     """The surfels of a surface by as_polydata, where its squares are after a (4, 4) linear transform.
 
     Other programs move squares and leave the arrays as they were. What is in a sheet grows by its volume, and the
-    thickness with it. Squares of no area are left out. Without `to_ras`, the surface is in the frame that it says.
-    Raises SimulationError as surfels_of does, and for cells that are no squares.
+    thickness with it. Squares without area are left out. Without `to_ras`, the surface is in the frame that it states.
+    Raises SimulationError as surfels_of does, and for cells other than squares.
     """
     from vtkmodules.util.numpy_support import vtk_to_numpy
 
@@ -147,7 +147,7 @@ def placed_surfels(data: vtkPolyData, source: str, to_ras: np.ndarray | None = N
     count = data.GetNumberOfPoints()
     require(
         len(squares) == 4 * len(surfels) and squares.min() >= 0 and squares.max() < count,
-        f"{source} has cells that are no squares, expected a model of `ussim segment --sheets`",
+        f"{source} has cells that are not squares, expected a model of `ussim segment --sheets`",
     )
     corners = (
         vtk_to_numpy(data.GetPoints().GetData())[squares].reshape(-1, 4, 3).astype(float) @ to_ras[:3, :3].T

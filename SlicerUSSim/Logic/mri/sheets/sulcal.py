@@ -18,7 +18,7 @@ from SlicerUSSim.Logic.tissue.surfels import Surfels
 #: The distance counts up to this, and darkness as much as this distance, mm
 _FARTHEST_MM, _DARK_MM = 7.0, 4.0
 _SIGMA_MM, _LEAST_STRENGTH = 0.65, 0.35
-#: Distance to white matter, depth below the hull of the brain, and area of connected parts from which on it is a sulcus
+#: Distance to white matter, depth below the hull of the brain, and least area of connected parts of a sulcus
 _LEAST_DISTANCE_MM, _LEAST_DEPTH_MM, _LEAST_MM2 = 1.2, 1.5, 40.0
 #: A dip is the intensity between two places at this distance along the normal and that at the middle, in deviations of
 #: the noise; the mean of this many neighbours counts
@@ -34,7 +34,7 @@ _BRIGHT = 3.0
 def sulci(head: Head, ventricles: np.ndarray) -> Surfels:
     """Surfels on the middles of sulci: ridges of min(D, 7 mm) + 4 mm fluid, where D is the distance to white matter.
 
-    None in and beside the `ventricles` (k, j, i), and none below the tentorium. Without an atlas, as of a part of a
+    None in and beside the `ventricles` (k, j, i), and none below the tentorium. Without an atlas, as in a part of a
     brain, darkness alone counts: the distance to white matter is not that of the whole, and a lesion may fill most of
     it.
     """
@@ -84,7 +84,7 @@ def smoothed_over_neighbours(place: np.ndarray, values: np.ndarray) -> np.ndarra
 
 
 def widths(head: Head, place: np.ndarray, normal: np.ndarray) -> np.ndarray:
-    """(n,) mm of fluid along the normal through the middle, as far as it goes on without tissue between."""
+    """(n,) mm of fluid along the normal through the middle, up to the first tissue."""
     total = head.fluid(head.at(place)) * _STEP_MM
     for side in (-1.0, 1.0):
         before = head.fluid(head.at(place))

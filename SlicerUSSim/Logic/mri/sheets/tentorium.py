@@ -11,14 +11,14 @@ from SlicerUSSim.Logic.mri.sheets.heights import patches, settled
 from SlicerUSSim.Logic.mri.sheets.regions import in_tentorium, tentorium_height
 from SlicerUSSim.Logic.tissue.surfels import Surfels
 
-#: x and y of MNI152 and how far along the normal it is looked for, mm
+#: x and y of MNI152 and length of the search along the normal, mm
 _X_MM, _Y_MM, _REACH_MM, _STEP_MM = 66.0, (-104.0, -12.0), 6.0, 0.5
 _WINDOWS_MM, _SMOOTHINGS_MM = (5.0, 4.0, 3.0, 2.0), (8.0, 6.0, 5.0, 4.0)
 #: Second derivatives along the normal are of the image after this Gaussian, over these steps
 _SIGMA_MM, _CURVATURE_STEPS = 1.0, 2
 #: Half width of the apex, which rises to the straight sinus, and of the part that is held there, mm
 _APEX_MM, _HELD_MM = 8.0, 3.0
-#: Where the straight sinus is looked for around the template's, mm
+#: Region of the search for the straight sinus around the template's, mm
 _SINUS_REACH_MM, _SINUS_BESIDE_MM = 8.0, 4.0
 #: Thickness; and its confidence by its place alone
 _THICKNESS_MM, _SURE = 0.8, 0.6
