@@ -31,10 +31,14 @@ def dataset(
     ctx: click.Context, recipe: str, out: Path, scheduler: str | None, workers: int | None, export: str | None,
     device: str | None,
 ) -> None:  # fmt: skip
-    """Make many labelled images from a recipe, a TOML file or the name of one in the package.
+    """Make many labelled images from a recipe.
 
-    Image n is the same whoever makes it. The same command resumes an interrupted set. The exit status is 1
-    if a patient was left out.
+    RECIPE is a file in TOML (docs/datasets.md), or the name of one in the package: brain-tumour, denoising,
+    mri-registration, standard-views or ventricles.
+
+    Image n is the same whoever makes it. The same command resumes an interrupted set.
+
+    The exit status is 1 if a patient was left out.
     """
     from SlicerUSSim.Logic.datasets import Recipe, export_coco, export_nnunet, make_dataset
     from SlicerUSSim.Logic.datasets.reader import labels_to_export

@@ -500,7 +500,7 @@ def _are_coloured(colours: np.ndarray, grey: np.ndarray, source: str) -> np.ndar
     if not is_coloured.any() or is_coloured[is_bright].mean() <= _MOST_COLOURED:
         return is_coloured
     _log.warning(
-        "%s: the images are tinted: %.0f %% of the bright pixels have colours; their luminance is the grey level",
+        "%s: the images are tinted: %.0f %% of the bright pixels are coloured; their luminance is the grey level",
         source, 100.0 * is_coloured[is_bright].mean(),
     )  # fmt: skip
     return np.zeros_like(is_coloured)
