@@ -85,7 +85,7 @@ def folder(tmp_path_factory) -> Path:
     for name, shift in (("brain", 0.0), ("second", 1.3)):
         block(lambda x, y, z, d=shift: labels(x + d, y + d, z), (54, 58, 54), 2.0).write(folder / f"{name}.nii.gz")
         name_labels(folder / f"{name}.nii.gz", ["csf", "grey matter", "white matter"])
-    (folder / "broken.nii.gz").write_bytes(b"this is no image")
+    (folder / "broken.nii.gz").write_bytes(b"this is not an image")
     return folder
 
 
@@ -185,7 +185,7 @@ def test_ready_recipes_are_read_and_name_their_purpose():
     for name in READY:
         made = Recipe.read(name)
         assert made.settings.title and made.settings.images >= 500 and len(made.draws["display"]) > 2
-    with pytest.raises(SimulationError, match=r"none.toml: is no file, .*or one of brain-tumour, denoising"):
+    with pytest.raises(SimulationError, match=r"none.toml: does not exist, .*or one of brain-tumour, denoising"):
         Recipe.read("none.toml")
 
 
@@ -549,7 +549,7 @@ def test_a_scheduler_that_is_gone_is_reported_within_ten_seconds(plain, folder, 
     try:
         while not file.exists():
             time.sleep(0.1)
-        with pytest.raises(SimulationError, match=r"the scheduler is gone .*the same command goes on"):
+        with pytest.raises(SimulationError, match=r"the scheduler is gone .*the same command resumes"):
             make_dataset(recipe(folder), tmp_path / "s", scheduler=str(file), progress=end, task=slow_task)
         assert time.perf_counter() - gone[0] < 10.0
     finally:

@@ -259,7 +259,7 @@ def _tissues(panel: PanelPresenter) -> tuple[Row, ...]:
 
 
 def _tracker(panel: PanelPresenter) -> tuple[Row, ...]:
-    """Of Slicer alone: the page has a tracker of its own, and a page must not name files of the server."""
+    """In Slicer only: the page has its own tracker, and a page must not name files of the server."""
     tracking = panel.tracking
     return (
         node("tracked", _("Tracked transform"), _("Pose of the sensor on the probe, such as ProbeToReference of Plus")),
@@ -278,7 +278,7 @@ def _tracker(panel: PanelPresenter) -> tuple[Row, ...]:
                 "transform (needs the extension SlicerOpenIGTLink)"), tracking.sendImages,
             ),
         ),
-        Control("tracked", "words", tip=_("What was taken for the calibration"), shows=tracking.text),
+        Control("tracked", "words", tip=_("How the calibration was read"), shows=tracking.text),
     )  # fmt: skip
 
 

@@ -110,7 +110,7 @@ def make_dataset(
     task : what renders and writes a shard; another one measures what is around it.
 
     Patients that cannot be read are left out, see Made.skipped. Raises SimulationError for a folder with another set,
-    if a file cannot be written, if a package is missing, and if the scheduler is gone; the same call then goes on.
+    if a file cannot be written, if a package is missing, and if the scheduler is gone; the same call then resumes.
     """
     if FORMATS[recipe.settings.format]:
         require_package(FORMATS[recipe.settings.format], EXTRA, f"format {recipe.settings.format}")
@@ -213,8 +213,8 @@ def _on_dask(
                 if not done:
                     sleep(0.02)
         except (OSError, TimeoutError, CancelledError) as error:
-            goes_on = "what is written stays, and the same command goes on"
-            raise SimulationError(f"the scheduler is gone ({_line(error)}); {goes_on}") from None
+            resume = "what is written stays, and the same command resumes"
+            raise SimulationError(f"the scheduler is gone ({_line(error)}); {resume}") from None
         finally:
             waiting.clear()  # which takes the tasks back
 

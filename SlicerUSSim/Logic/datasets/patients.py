@@ -47,7 +47,7 @@ from SlicerUSSim.Logic.tracked.sequence import TrackedSequence
 _MARGIN_MM = 5.0
 #: Wider than the probe's face is an opening, in which poses differ, mm
 _WIDER_MM = 30.0
-#: Where the middle of a lesion may lie, in which steps it is looked for, and how far from the wanted depth, mm
+#: Tissues in which the middle of a lesion may be, steps of the search, and distance from the wanted depth, mm
 _WITHIN, _COARSE_MM, _SHELL_MM = ("grey matter", "white matter", "brain"), 2.0, 1.5
 #: The scene of this process, by recipe, folder and case
 _kept: dict[tuple, Scene] = {}
@@ -143,7 +143,7 @@ def with_ventricles(
     Raises SimulationError for a CT, a FLAIR, and where there are none.
     """
     if not isinstance(segmentation, Segmentation) or tissues.membrane is None:
-        raise SimulationError("is a CT; ventricles are looked for in an MRI")
+        raise SimulationError("is a CT; ventricles can be found in an MRI only")
     head = Head.of(image, segmentation, contrast)
     labels, names = segmentation.labels, (*segmentation.tissue_names, VENTRICLE)
     inside = on_grid(head.image.with_array(ventricles(head).astype(np.float32)), labels) > 0.5

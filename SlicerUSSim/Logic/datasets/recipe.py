@@ -41,11 +41,11 @@ FORMATS = {"zarr": "zarr", "hdf5": "h5py", "png": "", "tracked": ""}
 _PICTURES = ("image", "labels", "labels_as_imaged", "clean")
 #: Recipes that come with the package, by name
 READY = {path.stem: path for path in sorted((Path(__file__).parent / "recipes").glob("*.toml"))}
-#: Bundled patients, which are no files
+#: Bundled patients, which need no file
 BUNDLED = ("mni152", "synthetic")
 ALL = "all"
 VENTRICLE = "ventricle"
-#: Names of the labels in all sets: the label is the place; and that of a tissue which is none of them
+#: Names of the labels in all sets: the label is the place; and the label of all other tissues
 CLASSES, OTHER = (*TISSUES, VENTRICLE), 255
 #: Probes that are drawn for a set: the record of a new one takes 20 ms
 PROBE_POOL = 16
@@ -123,7 +123,7 @@ def _entries(*kinds: type) -> dict[str, Parameter]:
 
 
 _PROBE = Parameter(name="name", type=str, label="Name", tip="Probe", default="phased", choices=tuple(PROBES))
-#: {table: {name: Parameter}} of draws that are none of a tissue; and what is drawn unless a recipe says it
+#: {table: {name: Parameter}} of draws that do not belong to a tissue; and what is drawn by default
 _KNOWN = {
     "pose": _entries(PoseSettings), "probe": {"name": _PROBE, **_entries(*PROBE_KINDS.values())},
     "display": _entries(DisplaySettings), "settings": _entries(SimulationSettings), "lesions": _entries(LesionSettings),
@@ -165,7 +165,7 @@ class Recipe:
     def read(cls, path: str | Path) -> Recipe:
         """From a file, or one of READY by its name. Raises SimulationError that names file, line and key."""
         path = READY.get(str(path), Path(path))
-        require(path.is_file(), f"{path}: is no file, expected a recipe in TOML, or one of {', '.join(READY)}")
+        require(path.is_file(), f"{path}: does not exist, expected a recipe in TOML, or one of {', '.join(READY)}")
         return cls.of_text(path.read_text(encoding="utf-8", errors="replace"), str(path), path.parent)
 
     @classmethod
@@ -179,7 +179,7 @@ class Recipe:
 
     @cached_property
     def shard(self) -> int:
-        """Images of a shard, but for the last."""
+        """Images of a shard, except for the last."""
         pixels, signals = np.prod(self.fixed("display", "image_size")), len(self.signals)
         image_bytes = 4 * pixels * (len(self.settings.outputs) - signals) + _SIGNAL_BYTES * signals
         most = min(_MOST_PER_SHARD, self.settings.images // self.cases, int(_SHARD_BYTES / image_bytes))
@@ -205,7 +205,7 @@ class Recipe:
         return Case(number, number // max(self.lesions, 1), number * self.shards // self.cases * self.shard)
 
     def drawn(self, image: int) -> dict[str, dict[str, Any]]:
-        """{section: {name: value}} of an image but for its tissues; probe.number is its place in `probes`."""
+        """{section: {name: value}} of an image without its tissues; probe.number is its place in `probes`."""
         probe = int(generator(self.settings.seed, image, "probe").integers(len(self.probes)))
         numbers = {"probe": probe, "lesions": self.case_of(image // self.shard).number}
         found = {section: self._of(section, numbers.get(section, image)) for section in _KNOWN}
