@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -131,15 +132,18 @@ def test_shapes_that_do_not_fit_are_refused():
 
 
 @pytest.mark.parametrize(
-    ("suffix", "compress"),
-    [(".igs.mha", True), (".seq.mha", False), (".mha", True), (".nrrd", False), (".seq.nrrd", True)],
-)
-def test_what_is_written_is_read_back(tmp_path, suffix, compress):
-    sequence = chain()
+    ("suffix", "compress", "kind"),
+    [
+        (".igs.mha", True, "u1"), (".seq.mha", False, ">i2"), (".mha", True, "<f4"), (".nrrd", False, "u1"),
+        (".seq.nrrd", True, "u1"),
+    ],
+)  # fmt: skip
+def test_what_is_written_is_read_back(tmp_path, suffix, compress, kind):
+    sequence = replace(chain(), images=chain().images.astype(kind))
     path = tmp_path / f"sweep{suffix}"
     sequence.write(path, compress)
     found = TrackedSequence.read(path)
-    assert np.array_equal(found.images, sequence.images) and found.images.dtype == np.uint8
+    assert np.array_equal(found.images, sequence.images) and found.images.dtype == np.dtype(kind).newbyteorder("=")
     assert np.allclose(found.timestamps, sequence.timestamps)
     assert found.fields == sequence.fields and found.image_type == "BRIGHTNESS"
     for ours, theirs in zip(found.transforms, sequence.transforms, strict=True):

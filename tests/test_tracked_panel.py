@@ -80,7 +80,10 @@ def test_the_face_is_given_found_in_the_image_or_in_its_first_row():
     _, words = face_of_calibration(IMAGE_TO_PROBE, np.zeros((1, 220, 260), np.uint8))
     assert "; face at column 129.5, row -0.5 (the middle of the first row, no field was found); " in words
     pose, words = face_of_calibration(IMAGE_TO_PROBE @ np.diag([1.0, 1.0, -1.0, 1.0]), face_pixel=(10, 0))
-    assert "; the calibration mirrors: " in words and np.linalg.det(pose) > 0
+    assert "; the calibration mirrors: " in words and np.linalg.det(pose) > 0 and "check" not in words
+    _, words = face_of_calibration(IMAGE_TO_PROBE, IMAGE[None], (5000, 10))
+    _, far = face_of_calibration(np.eye(4) + 600.0 * np.eye(4, k=3), face_pixel=(10, 0))
+    assert "; check: the face is outside of the image" in words and "; check: " in far
 
 
 @pytest.mark.parametrize(

@@ -128,6 +128,20 @@ def test_only_the_chosen_transform_moves_the_probe_where_it_is_rigid(link):
             assert len(poses) == 1 and np.allclose(poses[0], POSE, atol=1e-5)
 
 
+def test_the_probe_is_followed_instead_of_what_came_first(link):
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        ours, poses = link(*listener.getsockname()[:2])
+        for other, followed in (("ProbeToReference", "ProbeToReference"), ("RobotToReference", "StylusToReference")):
+            peer, _ = listener.accept()  # the second time any name again, since the first peer has gone
+            with peer:
+                peer.sendall(transform("ImageToProbe", np.diag([0.2, 0.2, 0.2, 1.0])).pack())  # not a pose
+                for name in ("StylusToReference", other, "StylusToReference"):
+                    peer.sendall(transform(name).pack())
+                until(lambda followed=followed: f"following {followed}" in ours.status)
+        until(lambda: "reconnecting" in ours.status)
+        assert len(poses) == 2 + 2 and ours.dropped == 2
+
+
 def test_damaged_and_invalid_poses_are_not_used_and_counted(link):
     with socket.create_server(("127.0.0.1", 0)) as listener:
         ours, poses = link(*listener.getsockname()[:2])

@@ -1,9 +1,10 @@
-"""The virtual ultrasound device, with a client of its own on loopback: what PlusServer answers, and what it sends."""
+"""The virtual ultrasound device, with a separate client on loopback: what PlusServer answers, and what it sends."""
 
 from __future__ import annotations
 
 import struct
 import threading
+import time
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +24,7 @@ from tests.test_tracking import free_port, until
 pyigtl = pytest.importorskip("pyigtl", reason="OpenIGTLink comes with pyigtl: pip install '.[serve]'")
 
 from SlicerUSSim.Logic.device import VirtualDevice  # noqa: E402
+from SlicerUSSim.Logic.device.recorder import Recorder  # noqa: E402
 from SlicerUSSim.Logic.tracked import openigtlink  # noqa: E402
 from SlicerUSSim.Logic.tracked.openigtlink import Address, TrackerLink  # noqa: E402
 
@@ -33,7 +35,7 @@ FAILED = "Command failed. See error message."
 
 
 class Running:
-    """A device with its port, whose images go on in a thread."""
+    """A device with its port, which makes images in a thread."""
 
     def __init__(self, folder: Path) -> None:
         made = simulator(block(lambda x, y, z: 1.0 + (x > 0)), TISSUES["liver"], TISSUES["fat"])
@@ -270,7 +272,7 @@ def test_what_plus_does_not_answer_is_not_answered(client, running):
         whole = packed("COMMAND", "", command_content(text, uid=12))
         other.socket.sendall(whole[:100])
         assert client.command(text, uid=11).command[0] == 11
-        other.next("IMAGE")  # goes on
+        other.next("IMAGE")  # continues
         other.socket.sendall(whole[100:])
         assert other.next("RTS_COMMAND").command[0] == 12
         for peer in running.device.link.peers:
@@ -324,12 +326,32 @@ def test_a_recording_that_was_not_stopped_is_written_at_the_end(tmp_path, caplog
     assert len(TrackedSequence.read(path)) > 2 and "was not stopped" in caplog.text
 
 
+def test_a_long_recording_is_written_soon_and_without_holding_images(tmp_path, monkeypatch):
+    recorder, write, begun = Recorder(tmp_path), TrackedSequence.write, time.process_time()
+    frame = np.zeros((4, 5), np.uint8), 0.0, {"ImageToProbe": np.eye(4), "ProbeToReference": POSE}
+
+    def write_while_adding(*arguments) -> None:
+        adding = threading.Thread(target=recorder.add, args=frame, daemon=True)
+        adding.start()
+        adding.join(30.0)
+        assert not adding.is_alive()
+        write(*arguments)
+
+    monkeypatch.setattr(TrackedSequence, "write", write_while_adding)
+    recorder.start("long.igs.mha")
+    for _ in range(4000):
+        recorder.add(*frame)
+    assert recorder.stop() == (tmp_path / "long.igs.mha", 4000)
+    assert time.process_time() - begun < 8.0  # 1 s where this was written; half a minute with SimpleITK
+    assert recorder.stop()[1] == 0 and [path.name for path in tmp_path.iterdir()] == ["long.igs.mha"]
+
+
 # ---- the command -----------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture
 def command_device(monkeypatch, tmp_path):
-    """The device of `ussim device` with these arguments, after which it does not run; and what was said."""
+    """The device of `ussim device` with these arguments, which does not run; and the messages."""
 
     def make(*arguments: object) -> tuple[VirtualDevice | None, str]:
         made: list[VirtualDevice] = []
@@ -355,6 +377,7 @@ def test_the_command_opens_labels_with_a_path_of_poses(command_device, tmp_path)
     for arguments, words in (
         ((labels, "--path", labels), "has no ProbeToReference, expected poses of the probe"),
         ((tmp_path / "nothing.mrb",), "nothing.mrb"),
+        ((tmp_path / "nothing.mrb", "--path", tmp_path / "none.igs.mha"), "none.igs.mha: no such file"),
         ((tmp_path / "nothing.mrb", "--gain", "3"), "is a scene, which has a patient and settings, expected no --gain"),
     ):
         device, said = command_device(*arguments)

@@ -42,8 +42,7 @@ _PARTS = (
 )
 #: Pages and files that are being rewritten, this one, and what is generated from declarations (docs/parameters.md)
 SKIPPED = re.compile(
-    r"docs/(device|tracked-ultrasound|parameters)|Logic/device/|approach|tracked_presenter|"
-    r"openigtlink|virtual_(ultrasound|device)|tracker|test_(device|tracked_panel|words)"
+    r"docs/(approach|parameters)|approach|test_(tracked_panel|words)"
 )
 
 

@@ -72,7 +72,7 @@ class ServeOptions(ImageOptions):
         "docs/security.md.",
     )  # fmt: skip
     igtl_device: str | None = declared(
-        "--igtl-device", help="Name of the transform to follow (default: the first one received)."
+        "--igtl-device", help="Name of the transform to follow (default: ProbeToReference, or else the first pose)."
     )
 
 

@@ -62,6 +62,7 @@ def device(patient: DeviceOptions, out: Path) -> None:
     address = Address(patient.host, patient.port, listen=True)
     require_usable(address)
     require_folder(out)
+    path = _poses(patient.path) if patient.path else []  # before the MRI is segmented
     with TemporaryDirectory(prefix="ussim-device-") as folder:
         if not patient.mri_or_labels:
             patient = replace(patient, mri_or_labels=str(Path(folder) / "MNI152.nii.gz"))
@@ -71,10 +72,9 @@ def device(patient: DeviceOptions, out: Path) -> None:
         else:
             examination, pose = open_examination_at(patient, patient.pose)
             simulator, preset = examination.simulator, patient.changed_preset()
-    poses = [pose] if patient.path is None else _poses(patient.path)
-    simulator.simulate(preset.probe, poses[0], preset.display)  # builds kernels
-    made = VirtualDevice(simulator, preset, poses, address, make_folder(out.resolve()))
-    note(f"a client may connect to {address}; recordings go to {out.resolve()} (-v tells who comes and goes)")
+    simulator.simulate(preset.probe, pose, preset.display)  # builds kernels
+    made = VirtualDevice(simulator, preset, path or [pose], address, make_folder(out.resolve()))
+    note(f"a client may connect to {address}; recordings go to {out.resolve()} (-v logs clients that connect)")
     try:
         made.run()
     finally:

@@ -37,7 +37,7 @@ class TrackedPresenter:
 
     def __init__(self, panel: PanelHost) -> None:
         self._panel = panel
-        #: What the last calibration was taken for, as text
+        #: How the last calibration was read, as text
         self.done = ""
 
     def text(self) -> str:

@@ -155,8 +155,8 @@ class PlusCommands:
         recorder = self._recorder if asked in (CAPTURE, CHANNEL) else None
         recorder = required(recorder, f"VirtualCapture has not been found ({asked}), {name}")
         if name.lower() == "stoprecording":
-            require(recorder.frames, f"{begin}No frames to record.")
             path, count = recorder.stop()
+            require(count, f"{begin}No frames to record.")
             return _Reply(f"{begin}Recording {count} frames successful to file {path}")
         require(not recorder.is_recording, f"{begin}Recording to file is already in progress.")
         try:
@@ -179,7 +179,7 @@ def _parsed(text: str) -> Element | None:
 
 
 def _asked(command: Element) -> dict[str, str]:
-    """{name: value or ""} of the parameters in a command. Raises SimulationError if they are of another device."""
+    """{name: value or ""} of the parameters in a command. Raises SimulationError if they name another device."""
     device = command.get("UsDeviceId", "")
     require(device in ("", ULTRASOUND), f"Device {device} is not found.")
     found = [child for child in command if child.tag.lower() == "parameter"]
@@ -205,7 +205,7 @@ def _parameters(preset: Preset) -> dict[str, str]:
 def _changed(preset: Preset, name: str, text: str) -> Preset:
     """A preset with one of these parameters changed.
 
-    Raises KeyError for an unknown one, ValueError for a text that is no number, or not three of them for
+    Raises KeyError for an unknown one, ValueError for a text without a number, or without three of them for
     TimeGainCompensation, and SimulationError for a value that is out of range, and for one of _NOT_SET.
     """
     require(name not in _NOT_SET, f"{name} cannot be changed in this device")

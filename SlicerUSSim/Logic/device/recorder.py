@@ -18,7 +18,7 @@ class Recorder:
     """Records images of one size into a folder. An existing recording is never replaced."""
 
     def __init__(self, folder: Path) -> None:
-        self._folder, self._lock = folder, Lock()
+        self._folder, self._adding, self._writing = folder, Lock(), Lock()
         self.is_recording = False
         self._path, self._shape = folder, (0, 0)
         self._forget()
@@ -42,20 +42,22 @@ class Recorder:
 
     def add(self, image: np.ndarray, stamp: float, transforms: Mapping[str, np.ndarray]) -> None:
         """An image (rows, columns) uint8, which is kept if it records."""
-        with self._lock:
+        with self._adding:
             if self.is_recording:
                 self._shape = image.shape
                 self._pixels.write(image.tobytes())
                 self.frames.append((stamp, transforms))
 
     def stop(self) -> tuple[Path, int]:
-        """(the file that was written, number of its images).
+        """(the file that was written, number of its images); without images there is no file.
 
-        Raises SimulationError if nothing was recorded, and if the file cannot be written: nothing is lost then.
+        Raises SimulationError if the file cannot be written: nothing is lost then.
         """
-        with self._lock:
-            require(self.frames, "nothing was recorded")
-            self.is_recording = False
+        with self._writing:
+            with self._adding:  # not while it writes, so that the device continues
+                self.is_recording = False
+            if not self.frames:
+                return self._path, 0
             self._pixels.flush()
             images = np.memmap(self._pixels, np.uint8, "r", shape=(len(self.frames), *self._shape))
             stamps, transforms = zip(*self.frames, strict=True)

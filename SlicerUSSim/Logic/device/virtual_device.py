@@ -90,8 +90,8 @@ class VirtualDevice:
         """End run(), close the connections, and write a recording that was not stopped."""
         self._stopping.set()
         self.link.stop()
-        if self.recorder.frames:
-            _log.warning("a recording was not stopped: written to %s (%d images)", *self.recorder.stop())
+        if (written := self.recorder.stop())[1]:
+            _log.warning("a recording was not stopped: written to %s (%d images)", *written)
 
     def _move(self, pose: np.ndarray) -> None:
         self._path = [pose]

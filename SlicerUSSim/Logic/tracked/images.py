@@ -25,8 +25,8 @@ _LEAST_SHOWN, _BLACK = 0.02, 4
 #: Least area of a given probe's field by that of what images show, which may have other bright areas beside it, and
 #: largest area by that of an image, which may be cropped
 _LEAST_AREA, _MOST_AREA = 1 / 3, 4.0
-#: Least size of a pixel of a scanner's image
-_LEAST_PIXEL_MM = 0.005
+#: Least size of a pixel of a scanner's image; largest distance of a probe's face from its sensor
+_LEAST_PIXEL_MM, _MOST_FACE_MM = 0.005, 500.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -219,10 +219,7 @@ def pixel_spacing(image_to_world: np.ndarray, path: str) -> tuple[float, float]:
     require(min(size) > 0, f"{path} is singular, expected an image's axes in millimetres per pixel")
     cosine = abs(float(x @ y)) / (size[0] * size[1])
     if np.linalg.det(image_to_world[:3, :3]) < 0.0:
-        _log.warning(
-            "%s mirrors: its third axis points against the right hand; if left and right are wrong, its calibration is",
-            path,
-        )
+        _log.warning("%s mirrors: its axes are left-handed; it is wrong if left and right are exchanged", path)
     require(cosine < _SKEW, f"{path} is skewed: the image's axes have a cosine of {cosine:.2g}, expected 0")
     return size
 
@@ -316,8 +313,10 @@ def face_of_calibration(
             _log.info("%s", error)
             place, how = (0.5 * (images.shape[2] - 1), -0.5), "the middle of the first row, no field was found"
     pose = face_pose(image_to_probe, place, "ImageToProbe")
-    words = f"{size}; face at column {place[0]:.1f}, row {place[1]:.1f} ({how})"
-    words += f"; {np.linalg.norm(pose[:3, 3]):.1f} mm from the sensor"
+    distance, end = np.linalg.norm(pose[:3, 3]), (np.inf, np.inf) if images is None else images.shape[:0:-1]
+    words = f"{size}; face at column {place[0]:.1f}, row {place[1]:.1f} ({how}); {distance:.1f} mm from the sensor"
+    if np.greater(place, end).any() or distance > _MOST_FACE_MM:
+        words += "; check: the face is outside of the image, or more than half a metre from the sensor"
     if np.linalg.det(image_to_probe[:3, :3]) < 0.0:
-        words += "; the calibration mirrors: if left and right of the image are wrong, it is"
+        words += "; the calibration mirrors: it is wrong if left and right of the image are exchanged"
     return pose, words

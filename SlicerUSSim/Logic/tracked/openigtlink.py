@@ -117,13 +117,13 @@ class _Peer(NamedTuple):
 class TrackerLink:
     """An OpenIGTLink connection that is maintained until stop(): to one peer, or with `listen` to several clients.
 
-    No image waits for another: a client that is slow gets the newest when it has taken the last.
+    Images are never queued: a slow client gets the newest image when it is ready, and skips those in between.
 
     Parameters
     ----------
     host, port : of the peer, or with `listen` the local address.
     moved : called with every pose, (4, 4) probe_to_ras in mm, in a thread of the link.
-    device : name of the TRANSFORM to follow (default: the first received). One client at a time moves the probe.
+    device : TRANSFORM to follow; by default ProbeToReference, or else the first usable. One client at a time leads.
     listen : wait for clients to connect, instead of connecting to a peer.
     image_name : device name of the IMAGE messages.
     answer : called with the content of every COMMAND, in a thread of its client; returns that of the reply, if any.
@@ -226,8 +226,7 @@ class TrackerLink:
             with self._changed, end:
                 self.peers.remove(peer)
                 if self._leader is not None and self._leader[0] is peer:
-                    self._leader = None
-                    self._device = self._chosen if self._address.listen else self._device
+                    self._leader, self._device = None, self._chosen
                 self._changed.notify_all()
 
     def _send_images(self, peer: _Peer) -> None:
@@ -318,13 +317,12 @@ class TrackerLink:
         from pyigtl.messages import CRC64, TransformMessage
 
         device, now = header["device_name"], time.monotonic()
-        if self._device is None and packed[-8:].hex() == f"{CRC64(body):016x}":
-            self._device = device
-            _log.info("OpenIGTLink: no transform was chosen, the first that came is followed: %r", device)
-        if self._device not in (None, device):
+        is_better = self._chosen is None and device == "ProbeToReference" != self._device
+        if not is_better and self._device not in (None, device):
             self._notice(f"transform {device!r} is passed over, {self._device!r} is followed")
             return
-        if self._leader is not None and self._leader[0] is not peer and now - self._leader[1] < _SILENT_S:
+        leader, last = self._leader or (None, now)
+        if not is_better and leader not in (None, peer) and now - last < _SILENT_S:
             self._say(f"connected to {self._peer_name}, of which two send {device}: the first is followed")
             return
         message, name, crc, expected = TransformMessage(), f"transform {device!r}", packed[-8:].hex(), CRC64(body)
@@ -337,9 +335,9 @@ class TrackerLink:
             self._refuse(str(error))
             return
         pose[:3, :3] = nearest_rotation(pose[:3, :3])  # without the rounding of single precision
-        is_new, self._refused = self._leader is None or self._leader[0] is not peer or self._refused > 0, 0
-        self._leader = peer, now
-        if is_new or not self.received:
+        is_new = leader is not peer or device != self._device or self._refused > 0
+        self._device, self._leader, self._refused = device, (peer, now), 0
+        if is_new:
             self._tell()
         self.received += 1
         self._moved(pose)
@@ -398,7 +396,7 @@ def _exactly(end: socket.socket, count: int) -> bytes:
 
 
 def _require_valid(name: str, device: str, metadata: dict[str, str]) -> None:
-    """Raise SimulationError for a pose that the tracker itself calls invalid, as of a tool that it does not see."""
+    """Raise SimulationError for a pose that the tracker itself calls invalid, for example of a hidden tool."""
     keys = {first + last for first in ("Transform", device, f"{device}Transform") for last in ("Valid", "Status")}
     for key, value in metadata.items():
         if key in keys:
