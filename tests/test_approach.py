@@ -152,13 +152,20 @@ def test_images_of_the_candidates_show_the_contrast_of_the_target(ill):
         plan = plan_approach(ill, names, PHASED, tissue, offered=2)
         shown = simulated_approach(plan, UltrasoundSimulator(ill, TissueTable.named(names)), PHASED).candidates
         for candidate in shown:
-            assert candidate.picture.max() > 100 and candidate.contrast_db is not None
+            assert candidate.pictures[0].max() > 100 and candidate.contrast_db is not None
             assert (candidate.contrast_db > 4.0) if is_brighter else (candidate.contrast_db < -4.0)
-        rows, columns = np.nonzero((shown[0].picture == (255, 200, 61)).all(axis=2))
-        depth = (rows + 0.5) * 90.0 / 256
+        picture, section = shown[0].pictures
+        rows, columns = np.nonzero((picture == (255, 200, 61)).all(axis=2))
+        depth = (rows + 0.5) * 90.0 / len(picture)
         middle = np.linalg.norm(plan.target.centre_ras - shown[0].probe_to_ras[:3, 3])
         assert [depth.min(), depth.max()] == pytest.approx([middle - 8.0, middle + 8.0], abs=2.0)
-        assert columns.mean() == pytest.approx(128, abs=4)
+        assert columns.mean() == pytest.approx(0.5 * picture.shape[1], abs=4)
+        assert np.ptp(columns) == pytest.approx(np.ptp(rows), abs=6)  # a ball is round: pixels are square
+        rows, columns = np.nonzero((section == (89, 217, 255)).all(axis=2))
+        pixel_mm = 90.0 / len(picture)
+        assert np.ptp(columns) * pixel_mm == pytest.approx(shown[0].opening_mm, abs=4.0)
+        above = np.linalg.norm(shown[0].entry_ras - shown[0].probe_to_ras[:3, 3])
+        assert np.ptp(rows) * pixel_mm == pytest.approx(above + middle, abs=3.0)  # from the skin to the target
 
 
 def test_the_example_of_the_page_runs(capsys):
@@ -175,11 +182,11 @@ def test_the_command_writes_a_report_and_simulates_the_first_candidate(ill, tmp_
     run = CliRunner().invoke(main, ["approach", str(labels), "-o", str(report), "--set", "approach.angle_weight=0.5"])
     assert run.exit_code == 0, run.output
     text = report.read_text(encoding="utf-8")
-    assert text.count("data:image/png;base64,") == 3 and NO_ADVICE in text and NO_ADVICE in run.stdout
+    assert text.count("data:image/png;base64,") == 6 and NO_ADVICE in text and NO_ADVICE in run.stdout
     assert text.count("<h2>Candidate") == 3 and all(line in unescape(text) for line in run.stdout.splitlines())
     image = tmp_path / "image.png"
     run = CliRunner().invoke(main, ["simulate", str(labels), "--approach", "tumour", "-o", str(image)])
-    assert run.exit_code == 0 and NO_ADVICE in run.output and "disc of" in run.output, run.output
+    assert run.exit_code == 0 and NO_ADVICE in run.output and "opening of" in run.output, run.output
     pixels = np.asarray(Image.open(image))
     assert pixels[100:200, 250:400].mean() > 20.0
     for arguments, message in (

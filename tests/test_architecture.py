@@ -24,7 +24,7 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = "SlicerUSSim"
-#: The rooms in the order of the table in docs/architecture.md, each of which may import those before it. The module's
+#: The rooms in the order of the table in docs/architecture.md, each of which may import the previous ones. The module's
 #: file is not one of them, and may import all but the workstation and the command.
 _PAGE = (ROOT / "docs/architecture.md").read_text(encoding="utf-8")
 _TABLE = re.findall(r"^\| \[(\w+)\]\(\.\./SlicerUSSim", _PAGE, re.MULTILINE)

@@ -42,7 +42,7 @@ _PARTS = (
 )
 #: Pages and files that are being rewritten, this one, and what is generated from declarations (docs/parameters.md)
 SKIPPED = re.compile(
-    r"docs/(?!slicer|workstation)|Logic/(device|datasets)/|approach|(tracked|datasets)_presenter|gym|"
+    r"docs/(?!slicer|workstation|approach)|Logic/(device|datasets)/|(tracked|datasets)_presenter|gym|"
     r"Widget/sections|openigtlink|virtual_(ultrasound|device)|tracker|test_(device|datasets|tracked_panel|words)"
 )
 

@@ -19,14 +19,15 @@ from SlicerUSSim.Logic.probe.arrays import Probe
 from SlicerUSSim.Logic.probe.image_grid import ImageGrid
 from SlicerUSSim.Logic.probe.poses import slice_under_probe
 from SlicerUSSim.Logic.tissue.names import OUTSIDE, labels_of
+from SlicerUSSim.Logic.tissue.presets import colour_of
 
-#: (rows, columns) of the images
-_PIXELS = (256, 256)
-#: The brain around a target is that so far from it in the image, mm; and fewer pixels are no mean
-_AROUND_MM, _FEWEST = (4.0, 12.0), 30
-_YELLOW = (255, 200, 61)
+#: The brain around a target is that so far from it in the image, mm; a mean needs so many pixels
+_AROUND_MM, _FEWEST = (4.0, 12.0), 100
+#: Pixels of a section of the labels above the skin
+_ABOVE = 40
+_YELLOW, _BLUE = (255, 200, 61), (89, 217, 255)
 _STYLE = """body { background: #161616; color: #e4e4e4; font: 15px/1.5 system-ui, sans-serif; margin: 2rem auto;
-max-width: 900px; padding: 0 1rem } .dim { color: #9a9a9a } .advice { color: #ffc83d }"""
+max-width: 900px; padding: 0 1rem } img { width: 49% } .dim { color: #9a9a9a } .advice { color: #ffc83d }"""
 
 
 def simulated_approach(
@@ -43,12 +44,16 @@ def simulated_approach(
         replace(simulator.settings, quality="draft", contact_gap_mm=None),  # saline fills the openings
         simulator.device, simulator.texture, medium.sheets,
     )  # fmt: skip
-    shown = replace(display or DisplaySettings(), image_size=_PIXELS, persistence=0.0, grey_map="linear")
+    shown = replace(display or DisplaySettings(), image_size=None, persistence=0.0, grey_map="linear")
     poses = [candidate.probe_to_ras for candidate in approach.candidates]
     batch = drafts.simulate_batch(probe, poses, display=shown, outputs=("image", "labels"))
-    grid, seen = ImageGrid.for_probe(probe, _PIXELS), []
-    for candidate, image, tissues in zip(approach.candidates, batch["image"], batch["labels"], strict=True):
-        inside = slice_under_probe(approach.target.region, grid, candidate.probe_to_ras, order=0) > 0
+    grid, seen = ImageGrid.for_probe(probe, None), []
+    pixel_mm, target = grid.pixel_spacing_mm[1], approach.target
+    colours = np.uint8([(0, 0, 0), *(np.multiply(colour_of(name), 255) for name in names)])
+    for candidate, pose, image, tissues in zip(
+        approach.candidates, poses, batch["image"], batch["labels"], strict=True
+    ):
+        inside = slice_under_probe(target.region, grid, pose, order=0) > 0
         picture = np.repeat(image[..., None], 3, axis=2)
         picture[inside & ~ndimage.binary_erosion(inside)] = _YELLOW  # type: ignore[operator]
         in_brain = (tissues > 0) & ~np.isin(tissues, labels_of(names, OUTSIDE))
@@ -58,15 +63,22 @@ def simulated_approach(
         contrast = None
         if min(map(len, levels)) >= _FEWEST:
             contrast = float(levels[0].mean() - levels[1].mean()) / 255.0 * shown.dynamic_range_db
-        seen.append(replace(candidate, picture=picture, contrast_db=contrast))
+        skin_mm, depth_mm = (np.linalg.norm(end - pose[:3, 3]) for end in (candidate.entry_ras, target.centre_ras))
+        skin, depth = int(skin_mm / pixel_mm), int(depth_mm / pixel_mm)
+        taller = replace(grid, rows=grid.rows + skin + _ABOVE, top_mm=-(skin + _ABOVE) * pixel_mm)
+        closed, opened = (slice_under_probe(each.labels, taller, pose, order=0) for each in (medium, drafts.medium))
+        section = colours[closed]
+        section[closed != opened] = _BLUE
+        section[_ABOVE : _ABOVE + skin + depth, grid.columns // 2 - 1 : grid.columns // 2 + 2] = _BLUE
+        seen.append(replace(candidate, pictures=(picture, section), contrast_db=contrast))
     return replace(approach, candidates=tuple(seen))
 
 
 def write_approach_report(path: str | os.PathLike, approach: Approach, subtitle: str = "") -> None:
     """Write simulated candidates with pictures and numbers as one HTML file; on failure an existing file is kept."""
     parts = "".join(
-        f"""<h2>Candidate {number}</h2><p>{html.escape(candidate.text)}</p>
-<img alt="simulated image {number}" src="{png_url(candidate.picture)}">"""
+        f"<h2>Candidate {number}</h2><p>{html.escape(candidate.text)}</p>"
+        + "".join(f'<img alt="" src="{png_url(picture)}">' for picture in candidate.pictures)
         for number, candidate in enumerate(approach.candidates, 1)
     )
     title = html.escape(f"Approach to the {approach.target.name}")
