@@ -33,11 +33,8 @@ if TYPE_CHECKING:
     from SlicerUSSim.Logic.base import Volume
     from SlicerUSSim.Logic.imaging import Preset, UltrasoundSimulator
     from SlicerUSSim.Logic.mri import Added
-    from SlicerUSSim.Logic.placement import ApproachWeights
     from SlicerUSSim.Logic.probe import Probe
     from SlicerUSSim.Logic.tissue import Surfels, Texture, TissueTable
-
-    Planned = tuple[str, ApproachWeights]
 
 #: A pose that is chosen; and those of mri.views.VIEWS
 AUTO = "auto"
@@ -149,11 +146,11 @@ class Examination:
 
 
 def open_examination(
-    patient: PatientOptions, pose: np.ndarray | str | Planned | None = None, *, one_image: bool = False
+    patient: PatientOptions, pose: np.ndarray | str | tuple | None = None, *, one_image: bool = False
 ) -> Examination:
     """The Examination of a command's options. An MRI is segmented, with a progress bar.
 
-    `pose` is a (4, 4) probe_to_ras, one of STANDARD_VIEWS, the target and weights of an approach, or AUTO: a view
+    `pose` is a (4, 4) probe_to_ras, one of STANDARD_VIEWS, (target, weights) of an approach, or AUTO: a view
     through a craniotomy, of what --add laid over the labels if there is something. With `one_image` only what an image
     at this pose shows is prepared.
     Fast checks come before slow computations. Raises SimulationError for inconsistent options.
@@ -243,7 +240,7 @@ def _import_nibabel() -> None:
 
 def _placed(
     patient: PatientOptions, craniotomy: Craniotomy, preset: Preset, added: Added, before: Volume,
-    pose: np.ndarray | str | Planned | None, tissues: TissueTable, texture: Texture | None, sheets: Surfels | None,
+    pose: np.ndarray | str | tuple | None, tissues: TissueTable, texture: Texture | None, sheets: Surfels | None,
     one_image: bool,
 ) -> Examination:  # fmt: skip
     """A patient with the craniotomy, and the probe at its pose with gel between them; says what bone is before it.
@@ -315,11 +312,11 @@ def say_contact(examination: Examination, probe: Probe, poses: Sequence[np.ndarr
 
 
 def open_examination_at(
-    patient: PatientOptions, pose: str | Planned, *, one_image: bool = False
+    patient: PatientOptions, pose: str | tuple, *, one_image: bool = False
 ) -> tuple[Examination, np.ndarray]:
     """(Examination, (4, 4) probe_to_ras) of a command's options.
 
-    The pose is a file, AUTO, one of STANDARD_VIEWS, or Planned, see open_examination.
+    The pose is a file, AUTO, one of STANDARD_VIEWS, or (target, weights), see open_examination.
     """
     from SlicerUSSim.Logic.tracked.pose_files import read_pose
 

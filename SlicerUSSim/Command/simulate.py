@@ -32,22 +32,21 @@ _WEIGHTS = " ".join(entry.name for entry in parameters_of(ApproachWeights))
 @gathered(f"{RARE} {_WEIGHTS}", patient=PatientOptions, approach=ApproachWeights)
 @pose_or_approach
 @click.option(
-    "--approach", "target", metavar="TISSUE|R,A,S", help="In place of a pose: the first candidate of an approach to "
+    "--approach", "what", metavar="TISSUE|R,A,S", help="In place of a pose: the first candidate of an approach to "
     "this lesion or point (mm), through its opening in a whole head (see `ussim approach`).",
 )  # fmt: skip
 @out_option("Image: .png .mha .nrrd .nii.gz or .vti")
 @overwrite_option
-def simulate(
-    patient: PatientOptions, approach: ApproachWeights, pose: str | None, target: str | None, out: Path
-) -> None:
+def simulate(patient: PatientOptions, approach: ApproachWeights, pose: str | None, what: str | None, out: Path) -> None:
     """Simulate one B-mode image from an MRI or a label map at a given pose."""
     from SlicerUSSim.Logic.base.volume import require_image_name
     from SlicerUSSim.Logic.imaging.figures import write_png
 
     require_image_name(out, also=(".png",))
     check_outputs(out)
-    require((pose is None) != (target is None), "expected exactly one of --pose and --approach")
-    examination, probe_to_ras = open_examination_at(patient, pose or (target or "", approach), one_image=True)
+    require((pose is None) != (what is None), "expected exactly one of --pose and --approach")
+    at = (what, approach) if pose is None else pose
+    examination, probe_to_ras = open_examination_at(patient, at, one_image=True)
     say_contact(examination, examination.probe, [probe_to_ras])
     frame = examination.simulator.simulate(examination.probe, probe_to_ras, examination.display)
     if out.suffix.lower() == ".png":

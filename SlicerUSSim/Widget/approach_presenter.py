@@ -68,7 +68,6 @@ class ApproachPresenter:
             plan = required(self.found, "no approach is planned, press Plan first")
             self._chosen = number
             self._panel.parameters.opening = self._panel.logic.showApproach(plan, plan.candidates[number])
-            self._planned = self._rim()
 
     def picture(self, number: int) -> str:
         """The image of a candidate as a data URL; "" without one."""
@@ -79,9 +78,9 @@ class ApproachPresenter:
         plan = self.found
         if plan is None:
             return ""
-        words = plan.candidates[self._chosen].text
-        chosen = _("Candidate {number}: {text}").format(number=self._chosen + 1, text=words)
-        if not np.array_equal(self._rim(), self._planned):
+        rim, candidate = self._rim(), plan.candidates[self._chosen]
+        chosen = _("Candidate {number}: {text}").format(number=self._chosen + 1, text=candidate.text)
+        if len(rim) and not np.allclose(rim.mean(axis=0), candidate.entry_ras, atol=0.1):
             chosen += "\n" + _("The opening was changed: these numbers are for the planned one.")
         return "\n".join((plan.target.text, chosen, _(NO_ADVICE)))
 

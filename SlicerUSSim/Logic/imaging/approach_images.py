@@ -23,8 +23,6 @@ from SlicerUSSim.Logic.tissue.presets import colour_of
 
 #: The brain around a target is that so far from it in the image, mm; a mean needs so many pixels
 _AROUND_MM, _FEWEST = (4.0, 12.0), 100
-#: Pixels of a section of the labels above the skin
-_ABOVE = 40
 _YELLOW, _BLUE = (255, 200, 61), (89, 217, 255)
 _STYLE = """body { background: #161616; color: #e4e4e4; font: 15px/1.5 system-ui, sans-serif; margin: 2rem auto;
 max-width: 900px; padding: 0 1rem } img { width: 49% } .dim { color: #9a9a9a } .advice { color: #ffc83d }"""
@@ -50,9 +48,8 @@ def simulated_approach(
     grid, seen = ImageGrid.for_probe(probe, None), []
     pixel_mm, target = grid.pixel_spacing_mm[1], approach.target
     colours = np.uint8([(0, 0, 0), *(np.multiply(colour_of(name), 255) for name in names)])
-    for candidate, pose, image, tissues in zip(
-        approach.candidates, poses, batch["image"], batch["labels"], strict=True
-    ):
+    for candidate, image, tissues in zip(approach.candidates, batch["image"], batch["labels"], strict=True):
+        pose, face = candidate.probe_to_ras, candidate.probe_to_ras[:3, 3]
         inside = slice_under_probe(target.region, grid, pose, order=0) > 0
         picture = np.repeat(image[..., None], 3, axis=2)
         picture[inside & ~ndimage.binary_erosion(inside)] = _YELLOW  # type: ignore[operator]
@@ -63,13 +60,14 @@ def simulated_approach(
         contrast = None
         if min(map(len, levels)) >= _FEWEST:
             contrast = float(levels[0].mean() - levels[1].mean()) / 255.0 * shown.dynamic_range_db
-        skin_mm, depth_mm = (np.linalg.norm(end - pose[:3, 3]) for end in (candidate.entry_ras, target.centre_ras))
-        skin, depth = int(skin_mm / pixel_mm), int(depth_mm / pixel_mm)
-        taller = replace(grid, rows=grid.rows + skin + _ABOVE, top_mm=-(skin + _ABOVE) * pixel_mm)
-        closed, opened = (slice_under_probe(each.labels, taller, pose, order=0) for each in (medium, drafts.medium))
+        skin, depth = (int(np.linalg.norm(end - face) / pixel_mm) for end in (candidate.entry_ras, target.centre_ras))
+        above = skin + 40  # the section and the path begin some pixels above the skin
+        taller = replace(grid, rows=grid.rows + above, top_mm=-above * pixel_mm)
+        volumes = medium.labels, opened_for(medium.labels, names, [candidate])
+        closed, opened = (slice_under_probe(volume, taller, pose, order=0) for volume in volumes)
         section = colours[closed]
         section[closed != opened] = _BLUE
-        section[_ABOVE : _ABOVE + skin + depth, grid.columns // 2 - 1 : grid.columns // 2 + 2] = _BLUE
+        section[: above + depth, grid.columns // 2 - 1 : grid.columns // 2 + 2] = _BLUE
         seen.append(replace(candidate, pictures=(picture, section), contrast_db=contrast))
     return replace(approach, candidates=tuple(seen))
 
@@ -78,7 +76,7 @@ def write_approach_report(path: str | os.PathLike, approach: Approach, subtitle:
     """Write simulated candidates with pictures and numbers as one HTML file; on failure an existing file is kept."""
     parts = "".join(
         f"<h2>Candidate {number}</h2><p>{html.escape(candidate.text)}</p>"
-        + "".join(f'<img alt="" src="{png_url(picture)}">' for picture in candidate.pictures)
+        + "".join(f'<img alt="candidate {number}" src="{png_url(picture)}">' for picture in candidate.pictures)
         for number, candidate in enumerate(approach.candidates, 1)
     )
     title = html.escape(f"Approach to the {approach.target.name}")

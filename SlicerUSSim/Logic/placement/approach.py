@@ -238,10 +238,9 @@ def find_target(
     around it; or None, the largest lesion. Raises SimulationError if there is no lesion, and for an unknown tissue and
     an invalid point.
     """
-    point, group = None, None
+    point = None
     if isinstance(what, str):
         name = tissue_to_add(what, names)
-        group = (name,)
     elif what is None:
         found = lesions(labels, names)
         require(bool(found), f"the labels have no lesion, expected one{_ADD}")
@@ -250,7 +249,7 @@ def find_target(
         point = np.asarray(what, float)
         require(point.shape == (3,) and np.isfinite(point).all(), f"the target is {what}, expected R, A, S in mm")
         name = ("", *names)[int(sample(labels, point[None], order=0)[0])]
-    group = group or next((group for group in LESION_GROUPS if name in group), None)
+    group = (name,) if isinstance(what, str) else next((group for group in LESION_GROUPS if name in group), None)
     if group is not None:
         parts, _ = ndimage.label(np.isin(labels.array, labels_of(names, group)))  # type: ignore[misc]
         require(parts.any(), f"the labels have no {name}, expected a lesion that they have{_ADD}")
