@@ -312,7 +312,7 @@ def say_contact(examination: Examination, probe: Probe, poses: Sequence[np.ndarr
 
 
 def open_examination_at(
-    patient: PatientOptions, pose: str | tuple, *, one_image: bool = False
+    patient: PatientOptions, pose: np.ndarray | str | tuple, *, one_image: bool = False
 ) -> tuple[Examination, np.ndarray]:
     """(Examination, (4, 4) probe_to_ras) of a command's options.
 
@@ -320,13 +320,14 @@ def open_examination_at(
     """
     from SlicerUSSim.Logic.tracked.pose_files import read_pose
 
-    is_chosen = isinstance(pose, tuple) or pose in (AUTO, *STANDARD_VIEWS)
-    require(
-        is_chosen or (pose != "" and Path(pose).exists()),
-        f"--pose is {pose!r} (no such file), expected a file with the pose (.json, .txt, .tfm, .h5), {AUTO}, "
-        f"or a view: {_VIEWS}",
-    )
-    examination = open_examination(patient, pose if is_chosen else read_pose(pose), one_image=one_image)
+    if isinstance(pose, str) and pose not in (AUTO, *STANDARD_VIEWS):
+        require(
+            pose != "" and Path(pose).exists(),
+            f"--pose is {pose!r} (no such file), expected a file with the pose (.json, .txt, .tfm, .h5), {AUTO}, "
+            f"or a view: {_VIEWS}",
+        )
+        pose = read_pose(pose)
+    examination = open_examination(patient, pose, one_image=one_image)
     return examination, required(examination.probe_to_ras, "the examination has no pose")
 
 

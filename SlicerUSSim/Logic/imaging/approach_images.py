@@ -47,7 +47,7 @@ def simulated_approach(
     batch = drafts.simulate_batch(probe, poses, display=shown, outputs=("image", "labels"))
     grid, seen = ImageGrid.for_probe(probe, None), []
     pixel_mm, target = grid.pixel_spacing_mm[1], approach.target
-    colours = np.uint8([(0, 0, 0), *(np.multiply(colour_of(name), 255) for name in names)])
+    colours = np.multiply([(0.0, 0.0, 0.0), *map(colour_of, names)], 255.0).astype(np.uint8)
     for candidate, image, tissues in zip(approach.candidates, batch["image"], batch["labels"], strict=True):
         pose, face = candidate.probe_to_ras, candidate.probe_to_ras[:3, 3]
         inside = slice_under_probe(target.region, grid, pose, order=0) > 0
