@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from html import unescape
 from pathlib import Path
 
@@ -82,6 +83,10 @@ def test_no_way_leads_through_the_other_side_of_the_brain(head, side):  # noqa: 
     labels = with_ball(head, np.array([9.0 * side, 0.0, 20.0]), 5.0)
     candidates = plan_approach(labels, ILL, PHASED, "tumour").candidates
     assert len(candidates) == 3 and all(side * candidate.probe_to_ras[0, 3] > 4.0 for candidate in candidates)
+    # nor through bone of the other side, to which some paths lead outside the brain
+    aslant = ApproachWeights(angle_weight=0.0, brain_weight=0.0, outside_weight=0.0, unseen_weight=0.0)
+    candidates = plan_approach(labels, ILL, PHASED, "tumour", weights=aslant, offered=40).candidates
+    assert all(side * candidate.entry_ras[0] >= 4.0 for candidate in candidates)
 
 
 def test_no_way_leads_from_below_or_where_the_image_ends(head):  # noqa: F811
@@ -116,6 +121,8 @@ def test_targets_of_all_sizes_and_places_are_planned(head):  # noqa: F811
         labels = with_ball(head, np.array(place), radius)
         best = plan_approach(labels, ILL, PHASED, "tumour").candidates[0]
         assert best.seen > (0.95 if radius < 20.0 else 0.5)
+    far = plan_approach(with_ball(head, PLACE, 5.0), ILL, replace(PHASED, focus_mm=85.0), "tumour").candidates[0]
+    assert far.focused == 0.0 and "0 % in focus (move the focus to the depth of the target)" in far.text
     deep = plan_approach(with_ball(head, np.zeros(3), 5.0), ILL, PROBES["linear"], "tumour").candidates[0]
     assert deep.seen == 0.0  # its field is 40 mm deep: told, not refused
 
@@ -152,13 +159,20 @@ def test_images_of_the_candidates_show_the_contrast_of_the_target(ill):
         plan = plan_approach(ill, names, PHASED, tissue, offered=2)
         shown = simulated_approach(plan, UltrasoundSimulator(ill, TissueTable.named(names)), PHASED).candidates
         for candidate in shown:
-            assert candidate.picture.max() > 100 and candidate.contrast_db is not None
+            assert candidate.pictures[0].max() > 100 and candidate.contrast_db is not None
             assert (candidate.contrast_db > 4.0) if is_brighter else (candidate.contrast_db < -4.0)
-        rows, columns = np.nonzero((shown[0].picture == (255, 200, 61)).all(axis=2))
-        depth = (rows + 0.5) * 90.0 / 256
+        picture, section = shown[0].pictures
+        rows, columns = np.nonzero((picture == (255, 200, 61)).all(axis=2))
+        depth = (rows + 0.5) * 90.0 / len(picture)
         middle = np.linalg.norm(plan.target.centre_ras - shown[0].probe_to_ras[:3, 3])
         assert [depth.min(), depth.max()] == pytest.approx([middle - 8.0, middle + 8.0], abs=2.0)
-        assert columns.mean() == pytest.approx(128, abs=4)
+        assert columns.mean() == pytest.approx(0.5 * picture.shape[1], abs=4)
+        assert np.ptp(columns) == pytest.approx(np.ptp(rows), abs=6)  # a ball is round: pixels are square
+        rows, columns = np.nonzero((section == (89, 217, 255)).all(axis=2))
+        pixel_mm = 90.0 / len(picture)
+        assert np.ptp(columns) * pixel_mm == pytest.approx(shown[0].opening_mm, abs=4.0)
+        above = np.linalg.norm(shown[0].entry_ras - shown[0].probe_to_ras[:3, 3])
+        assert np.ptp(rows) * pixel_mm == pytest.approx(above + middle + 40 * pixel_mm, abs=3.0)  # skin to target
 
 
 def test_the_example_of_the_page_runs(capsys):
@@ -175,13 +189,21 @@ def test_the_command_writes_a_report_and_simulates_the_first_candidate(ill, tmp_
     run = CliRunner().invoke(main, ["approach", str(labels), "-o", str(report), "--set", "approach.angle_weight=0.5"])
     assert run.exit_code == 0, run.output
     text = report.read_text(encoding="utf-8")
-    assert text.count("data:image/png;base64,") == 3 and NO_ADVICE in text and NO_ADVICE in run.stdout
+    assert text.count("data:image/png;base64,") == 6 and NO_ADVICE in text and NO_ADVICE in run.stdout
     assert text.count("<h2>Candidate") == 3 and all(line in unescape(text) for line in run.stdout.splitlines())
+    first = run.stdout.splitlines()[1].split("; contrast")[0]
     image = tmp_path / "image.png"
     run = CliRunner().invoke(main, ["simulate", str(labels), "--approach", "tumour", "-o", str(image)])
-    assert run.exit_code == 0 and NO_ADVICE in run.output and "disc of" in run.output, run.output
+    assert run.exit_code == 0 and NO_ADVICE in run.output and "opening of" in run.output, run.output
     pixels = np.asarray(Image.open(image))
     assert pixels[100:200, 250:400].mean() > 20.0
+    preset = tmp_path / "preset.json"
+    preset.write_text('{"approach": {"angle_weight": 0.5}}', encoding="utf-8")
+    for given in (["--set", "approach.angle_weight=0.5"], ["--preset", str(preset)]):
+        run = CliRunner().invoke(
+            main, ["simulate", str(labels), "--approach", "tumour", *given, "-o", str(image), "--overwrite"]
+        )
+        assert run.exit_code == 0 and first in run.output, run.output
     for arguments, message in (
         (["--approach", "1,2"], "expected R, A, S in mm"),
         (["--approach", "tumour", "--pose", "auto"], "expected exactly one of --pose and --approach"),

@@ -106,9 +106,10 @@ def test_the_opening_is_a_curve_that_can_be_moved(bench):
     approach.plan()
     curve = bench.logic.parameters.opening
     assert curve.IsA("vtkMRMLMarkupsClosedCurveNode") and curve.GetNumberOfControlPoints() == 12
-    step = 12.0 * approach.found.candidates[0].probe_to_ras[:3, 0]
+    before, step = approach.text(), 12.0 * approach.found.candidates[0].probe_to_ras[:3, 0]
     for number, place in enumerate(control_points(curve)):
         curve.SetNthControlPointPositionWorld(number, *(place + step))
+    assert "The opening was changed" not in before and "The opening was changed" in approach.text()
     approach.openHere()
     assert not bench.view.errors and bench.labels is not bench.whole
     pose, target = probe_pose(bench.probe), (TURN @ [*PLACE, 1.0])[:3]

@@ -342,7 +342,7 @@ def test_incomplete_files_of_pocls_cache_are_removed(tmp_path):
 
 
 def _in_process(script: str, **environment: str) -> subprocess.CompletedProcess[str]:
-    """A script in a process of its own, which prints the message of a SimulationError."""
+    """A script in a separate process, which prints the message of a SimulationError."""
     caught = f"from SlicerUSSim.Logic import SimulationError\ntry:\n{textwrap.indent(script, '    ')}\n"
     caught += "except SimulationError as error:\n    print('refused:', error)\n"
     return subprocess.run(

@@ -66,8 +66,8 @@ SECTIONS: list[tuple[str, type[Declared], str]] = [
      "([sheets.md](sheets.md))."),
     ("Fit", FitSettings, "Fit of simulated to real images ([optimization.md](optimization.md)). `fit` in the "
      "preset of `ussim optimize`, which has the options `--frames` and `--free`, too."),
-    ("Approach", ApproachWeights, "Weights of the cost of ways to a target ([approach.md](approach.md)); `approach` in "
-     "the preset of `ussim approach`."),
+    ("Approach", ApproachWeights, "Weights of the cost of paths to a target ([approach.md](approach.md)), in Python "
+     "and by commands: `approach` in the preset of `ussim approach` and `ussim simulate --approach`."),
     ("Similarity", SimilaritySettings, "The cost of a fit ([optimization.md](optimization.md#cost-function)); set in "
      "Python only."),
     ("Recipe", SetSettings, "Of a data set, before the tables of its recipe ([datasets.md](datasets.md))."),

@@ -40,8 +40,6 @@ if TYPE_CHECKING:
 AUTO = "auto"
 STANDARD_VIEWS = ("temporal", "temporal-left", "fontanelle", "fontanelle-sagittal")
 _VIEWS = f"{', '.join(STANDARD_VIEWS)} (temporal: from the right)"
-#: Begins the pose that is the first candidate of an approach to what follows
-APPROACH = "approach:"
 _POSE: dict[str, Any] = dict(
     help='File with probe_to_ras (4 x 4 in JSON, 16 numbers in text, or a Slicer transform), "auto": a coronal '
     "view through a craniotomy, of what --add laid over the labels if there is something, or a standard view: "
@@ -148,13 +146,13 @@ class Examination:
 
 
 def open_examination(
-    patient: PatientOptions, pose: np.ndarray | str | None = None, *, one_image: bool = False
+    patient: PatientOptions, pose: np.ndarray | str | tuple | None = None, *, one_image: bool = False
 ) -> Examination:
     """The Examination of a command's options. An MRI is segmented, with a progress bar.
 
-    `pose` is a (4, 4) probe_to_ras, one of STANDARD_VIEWS, APPROACH and a target, or AUTO: a view through a craniotomy,
-    of what --add laid over the labels if there is something. With `one_image` only what an image at this pose shows is
-    prepared.
+    `pose` is a (4, 4) probe_to_ras, one of STANDARD_VIEWS, (target, weights) of an approach, or AUTO: a view
+    through a craniotomy, of what --add laid over the labels if there is something. With `one_image` only what an image
+    at this pose shows is prepared.
     Fast checks come before slow computations. Raises SimulationError for inconsistent options.
     """
     import logging  # imported here to keep --help fast
@@ -242,7 +240,7 @@ def _import_nibabel() -> None:
 
 def _placed(
     patient: PatientOptions, craniotomy: Craniotomy, preset: Preset, added: Added, before: Volume,
-    pose: np.ndarray | str | None, tissues: TissueTable, texture: Texture | None, sheets: Surfels | None,
+    pose: np.ndarray | str | tuple | None, tissues: TissueTable, texture: Texture | None, sheets: Surfels | None,
     one_image: bool,
 ) -> Examination:  # fmt: skip
     """A patient with the craniotomy, and the probe at its pose with gel between them; says what bone is before it.
@@ -256,12 +254,12 @@ def _placed(
 
     labels, names, settings, probe = added.labels, added.tissue_names, preset.settings, preset.probe
     at, is_open, line = None, craniotomy.is_wanted, ""
-    if isinstance(pose, str) and pose.startswith(APPROACH):
+    if isinstance(pose, tuple):
         from SlicerUSSim.Logic.placement.approach import opened_for, plan_approach
         from SlicerUSSim.Logic.placement.approach_weights import NO_ADVICE
 
         require(not is_open, f"--craniotomy is {craniotomy.text} with --approach, expected none: it opens the head")
-        plan = plan_approach(labels, names, probe, target_of(pose.removeprefix(APPROACH)))
+        plan = plan_approach(labels, names, probe, target_of(pose[0]), weights=pose[1])
         best = plan.candidates[0]
         labels, pose, is_open = opened_for(labels, names, [best]), best.probe_to_ras, best.opening_mm > 0.0
         for line in (plan.target.text, best.text, NO_ADVICE):
@@ -314,21 +312,22 @@ def say_contact(examination: Examination, probe: Probe, poses: Sequence[np.ndarr
 
 
 def open_examination_at(
-    patient: PatientOptions, pose: str, *, one_image: bool = False
+    patient: PatientOptions, pose: np.ndarray | str | tuple, *, one_image: bool = False
 ) -> tuple[Examination, np.ndarray]:
     """(Examination, (4, 4) probe_to_ras) of a command's options.
 
-    The pose is a file, AUTO, one of STANDARD_VIEWS, or APPROACH with a target, see open_examination.
+    The pose is a file, AUTO, one of STANDARD_VIEWS, or (target, weights), see open_examination.
     """
     from SlicerUSSim.Logic.tracked.pose_files import read_pose
 
-    is_chosen = pose == AUTO or pose in STANDARD_VIEWS or pose.startswith(APPROACH)
-    require(
-        is_chosen or (pose != "" and Path(pose).exists()),
-        f"--pose is {pose!r} (no such file), expected a file with the pose (.json, .txt, .tfm, .h5), {AUTO}, "
-        f"or a view: {_VIEWS}",
-    )
-    examination = open_examination(patient, pose if is_chosen else read_pose(pose), one_image=one_image)
+    if isinstance(pose, str) and pose not in (AUTO, *STANDARD_VIEWS):
+        require(
+            pose != "" and Path(pose).exists(),
+            f"--pose is {pose!r} (no such file), expected a file with the pose (.json, .txt, .tfm, .h5), {AUTO}, "
+            f"or a view: {_VIEWS}",
+        )
+        pose = read_pose(pose)
+    examination = open_examination(patient, pose, one_image=one_image)
     return examination, required(examination.probe_to_ras, "the examination has no pose")
 
 

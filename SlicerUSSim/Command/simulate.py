@@ -9,7 +9,6 @@ import click
 
 from SlicerUSSim.Command.options import check_outputs, gathered, out_option, overwrite_option
 from SlicerUSSim.Command.patient_options import (
-    APPROACH,
     RARE,
     RARE_BESIDE,
     PatientOptions,
@@ -30,23 +29,23 @@ _WEIGHTS = " ".join(entry.name for entry in parameters_of(ApproachWeights))
 
 
 @click.command()
-@gathered(RARE, patient=PatientOptions)
+@gathered(f"{RARE} {_WEIGHTS}", patient=PatientOptions, approach=ApproachWeights)
 @pose_or_approach
 @click.option(
-    "--approach", metavar="TISSUE|R,A,S", help="In place of a pose: the first candidate of an approach to this lesion "
-    "or point (mm), through its opening in a whole head (see `ussim approach`).",
+    "--approach", "what", metavar="TISSUE|R,A,S", help="In place of a pose: the first candidate of an approach to "
+    "this lesion or point (mm), through its opening in a whole head (see `ussim approach`).",
 )  # fmt: skip
 @out_option("Image: .png .mha .nrrd .nii.gz or .vti")
 @overwrite_option
-def simulate(patient: PatientOptions, pose: str | None, approach: str | None, out: Path) -> None:
+def simulate(patient: PatientOptions, approach: ApproachWeights, pose: str | None, what: str | None, out: Path) -> None:
     """Simulate one B-mode image from an MRI or a label map at a given pose."""
     from SlicerUSSim.Logic.base.volume import require_image_name
     from SlicerUSSim.Logic.imaging.figures import write_png
 
     require_image_name(out, also=(".png",))
     check_outputs(out)
-    require((pose is None) != (approach is None), "expected exactly one of --pose and --approach")
-    at = f"{APPROACH}{approach}" if pose is None else pose
+    require((pose is None) != (what is None), "expected exactly one of --pose and --approach")
+    at = (what, approach) if pose is None else pose
     examination, probe_to_ras = open_examination_at(patient, at, one_image=True)
     say_contact(examination, examination.probe, [probe_to_ras])
     frame = examination.simulator.simulate(examination.probe, probe_to_ras, examination.display)
@@ -66,7 +65,7 @@ def simulate(patient: PatientOptions, pose: str | None, approach: str | None, ou
 @out_option("Report: .html")
 @overwrite_option
 def approach(patient: PatientOptions, approach: ApproachWeights, target: str | None, out: Path) -> None:
-    """Plan from where a probe sees a lesion best: candidates with ways, openings and images. No medical advice."""
+    """Plan from where a probe sees a lesion best: candidates with paths, openings and images. No medical advice."""
     from SlicerUSSim.Logic.imaging.approach_images import simulated_approach, write_approach_report
     from SlicerUSSim.Logic.placement.approach import plan_approach
 

@@ -27,7 +27,7 @@ class ApproachPresenter:
         self.forget()
 
     def forget(self) -> None:
-        """Forget the plan, which is of another patient."""
+        """Forget the plan, which was for another patient."""
         self._plan: Approach | None = None
         self._labels: Any = None  # of the plan: those of the closed head
         self._pictures: list[str] = []
@@ -59,30 +59,29 @@ class ApproachPresenter:
             progress(0.1)
             self._plan = plan = panel.logic.planApproach(labels, what)
             self._labels = panel.logic.closedLabels(labels)
-            self._pictures = [png_url(candidate.picture) for candidate in plan.candidates]
-            self._choose(0)
+            self._pictures = [png_url(candidate.pictures[0]) for candidate in plan.candidates]
+            self.choose(0)
 
     def choose(self, number: int) -> None:
-        """Show way and opening of candidate 0, 1, ... in the views; what Open skull opens is then that opening."""
+        """Show path and opening of candidate 0, 1, ... in the views; what Open skull opens is then that opening."""
         with self._panel.acting():
-            self._choose(number)
-
-    def _choose(self, number: int) -> None:
-        plan = required(self.found, "no approach is planned, press Plan first")
-        self._chosen = number
-        self._panel.parameters.opening = self._panel.logic.showApproach(plan, plan.candidates[number])
+            plan = required(self.found, "no approach is planned, press Plan first")
+            self._chosen = number
+            self._panel.parameters.opening = self._panel.logic.showApproach(plan, plan.candidates[number])
 
     def picture(self, number: int) -> str:
         """The image of a candidate as a data URL; "" without one."""
         return self._pictures[number] if self.found is not None and number < len(self._pictures) else ""
 
     def text(self) -> str:
-        """The target, what is known of the chosen candidate, and that it is no advice; "" without a plan."""
+        """The target, what is known of the chosen candidate, and the caution; "" without a plan."""
         plan = self.found
         if plan is None:
             return ""
-        words = plan.candidates[self._chosen].text
-        chosen = _("Candidate {number}: {text}").format(number=self._chosen + 1, text=words)
+        rim, candidate = self._rim(), plan.candidates[self._chosen]
+        chosen = _("Candidate {number}: {text}").format(number=self._chosen + 1, text=candidate.text)
+        if len(rim) and not np.allclose(rim.mean(axis=0), candidate.entry_ras, atol=0.1):
+            chosen += "\n" + _("The opening was changed: these numbers are for the planned one.")
         return "\n".join((plan.target.text, chosen, _(NO_ADVICE)))
 
     def canChoose(self, number: int) -> tuple[bool, str]:
@@ -114,6 +113,6 @@ class ApproachPresenter:
         probe: Any = parameters.probe_transform
         if plan is None or probe is None or not parameters.panel.keep_in_opening or probe.GetName() == FACE:
             return
-        self.probe.watch(None)  # the next change is none of the user
+        self.probe.watch(None)  # this change is not by the user
         set_node_to_world(probe, plan.in_opening(self._panel.preset.probe, probe_pose(probe), self._rim()))
         self.probe.watch(probe)

@@ -218,7 +218,7 @@ def _approach(panel: PanelPresenter) -> tuple[Row, ...]:
     return (
         (
             _("Target"), value("scene.target"),
-            button("plan", _("Plan"), _("Compare ways to the target (some seconds)"), approach.plan, panel.canSimulate),
+            button("plan", _("Plan"), _("Compare paths to the target (seconds)"), approach.plan, panel.canSimulate),
         ),
         Control(
             "approachNotes", "words", tip=_("The target, and what is known of the chosen candidate"),
@@ -227,7 +227,7 @@ def _approach(panel: PanelPresenter) -> tuple[Row, ...]:
         tuple(
             Control(
                 f"candidate{number + 1}", "picture", _("Candidate {number}").format(number=number + 1),
-                _("Image with the outline of the target; press it to see way and opening in the views"),
+                _("Image with the outline of the target; press it to see path and opening in the views"),
                 shows=partial(approach.picture, number), action=partial(approach.choose, number),
                 enabled=partial(approach.canChoose, number), depends=("tissues",),
             )

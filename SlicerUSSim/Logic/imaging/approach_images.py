@@ -19,14 +19,13 @@ from SlicerUSSim.Logic.probe.arrays import Probe
 from SlicerUSSim.Logic.probe.image_grid import ImageGrid
 from SlicerUSSim.Logic.probe.poses import slice_under_probe
 from SlicerUSSim.Logic.tissue.names import OUTSIDE, labels_of
+from SlicerUSSim.Logic.tissue.presets import colour_of
 
-#: (rows, columns) of the images
-_PIXELS = (256, 256)
-#: The brain around a target is that so far from it in the image, mm; and fewer pixels are no mean
-_AROUND_MM, _FEWEST = (4.0, 12.0), 30
-_YELLOW = (255, 200, 61)
+#: The brain around a target is that so far from it in the image, mm; a mean needs so many pixels
+_AROUND_MM, _FEWEST = (4.0, 12.0), 100
+_YELLOW, _BLUE = (255, 200, 61), (89, 217, 255)
 _STYLE = """body { background: #161616; color: #e4e4e4; font: 15px/1.5 system-ui, sans-serif; margin: 2rem auto;
-max-width: 900px; padding: 0 1rem } .dim { color: #9a9a9a } .advice { color: #ffc83d }"""
+max-width: 900px; padding: 0 1rem } img { width: 49% } .dim { color: #9a9a9a } .advice { color: #ffc83d }"""
 
 
 def simulated_approach(
@@ -43,12 +42,15 @@ def simulated_approach(
         replace(simulator.settings, quality="draft", contact_gap_mm=None),  # saline fills the openings
         simulator.device, simulator.texture, medium.sheets,
     )  # fmt: skip
-    shown = replace(display or DisplaySettings(), image_size=_PIXELS, persistence=0.0, grey_map="linear")
+    shown = replace(display or DisplaySettings(), image_size=None, persistence=0.0, grey_map="linear")
     poses = [candidate.probe_to_ras for candidate in approach.candidates]
     batch = drafts.simulate_batch(probe, poses, display=shown, outputs=("image", "labels"))
-    grid, seen = ImageGrid.for_probe(probe, _PIXELS), []
+    grid, seen = ImageGrid.for_probe(probe, None), []
+    pixel_mm, target = grid.pixel_spacing_mm[1], approach.target
+    colours = np.multiply([(0.0, 0.0, 0.0), *map(colour_of, names)], 255.0).astype(np.uint8)
     for candidate, image, tissues in zip(approach.candidates, batch["image"], batch["labels"], strict=True):
-        inside = slice_under_probe(approach.target.region, grid, candidate.probe_to_ras, order=0) > 0
+        pose, face = candidate.probe_to_ras, candidate.probe_to_ras[:3, 3]
+        inside = slice_under_probe(target.region, grid, pose, order=0) > 0
         picture = np.repeat(image[..., None], 3, axis=2)
         picture[inside & ~ndimage.binary_erosion(inside)] = _YELLOW  # type: ignore[operator]
         in_brain = (tissues > 0) & ~np.isin(tissues, labels_of(names, OUTSIDE))
@@ -58,15 +60,23 @@ def simulated_approach(
         contrast = None
         if min(map(len, levels)) >= _FEWEST:
             contrast = float(levels[0].mean() - levels[1].mean()) / 255.0 * shown.dynamic_range_db
-        seen.append(replace(candidate, picture=picture, contrast_db=contrast))
+        skin, depth = (int(np.linalg.norm(end - face) / pixel_mm) for end in (candidate.entry_ras, target.centre_ras))
+        above = skin + 40  # the section and the path begin some pixels above the skin
+        taller = replace(grid, rows=grid.rows + above, top_mm=-above * pixel_mm)
+        volumes = medium.labels, opened_for(medium.labels, names, [candidate])
+        closed, opened = (slice_under_probe(volume, taller, pose, order=0) for volume in volumes)
+        section = colours[closed]
+        section[closed != opened] = _BLUE
+        section[: above + depth, grid.columns // 2 - 1 : grid.columns // 2 + 2] = _BLUE
+        seen.append(replace(candidate, pictures=(picture, section), contrast_db=contrast))
     return replace(approach, candidates=tuple(seen))
 
 
 def write_approach_report(path: str | os.PathLike, approach: Approach, subtitle: str = "") -> None:
     """Write simulated candidates with pictures and numbers as one HTML file; on failure an existing file is kept."""
     parts = "".join(
-        f"""<h2>Candidate {number}</h2><p>{html.escape(candidate.text)}</p>
-<img alt="simulated image {number}" src="{png_url(candidate.picture)}">"""
+        f"<h2>Candidate {number}</h2><p>{html.escape(candidate.text)}</p>"
+        + "".join(f'<img alt="candidate {number}" src="{png_url(picture)}">' for picture in candidate.pictures)
         for number, candidate in enumerate(approach.candidates, 1)
     )
     title = html.escape(f"Approach to the {approach.target.name}")

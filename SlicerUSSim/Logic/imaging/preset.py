@@ -30,7 +30,7 @@ SECTIONS: dict[str, type[DisplaySettings] | type[SimulationSettings]] = {
 _POSE = "probe_to_ras"
 _KIND = "probe.kind"
 #: Objects of keys that the command alone has (Command/options.py)
-_OF_COMMAND = ("segmentation", "fit", "patient", "recording", "results")
+_OF_COMMAND = ("segmentation", "fit", "approach", "patient", "recording", "results")
 #: Tissues of segment_mri with thin sulci.
 _BRAIN = ("csf", "grey matter", "white matter", "leptomeninges")
 

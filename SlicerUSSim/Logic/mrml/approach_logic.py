@@ -1,4 +1,4 @@
-"""ApproachLogic: approaches to a lesion in labels of a scene; target, way and opening in its views."""
+"""ApproachLogic: approaches to a lesion in labels of a scene; target, path and opening in its views."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from SlicerUSSim.Logic.mrml.sheet_nodes import read_sheets
 from SlicerUSSim.Logic.placement.approach import Approach, Candidate, plan_approach
 
 #: Names of the nodes that show an approach, and their colours
-TARGET, WAY, OPENING = "Approach target", "Approach way", "Approach opening"
+TARGET, WAY, OPENING = "Approach target", "Approach path", "Approach opening"
 _YELLOW, _BLUE = (1.0, 0.78, 0.24), (0.35, 0.85, 1.0)
 
 
@@ -31,7 +31,7 @@ class ApproachLogic:
     def planApproach(self, labels_node, what: str | Sequence[float] | None = None) -> Approach:
         """The best candidates for the probe of the scene, with images; see plan_approach for `what` and errors.
 
-        Of labels with an opening it is that of those before.
+        Of labels with an opening, the plan is for the closed head.
         """
         require_node(labels_node, *LABEL_CLASSES, use="label map")
         imaged = self._patient.imaged(closed_labels(labels_node))
@@ -49,7 +49,7 @@ class ApproachLogic:
         return work.do(simulated)
 
     def showApproach(self, approach: Approach, candidate: Candidate) -> Any:
-        """Show the target, the way of a candidate and its opening in the 3D views and slices.
+        """Show the target, the path of a candidate and its opening in the 3D views and slices.
 
         Returns the closed curve around the opening, whose points can be moved; None without a skull.
         """

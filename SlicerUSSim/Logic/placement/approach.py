@@ -1,6 +1,6 @@
-"""Planning the approach to a target: from where a probe sees it, what lies on the way, and what is to be opened.
+"""Planning the approach to a target: the probe's position, the tissue on the path, and the opening.
 
-Straight ways from all directions are compared by a cost in millimetres (docs/approach.md): the lower, the better.
+Straight paths from all directions are compared by a cost in millimetres (docs/approach.md): the lower, the better.
 """
 
 from __future__ import annotations
@@ -23,23 +23,23 @@ from SlicerUSSim.Logic.probe.poses import aimed_at, pose_looking_at, sample
 from SlicerUSSim.Logic.probe.surface import PatientSurface
 from SlicerUSSim.Logic.tissue.names import labels_of
 
-#: Names of the parts of a way that no tissue has: fluid near the surface, and deep in the brain
+#: Names of the parts of a path without a tissue: fluid near the surface, and deep in the brain
 SULCI, VENTRICLE = "sulci", "ventricle or cistern"
 _FLUID, _VESSELS = ("csf", "leptomeninges"), ("blood", "enhancing")
-#: Fluid is that of sulci up to so far below the brain's surface along the way, mm
+#: Fluid is that of sulci up to so far below the brain's surface along the path, mm
 _SULCUS_MM = 15.0
 #: A point where no lesion is labelled stands for a ball of this radius, mm
 _POINT_MM = 3
 _STEP_MM, _LONGEST_MM = 0.5, 250.0
-#: Ways with more outside the brain lead through face or neck, mm, as do those from below (cosine to the top of the
+#: Paths with more outside the brain lead through face or neck, mm, as do those from below (cosine to the top of the
 #: head) that do not come from behind (to its front)
 _THICKEST_MM, _BELOW, _BEHIND = 35.0, -0.5, -0.4
 #: Falx and sagittal sinus are so near to the middle plane; the skin is so far from the end of the image at least, mm
 _MIDDLE_MM, _CUT_MM = 4.0, 2.0
-#: An opening is so much wider than the face. A probe is tilted as this and the thickness of the bone allow, but for a
+#: An opening is so much wider than the face. A probe is tilted as this and the thickness of the bone allow, less a
 #: clearance on each side, mm, and so far at most
 _ROOM_MM, _CLEAR_MM, _TILT_DEG = 15.0, 2.0, 35.0
-#: Number of ways, evenly in all directions; and the share of them that meet the surface from a place within it
+#: Number of paths, evenly in all directions; and the share of them that meet the surface from a place within it
 _COMPARED, _FROM_INSIDE = 500, 0.9
 #: Voxels that stand for a target, and places on the line to each that are looked at
 _VOXELS, _LOOKS = 150, 20
@@ -72,11 +72,11 @@ class Target:
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """A way to the target, and how a probe sees it from there."""
+    """A path to the target, and how a probe sees it from there."""
 
     #: (4, 4) of the probe, with its face on the brain
     probe_to_ras: np.ndarray = field(repr=False)
-    #: (3,) RAS mm where the way begins on the skin, or on the brain without a head
+    #: (3,) RAS mm where the path begins on the skin, or on the brain without a head
     entry_ras: np.ndarray
     #: {tissue: mm} from there to the target; SULCI and VENTRICLE are fluid
     path_mm: Mapping[str, float]
@@ -89,9 +89,10 @@ class Candidate:
     opening_mm: float
     #: In millimetres; the lower, the better
     cost: float
-    #: Mean echo of the target above that of the brain around it, and the image (rows, columns, 3) uint8, if simulated
+    #: Mean echo of the target above that of the brain around it, if simulated
     contrast_db: float | None = None
-    picture: np.ndarray = field(default_factory=lambda: np.zeros((1, 1, 3), np.uint8), repr=False)
+    #: (rows, columns, 3) uint8, if simulated: the image, and labels in its plane up to the skin, path and opening blue
+    pictures: tuple[np.ndarray, ...] = field(default=(), repr=False)
 
     @property
     def text(self) -> str:
@@ -99,10 +100,11 @@ class Candidate:
         place = ", ".join(f"{axis} {round(mm) + 0.0:.0f}" for axis, mm in zip("RAS", self.entry_ras, strict=True))
         path = ", ".join(f"{name} {mm:.0f}" for name, mm in self.path_mm.items() if mm >= 1.0)
         contrast = "" if self.contrast_db is None else f"; contrast {self.contrast_db:+.0f} dB"
-        disc = f"; disc of {self.opening_mm:.0f} mm" if self.opening_mm else ""
+        opening = f"; opening of {self.opening_mm:.0f} mm" if self.opening_mm else ""
+        focus = "" if self.focused >= 0.5 * self.seen else " (move the focus to the depth of the target)"
         return (
-            f"{place}: {100 * self.seen:.0f} % seen, {100 * self.focused:.0f} % in focus, {self.angle_deg:.0f}° to the "
-            f"surface; mm on the way: {path or 'none'}{disc}{contrast}; cost {self.cost:.0f}"
+            f"{place}: {100 * self.seen:.0f} % seen, {100 * self.focused:.0f} % in focus{focus}, {self.angle_deg:.0f}° "
+            f"to the surface's normal; path in mm: {path or 'none'}{opening}{contrast}; cost {self.cost:.0f}"
         )
 
 
@@ -145,7 +147,7 @@ def plan_approach(
     weights: ApproachWeights | None = None,
     offered: int = 3,
 ) -> Approach:
-    """Compare straight ways to a target, and return up to `offered` of the best, which are at least 25 mm apart.
+    """Compare straight paths to a target, and return up to `offered` of the best, which are at least 25 mm apart.
 
     `labels` 1, 2, ... called `names` are those of a closed head or of a brain alone. `what` is the target, see
     find_target; errors as there, and for a target outside the brain. The face of the probe stands on the brain; without
@@ -179,7 +181,8 @@ def plan_approach(
     }  # fmt: skip
     weighted = [getattr(weights or ApproachWeights(), f"{name}_weight") * amount for name, amount in amounts.items()]
     cost = np.sum(weighted, axis=0)
-    side, across = (target.centre_ras - surface.centre)[0], (faces - surface.centre)[:, 0]
+    entries = faces + outside[:, None] * outward
+    side, across = (target.centre_ras - surface.centre)[0], (entries - surface.centre)[:, 0]
     on_other_side = (abs(side) > _MIDDLE_MM) & (across * np.sign(side) < _MIDDLE_MM)
     from_below = (np.minimum(outward[:, 2], normals[:, 2]) < _BELOW) & (normals[:, 1] > _BEHIND)
     beyond = target.centre_ras + (skin_mm + _CUT_MM)[:, None] * outward
@@ -194,10 +197,9 @@ def plan_approach(
     for number, way in enumerate(best):
         on_way = tissues[way][tissues[way] > 0][::-1]
         path = {all_names[label - 1]: _STEP_MM * float((on_way == label).sum()) for label in dict.fromkeys(on_way)}
-        entry = target.centre_ras + max(skin_mm[way], brain_mm[way]) * outward[way]
         opening = face_width_mm(probe) + _ROOM_MM if bone[way] else 0.0
         shares = seen[number], focused[number]
-        candidates.append(Candidate(poses[number], entry, path, angles[way], *shares, opening, cost[way]))
+        candidates.append(Candidate(poses[number], entries[way], path, angles[way], *shares, opening, cost[way]))
     return Approach(target, tuple(candidates), surface)
 
 
@@ -233,13 +235,12 @@ def find_target(
     """The target among labels 1, 2, ... called `names`, below the `surface` of the brain.
 
     `what` is a tissue, of which it is the largest region; a point (3,) RAS mm, the lesion there or a ball of 3 mm
-    around it; or None, the largest lesion. Raises SimulationError if there is no lesion, and for an unknown tissue or
-    what is no point.
+    around it; or None, the largest lesion. Raises SimulationError if there is no lesion, and for an unknown tissue and
+    an invalid point.
     """
-    point, group = None, None
+    point = None
     if isinstance(what, str):
         name = tissue_to_add(what, names)
-        group = (name,)
     elif what is None:
         found = lesions(labels, names)
         require(bool(found), f"the labels have no lesion, expected one{_ADD}")
@@ -248,7 +249,7 @@ def find_target(
         point = np.asarray(what, float)
         require(point.shape == (3,) and np.isfinite(point).all(), f"the target is {what}, expected R, A, S in mm")
         name = ("", *names)[int(sample(labels, point[None], order=0)[0])]
-    group = group or next((group for group in LESION_GROUPS if name in group), None)
+    group = (name,) if isinstance(what, str) else next((group for group in LESION_GROUPS if name in group), None)
     if group is not None:
         parts, _ = ndimage.label(np.isin(labels.array, labels_of(names, group)))  # type: ignore[misc]
         require(parts.any(), f"the labels have no {name}, expected a lesion that they have{_ADD}")
@@ -266,16 +267,16 @@ def find_target(
     return Target(name, region, some, points.mean(axis=0), float(size), float(surface.distances_mm(points).min()))
 
 
-# ---- ways ------------------------------------------------------------------------------------------------------------
+# ---- paths -----------------------------------------------------------------------------------------------------------
 
 
 def _tissues_on(
     labels: Volume, names: Sequence[str], target: Target, outward: np.ndarray, faces: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """((n, steps) labels every _STEP_MM from the middle of the target outwards, (n,) mm to the skin) of ways.
+    """((n, steps) labels every _STEP_MM from the middle of the target outwards, (n,) mm to the skin) of paths.
 
     They are 0 in the target and outside of the patient. Fluid has labels of its own, after those of `names`: SULCI, and
-    VENTRICLE far below the `faces` (n, 3) in which the ways (n, 3) leave the brain.
+    VENTRICLE far below the `faces` (n, 3) in which the paths (n, 3) leave the brain.
     """
     distance = np.arange(0.0, _LONGEST_MM, _STEP_MM)
     points = target.centre_ras + distance[:, None] * outward[:, None]
@@ -308,8 +309,8 @@ def _views(
     """(share seen, share seen in the focal zone), each (n,), of poses (n, 4, 4) in openings of bone (n,).
 
     The probe is tilted about the lateral axis of its face as the opening allows. The focal zone is that within half of
-    the depth of field, 3.5 wavelengths times the square of the f-number, of the focus. What lies behind bone or air in
-    the brain is not seen.
+    the depth of field, 3.5 wavelengths times the square of the f-number, of the focus. Bone and air in the brain
+    hide the places behind them.
     """
     to_probe = np.linalg.inv(poses)
     x, y, z = np.moveaxis(target.points_ras @ np.swapaxes(to_probe[:, :3, :3], 1, 2) + to_probe[:, None, :3, 3], -1, 0)

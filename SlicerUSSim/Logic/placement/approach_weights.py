@@ -1,4 +1,4 @@
-"""ApproachWeights: what counts how much in the comparison of approaches; a module of its own, for fast --help."""
+"""ApproachWeights: weights in the comparison of approaches; a separate module, for fast --help."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class ApproachWeights(Declared):
     outside_weight: float = _weight(0.5, "Outside", "Each millimetre of skin, scalp and bone")
     ventricle_weight: float = _weight(5.0, "Ventricle", "Each millimetre of fluid that is 15 mm below the surface")
     vessel_weight: float = _weight(5.0, "Vessel", "Each millimetre of a vessel, or of what enhances")
-    air_weight: float = _weight(10.0, "Air", "Each millimetre of air in the head, as of a sinus")
+    air_weight: float = _weight(10.0, "Air", "Each millimetre of air in the head, such as a sinus")
     angle_weight: float = _weight(0.2, "Angle", "Each degree between probe and normal of the brain's surface")
     unseen_weight: float = _weight(2.0, "Unseen", "Each percent of the target outside of the field")
     unfocused_weight: float = _weight(0.05, "Unfocused", "Each percent of the target outside of the focal zone")
