@@ -125,7 +125,7 @@ def main(folder: Path) -> None:
     for tilt in 22.0 * np.sin(np.linspace(0.0, 2.0 * np.pi, 20, endpoint=False)):
         nodes.probe_transform.SetMatrixTransformToParent(vtk_matrix(turned(pose, tilt_deg=tilt - 20.0)))
         both = Image.fromarray(np.hstack([grab(red), grab(threed)]))
-        frames.append(both.resize((700, 294)).quantize(64, dither=Image.Dither.NONE))
+        frames.append(both.resize((700, 294)).quantize(128, dither=Image.Dither.NONE))
     frames[0].save(folder / "slicer-moving.gif", save_all=True, append_images=frames[1:], duration=90, loop=0)
 
 
