@@ -59,27 +59,30 @@ python_use_unqualified_type_names = True
 python_maximum_signature_line_length = 88
 toc_object_entries_show_parents = "hide"
 
+#: The four kinds of pages of https://diataxis.fr, and those for contributors
 PAGES = {
-    "Use": [
-        "docs/slicer",
-        "docs/tracked-ultrasound",
-        "docs/device",
-        "docs/workstation",
-        "docs/datasets",
-        "docs/security",
-        "docs/probes",
-        "docs/reference/command",
-        "docs/reference/index",
-    ],
-    "How it works": [
+    "Tutorials": ["docs/slicer", "docs/workstation", "docs/tracked-ultrasound", "docs/datasets", "docs/optimization"],
+    "How-to guides": [
         "docs/brain",
-        "docs/physics",
-        "docs/optimization",
-        "docs/performance",
+        "docs/ct",
+        "docs/label-maps",
+        "docs/probes",
+        "docs/approach",
+        "docs/device",
         "docs/scale",
+        "docs/security",
+    ],
+    "Reference": ["docs/parameters", "docs/reference/command", "docs/reference/index"],
+    "Explanation": [
+        "docs/physics",
+        "docs/segmentation",
+        "docs/sheets",
+        "docs/realism",
+        "docs/performance",
+        "docs/reliability",
         "docs/comparison",
     ],
-    "Change it": [
+    "Contribute": [
         "docs/architecture",
         "docs/developer",
         "CONTRIBUTING",
@@ -89,9 +92,8 @@ PAGES = {
         "CHANGELOG",
     ],
 }
-
 _NAMED = {page for pages in PAGES.values() for page in pages}
-PAGES["How it works"] += sorted({f"docs/{page.stem}" for page in (ROOT / "docs").glob("*.md")} - _NAMED)
+PAGES["Explanation"] += sorted({f"docs/{page.stem}" for page in (ROOT / "docs").glob("*.md")} - _NAMED)
 
 REPOSITORY = json.loads((ROOT / "USSim.json").read_text(encoding="utf-8"))["scm_url"].removesuffix(".git")
 
