@@ -248,6 +248,7 @@ def test_pocl_builds_for_a_processor_with_its_librarys_vectors(monkeypatch, tmp_
     assert ctypes.string_at(name).decode() == (named or called)
 
 
+@pytest.mark.slow  # it builds PoCL's own library in a new cache
 @pytest.mark.skipif(sys.platform != "linux", reason="PoCL's wheel is for Linux")
 def test_what_the_self_test_of_pocl_found_is_kept(monkeypatch, tmp_path):
     """On some processors it fails, or never ends: then PoCL is patched."""

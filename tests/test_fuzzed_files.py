@@ -241,7 +241,14 @@ def test_a_damaged_file_is_read_or_refused_in_one_line(name, tmp_path_factory):
     damaged()
 
 
-@pytest.mark.parametrize("kept", CORPUS, ids=lambda path: path.name)
+#: Refused after the limit of a minute
+ENDLESS = "bad_vol_mha_70.mha"
+
+
+@pytest.mark.parametrize(
+    "kept",
+    [pytest.param(path, marks=pytest.mark.slow if path.name == ENDLESS else (), id=path.name) for path in CORPUS],
+)
 def test_what_once_failed_is_read_or_refused_in_one_line(kept, tmp_path):
     name = kept.name.split("_")[1]
     name = {"vol": kept.suffix[1:], "mhau": "mhaseq"}.get(name, name)

@@ -37,7 +37,6 @@ _TABLES, _SUMMARY = "report.md", "report.json"
 @overwrite_option
 @click.pass_context
 def main(ctx: click.Context, out: Path, only: tuple[str, ...], device: str | None) -> None:
-    logging.getLogger("SlicerUSSim.Logic.imaging.simulator").setLevel(logging.ERROR)  # phantoms may end in the image
     checks = chosen_checks(only)
     check_results(out, (_TABLES, _SUMMARY, *(check.picture for check in checks)))
     with results_of(out) as folder:
@@ -55,4 +54,5 @@ def main(ctx: click.Context, out: Path, only: tuple[str, ...], device: str | Non
 
 
 if __name__ == "__main__":
+    logging.getLogger("SlicerUSSim.Logic.imaging.simulator").setLevel(logging.ERROR)  # phantoms may end in the image
     main(prog_name="python -m validation")
