@@ -34,7 +34,7 @@ STEPS_MM = (1e-4, 1e-3, 1e-2)
 #: Along an axis of the probe, or about one
 MOTIONS = ("lateral", "axial", "elevational", "about lateral", "about axial", "about elevational")
 #: Part of the signal by which it changes where nothing moves: depths are float32, 7 nm or 3e-4 radians at 100 mm
-ROUNDING = 3e-4
+ROUNDING = 1.2e-4
 #: mm, from the surface of a brain into it. Where edge lines cross the coupling beside it, nothing is proportional.
 _INSIDE_MM = 8.0
 #: Envelopes below this part of their surroundings' RMS are near zeros, whose logarithms have no gradient over 10 um
@@ -116,9 +116,9 @@ def brain(rotation: np.ndarray, device) -> Outcome:
         name: craniotomy_pose(found.labels, probe) @ motion("axial", _INSIDE_MM, probe.depth_mm) @ turn
         for name, probe in ARRAYS.items()
     }
-    # Rays begin and cease to meet a border within 10 um, most of all in the thin slice of the matrix array. Without
-    # walls gradients agree to 0.94 and more.
-    return Outcome(tuple(rows_of(simulator, poses, walls=dict.fromkeys(ARRAYS, 0.12) | {"matrix": 0.35})))
+    # The matrix array has the thinnest slice: rays across it begin and cease to meet a border within 10 um. Without
+    # walls its gradients agree to 0.94 and more, with them to 0.75 to 0.88.
+    return Outcome(tuple(rows_of(simulator, poses, walls={"matrix": 0.2})))
 
 
 CHECKS = (
