@@ -6,7 +6,7 @@ import os
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from functools import lru_cache
-from operator import index
+from numbers import Integral
 from typing import Any
 
 import numpy as np
@@ -39,11 +39,13 @@ _MOST_OF_MEMORY = 0.5
 def one_per_image(name: str, given: Any, kind: type, count: int) -> list:
     """`given`, one for all images or a sequence of one for each. Raises SimulationError for another number of them.
 
-    All but probes may be None.
+    All but probes may be None. One noise_seed is the first of consecutive ones.
     """
+    if kind is Integral and isinstance(given, kind):
+        return list(range(int(given), int(given) + count))
     if isinstance(given, kind) or (given is None and kind is not Probe):
         return [given] * count
-    values = list(given) if isinstance(given, Sequence) else []
+    values = list(given) if isinstance(given, Sequence | np.ndarray) else []
     require(
         len(values) == count and all(isinstance(value, kind) for value in values),
         f"{name} are {len(values)} for {count} poses, expected one {kind.__name__} or one for each pose",
@@ -51,28 +53,10 @@ def one_per_image(name: str, given: Any, kind: type, count: int) -> list:
     return values
 
 
-def seeds_of(noise_seed: int | Sequence[int], count: int) -> list[int]:
-    """The seed of every image. Raises SimulationError for other than a number, or one for each, from 0 to 2**32 - 1."""
-    try:
-        first = index(noise_seed)  # type: ignore[arg-type]
-        seeds = list(range(first, first + count))
-    except TypeError:
-        seeds = [index(seed) for seed in noise_seed] if isinstance(noise_seed, Sequence | np.ndarray) else []
-    require(
-        len(seeds) == count and all(0 <= seed < 2**32 for seed in seeds),
-        f"noise_seed is {noise_seed!r:.60}, expected a whole number from 0, or one for each of {count} poses",
-    )
-    return seeds
-
-
-def same_shapes(shapes: Sequence[tuple]) -> tuple:
-    """The shape of all images. Raises SimulationError that names the first of another shape."""
-    other = next((number for number, shape in enumerate(shapes) if shape != shapes[0]), None)
-    require(
-        other is None,
-        f"image {other} of the batch is {_times(shapes[other or 0])}, the first is {_times(shapes[0])}, expected one "
-        "size; set display.image_size, or simulate them apart",
-    )
+def same_shape(shapes: Sequence[tuple]) -> tuple:
+    """The shape of all images. Raises SimulationError if they have several."""
+    found = " and ".join(sorted({_times(shape) for shape in shapes}))
+    require(len(set(shapes)) == 1, f"images of the batch are {found}, expected one size; set display.image_size")
     return shapes[0]
 
 

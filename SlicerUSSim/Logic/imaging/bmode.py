@@ -51,7 +51,7 @@ class PulseFilter(Stage):
             taps = pulse_taps(sigma)
             self._pulse, self._reach, self._sigma = self.device.upload(taps), taps.size // 2, sigma
         lines, samples = frame.line_shape
-        frame.iq = self.workspace.get("iq", lines * samples * SAMPLE_BYTES)
+        frame.iq = self.device.pooled(lines * samples * SAMPLE_BYTES)
         if frame.acquisition["downshift"] > 0.0:
             self.device.run(
                 self._shift,
@@ -135,7 +135,6 @@ class Compressor(Stage):
     def __init__(self, device: Device) -> None:
         super().__init__(device)
         self.kernel = device.kernels("bmode.cl", device.lanes)["compress"]
-        self.workspace = Workspace(device)
         #: What the ring-down depends on, and its buffer
         self._ringing: tuple[tuple, Buffer] | None = None
         #: Likewise of the time-gain compensation
@@ -146,8 +145,8 @@ class Compressor(Stage):
     def run(self, frame: DeviceFrame) -> None:
         """Enqueue the grey levels of every line: the frame's `envelope` and `grey`."""
         display, acquisition, (lines, samples) = frame.display, frame.acquisition, frame.line_shape
-        frame.envelope = self.workspace.get("envelope", lines * samples * 4)
-        frame.grey = self.workspace.get("grey", lines * samples)
+        frame.envelope = self.device.pooled(lines * samples * 4)
+        frame.grey = self.device.pooled(lines * samples)
         # Noise power is shared between the two quadrature components.
         noise = 0.0 if display.noise_db is None else 10.0 ** (display.noise_db / 20.0) / np.sqrt(2.0)
         self.device.run(

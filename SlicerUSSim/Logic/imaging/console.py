@@ -10,7 +10,7 @@ import numpy as np
 from SlicerUSSim.Logic.base.settings import FULL_SCALE_DB, DisplaySettings
 from SlicerUSSim.Logic.imaging.grey_map import TABLE_SIZE, grey_table, is_linear
 from SlicerUSSim.Logic.imaging.stage import DeviceFrame, Stage
-from SlicerUSSim.Logic.opencl.device import Device, Workspace
+from SlicerUSSim.Logic.opencl.device import Device
 from SlicerUSSim.Logic.probe.arrays import LinearProbe, Probe
 
 if TYPE_CHECKING:
@@ -33,7 +33,6 @@ class EnvelopeSmoothing(Stage):
         super().__init__(device)
         kernels = device.kernels("console.cl", device.lanes)
         self._along, self._across = kernels["smooth_along"], kernels["smooth_across"]
-        self.workspace = Workspace(device)
         #: Taps by their standard deviation
         self._taps: dict[float, Buffer] = {}
 
@@ -42,10 +41,10 @@ class EnvelopeSmoothing(Stage):
         lines, samples = frame.line_shape
         sigmas = smoothing_sigmas(frame)
         size = samples // self.device.lanes, lines
-        for name, kernel, sigma in zip(("along", "across"), (self._along, self._across), sigmas, strict=True):
+        for kernel, sigma in zip((self._along, self._across), sigmas, strict=True):
             if sigma == 0.0:
                 continue
-            smooth = self.workspace.get(name, 4 * lines * samples)
+            smooth = self.device.pooled(4 * lines * samples)
             reach = np.int32(len(gaussian_taps(sigma)) // 2)
             self.device.run(kernel, size, frame.envelope, self._uploaded(sigma), reach, np.int32(samples), smooth)
             frame.envelope = smooth
@@ -66,7 +65,6 @@ class GreyMapping(Stage):
     def __init__(self, device: Device) -> None:
         super().__init__(device)
         self.kernel = device.kernels("console.cl", device.lanes)["map_grey"]
-        self.workspace = Workspace(device)
         # The table of the last display
         self._made_for: bytes | None = None
         self._table: Buffer
@@ -79,7 +77,7 @@ class GreyMapping(Stage):
         if self._made_for != table.tobytes():
             self._table, self._made_for = self.device.upload(table), table.tobytes()
         lines, samples = frame.line_shape
-        grey = self.workspace.get("grey", lines * samples)
+        grey = self.device.pooled(lines * samples)
         self.device.run(
             self.kernel,
             (samples // self.device.lanes, lines),
@@ -102,14 +100,13 @@ class EdgeEnhancement(Stage):
     def __init__(self, device: Device) -> None:
         super().__init__(device)
         self.kernel = device.kernels("console.cl", device.lanes)["enhance_edges"]
-        self.workspace = Workspace(device)
 
     def run(self, frame: DeviceFrame) -> None:
         """Enqueue the enhancement: the frame's `grey`."""
         if frame.display.edge_enhancement == 0.0:
             return
         lines, samples = frame.line_shape
-        sharp = self.workspace.get("grey", lines * samples)
+        sharp = self.device.pooled(lines * samples)
         self.device.run(
             self.kernel,
             (samples // self.device.lanes, lines),

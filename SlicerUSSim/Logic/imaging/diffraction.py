@@ -46,19 +46,16 @@ def lobes_of(probe: Probe) -> np.ndarray:
     square of the field of the pulse, of twice the received wavelength. Compounded waves are in focus at every depth.
     The probe's clutter falls as 1 + cos(pi u / U) with the distance u up to the end U of the lateral table.
     """
-    depth = probe.displayed_mm * np.maximum(np.arange(_DEPTHS), 0.5) / (_DEPTHS - 1)
+    depth, unit, clutter = _rows(probe)
     sigma = probe.beam_sigma_mm(depth)[0]
     column = np.arange(_DISTANCES)
-
-    unit = probe.wavelength_mm * np.maximum(probe.receive_f_number, depth / probe.aperture_mm)
     step, amplitude = _transmitted(probe, depth, unit)
     place = (step / unit).astype(np.float32)[:, None] * np.arange(amplitude.shape[1], dtype=np.float32)
     pattern = (amplitude * apodized_pattern(place, probe.receive_apodization)).astype(float) ** 2
     at = _STEP * column + np.array([[-0.5], [0.5]])  # of the lobe over which power is averaged
     near, far = np.moveaxis(_excess(step, pattern, sigma, unit[:, None, None] * np.maximum(at, 0.0)), 1, 0)
-    place = column / (_DISTANCES - 1)
-    clutter = 0.5 * probe.clutter_power / (_STEP * (_DISTANCES - 1)) * (1.0 + np.cos(np.pi * place))
-    fading = 0.5 + 0.5 * np.cos(np.pi * np.clip(4.0 * place - 3.0, 0.0, 1.0))  # the table ends smoothly
+    ends = np.clip(4.0 * column / (_DISTANCES - 1) - 3.0, 0.0, 1.0)  # smoothly
+    fading = 0.5 + 0.5 * np.cos(np.pi * ends)
     return np.sqrt(0.5 * (near - far) * fading + clutter).astype(np.float32)
 
 
@@ -70,15 +67,12 @@ def lateral_weights(probe: Probe) -> np.ndarray:
     interpolates between nodes and between the table's distances. Where the beam is out of focus and lobes fall by 8 dB
     per millimetre, that adds 1 to 2 dB. So weights are such that lobes have the power of the pattern after it.
     """
-    depth = probe.displayed_mm * np.maximum(np.arange(_DEPTHS), 0.5) / (_DEPTHS - 1)
-    unit = probe.wavelength_mm * np.maximum(probe.receive_f_number, depth / probe.aperture_mm)
+    depth, unit, clutter = _rows(probe)
     apart = np.maximum(probe.line_distance_mm(depth) / unit, 1e-6)
     dense = -(-probe.scan_lines // CONSTANTS["LOBE_NODES"])
     node = apart * np.clip((1.0 / apart).astype(int), dense, probe.scan_lines)
     variance = 0.5 * (probe.beam_sigma_mm(depth)[0] / unit) ** 2 + _NODE_VARIANCE * node**2 + _TABLE_VARIANCE
     column = np.arange(_DISTANCES)
-    place = column / (_DISTANCES - 1)
-    clutter = 0.5 * probe.clutter_power / (_STEP * (_DISTANCES - 1)) * (1.0 + np.cos(np.pi * place))
     power = np.maximum(lobes_of(probe).astype(float) ** 2 - clutter, 0.0)
     peak = power.argmax(axis=1)[:, None]  # nearer the axis is the main beam, which hides lobes
     known = np.log(np.where(column < peak, np.take_along_axis(power, peak, axis=1), power) + _LEAST_POWER)
@@ -92,6 +86,14 @@ def lateral_weights(probe: Probe) -> np.ndarray:
         made = made * wanted / np.maximum(cosines(cosines(made, kind=1) * filtered, kind=1), _LEAST_POWER)
     rows = np.where(column > peak, np.maximum(made[:, ::_FINER] - _LEAST_POWER, 0.0), power)
     return np.sqrt(rows + clutter).astype(np.float32)
+
+
+def _rows(probe: Probe) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(depths,) mm, (depths,) receive wavelengths x f-number in mm, and (distances,) power of the clutter."""
+    depth = probe.displayed_mm * np.maximum(np.arange(_DEPTHS), 0.5) / (_DEPTHS - 1)
+    unit = probe.wavelength_mm * np.maximum(probe.receive_f_number, depth / probe.aperture_mm)
+    falling = 1.0 + np.cos(np.linspace(0.0, np.pi, _DISTANCES))
+    return depth, unit, 0.5 * probe.clutter_power / (_STEP * (_DISTANCES - 1)) * falling
 
 
 def _transmitted(probe: Probe, depth: np.ndarray, unit: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -39,15 +39,17 @@ def seed_of_pose(probe_to_ras: np.ndarray) -> int:
     return zlib.crc32(steps.astype("<i8").tobytes())
 
 
-def noise_key(acquisition: np.ndarray, noise_seed: int) -> int:
-    """Initial value of the noise's hash, independent of that of the scatterers and of other noise seeds.
-
-    Raises SimulationError for a noise_seed that is not a whole number of 32 bits.
-    """
+def require_seed(noise_seed: int) -> None:
+    """Raise SimulationError for a noise_seed that is not a whole number of 32 bits."""
     require(
         isinstance(noise_seed, int | np.integer) and 0 <= noise_seed < 2**32,
         f"noise_seed is {noise_seed!r}, expected a whole number from 0 to {2**32 - 1}",
     )
+
+
+def noise_key(acquisition: np.ndarray, noise_seed: int) -> int:
+    """Initial value of the noise's hash, independent of that of the scatterers and of other noise seeds."""
+    require_seed(noise_seed)
     return (int(acquisition["seed"]) * 0x9E3779B1 + 0x7F4A7C15 + stirred(int(noise_seed))) % 2**32
 
 

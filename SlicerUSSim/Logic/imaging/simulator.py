@@ -9,6 +9,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
+from numbers import Integral
 from threading import RLock
 from time import perf_counter
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -23,13 +24,13 @@ from SlicerUSSim.Logic.base.transforms import check_rigid
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.imaging import stages
 from SlicerUSSim.Logic.imaging.aperture import Aperture, aperture_fields
-from SlicerUSSim.Logic.imaging.batch import OUTPUTS, arrays_for, fetched, one_per_image, same_shapes, seeds_of
+from SlicerUSSim.Logic.imaging.batch import OUTPUTS, arrays_for, fetched, one_per_image, same_shape
 from SlicerUSSim.Logic.imaging.bmode import downshift, log_band_above, pulse_taps
 from SlicerUSSim.Logic.imaging.compounding import Compounder, sweep_grid
 from SlicerUSSim.Logic.imaging.contact import line_contact
 from SlicerUSSim.Logic.imaging.frame import Echoes, Frame
 from SlicerUSSim.Logic.imaging.medium import Medium, as_labels
-from SlicerUSSim.Logic.imaging.noise import stirred
+from SlicerUSSim.Logic.imaging.noise import require_seed, stirred
 from SlicerUSSim.Logic.imaging.quality import coarser_fans, cycles_per_mm, line_shape, sample_mm, sigmas_between, worked
 from SlicerUSSim.Logic.imaging.raytracing import RayTracer
 from SlicerUSSim.Logic.imaging.scattering import cells_in_view, sites_per_mm3
@@ -272,22 +273,23 @@ class UltrasoundSimulator:
         require_kind("poses", poses, Iterable, "of (4, 4) probe_to_ras")
         poses = [check_rigid(f"pose {number}", pose) for number, pose in enumerate(poses)]
         require(bool(poses), "the batch has no pose, expected at least one")
-        probes, displays, tables, each = (
+        probes, displays, tables, each, noise_seeds = (
             one_per_image(name, given, kind, len(poses))
             for name, given, kind in (
                 ("probes", probes, Probe), ("display", display, DisplaySettings), ("tissues", tissues, TissueTable),
-                ("settings", settings or self.settings, SimulationSettings),
+                ("settings", settings or self.settings, SimulationSettings), ("noise_seed", noise_seed, Integral),
             )
         )  # fmt: skip
-        noise_seeds = seeds_of(noise_seed, len(poses))
+        for seed in noise_seeds:
+            require_seed(seed)
         grids = [
             ImageGrid.for_probe(probe, shown and shown.image_size)
             for probe, shown in zip(probes, displays, strict=True)
         ]
-        pixels = same_shapes([(grid.rows, grid.columns) for grid in grids])
+        pixels = same_shape([(grid.rows, grid.columns) for grid in grids])
         lines = [line_shape(*worked(*both, pixels[1])) for both in zip(probes, each, strict=True)]
         has_signals = not all(OUTPUTS[name][2] for name in outputs if name in OUTPUTS)
-        arrays = arrays_for(outputs, len(poses), pixels, same_shapes(lines) if has_signals else lines[0], out)
+        arrays = arrays_for(outputs, len(poses), pixels, same_shape(lines) if has_signals else lines[0], out)
         for probe in dict.fromkeys(probes):
             self.warn_if_slow(probe)
 
@@ -677,22 +679,18 @@ class UltrasoundSimulator:
         if cells <= _MANY_CELLS:
             self._fast_for = asked_for
             return
-        density = self.settings.scatterers_per_mm3
-        automatic = sites_per_mm3(replace(self.settings, scatterers_per_mm3=None), probe)
-        if density is not None:
-            what = f"scatterers_per_mm3 is {density:g}"
-            remedy = f"none, {automatic:.0f} for this probe, is enough for developed speckle"
-        else:
-            what = (
-                f"the probe needs {automatic:.0f} scatterers per mm³ ({probe.frequency_mhz:g} MHz, elevation aperture "
-                f"{probe.elevation_aperture_mm:g} mm, elevation focus {probe.elevation_focus_mm:g} mm)"
-            )
-            remedy = (
-                "a smaller elevation aperture, a deeper elevation focus, fewer scan lines or a smaller depth takes less"
-            )
-        many = f"{cells:.1e} cells of the lattice per image, about {cells / _CELLS_PER_S:.0f} s on two cores of a CPU"
-        require(cells <= _MOST_CELLS, f"{what}: {many}, expected at most {_MOST_CELLS:.0e} cells; {remedy}")
-        warnings.warn(f"{what}: {many}; {remedy}", SlowScatterersWarning, stacklevel=3)
+        automatic = replace(self.settings, scatterers_per_mm3=None)
+        found = (
+            f"{sites_per_mm3(self.settings, probe):.6g} scatterers per mm³ ({probe.frequency_mhz:g} MHz, elevation "
+            f"aperture {probe.elevation_aperture_mm:g} mm, elevation focus {probe.elevation_focus_mm:g} mm) are "
+            f"{cells:.1e} cells of the lattice per image, about {cells / _CELLS_PER_S:.0f} s on two cores of a CPU"
+        )
+        remedy = (
+            f"fewer scatterers_per_mm3 (none: {sites_per_mm3(automatic, probe):.0f}), a smaller elevation aperture, a "
+            "deeper elevation focus, fewer scan lines or a smaller depth takes less"
+        )
+        require(cells <= _MOST_CELLS, f"{found}, expected at most {_MOST_CELLS:.0e} cells; {remedy}")
+        warnings.warn(f"{found}; {remedy}", SlowScatterersWarning, stacklevel=3)
 
     def _warn_if_empty(self, probe: Probe, pose: np.ndarray, stacklevel: int = 3) -> None:
         """Warn if the volume has no labels, or the bounding box of the imaged field, in voxels, does not meet it."""

@@ -94,11 +94,9 @@ class DeviceFrame:
         return self.medium.device.download(*self._signal(signal))
 
     def on_demand(self, signal: str, samples: int) -> Any:
-        """What gives (scan lines, samples) of it when called, and keeps its buffer for that."""
-        buffer, shape, kind = self._signal(signal)
-        device = self.medium.device
-        loan = device.lend(buffer)
-        return lambda: device.download(loan.buffer, shape, kind)[:, :samples]
+        """What gives (scan lines, samples) of it when called, and keeps its pooled buffer for that."""
+        device, content = self.medium.device, self._signal(signal)
+        return lambda: device.download(*content)[:, :samples]
 
     def start_download(self, signal: str) -> Callable[[], np.ndarray]:
         """The same without waiting, see Device.start_download."""

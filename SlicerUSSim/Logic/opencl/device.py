@@ -12,8 +12,7 @@ from functools import lru_cache
 from pathlib import Path
 from threading import RLock
 from time import perf_counter
-from typing import TYPE_CHECKING, TypeAlias
-from weakref import WeakValueDictionary
+from typing import TYPE_CHECKING, TypeAlias, cast
 
 import numpy as np
 
@@ -36,13 +35,6 @@ _ZERO = np.zeros(1, np.float32)
 _ATTEMPTS = 4
 
 
-class Loan:
-    """As long as it is referenced, no Workspace gives its buffer for other content."""
-
-    def __init__(self, buffer: Buffer) -> None:
-        self.buffer = buffer
-
-
 class Device:
     """An opened OpenCL device: its context, its in-order queue and its built programs.
 
@@ -53,6 +45,8 @@ class Device:
 
     def __init__(self, info: DeviceInfo) -> None:
         cl = load_pyopencl()
+        from pyopencl.tools import ImmediateAllocator, MemoryPool
+
         self.cl = cl
         self.info = info
         self._is_pocl = "Portable Computing Language" in info.platform
@@ -79,6 +73,7 @@ class Device:
         try:
             self.context = cl.Context([info.handle])
             self.queue = cl.CommandQueue(self.context, properties=cl.command_queue_properties.PROFILING_ENABLE)
+            self._pool = MemoryPool(ImmediateAllocator(self.queue))
             if self._is_pocl:
                 keep_signals(cl, self.context)
         except cl.Error as error:
@@ -90,7 +85,6 @@ class Device:
         self.profiling = False
         self._events: list[tuple[str, Event]] = []
         self._writes: deque[Event] = deque(maxlen=64)
-        self._loans: WeakValueDictionary[Buffer, Loan] = WeakValueDictionary()
         self._kernels: dict[tuple, dict[str, Kernel]] = {}
         # A kernel keeps its arguments until it is enqueued, and all simulators of a device share it
         self._lock = RLock()
@@ -208,11 +202,17 @@ class Device:
         flags = self.cl.mem_flags
         _require_not_forked()
         array = np.ascontiguousarray(array)
-        return self._buffer(array.nbytes, flags.READ_ONLY | flags.COPY_HOST_PTR, hostbuf=array)
+        flags = flags.READ_ONLY | flags.COPY_HOST_PTR
+        return self._allocated(array.nbytes, lambda: self.cl.Buffer(self.context, flags, hostbuf=array))
 
     def empty(self, nbytes: int) -> Buffer:
         """A new uninitialised device buffer."""
-        return self._buffer(int(nbytes), self.cl.mem_flags.READ_WRITE, size=max(int(nbytes), 4))
+        flags, size = self.cl.mem_flags.READ_WRITE, max(int(nbytes), 4)
+        return self._allocated(int(nbytes), lambda: self.cl.Buffer(self.context, flags, size=size))
+
+    def pooled(self, nbytes: int) -> Buffer:
+        """An uninitialised buffer of at least `nbytes`, whose memory is used again when nothing refers to it."""
+        return self._allocated(nbytes, lambda: cast("Buffer", self._pool.allocate(nbytes)))
 
     def zeros(self, nbytes: int) -> Buffer:
         """A new device buffer of zeros; `nbytes` is a multiple of four."""
@@ -266,14 +266,6 @@ class Device:
 
         return wait
 
-    def lend(self, buffer: Buffer) -> Loan:
-        """The loan of a buffer of a Workspace, which keeps its content."""
-        return self._loans.setdefault(buffer, Loan(buffer))
-
-    def is_lent(self, buffer: Buffer) -> bool:
-        """Whether its loan is in use."""
-        return buffer in self._loans
-
     def take_profile(self) -> dict[str, float]:
         """Milliseconds per kernel since the last call (requires profiling)."""
         self.queue.finish()
@@ -292,11 +284,11 @@ class Device:
 
         return [cache_folder(), Path(platformdirs.user_cache_dir("pyopencl", "pyopencl"))]
 
-    def _buffer(self, nbytes: int, flags: int, **content) -> Buffer:
+    def _allocated(self, nbytes: int, make: Callable[[], Buffer]) -> Buffer:
         """A new device buffer. Raises SimulationError with its size if the device has no room for it."""
         self._check_size(nbytes)
         try:
-            return self.cl.Buffer(self.context, flags, **content)
+            return make()
         except (MemoryError, self.cl.MemoryError) as error:
             raise SimulationError(
                 f"{self.info.name} has no memory for a buffer of {nbytes / 2**20:.0f} MB; close other programs, use a "
@@ -392,20 +384,14 @@ def kernel_folder() -> Path:
 
 
 class Workspace:
-    """Named buffers of one stage, kept between frames and replaced only by larger ones.
-
-    While some are lent (Device.lend), there are others of the same name.
-    """
+    """Named buffers of one stage, kept between frames and replaced only by larger ones."""
 
     def __init__(self, device: Device) -> None:
         self._device = device
-        self._buffers: dict[str, list[Buffer]] = {}
+        self._buffers: dict[str, Buffer] = {}
 
     def get(self, name: str, nbytes: int) -> Buffer:
         """A buffer of at least `nbytes`, with the content of its last use."""
-        held = self._buffers.get(name, [])
-        for buffer in held:
-            if buffer.size >= nbytes and not self._device.is_lent(buffer):
-                return buffer
-        self._buffers[name] = [*(each for each in held if each.size >= nbytes), self._device.empty(nbytes)]
-        return self._buffers[name][-1]
+        if name not in self._buffers or self._buffers[name].size < nbytes:
+            self._buffers[name] = self._device.empty(nbytes)
+        return self._buffers[name]

@@ -84,15 +84,11 @@ def craniotomy_pose(
 
 
 def _centre_of_mass(inside: np.ndarray) -> np.ndarray:
-    """(k, j, i) of a bool array; a tenth of the time of scipy's, since sums of bytes are vectors of 255 planes."""
+    """(k, j, i) of a bool array; a fifth of the time of scipy's."""
     require(inside.any(), "the brain mask is empty, expected voxels inside")
-    by_plane = np.array([np.count_nonzero(plane) for plane in inside])
-    parts = [
-        inside[first : first + 255].view(np.uint8).sum(axis=0, dtype=np.uint8) for first in range(0, len(inside), 255)
-    ]
-    column = np.sum(parts, axis=0, dtype=np.int64)
-    counts = by_plane, column.sum(axis=1), column.sum(axis=0)
-    return np.array([np.arange(len(along)) @ along / along.sum() for along in counts])
+    column = inside.view(np.uint8).sum(axis=0, dtype=np.uint16).astype(int)
+    counts = [np.count_nonzero(plane) for plane in inside], column.sum(axis=1), column.sum(axis=0)
+    return np.array([np.average(np.arange(len(along)), weights=along) for along in counts])
 
 
 def _point(ras: np.ndarray) -> str:
