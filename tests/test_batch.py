@@ -123,7 +123,7 @@ def test_labels_as_imaged_are_displaced_by_travel_time():
     ],
 )  # fmt: skip
 def test_what_makes_no_batch_is_reported_before_anything_is_computed(made, monkeypatch, change, says):
-    monkeypatch.setattr(made, "_rendered", lambda *_: pytest.fail("computed"))
+    monkeypatch.setattr(made, "render", lambda *_, **__: pytest.fail("computed"))
     values = {"probes": PROBE, "poses": POSES, "display": SMALL, **change}
     with pytest.raises(SimulationError, match=says) as error:
         made.simulate_batch(values.pop("probes"), values.pop("poses"), **values)

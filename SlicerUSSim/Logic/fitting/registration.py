@@ -189,7 +189,7 @@ class _PoseCost:
         self.simulator.settings = self.simulation
         try:
             for pose, comparison in zip(self.poses, self.comparisons, strict=True):
-                comparison.run(self.simulator.render(self.probe, matrix @ pose, self.display, self.grid))
+                comparison.run(self.simulator.render(self.probe, matrix @ pose, self.display, self.grid).image)
             return mean_total(comparison.result() for comparison in self.comparisons)
         finally:
             self.simulator.settings = before

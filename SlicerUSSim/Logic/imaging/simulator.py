@@ -203,7 +203,7 @@ class UltrasoundSimulator:
         self.warn_if_slow(probe)
         timings: dict[str, float] = {}
         with self._lock:
-            frame = self._rendered(probe, pose, display, grid, timings, noise_seed)
+            frame = self.render(probe, pose, display, grid, noise_seed=noise_seed, timings=timings)
             self._warn_if_empty(probe, pose)  # while the device computes
             with self._timed("download", timings):
                 image = self._persisted(frame.download("image"), probe, display, frame.grid)
@@ -322,23 +322,6 @@ class UltrasoundSimulator:
         self._warn_if_overflown(len(poses))
         return arrays
 
-    def render(
-        self,
-        probe: Probe,
-        pose: np.ndarray,
-        display: DisplaySettings,
-        grid: ImageGrid,
-        timings: dict[str, float] | None = None,
-        *,
-        noise_seed: int = 0,
-    ) -> Buffer:
-        """Enqueue all stages of one frame; returns the device buffer of its image, which the next frame overwrites.
-
-        If only the display, the noise or the pixels have changed since the last frame, its echoes are reused.
-        """
-        with self._lock:
-            return self._rendered(probe, pose, display, grid, {} if timings is None else timings, noise_seed).image
-
     def redisplay(
         self, echoes: Echoes, probe: Probe, settings: SimulationSettings, display: DisplaySettings, noise_seed: int = 0
     ) -> np.ndarray:
@@ -382,31 +365,38 @@ class UltrasoundSimulator:
         """
         self._iq_made_for = None
 
-    def _rendered(
+    def render(
         self,
         probe: Probe,
         pose: np.ndarray,
-        display: DisplaySettings | None,
-        grid: ImageGrid | None,
-        timings: dict[str, float],
-        noise_seed: int,
+        display: DisplaySettings | None = None,
+        grid: ImageGrid | None = None,
+        *,
+        noise_seed: int = 0,
+        timings: dict[str, float] | None = None,
     ) -> DeviceFrame:
-        with self._timed("upload", timings):
-            grid = grid or ImageGrid.for_probe(probe, None if display is None else display.image_size)
-            probe, settings = worked(probe, self.settings, grid.columns)
-            frame = self.device_frame(probe, pose, display, grid, noise_seed, self._acquisition_buffer, settings)
-        # The baseband signal does not depend on display, noise or pixels.
-        inputs = (frame.acquisition.tobytes(), settings, self.medium.version)
-        if self.profiling or self._iq_made_for != inputs:
-            _log.debug("frame: rays and echoes computed")
-            self._iq_made_for = None
-            self._run([*self.impulse_stages, *self.linear_stages], frame, timings)
-            self._iq, self._iq_made_for = frame.iq, inputs
-        else:
-            _log.debug("frame: the echoes of the last frame are reused")
-        frame.iq = self._iq
-        self._run(self.display_stages, frame, timings)
-        return frame
+        """Enqueue all stages of one frame, whose image is on the device until the next one overwrites it.
+
+        If only the display, the noise or the pixels have changed since the last frame, its echoes are reused.
+        """
+        timings = {} if timings is None else timings
+        with self._lock:
+            with self._timed("upload", timings):
+                grid = grid or ImageGrid.for_probe(probe, None if display is None else display.image_size)
+                probe, settings = worked(probe, self.settings, grid.columns)
+                frame = self.device_frame(probe, pose, display, grid, noise_seed, self._acquisition_buffer, settings)
+            # The baseband signal does not depend on display, noise or pixels.
+            inputs = (frame.acquisition.tobytes(), settings, self.medium.version)
+            if self.profiling or self._iq_made_for != inputs:
+                _log.debug("frame: rays and echoes computed")
+                self._iq_made_for = None
+                self._run([*self.impulse_stages, *self.linear_stages], frame, timings)
+                self._iq, self._iq_made_for = frame.iq, inputs
+            else:
+                _log.debug("frame: the echoes of the last frame are reused")
+            frame.iq = self._iq
+            self._run(self.display_stages, frame, timings)
+            return frame
 
     def _run(self, chosen: Iterable[Stage], frame: DeviceFrame, timings: dict[str, float]) -> None:
         for stage in chosen:
@@ -516,7 +506,7 @@ class UltrasoundSimulator:
         before: Callable[[], object] | None = None
         for number, (probe, pose, display, grid, noise_seed) in enumerate(jobs):
             with self._lock:  # for one image, so that others need not wait for all
-                frame = self._rendered(probe, pose, display, grid, {}, noise_seed)
+                frame = self.render(probe, pose, display, grid, noise_seed=noise_seed)
                 complete = start(number, frame)
                 self.device.queue.flush()
             self._warn_if_empty(probe, pose, stacklevel=4)
