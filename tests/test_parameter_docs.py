@@ -32,9 +32,7 @@ from SlicerUSSim.Logic.tissue.tissue import Membrane, Tissue
 PAGE = Path(__file__).parents[1] / "docs" / "parameters.md"
 INTRODUCTION = """# Parameters
 
-All parameters, generated from their declarations in the code by `python -m tests.test_parameter_docs`. The declaration
-also defines a parameter's checks, its name in a preset, its field in the panel and on the page, and the bounds of its
-fit.
+All parameters, generated from their declarations in the code by `python -m tests.test_parameter_docs`.
 
 A preset is a JSON file with the objects `probe`, `display`, `settings`, `tissues` (by label, `"1"` to `"62"`, and `"0"`
 for the coupling medium) and `membrane`. `probe_to_ras`, four rows of four numbers, is the pose of the probe, which
@@ -47,8 +45,8 @@ often changed also have an option, which `--help` lists. `--set` overrides optio
 preset of the command may also have the objects `segmentation`, `fit`, `patient`, `recording` and `results`; the last
 three have the [keys of the command](#command).
 
-Parameters without values are `true` or `false`. *Fit* has the bounds and the tolerance of a
-[fit](optimization.md). `n` stands for a number.
+A bold text is the label of a field in the panels, if it differs from the name. Parameters without values are `true` or
+`false`. *Fit* has the bounds and the tolerance of a [fit](optimization.md). `n` stands for a number.
 """
 #: (heading, declared class, description)
 SECTIONS: list[tuple[str, type[Declared], str]] = [
@@ -118,8 +116,10 @@ def table(entries: list[Parameter]) -> str:
 
 def description(entry: Parameter) -> str:
     symbol = f" {entry.symbol}" if entry.symbol else ""
+    is_name = re.sub("_(mm|deg|db|mhz)$", "", entry.name).replace("_", " ") == entry.label.lower() and not symbol
+    label = "" if is_name else f"**{entry.label}{symbol}**: "
     more = " ".join(f"{text}." for text in (entry.note, entry.source) if text)
-    return f"**{entry.label}{symbol}**: {entry.tip}." + (f" {more}" if more else "")
+    return f"{label}{entry.tip}." + (f" {more}" if more else "")
 
 
 def values(entry: Parameter) -> str:

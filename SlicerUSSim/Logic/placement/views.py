@@ -42,18 +42,18 @@ _WORTH_MM = 2
 #: coronal images are seen from the front, with the patient's right on their left
 VIEWS = {
     "temporal": View(
-        "axial, through the right temporal bone: midline, ventricles, the other hemisphere; 2 MHz",
+        "axial, through the right temporal bone; 2 MHz",
         (1.0, 0.1, 0.1), (0.0, -1.0, 0.0), _WINDOW_MM,
     ),
     "temporal-left": View(
         "the same through the left temporal bone", (-1.0, 0.1, 0.1), (0.0, -1.0, 0.0), _WINDOW_MM
     ),
     "fontanelle": View(
-        "coronal, through the anterior fontanelle: ventricles, corpus callosum; 6 to 8 MHz in newborns",
+        "coronal, through the anterior fontanelle; 6 to 8 MHz in newborns",
         (0.0, 0.35, 1.0), (-1.0, 0.0, 0.0),
     ),
     "fontanelle-sagittal": View(
-        "sagittal, through the anterior fontanelle: corpus callosum, in newborns the cerebellum",
+        "sagittal, through the anterior fontanelle",
         (0.0, 0.35, 1.0), (0.0, -1.0, 0.0),
     ),
 }  # fmt: skip
