@@ -115,11 +115,10 @@ def table(entries: list[Parameter]) -> str:
 
 
 def description(entry: Parameter) -> str:
-    symbol = f" {entry.symbol}" if entry.symbol else ""
-    is_name = re.sub("_(mm|deg|db|mhz)$", "", entry.name).replace("_", " ") == entry.label.lower() and not symbol
-    label = "" if is_name else f"**{entry.label}{symbol}**: "
+    label = f"{entry.label} {entry.symbol}".strip()
+    is_name = re.sub("_(mm|deg|db|mhz)$", "", entry.name).replace("_", " ") == label.lower()
     more = " ".join(f"{text}." for text in (entry.note, entry.source) if text)
-    return f"{label}{entry.tip}." + (f" {more}" if more else "")
+    return ("" if is_name else f"**{label}**: ") + f"{entry.tip}." + (f" {more}" if more else "")
 
 
 def values(entry: Parameter) -> str:

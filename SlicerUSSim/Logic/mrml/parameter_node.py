@@ -1,7 +1,7 @@
 """The choices of the Slicer module, saved with the scene.
 
 The parameters are stored in the module's vtkMRMLScriptedModuleNode, in the format of Slicer's parameterNodeWrapper.
-Scenes can therefore be exchanged between scripts and the module. Values are those of declared dataclasses
+Scenes can therefore be exchanged between scripts and the module. Values belong to declared dataclasses
 (base/declaration.py): all parameters declared there are saved.
 """
 

@@ -184,7 +184,7 @@ _AXES = ("R", "A", "S")
 def head_axes(brain: Volume, names: Sequence[str]) -> tuple[np.ndarray, str]:
     """((3, 3) whose columns are the head's right, front and top in RAS, a line about it or "").
 
-    `brain` are labels 1, 2, ... called `names`, of a brain without what is around it. The axes are those of MNI152,
+    `brain` are labels 1, 2, ... called `names`, of a brain without its surroundings. The axes belong to MNI152,
     registered to the labels with the brightness that tissues have in a T1; those of the image where that is not to be
     trusted: in a part of a brain, where the two do not agree. Takes about two seconds, and ten for a
     head that lies turned by more than a scanner's nod.

@@ -22,7 +22,7 @@ FWHM_PER_SIGMA = 2.0 * np.sqrt(2.0 * np.log(2.0))
 CURVED = 0.6
 #: Largest number of focal zones
 MOST_ZONES = 8
-#: Amplitude of twice the pulse's frequency that leaves the face itself, and of what is left of the pulse in the band,
+#: Amplitude of twice the pulse's frequency that leaves the face itself, and of the rest of the pulse in the band,
 #: relative to the harmonic at the focus: typical of transmitters (docs/physics.md#harmonic-imaging)
 LEAKED = 0.1
 #: f-number of a beam that is wide compared with all others
