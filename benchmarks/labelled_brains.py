@@ -1,6 +1,6 @@
 """Brains whose tissues another program or a person has labelled, as phantoms and as scans to be judged on.
 
-The values are those of FreeSurfer's colour table (Fischl et al., Neuron 33(3), 2002), which SynthSeg and FastSurfer
+The values are from FreeSurfer's colour table (Fischl et al., Neuron 33(3), 2002), which SynthSeg and FastSurfer
 use too.
 """
 

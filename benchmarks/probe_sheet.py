@@ -24,7 +24,7 @@ COLUMNS, HEIGHT, GAP, TITLE = 4, 224, 6, 16
 
 
 def image_of(probe: Probe, device: str | None) -> np.ndarray:
-    """(rows, columns) uint8 image of the sphere in the tissue; the probe frame is that of the patient."""
+    """(rows, columns) uint8 image of the sphere in the tissue; the probe frame is the patient's."""
     radius = 2.0 if probe.frequency_mhz >= 10.0 else 5.0
     spacing = radius / 20.0
     axis = np.arange(-24, 25) * spacing

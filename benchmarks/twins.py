@@ -77,7 +77,7 @@ def make_twin(
     """Patient number `seed` on true `labels` (1 is CSF), with `frames` images of a tilted probe.
 
     With `crossing` there are as many images again with the probe turned by 90 degrees about its axis.
-    `display` is the start of the optimisation; with `display_is_known` it is that of the reference images too.
+    `display` is the start of the optimisation; with `display_is_known` the reference images have it too.
     """
     random = np.random.default_rng(1000 + seed)
     display = display or DisplaySettings()

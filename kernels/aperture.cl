@@ -469,7 +469,7 @@ inline float transmit_focus_at(Frame frame, float path) {
 }
 
 // The parts of the wave that lines bring to a depth, without amplitudes: `turned` by the phases of soft tissue, and
-// `focus`, the phase of the transmitted wave that is focused elsewhere. They are those of all levels.
+// `focus`, the phase of the transmitted wave that is focused elsewhere. They hold for all levels.
 typedef struct {
   float2 turned[ROWS][MOST_POINTS], focus[MOST_POINTS];
 } Phases;
@@ -738,7 +738,7 @@ inline Between between_lines(Frame frame, float place) {
 // The amplitude that strong tissue lets through at the depth `node`, at a place among the screen lines: of one of the
 // two `kinds` of shades. In shadows it is the mean over a deviation `sigma` in screen lines, by a Gauss-Hermite rule of
 // three points; from where the beam passes beside, nothing is taken. In strong tissue shades are those in front of it,
-// and light from there does not reach what is behind: its lines count as the line itself.
+// and light from there does not reach the space behind: its lines count as the line itself.
 inline float mean_lit(Frame frame, __global const float *shades, int kind, int node, float place, float sigma) {
   const int nodes = frame->screen_depths;
   const Between middle = between_lines(frame, place);

@@ -9,7 +9,7 @@
 // reduced by that.
 //
 // The phase of the beam is curved across it (lateral_curvature), so that the weights are complex. Linear interpolation
-// between edges lowers their power the more they turn from edge to edge; `kept` is what is left of it.
+// between edges lowers their power the more they turn from edge to edge; `kept` is the remaining part.
 //
 // Where tissue has disturbed the phases of the aperture, the beam is wider (aperture.cl), of the same power of speckle:
 // the level has what it loses. Its phase then turns as much over its width as before.

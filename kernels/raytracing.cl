@@ -21,7 +21,7 @@
 // the stack; the refracted one, w (1 - R), is followed in its place, turned by Snell's law (Salehi et al. 2015, section
 // 2.2). Of the amplitude, 10^(-alpha f 2 l / 20) remains over a length of l cm. A ray ends at the depth of the image,
 // where w A falls below intensity_threshold, or where nothing more can be written (the number of branches can grow
-// exponentially). What is left of it then, and children that are not followed, is added to `cut`: leaves and cuts
+// exponentially). The rest of it then, and children that are not followed, is added to `cut`: leaves and cuts
 // sum to one. Through soft borders, with the aperture's beams, it goes straight on.
 inline void trace_ray(Line *line, Ray ray) {
   Frame frame = line->frame;

@@ -21,7 +21,7 @@
 //
 // With LOBES defined, the echoes are those that elevational side lobes receive, and are added to those that are there.
 // Lobes have a record and a coarser lattice of their own (side_lobes.py), whose cells are wider than the strip of a
-// line: one work-item computes `together` lines, along the path of the one in their middle. The table is that of what
+// line: one work-item computes `together` lines, along the path of the one in their middle. The table has what
 // the main beam leaves out. Only pieces of the path in dark tissue count.
 //
 // With FOUND defined, planes have two words: some are of sheets that were found in the MRI (sheets.clh). Beside these
@@ -295,7 +295,7 @@ inline int drawn_label(const Patient *patient, const Piece *piece, int here, flo
 }
 
 // A scatterer of the membrane is the brighter the more squarely the beam meets the sheet; one of falx and tentorium
-// that were found by Lambert's law, except for a part that is the same from all sides. Its normal is that of the
+// that were found by Lambert's law, except for a part that is the same from all sides. Its normal comes from the
 // fitted plane, or the gradient of the fluid distance: from lines of two voxels along i, first those of the near plane,
 // then of the far.
 inline float gain_on_membrane(const Patient *patient, const Piece *piece, int here, float3 at) {
@@ -330,7 +330,7 @@ inline float gain_on_membrane(const Patient *patient, const Piece *piece, int he
   return level * exp2_scalar(max(exponent * log2_scalar(fmax(cosine, 1e-6f)), -100.0f));
 }
 
-// By how much tissue varies at LANES places in the patient, as factors of amplitudes. `words` are those of the tissue
+// By how much tissue varies at LANES places in the patient, as factors of amplitudes. `words` of the tissue
 // at each place.
 inline floatn unevenness(uint seed, const floatn *words, int has_specks, floatn x, floatn y, floatn z) {
   floatn level = words[2];

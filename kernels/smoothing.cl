@@ -117,7 +117,7 @@ __kernel void smooth_planes(__global const float *from, __constant const float *
   STORE_SMOOTH(min(sum, (floatn)(1.0f)), smooth + offset + (plane + first) * size + here);
 }
 
-// Means of two voxels along each axis: half the resolution. `columns`, `rows` and `planes` are those of `smooth`, whose
+// Means of two voxels along each axis: half the resolution. `columns`, `rows` and `planes` as for `smooth`, whose
 // last voxels are repeated; the planes of the result start at `first`, each clamped. Global size (columns of the result
 // or more, rows, planes).
 ONE_BY_ONE

@@ -23,7 +23,7 @@ SERIES = Volume(
 
 
 def images(volume: Volume = SERIES, change: Callable[[Dataset, int], object] | None = None, **values) -> list[Dataset]:
-    """One MR image per slice of a volume whose axes are those of LPS; `change` gets each with its number."""
+    """One MR image per slice of a volume with the axes of LPS; `change` gets each with its number."""
     series, reference, (columns, rows, step) = generate_uid(), generate_uid(), volume.spacing_mm.tolist()
     template = pydicom.dcmread(get_testdata_file("MR_small.dcm"))
     found = []

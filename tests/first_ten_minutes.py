@@ -106,7 +106,7 @@ def main(head_file: Path) -> None:
     presenter.values.setValue("scene.view", "temporal")
     with step("Place at view"):
         presenter.placing.placeAtView()
-    with step("Live: the first image, with what is left of building kernels"):
+    with step("Live: the first image, with the rest of building kernels"):
         presenter.images.setLive(True)
     FOUND["titles"] = view.titles
     before = image(presenter)

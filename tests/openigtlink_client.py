@@ -118,7 +118,7 @@ class StrictClient:
 
 
 def command_content(text: str, name: str | None = None, uid: int = 1) -> bytes:
-    """Of COMMAND; the name is that of the XML by default."""
+    """Of COMMAND; the name as in the XML by default."""
     name = ElementTree.fromstring(text).get("Name", "") if name is None else name
     return struct.pack(">I128sHI", uid, name.encode(), 3, len(text)) + text.encode()
 

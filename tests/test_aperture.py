@@ -267,7 +267,7 @@ def test_behind_a_lossy_plate_beams_have_the_mean_of_their_aperture(loss_db, thi
     [("linear", 15.0, 2.5), ("linear", 39.0, 6.5), ("convex", 15.0, 8.5), ("phased", 39.0, 6.5)],
 )
 def test_a_lossy_plate_brightens_nothing_and_shifts_what_has_passed_it(kind, loss_db, thick_mm):
-    """Also where a piece of the beam ends in the plate, behind which its level is that of the lines beside it."""
+    """Also where a piece of the beam ends in the plate, behind which it has the level of the lines beside it."""
     labels, tissue = lossy_plate(loss_db, thick_mm)
     probe = replace(PROBES[kind], depth_mm=48.0, frequency_mhz=5.0)
     tree = simulator(labels, PLAIN, tissue, coupling=PLAIN, interfaces=False).trace(probe, FACE)

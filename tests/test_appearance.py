@@ -86,7 +86,7 @@ def test_attenuation_by_the_direct_path_is_that_of_a_whole_simulation(layers, mo
     field = exact > 0
     assert np.abs(exact[field].astype(int) - before[field]).mean() > 10.0 * abs(attenuation - 0.5)
     assert abs((image - exact)[field].mean()) < 0.4
-    # The grains are those of the anchor's frequency.
+    # The grains belong to the anchor's frequency.
     assert np.abs(image - exact)[field].mean() < 10.0 * abs(attenuation - 0.5)
 
 

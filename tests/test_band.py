@@ -43,7 +43,7 @@ def in_band(attenuation: float, probe: Probe, depth_mm: np.ndarray) -> np.ndarra
 @pytest.mark.parametrize("name", WIDE)
 def test_levels_are_those_of_a_band_wise_sum_down_to_the_full_depth(name):
     """The frequency stopped at half of the pulse's, which made the far field 6 to 17 dB too dark."""
-    probe = replace(PROBES[name], scan_lines=128, directivity="none")  # the sum is that of lines that are not steered
+    probe = replace(PROBES[name], scan_lines=128, directivity="none")  # the sum is for lines that are not steered
     found = frames(probe, 0.8)
     for part in (0.4, 0.7, 0.95):
         depth, half = part * probe.depth_mm, 0.02 * probe.depth_mm

@@ -1,6 +1,6 @@
 """The extension: built and installed with a substitute for Slicer, loaded from there, valid for the Extensions Index.
 
-tests/slicer_cmake/SlicerConfig.cmake lays files out as Slicer's build does. The Index's rules are those of
+tests/slicer_cmake/SlicerConfig.cmake lays files out as Slicer's build does. The Index's rules are in
 scripts/check_description_files.py and schemas/slicer-extension-catalog-entry-schema-v1.0.2.json in
 Slicer/ExtensionsIndex, as far as they can be held without the network.
 """

@@ -62,7 +62,7 @@ class Bench:
         return self.logic.parameters.labels
 
     def tissues(self, node) -> np.ndarray:
-        """(k, j, i) of the brain (1) and of what is around it (2) in a box that both kinds of nodes have."""
+        """(k, j, i) of the brain (1) and of its surroundings (2) in a box that both kinds of nodes have."""
         found = read_labels(node, self.logic.preset.tissues)
         around = [number for number, name in enumerate(found.names, 1) if name not in ("csf", "grey matter")]
         return np.where(np.isin(found.labels.array, around), 2, np.minimum(found.labels.array, 1))

@@ -189,7 +189,7 @@ def test_real_images_show_the_field_of_the_38_mm_probe_that_took_them(name, dept
 
 @cache
 def recording(probe, count: int = 6) -> TrackedSequence:
-    """Images of one probe with other speckle each, whose calibration is that of its own frame."""
+    """Images of one probe with other speckle each, with the calibration of its own frame."""
     grid = ImageGrid.for_probe(probe, None)
     inside = grid.field(probe)
     random = np.random.default_rng(3)
@@ -225,7 +225,7 @@ def test_one_image_that_is_partly_dark_is_enough_with_a_probe():
     found = TrackedImages.of(sequence, probe=probe)
     face = (np.linalg.inv(found.field.image_to_probe) @ [0, 0, 0, 1])[:2]
     assert np.abs(face - np.linalg.inv(grid.image_to_probe)[:2, 3] - [60, 15]).max() < 5.0
-    with pytest.raises(SimulationError, match="of what is bright in the images, expected at least 85%"):
+    with pytest.raises(SimulationError, match="of the bright region in the images, expected at least 85%"):
         TrackedImages.of(sequence, probe=LinearProbe(8, 20))
 
 

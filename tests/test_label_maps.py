@@ -329,7 +329,7 @@ def test_a_numbering_that_is_given_has_to_have_most_labels():
     found = read_label_map(tumour((1, 2, 3)), mapping=LabelMapping.of("brats"))
     assert found.names == ("necrosis", "oedema", "enhancing") and "has a tumour alone" in found.warnings[0]
     found = read_label_map(tumour((1, 2, 4)), mapping=LabelMapping.of("brats"))
-    assert "its labels are those of BraTS 2017 to 2022 (--map brats-2022)" in found.warnings[1]
+    assert "its labels belong to BraTS 2017 to 2022 (--map brats-2022)" in found.warnings[1]
 
 
 def test_a_mapping_goes_before_names_and_numbers_and_removes_labels():

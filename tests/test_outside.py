@@ -130,7 +130,7 @@ def test_a_brain_without_a_head_is_refused_before_it_is_segmented(tmp_path):
     path = str(tmp_path / "brain.nii.gz")
     head_mri(4.0).write(path)
     done = CliRunner().invoke(main, ["segment", path, "--outside", "-o", str(tmp_path / "labels.nii.gz")])
-    assert done.exit_code == 2 and "is a brain without its head (skull-stripped), and what is outside" in done.stderr
+    assert done.exit_code == 2 and "is a brain without its head (skull-stripped), and tissue outside" in done.stderr
     assert "segmented" not in done.stderr and not (tmp_path / "labels.nii.gz").exists()
 
 

@@ -7,6 +7,7 @@ generates it from them.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -31,22 +32,21 @@ from SlicerUSSim.Logic.tissue.tissue import Membrane, Tissue
 PAGE = Path(__file__).parents[1] / "docs" / "parameters.md"
 INTRODUCTION = """# Parameters
 
-All parameters, generated from their declarations in the code by `python -m tests.test_parameter_docs`. The declaration
-of a parameter also defines its checks, its name in a preset, its field in the panel and on the page, and the bounds of
-its fit.
+All parameters, generated from their declarations in the code by `python -m tests.test_parameter_docs`.
 
 A preset is a JSON file with the objects `probe`, `display`, `settings`, `tissues` (by label, `"1"` to `"62"`, and `"0"`
-for the coupling medium) and `membrane`, and `probe_to_ras`, four rows of four numbers, if it has a pose of the probe
-(*Pose in presets*); `--pose` reads it from there, too. `ussim demo` and the panels write presets; `--preset` and the
-panels read them. Types are strict: `true` and `"5"` are not accepted as numbers, nor 3.0 as a whole number, and names
-that are not in these tables are refused. *None* is `null` in JSON.
+for the coupling medium) and `membrane`. `probe_to_ras`, four rows of four numbers, is the pose of the probe, which
+`--pose` also reads. `ussim demo` and the panels write presets; `--preset` and the panels read them. Types are strict:
+`true` and `"5"` are not numbers, 3.0 is not a whole number, and unknown names are errors. *None* is `null` in JSON.
 
-In the command, `--set` changes any parameter of probe, display, settings, membrane, tissues, segmentation and fit. Its
-value is the name of the section or tissue, a dot, the name of the parameter, and the new value: `--set
-settings.max_ray_depth=4`, `--set probe.depth_mm=70`, `--set "white matter.mu0=0.5"`, `--set fit.restarts=0`. Parameters
-that are often changed also have an option, which `--help` lists. `--set` overrides options, and they override
-`--preset`. A preset of the command may have the objects `segmentation`, `fit`, `patient`, `recording` and `results`,
-too; the last three have what the [command](#command) alone takes.
+In the command, `--set` changes any parameter of probe, display, settings, membrane, tissues, segmentation and fit, by
+the name of the section or tissue: `--set settings.max_ray_depth=4`, `--set "white matter.mu0=0.5"`. Parameters that are
+often changed also have an option, which `--help` lists. `--set` overrides options, and they override `--preset`. A
+preset of the command may also have the objects `segmentation`, `fit`, `patient`, `recording` and `results`; the last
+three have the [keys of the command](#command).
+
+A bold text is the label of a field in the panels, if it differs from the name. Parameters without values are `true` or
+`false`. *Fit* has the bounds and the tolerance of a [fit](optimization.md). `n` stands for a number.
 """
 #: (heading, declared class, description)
 SECTIONS: list[tuple[str, type[Declared], str]] = [
@@ -60,14 +60,14 @@ SECTIONS: list[tuple[str, type[Declared], str]] = [
      "every value."),
     ("Membrane", Membrane, "A thin rough sheet along the border between fluid and brain; `membrane` in a preset. "
      "Its `tissue` is an object as in [Tissues](#tissues)."),
-    ("Segmentation", SegmentationSettings, "Segmentation of an MRI into tissues, by commands (`segmentation` in their "
-     "preset), `segment_mri` and the VTK filter."),
+    ("Segmentation", SegmentationSettings, "Segmentation of an MRI into tissues; `segmentation` in a preset of the "
+     "command."),
     ("Sheets", SheetSettings, "Sheets and vessels of a scene, in Slicer and on the page; commands have `--sheets` "
      "([sheets.md](sheets.md))."),
-    ("Fit", FitSettings, "Fit of simulated to real images ([optimization.md](optimization.md)). `fit` in the "
-     "preset of `ussim optimize`, which has the options `--frames` and `--free`, too."),
-    ("Approach", ApproachWeights, "Weights of the cost of paths to a target ([approach.md](approach.md)), in Python "
-     "and by commands: `approach` in the preset of `ussim approach` and `ussim simulate --approach`."),
+    ("Fit", FitSettings, "Fit of simulated to real images ([optimization.md](optimization.md)); `fit` in the preset of "
+     "`ussim optimize`."),
+    ("Approach", ApproachWeights, "Weights of the cost of paths to a target ([approach.md](approach.md)); `approach` "
+     "in the preset of `ussim approach` and `ussim simulate --approach`."),
     ("Similarity", SimilaritySettings, "The cost of a fit ([optimization.md](optimization.md#cost-function)); set in "
      "Python only."),
     ("Recipe", SetSettings, "Of a data set, before the tables of its recipe ([datasets.md](datasets.md))."),
@@ -99,26 +99,26 @@ def page() -> str:
 
 
 def table(entries: list[Parameter]) -> str:
-    """One row for each parameter, without empty columns."""
+    """One row for each parameter, or for several numbered ones, without empty columns."""
     columns: dict[str, Callable[[Parameter], str]] = {
         "Name": lambda entry: f"`{entry.name}`",
         "Description": description,
-        "Unit": lambda entry: entry.unit,
         "Values": values,
         "Default": default,
-        "Fit: bounds": fit_bounds,
-        "Fit: tolerance": lambda entry: f"± {entry.fit.tolerance:g}" if entry.fit else "",
+        "Fit": fit,
     }
-    cells = {name: [column(entry).replace("|", r"\|") for entry in entries] for name, column in columns.items()}
-    cells = {name: column for name, column in cells.items() if any(column)}
-    rows = [list(cells), ["---"] * len(cells), *map(list, zip(*cells.values(), strict=True))]
-    return "".join(f"| {' | '.join(row)} |\n" for row in rows)
+    rows = [[column(entry).replace("|", r"\|") for column in columns.values()] for entry in entries]
+    rows = list(dict.fromkeys(tuple(re.sub(r"(?<=_)\d(?=_)|\d(?= of \d)", "n", cell) for cell in row) for row in rows))
+    kept = [place for place in range(len(columns)) if any(row[place] for row in rows)]
+    rows = [tuple(columns), ("---",) * len(columns), *rows]
+    return "".join(f"| {' | '.join(row[place] for place in kept)} |\n" for row in rows)
 
 
 def description(entry: Parameter) -> str:
-    symbol = f" {entry.symbol}" if entry.symbol else ""
+    label = f"{entry.label} {entry.symbol}".strip()
+    is_name = re.sub("_(mm|deg|db|mhz)$", "", entry.name).replace("_", " ") == label.lower()
     more = " ".join(f"{text}." for text in (entry.note, entry.source) if text)
-    return f"**{entry.label}{symbol}**: {entry.tip}." + (f" {more}" if more else "")
+    return ("" if is_name else f"**{label}**: ") + f"{entry.tip}." + (f" {more}" if more else "")
 
 
 def values(entry: Parameter) -> str:
@@ -132,7 +132,9 @@ def values(entry: Parameter) -> str:
     elif kind is tuple:
         text = "texts"
     else:
-        text = {bool: "true, false", int: f"whole, {between}", float: between, str: "text"}.get(kind, "object of texts")
+        of_bool = "true, false" if entry.can_be_none else ""
+        text = {bool: of_bool, int: f"whole, {between}", float: between, str: "text"}.get(kind, "object of texts")
+    text = f"{text} {entry.unit}".strip()
     return f"{text}, none" if entry.can_be_none else text
 
 
@@ -149,10 +151,11 @@ def default(entry: Parameter) -> str:
     return f"{value:.10g}" if isinstance(value, int | float) else value or "empty"
 
 
-def fit_bounds(entry: Parameter) -> str:
+def fit(entry: Parameter) -> str:
     if entry.fit is None:
         return ""
-    return f"{entry.fit.low:g} to {entry.fit.high:g}{', logarithmic' if entry.fit.is_logarithmic else ''}"
+    scale = "logarithmic " if entry.fit.is_logarithmic else ""
+    return f"{scale}{entry.fit.low:g} to {entry.fit.high:g} ± {entry.fit.tolerance:g}"
 
 
 def test_the_page_agrees_with_the_declarations():

@@ -67,7 +67,7 @@ def test_the_tissues_predict_what_one_tissue_cannot(recording, found):
     written = json.loads(json.dumps(made.to_dict(), allow_nan=False))
     assert written["of_uniform"] == pytest.approx(made.of_uniform)
     assert any("fitted: images 0, 2   predicted: images 1, 4" in line for line in made.lines())
-    # The control has no anatomy: levels to the left and right of the ball's middle are those of the same depths
+    # The control has no anatomy: levels to the left and right of the ball's middle agree with the same depths
     image = made.images["uniform tissue"][0].astype(float)
     assert abs(image[42:84, 42:70].mean() - image[42:84, 84:112].mean()) < 12.0
 

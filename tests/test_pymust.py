@@ -77,7 +77,7 @@ def probe() -> LinearProbe:
 def channels(param, lateral_mm, depth_mm, strength, delays) -> np.ndarray:
     """(samples, elements) analytic signals of point scatterers."""
     options = pymust.utils.Options()
-    options.dBThresh = -60  # of frequencies: the signals are those of its default, -100, except for 1e-6 of them
+    options.dBThresh = -60  # of frequencies: the signals agree with its default, -100, except for 1e-6 of them
     rf, _ = pymust.simus(
         np.asarray(lateral_mm) * 1e-3, np.asarray(depth_mm) * 1e-3, np.asarray(strength), delays, param, options
     )

@@ -77,7 +77,7 @@ def cysts() -> tuple[UltrasoundSimulator, np.ndarray]:
 
 
 def test_the_coarse_search_compares_the_same_field_at_half_the_resolution():
-    """Half the scan lines, pixels twice as large, fewer scatterers and rays: the first cost is that of such images."""
+    """Half the scan lines, pixels twice as large, fewer scatterers and rays: the first cost belongs to such images."""
     seen, rotation = cysts()
     display = DisplaySettings(image_size=(96, 92))
     grid = ImageGrid.for_probe(SMALL, display.image_size)

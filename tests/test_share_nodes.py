@@ -1,4 +1,4 @@
-"""Shares of tissues in a scene: the images of a patient that Segment labelled are those of the same in Python."""
+"""Shares of tissues in a scene: the images of a patient that Segment labelled agree with the same in Python."""
 
 from __future__ import annotations
 

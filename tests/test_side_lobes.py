@@ -57,7 +57,7 @@ def test_apodisation_widens_the_main_lobe_as_diffraction_does(apodization):
 
 
 def test_images_are_as_wide_as_the_apodised_pattern():
-    """The correlation of speckle of neighbouring lines is that of the pattern with itself."""
+    """The correlation of speckle of neighbouring lines equals the autocorrelation of the pattern."""
     apodization = 1.0
     probe = replace(PROBE, receive_apodization=apodization)
     pattern = two_way(probe, 24.0)

@@ -139,7 +139,7 @@ def test_the_sum_over_angles_has_the_width_of_the_array_factor():
     factor = np.abs(np.exp(2j * np.pi / probe.wavelength_mm * np.outer(x, np.sin(angle))).mean(axis=1))
     half = x[np.argmax(factor < 0.5)]
     assert 2.3548 * probe.lateral_sigmas_mm(20.0)[0] == pytest.approx(2.0 * half, rel=0.02)
-    # Deeper than the face is seen under these angles, it is that of the face.
+    # Deeper than the face is seen under these angles, the aperture is the whole face.
     assert probe.lateral_sigmas_mm(150.0)[0] * 2.3548 == pytest.approx(1.21 * probe.wavelength_mm * 150 / 38, rel=1e-3)
 
 

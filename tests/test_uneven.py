@@ -1,6 +1,6 @@
 """Echogenicity that varies within a tissue (docs/physics.md#uneven-tissue): texture and specks, fixed in it.
 
-Statistics are those of the reference in numpy, with which test_kernels.py compares the kernel.
+Statistics come from the reference in numpy, with which test_kernels.py compares the kernel.
 """
 
 from __future__ import annotations

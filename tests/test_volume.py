@@ -157,7 +157,7 @@ def test_nifti_is_read_whatever_its_version_and_the_end_of_its_name(tmp_path):
 
 
 def nifti(path, **fields) -> Volume:
-    """What is read of an image whose axes are those of RAS and whose header has other `fields`."""
+    """What is read of an image with the axes of RAS whose header has other `fields`."""
     image = nibabel.Nifti1Image(np.arange(60, dtype=np.int16).reshape(5, 4, 3), np.diag([2.0, 2, 2, 1]))
     image.set_qform(image.affine, 1)
     nibabel.save(image, path)

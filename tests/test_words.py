@@ -33,7 +33,8 @@ PATTERNS = {
     r"any more|but for|for ever|on the mean": "no longer, except for, forever, on average",
     r"(stays?|left) as (it|they) (is|are|was|were)": "does not change",
     r"(?<!\.)taken for": "assumed to be, read as, counts as, mistaken for",
-    r"what lies": "name the thing: the tissue behind, the part outside",
+    r"what (lies|is (outside|inside|behind|beyond|below|around|between|bright|dark|left))": "name the thing: the rest",
+    r"(is|are|was|were) (that|those) of": "agrees with, comes from; a pronoun makes readers search for its noun",
 }
 _ANY = "|".join(rf"\b(?P<n{n}>{pattern})\b" for n, pattern in enumerate(PATTERNS)).replace(" ", r"\s+")
 _PARTS = (

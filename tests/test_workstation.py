@@ -366,7 +366,7 @@ def test_slice_views_show_the_field_outlined_and_the_image_blended_in(page):
     outlined = picture(page, box)
     red, green, blue = np.moveaxis(outlined, -1, 0)
     yellow = (red > 110) & (green > 80) & (blue < 0.6 * green)
-    assert yellow.sum() > 25  # of a line of one pixel, what is not blended with what is below
+    assert yellow.sum() > 25  # of a line of one pixel, not blended with the image below
     inside = np.zeros(yellow.shape, bool)
     rows, columns = np.nonzero(yellow)
     inside[rows.min() + 20 : rows.max() - 5, columns.min() + 40 : columns.max() - 40] = True

@@ -268,7 +268,7 @@ def test_the_workstation_starts_with_a_scene(browser, module_scene):
         assert not errors(page) and state(page, NAMES.title) == "Ms. Example T1"
         np.testing.assert_allclose(page.evaluate("window.ussim.image.pose"), pose, atol=2e-3)
         assert np.array_equal(np.asarray(Image.open(download(page, "png"))), image)
-        # It is that of a user, who is asked before it is closed
+        # It belongs to a user, who is asked before it is closed
         page.set_input_files("#open-file", path)
         page.wait_for_function("document.getElementById('question')?.dataset.number > 0")
         page.keyboard.press("Escape")

@@ -339,7 +339,7 @@ CHECKS = (
     ),
     Check(
         "beams behind cysts",
-        "Behind a cyst of another speed of sound, mean power and edge shadow are those of wave propagation.",
+        "Behind a cyst of another speed of sound, mean power and edge shadow agree with wave propagation.",
         beams_behind_cysts,
     ),
 )

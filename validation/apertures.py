@@ -223,5 +223,5 @@ CHECKS = (
         "Beams of steered lines are as wide as the foreshortened aperture makes them, and fainter by their elements.",
         sectors,
     ),
-    Check("slices", "The thickness of a slice is that of the lens: sums over its points, at all depths.", slices),
+    Check("slices", "The thickness of a slice agrees with the lens: sums over its points, at all depths.", slices),
 )

@@ -68,7 +68,7 @@ def downshift(rotation: np.ndarray, device) -> Outcome:
 
 
 def _wide_bands(rotation: np.ndarray, device) -> list[Row]:
-    """Levels down to the end of the image, and after TGC, which is that of the band."""
+    """Levels down to the end of the image, and after the TGC of the band."""
     tissue = replace(BACKGROUND, attenuation_db_cm_mhz=_MUCH_DB_CM_MHZ)
     phantom = uniform_speckle(tissue, rotation)
     display = DisplaySettings(look="even", tgc_db_cm_mhz=_MUCH_DB_CM_MHZ, tgc_reach=1.0, noise_db=None)
@@ -130,7 +130,7 @@ def _widths(name: str, probe: Probe, pose: np.ndarray, simulators, frames: list[
 CHECKS = (
     Check(
         "frequency downshift",
-        "Level and mean frequency are those of a sum over the frequencies of the pulse; the beam is that of the mean.",
+        "Level and mean frequency agree with a sum over the frequencies of the pulse, the beam with the mean.",
         downshift,
     ),
 )

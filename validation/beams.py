@@ -79,7 +79,7 @@ def specular_echoes(rotation: np.ndarray, device) -> Outcome:
 
 
 def tilted_in_elevation(rotation: np.ndarray, device) -> Outcome:
-    """A plane tilted out of the image plane: its echo is that of its mirror images over the lens.
+    """A plane tilted out of the image plane: its echo agrees with its mirror images over the lens.
 
     Where the beam is wide, rays meet a steep plane at ranges that differ by a pulse length or more. The integral over
     the stratum of each ray still vanishes, as does the integral over the whole beam. Without it, the image would show
@@ -113,7 +113,7 @@ def interface_width(rotation: np.ndarray, device) -> Outcome:
     """A small sheet away from the focus: its profile is a box convolved with the beam."""
     half, depth = 1.5, 20.0
     phantom = small_sheet(rotation, depth_mm=depth, half_mm=half)
-    # The second moment is that of the main beam.
+    # The second moment belongs to the main beam.
     settings = SimulationSettings(scattering=False, side_lobes=False, elevational_rays=16, specular_exponent=0.0)
     simulator = UltrasoundSimulator(phantom.labels, phantom.tissues, settings, device)
     offsets = np.arange(-5.0, 5.01, 0.5)
@@ -304,7 +304,7 @@ CHECKS = (
     Check("specular echoes", "The echo of a hit is w A |r| cos^n of the angle of incidence.", specular_echoes),
     Check(
         "elevational tilt",
-        "The echo of a plane tilted out of the image is that of its mirror images: sums over the ways of the lens.",
+        "The echo of a plane tilted out of the image agrees with its mirror images: sums over the ways of the lens.",
         tilted_in_elevation,
     ),
     Check("interface width", "The echo of a small sheet is widened by the beam in both directions.", interface_width),

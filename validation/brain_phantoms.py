@@ -108,7 +108,7 @@ def tissue_maps(name: str) -> TissueMaps | None:
     mricron-data. No share maps are published with it, so that they come from its intensity, which has little noise:
     linear between the means of CSF, grey and white matter, pure beyond the outer two. A phantom of it has the anatomy
     of one person, and its truth depends on none of the methods that are judged by it. It is not the truth about
-    that person: what is between grey and white in intensity, such as deep nuclei, is partly white here.
+    that person: tissue between grey and white in intensity, such as deep nuclei, is partly white here.
 
     Raises SimulationError for another name.
     """

@@ -1,8 +1,8 @@
 """CT phantoms of a lumbar spine and of the lower chest, whose tissues are known.
 
 A phantom is a list of shapes, painted one over the other. A voxel is the mean of its parts, blurred by the scanner,
-with noise that the reconstruction kernel has made smooth; so borders have the partial volumes of a scan. Sizes are
-those of an adult, rounded (vertebrae: Panjabi et al., Spine 17(3), 1992), not of a person. Coordinates are RAS mm.
+with noise that the reconstruction kernel has made smooth; so borders have the partial volumes of a scan. Sizes belong
+to an adult, rounded (vertebrae: Panjabi et al., Spine 17(3), 1992), not of a person. Coordinates are RAS mm.
 """
 
 from __future__ import annotations

@@ -183,7 +183,7 @@ def planes_along_diagonals(rotation: np.ndarray, device) -> Outcome:
     for spacing, across in itertools.product((0.5, 1.0), _DIAGONALS):
         variations = []
         for angle in _FROM_DIAGONAL:
-            # The orientation of the phantom about its normal is that of this run.
+            # The orientation of the phantom about its normal belongs to this run.
             to_diagonal = Rotation.align_vectors([across], [[0.0, 1.0, 0.0]])[0]
             off = Rotation.from_euler("x", angle, degrees=True)
             spin = Rotation.from_rotvec([0.0, 0.5 + Rotation.from_matrix(rotation).magnitude(), 0.0])

@@ -52,7 +52,7 @@ def cyst_contrast(rotation: np.ndarray, device) -> Outcome:
     focused = replace(phased, focus_mm=30.0, elevation_focus_mm=30.0, clutter_db=None)
     row("phased 5 MHz, Hann window", replace(focused, receive_apodization=1.0), 30.0)
     row("phased 5 MHz, clutter of -30 dB", replace(focused, clutter_db=-30.0), 30.0)
-    # Lobes are the mean over the band, and the prediction is that of its centre, which counts 60 dB down.
+    # Lobes are the mean over the band, and the prediction belongs to its centre, which counts 60 dB down.
     row("phased 5 MHz as harmonic", replace(focused, frequency_mhz=2.5, harmonic=True), 30.0, 4.0)
     plot = Plot("centre of a 10 mm cyst relative to its surroundings", "depth [mm]", "dB", curves)
     return Outcome(tuple(rows), partial(draw_plots, plots=[plot]))

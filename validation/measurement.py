@@ -134,7 +134,7 @@ def envelope_snr(
     """Predicted mean / standard deviation of the envelope of speckle with few scatterers in the resolution cell.
 
     Scatterers of one amplitude and random phases are in independent cells of a lattice, of which each has one or none,
-    anywhere within it. `sigmas_mm` are those of Gaussian point spread functions (axial, lateral, elevational), by which
+    anywhere within it. `sigmas_mm` of Gaussian point spread functions (axial, lateral, elevational), by which
     parts of the envelope of the same mean power were seen.
 
     The envelope A of such a sum is the length of a random walk in a plane: E A is the integral of (1 - f(u)) / u^2,

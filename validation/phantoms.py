@@ -280,7 +280,7 @@ def curved_mirror(
 ) -> Phantom[Level]:
     """A steel ball, or a rod across the image, that mirrors the surrounding speckle; the level falls with distance.
 
-    The level is that of the exact waves at a rod, laterally and, for a ball, also elevationally.
+    The level follows from the exact waves at a rod, laterally and, for a ball, also elevationally.
     """
     top = 22.0
     plain = replace(BACKGROUND, attenuation_db_cm_mhz=0.0)
@@ -427,7 +427,7 @@ def round_cyst(rotation: np.ndarray | None = None, *, depth_mm: float = 40.0, ra
 def clutter_power(probe: Probe, depth_mm: float, radius_mm: float, within_mm: float = 0.0) -> float:
     """Power received from outside a disc across the beam at a depth, relative to all power; without attenuation.
 
-    It is that of lines through the centre of the disc, or the mean of those within `within_mm` of it laterally.
+    It belongs to lines through the centre of the disc, or the mean of those within `within_mm` of it laterally.
 
     By diffraction (Goodman, Introduction to Fourier Optics, section 3.4): the sum of the waves of 512 points of each
     aperture, by their exact distances. The transmit aperture and the elements are focused once, the receive aperture at

@@ -2,7 +2,7 @@
 
 Profiles across the line are averaged along it over 2 mm, shifted so that their maxima within 2 mm coincide, since poses
 and labels are not more accurate, and averaged. The maximum of noise is bright, too: `chance` is what the same procedure
-finds beside the line, and only what is above it is contrast.
+finds beside the line, and only the excess over it is contrast.
 """
 
 from __future__ import annotations

@@ -378,7 +378,7 @@ CHECKS = (
     ),
     Check(
         "sparse speckle",
-        "With few scatterers in the resolution cell, mean / standard deviation is that of a random walk.",
+        "With few scatterers in the resolution cell, mean / standard deviation agrees with a random walk.",
         sparse,
     ),
     Check("speckle coherence", "The scatterers are the same at every pose.", coherence),

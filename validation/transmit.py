@@ -247,13 +247,13 @@ CHECKS = (
     ),
     Check(
         "compounded angles",
-        "Width and correlation of speckle are those of two apertures at every depth (product of two sinc functions).",
+        "Width and correlation of speckle agree with two apertures at every depth (product of two sinc functions).",
         compounded_angles,
     ),
     Check("steered lines", "Wires have their places, and the field its edges, with steered lines too.", steered_lines),
     Check(
         "harmonic",
-        "Wires are narrower by sqrt(1/3), and the level is that of the quasi-linear solution for a Gaussian beam.",
+        "Wires are narrower by sqrt(1/3), and the level agrees with the quasi-linear solution for a Gaussian beam.",
         harmonic,
     ),
 )

@@ -144,7 +144,7 @@ def sheets(rotation: np.ndarray, device) -> Outcome:
 CHECKS = (
     Check(
         "oblique walls",
-        "The echo of a tilted plane is that of its mirror images: sums over the ways between points of the apertures; "
+        "The echo of a tilted plane agrees with its mirror images: sums over the ways between points of the apertures; "
         "below -30 dB it stays below -28 dB.",
         oblique_walls,
     ),

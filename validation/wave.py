@@ -77,7 +77,7 @@ def beam_fields(
     # Where the way from the start to the focus crosses the aperture: its part, and the place on the aperture
     crossed = (x * sine - start * cosine) / (away * cosine + x * sine)
     face = x * (1.0 - crossed) * cosine + (start + crossed * away) * sine
-    # Over an element, the edge of the aperture is soft: so is that of the simulator's.
+    # Over an element, the edge of the aperture is soft: so is the simulator's.
     waves = np.clip((0.5 * open_mm - np.abs(face)) / _DX_MM + 0.5, 0.0, 1.0)
     waves = waves * np.exp(-1j * k * (np.hypot(x, away) - away))
     ends = np.rint((np.asarray(depths_mm) - start) / _DZ_MM).astype(int)

@@ -47,7 +47,7 @@ class _OneLineErrors(click.Command):
                 raise
             with contextlib.suppress(OSError):  # both may go to the same full disk
                 click.echo(f"ussim: standard output cannot be written ({os.strerror(error.errno)})", err=True)
-            sys.stdout = open(os.devnull, "w")  # noqa: SIM115, what is left in its buffer would be tried again at the end
+            sys.stdout = open(os.devnull, "w")  # noqa: SIM115, the rest of its buffer would be tried again at the end
             sys.exit(2)
 
     def invoke(self, ctx: click.Context) -> Any:

@@ -58,7 +58,7 @@ class Craniotomy:
 
     @property
     def is_file(self) -> bool:
-        """Whether the opening is that of a file."""
+        """Whether the opening is from a file."""
         return self.is_wanted and not self.needs_pose
 
     @property

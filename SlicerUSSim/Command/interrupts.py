@@ -82,7 +82,7 @@ def _end_even_in_kernels() -> None:
     """End the process at a signal also while it waits for a kernel, where Python's handlers do not run.
 
     A thread sees every signal. If the handler has not run some seconds later, the main thread is in a library,
-    and the process ends at once: files are replaced whole or not at all, and the next run removes what is left beside
+    and the process ends at once: files are replaced whole or not at all, and the next run removes the remains beside
     them.
     """
     if any(thread.name == _WATCHER for thread in threading.enumerate()):

@@ -202,7 +202,7 @@ def _read_organs(path: str, maps: Iterable[str]) -> LabelledTissues:
 def read_mri(path: str, patient: MriOptions, *, is_served: bool = False) -> Volume:
     """Read an MRI or a CT, which is not a label map unless it is segmented all the same.
 
-    `is_served` is for the words of the errors: the command is that of the workstation.
+    `is_served` is for the words of the errors: the command serves the workstation.
     Raises SimulationError, saying what it is, for a label map, a mask or a tracked sequence, and if it is constant.
     """
     import numpy as np

@@ -138,7 +138,7 @@ class SegmentPresenter:
     def replaceable(self, name: str, source: Any) -> Iterator[Any]:
         """The chosen labels if Segment made them and no user edited them; otherwise a new node, which is selected.
 
-        Afterwards the notes are those of the logic, about the node `source`.
+        Afterwards the notes are the logic's, about the node `source`.
         """
         panel, chosen = self._panel, self._panel.parameters.labels
         kept, is_of_other = None, chosen is not None and self._are_of_other(chosen, source)

@@ -203,7 +203,7 @@ class Cine:
             self._logic.showTaken(taken, self._logic.parameters.output)
 
     def _display(self, kept: CineImage) -> DisplaySettings:
-        """That of now, without what is left of images before."""
+        """The current display, without the rest of earlier images."""
         return replace(self._logic.preset.display, persistence=kept.taken.preset.display.persistence)
 
     def _displayed(self, kept: CineImage) -> TakenImage:

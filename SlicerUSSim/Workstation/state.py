@@ -157,7 +157,7 @@ class SequenceState:
 
 @dataclass
 class ImageState:
-    """The shown image, from its record (TakenImage) alone, and whether the record is that of now."""
+    """The shown image, from its record (TakenImage) alone, and whether the record is up to date."""
 
     #: "LIVE", "OUTDATED" or "FROZEN"; "" without an image
     status: str = ""

@@ -34,7 +34,7 @@ def lateral_beam(record: np.ndarray, traced: np.ndarray, spreads: np.ndarray, fr
         apart2 = (apart / sigma) ** 2 / narrow2
         away = np.arange(len(edges))[:, None] + 0.5 - centre
         near = np.abs(away) <= np.ceil(of["beam_cutoff"] * sigma / apart) + 0.5
-        # The phase is that of the middle of sixteen samples.
+        # The phase in the middle of sixteen samples.
         blocks = np.arange(len(s)) // 16
         middle = np.maximum((16 * blocks + 8) * of["sample_mm"] - start, 0.0)
         of_blocks = frequencies[n].reshape(-1, 16).mean(axis=1)[blocks]

@@ -90,7 +90,7 @@ def scatterer_lines(record, lens: LensBeam, labels: np.ndarray, tissues: np.ndar
 def _amplitudes(record, labels: np.ndarray, tissues: np.ndarray, places: np.ndarray, random: np.ndarray) -> np.ndarray:
     """(n,) amplitudes of the cells' scatterers at (n, 3) RAS mm, 0 where there is none.
 
-    The label is that of one of the eight voxels around, drawn with its trilinear weight. A cell stands for all sites of
+    The label belongs to one of the eight voxels around, drawn with its trilinear weight. A cell stands for all sites of
     the paper's lattice of 20 um in it, and has a scatterer where one of them has.
     """
     matrix = record["ras_to_voxel"].reshape(3, 4).astype(float)

@@ -232,7 +232,7 @@ def read_small(path: str | os.PathLike, most_bytes: int = 16 * 2**20) -> bytes:
 def read_text(path: str | os.PathLike, most_bytes: int = 16 * 2**20, errors: str = "strict") -> str:
     """The text of a file in UTF-8, or in UTF-16 if it starts with the mark of that; no mark is left in it.
 
-    `errors` is that of bytes.decode. Raises UnicodeDecodeError, and SimulationError as read_small does.
+    `errors` as in bytes.decode. Raises UnicodeDecodeError, and SimulationError as read_small does.
     """
     content = read_small(path, most_bytes)
     is_utf_16 = content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))

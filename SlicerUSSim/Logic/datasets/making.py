@@ -107,7 +107,7 @@ def make_dataset(
     workers : number of these; 1: this process alone, without Dask. Default: best_workers().
     progress : called after every shard; may raise errors.Cancelled.
     say : called with a line about what is waited for: a patient that is prepared, workers.
-    task : what renders and writes a shard; another one measures what is around it.
+    task : what renders and writes a shard; another one measures the work around it.
 
     Patients that cannot be read are left out, see Made.skipped. Raises SimulationError for a folder with another set,
     if a file cannot be written, if a package is missing, and if the scheduler is gone; the same call then resumes.

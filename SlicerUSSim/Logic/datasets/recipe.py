@@ -65,8 +65,8 @@ class SetSettings(Declared):
     """What a recipe says before its tables."""
 
     images: int = parameter(label="Images", tip="Number of images", bounds=(1, 10**9))
-    seed: int = parameter(0, "Seed", "Seed of all that is drawn", bounds=(0, 2**32 - 1))
-    outputs: tuple[str, ...] = parameter(("image", "labels"), "Outputs", "What is kept of every image")
+    seed: int = parameter(0, "Seed", "Seed of all random draws", bounds=(0, 2**32 - 1))
+    outputs: tuple[str, ...] = parameter(("image", "labels"), "Outputs", "Saved results of every image")
     format: str = parameter("zarr", "Format", "Format of the files", choices=tuple(FORMATS))
     shard: int | None = parameter(None, "Shard", "Images of a file; none: up to 64", bounds=(1, 100_000))
     title: str = parameter("Simulated ultrasound", "Title", "Title of the set")
@@ -97,14 +97,14 @@ class PoseSettings(Declared):
     view: str = parameter("temporal", "View", "Standard view", choices=tuple(VIEWS))
     file: str = parameter("", "File", "Curve (.mrk.json) of a path, or tracked sequence")
     transform: str = parameter("ProbeToReference", "Transform", "Pose of the probe in a tracked sequence")
-    within_deg: float = parameter(90.0, "Within", "Of the surface, so far from its top", unit="°", bounds=(0, 180))
-    aim: str = parameter("", "Aim", "Tissue at whose innermost place the probe looks")
-    right_deg: float = parameter(0.0, "Right", "Moved over the surface to the right", **_DEGREES)
-    front_deg: float = parameter(0.0, "Front", "Moved over the surface to the front", **_DEGREES)
-    rock_deg: float = parameter(0.0, "Rock", "Turned in the image plane", **_DEGREES)
-    tilt_deg: float = parameter(0.0, "Tilt", "Turned out of the image plane", **_DEGREES)
-    rotate_deg: float = parameter(0.0, "Rotate", "Turned about the axis", **_DEGREES)
-    lift_mm: float = parameter(0.0, "Lift", "Drawn back along its axis", unit="mm", bounds=(-20, 50))
+    within_deg: float = parameter(90.0, "Within", "Largest angle from the top", unit="°", bounds=(0, 180))
+    aim: str = parameter("", "Aim", "Tissue at which the probe looks, at its innermost voxel")
+    right_deg: float = parameter(0.0, "Right", "Shift over the surface to the right", **_DEGREES)
+    front_deg: float = parameter(0.0, "Front", "Shift over the surface to the front", **_DEGREES)
+    rock_deg: float = parameter(0.0, "Rock", "Rotation in the image plane", **_DEGREES)
+    tilt_deg: float = parameter(0.0, "Tilt", "Rotation out of the image plane", **_DEGREES)
+    rotate_deg: float = parameter(0.0, "Rotate", "Rotation about the axis", **_DEGREES)
+    lift_mm: float = parameter(0.0, "Lift", "Retraction along the axis", unit="mm", bounds=(-20, 50))
 
 
 @dataclass(frozen=True)
@@ -112,10 +112,10 @@ class LesionSettings(Declared):
     """Balls with a rough surface, each in a part of the images: `[lesions]`; all but `each` may be distributions."""
 
     each: int = parameter(4, "Each", "Lesions of every patient, one at a time", bounds=(1, 10_000))
-    tissue: str = parameter("tumour", "Tissue", "What it is", choices=tuple(n for n in LESIONS if n != "brats"))
+    tissue: str = parameter("tumour", "Tissue", "Its tissue", choices=tuple(n for n in LESIONS if n != "brats"))
     radius_mm: float = parameter(10.0, "Radius", "Mean radius", unit="mm", bounds=(2, 50))
-    depth_mm: float = parameter(25.0, "Depth", "Of its middle below the brain's surface", unit="mm", bounds=(0, 80))
-    roughness: float = parameter(0.25, "Roughness", "Deviation of its radius by the radius", bounds=(0, 0.6))
+    depth_mm: float = parameter(25.0, "Depth", "From the brain's surface to the centre", unit="mm", bounds=(0, 80))
+    roughness: float = parameter(0.25, "Roughness", "Relative deviation of the radius", bounds=(0, 0.6))
 
 
 def _entries(*kinds: type) -> dict[str, Parameter]:

@@ -87,7 +87,7 @@ def _simulated(made: Scene, shots: list[Shot], outputs: list[str], noise: list[i
 
 
 def _computed(name: str, made: Scene, shot: Shot, labels: np.ndarray | None) -> np.ndarray:
-    """(rows, columns) of an output that simulate_batch has not; `labels` are those of the pixels, for "walls"."""
+    """(rows, columns) of an output that simulate_batch has not; `labels` of the pixels, for "walls"."""
     if name == "mri" and made.mri is not None:
         return slice_under_probe(made.mri, shot.grid, shot.pose)
     if name == "walls" and labels is not None:
@@ -124,7 +124,7 @@ def along_lines(name: str, labels: Volume, shot: Shot) -> np.ndarray:
 def walls(labels: np.ndarray, shot: Shot) -> np.ndarray:
     """(rows, columns) float32 largest amplitude reflection coefficient of the borders below and right of a pixel.
 
-    `labels` are those of the image's pixels, (rows, columns); 0 outside the imaged field.
+    `labels` of the image's pixels, (rows, columns); 0 outside the imaged field.
     """
     impedance = np.ones(256, np.float32)
     for label, tissue in shot.tissues.items():

@@ -1,6 +1,6 @@
 """PlusCommands: answers commands of OpenIGTLink clients, such as SlicerOpenIGTLink's, as PlusServer does.
 
-Texts and names are those of PlusLib (src/PlusServer and vtkPlusUsImagingParameters, 2.9), which answers COMMAND by
+Texts and names are from PlusLib (src/PlusServer and vtkPlusUsImagingParameters, 2.9), which answers COMMAND by
 RTS_COMMAND. FocusDepthMm is this device's own.
 """
 
@@ -28,7 +28,7 @@ _log = logging.getLogger(__name__)
 ULTRASOUND, CAPTURE, CHANNEL = "VideoDevice", "CaptureDevice", "TrackedVideoStream"
 #: {type that clients ask for: its device}
 _TYPES = {"UsSimulator": ULTRASOUND, "VirtualCapture": CAPTURE, "VirtualVolumeReconstructor": ""}
-#: {name: (section, field, the field's value at 0, its change by 1)}; the gain is that of the panel's slider
+#: {name: (section, field, the field's value at 0, its change by 1)}; the gain as on the panel's slider
 _NUMBERS = {
     "DepthMm": ("probe", "depth_mm", 0.0, 1.0), "FrequencyMhz": ("probe", "frequency_mhz", 0.0, 1.0),
     "FocusDepthMm": ("probe", "focus_mm", 0.0, 1.0), "DynRangeDb": ("display", "dynamic_range_db", 0.0, 1.0),

@@ -34,7 +34,7 @@ class VirtualDevice:
     address : where it listens.
     folder : of recordings.
 
-    The frame Reference is that of the patient, RAS in mm. Raises SimulationError for an address in use.
+    The frame Reference is the patient's RAS in mm. Raises SimulationError for an address in use.
     """
 
     def __init__(

@@ -20,12 +20,11 @@ class FitSettings(Declared):
     )
     free: str = parameter(
         "display, tissues", "Free parameters",
-        'Comma-separated: "display", "tissues" (what the images show of each), a tissue, or a parameter (gain_db, '
-        "white matter.mu0)",
+        'Comma-separated: "display", "tissues", a tissue, or a parameter (gain_db, white matter.mu0)',
     )  # fmt: skip
     estimate: bool = parameter(
         False, "Find the geometry in the images",
-        "Estimate the geometry of the probe from the images; its frequency and beam stay the same",
+        "Estimate the geometry of the probe, but not its frequency and beam, from the images",
         shown=True,
     )  # fmt: skip
     register: bool = parameter(
@@ -35,24 +34,21 @@ class FitSettings(Declared):
     )  # fmt: skip
     evaluations: int = parameter(
         1000, "Evaluations",
-        "Largest number of evaluations of the cost, with restarts; each takes some milliseconds. Registration, speckle "
-        "and prediction take more",
+        "Largest number of evaluations of the cost, with restarts; registration, speckle and prediction take more",
         bounds=(1, 1_000_000), shown=Shown(10, 100_000, 100), option="evaluations",
     )  # fmt: skip
     restarts: int = parameter(
-        2, "Restarts", "Additional searches with other starting points and speckle, to find equally good fits",
+        2, "Restarts", "Additional searches from other starting points, to find equally good fits",
         bounds=(0, 100), option="restarts",
     )  # fmt: skip
     speckle: bool = parameter(
         False, "Also fit the speckle",
-        "Also take the grey map from the real images, and fit the smoothing of the envelope and the tissues' texture "
-        "to the size and number of speckle grains",
+        "Also estimate the grey map, the smoothing and the tissues' texture from the speckle of the real images",
         shown=True, option="speckle/no-speckle",
     )  # fmt: skip
     validate: str = parameter(
         "", "Predict",
-        "Images of the sequence to predict instead of fit, such as 2,6: reports their cost, that of a uniform tissue "
-        "fitted in the same way, and that of neighbouring real images; empty: none",
+        "Images of the sequence to predict instead of fit, such as 2,6; empty: none",
         option="validate",
     )  # fmt: skip
 

@@ -45,7 +45,7 @@ GROUPS = {"smoothing": "smoothing_", "map": "map_", "sliders": "depth_gain_", "l
 ECHOGENICITY = Declaration(
     name="echogenicity_db", type=float, label="Echogenicity", symbol="Var", unit="dB",
     tip="Level of a tissue's speckle, 10 log10 Var, by a common factor of its mu0 and sigma0",
-    fit=Fit(-12.0, 12.0, tolerance=1.5), source="Bounds of a fit: 12 dB about the tissue table's value",
+    fit=Fit(-12.0, 12.0, tolerance=1.5), source="Fit bounds: 12 dB about the tissue table's value",
 )  # fmt: skip
 ATTENUATION = "attenuation_db_cm_mhz"
 

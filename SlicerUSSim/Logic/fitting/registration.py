@@ -101,7 +101,7 @@ def register_poses(
 ) -> Registration:
     """Move all poses together so that simulated and real images agree best.
 
-    Parameters are those of optimization.optimize_appearance. Tissues and display are not changed, so fit them first.
+    Parameters as in optimization.optimize_appearance. Tissues and display are not changed, so fit them first.
     `range_mm` and `range_deg` are the bounds of each parameter.
 
     Raises SimulationError for poses that are not rigid and references that do not fit.

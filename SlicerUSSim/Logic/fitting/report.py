@@ -173,7 +173,7 @@ def _number(value: float) -> str:
 def _speckle(speckle: SpeckleFit) -> str:
     """What the fit of the speckle found, step by step."""
     return f"""<h2>Fit of the speckle</h2>
-<p class="dim">The grey map is that of the images alone. Smoothing and texture are found by T1 + T2 / 2, and smoothing
+<p class="dim">The grey map comes from the images alone. Smoothing and texture are found by T1 + T2 / 2, and smoothing
 once more with the width of the speckle. The fit by the paper's cost started from the values below.</p>
 {_table(["step", "found"], speckle.rows(), "words")}"""
 

@@ -123,7 +123,7 @@ def along_beams(values: np.ndarray, probe: Probe, grid: ImageGrid, order: int = 
     """Pixels (rows, columns) resampled along and across the beams.
 
     Returns (depths, angles) values, beyond the image those of its edge, and (depths,) mm between neighbours across.
-    `order` is that of the splines. A linear array's lines are parallel.
+    `order` of the splines. A linear array's lines are parallel.
     """
     radius = 0.0 if probe.is_linear else probe.apex_radius_mm
     depth = np.arange(0.5 * _STEP_MM, probe.depth_mm, _STEP_MM)

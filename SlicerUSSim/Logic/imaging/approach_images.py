@@ -33,8 +33,8 @@ def simulated_approach(
 ) -> Approach:
     """The candidates with images, in which the target is outlined, and contrasts, from one batch of drafts.
 
-    `simulator` is that of the labels of the plan, which are closed. All openings are made in one label map, which the
-    batch shares. A contrast is that of the displayed levels; None where target or brain around it are not in the field.
+    `simulator` belongs to the labels of the plan, which are closed. All openings are made in one label map, which the
+    batch shares. Contrasts are between displayed levels; None where target or brain around it are not in the field.
     """
     medium, names = simulator.medium, simulator.medium.tissues.names_by_label()
     drafts = UltrasoundSimulator(

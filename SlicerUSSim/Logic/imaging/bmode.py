@@ -109,14 +109,14 @@ def downshift(probe: Probe) -> float:
 
 
 def log_band_above(shift: float) -> float:
-    """log erfc(-f0 / sf) of the transmitted band, whose `shift` is that of `downshift`: twice its part above zero."""
+    """log erfc(-f0 / sf) of the transmitted band, whose `shift` comes from `downshift`: twice its part above zero."""
     return float(np.log(2.0) + log_ndtr(np.sqrt(2.0 / shift))) if shift else float(np.log(2.0))
 
 
 def gain_of_band(shift: float, loss: np.ndarray) -> np.ndarray:
     """By how many nepers the band of a pulse has more amplitude than its centre alone, after `loss` nepers both ways.
 
-    `shift` is that of `downshift`, 0 for a single frequency. Only frequencies above zero count: the Gaussian spectrum
+    `shift` as for `downshift`, 0 for a single frequency. Only frequencies above zero count: the Gaussian spectrum
     about 1 - shift loss has the part erfc(-z) / 2 of its power there, z in its widths
     (docs/physics.md#frequency-that-falls-with-depth).
     """
@@ -202,7 +202,7 @@ def ring_down(probe: Probe, depth_mm: np.ndarray, axial_sigma_mm: float, cycles_
     """(samples,) complex64 baseband signal of the pulse that bounces between the face's layers and the skin.
 
     One echo a pulse length after the other, each weaker by the same factor and of the other sign, since one of the two
-    borders is harder than what is between them. It falls by 40 dB over the probe's ring_down_mm.
+    borders is harder than the tissue between them. It falls by 40 dB over the probe's ring_down_mm.
     """
     if probe.ring_down_mm == 0.0:
         return np.zeros(len(depth_mm), np.complex64)

@@ -216,7 +216,7 @@ def scanner_looks(display: DisplaySettings, probe: Probe) -> tuple[tuple[float, 
     """(share, look) of a display with a probe; the shares add up to 1."""
     if display.look == "even":
         return ((1.0, _EVEN),)
-    if isinstance(probe, LinearProbe):  # a trapezoid's radius is that of where its lines come from
+    if isinstance(probe, LinearProbe):  # a trapezoid's radius reaches to where its lines meet
         return ((1.0, _LINEAR),)
     large = float(np.interp(probe.apex_radius_mm, (_SMALL_RADIUS_MM, _LARGE_RADIUS_MM), (0.0, 1.0)))
     return ((1.0 - large, _SECTOR), (large, _CONVEX))

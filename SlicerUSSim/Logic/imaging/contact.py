@@ -41,7 +41,7 @@ def line_contact(labels: Volume, probe: Probe, probe_to_ras: np.ndarray, gap_mm:
 def touching_share(labels: Volume, probe: Probe, probe_to_ras: np.ndarray, gap_mm: float) -> float:
     """Share of the face, over all of its apertures, that touches the patient, 0 to 1; at 0 no line has an echo.
 
-    The parameters are those of line_contact.
+    Parameters as in line_contact.
     """
     return float(_touching(labels, probe, probe_to_ras, gap_mm)[1].mean())
 

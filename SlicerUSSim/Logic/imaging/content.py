@@ -22,7 +22,7 @@ from SlicerUSSim.Logic.tissue.probability_maps import combined_probability_maps
 from SlicerUSSim.Logic.tissue.schemes import Scheme, recognised
 from SlicerUSSim.Logic.tracked.sequence import is_tracked_sequence
 
-#: More numbers, or more millilitres, are the labels of a brain or a body, and not of a lesion and what is around it
+#: More numbers, or more millilitres, are the labels of a brain or a body, and not of a lesion and its surroundings
 _MOST_OF_LESION, _MOST_LESION_ML = 4, 400.0
 
 

@@ -117,7 +117,7 @@ def _focused_once(
 ) -> tuple[np.ndarray, np.ndarray]:
     """((depths,) mm, and (depths, n) amplitudes so far apart, from the axis on) of a uniform aperture, by Fresnel.
 
-    The field is that of a frequency `octaves` lower, at the distances of this wavelength; the others are (depths,). So
+    The field has a frequency `octaves` lower, at the distances of this wavelength; the others are (depths,). So
     near the face that points are too far apart, it is the shadow of the aperture: that of farther away, as much wider.
     """
     nearest = 1.0 / (1.0 / focus + 0.5 * _POINTS * wavelength / aperture**2)
@@ -133,7 +133,7 @@ def _focused_once(
 def _excess(step: np.ndarray, pattern: np.ndarray, sigma: np.ndarray, at: np.ndarray) -> np.ndarray:
     """By how much a pattern has more power beyond the distances `at` (depths, ...) than a Gaussian.
 
-    The pattern (depths, n) is at distances `step` (depths,) apart, from the axis on; `sigma` (depths,) is that of the
+    The pattern (depths, n) is at distances `step` (depths,) apart, from the axis on; `sigma` (depths,) of the
     Gaussian's amplitude. The excess falls with the distance, to 0; what is near the axis belongs to the main beam.
     """
     inside = 0.5 * (pattern + pattern[:, :1])

@@ -54,7 +54,7 @@ class FoundSheets:
 def found_sheets(
     surfels: Surfels, padded: np.ndarray, grid: Volume, fluids: tuple[int, ...], tissues: TissueTable
 ) -> FoundSheets:
-    """Lay sheets over a label map. Whether they are those of this patient is up to the caller.
+    """Lay sheets over a label map. The caller ensures that they belong to this patient.
 
     Parameters
     ----------
@@ -71,7 +71,7 @@ def found_sheets(
     extent = _fluid_beside(surfels, padded, grid, fluids)
     is_gap = np.isin(surfels.kind, [KINDS.index(kind) for kind in ("sulcus", "falx", "tentorium")])
     is_wide = is_gap & (extent >= _WIDE_MM - 1e-6).any(axis=1)
-    # Walls of a cistern are drawn as such; a line in its middle is that of a sheet only if it is dura.
+    # Walls of a cistern are drawn as such; a line in its middle belongs to a sheet only if it is dura.
     kept = ~(is_wide & (surfels.kind == KINDS.index("sulcus")))
     surfels, extent, closes = surfels.chosen(kept), extent[kept], (is_gap & ~is_wide)[kept]
     labels, closed = _closed(surfels.chosen(closes), extent[closes], padded, grid, fluids)

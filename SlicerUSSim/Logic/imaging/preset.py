@@ -124,7 +124,7 @@ class Preset:
     def to_texts(self) -> dict[str, str]:
         """{name: text} of all values, so that what is kept does not change with the defaults of a later version.
 
-        Names are those of preset_parameters, and "tissues.2" for label 2 or "membrane.fluids", whose values are JSON:
+        Names as in preset_parameters, and "tissues.2" for label 2 or "membrane.fluids", whose values are JSON:
         null for what this preset lacks. The pose is left out.
         """
         values, declared = _flat(self), preset_parameters()

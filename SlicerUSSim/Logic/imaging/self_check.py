@@ -199,7 +199,7 @@ def difference(one: np.ndarray, other: np.ndarray) -> str:
 def _physics(device: Device) -> Iterator[Finding]:
     """Speed, attenuation and speckle in one image of a plate (docs/physics.md#3-rays, #5-scatterers).
 
-    Attenuation is that of the centre frequency: without the downshift of the band the level falls by 2 a f d.
+    Attenuation at the centre frequency: without the downshift of the band the level falls by 2 a f d.
     """
     probe, settings = PROBES["linear"], SimulationSettings(frequency_downshift=False)
     labels = np.zeros((46, 21, 61), np.uint8)  # label 0 continues beyond the volume

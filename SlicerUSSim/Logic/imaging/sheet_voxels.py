@@ -76,7 +76,7 @@ def _planes(surfels: Surfels, tree: Any, voxels: np.ndarray, grid: Volume, reach
     count = min(_NEIGHBOURS, len(surfels))
     _, nearest = tree.query(centres, count, workers=-1)
     nearest = nearest.reshape(len(centres), count)
-    # The sheet is that of the surfel whose disc is nearest; its neighbours smooth it.
+    # The sheet belongs to the surfel whose disc is nearest; its neighbours smooth it.
     apart = surfels.place[nearest] - centres[:, None]
     normals = surfels.normal[nearest]
     across = np.einsum("nkx,nkx->nk", apart, normals)

@@ -327,7 +327,7 @@ class UltrasoundSimulator:
     ) -> np.ndarray:
         """(rows, columns) uint8 image of echoes that were kept, without earlier images (display.persistence).
 
-        `probe`, `settings` and `noise_seed` are those of the echoes; the patient of this simulator does not matter.
+        `probe`, `settings` and `noise_seed` belong to the echoes; the patient of this simulator does not matter.
         """
         with self._lock:
             own, self.settings = self.settings, replace(settings, contact_gap_mm=None)  # which the echoes have already
@@ -547,7 +547,7 @@ class UltrasoundSimulator:
     ) -> DeviceFrame:
         """The inputs of the stages of one frame; its record is written to `buffer`, by default a new one.
 
-        Of full quality, unless probe and `settings` (default: the simulator's) are those of quality.worked.
+        Of full quality, unless probe and `settings` (default: the simulator's) come from quality.worked.
         """
         display, settings = _DEFAULT_DISPLAY if display is None else display, settings or self.settings
         require(isinstance(display, DisplaySettings), f"display is {display!r:.80}, expected DisplaySettings")

@@ -132,7 +132,7 @@ def _smooth_maps(atlas: Atlas) -> tuple[np.ndarray, tuple[np.ndarray, ...]]:
 
 
 def _block_means(array: np.ndarray, shrink: np.ndarray) -> np.ndarray:
-    """(k, j, i) float32 means of blocks of `shrink` voxels; what is left over at the far ends is cut off."""
+    """(k, j, i) float32 means of blocks of `shrink` voxels; the remainder at the far ends is cut off."""
     counts = [size // step for size, step in zip(array.shape, shrink, strict=True)]
     cut = array[tuple(slice(0, n * step) for n, step in zip(counts, shrink, strict=True))]
     shape = [n for pair in zip(counts, shrink, strict=True) for n in pair]

@@ -244,7 +244,7 @@ def _named(
         channel = next(n for n, contrast in enumerate(contrasts) if contrast in _BRIGHT_NAMES)
         brightest = mixture.means[:, channel].max()
         bright = points.values[:, channel] > brightest + 2.0 * deviation[channel]
-    # By the contrast that tells tissues apart best: what is dark in T1 and in T2 is nearest to white matter in T2.
+    # By the contrast that tells tissues apart best: tissue dark in T1 and in T2 is nearest to white matter in T2.
     best = _best_channel(contrasts)
     away = np.abs(points.values[:, best] - mixture.means[:, best, None])
     nearest = away.argmin(axis=0)

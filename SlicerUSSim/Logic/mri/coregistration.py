@@ -17,7 +17,7 @@ _COARSE_MM = 3.0
 #: and from how many of the best starts is searched
 _NODS, _TURNS, _MOST_SEARCHES = (-24.0, -12.0, 0.0, 12.0, 24.0), (-10.0, 0.0, 10.0), 6
 #: Least share of the brain in which the other volume has to have data. With T1 and T2 of a patient, where the T2 has
-#: none, 0.86 of the labels are those of the T1 alone; its own mask may be tighter, and CSF may be clipped.
+#: none, 0.86 of the labels agree with the T1 alone; its own mask may be tighter, and CSF may be clipped.
 _LEAST_COVER = 0.75
 #: Mutual information from which no further start is tried
 _FOUND = 0.2

@@ -69,12 +69,12 @@ def find_body(hu: np.ndarray, ct: Volume) -> np.ndarray:
 
 
 def _eroded(mask: np.ndarray, times: int) -> np.ndarray:
-    """Eroded by cells; what is beyond the ends of the image counts as inside, so that a cut body stays whole."""
+    """Eroded by cells; space beyond the ends of the image counts as inside, so that a cut body stays whole."""
     return cast(np.ndarray, ndimage.binary_erosion(mask, _BALL, times, border_value=1))
 
 
 def _cut_couch(inside: np.ndarray, hu: np.ndarray, ct: Volume) -> None:
-    """Take out what is beyond the surface of a couch that touches the patient at the first rows.
+    """Remove everything beyond the surface of a couch that touches the patient at the first rows.
 
     A couch is the same in all slices. On both sides of the patient its surface is seen; a parabola through it continues
     below.

@@ -83,7 +83,7 @@ def classified(
         outside, radius = sitk.GetImageFromArray((~body).astype(np.uint8)), np.rint(skin_mm / ct.spacing_mm)
         near = sitk.GetArrayFromImage(sitk.BinaryDilate(outside, radius.astype(int).tolist(), sitk.sitkBall)) > 0
         classes[body & near & ~np.isin(classes, (SPONGY, BONE, METAL))] = SKIN
-        soft = classes == SOFT  # what is left of thicker skin
+        soft = classes == SOFT  # the rest of thicker skin
         classes[soft & largest_around(classes == SKIN) & ~largest_around(smallest_around(soft))] = SKIN
     return classes
 

@@ -35,7 +35,7 @@ class Evidence:
     #: First voxel (k, j, i) of the box, and (k, j, i) size of the MRI
     start: tuple[int, int, int]
     shape: tuple[int, int, int]
-    #: (3, channels) mean of CSF, grey and white matter; (channels,) standard deviation of what is left of the noise
+    #: (3, channels) mean of CSF, grey and white matter; (channels,) standard deviation of the remaining noise
     means: np.ndarray
     deviations: np.ndarray
     #: The registered atlas; None without one

@@ -39,7 +39,7 @@ def guided_filter(
 ) -> np.ndarray:
     """(k, j, i) float32 self-guided filter of `image` inside the boolean `mask` (He et al., ECCV 2010).
 
-    `radius` is that of the box window in voxels, `epsilon` the variance below which a window counts as homogeneous. The
+    `radius` of the box window in voxels, `epsilon` the variance below which a window counts as homogeneous. The
     models of overlapping windows are weighted by the inverse of their variance, not equally.
     Outside the mask the result is 0. A radius of 0 returns the image.
     """

@@ -71,7 +71,7 @@ def volume_doubts(millilitres: float) -> tuple[str, ...]:
         return ()
     return (
         f"the brain has {millilitres:.0f} ml, expected {USUAL_ML[0]:.0f} to {USUAL_ML[1]:.0f} ml of an adult; check "
-        "the mask: what is outside it has no tissue (a lesion is added with --add tumour=FILE)",
+        "the mask: the space outside it has no tissue (a lesion is added with --add tumour=FILE)",
     )
 
 

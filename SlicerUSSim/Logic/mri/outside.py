@@ -2,7 +2,7 @@
 
 Bone, its tables at least, and air give no signal; fat, muscle and marrow do. As in Dogdas, Shattuck and Leahy,
 "Segmentation of skull and scalp in 3-D human MRI using mathematical morphology" (Human Brain Mapping 26, 2005), the
-skull is what is dark between the brain and the scalp, closed over its marrow. Bone and air look alike: what is dark
+skull is the dark space between the brain and the scalp, closed over its marrow. Bone and air look alike: dark space
 farther from the brain is air.
 """
 
@@ -29,7 +29,7 @@ CONTRASTS = ("t1", "t1gd")
 _AIR, _DARK = 0.35, 0.8
 #: Gaps of the head's outline that are closed: mouth, ears, sinuses
 _OUTLINE_MM = 10.0
-#: Sulci over which the inner surface of the skull goes, and the dura with what is between it and the brain
+#: Sulci over which the inner surface of the skull goes, and the dura with the space between it and the brain
 _SULCUS_MM, _DURA_MM = 5.0, 1.0
 #: Bright tissue beside the brain, from which the threshold is found
 _BESIDE_MM = (2.0, 30.0)
@@ -43,7 +43,7 @@ _CUT_CM2 = 4.0
 _FACES_MM = 8.0
 #: Tables of the skull over its marrow
 _TABLE_MM = 1.2
-#: Air in the head, other than cracks between tissues; it is darker than this part of what is dark, as bone between fat
+#: Air in the head, except for cracks between tissues: darker than this part of the dark voxels, as bone between fat
 #: and marrow is not
 _CAVITY_MM, _VOID = 1.5, 0.6
 
@@ -63,13 +63,13 @@ class Outside:
         """One line for the user: "outside the brain: skin 240 ml, scalp 1100 ml, ..."."""
         counts = np.bincount(self.labels.ravel(), minlength=len(OUTSIDE) + 1)[1:]
         parts = [f"{name} {count * voxel_ml:.0f} ml" for name, count in zip(OUTSIDE, counts, strict=True)]
-        line = f"outside the brain: {', '.join(parts)}; bone is what is darker than {self.dark:.4g}"
+        line = f"outside the brain: {', '.join(parts)}; bone is darker than {self.dark:.4g}"
         return f"{line}, and so is CSF between brain and skull"
 
     def over(self, labels: Volume, names: Sequence[str]) -> tuple[Volume, tuple[str, ...]]:
         """(labels with those outside the brain after them, names of all labels from 1 on).
 
-        `labels` (k, j, i) are those of the brain, which go first.
+        `labels` (k, j, i) of the brain, which go first.
         """
         present = [n for n in range(1, len(OUTSIDE) + 1) if (self.labels == n).any()]
         lookup = np.zeros(len(OUTSIDE) + 1, labels.array.dtype)
@@ -112,7 +112,7 @@ def find_outside(
     margin = [slice(max(box.start - 2, 0), box.stop + 2) for box in ndimage.find_objects(head.astype(np.uint8))[0]]
     box = tuple(margin)
     image, head, brain, mm = image[box], head[box], brain[box], mri.spacing_mm
-    inner = _within(_closed(brain, _SULCUS_MM, mm), _DURA_MM, mm)  # with sulci, dura and what is between
+    inner = _within(_closed(brain, _SULCUS_MM, mm), _DURA_MM, mm)  # with sulci, dura and the space between
     progress(0.46)
     from_brain = distance_to(inner, mm)
     beside = image[head & (from_brain > _BESIDE_MM[0]) & (from_brain < _BESIDE_MM[1])]
@@ -195,7 +195,7 @@ def _within(mask: np.ndarray, distance_mm: float, mm: np.ndarray) -> np.ndarray:
 
 
 def _depth(mask: np.ndarray, mm: np.ndarray) -> np.ndarray:
-    """(k, j, i) distance in mm to what is outside; it keeps growing beyond the image."""
+    """(k, j, i) distance in mm to the outside; it keeps growing beyond the image."""
     return distance_to(~mask, mm)
 
 
@@ -212,13 +212,13 @@ def _closed(mask: np.ndarray, radius_mm: float, mm: np.ndarray) -> np.ndarray:
 # ---- the outer surface of the skull: a smooth layer over the brain, from dark bone to bright scalp -------------------
 # The outer table of the skull is as thin as a voxel, between marrow and fat, which are both bright. A skull is smooth,
 # so its thickness over the brain is found for all places together: where the image rises from dark to bright outward,
-# near the usual thickness, and alike in neighbours. The profiles along normals of the brain are those of Smith, Human
+# near the usual thickness, and alike in neighbours. The profiles along normals of the brain are from Smith, Human
 # Brain Mapping 17, 2002.
 
 #: Places over the brain, mm apart, and thicknesses that are tried, mm
 _PLACES_MM, _STEP_MM = 4.0, 0.5
 LEAST_MM, LARGEST_MM = 2.5, 14.0
-#: Usual distance from the brain's surface to that of the skull with what is between, and its deviation over heads and
+#: Usual distance from the brain's surface to that of the skull with the space between, and its deviation over heads and
 #: places (skulls of adults: 3 mm at the temples to 9 mm at the back; Lillie et al., Journal of Anatomy 228, 2016)
 _USUAL_MM, _DEVIATION_MM = 5.5, 3.0
 #: Width of the search across a border

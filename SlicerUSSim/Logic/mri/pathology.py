@@ -256,7 +256,7 @@ def _label_of(tissue: str, array: np.ndarray, names: Sequence[str]) -> tuple[int
 
 
 def _mm_outside(patient: np.ndarray, grid: Volume, masks: Masks) -> float:
-    """Least distance of what is inside the masks from the patient, bool (k, j, i) on a grid."""
+    """Least distance of the voxels in the masks from the patient, bool (k, j, i) on a grid."""
     from scipy.spatial import KDTree  # not needed for an image without masks
 
     points = masks.union.ijk_to_ras[:3, :3] @ np.argwhere(masks.inside)[:, ::-1].T + masks.union.ijk_to_ras[:3, 3:]

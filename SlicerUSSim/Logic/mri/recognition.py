@@ -61,7 +61,7 @@ def require_no_ct(mri: Volume) -> None:
 def check_finite(mri: Volume, name: str = "MRI", remedy: str = "for example by 0 outside the head") -> None:
     """Raise SimulationError if voxels are not finite, naming how many and the first (i, j, k), or all are equal.
 
-    `name` is that of the image, and `remedy` by what to replace such voxels.
+    `name` of the image; `remedy`: by what to replace such voxels.
     """
     values = mri.array
     if np.issubdtype(values.dtype, np.floating):

@@ -163,8 +163,8 @@ def segment_mri(
     thin_sulci : also label the middle of sulci that are too narrow to reach CSF intensity, one voxel thick, as an extra
         tissue "leptomeninges" within the grey matter. Ultrasound shows these sulci, but intensity classes miss them.
         Voxels of more than 3.5 mm do not show them, which the notes state.
-    outside : also label what is outside the brain of a whole head (t1, t1gd), after all others: see
-        outside.find_outside. Probabilities are those of the brain.
+    outside : also label the tissues outside the brain of a whole head (t1, t1gd), after all others: see
+        outside.find_outside. Probabilities cover the brain alone.
     skull_strip : how the brain is found without a `mask`; see brain.find_brain.
 
     Raises SimulationError for an unknown contrast or number of classes, an image that is constant or not finite or has
@@ -215,7 +215,7 @@ def segment_mri(
         )
     require(
         not settings.outside or brain.method != "stripped",
-        "image is a brain without its head (skull-stripped), and what is outside the brain (--outside) is found in a "
+        "image is a brain without its head (skull-stripped), and tissue outside the brain (--outside) is found in a "
         "whole head",
     )
     # Blocks of coarse images begin at the first voxel: in any order of voxels but this, others would
@@ -338,7 +338,7 @@ def _called(name: str, volume: object) -> str:
 
 
 def _require_intensities(volume: Volume, name: str) -> None:
-    """Raise SimulationError for a label map, or what is left of one."""
+    """Raise SimulationError for a label map, or the remains of one."""
     check_intensities(volume, name)
     why = not_intensities(volume)
     require(why is None, f"{name} {why}")
@@ -358,7 +358,7 @@ _EVIDENCE = 0.9
 def smoothed_posteriors(posteriors: np.ndarray, inside: np.ndarray, weight: float = _WEIGHT) -> np.ndarray:
     """(classes, voxels) posteriors of the voxels `inside` (k, j, i), led by those of their six neighbours.
 
-    Mean field: the log-odds of every voxel are those of its intensity plus `weight` times the sum of the neighbours'
+    Mean field: every voxel has the log-odds of its intensity plus `weight` times the sum of the neighbours'
     posteriors. Voxels whose intensity leaves no doubt keep theirs.
     """
     open_ = np.flatnonzero(posteriors.max(axis=0) < _SURE)

@@ -21,31 +21,30 @@ class SegmentationSettings(Declared):
     """Parameters of segmentation.segment_mri and ct.segment_ct, other than the image and its mask."""
 
     contrast: str = parameter(
-        "t1", "Contrast", "Contrast of the MRI, which gives the order of the tissues by intensity; ct: a CT in "
-        "Hounsfield units", choices=(*MRI_CONTRASTS, CT), shown=True, option="contrast",
-        note="The other parameters but the filter's are of MRIs",
+        "t1", "Contrast", "Contrast of the MRI; ct: a CT in Hounsfield units", choices=(*MRI_CONTRASTS, CT), shown=True,
+        option="contrast", note="For a CT, only the parameters of the filter apply",
     )  # fmt: skip
     classes: int | None = parameter(
-        None, "Classes", "Number of tissues to distinguish by intensity: 3, or 4 with t1gd and flair; none: 3, and 4 "
-        "with t1gd", bounds=(3, 4), shown=Shown(2, 4, none_at=2), option="classes",
+        None, "Classes", "Number of tissues by intensity: 3, or 4 with t1gd and flair; none: 3, and 4 with t1gd",
+        bounds=(3, 4), shown=Shown(2, 4, none_at=2), option="classes",
     )  # fmt: skip
     skull_strip: str = parameter(
-        "atlas", "Brain extraction", "How the brain is found in a whole head; none: everything brighter than the "
-        "background is brain", option="skull-strip", shown=True, choices=("atlas", "none"),
+        "atlas", "Brain extraction", "How the brain is found in a head; none: everything brighter than the background "
+        "is brain", option="skull-strip", shown=True, choices=("atlas", "none"),
     )  # fmt: skip
     thin_sulci: bool = parameter(
         True, "Label thin sulci",
-        "Label sulci too narrow to reach CSF intensity as leptomeninges, one voxel thick",
+        "Label sulci too narrow to show CSF as leptomeninges, one voxel thick",
         option="thin-sulci/no-thin-sulci",
     )  # fmt: skip
     outside: bool = parameter(
         False, "Label tissues outside the brain",
-        "Also label skin, scalp, skull, its marrow and air in the T1 of a whole head, so that a probe stands on the "
-        "skin", shown=True, option="outside/no-outside",
+        "Also label skin, scalp, skull, its marrow and air in the T1 of a head, for a probe on the skin", shown=True,
+        option="outside/no-outside",
     )  # fmt: skip
     bias_correction: bool | None = parameter(
-        None, "Correct the bias field", "Remove the bias field, for scans with an intensity gradient; none: decided "
-        "from the image", option="bias-correction/no-bias-correction",
+        None, "Correct the bias field", "Remove an intensity gradient of the scan; none: decided from the image",
+        option="bias-correction/no-bias-correction",
     )  # fmt: skip
     filter_radius: int = parameter(
         1, "Filter radius", "Radius of the guided filter; 0: none", unit="voxels", bounds=(0, 64), option="radius"
@@ -74,23 +73,19 @@ class SheetSettings(Declared):
     """What a scene looks for with sheets.find_sheets, and what its images show of it."""
 
     find: bool = parameter(
-        False, "Find sheets and vessels", "Segment also finds sulci, falx, tentorium, walls of the ventricles, "
-        "corpus callosum, choroid plexus and vessels, in a T1 or T2 (about a minute); off: images have the lines of "
-        "the labels, as in the paper", shown=True,
+        False, "Find sheets and vessels", "Segment also finds sheets, choroid plexus and vessels, in a T1 or T2 (about "
+        "a minute); off: images have the lines of the labels, as in the paper", shown=True,
     )  # fmt: skip
     sulcus: bool = parameter(True, "Sulci", "Sulci as thin sheets, also closed ones")
     falx: bool = parameter(True, "Falx", "Falx as a thin sheet")
     tentorium: bool = parameter(True, "Tentorium", "Tentorium as a thin sheet")
     ependyma: bool = parameter(True, "Ependyma", "Walls of the ventricles as thin sheets")
-    corpus_callosum: bool = parameter(
-        True, "Corpus callosum", "Corpus callosum as a separate tissue, from the next Segment on"
-    )
+    corpus_callosum: bool = parameter(True, "Corpus callosum", "Corpus callosum as a tissue, from the next Segment on")
     choroid_plexus: bool = parameter(
-        True, "Choroid plexus", "Choroid plexus as enhancing tissue, in a T1 with contrast agent alone; from the next "
-        "Segment on",
+        True, "Choroid plexus", "Choroid plexus as enhancing tissue in a T1 with gadolinium, from the next Segment on",
     )  # fmt: skip
     vessels: bool = parameter(
-        True, "Vessels", "Vessels as enhancing tissue, in a T1 with contrast agent alone; from the next Segment on",
+        True, "Vessels", "Vessels as enhancing tissue in a T1 with gadolinium, from the next Segment on",
     )  # fmt: skip
 
     @property

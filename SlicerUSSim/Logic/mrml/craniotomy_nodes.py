@@ -34,7 +34,7 @@ def is_opened(labels_node: Any) -> bool:
 
 
 def set_closed_labels(labels_node: Any, closed_node: Any | None) -> None:
-    """Record that labels are those of another node with an opening, or that they no longer are; hides the piece."""
+    """Record that labels are another node's with an opening, or that they no longer are; hides the piece."""
     labels_node.SetNodeReferenceID(_CLOSED, None if closed_node is None else closed_node.GetID())
     hide_flap(labels_node)
 

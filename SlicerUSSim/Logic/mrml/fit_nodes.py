@@ -49,8 +49,8 @@ def tracked_images(
 ) -> TrackedImages:  # fmt: skip
     """Real images from a sequence of volumes, from a volume of one slice, or a slice of a 3D volume under the probe.
 
-    The poses of a sequence are those of its browser's transforms at the same times. With `estimate_geometry` the
-    geometry of the probe is estimated from the images; its other parameters are those of `probe`. `apart` are numbers
+    A sequence has the poses of its browser's transforms at the same times. With `estimate_geometry` the
+    geometry of the probe is estimated from the images; `probe` gives its other parameters. `apart` are numbers
     of images that are prepared beside those of the default choice.
     Raises SimulationError for nodes without such images and as TrackedImages does.
     """

@@ -78,7 +78,7 @@ def labels_version(labels_node) -> Hashable:
 def read_labels(labels_node, tissues: TissueTable, *, of_ct: bool = False) -> LabelledTissues:
     """The content of a label map or segmentation, with one label for every tissue of its names.
 
-    The names are those of segments, or of a label map's colours. They are looked up in `tissues`, then in the presets.
+    Names of segments or of a label map's colours are looked up in `tissues`, then in the presets.
     A label whose colour has no tissue's name, or only the name in Slicer's default table, is the tissue with that
     label in `tissues`; if these are the brain's, or do not have it, the numbers of other programs are recognised
     (label_maps.read_label_map). With `of_ct` it has organs of a CT, whose numbers are not those of `tissues`.

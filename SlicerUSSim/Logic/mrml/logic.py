@@ -42,7 +42,7 @@ class _Of(Generic[P, R]):
 class UltrasoundSceneLogic:
     """Simulates on the nodes of one scene.
 
-    Every method is that of the part with its subject. The choices (`preset`, and the nodes of the module) are saved in
+    Every method belongs to the part with its subject. The choices (`preset`, and the nodes of the module) are saved in
     the scene, see parameter_node. All methods raise SimulationError for a node that is missing, empty, of the wrong
     kind or under a transform that is not linear.
 

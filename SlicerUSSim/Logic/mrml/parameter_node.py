@@ -1,7 +1,7 @@
 """The choices of the Slicer module, saved with the scene.
 
 The parameters are stored in the module's vtkMRMLScriptedModuleNode, in the format of Slicer's parameterNodeWrapper.
-Scenes can therefore be exchanged between scripts and the module. Values are those of declared dataclasses
+Scenes can therefore be exchanged between scripts and the module. Values belong to declared dataclasses
 (base/declaration.py): all parameters declared there are saved.
 """
 
@@ -35,18 +35,17 @@ class PanelSettings(Declared):
 
     show_in_slice: bool = parameter(
         True, "Slice view",
-        "Move the slice view to the image plane and overlay the image, with every new image", shown=True,
+        "Move the slice view to the image plane and overlay the image", shown=True,
     )  # fmt: skip
     show_in_3d: bool = parameter(True, "3D", "Show the slice view with the image in the 3D views as well", shown=True)
     show_probe: bool = parameter(True, "Probe", "Show a model of the probe in the 3D views", shown=True)
     second_contrast: str = parameter(
-        "none", "Second contrast", "Contrast of the second MRI, which is classified together with the first",
+        "none", "Second contrast", "Contrast of the second MRI of this patient",
         choices=("none", *MRI_CONTRASTS), shown=True,
     )  # fmt: skip
     gel: bool = parameter(
-        True, "Gel on the skin", "Where tissues have skin, and Contact gap is none, gel fills gaps of up to 3 mm "
-        "between skin and probe, and lines without contact are dark; off: the coupling medium is everywhere",
-        shown=True,
+        True, "Gel on the skin", "Where tissues have skin and Contact gap is none, gel fills gaps of up to 3 mm, and "
+        "lines without contact are dark; off: the coupling medium is everywhere", shown=True,
     )  # fmt: skip
     craniotomy_mm: float | None = parameter(
         None, "Craniotomy", "Diameter of the opening under the probe; none: as wide as its face needs",
@@ -61,12 +60,12 @@ class PanelSettings(Declared):
         "farther out", choices=(SMALLER, LARGER), shown=True,
     )  # fmt: skip
     target: str = parameter(
-        LARGEST, "Target", "Target of Plan: the largest lesion, the largest of a tissue, or a point that is "
-        "clicked in a slice view", choices=(LARGEST, *LESION_TISSUES, POINT), shown=True,
+        LARGEST, "Target", "Target of Plan: a lesion, the largest of a tissue, or a point in a slice view",
+        choices=(LARGEST, *LESION_TISSUES, POINT), shown=True,
     )  # fmt: skip
     keep_in_opening: bool = parameter(
-        False, "Keep in the opening, aimed at the target", "A probe that is moved stays on the brain in the opening of "
-        "the approach, and looks at its target", shown=True,
+        False, "Keep in the opening, aimed at the target", "A moved probe stays in the opening of the approach, and "
+        "looks at the target", shown=True,
     )  # fmt: skip
     view: str = parameter(
         next(iter(VIEWS)), "Standard view", "; ".join(f"{name}: {view.tip}" for name, view in VIEWS.items()),
@@ -80,8 +79,8 @@ class PanelSettings(Declared):
         "found in the real images", shown=True,
     )  # fmt: skip
     preset_pose: bool = parameter(
-        False, "Pose in presets", "Save preset saves the pose of the probe, too; a preset with a pose moves the probe "
-        "there when it is loaded", shown=True,
+        False, "Pose in presets", "Save preset also saves the pose of the probe; loading it moves the probe there",
+        shown=True,
     )  # fmt: skip
 
     def _owner(self) -> str:

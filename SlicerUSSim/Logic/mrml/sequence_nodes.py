@@ -115,7 +115,7 @@ def add_sequence(
 ):  # fmt: skip
     """(browser, images): a vtkMRMLSequenceBrowserNode and the vtkMRMLSequenceNode of the images in `scene`.
 
-    The images are in pixels, under the recorded transforms to the world (RAS); `path` and `to_ras` (4, 4) are those of
+    The images are in pixels, under the recorded transforms to the world (RAS); `path` and `to_ras` (4, 4) as for
     TrackedImages.of. Images that were not tracked are omitted. `poses`, one probe_to_ras (4, 4) for each remaining
     image, become a sequence for `probe_transform_node`, which follows the browser, and has the reference POSES. The
     index of all three sequences is the images' times (with unique values, see SequenceIndex); the original time of an
@@ -162,7 +162,7 @@ def add_poses(scene, poses: Sequence[np.ndarray], name: str):
 
 
 def _browser(scene, name: str, transforms: Any):
-    """A browser whose master sequence is that of the transforms."""
+    """A browser whose master sequence has the transforms."""
     browser = scene.AddNewNodeByClass("vtkMRMLSequenceBrowserNode", scene.GenerateUniqueName(f"{name} browser"))
     browser.SetAndObserveMasterSequenceNodeID(transforms.GetID())
     return browser

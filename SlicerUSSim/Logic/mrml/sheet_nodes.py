@@ -45,7 +45,7 @@ def holds_sheets(model_node) -> bool:
 def read_sheets(model_node, world_to_labels: np.ndarray, kinds: Iterable[str]) -> Surfels:
     """Sheets of some kinds, in the frame to which a (4, 4) linear transform leads from the world.
 
-    Places and normals are those of the squares, which a hardened transform moves. Raises SimulationError for another
+    Places and normals belong to the squares, which a hardened transform moves. Raises SimulationError for another
     node, and for a model of something else.
     """
     require_node(model_node, "vtkMRMLModelNode", use="sheets")

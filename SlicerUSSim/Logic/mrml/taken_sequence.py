@@ -45,7 +45,7 @@ def write_taken(images_node, index: SequenceIndex, taken: Sequence[TakenImage]) 
 def read_taken(images_node, number: int, anatomy: Hashable = None) -> TakenImage:
     """The image with this number of a sequence that write_taken filled. Raises SimulationError for another one.
 
-    `anatomy` is that of all its images, if it is known.
+    `anatomy` of all its images, if it is known.
     """
     count = images_node.GetNumberOfDataNodes()
     require(0 <= number < count, f"{named(images_node)} has {count} images, expected one with the number {number}")

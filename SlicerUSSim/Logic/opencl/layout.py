@@ -22,7 +22,7 @@ CONSTANTS = {
     "ON_SHEET": 0x40,  # added to the label of a scatterer in a sheet of the dura's own tissue (scattering.cl)
     "MAX_TISSUES": 64,
     # Of the Gaussians that smooth the indicators of acoustic groups (borders.py), in voxels: at full resolution, and
-    # after that at half the resolution. The variances are those of the Gaussians that they resemble near their centre:
+    # after that at half the resolution. The variances belong to the Gaussians that they resemble near their centre:
     # more than of their taps, since they are cut off
     "WIDE_SIGMA": 3.0,
     "WIDE_VARIANCE": 8.91,

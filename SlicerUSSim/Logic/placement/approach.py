@@ -26,7 +26,7 @@ from SlicerUSSim.Logic.tissue.names import labels_of
 #: Names of the parts of a path without a tissue: fluid near the surface, and deep in the brain
 SULCI, VENTRICLE = "sulci", "ventricle or cistern"
 _FLUID, _VESSELS = ("csf", "leptomeninges"), ("blood", "enhancing")
-#: Fluid is that of sulci up to so far below the brain's surface along the path, mm
+#: Fluid counts as sulci up to so far below the brain's surface along the path, mm
 _SULCUS_MM = 15.0
 #: A point where no lesion is labelled stands for a ball of this radius, mm
 _POINT_MM = 3
@@ -149,7 +149,7 @@ def plan_approach(
 ) -> Approach:
     """Compare straight paths to a target, and return up to `offered` of the best, which are at least 25 mm apart.
 
-    `labels` 1, 2, ... called `names` are those of a closed head or of a brain alone. `what` is the target, see
+    `labels` 1, 2, ... called `names` show a closed head or of a brain alone. `what` is the target, see
     find_target; errors as there, and for a target outside the brain. The face of the probe stands on the brain; without
     a head nothing is opened, and entries are on the brain. imaging.approach_images adds images and contrasts.
     It is a simulation and no medical advice.
@@ -297,7 +297,7 @@ def _directions(count: int) -> np.ndarray:
 
 
 def _aimed(face: np.ndarray, target: Target) -> np.ndarray:
-    """(4, 4) of a probe: the right of the image is that of the patient, or the back where it looks from the side."""
+    """(4, 4) of a probe: the right of the image is the patient's right, or the back where it looks from the side."""
     depth = target.centre_ras - face
     from_side = abs(depth[0]) > 0.8 * np.linalg.norm(depth)
     return pose_looking_at(face, target.centre_ras, (0.0, -1.0, 0.0) if from_side else (1.0, 0.0, 0.0))

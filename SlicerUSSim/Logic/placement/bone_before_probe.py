@@ -42,7 +42,7 @@ def about_bone(
     """Lines about a probe at a pose (4, 4) on labels 1, 2, ... called `names`: bone before it, or a face that does not
     fit an opening. None where no skull is labelled, and of images that show the brain.
 
-    `tissues` are those of the names. `is_open` says that the labels have an opening.
+    `tissues` of the names. `is_open` says that the labels have an opening.
     """
     if "skull" not in names:
         return ()

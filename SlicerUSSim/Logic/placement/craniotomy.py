@@ -49,7 +49,7 @@ def without_outside(labels: Volume, names: Sequence[str]) -> Volume:
 
 
 def require_brain(names: Sequence[str]) -> None:
-    """Raise SimulationError if tissues are those of a body without a brain, such as a spine or an abdomen."""
+    """Raise SimulationError if tissues belong to a body without a brain, such as a spine or an abdomen."""
     require(
         not set(_OF_BRAIN).isdisjoint(names) or set(_OF_BODY).isdisjoint(names),
         f"the labels have no tissue of a brain (they have {', '.join(names)}), expected those of a head",
@@ -112,8 +112,8 @@ def polygon_opening(labels: Volume, names: Sequence[str], points_ras: np.ndarray
     away = float(np.median([np.linalg.norm(patient - point, axis=1).min() for point in drawn]))
     if away > _NEAR_POLYGON_MM:
         _log.warning(
-            "the points of the polygon lie %.0f mm from the patient, %.0f or less of one that was drawn there; what is "
-            "below them is opened: check that it belongs to this patient", away, _NEAR_POLYGON_MM,
+            "the points of the polygon lie %.0f mm from the patient, %.0f or less of one that was drawn there; the "
+            "tissue below them is opened: check that it belongs to this patient", away, _NEAR_POLYGON_MM,
         )  # fmt: skip
     return inside & (places[..., 1] < deepest)
 

@@ -42,18 +42,18 @@ _WORTH_MM = 2
 #: coronal images are seen from the front, with the patient's right on their left
 VIEWS = {
     "temporal": View(
-        "axial, through the right temporal bone: midline, ventricles, the other hemisphere; 2 MHz",
+        "axial, through the right temporal bone; 2 MHz",
         (1.0, 0.1, 0.1), (0.0, -1.0, 0.0), _WINDOW_MM,
     ),
     "temporal-left": View(
         "the same through the left temporal bone", (-1.0, 0.1, 0.1), (0.0, -1.0, 0.0), _WINDOW_MM
     ),
     "fontanelle": View(
-        "coronal, through the anterior fontanelle: ventricles, corpus callosum; 6 to 8 MHz in newborns",
+        "coronal, through the anterior fontanelle; 6 to 8 MHz in newborns",
         (0.0, 0.35, 1.0), (-1.0, 0.0, 0.0),
     ),
     "fontanelle-sagittal": View(
-        "sagittal, through the anterior fontanelle: corpus callosum, in newborns the cerebellum",
+        "sagittal, through the anterior fontanelle",
         (0.0, 0.35, 1.0), (0.0, -1.0, 0.0),
     ),
 }  # fmt: skip
@@ -184,7 +184,7 @@ _AXES = ("R", "A", "S")
 def head_axes(brain: Volume, names: Sequence[str]) -> tuple[np.ndarray, str]:
     """((3, 3) whose columns are the head's right, front and top in RAS, a line about it or "").
 
-    `brain` are labels 1, 2, ... called `names`, of a brain without what is around it. The axes are those of MNI152,
+    `brain` are labels 1, 2, ... called `names`, of a brain without its surroundings. The axes belong to MNI152,
     registered to the labels with the brightness that tissues have in a T1; those of the image where that is not to be
     trusted: in a part of a brain, where the two do not agree. Takes about two seconds, and ten for a
     head that lies turned by more than a scanner's nod.

@@ -61,12 +61,12 @@ class Probe(Beam):
         bounds=(0, 10),
     )  # fmt: skip
     ring_down_db: float = parameter(
-        0.0, "Ring-down level", "Reverberation at the face, relative to tissue of unit scatterer variance", unit="dB",
+        0.0, "Ring-down level", "Level of this reverberation at the face", unit="dB",
         bounds=(-100, 100),
     )  # fmt: skip
     face_reflection: float = parameter(
         0.25, "Face reflection",
-        "Amplitude reflected at the face, so that echoes of bone and gas appear again at twice their depth; 0: none",
+        "Amplitude reflected at the face: bone and gas appear again at twice their depth; 0: none",
         bounds=(0, 1),
     )  # fmt: skip
 
@@ -318,11 +318,11 @@ class LinearProbe(Probe):
     depth_mm: float = _depth_mm()
     steering_deg: float = parameter(
         0.0, "Steering", "Angle of all scan lines to the normal of the face, positive to the right", unit="°",
-        bounds=(-45, 45), kw_only=True, note="Elements send less to the side: echoes lose 3 dB at 15°, 13 dB at 30°",
+        bounds=(-45, 45), kw_only=True,
     )  # fmt: skip
     trapezoid_deg: float = parameter(
-        0.0, "Trapezoid", "Angle of the outermost scan lines to the normal of the face, by which the field opens to "
-        "both sides; 0: parallel lines", unit="°", bounds=(0, 45), kw_only=True,
+        0.0, "Trapezoid", "Angle by which the field opens to each side; 0: parallel lines", unit="°", bounds=(0, 45),
+        kw_only=True,
     )  # fmt: skip
 
     def __post_init__(self) -> None:

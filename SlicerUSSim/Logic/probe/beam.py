@@ -22,7 +22,7 @@ FWHM_PER_SIGMA = 2.0 * np.sqrt(2.0 * np.log(2.0))
 CURVED = 0.6
 #: Largest number of focal zones
 MOST_ZONES = 8
-#: Amplitude of twice the pulse's frequency that leaves the face itself, and of what is left of the pulse in the band,
+#: Amplitude of twice the pulse's frequency that leaves the face itself, and of the rest of the pulse in the band,
 #: relative to the harmonic at the focus: typical of transmitters (docs/physics.md#harmonic-imaging)
 LEAKED = 0.1
 #: f-number of a beam that is wide compared with all others
@@ -53,72 +53,65 @@ class Beam(Declared):
     )  # fmt: skip
     harmonic: bool = parameter(
         False, "Harmonic imaging",
-        "Receive the second harmonic, which arises in tissue where the beam is strong: twice the frequency, narrower "
-        "beams, weaker side lobes, dark near the face", shown=True,
-        note="frequency_mhz belongs to the pulse. At the transmit focus the harmonic has the level of the fundamental, "
-        "as with a scanner's gain",
+        "Receive at twice the frequency of the pulse: narrower beams, weaker side lobes, dark near the face",
+        shown=True,
     )  # fmt: skip
     band_mhz: tuple[float, float] | None = parameter(
-        None, "Band", "Lowest and highest frequency that the array receives, -6 dB; the second harmonic of the pulse "
-        "must lie within; none: any", unit="MHz", bounds=(0.1, 100),
-        note="Without harmonic, frequency_mhz may be outside of it: a preset can be tried at any frequency",
+        None, "Band", "Frequencies that the array receives, -6 dB; a harmonic must be among them; none: any",
+        unit="MHz", bounds=(0.1, 100),
     )  # fmt: skip
     fractional_bandwidth: float = parameter(
-        0.5, "Bandwidth", "-6 dB bandwidth of the two-way pulse, as a fraction of the frequency", bounds=(0.05, 1.5)
+        0.5, "Bandwidth", "Relative bandwidth of the two-way pulse, -6 dB", bounds=(0.05, 1.5)
     )
     focus_mm: MmOrNone = parameter(  # noqa: RUF009, which ignores descriptors
         _BY_DEPTH, "Focus", "Depth of the transmit focus; none (panels: 0): 60 % of the image depth", unit="mm",
         bounds=(0.1, 1000), shown=Shown(0, 300, is_slider=True, none_at=0.0), can_be_none=True,
-        note="It then moves with the depth",
     )  # fmt: skip
     transmit: str = parameter(
         "focus", "Transmit",
-        "focus: one focus. zones: several foci; each depth uses the narrowest beam. angles: plane or diverging waves "
-        "at several angles, compounded coherently, in focus at every depth",
+        "focus: one focus. zones: several foci. angles: plane or diverging waves at several angles, in focus at every "
+        "depth",
         choices=("focus", "zones", "angles"), shown=True,
     )  # fmt: skip
     focal_zones: int = parameter(
         3, "Focal zones", "Number of foci with zones, evenly over twice the focal depth", bounds=(2, MOST_ZONES),
-        note="Their f-number is at least that of reception",
     )  # fmt: skip
     transmit_angles: int = parameter(
-        5, "Angles", "Number of waves to compound for transmit angles; 1: one wave, without focus", bounds=(1, 255),
+        5, "Angles", "Number of waves with angles; 1: without focus", bounds=(1, 255),
     )  # fmt: skip
     largest_angle_deg: float = parameter(
-        10.0, "Largest angle", "Angle of the outermost waves to the axis: half that of the aperture they replace",
+        10.0, "Largest angle", "Angle of the outermost waves to the axis",
         unit="°", bounds=(0.1, 60),
     )  # fmt: skip
     aperture_mm: float = parameter(
         12.0, "Aperture", "Lateral size of the fully open aperture", unit="mm", bounds=(0.5, 200)
     )
     receive_f_number: float = parameter(
-        2.5, "Receive f-number", "Smallest f-number of the receive aperture", bounds=(0.5, 20),
-        note="The receive aperture grows with depth up to the full aperture",
+        2.5, "Receive f-number", "Smallest f-number of the receive aperture, which grows with depth",
+        bounds=(0.5, 20),
     )  # fmt: skip
     receive_apodization: float = parameter(
-        0.0, "Apodisation", "Weights of the receive aperture: 0 uniform, 1 Hann; lower side lobes, a wider beam",
+        0.0, "Apodisation", "0: uniform receive aperture; 1: Hann, with lower side lobes and a wider beam",
         bounds=(0, 1),
     )  # fmt: skip
     clutter_db: float | None = parameter(
-        -36.0, "Clutter", "Diffuse echoes from beside the beam, by multiple scattering and aberration, relative to "
-        "echoes of the beam; none: only side lobes", unit="dB", bounds=(-100, 0),
-        note="Clutter and side lobes fill cysts. Clutter falls off over 48 wavelengths x f-number to each side",
+        -36.0, "Clutter", "Diffuse echoes from beside the beam, which fill cysts, relative to echoes of the beam; "
+        "none: only side lobes", unit="dB", bounds=(-100, 0),
     )  # fmt: skip
     element_mm: float | None = parameter(
-        None, "Element", "Lateral size of the elements: larger ones send and receive less along steered lines; none: "
-        "half a wavelength", unit="mm", bounds=(0.01, 10),
+        None, "Element", "Width of the elements: wider ones darken steered lines; none: half a wavelength", unit="mm",
+        bounds=(0.01, 10),
     )  # fmt: skip
     directivity: str = parameter(
-        "soft", "Directivity", "Loss of steered lines. rigid: directivity of elements of this size; soft: also the "
-        "cosine of the angle, both ways, of a soft baffle, as measured on arrays; none: no loss, as if a gain "
-        "compensated it", choices=("soft", "rigid", "none"),
+        "soft", "Directivity", "Loss of steered lines. soft: elements in a soft baffle, as measured on arrays. rigid: "
+        "less. none: no loss", choices=("soft", "rigid", "none"),
     )  # fmt: skip
     elevation_aperture_mm: float = parameter(
-        7.0, "Elevational aperture", "Height of the elements, in the elevation direction", unit="mm", bounds=(0.5, 100)
+        7.0, "Elevational aperture", "Height of the elements", unit="mm", bounds=(0.5, 100)
     )
     elevation_focus_mm: MmOrNone = parameter(  # noqa: RUF009
         _BY_DEPTH, "Elevational focus", "Depth of the focus of the lens; none: 60 % of the image depth", unit="mm",
-        bounds=(0.1, 1000), can_be_none=True, note="It then moves with the depth",
+        bounds=(0.1, 1000), can_be_none=True,
     )  # fmt: skip
 
     @property

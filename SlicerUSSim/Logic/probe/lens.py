@@ -47,7 +47,7 @@ def lens_beam(
 ) -> LensBeam:
     """The beam of a uniform aperture with a lens.
 
-    Power is the mean over the band of the pulse, phases are those of its centre frequency.
+    Power is the mean over the band of the pulse, phases belong to its centre frequency.
 
     Parameters
     ----------

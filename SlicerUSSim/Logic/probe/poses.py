@@ -116,7 +116,7 @@ def turned(probe_to_ras: np.ndarray, *, rock_deg=0.0, tilt_deg=0.0, rotate_deg=0
     """(4, 4) probe_to_ras turned about the middle of the probe face, which does not move.
 
     Rocking is in the image plane (about z), tilting out of it (about the lateral axis x), rotating about the probe axis
-    (y); signs as rotations about these axes. The terms are those of the AIUM.
+    (y); signs as rotations about these axes. The terms are from the AIUM.
 
     >>> import numpy as np
     >>> from SlicerUSSim.Logic.probe import turned

@@ -132,7 +132,7 @@ class Findings:
             )
         complete = recognised(self.names, of_ct=self.of_ct)[0] if self.mapping.scheme else None
         if complete is not None and complete is not self.scheme:
-            doubts.append(f"{self.source}: its labels are those of {complete.title} (--map {complete.key})")
+            doubts.append(f"{self.source}: its labels belong to {complete.title} (--map {complete.key})")
         nearest: dict[str, list[str]] = {}
         for label, name in self.names.items():
             tissue = self.found[label]

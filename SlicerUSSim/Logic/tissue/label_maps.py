@@ -28,7 +28,7 @@ _log = logging.getLogger(__name__)
 LARGEST_LABEL = 99_999
 #: Smallest distance of a label from a whole number that is reported
 _WORTH_ROUNDING = 0.01
-#: Share of the labels that may be unknown to a program, and are taken as what is around them
+#: Share of the labels that may be unknown to a program, and are taken as their surroundings
 _MOST_UNKNOWN = 0.25
 #: Labels of each numbering that is offered
 _SHOWN = 4

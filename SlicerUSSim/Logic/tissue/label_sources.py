@@ -35,7 +35,7 @@ def is_label_file(path: Path, volume: Volume) -> bool:
 
 
 def not_intensities(volume: Volume) -> str | None:
-    """What a volume is, and what to do, if it is a label map or what is left of one; None for an image."""
+    """What a volume is, and what to do, if it is a label map or the remains of one; None for an image."""
     if volume.looks_like_labels():
         return "is a label map, expected the intensities of an MRI"
     if has_uniform_fractions(volume.array):

@@ -1,6 +1,6 @@
 """Numberings of programs that write label maps: labels/*.csv, with numbers, names, tissues and SNOMED CT codes.
 
-Numbers and names are those of FreeSurfer's FreeSurferColorLUT.txt
+Numbers and names are from FreeSurfer's FreeSurferColorLUT.txt
 (https://surfer.nmr.mgh.harvard.edu/fswiki/FsTutorial/AnatomicalROI/FreeSurferColorLUT), without 500 to 558, parts of
 the hippocampus that other programs use for bone and skin; of SynthSeg's and FastSurfer's tables, which are parts of
 it; of TotalSegmentator's class details (https://github.com/wasserth/TotalSegmentator); of FSL

@@ -130,7 +130,7 @@ def volume_shares(
 
     A voxel of both tissues lies between their means by the parts that they fill; its class is more certain than that
     (`second_share`). Only voxels next to the second tissue count as mixed, and pairs of tissues whose means differ
-    by _CLEAR standard deviations; of the others the share is that of the class. The outer parts of the range count as
+    by _CLEAR standard deviations; the others have the share of the class. The outer parts of the range count as
     whole, since noise there would have one sign.
     """
     inside = labels > 0

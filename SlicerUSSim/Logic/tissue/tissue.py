@@ -15,7 +15,7 @@ from SlicerUSSim.Logic.base.declaration import Declared, Fit, parameter, paramet
 from SlicerUSSim.Logic.base.errors import require
 
 _LONGEST_NAME = 200
-_ECHOGENICITY = "Bounds of a fit: some 40 dB of echogenicity"
+_ECHOGENICITY = "Fit bounds: some 40 dB of echogenicity"
 
 
 def _is_line(name: object) -> bool:
@@ -42,14 +42,14 @@ class Tissue(Declared):
     )
     attenuation_db_cm_mhz: float = parameter(
         label="Attenuation", tip="Attenuation, one way", unit="dB/(cm MHz)", symbol="α", bounds=(0, 100),
-        fit=Fit(0.1, 1.2, tolerance=0.1), source="Bounds of a fit: from blood to tendon (Duck 1990)",
+        fit=Fit(0.1, 1.2, tolerance=0.1), source="Fit bounds: from blood to tendon (Duck 1990)",
     )  # fmt: skip
     mu0: float = parameter(
         0.0, "Mean amplitude", "Mean amplitude of the scatterers", symbol="μ₀", bounds=(-100, 100),
         fit=Fit(0.02, 1.5, tolerance=0.05, is_logarithmic=True), source=_ECHOGENICITY,
     )  # fmt: skip
     mu1: float = parameter(
-        0.0, "Threshold", "Threshold of scatterers: a fraction 1 - Φ(μ₁) of the sites has one", symbol="μ₁",
+        0.0, "Threshold", "A fraction 1 - Φ(μ₁) of the sites has a scatterer", symbol="μ₁",
         bounds=(-10, 10), fit=Fit(-1.0, 1.5, tolerance=0.1), source=_ECHOGENICITY,
     )  # fmt: skip
     sigma0: float = parameter(
@@ -57,10 +57,8 @@ class Tissue(Declared):
         fit=Fit(0.02, 1.0, tolerance=0.05, is_logarithmic=True), source=_ECHOGENICITY,
     )  # fmt: skip
     texture_db: float = parameter(
-        0.0, "Texture", "Standard deviation of the echogenicity within the tissue, in decibels; 0: even", unit="dB",
-        symbol="σₜ", bounds=(0, 8), source="0 in the paper",
-        note="Fixed in the patient. The tissue's mean power stays the same. A slice averages over its thickness, so "
-        "that images show about half of it",
+        0.0, "Texture", "Standard deviation of the echogenicity within the tissue, of which images show about half",
+        unit="dB", symbol="σₜ", bounds=(0, 8), source="0 in the paper",
     )  # fmt: skip
     texture_mm: float = parameter(
         0.5, "Texture length", "Distance at which the echogenicity's correlation is one half, and diameter of specks",
@@ -68,7 +66,7 @@ class Tissue(Declared):
     )  # fmt: skip
     specks_per_mm3: float = parameter(
         0.0, "Specks", "Bright specks per cubic millimetre, such as small vessels and calcifications", unit="1/mm³",
-        symbol="nₛ", bounds=(0, 10), note="At most one in a cube of twice the texture length",
+        symbol="nₛ", bounds=(0, 10),
     )  # fmt: skip
     speck_db: float = parameter(
         0.0, "Speck level", "Level of a speck's centre above its tissue", unit="dB", symbol="Δₛ", bounds=(0, 30)
@@ -115,32 +113,31 @@ class Membrane(Declared):
     )
     fluids: tuple[str, ...] = parameter(
         ("csf", "coupling", "leptomeninges"), "Fluids", "Names of the tissues on the fluid side",
-        note="A thin sulcus, whose two sides meet, counts as one sheet",
     )  # fmt: skip
     roughness_mm: float = parameter(
-        0.03, "Roughness", "RMS height of the sheet: the border's own echo falls by exp(-(2 k s cos i)²/2)", unit="mm",
-        bounds=(0, 1), note="0 is a mirror; at 5 MHz 0.03 mm lowers the echo by 6 dB at normal incidence",
+        0.03, "Roughness", "RMS height of the sheet: 0 is a mirror; at 5 MHz 0.03 mm lowers the border's echo by 6 dB",
+        unit="mm", bounds=(0, 1),
     )  # fmt: skip
     diffuse_db: float = parameter(
         12.0, "Diffuse echo", "Level of its scatterers at normal incidence, relative to those of its tissue",
         unit="dB", bounds=(-100, 40),
     )  # fmt: skip
     sheet_exponent: float | None = parameter(
-        None, "Diffuse exponent of sheets", "The same for sulci and other sheets, which hold vessels; none: as walls",
+        None, "Diffuse exponent of sheets", "Exponent for sulci and other sheets; none: as walls",
         bounds=(0, 20), can_be_none=True,
     )  # fmt: skip
     roughness_octaves: float = parameter(
-        0.0, "Variation of roughness", "Standard deviation of the roughness from patch to patch, which breaks lines",
+        0.0, "Variation of roughness", "Standard deviation between patches, which breaks lines",
         unit="octaves", bounds=(0, 4),
     )  # fmt: skip
     patch_db: float = parameter(
-        0.0, "Variation of the diffuse echo", "Standard deviation of its level from patch to patch, at constant mean",
+        0.0, "Variation of the diffuse echo", "Standard deviation between patches, at constant mean",
         unit="dB", bounds=(0, 20),
     )  # fmt: skip
     patch_mm: float = parameter(5.0, "Patches", "Size of the patches along a sheet", unit="mm", bounds=(0.5, 50))
     diffuse_exponent: float = parameter(
-        1.5, "Diffuse exponent", "Exponent n of cosⁿ of the angle of incidence, for scatterers of the sheet",
-        bounds=(0, 20), note="1 is Lambert's law; with 0 a sheet is equally bright at all angles",
+        1.5, "Diffuse exponent", "Exponent n of cosⁿ of the angle of incidence: 1 is Lambert's law, 0 equally bright",
+        bounds=(0, 20),
     )  # fmt: skip
 
     def __post_init__(self) -> None:

@@ -1,6 +1,6 @@
 """Tracked real ultrasound: sequences and pose files, the imaged field in images, OpenIGTLink.
 
-File formats are those of Plus, IGSIO, 3D Slicer and the MNI; world frames are RAS in millimetres.
+File formats of Plus, IGSIO, 3D Slicer and the MNI; world frames are RAS in millimetres.
 """
 
 from typing import TYPE_CHECKING

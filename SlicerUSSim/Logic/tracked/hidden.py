@@ -47,7 +47,7 @@ def visible_part(
     coloured : (rows, columns) bool, pixels that have a colour in any image, such as Doppler's.
     finds_marks : whether to find what a scanner draws over the field; nothing is drawn over simulated images.
 
-    What is left out is logged as a warning.
+    The omitted part is logged as a warning.
     """
     images = spread_images(images)
     seen = _without(field, ~_shown(images.max(axis=0) > _DARK, field), "are beyond what the file shows")
@@ -73,7 +73,7 @@ def _without(seen: np.ndarray, hidden: np.ndarray, what: str) -> np.ndarray:
 def _shown(bright: np.ndarray, field: np.ndarray) -> np.ndarray:
     """(rows, columns) bool, the rectangle of rows and columns from the first to the last that is bright in the field.
 
-    An end at which only a few lines are black is that of the field.
+    An end at which only a few lines are black belongs to the field.
     """
     found = np.ones_like(field)
     for axis in (0, 1):

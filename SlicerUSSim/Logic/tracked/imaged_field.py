@@ -22,7 +22,7 @@ _log = logging.getLogger(__name__)
 
 #: Largest grey level of the black background around the field.
 _DARK = 4
-#: Sides with a smaller angle to the vertical are those of a linear array, degrees.
+#: Sides with a smaller angle to the vertical belong to a linear array, degrees.
 _PARALLEL_DEG = 1.5
 #: A phased array has an apex radius below this fraction of the outer radius: 4.5 of 78 mm are a small convex array,
 #: whose image would begin 4.5 mm early as a phased array.
@@ -107,15 +107,15 @@ def estimate_field(images: np.ndarray, pixel_spacing_mm: tuple[float, float], **
         "position",
     )
     sizes = ", ".join(f"{name} {value:.1f}" for name, value in geometry.items())
-    _log.info("field found in the images: %s probe (%s), covers what is bright to %.0f %%", kind, sizes, 100 * overlap)
+    _log.info("field found in the images: %s probe (%s), over %.0f %% of the bright region", kind, sizes, 100 * overlap)
     return replace(field, overlap=overlap)
 
 
 def place_field(images: np.ndarray, pixel_spacing_mm: tuple[float, float], probe: Probe) -> ImagedField:
-    """The field of a known probe at the place where it covers what is bright in the images best; one may be enough.
+    """The field of a known probe at the place where it covers the bright region of the images best; one may be enough.
 
-    Parameters as those of estimate_field. What is bright lies in the field, and begins at the probe's face.
-    Raises SimulationError for black images, and if the field covers less than 0.85 of what is bright.
+    Parameters as those of estimate_field. The bright region is in the field, and begins at the probe's face.
+    Raises SimulationError for black images, and if the field covers less than 0.85 of the bright region.
     """
     from scipy import signal  # takes half a second to import, which every start of the program would have to wait for
 
@@ -141,10 +141,10 @@ def place_field(images: np.ndarray, pixel_spacing_mm: tuple[float, float], probe
     share = float((field.mask & bright).sum() / bright.sum())
     require(
         share >= _LEAST_OVERLAP,
-        f"the probe's field covers {share:.0%} of what is bright in the images, expected at least "
+        f"the probe's field covers {share:.0%} of the bright region in the images, expected at least "
         f"{_LEAST_OVERLAP:.0%}; check its geometry and the calibration",
     )
-    _log.info("the probe's field covers %.0f %% of what is bright in the images", 100 * share)
+    _log.info("the probe's field covers %.0f %% of the bright region in the images", 100 * share)
     return replace(field, overlap=float((field.mask & bright).sum() / (field.mask | bright).sum()))
 
 

@@ -162,7 +162,7 @@ class TrackedImages:
 
 
 def pixels_for_poses(sequence: TrackedSequence, path: str, probe: Probe) -> tuple[TrackedSequence, str, ImagedField]:
-    """(sequence, path, field) for TrackedImages.of, with which poses without images are those of pixels of `probe`.
+    """(sequence, path, field) for TrackedImages.of, with which poses without images refer to pixels of `probe`.
 
     A path from Image is taken from Probe, which is the probe's own frame then. Raises SimulationError for a path that
     no pose has, and for an ImageToProbe of another frame, as the place of the probe in images is not known.
@@ -240,7 +240,7 @@ def _located_field(
         image_to_probe = np.array(sequence.transforms[0]["ImageToProbe"])
         if _is_upright(image_to_probe, spacing):
             image_to_probe[2, 2] = 1.0
-            _log.info("the probe's place in the images is that of ImageToProbe, which is in the probe's own frame")
+            _log.info("the probe's place in the images is from ImageToProbe, which is in the probe's own frame")
             return ImagedField.of(probe, image_to_probe, images.shape[1:])
     _log.info("the probe's place is estimated from the images: no ImageToProbe in the probe's own frame")
     try:

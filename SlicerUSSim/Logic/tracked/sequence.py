@@ -294,7 +294,7 @@ class TrackedSequence:
     def from_volume(cls, volume: Volume, probe, poses: Iterable[np.ndarray], image_size=None) -> TrackedSequence:
         """Slices of a 3D ultrasound volume (such as RESECT's) in the image planes of a probe at (4, 4) probe_to_ras.
 
-        ProbeToReference are the poses, ImageToProbe is that of the probe's image. Outside the imaged field the images
+        ProbeToReference are the poses, ImageToProbe belongs to the probe's image. Outside the imaged field the images
         are black.
         """
         from SlicerUSSim.Logic.base.transforms import check_rigid

@@ -147,7 +147,7 @@ class SegmentationFilter(_ImageFilter):
     Tissues can be laid over the labels from masks (AddTissueData).
 
     The names of the labels are field data "TissueNames" of the output, from which UltrasoundSimulationFilter identifies
-    the tissues. Parameters and defaults are those of SegmentationSettings, errors those of modality.segment_image.
+    the tissues. Parameters and defaults as in SegmentationSettings, errors as in modality.segment_image.
     """
 
     def __init__(self) -> None:
@@ -294,7 +294,7 @@ class UltrasoundSimulationFilter(_ImageFilter):
         preset = Preset()
         self._probe, self._display, self._settings = preset.probe, preset.display, preset.settings
         self._tissues, self._texture = preset.tissues, None
-        self._are_numbered = False  # whether the table's labels are those of the label image
+        self._are_numbered = False  # whether the table has the labels of the label image
         self._field_alpha = False
         self._probe_transform: vtkLinearTransform | vtkMatrix4x4 = vtkTransform()  # as it was given
         self._simulator = ReusedSimulator()

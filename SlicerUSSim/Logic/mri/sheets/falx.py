@@ -58,7 +58,7 @@ def falx(head: Head, use_intensity: bool = True) -> Surfels:
     beyond = np.asarray(ndimage.distance_transform_edt(~between, _STEP_MM))
     evidence = _sampled_evidence(head, sampled, beyond) if use_intensity else np.zeros_like(distance)
     relief = np.minimum(distance, _FARTHEST_MM) + _EVIDENCE_MM * np.where(distance > 0.5, evidence, 0.0)
-    # Beyond the rims the relief is flat, and counts as such: were it left out, the middle of what is left beside a rim
+    # Beyond the rims the relief is flat, and counts as such: were it left out, the middle of the rest beside a rim
     # that is higher than the other would draw the falx over that rim.
     usable = np.ones(relief.shape, bool)
     height, _ = settled(relief, x, usable, _WINDOWS_MM, _SMOOTHINGS_MM)
@@ -128,7 +128,7 @@ def thick_white_matter(head: Head, box: tuple[slice, ...] = (slice(None),) * 3) 
 def _sampled_evidence(
     head: Head, sampled: Callable[[np.ndarray], np.ndarray], beyond: np.ndarray
 ) -> np.ndarray:  # fmt: skip
-    """(z, y, x) float32 evidence; `beyond` are mm (z, y, x) from what is between the rims of the hemispheres."""
+    """(z, y, x) float32 evidence; `beyond` are mm (z, y, x) from the space between the rims of the hemispheres."""
     found = sampled(_evidence(head))
     if head.is_enhanced:
         return np.where(beyond <= _SINUS_MM, found, 0.0)  # marrow and scalp are bright as well

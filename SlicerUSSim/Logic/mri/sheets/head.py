@@ -93,7 +93,7 @@ class Head:
     ) -> Head:  # fmt: skip
         """The head in which an atlas does not lead: `image` without bias field, (k, j, i) bool `brain` on its grid.
 
-        `means` are those of CSF, grey and white matter, which rise.
+        `means` of CSF, grey and white matter, which rise.
         """
         csf, grey, white = map(float, means)
         grid = _working_grid(image)

@@ -62,7 +62,7 @@ def centred(
     total = np.maximum(weight.sum(axis=2), 1e-9)
     middle = (weight * offsets).sum(axis=2) / total
     spread = np.sqrt((weight * (offsets - middle[..., None]) ** 2).sum(axis=2) / total)
-    # Of a uniform relief the spread is that of the window.
+    # A uniform relief has the spread of the window.
     sure = np.where(near.any(axis=2), np.clip(1.0 - spread / (window_mm / np.sqrt(3.0)), 0.02, 1.0), 0.0)
     return middle, sure.astype(np.float32)
 

@@ -1,4 +1,4 @@
-"""Regions of a head by the atlas and the patient's own intensities: ventricles, the hindbrain, what is bright."""
+"""Regions of a head by the atlas and the patient's own intensities: ventricles, the hindbrain, bright tissue."""
 
 from __future__ import annotations
 
