@@ -25,6 +25,7 @@ from SlicerUSSim.Logic import (
     Volume,
     segment_mri,
 )
+from SlicerUSSim.Logic.base.files import write_json
 from SlicerUSSim.Logic.mri.atlas import mni152
 from SlicerUSSim.Logic.mri.samples import head_mri
 from SlicerUSSim.Logic.probe.image_grid import ImageGrid
@@ -149,6 +150,7 @@ def files(tmp_path_factory) -> Path:
     tissues = TissueTable.brain(segmentation.tissue_names)
     tissues.write(folder / "labels.json")
     probe = PhasedProbe(field_of_view_deg=75.0, depth_mm=70.0, scan_lines=96)
+    write_json(folder / "probe.json", probe.to_dict())
     poses = tilt_sweep(craniotomy_pose(segmentation.labels, probe), 20.0, 6)
     louder = tissues.replace("white matter", mu0=0.6)
     images = [frame.image for frame in UltrasoundSimulator(segmentation.labels, louder).sweep(probe, poses)]

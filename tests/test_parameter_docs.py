@@ -32,7 +32,11 @@ from SlicerUSSim.Logic.tissue.tissue import Membrane, Tissue
 PAGE = Path(__file__).parents[1] / "docs" / "parameters.md"
 INTRODUCTION = """# Parameters
 
-All parameters, generated from their declarations in the code by `python -m tests.test_parameter_docs`.
+This page lists all parameters. `python -m tests.test_parameter_docs` generates it from their declarations in the code.
+
+```bash
+ussim simulate labels.nii.gz --pose auto --set probe.depth_mm=70 --set "white matter.mu0=0.5" -o image.png
+```
 
 A preset is a JSON file with the objects `probe`, `display`, `settings`, `tissues` (by label, `"1"` to `"62"`, and `"0"`
 for the coupling medium) and `membrane`. `probe_to_ras`, four rows of four numbers, is the pose of the probe, which

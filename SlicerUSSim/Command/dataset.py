@@ -36,7 +36,7 @@ def dataset(
     RECIPE is a file in TOML (docs/datasets.md), or the name of one in the package: brain-tumour, denoising,
     mri-registration, standard-views or ventricles.
 
-    Image n is the same whoever makes it. The same command resumes an interrupted set.
+    Image n is the same whoever makes it on the same OpenCL runtime. The same command resumes an interrupted set.
 
     The exit status is 1 if a patient was left out.
     """

@@ -1,6 +1,7 @@
 """Data sets: many labelled images from a recipe, made by one process or by many, and what reads them.
 
-Image i is a function of the recipe's seed and i alone, so that any worker makes the same bits.
+Image i is a function of the recipe's seed and i alone, so that any worker with the same OpenCL runtime makes the same
+bits.
 """
 
 from typing import TYPE_CHECKING
