@@ -61,7 +61,14 @@ toc_object_entries_show_parents = "hide"
 
 #: The four kinds of pages of https://diataxis.fr, and those for contributors
 PAGES = {
-    "Tutorials": ["docs/slicer", "docs/workstation", "docs/tracked-ultrasound", "docs/datasets", "docs/optimization"],
+    "Tutorials": [
+        "docs/gallery",
+        "docs/slicer",
+        "docs/workstation",
+        "docs/tracked-ultrasound",
+        "docs/datasets",
+        "docs/optimization",
+    ],
     "How-to guides": [
         "docs/brain",
         "docs/ct",
