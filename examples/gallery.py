@@ -27,9 +27,9 @@ def save(path: Path, rows: int, images: dict[str, np.ndarray], aspect: float = 1
     parts = []
     for title, image in images.items():
         width = round(rows * aspect * image.shape[1] / image.shape[0])
-        parts.append(Image.new("RGB", (width + 6, rows + 20)))
-        parts[-1].paste(Image.fromarray(image).resize((width, rows), Image.Resampling.LANCZOS), (0, 20))
-        ImageDraw.Draw(parts[-1]).text((4, 3), title, fill="white", font=ImageFont.load_default(13))
+        parts.append(Image.new("RGB", (width + 6, rows + 30)))
+        parts[-1].paste(Image.fromarray(image).resize((width, rows), Image.Resampling.LANCZOS), (0, 30))
+        ImageDraw.Draw(parts[-1]).text((5, 3), title, fill="white", font=ImageFont.load_default(20))
     Image.fromarray(np.hstack(parts)).save(path, quality=80, optimize=True)
 
 
