@@ -48,18 +48,16 @@ quality = "draft"
 def inputs(files, tmp_path_factory) -> Path:
     """The files that the examples read, by the names that they use."""
     folder = tmp_path_factory.mktemp("inputs")
-    copies = {"brain": "head", "t1": "head", "labels": "labels", "untrusted": "labels"}
-    for name, source in copies.items():
+    for name, source in {"brain": "head", "labels": "labels", "untrusted": "labels"}.items():
         shutil.copy(files / f"{source}.nii.gz", folder / f"{name}.nii.gz")
     for name in ("sweep.igs.mha", "probe.json"):
         shutil.copy(files / name, folder)
     write_pose(folder / "reference-to-mri.tfm", np.eye(4))
-    head, brain = whole_head()
     grid, radius = ellipsoid((70, 85, 65))
     chest, labelled = coarse_chest(), labelled_head()
     nibabel.save(nibabel.MGHImage(labelled.array.T, labelled.ijk_to_ras), folder / "aseg.mgz")
     for name, volume in {
-        "head": head, "mask": head.with_array(brain.astype(np.uint8)), "ct": chest.ct, "total": chest.organs,
+        "head": whole_head()[0], "ct": chest.ct, "total": chest.organs,
         "tumour": grid.with_array((radius < 0.15).astype(np.uint8)),
     }.items():  # fmt: skip
         volume.write(folder / f"{name}.nii.gz")
