@@ -11,6 +11,7 @@ import sys
 import time
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -464,11 +465,14 @@ def test_exports_are_what_coco_and_nnunet_read(plain):
     }
 
 
-def test_without_a_package_one_line_says_which_extra_to_install(folder, tmp_path, monkeypatch):
+def test_without_a_package_or_python_3_11_one_line_says_what_to_do(folder, tmp_path, monkeypatch):
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None if name == "zarr" else name)
     with pytest.raises(
         SimulationError, match=r"format zarr needs SlicerUSSim\[datasets\]; install it with: pip install"
     ):
+        make_dataset(recipe(folder), tmp_path / "s", workers=1)
+    monkeypatch.setattr(making_module, "sys", SimpleNamespace(version_info=(3, 10, 13)))
+    with pytest.raises(SimulationError, match=r'zarr needs Python 3\.11; write format = "hdf5"'):
         make_dataset(recipe(folder), tmp_path / "s", workers=1)
 
 

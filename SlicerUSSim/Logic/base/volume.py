@@ -134,7 +134,7 @@ class Volume:
         array = self.array.T.transpose(own)
         to_own = np.eye(4)[:, [*own, 3]] * [*ways, 1.0]
         to_own[own, 3] = np.where(ways < 0, np.array(array.shape) - 1, 0)
-        array = np.ascontiguousarray(np.flip(array, np.flatnonzero(ways < 0).tolist()).T)
+        array = np.ascontiguousarray(np.flip(array, tuple(np.flatnonzero(ways < 0).tolist())).T)
         return replace(self, array=array, ijk_to_ras=self.ijk_to_ras @ to_own)
 
     def looks_like_labels(self) -> bool:

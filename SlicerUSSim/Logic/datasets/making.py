@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
+import sys
 from collections.abc import Callable, Iterator
 from concurrent.futures import CancelledError
 from contextlib import ExitStack, contextmanager, suppress
@@ -112,8 +113,10 @@ def make_dataset(
     Patients that cannot be read are left out, see Made.skipped. Raises SimulationError for a folder with another set,
     if a file cannot be written, if a package is missing, and if the scheduler is gone; the same call then resumes.
     """
-    if FORMATS[recipe.settings.format]:
-        require_package(FORMATS[recipe.settings.format], EXTRA, f"format {recipe.settings.format}")
+    form = recipe.settings.format
+    require(form != "zarr" or sys.version_info >= (3, 11), 'format zarr needs Python 3.11; write format = "hdf5"')
+    if FORMATS[form]:
+        require_package(FORMATS[form], EXTRA, f"format {form}")
     folder = _own_folder(recipe, Path(out).absolute())
     made, began = Made(folder, recipe.settings.images), perf_counter()
     there = {shard for shard in range(recipe.shards) if record_path(folder, shard).exists()}
