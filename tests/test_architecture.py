@@ -47,13 +47,13 @@ HEAVY = {
 #: Lines of Python that a room, or a folder beside the product, may have. Raising one is a decision: the commit says
 #: what users get for it.
 BUDGETS = {
-    "base": 3360, "opencl": 1325, "probe": 1750, "tissue": 2065, "tracked": 2100, "mri": 7465, "placement": 1205,
-    "imaging": 5595, "device": 395, "datasets": 1475, "fitting": 3685, "vtk": 510, "mrml": 4895, "Widget": 3390,
+    "base": 3335, "opencl": 1310, "probe": 1740, "tissue": 2065, "tracked": 2100, "mri": 7460, "placement": 1205,
+    "imaging": 5565, "device": 395, "datasets": 1475, "fitting": 3680, "vtk": 510, "mrml": 4895, "Widget": 3390,
     "Workstation": 5835, "Command": 3070, "gym": 125, "module": 430, "validation": 6625, "benchmarks": 3995,
-    "tests": 31205, "tests/reference": 505,
+    "tests": 31215, "tests/reference": 505,
 }  # fmt: skip
 #: Lines of all of SlicerUSSim/, and of kernels/
-LARGEST_PRODUCT, LARGEST_KERNELS = 48_650, 5_860
+LARGEST_PRODUCT, LARGEST_KERNELS = 48_550, 5_860
 #: Packages of the checkout that use the product and are not installed with it
 CHECKOUT = {"validation", "benchmarks", "tests", "examples"}
 
@@ -328,7 +328,7 @@ def test_what_reads_the_imports_finds_them_all(tmp_path):
         ("Logic.high.b", "Logic.low.a"), ("Logic.high.c", "Logic.high.b"), ("Logic.high.c", "Logic.low.a"),
         ("Logic.round", "Logic.high.c"), ("Widget.d", "Logic.round"),
     }  # fmt: skip
-    assert levels(found.room_edges) == {"low": 1, "high": 2, "round": 3, "Widget": 4}
+    assert levels(found.room_edges) == {"low": 1, "high": 2, "round": 3, "Widget": 3390}
     assert found.importers("vtk") == {f"{PACKAGE}.Logic.high.b"} and not found.importers("vtk", at_top=True)
     assert found.importers("json", at_top=True) == {f"{PACKAGE}.Logic.low.a"}
     assert found.importers("tests") == {f"{PACKAGE}.Widget.d"}
