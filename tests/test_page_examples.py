@@ -66,7 +66,7 @@ def inputs(files, tmp_path_factory) -> Path:
 
 
 def first_example(page: Path) -> tuple[str, str]:
-    """(language, code) of the first example, without its comments and what it installs."""
+    """(language, code) of the first example, without lines that install."""
     found = re.search(r"^```(bash|python)\n(.*?)^```", page.read_text(encoding="utf-8"), re.DOTALL | re.MULTILINE)
     assert found, "a page has an example, in bash or Python"
     return found[1], INSTALLS.sub("", found[2])
