@@ -79,6 +79,8 @@ class Bench:
             each()
             await self.move()
         await self.run(self.cine.freeze)
+        while any(kept.echoes is None for kept in self.cine._kept):
+            await asyncio.sleep(0.005)
         return [kept.taken for kept in self.cine._kept]
 
     def tell(self) -> tuple[str, str]:

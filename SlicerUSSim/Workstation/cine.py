@@ -74,7 +74,9 @@ class Cine:
         if kept and kept[-1].taken.grid != taken.grid:
             kept.clear()
         kept.append(new)
-        get_event_loop().run_in_executor(None, lambda: setattr(new, "echoes", Echoes.of(frame)))
+        done = get_event_loop().run_in_executor(None, lambda: setattr(new, "echoes", Echoes.of(frame)))
+        # The display may have changed meanwhile
+        done.add_done_callback(lambda _: self._logic.isLive or self._tasks.start(self.follow_display))
         size = taken.image.nbytes + next((one.echoes.parts.nbytes for one in kept if one.echoes), 0)
         while new.seconds - kept[0].seconds > KEPT_S or len(kept) * size > _MOST_BYTES:
             kept.popleft()
@@ -208,9 +210,7 @@ class Cine:
 
     def _displayed(self, kept: CineImage) -> TakenImage:
         taken = kept.taken
-        while kept.echoes is not None and taken.preset.display != (
-            display := self._display(kept)
-        ):  # it may change again
+        while kept.echoes is not None and taken.preset.display != (display := self._display(kept)):  # it may change
             is_own = display == kept.taken.preset.display
             taken = kept.taken if is_own else self._logic.redisplay(kept.taken, kept.echoes, display)
         return taken
