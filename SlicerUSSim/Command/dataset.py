@@ -23,12 +23,12 @@ from SlicerUSSim.Command.progress import Curve, note
     help="Processes on this computer; 1: without Dask (default: one for each core that has memory).",
 )  # fmt: skip
 @click.option(
-    "--export", type=click.Choice(("coco", "nnunet")), help="Also write the set as COCO, or as nnU-Net v2 reads it."
+    "--export", type=click.Choice(("coco", "nnunet")), multiple=True, help="Also for COCO or nnU-Net v2; repeatable."
 )
 @device_option
 @click.pass_context
 def dataset(
-    ctx: click.Context, recipe: str, out: Path, scheduler: str | None, workers: int | None, export: str | None,
+    ctx: click.Context, recipe: str, out: Path, scheduler: str | None, workers: int | None, export: tuple[str, ...],
     device: str | None,
 ) -> None:  # fmt: skip
     """Make many labelled images from a recipe.
@@ -46,15 +46,16 @@ def dataset(
     if device is not None:
         os.environ["USSIM_DEVICE"] = device  # workers have it, too
     read = Recipe.read(recipe)
-    if export is not None:  # before hours of work
+    if export:  # before hours of work
         labels_to_export(read.settings.outputs, read.settings.format, recipe)
     note(f"{recipe}: {read.settings.images} images of {read.cases} cases in {read.shards} shards of {read.shard}")
     with Curve("dataset") as progress:
         made = make_dataset(read, out, scheduler=scheduler, workers=workers, progress=progress, say=note)
     for why in made.skipped.values():
         note(f"left out: {why}")
-    if export is not None:
-        note(f"wrote {(export_coco if export == 'coco' else export_nnunet)(out)}")
+    for form in export:
+        note(f"wrote {(export_coco if form == 'coco' else export_nnunet)(out)}")
     memory = f", at most {made.peak_mb:.0f} MB in a process" if made.peak_mb else ""
-    note(f"wrote {out} ({made.done} images, {made.rate:.1f} images/s{memory})")
+    rate = f", {made.rate:.1f} images/s" if made.rate else ""
+    note(f"wrote {out} ({made.done} images{rate}{memory})")
     ctx.exit(1 if made.skipped else 0)

@@ -70,7 +70,7 @@ def _type_of(value: object) -> str:
 def require_package(module: str, distribution: str, purpose: str) -> None:
     """Raise SimulationError if `module` is missing; the message names the pip `distribution` to install."""
     if importlib.util.find_spec(module) is None:
-        raise SimulationError(f"{purpose} needs {distribution}; install it with: pip install {distribution}")
+        raise SimulationError(f'{purpose} needs {distribution}; install it with: pip install "{distribution}"')
 
 
 def required(value: _T | None, message: str) -> _T:
