@@ -493,15 +493,6 @@ def test_a_forest_finds_ventricles_of_another_head_better_than_a_threshold(tmp_p
     assert forest > max(threshold, 0.2)
 
 
-@pytest.mark.slow
-def test_the_gallery_draws_every_picture_that_its_page_shows(tmp_path):
-    example("gallery").main(tmp_path, rows=60)
-    page = (Path(__file__).parents[1] / "docs/gallery.md").read_text(encoding="utf-8")
-    shown = re.findall(r"!\[.*?\]\(images/gallery/(.+?)\)", page)
-    assert sorted(shown) == sorted(picture.name for picture in tmp_path.iterdir()) and len(shown) > 5
-    assert all(np.asarray(Image.open(tmp_path / name))[30:].std() > 20 for name in shown)
-
-
 # ---- Dask ------------------------------------------------------------------------------------------------------------
 
 
