@@ -51,6 +51,7 @@ def save(path: Path, *rows: list[np.ndarray]) -> None:
 
 
 def main(folder: Path) -> None:
+    folder.mkdir(parents=True, exist_ok=True)
     app = SlicerApp()
     scene = app.scene
     app.register_module_logic(slicer.vtkSlicerSequencesLogic())

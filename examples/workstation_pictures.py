@@ -56,6 +56,7 @@ def pictures(address: str, folder: Path) -> None:
 
 
 def main(folder: Path) -> None:
+    folder.mkdir(parents=True, exist_ok=True)
     command = [sys.executable, "-m", "SlicerUSSim.Command.cli", "serve", "--port", "0", "--no-autosave"]
     server = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
     try:

@@ -51,7 +51,7 @@ def test_the_first_ten_minutes_work_with_the_modules_packages(bare_python, tmp_p
     print(json.dumps(result["seconds"], indent=1))
     found = result["found"]
     assert found["overlap"] > 0.95 and found["mask is the same"]
-    assert "brain extracted by the atlas" in found["notes"] and "led by the MNI152 atlas" in found["notes"]
+    assert "brain extracted by the atlas" in found["notes"] and "guided by the MNI152 atlas" in found["notes"]
     assert "Build kernels, once on this computer" in found["titles"] or result["seconds"]["Segment"] > 20
     assert found["changed"] > 0.02 and found["after close"] == ["", "", False, False]
     assert found["loaded"] == ["Head", "Head tissues", "Probe"] and found["images"] == 5

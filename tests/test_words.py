@@ -39,6 +39,7 @@ PATTERNS = {
 _ANY = "|".join(rf"\b(?P<n{n}>{pattern})\b" for n, pattern in enumerate(PATTERNS)).replace(" ", r"\s+")
 _PARTS = (
     *("SlicerUSSim/**/*.py", "SlicerUSSim/**/*.js", "SlicerUSSim/**/*.html", "kernels/*.cl*", "docs/*.md", "*.md"),
+    *("paper/*.md", "NOTICE", ".github/**/*.md", "examples/**/*.ipynb"),
     *(f"{folder}/**/*.py" for folder in ("validation", "benchmarks", "examples", "tests")),
 )
 #: This file, and what is generated from declarations
@@ -56,3 +57,9 @@ def test_the_text_has_no_phrases_of_the_house_dialect():
                 line, advice = text.count("\n", 0, hit.start()) + 1, instead[int(str(hit.lastgroup)[1:])]
                 found.append(f"{name}:{line}: {' '.join(hit[0].split())!r}: write {advice!r}")
     assert not found, "\n".join(found)
+
+
+def test_the_text_has_no_conflict_markers_of_a_merge():
+    paths = [path for part in _PARTS for path in ROOT.glob(part)]
+    markers = re.compile(r"^(<{7}|>{7}) ", re.MULTILINE)
+    assert [path.name for path in paths if markers.search(path.read_text(encoding="utf-8"))] == []

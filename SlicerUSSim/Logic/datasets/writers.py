@@ -34,8 +34,8 @@ _SOURCES = {
 _LIBRARIES = {"numpy", "pyopencl", "zarr", "h5py", "distributed"}
 _PAGE = """# {title}
 
-{made} of {images} B-mode images, simulated by SlicerUSSim {makers} from the recipe `recipe.toml` with seed {seed}. No
-scanner measured them: test on real images what you train on these.
+{made} of {images} B-mode images, simulated by SlicerUSSim {makers} from the recipe `recipe.toml` with seed {seed}. They
+are not measurements: test a model that was trained on them on real images.
 
 Licence: {licence}
 
@@ -141,7 +141,7 @@ def write_datasheet(recipe: Recipe, out: Path, skipped: Mapping[str, str]) -> No
     sums = json.dumps([one["checksums"] for one in shards.values()])
     found = {one.name: one.version for one in distributions() if one.name in _LIBRARIES}
     manifest = {
-        "title": settings.title, "licence": settings.licence or "that of the sources", "seed": settings.seed,
+        "title": settings.title, "licence": settings.licence or "see Sources", "seed": settings.seed,
         "format": settings.format, "images": settings.images, "shard": recipe.shard,
         "made": sum(one["images"][1] - one["images"][0] for one in shards.values()), "checksum": _sha256(sums.encode()),
         "recipe_sha256": _sha256(recipe.text.encode()), "outputs": {name: OUTPUTS[name] for name in settings.outputs},

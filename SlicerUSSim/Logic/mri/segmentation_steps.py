@@ -86,7 +86,7 @@ def atlas_of(part: BrainPart, report: Callable[[float], None]) -> tuple[AtlasFit
     share = explained(part.images[0], np.linalg.inv(fit.patient_to_atlas))
     if not fit.is_good:
         return None, f"without an atlas, since MNI152 covers the brain with a Dice of {fit.dice:.2f} only", share
-    return fit, f"led by the MNI152 atlas, whose brain covers this one with a Dice of {fit.dice:.2f}", share
+    return fit, f"guided by the MNI152 atlas (overlap of the brains: Dice {fit.dice:.2f})", share
 
 
 def finite(mri: Volume) -> np.ndarray:
