@@ -62,12 +62,13 @@ toc_object_entries_show_parents = "hide"
 #: The four kinds of pages of https://diataxis.fr, and those for contributors
 PAGES = {
     "Tutorials": [
-        "docs/gallery",
+        "docs/first-image",
         "docs/slicer",
         "docs/workstation",
         "docs/tracked-ultrasound",
         "docs/datasets",
         "docs/optimization",
+        "docs/gallery",
     ],
     "How-to guides": [
         "docs/brain",
