@@ -35,7 +35,7 @@ def test_an_interrupted_fit_leaves_nothing_half_done(tmp_path):
     write_json(tmp_path / "probe.json", probe.to_dict())
     inputs = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
     command = (
-        "optimize labels.nii.gz --sequence tracked.igs.mha --probe probe.json --free gain_db "
+        "optimize labels.nii.gz --sequence tracked.igs.mha --probe probe.json "
         "--set fit.restarts=0 --set fit.evaluations=100000 -o out.json"
     )
     process = subprocess.Popen(
