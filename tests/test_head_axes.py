@@ -28,9 +28,12 @@ def lying(brain: Volume, turn: Rotation) -> Volume:
     return Volume(brain.array, matrix @ brain.ijk_to_ras)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
-    "turn", [pytest.param((25.0, 0.0, 0.0), id="nodding"), pytest.param((40.0, 30.0, 155.0), id="oblique")]
+    "turn",
+    [
+        pytest.param((25.0, 0.0, 0.0), id="nodding", marks=pytest.mark.long),
+        pytest.param((40.0, 30.0, 155.0), id="oblique", marks=pytest.mark.slow),
+    ],
 )
 def test_views_of_a_turned_head_are_those_of_the_upright_one_turned(brain, turn):
     rotation = Rotation.from_euler("xyz", turn, degrees=True)

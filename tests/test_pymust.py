@@ -290,7 +290,7 @@ def test_compounded_plane_waves_have_the_same_width_and_correlation(
         assert float(ours.speckle_sigma_mm(depth)) * HALF == pytest.approx(half_correlation(echo, spacing), rel=0.15)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_attenuation_lowers_the_level_of_speckle_by_as_much(scatterers):
     """From the near to the middle and the far window, within 1 dB."""
     delays, lateral = np.zeros((1, 128)), np.arange(-6, 6.01, 0.2)

@@ -56,7 +56,7 @@ def simulator(tissues=TISSUES, seed: int = 2) -> UltrasoundSimulator:
     return UltrasoundSimulator(LABELS, tissues, SimulationSettings(seed=seed, ring_down=False))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_smoothing_and_texture_are_found_by_the_costs_of_texture(tracked):
     shown, has_map = with_estimated_map(PLAIN, tracked[1])
     assert has_map and shown.map_dark == pytest.approx(0.75, abs=0.25)
