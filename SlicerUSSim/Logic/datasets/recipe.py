@@ -214,7 +214,10 @@ class Recipe:
     def _of(self, section: str, number: int) -> dict[str, Any]:
         """What is drawn for an image; or for a probe, or the lesion of a case, which several images have."""
         draws, seed = self.draws[section], self.settings.seed
-        return {name: draw(generator(seed, number, f"{section}.{name}")) for name, draw in draws.items()}
+        return {
+            name: draw.values[0] if draw.is_fixed else draw(generator(seed, number, f"{section}.{name}"))
+            for name, draw in draws.items()
+        }
 
     @cached_property
     def probes(self) -> tuple[Probe, ...]:

@@ -80,7 +80,7 @@ def checksums(arrays: Mapping[str, np.ndarray]) -> dict[str, str]:
 
 
 def _zarr(recipe: Recipe, out: Path, shard: int, arrays: Mapping[str, np.ndarray], _: list[dict]) -> None:
-    """Zarr v3: an array per output of all images, a chunk per image, a file per shard."""
+    """Zarr v3: an array per output of all images, a chunk per image or for all poses of a shard, a file per shard."""
     import zarr
     from zarr.errors import ContainsArrayError
 
@@ -88,10 +88,12 @@ def _zarr(recipe: Recipe, out: Path, shard: int, arrays: Mapping[str, np.ndarray
     for name, values in arrays.items():
         if not (path / name / "zarr.json").exists():  # another worker may write the same at the same time
             zarr.open_group(path, mode="a", zarr_format=3)
-            shape, chunks, shards = ((n, *values.shape[1:]) for n in (recipe.settings.images, 1, recipe.shard))
+            chunk = recipe.shard if name in GEOMETRY else 1
+            shape, chunks, shards = ((n, *values.shape[1:]) for n in (recipe.settings.images, chunk, recipe.shard))
             with suppress(ContainsArrayError):
                 zarr.create_array(path, name=name, shape=shape, chunks=chunks, shards=shards, dtype=values.dtype)
-        zarr.open_array(path, path=name, mode="r+")[numbers.start : numbers.stop] = values
+        with zarr.config.set({"codec_pipeline.batch_size": recipe.shard}):  # twice as fast as one after the other
+            zarr.open_array(path, path=name, mode="r+")[numbers.start : numbers.stop] = values
 
 
 def _hdf5(recipe: Recipe, out: Path, shard: int, arrays: Mapping[str, np.ndarray], _: list[dict]) -> None:
