@@ -257,7 +257,7 @@ def test_the_examples_of_three_users_run(tmp_path):
     assert pairs["image"].shape == pairs["labels"].shape == (4, 128, 160) and (pairs["image"] > 0).mean() > 0.1
     filter_ = example("vtk_picture").write_picture(mri.to_vtk(), str(tmp_path / "picture.png"))
     np.testing.assert_array_equal(np.asarray(Image.open(tmp_path / "picture.png")), filter_.GetFrame().image)
-    before, after = example("recover_pose").errors_mm(head_mri(spacing_mm=4.0), evaluations=90)
+    before, after = example("recover_pose").errors_mm(head_mri(spacing_mm=4.0), evaluations=45)
     assert before > 4.0 and after < before
 
 
