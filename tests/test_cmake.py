@@ -85,7 +85,15 @@ def test_the_module_its_resources_and_one_folder_are_installed(build, installed)
     for folder in ("Logic", "Widget"):  # Slicer has no use for the command and the workstation in the browser
         wanted |= {f"SlicerUSSim/{folder}/{path}" for path in files(package / folder)}
     wanted |= {f"SlicerUSSim/kernels/{path}" for path in files(ROOT / "kernels")}
-    assert {"Resources/Icons/USSim.png", "SlicerUSSim/Logic/mri/mni152.npz"} <= wanted
+    data = {
+        "Logic/fitting/report.html",
+        "Logic/imaging/golden/convex.png",
+        "Logic/mri/mni152.npz",
+        "Logic/mri/mni152.txt",
+        "Logic/py.typed",
+        "Logic/tissue/labels/spm.csv",
+    }
+    assert {f"SlicerUSSim/{path}" for path in data} | {"Resources/Icons/USSim.png"} <= wanted
     # Resources of other extensions are in the same folders: a name such as Resources/UI/Settings.ui could conflict.
     mine = files(package / "Resources")
     assert all("USSim" in Path(path).parts or Path(path).stem == "USSim" for path in mine)

@@ -46,8 +46,9 @@ from SlicerUSSim.Logic.mrml.nodes import (  # noqa: E402
     write_volume,
 )
 from SlicerUSSim.Logic.mrml.taken_image import about_image, is_frozen, patient_of  # noqa: E402
+from SlicerUSSim.Logic.probe.image_grid import ImageGrid  # noqa: E402
 from SlicerUSSim.Logic.probe.poses import slice_under_probe  # noqa: E402
-from tests.conftest import FLUID, SPECKLE, block, rigid  # noqa: E402
+from tests.conftest import FLUID, SPECKLE, block, example, rigid  # noqa: E402
 
 pytestmark = pytest.mark.usefixtures("segmented_once")
 
@@ -1007,6 +1008,27 @@ def test_slicers_own_slice_view_shows_the_image_upright_and_not_mirrored(bench):
     assert compared > 100
     top = shown[np.flatnonzero(shown.any(axis=1))[-1]]  # VTK counts rows from below
     assert top.mean() > 0 and to_pixel[1, 1] < 0 < to_pixel[0, 0]  # depth runs down, left is left
+
+
+@pytest.mark.long
+def test_the_example_builds_a_scene_and_saves_it_so_that_it_opens(mni, tmp_path, capsys):
+    slicer_scene = example("slicer_scene")
+    slicer_scene.main(tmp_path / "brain.mrb")
+    said = capsys.readouterr().out
+    assert "13 images followed the probe" in said and "the same image (100.00%)" in said
+    scene = slicer_scene.read_back(tmp_path / "brain.mrb")
+    browser = scene.GetFirstNodeByClass("vtkMRMLSequenceBrowserNode")
+    assert browser.GetNumberOfItems() == 13 and browser.GetNumberOfSynchronizedSequenceNodes(True) == 2
+    nodes = UltrasoundSceneLogic(scene).parameters
+    assert nodes.mri.GetImageData().GetDimensions() == (197, 233, 189)
+    assert nodes.labels.GetSegmentation().GetNumberOfSegments() == 4
+    # Live has ended: the image is where the probe was, and does not move with it
+    assert nodes.output.GetParentTransformNode() is None and pixels(nodes.output).mean() > 10
+    about = about_image(nodes.output)
+    grid = ImageGrid.for_probe(Preset.from_dict(about["preset"]).probe, None)
+    np.testing.assert_allclose(
+        ijk_to_ras(nodes.output), np.array(about["probe_to_ras"]) @ grid.slice_to_probe, atol=1e-3
+    )
 
 
 # ---- what an image is of ---------------------------------------------------------------------------------------------

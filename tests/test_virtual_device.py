@@ -385,6 +385,12 @@ def test_the_command_opens_labels_with_a_path_of_poses(command_device, tmp_path)
 
 
 @pytest.mark.slow
+def test_the_command_without_a_file_has_the_demo_brain(command_device):
+    device, said = command_device("--set", "segmentation.classes=3")
+    assert device is not None and "skull-stripped brain" in said
+
+
+@pytest.mark.slow
 def test_the_command_opens_a_scene_of_the_module(command_device, tmp_path):
     slicer = pytest.importorskip("slicer")
     core = pytest.importorskip("trame_slicer.core", reason="scenes come with: pip install '.[serve]'")

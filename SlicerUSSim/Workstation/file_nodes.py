@@ -136,7 +136,7 @@ class FileNodes:
     def labels(self, path: str, table: LabelTable | None = None) -> tuple[Any, LabelledTissues]:
         """(label map node, what was recognised) of a file; see label_sources.read_label_file.
 
-        Tissues come from `table`, the table or names beside it, of the preset, or of a known program's numbers.
+        Tissues come from `table`, the table or names beside the file, the preset, or a known program's numbers.
         """
         volume, mine = self._volume(path), self._logic.preset.tissues
         mapping = LabelMapping.of(self._files.maps if path == self._files.labels else (), mine)
@@ -218,8 +218,8 @@ class FileNodes:
     def prepared(self, record: SequenceRecord, probe: Probe | None = None) -> TrackedImages:
         """The images of a record. Raises SimulationError for those in which the probe's field is not found.
 
-        Without a known field the beam is taken from `probe` or the present one, and the geometry that of the preset at
-        the start, if there was one.
+        Without a known field the beam comes from `probe` or the present one, and the geometry from the preset at the
+        start, if there was one.
         """
         probe = probe or self._logic.preset.probe
         known = probe if self._files.preset is not None else None

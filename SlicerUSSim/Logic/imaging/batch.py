@@ -53,10 +53,14 @@ def one_per_image(name: str, given: Any, kind: type, count: int) -> list:
     return values
 
 
-def same_shape(shapes: Sequence[tuple]) -> tuple:
-    """The shape of all images. Raises SimulationError if they have several."""
-    found = " and ".join(sorted({_times(shape) for shape in shapes}))
-    require(len(set(shapes)) == 1, f"images of the batch are {found}, expected one size; set display.image_size")
+def same_shapes(shapes: Sequence[tuple]) -> tuple:
+    """The shape of all images. Raises SimulationError that names the first of another shape."""
+    other = next((number for number, shape in enumerate(shapes) if shape != shapes[0]), None)
+    require(
+        other is None,
+        f"image {other} of the batch is {_times(shapes[other or 0])}, the first is {_times(shapes[0])}, expected one "
+        "size; set display.image_size, or simulate them apart",
+    )
     return shapes[0]
 
 

@@ -54,7 +54,7 @@ def lobes_of(probe: Probe) -> np.ndarray:
     pattern = (amplitude * apodized_pattern(place, probe.receive_apodization)).astype(float) ** 2
     at = _STEP * column + np.array([[-0.5], [0.5]])  # of the lobe over which power is averaged
     near, far = np.moveaxis(_excess(step, pattern, sigma, unit[:, None, None] * np.maximum(at, 0.0)), 1, 0)
-    ends = np.clip(4.0 * column / (_DISTANCES - 1) - 3.0, 0.0, 1.0)  # smoothly
+    ends = np.clip(4.0 * column / (_DISTANCES - 1) - 3.0, 0.0, 1.0)  # the table ends smoothly
     fading = 0.5 + 0.5 * np.cos(np.pi * ends)
     return np.sqrt(0.5 * (near - far) * fading + clutter).astype(np.float32)
 

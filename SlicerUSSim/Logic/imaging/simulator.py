@@ -24,7 +24,7 @@ from SlicerUSSim.Logic.base.transforms import check_rigid
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.imaging import stages
 from SlicerUSSim.Logic.imaging.aperture import Aperture, aperture_fields
-from SlicerUSSim.Logic.imaging.batch import OUTPUTS, arrays_for, fetched, one_per_image, same_shape
+from SlicerUSSim.Logic.imaging.batch import OUTPUTS, arrays_for, fetched, one_per_image, same_shapes
 from SlicerUSSim.Logic.imaging.bmode import downshift, log_band_above, pulse_taps
 from SlicerUSSim.Logic.imaging.compounding import Compounder, sweep_grid
 from SlicerUSSim.Logic.imaging.contact import line_contact
@@ -286,10 +286,10 @@ class UltrasoundSimulator:
             ImageGrid.for_probe(probe, shown and shown.image_size)
             for probe, shown in zip(probes, displays, strict=True)
         ]
-        pixels = same_shape([(grid.rows, grid.columns) for grid in grids])
+        pixels = same_shapes([(grid.rows, grid.columns) for grid in grids])
         lines = [line_shape(*worked(*both, pixels[1])) for both in zip(probes, each, strict=True)]
         has_signals = not all(OUTPUTS[name][2] for name in outputs if name in OUTPUTS)
-        arrays = arrays_for(outputs, len(poses), pixels, same_shape(lines) if has_signals else lines[0], out)
+        arrays = arrays_for(outputs, len(poses), pixels, same_shapes(lines) if has_signals else lines[0], out)
         for probe in dict.fromkeys(probes):
             self.warn_if_slow(probe)
 

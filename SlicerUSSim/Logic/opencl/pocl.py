@@ -125,7 +125,7 @@ def self_test() -> None:
 def require_linker(version: str) -> None:
     """Raise SimulationError if PoCL cannot link kernels, which would end the process: up to version 5 it links every
     kernel with `ld` of PATH against libgcc and libc, and aborts if they are missing, as on a minimal Debian.
-    `version` of the OpenCL platform."""
+    `version` belongs to the OpenCL platform."""
     found = re.search(r"PoCL (\d+)", version, re.IGNORECASE)
     if found is None or int(found.group(1)) > 5 or sys.platform != "linux":
         return
