@@ -6,6 +6,7 @@ import sys
 
 from vtkmodules.vtkCommonDataModel import vtkImageData
 from vtkmodules.vtkCommonTransforms import vtkTransform
+from vtkmodules.vtkImagingCore import vtkImageChangeInformation, vtkImageFlip
 from vtkmodules.vtkIOImage import vtkPNGWriter
 
 from SlicerUSSim.Logic import Volume
@@ -27,8 +28,17 @@ def write_picture(mri: vtkImageData, path: str) -> UltrasoundSimulationFilter:
     transform.SetMatrix(vtk_matrix(craniotomy_pose(labels, simulation.GetProbe())))
     simulation.SetProbeTransform(transform)
 
+    # Writers put the first row at the bottom, but it is next to the probe. A flip keeps to the axes of the patient, so
+    # that the image is taken out of the patient's space first.
+    upright = vtkImageChangeInformation()
+    upright.SetInputConnection(simulation.GetOutputPort())
+    upright.SetOutputDirection((1, 0, 0, 0, 1, 0, 0, 0, 1))
+    flip = vtkImageFlip()
+    flip.SetFilteredAxis(1)
+    flip.SetInputConnection(upright.GetOutputPort())
+
     writer = vtkPNGWriter()
-    writer.SetInputData(simulation.GetPicture())
+    writer.SetInputConnection(flip.GetOutputPort())
     writer.SetFileName(path)
     writer.Write()
     return simulation

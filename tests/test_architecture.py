@@ -47,13 +47,13 @@ HEAVY = {
 #: Lines of Python that a room, or a folder beside the product, may have. Raising one is a decision: the commit says
 #: what users get for it.
 BUDGETS = {
-    "base": 3335, "opencl": 1310, "probe": 1740, "tissue": 2065, "tracked": 2100, "mri": 7460, "placement": 1205,
-    "imaging": 5570, "device": 395, "datasets": 1480, "fitting": 3680, "vtk": 510, "mrml": 4895, "Widget": 3390,
+    "base": 3335, "opencl": 1310, "probe": 1735, "tissue": 2065, "tracked": 2100, "mri": 7460, "placement": 1205,
+    "imaging": 5530, "device": 395, "datasets": 1480, "fitting": 3680, "vtk": 485, "mrml": 4895, "Widget": 3390,
     "Workstation": 5835, "Command": 3070, "gym": 125, "module": 430, "validation": 6625, "benchmarks": 3995,
     "tests": 31250, "tests/reference": 505,
 }  # fmt: skip
 #: Lines of all of SlicerUSSim/, and of kernels/
-LARGEST_PRODUCT, LARGEST_KERNELS = 48_600, 5_860
+LARGEST_PRODUCT, LARGEST_KERNELS = 48_500, 5_860
 #: Packages of the checkout that use the product and are not installed with it
 CHECKOUT = {"validation", "benchmarks", "tests", "examples"}
 

@@ -34,6 +34,7 @@ PROBE = PhasedProbe(70, 50, scan_lines=64)
 SMALL = DisplaySettings(image_size=(64, 80))
 POSES = slide_sweep(rigid(np.eye(3), [0, -25, 0]), length_mm=12, frames=3)
 WALL = Tissue("wall", 1540.0, 1.75, 0.1)
+DENSE = SimulationSettings(scatterers_per_mm3=2e5)
 
 
 def cyst(fluid: Tissue = FLUID) -> UltrasoundSimulator:
@@ -45,13 +46,6 @@ def cyst(fluid: Tissue = FLUID) -> UltrasoundSimulator:
 @pytest.fixture(scope="module")
 def made() -> UltrasoundSimulator:
     return cyst()
-
-
-@pytest.fixture
-def draft(made):
-    made.settings = replace(made.settings, quality="draft")
-    yield made
-    made.settings = replace(made.settings, quality="full")
 
 
 @pytest.mark.parametrize("quality", ["full", "draft"])
@@ -118,6 +112,10 @@ def test_labels_as_imaged_are_displaced_by_travel_time():
         ({"probes": None}, "probes are 0 for 3 poses, expected one Probe"),
         ({"probes": [PROBE, PROBE, replace(PROBE, scan_lines=65)], "outputs": ["iq"]}, "image 2 of the batch is 65 x"),
         ({"outputs": ("picture",)}, "output 'picture' is unknown, expected some of image, labels"),
+        (
+            {"probes": replace(PROBES["phased"], depth_mm=200.0), "settings": [SimulationSettings()] * 2 + [DENSE]},
+            "200000 scatterers per mm³ .* expected at most",
+        ),
         ({"poses": []}, "the batch has no pose"),
         ({"poses": [2.0 * np.eye(4)]}, "pose 0"),
     ],
@@ -152,9 +150,9 @@ def test_a_draft_has_less_work_the_smaller_the_image_and_full_none(made):
     assert (settings.samples_per_cycle, settings.elevational_rays, settings.scatterers_per_mm3) == (2, 1, 3.0)
 
 
-def test_a_draft_has_level_and_structures_of_the_full_image(made, draft):
-    drafts = made.simulate_batch(PROBE, POSES, display=SMALL, outputs=("image", "labels"))
-    made.settings = replace(made.settings, quality="full")
+def test_a_draft_has_level_and_structures_of_the_full_image(made):
+    coarse = replace(made.settings, quality="draft")
+    drafts = made.simulate_batch(PROBE, POSES, display=SMALL, settings=coarse, outputs=("image", "labels"))
     full = made.simulate_batch(PROBE, POSES, display=SMALL)["image"].astype(float)
     tissue, fluid = (drafts["labels"] == label for label in (1, 2))
     db = SMALL.dynamic_range_db / 255.0

@@ -145,7 +145,7 @@ def test_the_record_of_a_frame_follows_from_the_equations():
     }  # fmt: skip
     for name, value in expected.items():
         np.testing.assert_allclose(record[name], value, rtol=1e-5, atol=1e-5, err_msg=name)
-    assert made.axial_sigma_mm(probe) == pytest.approx(axial)
+    assert made.device_frame(probe, pose).axial_sigma_mm == pytest.approx(axial)
 
 
 @pytest.mark.parametrize("has_shares", [False, True])

@@ -185,14 +185,11 @@ class _PoseCost:
         self.comparisons = comparisons
 
     def __call__(self, units: np.ndarray) -> float:
-        matrix, before = self.correction(units), self.simulator.settings
-        self.simulator.settings = self.simulation
-        try:
-            for pose, comparison in zip(self.poses, self.comparisons, strict=True):
-                comparison.run(self.simulator.render(self.probe, matrix @ pose, self.display, self.grid).image)
-            return mean_total(comparison.result() for comparison in self.comparisons)
-        finally:
-            self.simulator.settings = before
+        matrix, render = self.correction(units), self.simulator.render
+        for pose, comparison in zip(self.poses, self.comparisons, strict=True):
+            frame = render(self.probe, matrix @ pose, self.display, self.grid, settings=self.simulation)
+            comparison.run(frame.image)
+        return mean_total(comparison.result() for comparison in self.comparisons)
 
 
 def middle_frame(probe: Probe, poses: list[np.ndarray]) -> np.ndarray:

@@ -18,6 +18,7 @@ _LONGEST = 1.06  # of paths, in image depths: the fastest soft tissue
 _SCREEN_STEP_MM, _SCREEN_DEPTHS = 8.0, (8, 24)
 _LINES_PER_SCREEN = 3
 _FAN_STEP_MM, _MOST_DEPTHS = (0.25, 1.0), 192  # limits of the length of a look-up; else a voxel
+_COARSER, _COARSE_FAN_STEP_MM = 2.0, 2.0  # of drafts
 _ANGLE_STEP, _WIDEST = 0.022, 1.5  # radians
 
 _NEPERS_PER_DB = np.log(10.0) / 20.0
@@ -101,6 +102,8 @@ def aperture_fields(
 
     Points are a twelfth of the aperture apart, along all of the face and as far beyond it as lines are traced.
     """
+    is_full = settings.quality == "full"
+    coarser = 1.0 if is_full else _COARSER
     depth = _LONGEST * probe.depth_mm
     screens = int(np.clip(np.ceil(depth / _SCREEN_STEP_MM), *_SCREEN_DEPTHS))
     widest = 0.5 / probe.receive_f_number  # of the directions from which a depth is reached, to the line
@@ -110,19 +113,20 @@ def aperture_fields(
         if probe.has_flat_face and not probe.is_linear:
             along = probe.apex_radius_mm * np.tan(reach)
         span = 2.0 * along + probe.aperture_mm
-        pitch = max(probe.aperture_mm / _POINTS, span / (_MOST_POINTS - 1))
+        pitch = coarser * max(probe.aperture_mm / _POINTS, span / (_MOST_POINTS - 1))
         if probe.has_flat_face:
             widest += abs(probe.steering_rad) if probe.is_linear else reach
         else:
             widest += 0.5 * (probe.aperture_mm + pitch) / probe.apex_radius_mm
     else:
-        span, pitch = probe.aperture_mm, probe.aperture_mm / _POINTS
+        span, pitch = probe.aperture_mm, coarser * probe.aperture_mm / _POINTS
         widest += reach
     points = round(span / pitch) + 1
     widest = min(widest, _WIDEST)
-    angles = int(np.ceil(2.0 * widest / _ANGLE_STEP)) + 1
+    angles = int(np.ceil(2.0 * widest / (coarser * _ANGLE_STEP))) + 1
     fan = depth + 0.5 * probe.aperture_mm  # from the edge of the aperture
-    depths = int(min(np.ceil(fan / float(np.clip(voxel_mm, *_FAN_STEP_MM))) + 1, _MOST_DEPTHS))
+    step_mm = float(np.clip(voxel_mm, *_FAN_STEP_MM)) if is_full else _COARSE_FAN_STEP_MM
+    depths = int(min(np.ceil(fan / step_mm) + 1, _MOST_DEPTHS))
     return {
         "aperture_beams": settings.beam == "aperture",
         "screen_lines": max(2, -(-traced_lines // _LINES_PER_SCREEN)),

@@ -10,6 +10,7 @@ from numbers import Integral
 from typing import Any
 
 import numpy as np
+from scipy import ndimage
 
 from SlicerUSSim.Logic.base.errors import SimulationError, require
 from SlicerUSSim.Logic.base.volume import Volume
@@ -65,17 +66,18 @@ def same_shapes(shapes: Sequence[tuple]) -> tuple:
 
 
 def arrays_for(
-    outputs: Sequence[str], count: int, pixels: tuple[int, int], lines: tuple[int, int],
+    outputs: Sequence[str], pixels: tuple[int, int], lines: Sequence[tuple[int, int]],
     out: Mapping[str, np.ndarray] | None,
 ) -> dict[str, np.ndarray]:  # fmt: skip
-    """{output: array of `count` images}: those of `out`, or new ones, which are temporary files if memory is short.
+    """{output: array of all images}: those of `out`, or new ones, which are temporary files if memory is short.
 
-    Raises SimulationError for unknown outputs, for an `out` of another shape or type, and if neither has room.
+    Images have `pixels` (rows, columns), and each its `lines` (scan_lines, samples). Raises SimulationError for unknown
+    outputs, for signals of different shapes, for an `out` of another shape or type, and if neither has room.
     """
     require(not isinstance(outputs, str), f"outputs are {outputs!r}, expected a list such as [{outputs!r}]")
     for name in outputs:
         require(name in OUTPUTS, f"output {name!r} is unknown, expected some of {', '.join(OUTPUTS)}")
-    shapes = {name: (count, *(pixels if OUTPUTS[name][2] else lines)) for name in outputs}
+    shapes = {name: (len(lines), *(pixels if OUTPUTS[name][2] else same_shapes(lines))) for name in outputs}
     if out is not None:
         require(
             isinstance(out, Mapping) and set(out) == set(outputs),
@@ -208,28 +210,22 @@ def _imaged(
     is_seen = is_direct.any(axis=1)[:, None] & (along <= direct["length_mm"][piece] + _SHIFT_STEP_MM)
     shift = np.where(is_seen[..., None], shift @ labels.ras_to_ijk[:3, :3].T, _FAR_MM).astype(np.float32)
 
-    row, column, nearest = _nearest(probe, grid, lateral, guard, len(counts))
-    to_ijk = (labels.ras_to_ijk @ pose @ grid.image_to_probe).astype(np.float32)
-    inside, index = np.ones(len(row), bool), []
-    for axis, size in enumerate(labels.array.shape[::-1]):
-        place = shift[..., axis].ravel().take(nearest)
-        place += column * to_ijk[axis, 0] + to_ijk[axis, 3]
-        place += row * to_ijk[axis, 1]
-        index.append(np.rint(place, out=place).astype(np.intp))
-        inside &= (place >= 0) & (place < size)
+    row, column, nearest = _nearest(probe, grid, lateral, guard, len(counts), len(depth))
+    to_ijk = (labels.ras_to_ijk @ pose @ grid.image_to_probe)[:3].astype(np.float32)
+    place = shift.reshape(-1, 3).T.copy().take(nearest, axis=1)
+    place += to_ijk[:, :1] * column + to_ijk[:, 1:2] * row + to_ijk[:, 3:]
     found = np.zeros((grid.rows, grid.columns), np.uint8)
-    found[_field(probe, grid)] = np.where(inside, labels.array[tuple(np.where(inside, at, 0) for at in index[::-1])], 0)
+    found[_field(probe, grid)] = ndimage.map_coordinates(labels.array, place[::-1], order=0, cval=0)
     return found
 
 
 @lru_cache(maxsize=4)
 def _nearest(
-    probe: Probe, grid: ImageGrid, lateral: int, guard: int, traced: int
+    probe: Probe, grid: ImageGrid, lateral: int, guard: int, traced: int, depths: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Of the pixels in the imaged field: float32 row, column, and which of (traced lines, depths) is nearest."""
     position, along = (of[_field(probe, grid)] for of in lines_of_pixels(probe, grid))
     line = np.rint((position - probe.first_line) / probe.line_spacing * lateral).astype(int) + guard
     depth = np.rint(np.clip(along, 0.0, probe.displayed_mm) / _SHIFT_STEP_MM).astype(int)
-    depths = len(np.arange(0.0, probe.displayed_mm + _SHIFT_STEP_MM, _SHIFT_STEP_MM))
     row, column = (of.astype(np.float32) for of in np.nonzero(_field(probe, grid)))
     return row, column, np.clip(line, 0, traced - 1) * depths + depth

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import os
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -128,10 +127,8 @@ class Frame:
         """Open the image in the viewer of pictures of this computer; a notebook shows a frame by itself."""
         self._picture().show("B-mode")
 
-    def _repr_png_(self) -> bytes:
-        buffer = io.BytesIO()
-        self._picture().save(buffer, "PNG")
-        return buffer.getvalue()
+    def _repr_png_(self) -> bytes | None:
+        return self._picture()._repr_png_()
 
     def _picture(self):
         """The image with square pixels."""

@@ -22,16 +22,15 @@ from SlicerUSSim.Logic.base.errors import require, require_kind, required
 from SlicerUSSim.Logic.base.settings import DisplaySettings, SimulationSettings
 from SlicerUSSim.Logic.base.transforms import check_rigid
 from SlicerUSSim.Logic.base.volume import Volume
-from SlicerUSSim.Logic.imaging import stages
+from SlicerUSSim.Logic.imaging import quality, stages
 from SlicerUSSim.Logic.imaging.aperture import Aperture, aperture_fields
-from SlicerUSSim.Logic.imaging.batch import OUTPUTS, arrays_for, fetched, one_per_image, same_shapes
+from SlicerUSSim.Logic.imaging.batch import arrays_for, fetched, one_per_image, same_shapes
 from SlicerUSSim.Logic.imaging.bmode import downshift, log_band_above, pulse_taps
 from SlicerUSSim.Logic.imaging.compounding import Compounder, sweep_grid
 from SlicerUSSim.Logic.imaging.contact import line_contact
 from SlicerUSSim.Logic.imaging.frame import Echoes, Frame
 from SlicerUSSim.Logic.imaging.medium import Medium, as_labels
 from SlicerUSSim.Logic.imaging.noise import require_seed, stirred
-from SlicerUSSim.Logic.imaging.quality import coarser_fans, cycles_per_mm, line_shape, sample_mm, sigmas_between, worked
 from SlicerUSSim.Logic.imaging.raytracing import RayTracer
 from SlicerUSSim.Logic.imaging.scattering import cells_in_view, sites_per_mm3
 from SlicerUSSim.Logic.imaging.signals import RayTree
@@ -39,7 +38,7 @@ from SlicerUSSim.Logic.imaging.stage import DeviceFrame, Stage
 from SlicerUSSim.Logic.opencl.device import Device, DeviceChoice
 from SlicerUSSim.Logic.opencl.layout import ACQUISITION, CONSTANTS
 from SlicerUSSim.Logic.probe.arrays import Probe
-from SlicerUSSim.Logic.probe.beam import CURVED, NOMINAL_SPEED_M_S
+from SlicerUSSim.Logic.probe.beam import CURVED
 from SlicerUSSim.Logic.probe.image_grid import ImageGrid
 from SlicerUSSim.Logic.tissue.sheet_looks import DURA_ISOTROPIC, dura_label
 from SlicerUSSim.Logic.tissue.surfels import Surfels
@@ -135,8 +134,6 @@ class UltrasoundSimulator:
         self.display_stages = [stage(self.device) for stage in stages.DISPLAY_STAGES]
         self.tracer = self.stage(RayTracer)
         self._acquisition_buffer = self.device.empty(ACQUISITION.itemsize)
-        # The last probe and settings that were found fast enough
-        self._fast_for: tuple | None = None
         # The record of the last frame, and its inputs except the pose
         self._record: np.ndarray | None = None
         self._record_made_for: tuple | None = None
@@ -203,20 +200,20 @@ class UltrasoundSimulator:
         self.warn_if_slow(probe)
         timings: dict[str, float] = {}
         with self._lock:
-            frame = self.render(probe, pose, display, grid, noise_seed=noise_seed, timings=timings)
+            frame = self.render(probe, pose, display, grid, noise_seed, timings=timings)
             self._warn_if_empty(probe, pose)  # while the device computes
             with self._timed("download", timings):
                 image = self._persisted(frame.download("image"), probe, display, frame.grid)
                 self._warn_if_overflown()
-            samples = line_shape(frame.probe, frame.settings)[1]
+            samples = quality.line_shape(frame.probe, frame.settings)[1]
             iq, envelope, bmode = (frame.on_demand(name, samples) for name in ("iq", "envelope", "grey"))
             made = Frame(
                 iq=iq,
                 envelope=envelope,
                 bmode=bmode,
                 image=image,
-                sample_interval_mm=sample_mm(frame.probe, frame.settings),
-                cycles_per_mm=cycles_per_mm(probe, self.settings),
+                sample_interval_mm=quality.sample_mm(frame.probe, frame.settings),
+                cycles_per_mm=quality.cycles_per_mm(probe, self.settings),
                 grid=frame.grid,
                 probe_to_ras=pose,
                 timings_ms=timings,
@@ -287,11 +284,10 @@ class UltrasoundSimulator:
             for probe, shown in zip(probes, displays, strict=True)
         ]
         pixels = same_shapes([(grid.rows, grid.columns) for grid in grids])
-        lines = [line_shape(*worked(*both, pixels[1])) for both in zip(probes, each, strict=True)]
-        has_signals = not all(OUTPUTS[name][2] for name in outputs if name in OUTPUTS)
-        arrays = arrays_for(outputs, len(poses), pixels, same_shapes(lines) if has_signals else lines[0], out)
-        for probe in dict.fromkeys(probes):
-            self.warn_if_slow(probe)
+        lines = [quality.line_shape(*quality.worked(*both, pixels[1])) for both in zip(probes, each, strict=True)]
+        arrays = arrays_for(outputs, pixels, lines, out)
+        for both in dict.fromkeys(zip(probes, each, strict=True)):
+            self.warn_if_slow(*both)
 
         def jobs() -> Iterator[tuple]:
             before = None
@@ -299,10 +295,9 @@ class UltrasoundSimulator:
                 if table is not before:
                     self.set_tissues(table)
                     before = table
-                self.settings = each[number]
                 if "labels_as_imaged" in arrays:
                     self.forget_echoes()  # they need the rays, too
-                yield probes[number], poses[number], displays[number], grids[number], noise_seeds[number]
+                yield probes[number], poses[number], displays[number], grids[number], noise_seeds[number], each[number]
 
         def start(number: int, frame: DeviceFrame) -> Callable[[], None]:
             fetching = {name: fetched(name, frame, poses[number], lines[number][1]) for name in arrays}
@@ -314,10 +309,9 @@ class UltrasoundSimulator:
             return complete
 
         with ExitStack() as stack:
-            if tissues is not None or settings is not None:  # of this batch alone
+            if tissues is not None:  # of this batch alone
                 stack.enter_context(self._lock)
                 stack.enter_context(self.with_tissues(self.medium.tissues))
-                stack.callback(setattr, self, "settings", self.settings)
             self._in_turn(jobs(), start)
         self._warn_if_overflown(len(poses))
         return arrays
@@ -330,16 +324,13 @@ class UltrasoundSimulator:
         `probe`, `settings` and `noise_seed` belong to the echoes; the patient of this simulator does not matter.
         """
         with self._lock:
-            own, self.settings = self.settings, replace(settings, contact_gap_mm=None)  # which the echoes have already
-            try:
-                grid = ImageGrid.for_probe(probe, display.image_size)
-                probe, settings = worked(probe, self.settings, grid.columns)
-                probe = replace(probe, scan_lines=len(echoes.parts))
-                frame = self.device_frame(
-                    probe, echoes.probe_to_ras, display, grid, noise_seed, self._acquisition_buffer, settings
-                )
-            finally:
-                self.settings = own
+            grid = ImageGrid.for_probe(probe, display.image_size)
+            made_by = replace(settings, contact_gap_mm=None)  # the echoes have that of contact already
+            probe, settings = quality.worked(probe, made_by, grid.columns)
+            frame = self.device_frame(
+                replace(probe, scan_lines=len(echoes.parts)), echoes.probe_to_ras, display, grid, noise_seed,
+                self._acquisition_buffer, settings,
+            )  # fmt: skip
             frame.iq = self.device.upload(echoes.iq(frame.line_shape[1]))
             self._run(self.display_stages, frame, {})
             return frame.download("image")
@@ -371,19 +362,21 @@ class UltrasoundSimulator:
         pose: np.ndarray,
         display: DisplaySettings | None = None,
         grid: ImageGrid | None = None,
-        *,
         noise_seed: int = 0,
+        settings: SimulationSettings | None = None,
+        *,
         timings: dict[str, float] | None = None,
     ) -> DeviceFrame:
         """Enqueue all stages of one frame, whose image is on the device until the next one overwrites it.
 
-        If only the display, the noise or the pixels have changed since the last frame, its echoes are reused.
+        `settings` replace those of the simulator. If only the display, the noise or the pixels have changed since the
+        last frame, its echoes are reused.
         """
         timings = {} if timings is None else timings
         with self._lock:
             with self._timed("upload", timings):
                 grid = grid or ImageGrid.for_probe(probe, None if display is None else display.image_size)
-                probe, settings = worked(probe, self.settings, grid.columns)
+                probe, settings = quality.worked(probe, settings or self.settings, grid.columns)
                 frame = self.device_frame(probe, pose, display, grid, noise_seed, self._acquisition_buffer, settings)
             # The baseband signal does not depend on display, noise or pixels.
             inputs = (frame.acquisition.tobytes(), settings, self.medium.version)
@@ -499,17 +492,17 @@ class UltrasoundSimulator:
         start: Callable[[int, DeviceFrame], Callable[[], object]],
         progress: Callable[[int], None] | None = None,
     ) -> None:
-        """Enqueue images (probe, pose, display, grid, noise_seed), and call what `start` gives to complete each.
+        """Enqueue images, each by arguments of render(), and call what `start` gives to complete them.
 
         While the device computes an image, the host completes the previous one and prepares the next, no more than one.
         """
         before: Callable[[], object] | None = None
-        for number, (probe, pose, display, grid, noise_seed) in enumerate(jobs):
+        for number, job in enumerate(jobs):
             with self._lock:  # for one image, so that others need not wait for all
-                frame = self.render(probe, pose, display, grid, noise_seed=noise_seed)
+                frame = self.render(*job)
                 complete = start(number, frame)
                 self.device.queue.flush()
-            self._warn_if_empty(probe, pose, stacklevel=4)
+            self._warn_if_empty(*job[:2], stacklevel=4)
             if before is not None:
                 before()
             before = complete
@@ -557,7 +550,7 @@ class UltrasoundSimulator:
             settings=settings,
             contact=None if gap_mm is None else line_contact(self.medium.labels, probe, pose, gap_mm),
             acquisition=self.acquisition(probe, pose, settings),
-            axial_sigma_mm=self.axial_sigma_mm(probe),
+            axial_sigma_mm=quality.axial_sigma_mm(probe, settings),
             display=display,
             grid=grid or ImageGrid.for_probe(probe, display.image_size),
             noise_seed=noise_seed,
@@ -579,9 +572,9 @@ class UltrasoundSimulator:
 
     def _record_of(self, probe: Probe, settings: SimulationSettings) -> np.ndarray:
         """The part of the record that does not depend on the pose."""
-        medium, step_mm = self.medium, sample_mm(probe, settings)
+        medium, step_mm = self.medium, quality.sample_mm(probe, settings)
         block = CONSTANTS["BLOCK"]
-        axial_sigma = self.axial_sigma_mm(probe)
+        axial_sigma = quality.axial_sigma_mm(probe, settings)
         acquisition = np.zeros((), ACQUISITION)
         for owner in (probe, settings):
             for parameter in parameters_of(type(owner)):
@@ -606,7 +599,7 @@ class UltrasoundSimulator:
             acquisition["membrane_variation"] = membrane.roughness_octaves
             acquisition["membrane_octaves"] = membrane.patch_db / 6.0206
             # 2 k s of the range's deviation s: the carrier has 2 k / 2 pi cycles per millimetre of depth.
-            acquisition["membrane_phase"] = 2.0 * np.pi * cycles_per_mm(probe, self.settings) * membrane.roughness_mm
+            acquisition["membrane_phase"] = 2.0 * np.pi * quality.cycles_per_mm(probe, settings) * membrane.roughness_mm
         acquisition["linear"] = probe.is_linear
         acquisition["apex_radius_mm"] = 0.0 if probe.is_linear else probe.apex_radius_mm
         for name, value in steering_fields(probe).items():
@@ -618,12 +611,12 @@ class UltrasoundSimulator:
         acquisition["line_spacing"] = probe.line_spacing
         acquisition["frequency_mhz"] = probe.received_mhz
         acquisition["fractional_bandwidth"] = probe.received_bandwidth
-        acquisition["cycles_per_mm"] = cycles_per_mm(probe, self.settings)
+        acquisition["cycles_per_mm"] = quality.cycles_per_mm(probe, settings)
         acquisition["sample_mm"] = step_mm
         # The last samples of the image have echoes from half a pulse behind it. Borders are found by labels, up to a
         # voxel behind where they are.
         behind = pulse_taps(axial_sigma / step_mm).size // 2
-        acquisition["samples"] = -(-(line_shape(probe, settings)[1] + behind) // block) * block
+        acquisition["samples"] = -(-(quality.line_shape(probe, settings)[1] + behind) // block) * block
         acquisition["traced_mm"] = probe.displayed_mm + behind * step_mm + medium.labels.spacing_mm.min()
         acquisition["wavefront_curvature"] = CURVED if settings.wavefront_curvature else 0.0
         for name, value in transmit_fields(probe).items():
@@ -636,8 +629,7 @@ class UltrasoundSimulator:
         acquisition["lateral_rays"], acquisition["guard_lines"] = lateral, guard
         traced = acquisition["traced_lines"] = (probe.scan_lines - 1) * lateral + 1 + 2 * guard
         voxel_mm = float(acquisition["voxel_mm"])
-        fans = aperture_fields(probe, settings, voxel_mm, traced, guard, lateral)
-        for name, value in (fans if settings.quality == "full" else fans | coarser_fans(fans)).items():
+        for name, value in aperture_fields(probe, settings, voxel_mm, traced, guard, lateral).items():
             acquisition[name] = value
         acquisition["interface_gain"] = 10.0 ** (settings.interface_gain_db / 20.0)
         acquisition["interface_is_energy"] = settings.interface_reflection == "energy"
@@ -650,28 +642,22 @@ class UltrasoundSimulator:
         acquisition["speckle_scale"] = (density * np.pi**1.5 * axial_sigma) ** -0.5
         return acquisition
 
-    def axial_sigma_mm(self, probe: Probe) -> float:
-        """Standard deviation of the pulse in depth, millimetres, with the scanner's speed of sound."""
-        return probe.axial_sigma_mm * self.settings.reference_speed_m_s / NOMINAL_SPEED_M_S
-
-    def warn_if_slow(self, probe: Probe) -> None:
-        """Warn if an image has so many scatterers that it takes seconds.
+    def warn_if_slow(self, probe: Probe, settings: SimulationSettings | None = None) -> None:
+        """Warn if an image has so many scatterers that it takes seconds; with the simulator's settings by default.
 
         Raises SimulationError, before anything is computed, if it would take minutes.
         """
-        asked_for = probe, self.settings
-        if not self.settings.scattering or self._fast_for == asked_for:
+        settings = settings or self.settings
+        if not settings.scattering:
             return
-        lateral, guard = _traced_lines_for(probe, self.settings)
+        lateral, guard = _traced_lines_for(probe, settings)
         traced = (probe.scan_lines - 1) * lateral + 1 + 2 * guard
-        chunk_mm = CONSTANTS["BLOCK"] * sample_mm(probe, self.settings)
-        cells = cells_in_view(self.settings, probe, traced, lateral, chunk_mm)
+        cells = cells_in_view(settings, probe, traced, lateral, CONSTANTS["BLOCK"] * quality.sample_mm(probe, settings))
         if cells <= _MANY_CELLS:
-            self._fast_for = asked_for
             return
-        automatic = replace(self.settings, scatterers_per_mm3=None)
+        automatic = replace(settings, scatterers_per_mm3=None)
         found = (
-            f"{sites_per_mm3(self.settings, probe):.6g} scatterers per mm³ ({probe.frequency_mhz:g} MHz, elevation "
+            f"{sites_per_mm3(settings, probe):.6g} scatterers per mm³ ({probe.frequency_mhz:g} MHz, elevation "
             f"aperture {probe.elevation_aperture_mm:g} mm, elevation focus {probe.elevation_focus_mm:g} mm) are "
             f"{cells:.1e} cells of the lattice per image, about {cells / _CELLS_PER_S:.0f} s on two cores of a CPU"
         )
@@ -792,7 +778,7 @@ def _traced_lines_for(probe: Probe, settings: SimulationSettings) -> tuple[int, 
     Those beyond the edge provide the other half of the beam for the outermost scan lines (if it is at most 16 lines
     wide, which is not the case only near the apex of a phased array).
     """
-    depth, sigmas = sigmas_between(probe)
+    depth, sigmas = quality.sigmas_between(probe)
     lateral = settings.lateral_rays or int(min(np.ceil(sigmas.max() / 1.5), 128))
     deep = sigmas[depth >= 0.1 * probe.depth_mm]
     return lateral, int(min(np.ceil(settings.beam_cutoff * lateral / deep.min()), 16 * lateral))

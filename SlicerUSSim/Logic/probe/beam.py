@@ -288,10 +288,6 @@ class Beam(Declared):
         """Largest distance from line_at's origin within the imaged field, defined by each kind."""
         raise NotImplementedError
 
-    def transmit_waist(self) -> tuple[float, float, float]:
-        """(sigma at the focus, focus, Rayleigh length) of the one-way lateral transmit beam, millimetres."""
-        return self._sent(self.focus_mm, self.aperture_mm)
-
     def elevation_waist(self) -> tuple[float, float, float]:
         """(sigma at the focus, focus, Rayleigh length) of the one-way elevational beam of the pulse, millimetres."""
         return self._waist(self.elevation_focus_mm, self.elevation_aperture_mm)

@@ -8,8 +8,8 @@
     actor.GetMapper().SetInputConnection(simulation.GetOutputPort())
 
 All images are in patient space (RAS, mm), with origin, spacing and direction matrix. The first row of a B-mode image is
-next to the probe, and writers of pictures put the first row at the bottom: `GetPicture` is for them. Errors caused by
-the caller are reported by an ErrorEvent with one line, and by GetErrorMessage; the output is then empty.
+next to the probe. Writers of pictures put it at the bottom: flip the image for them (examples/vtk_picture.py). Errors
+caused by the caller are reported by an ErrorEvent with one line, and by GetErrorMessage; the output is then empty.
 """
 
 from __future__ import annotations
@@ -87,6 +87,7 @@ class _ImageFilter(VTKPythonAlgorithmBase):
         self._change("_device", device)
 
     GetDevice = _getter("_device", "The choice of an OpenCL device; None: the best.")
+    GetErrorMessage = _getter("_message", "The error of the last update, one line; empty without an error.")
 
     def SetInputData(self, image: vtkImageData | None) -> None:
         """Set the input image directly, without a pipeline connection."""
@@ -95,10 +96,6 @@ class _ImageFilter(VTKPythonAlgorithmBase):
     def GetOutput(self, port: int = 0):
         """The output of the last update."""
         return self.GetOutputDataObject(port)
-
-    def GetErrorMessage(self) -> str:
-        """The error of the last update, one line; empty without an error."""
-        return self._message
 
     def ProcessRequest(self, request, inInfo, outInfo):  # noqa: N803
         try:
@@ -167,6 +164,9 @@ class SegmentationFilter(_ImageFilter):
     GetSettings = _getter("_settings", "The SegmentationSettings.")
     GetOtherData = _getter("_others", "{contrast: vtkImageData} of the other MRIs.")
     GetAddedTissues = _getter("_added", "(tissue, vtkImageData) of all that is laid over the labels, the last on top.")
+    GetNotes = _getter("_notes", "What the last update recognised and decided, one line each.")
+    GetWarnings = _getter("_warnings", "What should be checked after the last update, one line each.")
+    GetSegmentation = _getter("_segmentation", "Segmentation or CtSegmentation of the last update, with its texture.")
 
     def SetOtherData(self, contrast: str, image: vtkImageData | None) -> None:
         """Another MRI of the same patient, on any grid, to classify together with the first; None removes it.
@@ -187,14 +187,6 @@ class SegmentationFilter(_ImageFilter):
         """Undo AddTissueData."""
         self._change("_added", ())
 
-    def GetNotes(self) -> tuple[str, ...]:
-        """What the last update recognised and decided, one line each."""
-        return self._notes
-
-    def GetWarnings(self) -> tuple[str, ...]:
-        """What should be checked after the last update, one line each."""
-        return self._warnings
-
     def SetMaskData(self, mask: vtkImageData | None) -> None:
         """A mask of the brain or patient on the MRI's grid, non-zero inside; or SetInputConnection(1, port)."""
         self.SetInputDataObject(1, mask)
@@ -202,10 +194,6 @@ class SegmentationFilter(_ImageFilter):
     def GetMaskData(self) -> vtkImageData | None:
         """The mask, or None."""
         return self.GetInputDataObject(1, 0)
-
-    def GetSegmentation(self) -> Segmentation | CtSegmentation | None:
-        """The mixture, posteriors and texture of the last update; of a CT its noise and texture."""
-        return self._segmentation
 
     def FillInputPortInformation(self, port, info):
         super().FillInputPortInformation(port, info)
@@ -387,19 +375,6 @@ class UltrasoundSimulationFilter(_ImageFilter):
     def GetFrame(self) -> Frame | None:
         """The frame of the last update: RF, envelope, image, pose; None after an error."""
         return self._frame if self.GetOutput().GetNumberOfPoints() else None
-
-    def GetPicture(self) -> vtkImageData:
-        """The image, updated, for vtkPNGWriter and other writers of pictures: its last row first, without its place.
-
-        Empty after an error of the update.
-        """
-        self.Update()
-        picture, frame = vtkImageData(), self.GetFrame()
-        if frame is not None:
-            picture.SetDimensions(frame.grid.columns, frame.grid.rows, 1)
-            picture.SetSpacing(*frame.pixel_spacing_mm, 1.0)
-            set_scalars(picture, frame.image[::-1])
-        return picture
 
     def FillInputPortInformation(self, port, info):
         info.Set(vtkAlgorithm.INPUT_REQUIRED_DATA_TYPE(), ("vtkImageData", "vtkPolyData")[port])
