@@ -28,8 +28,8 @@ def write_picture(mri: vtkImageData, path: str) -> UltrasoundSimulationFilter:
     transform.SetMatrix(vtk_matrix(craniotomy_pose(labels, simulation.GetProbe())))
     simulation.SetProbeTransform(transform)
 
-    # Writers put the first row at the bottom, but it is next to the probe. A flip keeps to the axes of the patient, so
-    # that the image is taken out of the patient's space first.
+    # The first row is next to the probe, and writers put it at the bottom. vtkImageFlip works along the patient's axes,
+    # so that the image loses its direction first (VTK 9.3 or newer).
     upright = vtkImageChangeInformation()
     upright.SetInputConnection(simulation.GetOutputPort())
     upright.SetOutputDirection((1, 0, 0, 0, 1, 0, 0, 0, 1))
