@@ -11,7 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from SlicerUSSim.Logic import DisplaySettings, UltrasoundSimulator, Volume
+from SlicerUSSim.Logic import DisplaySettings, SimulationError, UltrasoundSimulator, Volume
 from SlicerUSSim.Logic.fitting import register_poses
 from SlicerUSSim.Logic.probe import PROBES, craniotomy_pose, tilt_sweep, turned
 
@@ -41,4 +41,7 @@ def errors_mm(mri: Volume, evaluations: int = 300) -> tuple[float, float]:
 if __name__ == "__main__":
     if len(sys.argv) < 2:
         sys.exit(__doc__)
-    print("{:.1f} mm before, {:.1f} mm after".format(*errors_mm(Volume.read(sys.argv[1]))))
+    try:
+        print("{:.1f} mm before, {:.1f} mm after".format(*errors_mm(Volume.read(sys.argv[1]))))
+    except SimulationError as error:
+        sys.exit(str(error))

@@ -12,7 +12,7 @@ from time import perf_counter
 
 import numpy as np
 
-from SlicerUSSim.Logic import DisplaySettings, SimulationSettings, UltrasoundSimulator, Volume
+from SlicerUSSim.Logic import DisplaySettings, SimulationError, SimulationSettings, UltrasoundSimulator, Volume
 from SlicerUSSim.Logic.probe import PROBES, PatientSurface, craniotomy_pose, turned
 
 
@@ -30,7 +30,9 @@ def write_pairs(mri: Volume, out: Path, images: int, seed: int = 0) -> None:
     probes = [replace(PROBES["phased"], focus_mm=focus) for focus in random.choice([30.0, 45.0, 60.0], images)]
     gains = random.uniform(-6, 6, images)
     displays = [DisplaySettings(gain_db=gain, image_size=(128, 160)) for gain in gains]
+    started = perf_counter()
     pairs = simulator.simulate_batch(probes, poses, display=displays, outputs=("image", "labels"))
+    print(f"{images} pairs in {perf_counter() - started:.1f} s, after the segmentation", file=sys.stderr)
     np.savez_compressed(out, poses=poses, image=pairs["image"], labels=pairs["labels"])
 
 
@@ -38,6 +40,7 @@ if __name__ == "__main__":
     if len(sys.argv) < 3:
         sys.exit(__doc__)
     count = int(sys.argv[3]) if len(sys.argv) > 3 else 100
-    started = perf_counter()
-    write_pairs(Volume.read(sys.argv[1]), Path(sys.argv[2]), count)
-    print(f"{count} pairs in {perf_counter() - started:.1f} s", file=sys.stderr)
+    try:
+        write_pairs(Volume.read(sys.argv[1]), Path(sys.argv[2]), count)
+    except SimulationError as error:
+        sys.exit(str(error))

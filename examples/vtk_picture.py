@@ -9,7 +9,8 @@ from vtkmodules.vtkCommonTransforms import vtkTransform
 from vtkmodules.vtkImagingCore import vtkImageChangeInformation, vtkImageFlip
 from vtkmodules.vtkIOImage import vtkPNGWriter
 
-from SlicerUSSim.Logic import Volume
+from SlicerUSSim.Logic import SimulationError, Volume
+from SlicerUSSim.Logic.base.errors import require
 from SlicerUSSim.Logic.base.vtk_data import vtk_matrix
 from SlicerUSSim.Logic.probe import craniotomy_pose
 from SlicerUSSim.Logic.vtk import SegmentationFilter, UltrasoundSimulationFilter
@@ -41,10 +42,14 @@ def write_picture(mri: vtkImageData, path: str) -> UltrasoundSimulationFilter:
     writer.SetInputConnection(flip.GetOutputPort())
     writer.SetFileName(path)
     writer.Write()
+    require(not writer.GetErrorCode(), f"{path}: cannot be written")
     return simulation
 
 
 if __name__ == "__main__":
     if len(sys.argv) < 3:
         sys.exit(__doc__)
-    write_picture(Volume.read(sys.argv[1]).to_vtk(), sys.argv[2])
+    try:
+        write_picture(Volume.read(sys.argv[1]).to_vtk(), sys.argv[2])
+    except SimulationError as error:
+        sys.exit(str(error))

@@ -31,6 +31,7 @@ from SlicerUSSim.Logic.base.errors import (
     OtherFileError,
     SimulationError,
     is_our_warning,
+    require_path,
     shown_path,
     warn_again,
 )
@@ -126,6 +127,7 @@ def _reading(function: Callable[_P, _T], *, always_in_child: bool) -> Callable[_
     @functools.wraps(function)
     def read(*args: _P.args, **kwargs: _P.kwargs) -> _T:
         path = signature.bind(*args, **kwargs).arguments["path"]
+        require_path(path)
         limits = _limits_of(path)
         if limits is None and always_in_child and not _is_child:
             limits = ReadingLimits()

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from SlicerUSSim.Logic.base.dicom import is_dicom, read_dicom
-from SlicerUSSim.Logic.base.errors import require, require_path
+from SlicerUSSim.Logic.base.errors import require
 from SlicerUSSim.Logic.base.files import messages_withheld, written_whole
 from SlicerUSSim.Logic.base.image_files import (
     ImageFile,
@@ -156,7 +156,6 @@ class Volume:
 
         Raises SimulationError for a missing or unreadable file and for an image that is not 3D and scalar.
         """
-        require_path(path)
         path = Path(path)
         found = read_image_file(path)
         volume = cls.from_image_file(found, str(path))

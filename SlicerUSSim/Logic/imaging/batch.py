@@ -12,8 +12,11 @@ from typing import Any
 import numpy as np
 from scipy import ndimage
 
+from SlicerUSSim.Logic.base.declaration import short
 from SlicerUSSim.Logic.base.errors import SimulationError, require
+from SlicerUSSim.Logic.base.settings import SimulationSettings
 from SlicerUSSim.Logic.base.volume import Volume
+from SlicerUSSim.Logic.imaging.quality import line_shape
 from SlicerUSSim.Logic.imaging.stage import DeviceFrame
 from SlicerUSSim.Logic.opencl.layout import CONSTANTS, SEGMENT
 from SlicerUSSim.Logic.probe.arrays import Probe
@@ -33,6 +36,7 @@ OUTPUTS: dict[str, tuple[type[np.generic], str, bool]] = {
 }
 #: Steps of the displacement of lines, and a distance beyond all volumes
 _SHIFT_STEP_MM, _FAR_MM = 0.25, 1e6
+_NO_RF = "rf has 2 samples per cycle, expected more; take iq, or quality full"
 #: Part of the free memory that arrays may have; larger ones are files
 _MOST_OF_MEMORY = 0.5
 
@@ -46,38 +50,43 @@ def one_per_image(name: str, given: Any, kind: type, count: int) -> list:
         return list(range(int(given), int(given) + count))
     if isinstance(given, kind) or (given is None and kind is not Probe):
         return [given] * count
-    values = list(given) if isinstance(given, Sequence | np.ndarray) else []
-    require(
-        len(values) == count and all(isinstance(value, kind) for value in values),
-        f"{name} are {len(values)} for {count} poses, expected one {kind.__name__} or one for each pose",
-    )
+    expected = f"expected one {'whole number' if kind is Integral else kind.__name__} or one for each pose"
+    values = list(given) if isinstance(given, Sequence | np.ndarray) else [given]
+    wrong = [value for value in values if not isinstance(value, kind)]
+    require(not wrong, f"{name} is {short(given)}, {expected}")
+    require(len(values) == count, f"{name} are {len(values)} for {count} poses, {expected}")
     return values
 
 
-def same_shapes(shapes: Sequence[tuple]) -> tuple:
-    """The shape of all images. Raises SimulationError that names the first of another shape."""
+def same_shapes(shapes: Sequence[tuple], remedy: str) -> tuple:
+    """The shape of all images. Raises SimulationError that names the first of another shape, with what to do."""
     other = next((number for number, shape in enumerate(shapes) if shape != shapes[0]), None)
     require(
         other is None,
         f"image {other} of the batch is {_times(shapes[other or 0])}, the first is {_times(shapes[0])}, expected one "
-        "size; set display.image_size, or simulate them apart",
+        f"size; {remedy}",
     )
     return shapes[0]
 
 
 def arrays_for(
-    outputs: Sequence[str], pixels: tuple[int, int], lines: Sequence[tuple[int, int]],
+    outputs: Sequence[str], pixels: tuple[int, int], works: Sequence[tuple[Probe, SimulationSettings]],
     out: Mapping[str, np.ndarray] | None,
 ) -> dict[str, np.ndarray]:  # fmt: skip
     """{output: array of all images}: those of `out`, or new ones, which are temporary files if memory is short.
 
-    Images have `pixels` (rows, columns), and each its `lines` (scan_lines, samples). Raises SimulationError for unknown
-    outputs, for signals of different shapes, for an `out` of another shape or type, and if neither has room.
+    Images have `pixels` (rows, columns) and are computed by `works` (quality.worked). Raises SimulationError for
+    unknown outputs, signals of different shapes, the rf of drafts, an `out` of another shape or type, and if neither
+    has room.
     """
-    require(not isinstance(outputs, str), f"outputs are {outputs!r}, expected a list such as [{outputs!r}]")
+    require(bool(outputs) and not isinstance(outputs, str), f"outputs are {outputs!r}, expected a list of names")
     for name in outputs:
         require(name in OUTPUTS, f"output {name!r} is unknown, expected some of {', '.join(OUTPUTS)}")
-    shapes = {name: (len(lines), *(pixels if OUTPUTS[name][2] else same_shapes(lines))) for name in outputs}
+    require("rf" not in outputs or min(settings.samples_per_cycle for _, settings in works) > 2, _NO_RF)
+    shapes, lines = {}, [line_shape(*work) for work in works]
+    for name in outputs:
+        one = pixels if OUTPUTS[name][2] else same_shapes(lines, f"simulate them apart, or without {name}")
+        shapes[name] = (len(works), *one)
     if out is not None:
         require(
             isinstance(out, Mapping) and set(out) == set(outputs),
@@ -120,8 +129,8 @@ def _filed(shape: tuple[int, ...], kind: type[np.generic]) -> np.ndarray:
             return np.memmap(file, kind, "w+", shape=shape)
     except OSError as error:
         raise SimulationError(
-            f"a batch of {size / 2**30:.1f} GB fits neither into memory nor into {tempfile.gettempdir()} "
-            f"({error.strerror}); simulate it in parts, or set TMPDIR"
+            f"arrays of a batch that fill the memory are files, but {tempfile.gettempdir()} has no room for one of "
+            f"{size / 1e9:.1f} GB ({error.strerror}); simulate the batch in parts, or set TMPDIR"
         ) from None
 
 
@@ -129,9 +138,10 @@ def _times(shape: Sequence[int]) -> str:
     return " x ".join(map(str, shape))
 
 
-def on_carrier(iq: np.ndarray, cycles: float) -> np.ndarray:
-    """(scan_lines, samples) complex64 analytic RF signal of a baseband signal; `cycles` of the carrier are a sample."""
-    return iq * np.exp(2j * np.pi * cycles * np.arange(iq.shape[1])).astype(np.complex64)
+def on_carrier(iq: np.ndarray, samples_per_cycle: int) -> np.ndarray:
+    """(scan_lines, samples) complex64 analytic RF signal of a baseband signal. Raises SimulationError for too few."""
+    require(samples_per_cycle > 2, _NO_RF)
+    return iq * np.exp(2j * np.pi / samples_per_cycle * np.arange(iq.shape[1])).astype(np.complex64)
 
 
 # ---- labels and depths -----------------------------------------------------------------------------------------------
@@ -164,7 +174,7 @@ def lines_of_pixels(probe: Probe, grid: ImageGrid) -> tuple[np.ndarray, np.ndarr
     return probe.line_through(x + dx * columns, y + dy * rows)
 
 
-def fetched(name: str, frame: DeviceFrame, pose: np.ndarray, samples: int) -> Callable[[], np.ndarray]:
+def fetched(name: str, frame: DeviceFrame, pose: np.ndarray) -> Callable[[], np.ndarray]:
     """What gives one of OUTPUTS of a frame that is enqueued; downloads begin now, the rest is computed when called."""
     labels, probe, grid = frame.medium.labels, frame.probe, frame.grid
     if name == "labels":
@@ -177,12 +187,9 @@ def fetched(name: str, frame: DeviceFrame, pose: np.ndarray, samples: int) -> Ca
         segments = start(tree.segments, (traced, CONSTANTS["MAX_SEGMENTS"]), SEGMENT)
         counts = start(tree.segment_counts, (traced,), np.int32)
         return lambda: _imaged(frame, labels, pose, segments(), counts())
-    signal = frame.start_download(OUTPUTS[name][1])
+    signal, samples = frame.start_download(OUTPUTS[name][1]), line_shape(probe, frame.settings)[1]
     if name == "rf":
-        cycles = float(frame.acquisition["sample_mm"]) * float(frame.acquisition["cycles_per_mm"])
-        too_few = f"rf has {1 / cycles:.1f} samples per cycle, expected more than 2.2; take iq, or quality full"
-        require(cycles < 0.45, too_few)
-        return lambda: np.real(on_carrier(signal()[:, :samples], cycles))
+        return lambda: np.real(on_carrier(signal()[:, :samples], frame.settings.samples_per_cycle))
     return signal if name == "image" else lambda: signal()[:, :samples]
 
 

@@ -75,9 +75,9 @@ class Frame:
     def rf(self) -> np.ndarray:
         """(scan_lines, samples) complex64 analytic RF signal; its real part is the sampled echo signal.
 
-        A draft has two samples per cycle, which cannot hold it: take `iq`, or quality "full".
+        Raises SimulationError for a draft, whose two samples per cycle cannot hold it: take `iq`, or quality "full".
         """
-        return on_carrier(self.iq, self.cycles_per_mm * self.sample_interval_mm)
+        return on_carrier(self.iq, round(1.0 / (self.cycles_per_mm * self.sample_interval_mm)))
 
     @property
     def sampling_rate_hz(self) -> float:
@@ -142,7 +142,7 @@ class Frame:
         return Volume(self.image[None], self.probe_to_ras @ self.grid.slice_to_probe)
 
     def to_vtk(self):
-        """The image as a vtkImageData of one slice in patient space (RAS)."""
+        """The image as a vtkImageData of one slice in patient space (RAS); save() has it the right way up."""
         return self.to_volume().to_vtk()
 
 

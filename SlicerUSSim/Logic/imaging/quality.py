@@ -16,9 +16,9 @@ from SlicerUSSim.Logic.imaging.scattering import sites_per_mm3
 from SlicerUSSim.Logic.probe.arrays import Probe
 from SlicerUSSim.Logic.probe.beam import NOMINAL_SPEED_M_S
 
-_LINES_PER_COLUMN, _APART_SIGMAS = 0.6, 1.75
+_LINES_PER_COLUMN, _APART_SIGMAS = 0.5, 2.0
 _SAMPLES_PER_BANDWIDTH, _LEAST_SAMPLES = 4.0, 2
-_FEWER_SITES, _LEAST_SITES, _CUTOFF = 5.0, 0.1, 2.0
+_FEWER_SITES, _LEAST_SITES, _CUTOFF = 5.0, 0.1, 1.5
 
 
 @lru_cache(maxsize=64)

@@ -216,6 +216,7 @@ def _integral(values: np.ndarray, places: np.ndarray) -> np.ndarray:
     return (0.5 * (values[1:] + values[:-1]) * np.diff(places, axis=0)).sum(axis=0)
 
 
+@lru_cache(maxsize=16)
 def cells_in_view(
     settings: SimulationSettings, probe: Probe, traced_lines: int, lateral_rays: int, chunk_mm: float
 ) -> float:

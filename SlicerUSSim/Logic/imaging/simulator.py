@@ -157,8 +157,9 @@ class UltrasoundSimulator:
     ) -> UltrasoundSimulator:  # fmt: skip
         """From an MRI or CT, or its file, to a simulator: segmented, with preset tissues and texture.
 
-        `segmentation` are values of SegmentationSettings, such as contrast="t2" or thin_sulci=True. medium.labels is
-        the label map, for example for craniotomy_pose. Raises SimulationError as Volume.read and segment_image do.
+        `segmentation` are values of SegmentationSettings, such as contrast="t2" or thin_sulci=True, and arguments of
+        segment_image, such as mask or progress: a whole head takes some 20 s. medium.labels is the label map, for
+        example for craniotomy_pose. Raises SimulationError as Volume.read and segment_image do.
         """
         from SlicerUSSim.Logic.mri.modality import segment_image  # a simulator of labels does not wait for it
 
@@ -250,11 +251,11 @@ class UltrasoundSimulator:
             "labels_as_imaged", where travel time and refraction put them, both (n, rows, columns) uint8 and 0 outside
             the imaged field; "depth" (n, rows, columns) float32, mm along the scan line, nan outside; "iq" complex64,
             "rf", its real signal, and "envelope" float32, and "bmode" uint8 (n, scan_lines, samples).
-        out : {output: array} to write to, as np.memmap. Without it arrays for which memory is short are temporary files
-            (in TMPDIR), which go with them.
+        out : {output: array} to write to, with all outputs, such as np.memmap. Without it arrays for which memory is
+            short are temporary files (in TMPDIR), which go with them.
 
-        Warns as simulate(), and once for all images that are empty. Raises SimulationError, before anything is
-        computed, as simulate(), for images of different sizes and for an `out` of another shape or type.
+        Warns as simulate(). Raises SimulationError, before anything is computed, as simulate(), for images of different
+        sizes, for an `out` of another shape or type, and for the "rf" of drafts, whose samples cannot hold it.
 
         >>> import numpy as np
         >>> from SlicerUSSim.Logic import DisplaySettings, LinearProbe, TissueTable, UltrasoundSimulator, Volume
@@ -283,9 +284,10 @@ class UltrasoundSimulator:
             ImageGrid.for_probe(probe, shown and shown.image_size)
             for probe, shown in zip(probes, displays, strict=True)
         ]
-        pixels = same_shapes([(grid.rows, grid.columns) for grid in grids])
-        lines = [quality.line_shape(*quality.worked(*both, pixels[1])) for both in zip(probes, each, strict=True)]
-        arrays = arrays_for(outputs, pixels, lines, out)
+        sizes = [(grid.rows, grid.columns) for grid in grids]
+        pixels = same_shapes(sizes, "set display.image_size, or simulate them apart")
+        works = [quality.worked(*both, pixels[1]) for both in zip(probes, each, strict=True)]
+        arrays = arrays_for(outputs, pixels, works, out)
         for both in dict.fromkeys(zip(probes, each, strict=True)):
             self.warn_if_slow(*both)
 
@@ -300,7 +302,7 @@ class UltrasoundSimulator:
                 yield probes[number], poses[number], displays[number], grids[number], noise_seeds[number], each[number]
 
         def start(number: int, frame: DeviceFrame) -> Callable[[], None]:
-            fetching = {name: fetched(name, frame, poses[number], lines[number][1]) for name in arrays}
+            fetching = {name: fetched(name, frame, poses[number]) for name in arrays}
 
             def complete() -> None:
                 for name, output in fetching.items():

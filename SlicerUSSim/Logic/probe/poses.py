@@ -224,7 +224,7 @@ def sample(volume: Volume, points_ras: np.ndarray, order: int = 1) -> np.ndarray
 
 
 def slice_under_probe(volume: Volume, grid: ImageGrid, probe_to_ras: np.ndarray, order: int = 1) -> np.ndarray:
-    """(rows, columns) values of `volume` at the pixels of a probe's image, as by sample()."""
+    """(rows, columns) values of `volume` at the pixels of a probe's image (frame.grid), as by sample()."""
     array, to_ijk = volume.array, volume.ras_to_ijk @ probe_to_ras @ grid.image_to_probe
     _, height, width = array.shape
     flat, last = array.reshape(-1), np.array(array.shape[::-1])[:, None, None] - 1

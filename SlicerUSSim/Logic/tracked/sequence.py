@@ -19,7 +19,7 @@ from pathlib import Path
 
 import numpy as np
 
-from SlicerUSSim.Logic.base.errors import SimulationError, require, require_package, require_path, required
+from SlicerUSSim.Logic.base.errors import SimulationError, require, require_package, required
 from SlicerUSSim.Logic.base.files import read_text, written_whole
 from SlicerUSSim.Logic.base.image_files import read_image
 from SlicerUSSim.Logic.base.reading import reader
@@ -234,7 +234,6 @@ class TrackedSequence:
         saves a sequence of them, are poses without images.
         Raises SimulationError for a file that is missing, unreadable or of another format.
         """
-        require_path(path)
         path = Path(path)
         require(path.is_file(), f"{path}: no such file")
         with path.open("rb") as file:
