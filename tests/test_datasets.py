@@ -235,7 +235,7 @@ def test_every_output_is_of_the_images_pixels_or_lines(folder, tmp_path):
     more = '[pose]\non = "surface"\n'
     made = recipe(folder, more, outputs=names, format_="hdf5")
     making_module.prepare(made, 0, tmp_path)
-    with pytest.raises(SimulationError, match=r"rf has 2.0 samples per cycle, .* quality full"):
+    with pytest.raises(SimulationError, match=r"rf has 2 samples per cycle, .* quality full"):
         render(made, tmp_path, 1)
     text = START.replace("draft", "full").format(
         outputs=", ".join(f'"{name}"' for name in names.split()), format="hdf5", file="brain.nii.gz"
