@@ -52,7 +52,8 @@ def made() -> UltrasoundSimulator:
 @pytest.mark.parametrize("varied", [False, True])
 def test_a_batch_has_the_bits_of_single_images(made, quality, varied):
     before, made.settings = made.settings, replace(made.settings, quality=quality)
-    probes = [replace(PROBE, focus_mm=30.0 + 5 * n) for n in range(3)] if varied else PROBE
+    nearest = 20.0 if quality == "full" else 30.0  # drafts have fewer scan lines for nearer foci, and signals one shape
+    probes = [replace(PROBE, focus_mm=nearest + 5 * n) for n in range(3)] if varied else PROBE
     displays = [replace(SMALL, gain_db=3.0 * n) for n in range(3)] if varied else SMALL
     own = made.medium.tissues
     tables = [own, own.replace("speckle", mu0=0.5), own] if varied else None
@@ -147,7 +148,7 @@ def test_a_draft_has_less_work_the_smaller_the_image_and_full_none(made):
     assert lines[0] <= lines[1] == 80 < lines[2] == own.scan_lines
     probe, settings = worked(own, replace(full, quality="draft", scatterers_per_mm3=3.0), 16)
     depth = np.linspace(0.0, own.depth_mm, 50)
-    assert (probe.line_distance_mm(depth) / probe.beam_sigma_mm(depth)[0]).max() < 2.05
+    assert (probe.line_distance_mm(depth) / probe.beam_sigma_mm(depth)[0]).max() < 2.0
     assert (settings.samples_per_cycle, settings.elevational_rays, settings.scatterers_per_mm3) == (2, 1, 3.0)
 
 

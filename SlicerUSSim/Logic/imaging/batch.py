@@ -52,8 +52,7 @@ def one_per_image(name: str, given: Any, kind: type, count: int) -> list:
         return [given] * count
     expected = f"expected one {'whole number' if kind is Integral else kind.__name__} or one for each pose"
     values = list(given) if isinstance(given, Sequence | np.ndarray) else [given]
-    wrong = [value for value in values if not isinstance(value, kind)]
-    require(not wrong, f"{name} is {short(given)}, {expected}")
+    require(all(isinstance(value, kind) for value in values), f"{name} is {short(given)}, {expected}")
     require(len(values) == count, f"{name} are {len(values)} for {count} poses, {expected}")
     return values
 
